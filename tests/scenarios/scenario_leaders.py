@@ -14,34 +14,15 @@ from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.operation import FormationsOperation
 from laneweave.coordinator.formations.roster import Formation
 from laneweave.protocol.lattice import PlannedMove, territory
-from laneweave.protocol.runtime.node import (
-    Arrived,
-    Compute,
-    Effect,
-    Event,
-    Send,
-    Started,
-    Wakeup,
-    run_job,
-)
+from laneweave.protocol.runtime import node
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.wire.messages import (
-    Ballot,
-    Census,
-    CensusEntry,
-    Heartbeat,
-    LogEvent,
-    Name,
-    Plan,
-    Prepare,
-    VehicleState,
-)
+from laneweave.protocol.wire import messages
 from laneweave.protocol.wire.topics import CENSUS, HEARTBEAT, STATE, Topic
 from scenarios.scenario_road import SCENARIO, SLOT_S, Vehicle
 from scenarios.scenario_text import cell_of, shown, written
 from support.paper import PAPER, closed_blocks
 
-Mail = dict[tuple[str, str, str], Prepare | Plan]
+Mail = dict[tuple[str, str, str], messages.Prepare | messages.Plan]
 """What has been sent: (PREPARE or PLAN, ballot, vehicle) to message."""
 
 RESEND_S = 0.2
@@ -66,7 +47,7 @@ class Leader:
         rules: RuleBook,
     ) -> Leader:
         """Return a leader that begins to observe."""
-        core = CoordinatorCore(Name(name), incarnation, PAPER)
+        core = CoordinatorCore(messages.Name(name), incarnation, PAPER)
         core.election.term = term
         rng = random.Random(0)
         control = FormationLeader(formation, core._new_ballot, rng, resend_s=RESEND_S, rules=rules)
@@ -83,7 +64,7 @@ class Leader:
         for vehicle, message in self.control.outgoing(now_s):
             yield post(mail, message, vehicle)
 
-    def hear(self, state: VehicleState, mail: Mail, now_s: float) -> Iterator[str]:
+    def hear(self, state: messages.VehicleState, mail: Mail, now_s: float) -> Iterator[str]:
         del mail
         yield from self._watched(lambda: self.control.on_state(state, now_s))
 
@@ -122,9 +103,9 @@ class Candidate:
     name: str
     core: CoordinatorCore
     incarnation: int
-    heartbeat: Heartbeat | None = None
+    heartbeat: messages.Heartbeat | None = None
     """The newest that it has sent."""
-    jobs: list[Compute] = field(factory=list)
+    jobs: list[node.Compute] = field(factory=list)
     """Plannings that it has ordered."""
 
     @classmethod
@@ -132,9 +113,9 @@ class Candidate:
         cls, name: str, incarnation: int, mail: Mail, now_s: float, rules: RuleBook
     ) -> Candidate:
         """Return a process that has just started."""
-        core = CoordinatorCore(Name(name), incarnation, SCENARIO, rules)
+        core = CoordinatorCore(messages.Name(name), incarnation, SCENARIO, rules)
         candidate = cls(name, core, incarnation)
-        list(candidate.handle(Started(), mail, now_s))
+        list(candidate.handle(node.Started(), mail, now_s))
         return candidate
 
     @property
@@ -149,28 +130,30 @@ class Candidate:
 
     def wake(self, mail: Mail, now_s: float) -> Iterator[str]:
         """Let timers run; list what is sent."""
-        yield from self.handle(Wakeup(), mail, now_s)
+        yield from self.handle(node.Wakeup(), mail, now_s)
 
-    def hear(self, what: VehicleState | Heartbeat, mail: Mail, now_s: float) -> Iterator[str]:
-        topic = HEARTBEAT if isinstance(what, Heartbeat) else STATE
+    def hear(
+        self, what: messages.VehicleState | messages.Heartbeat, mail: Mail, now_s: float
+    ) -> Iterator[str]:
+        topic = HEARTBEAT if isinstance(what, messages.Heartbeat) else STATE
         yield from self.get(topic, what, mail, now_s)
 
     def census(self, on_road: Iterable[Vehicle], mail: Mail, now_s: float) -> Iterator[str]:
         entries = tuple(map(entry_of, on_road))
-        census = Census(now_s, entries, (), *closed_blocks(entries, now_s, SCENARIO))
+        census = messages.Census(now_s, entries, (), *closed_blocks(entries, now_s, SCENARIO))
         yield from self.get(CENSUS, census, mail, now_s)
 
     def get(self, topic: Topic, message: object, mail: Mail, now_s: float) -> Iterator[str]:
-        yield from self.handle(Arrived(topic, {}, message), mail, now_s)
+        yield from self.handle(node.Arrived(topic, {}, message), mail, now_s)
 
     def plan(self, mail: Mail, now_s: float) -> Iterator[str]:
         """Let the planner finish what was ordered first."""
         if not self.jobs:
             yield f"{self.name} cannot plan"
             return
-        yield from self.handle(run_job(self.jobs.pop(0)), mail, now_s)
+        yield from self.handle(node.run_job(self.jobs.pop(0)), mail, now_s)
 
-    def handle(self, event: Event, mail: Mail, now_s: float) -> Iterator[str]:
+    def handle(self, event: node.Event, mail: Mail, now_s: float) -> Iterator[str]:
         """Pass an event to the core; yield its effects."""
         before = self.about()
         effects = self.core.handle(event, now_s)
@@ -195,21 +178,21 @@ class Candidate:
         election = self.core.election
         return f"{self.name} {'leads' if election.leading else 'waits'}, term {election.term}"
 
-    def _effect(self, effect: Effect, mail: Mail) -> str:
+    def _effect(self, effect: node.Effect, mail: Mail) -> str:
         match effect:
-            case Send(_, (Prepare() | Plan()) as message, parameters):
+            case node.Send(_, (messages.Prepare() | messages.Plan()) as message, parameters):
                 return post(mail, message, str(parameters["vehicle"]))
-            case Send(_, Heartbeat() as heartbeat):
+            case node.Send(_, messages.Heartbeat() as heartbeat):
                 self.heartbeat = heartbeat
-            case Send(_, LogEvent() as event):
+            case node.Send(_, messages.LogEvent() as event):
                 return self._log(event)
-            case Compute():
+            case node.Compute():
                 self.jobs.append(effect)
             case _:
                 pass
         return ""
 
-    def _log(self, event: LogEvent) -> str:
+    def _log(self, event: messages.LogEvent) -> str:
         match event.kind:
             case "leader-elected":
                 return f"{self.name} leads, term {event.data['term']}"
@@ -226,9 +209,9 @@ class Candidate:
                 return f"{self.name}: {kind}"
 
 
-def entry_of(vehicle: Vehicle) -> CensusEntry:
+def entry_of(vehicle: Vehicle) -> messages.CensusEntry:
     """Return how the census lists a vehicle."""
-    return CensusEntry(vehicle.name, vehicle.entry_cell, vehicle.preferred_lane, 0.0)
+    return messages.CensusEntry(vehicle.name, vehicle.entry_cell, vehicle.preferred_lane, 0.0)
 
 
 def formation_of(vehicles: Mapping[str, Vehicle], roster: str) -> Formation:
@@ -239,7 +222,7 @@ def formation_of(vehicles: Mapping[str, Vehicle], roster: str) -> Formation:
     return Formation(numbers, members)
 
 
-def written_plan(text: str, control: FormationLeader, ballot: Ballot) -> Plan:
+def written_plan(text: str, control: FormationLeader, ballot: messages.Ballot) -> messages.Plan:
     """Return the plan that a scenario gives, as the leader would issue it.
 
     Args:
@@ -252,19 +235,19 @@ def written_plan(text: str, control: FormationLeader, ballot: Ballot) -> Plan:
     text, _, roster = text.partition(" for ")
     members = frozenset(roster.split()) or frozenset(control.hold_cells)
     cells = {name: cell for name, cell in control.hold_cells.items() if name in members}
-    moves: dict[Name, tuple[PlannedMove, ...]] = dict.fromkeys(cells, ())
+    moves: dict[messages.Name, tuple[PlannedMove, ...]] = dict.fromkeys(cells, ())
     at = dict(cells)
     text, _, blocks = text.partition(" in blocks ")
     for item in text.split():
         who, step, target = re.split("[@>]", item)
         name, _, believed = who.partition(":")
-        mover = Name(name)
+        mover = messages.Name(name)
         if believed:
             at[mover] = cells[mover] = cell_of(believed)
         moves[mover] = (*moves[mover], (int(step), at[mover], cell_of(target)))
         at[mover] = cell_of(target)
     every_move = [move for each in moves.values() for move in each]
-    return Plan(
+    return messages.Plan(
         ballot=ballot,
         formations=tuple(map(int, blocks.split())) or control.formation.numbers,
         roster=tuple(cells),
@@ -277,9 +260,9 @@ def written_plan(text: str, control: FormationLeader, ballot: Ballot) -> Plan:
     )
 
 
-def post(mail: Mail, message: Prepare | Plan, vehicle: str) -> str:
+def post(mail: Mail, message: messages.Prepare | messages.Plan, vehicle: str) -> str:
     """Put a message into the mail; return the line that says so."""
-    kind = "PLAN" if isinstance(message, Plan) else "PREPARE"
+    kind = "PLAN" if isinstance(message, messages.Plan) else "PREPARE"
     mail[kind, written(message.ballot), vehicle] = message
     return f"{kind} {written(message.ballot)} to {vehicle}"
 
@@ -290,7 +273,7 @@ def about(name: str, control: FormationLeader) -> str:
     return f"{name} {control.phase.value}{ballot}"
 
 
-def _moves_of(plan: Plan) -> str:
+def _moves_of(plan: messages.Plan) -> str:
     moves = [
         f"{name}@{step}>{shown(target)}"
         for name, moves in sorted(plan.moves.items())

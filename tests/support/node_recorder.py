@@ -6,20 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 from attrs import define, field
 
-from laneweave.protocol.runtime.node import (
-    Announce,
-    Arrived,
-    Compute,
-    Effect,
-    Event,
-    Listen,
-    PeerDown,
-    PeerUp,
-    Send,
-    Started,
-    Wakeup,
-    Watch,
-)
+from laneweave.protocol.runtime import node
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions, Trace
 from laneweave.protocol.wire.messages import Heartbeat, Name
@@ -30,10 +17,10 @@ CALM = Conditions(delay_s=0.002, jitter_s=0.0)
 STORM = Conditions(
     jitter_s=0.05, loss=0.3, duplication=0.2, compute_jitter_s=0.1, compute_failure=0.3
 )
-Handler = Callable[[Event, float], Iterable[Effect]]
+Handler = Callable[[node.Event, float], Iterable[node.Effect]]
 
 
-def no_effects(_: Event, __: float) -> Iterable[Effect]:
+def no_effects(_: node.Event, __: float) -> Iterable[node.Effect]:
     return ()
 
 
@@ -42,14 +29,14 @@ class Recorder:
     """A core that records every event and answers with what `on_event` says."""
 
     on_event: Handler = no_effects
-    events: list[tuple[float, Event]] = field(factory=list)
+    events: list[tuple[float, node.Event]] = field(factory=list)
     wakeup_s: float | None = None
 
-    def handle(self, event: Event, now_s: float) -> Iterable[Effect]:
+    def handle(self, event: node.Event, now_s: float) -> Iterable[node.Effect]:
         self.events.append((now_s, event))
         return self.on_event(event, now_s)
 
-    def of(self, *kinds: type) -> list[Event]:
+    def of(self, *kinds: type) -> list[node.Event]:
         return [event for _, event in self.events if isinstance(event, kinds)]
 
     def times(self, kind: type) -> list[float]:
@@ -58,34 +45,34 @@ class Recorder:
     @property
     def numbers(self) -> list[int]:
         """Which beats arrived, in order."""
-        return [event.message.term for _, event in self.events if isinstance(event, Arrived)]
+        return [event.message.term for _, event in self.events if isinstance(event, node.Arrived)]
 
     @property
     def tokens(self) -> list[str]:
         """`+name` and `-name` of each token that appeared or vanished."""
-        signs = {PeerUp: "+", PeerDown: "-"}
+        signs = {node.PeerUp: "+", node.PeerDown: "-"}
         return [
             signs[type(event)] + event.parameters["vehicle"]
             for _, event in self.events
-            if isinstance(event, (PeerUp, PeerDown))
+            if isinstance(event, (node.PeerUp, node.PeerDown))
         ]
 
 
-def beat(number: int, sender: str = "a") -> Send:
+def beat(number: int, sender: str = "a") -> node.Send:
     message = Heartbeat(Name(sender), 1, number, leading=False, formations=0)
-    return Send(HEARTBEAT, message, {"coordinator": sender})
+    return node.Send(HEARTBEAT, message, {"coordinator": sender})
 
 
-def at_start(*effects: Effect) -> Handler:
-    return lambda event, _: effects if isinstance(event, Started) else ()
+def at_start(*effects: node.Effect) -> Handler:
+    return lambda event, _: effects if isinstance(event, node.Started) else ()
 
 
-def token(name: str) -> Announce:
-    return Announce(VEHICLE_ALIVE, {"vehicle": name})
+def token(name: str) -> node.Announce:
+    return node.Announce(VEHICLE_ALIVE, {"vehicle": name})
 
 
 def listener() -> Recorder:
-    return Recorder(at_start(Listen(HEARTBEAT), Watch(VEHICLE_ALIVE)))
+    return Recorder(at_start(node.Listen(HEARTBEAT), node.Watch(VEHICLE_ALIVE)))
 
 
 def network_of(
@@ -107,33 +94,36 @@ def send(network: SimulatedNetwork, name: str, *numbers: int) -> None:
     perform(network, name, *(beat(number, name) for number in numbers))
 
 
-def perform(network: SimulatedNetwork, name: str, *effects: Effect) -> None:
+def perform(network: SimulatedNetwork, name: str, *effects: node.Effect) -> None:
     """Have a node carry out effects now."""
     core = network.node(name).core
     assert isinstance(core, Recorder)
     before, core.on_event = core.on_event, lambda *_: effects
-    network.node(name).dispatch(Wakeup(), network.now_s)
+    network.node(name).dispatch(node.Wakeup(), network.now_s)
     core.on_event = before
 
 
 def chatter(
     seed: int, conditions: Conditions, trace: Trace | None = None, *, skip_codec: bool = False
-) -> tuple[list[list[tuple[float, Event]]], tuple[int, int]]:
+) -> tuple[list[list[tuple[float, node.Event]]], tuple[int, int]]:
     """Run nodes that talk, with all faults, and return what each saw."""
 
     def make(name: str) -> Recorder:
         core = Recorder()
         sent = 0
 
-        def talk(event: Event, now_s: float) -> Iterable[Effect]:
+        def talk(event: node.Event, now_s: float) -> Iterable[node.Effect]:
             nonlocal sent
-            if isinstance(event, Started):
+            if isinstance(event, node.Started):
                 core.wakeup_s = now_s + 0.01
-                return [Listen(HEARTBEAT), Watch(VEHICLE_ALIVE), token(name)]
-            if isinstance(event, Wakeup):
+                return [node.Listen(HEARTBEAT), node.Watch(VEHICLE_ALIVE), token(name)]
+            if isinstance(event, node.Wakeup):
                 core.wakeup_s = now_s + 0.01
                 sent += 1
-                return [beat(sent, name), *([Compute(sent, lambda: 1)] if sent % 10 == 0 else [])]
+                return [
+                    beat(sent, name),
+                    *([node.Compute(sent, lambda: 1)] if sent % 10 == 0 else []),
+                ]
             return ()
 
         core.on_event = talk

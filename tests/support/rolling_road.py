@@ -19,15 +19,7 @@ from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.scenario.fields import FormationSettings, Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
-from laneweave.protocol.wire.messages import (
-    Ballot,
-    Command,
-    Name,
-    Plan,
-    Prepare,
-    Sense,
-    VehicleState,
-)
+from laneweave.protocol.wire import messages
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from support.road_vehicles import controller_in
 
@@ -60,13 +52,13 @@ def controller_of(cells: Iterable[Cell]) -> MotionController:
 class Car:
     """A motion controller, and the process in charge of it."""
 
-    name: Name
+    name: messages.Name
     controller: MotionController
     rules: RuleBook = VEHICLE_RULES
     tick: int = 0
     attended: bool = True
     execution: PlanExecution = field(init=False)
-    sense: Sense = field(init=False)
+    sense: messages.Sense = field(init=False)
     """The newest one."""
 
     def __attrs_post_init__(self) -> None:
@@ -94,31 +86,31 @@ class Car:
         )
         self.execution.on_owned(self.sense)
 
-    def sense_now(self) -> Sense:
+    def sense_now(self) -> messages.Sense:
         controller = self.controller
-        return Sense(
+        return messages.Sense(
             self.name, self.tick, LATER_S + self.tick, controller.plant.state, controller.hold_cell,
             controller.motion_end_tick, controller.motion_origin, 0, (), (),
             attendant=controller.attendant, accepted=controller.accepted,
             owned=controller.owned, promised=controller.promised, transfer=controller.transfer,
         )  # fmt: skip
 
-    def command(self) -> Command:
+    def command(self) -> messages.Command:
         execution = self.execution
-        return Command(
+        return messages.Command(
             self.name, execution.incarnation, self.tick, execution.hold_cell, 0,
             self.controller.hold_cell, b"", accepted=execution.wanted_accepted,
             promised=execution.wanted_promised, transfer=execution.transfer,
         )  # fmt: skip
 
-    def state(self) -> VehicleState:
+    def state(self) -> messages.VehicleState:
         return self.execution.state(self.sense, 0, attended=self.attended)
 
-    def state_now(self) -> VehicleState:
+    def state_now(self) -> messages.VehicleState:
         """Return what it would show if its process had just heard of its controller."""
         return self.execution.state(self.sense_now(), 0, attended=self.attended)
 
-    def take(self, sense: Sense) -> None:
+    def take(self, sense: messages.Sense) -> None:
         """Hear of the controller, as a process in charge does."""
         if sense.attendant != self.execution.incarnation or sense.tick < self.sense.tick:
             return
@@ -135,7 +127,7 @@ class Car:
                 execution.end_motion()
             execution.tick(LATER_S)
 
-    def obey(self, command: Command) -> None:
+    def obey(self, command: messages.Command) -> None:
         """Take a COMMAND in the controller."""
         controller = self.controller
         controller.store_requests(command)
@@ -147,11 +139,11 @@ class Car:
             controller.hold_cell = command.hold_cell
             controller.motion_end_tick = UNDER_WAY
 
-    def told(self, message: Prepare | Plan | VehicleState) -> None:
+    def told(self, message: messages.Prepare | messages.Plan | messages.VehicleState) -> None:
         """Take a message of others in the process in charge."""
-        if isinstance(message, Prepare):
+        if isinstance(message, messages.Prepare):
             self.execution.on_prepare(message)
-        elif isinstance(message, VehicleState):
+        elif isinstance(message, messages.VehicleState):
             if self.attended:
                 self.execution.on_state(message)
         elif self.attended or not message.moves.get(self.name):
@@ -162,12 +154,12 @@ class Car:
 class Leader:
     """Somebody who thinks to lead."""
 
-    name: Name
+    name: messages.Name
     seq: int = 0
-    states: dict[Name, VehicleState] = field(factory=dict)
+    states: dict[messages.Name, messages.VehicleState] = field(factory=dict)
     handovers: list[CellTransfer] = field(factory=list)
 
-    def hear(self, state: VehicleState) -> None:
+    def hear(self, state: messages.VehicleState) -> None:
         known = self.states.get(state.vehicle)
         if known is not None and is_older(state, known):
             return
@@ -176,7 +168,7 @@ class Leader:
             if state.vehicle in handover.roster and handover.wakeup_s is not None:
                 handover.on_state(state, self.states, 0.0)
 
-    def owners(self) -> dict[Cell, Name]:
+    def owners(self) -> dict[Cell, messages.Name]:
         return {
             cell: name
             for name, state in self.states.items()
@@ -190,7 +182,7 @@ class Leader:
             return
         owners = self.owners()
         held = {state.hold_cell for state in self.states.values()}
-        name = rng.choice(sorted(self.states) or [Name("A")])
+        name = rng.choice(sorted(self.states) or [messages.Name("A")])
         if name not in self.states:
             return
         column, lane = self.states[name].hold_cell
@@ -202,7 +194,7 @@ class Leader:
         if roster == (name,) and rng.random() < 0.7:
             return
         self.seq += 1
-        ballot = Ballot(term, self.name, 1, self.seq)
+        ballot = messages.Ballot(term, self.name, 1, self.seq)
         move = ((column, lane), target)
         self.handovers = [
             *self.handovers[-2:],
@@ -221,7 +213,7 @@ class Leader:
 class Mail:
     """A message on its way."""
 
-    to: Name
+    to: messages.Name
     message: object
 
 
@@ -235,10 +227,10 @@ class Road:
 
     rng: Random
     rules: RuleBook = VEHICLE_RULES
-    cars: dict[Name, Car] = field(init=False)
+    cars: dict[messages.Name, Car] = field(init=False)
     leaders: tuple[Leader, ...] = field(init=False)
     mail: list[Mail] = field(factory=list)
-    opened: set[Ballot] = field(factory=set)
+    opened: set[messages.Ballot] = field(factory=set)
     """Ballots whose gates some controller knows to be open."""
     moves: int = 0
     """Moves that have begun."""
@@ -247,10 +239,10 @@ class Road:
     def __attrs_post_init__(self) -> None:
         """Let everybody hold in its cell."""
         self.cars = {
-            Name(name): Car(Name(name), controller_of(cells), self.rules)
+            messages.Name(name): Car(messages.Name(name), controller_of(cells), self.rules)
             for name, cells in OWNED.items()
         }
-        self.leaders = (Leader(Name("c1")), Leader(Name("c2")))
+        self.leaders = (Leader(messages.Name("c1")), Leader(messages.Name("c2")))
 
     def run(self, steps: int) -> None:
         """Let anything happen."""
@@ -270,7 +262,7 @@ class Road:
     def car(self) -> Car:
         return self.cars[self.rng.choice(sorted(self.cars))]
 
-    def post(self, to: Name, message: object) -> None:
+    def post(self, to: messages.Name, message: object) -> None:
         if self.rng.random() < 0.9:
             self.mail.append(Mail(to, message))
 
@@ -283,24 +275,24 @@ class Road:
         message, car = mail.message, self.cars.get(mail.to)
         if car is None:
             for leader in self.leaders:
-                if leader.name == mail.to and isinstance(message, VehicleState):
+                if leader.name == mail.to and isinstance(message, messages.VehicleState):
                     leader.hear(message)
-        elif isinstance(message, Command):
+        elif isinstance(message, messages.Command):
             self.obey(car, message)
             self.post(car.name, car.sense_now())
-        elif isinstance(message, Sense):
+        elif isinstance(message, messages.Sense):
             shown = car.execution.promise_stored, car.execution.accepted
             car.take(message)
             if (car.execution.promise_stored, car.execution.accepted) != shown:
                 self.show(car)
-        elif isinstance(message, Prepare | Plan | VehicleState):
+        elif isinstance(message, messages.Prepare | messages.Plan | messages.VehicleState):
             car.told(message)
-            if not isinstance(message, VehicleState):
+            if not isinstance(message, messages.VehicleState):
                 self.post(car.name, car.command())
         if len(self.mail) > 60:
             del self.mail[self.rng.randrange(60)]
 
-    def obey(self, car: Car, command: Command) -> None:
+    def obey(self, car: Car, command: messages.Command) -> None:
         before = car.controller.hold_cell
         car.obey(command)
         self.moves += car.controller.hold_cell != before
@@ -359,7 +351,7 @@ class Road:
 
     def check(self) -> None:
         """Check that no cell has two owners, and that everybody is where it may be."""
-        owner: dict[Cell, Name] = {}
+        owner: dict[Cell, messages.Name] = {}
         for name, car in self.cars.items():
             cells = self.owned(car)
             for cell in cells:

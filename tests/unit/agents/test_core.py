@@ -7,25 +7,10 @@ import pytest
 
 from laneweave.agents.core import AgentCore
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.runtime.node import (
-    Announce,
-    Listen,
-    Send,
-    Started,
-    Unlisten,
-    Withdraw,
-)
+from laneweave.protocol.runtime import node
 from laneweave.protocol.vehicle.motion import ARRIVED_ACROSS_M, ARRIVED_ALONG_M
+from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.messages import Command, Name, Neighbour, Prepare, Report
-from laneweave.protocol.wire.topics import (
-    COMMAND,
-    PLAN,
-    PREPARE,
-    REPORT,
-    SENSE,
-    STATE,
-    VEHICLE_ALIVE,
-)
 from support.agent_rig import HOME, ME, MOVE_TICKS, OTHER, SCENARIO, TICK_S, Rig, up_and_running
 from support.states import BALLOT, holding, make_plan, sent
 
@@ -37,11 +22,11 @@ BOTH: dict[Name, Cell] = {ME: HOME, OTHER: (0, 0)}
 def test_starts_with_its_own_topics_and_the_token_last() -> None:
     agent = AgentCore(ME, lambda: 1, SCENARIO)
     own = {"vehicle": ME}
-    assert list(agent.handle(Started(), 0.0)) == [
-        Listen(SENSE, own),
-        Listen(PREPARE, own),
-        Listen(PLAN, own),
-        Announce(VEHICLE_ALIVE, own),
+    assert list(agent.handle(node.Started(), 0.0)) == [
+        node.Listen(topics.SENSE, own),
+        node.Listen(topics.PREPARE, own),
+        node.Listen(topics.PLAN, own),
+        node.Announce(topics.VEHICLE_ALIVE, own),
     ]
     assert agent.wakeup_s is None
     assert agent.wanted_states == ()
@@ -50,12 +35,12 @@ def test_starts_with_its_own_topics_and_the_token_last() -> None:
 def test_the_state_contains_measurements_and_the_block_of_entry() -> None:
     rig = Rig()
     sense = attrs.evolve(rig.sense(), formation=5, joined=(5, 6))
-    rig.hand(SENSE, sense)
+    rig.hand(topics.SENSE, sense)
     rig.coast(1)
     sense = attrs.evolve(rig.sense(), formation=5, joined=(5, 6), attendant=1)
-    command, state = (each for each in rig.hand(SENSE, sense) if isinstance(each, Send))
-    assert (command.topic, command.parameters) == (COMMAND, {"vehicle": ME})
-    assert (state.topic, state.parameters) == (STATE, {"formation": 5, "vehicle": ME})
+    command, state = (each for each in rig.hand(topics.SENSE, sense) if isinstance(each, node.Send))
+    assert (command.topic, command.parameters) == (topics.COMMAND, {"vehicle": ME})
+    assert (state.topic, state.parameters) == (topics.STATE, {"formation": 5, "vehicle": ME})
     s_m, speed_mps, _, y_m, *_ = sense.state
     values = {"s_m": s_m, "y_m": y_m, "speed_mps": speed_mps, "t_s": TICK_S}
     assert rig.shown == [holding(ME, None, HOME, formation=5, joined=(5, 6), **values)]
@@ -63,16 +48,19 @@ def test_the_state_contains_measurements_and_the_block_of_entry() -> None:
 
 def test_left_reports_once_and_withdraws_its_token_last() -> None:
     rig = up_and_running()
-    effects = rig.hand(SENSE, rig.sense(left=True))
+    effects = rig.hand(topics.SENSE, rig.sense(left=True))
     assert rig.agent.ended
     (report,) = sent(effects, Report)
     assert (report.role, report.name, report.solves, report.unusable) == ("agent", ME, 2, 0)
     assert len(report.solve_ms) == 2 * 4
-    assert isinstance(effects[0], Send)
-    assert effects[0].topic is REPORT
-    assert effects[1:-1] == [Unlisten(topic, {"vehicle": ME}) for topic in (SENSE, PREPARE, PLAN)]
-    assert effects[-1] == Withdraw(VEHICLE_ALIVE, {"vehicle": ME})
-    assert rig.hand(SENSE, rig.sense(left=True)) == []
+    assert isinstance(effects[0], node.Send)
+    assert effects[0].topic is topics.REPORT
+    assert effects[1:-1] == [
+        node.Unlisten(topic, {"vehicle": ME})
+        for topic in (topics.SENSE, topics.PREPARE, topics.PLAN)
+    ]
+    assert effects[-1] == node.Withdraw(topics.VEHICLE_ALIVE, {"vehicle": ME})
+    assert rig.hand(topics.SENSE, rig.sense(left=True)) == []
 
 
 # --- one answer per tick ----------------------------------------------------------------------
@@ -81,14 +69,14 @@ def test_left_reports_once_and_withdraws_its_token_last() -> None:
 def test_answers_each_tick_once_and_repeats_are_the_same_bytes() -> None:
     rig = up_and_running()
     sense = rig.sense()
-    effects = rig.hand(SENSE, sense)
-    assert [e.topic for e in effects if isinstance(e, Send)] == [COMMAND, STATE]
+    effects = rig.hand(topics.SENSE, sense)
+    assert [e.topic for e in effects if isinstance(e, node.Send)] == [topics.COMMAND, topics.STATE]
     (command,) = sent(effects, Command)
     assert (command.tick, command.hold_cell, command.motion_end_tick) == (2, HOME, 0)
     assert (command.incarnation, command.joined) == (1, (0,))
     for _ in range(3):
-        assert rig.hand(SENSE, attrs.evolve(sense, t_s=99.0)) == [
-            Send(COMMAND, command, {"vehicle": ME})
+        assert rig.hand(topics.SENSE, attrs.evolve(sense, t_s=99.0)) == [
+            node.Send(topics.COMMAND, command, {"vehicle": ME})
         ]
 
 
@@ -96,8 +84,8 @@ def test_older_ticks_and_other_vehicles_are_ignored() -> None:
     rig = up_and_running()
     old = rig.sense()
     rig.run(2)
-    assert rig.hand(SENSE, old) == []
-    assert rig.hand(SENSE, attrs.evolve(rig.sense(), vehicle=OTHER)) == []
+    assert rig.hand(topics.SENSE, old) == []
+    assert rig.hand(topics.SENSE, attrs.evolve(rig.sense(), vehicle=OTHER)) == []
     assert rig.run().t_s == pytest.approx((rig.tick - 1) * TICK_S)
 
 
@@ -107,32 +95,32 @@ def test_an_agent_starts_anew_on_the_road_of_a_newer_bridge() -> None:
     rig.run(20)
     old = attrs.evolve(rig.sense(), tick=rig.tick + 50)
     first = Rig().sense()  # of the next road: tick 0, and no process is in charge yet
-    (claim,) = sent(rig.hand(SENSE, attrs.evolve(first, bridge=7)), Command)
+    (claim,) = sent(rig.hand(topics.SENSE, attrs.evolve(first, bridge=7)), Command)
     assert (claim.tick, claim.incarnation, claim.hold_cell) == (0, 2, HOME)
     assert not rig.agent.in_charge
     # A message of the earlier bridge may still be on its way, and its tick is higher.
-    assert rig.hand(SENSE, old) == []
+    assert rig.hand(topics.SENSE, old) == []
     granted = attrs.evolve(first, bridge=7, tick=1, t_s=TICK_S, attendant=2)
-    rig.hand(SENSE, granted)
+    rig.hand(topics.SENSE, granted)
     state = rig.shown[-1]
     assert (state.incarnation, state.promised, state.accepted) == (2, None, False)
-    assert rig.hand(SENSE, attrs.evolve(old, left=True)) == []
+    assert rig.hand(topics.SENSE, attrs.evolve(old, left=True)) == []
     assert not rig.agent.ended
 
 
 def test_a_lost_note_is_requested_again_with_each_tick() -> None:
     rig = up_and_running()
-    rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME,)))
+    rig.hand(topics.PREPARE, Prepare(BALLOT, (0,), (ME,)))
     plan = make_plan({ME: HOME}, {ME: ((0, HOME, (-1, 2)),)})
-    (asked,) = sent(rig.hand(PLAN, plan), Command)  # it is lost
+    (asked,) = sent(rig.hand(topics.PLAN, plan), Command)  # it is lost
     assert rig.played is not None
     assert asked == attrs.evolve(rig.played, accepted=BALLOT)  # the same motion
     for _ in range(3):
-        effects = rig.hand(SENSE, rig.sense())
+        effects = rig.hand(topics.SENSE, rig.sense())
         (command,) = sent(effects, Command)
         assert (command.accepted, command.hold_cell) == (BALLOT, HOME)
         assert not rig.shown[-1].accepted
-        assert rig.hand(PLAN, plan) == []  # it has asked already
+        assert rig.hand(topics.PLAN, plan) == []  # it has asked already
         rig.coast(1)
     assert not rig.run().accepted  # now the controller hears of it
     state = rig.run()

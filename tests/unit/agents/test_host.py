@@ -11,23 +11,9 @@ from attrs import evolve
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import NO_BRIDGE_S, AgentHost, AgentMetrics
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.runtime.node import (
-    Announce,
-    Arrived,
-    Effect,
-    End,
-    Event,
-    Listen,
-    PeerDown,
-    PeerUp,
-    Started,
-    Stopping,
-    Unlisten,
-    Wakeup,
-    Watch,
-    Withdraw,
-)
+from laneweave.protocol.runtime import node
 from laneweave.protocol.scenario.deployment_fields import Shard
+from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.messages import (
     Announcement,
     Census,
@@ -38,17 +24,6 @@ from laneweave.protocol.wire.messages import (
     Report,
     VehicleState,
 )
-from laneweave.protocol.wire.topics import (
-    BRIDGE_ALIVE,
-    CENSUS,
-    MOTION,
-    PLAN,
-    PREPARE,
-    SENSE,
-    STATE,
-    VEHICLE_ALIVE,
-    Topic,
-)
 from support.paper import PAPER
 from support.states import BALLOT, make_plan, sense_in, sent
 
@@ -57,19 +32,19 @@ FRONT: Cell = (0, 0)
 """In formation 0; the next block begins at column -4."""
 SIDE: Cell = (-1, 1)
 """Likewise."""
-STATES_OF_0 = STATE, {"formation": 0}
+STATES_OF_0 = topics.STATE, {"formation": 0}
 
 
 def make_host(*vehicles: Name, shard: Shard | None = None) -> AgentHost:
     return AgentHost(lambda name: AgentCore(name, lambda: 1, PAPER), vehicles, shard)
 
 
-def give(host: AgentHost, event: Event, now_s: float = 0.0) -> list[Effect]:
+def give(host: AgentHost, event: node.Event, now_s: float = 0.0) -> list[node.Effect]:
     return list(host.handle(event, now_s))
 
 
-def hand(host: AgentHost, topic: Topic, vehicle: Name, message: object) -> list[Effect]:
-    return give(host, Arrived(topic, {"vehicle": vehicle}, message))
+def hand(host: AgentHost, topic: topics.Topic, vehicle: Name, message: object) -> list[node.Effect]:
+    return give(host, node.Arrived(topic, {"vehicle": vehicle}, message))
 
 
 def feel(
@@ -78,49 +53,49 @@ def feel(
     cell: Cell = FRONT,
     tick: int = 1,
     **more: Any,  # noqa: ANN401 (fields)
-) -> list[Effect]:
+) -> list[node.Effect]:
     """Send a vehicle its SENSE; its agent is in charge, unless another attendant is given."""
     felt = sense_in(cell, tick, vehicle=vehicle, **({"attendant": 1} | more))
-    return hand(host, SENSE, vehicle, felt)
+    return hand(host, topics.SENSE, vehicle, felt)
 
 
-def show(host: AgentHost, state: VehicleState) -> list[Effect]:
+def show(host: AgentHost, state: VehicleState) -> list[node.Effect]:
     """Bring the host a state of a vehicle, as the network does."""
     key = {"formation": str(state.formation), "vehicle": state.vehicle}
-    return give(host, Arrived(STATE, key, state))
+    return give(host, node.Arrived(topics.STATE, key, state))
 
 
 def census(
     *announced: Name, on_road: Iterable[Name] = (), t_s: float = 1.0, bridge: int = 0
-) -> Arrived:
+) -> node.Arrived:
     entries = tuple(CensusEntry(name, FRONT, 0, 0.0) for name in on_road)
     announcements = tuple(Announcement(name, 0, 0, 5.0) for name in announced)
-    return Arrived(CENSUS, {}, Census(t_s, entries, announcements, bridge=bridge))
+    return node.Arrived(topics.CENSUS, {}, Census(t_s, entries, announcements, bridge=bridge))
 
 
 def accept(
     host: AgentHost, cells: dict[Name, Cell], formations: tuple[int, ...] = (0,)
-) -> list[Effect]:
+) -> list[node.Effect]:
     """Let all vehicles of a roster promise and accept a plan without moves, in the first tick."""
-    effects: list[Effect] = []
+    effects: list[node.Effect] = []
     for name in cells:
-        effects += hand(host, PREPARE, name, Prepare(BALLOT, formations, tuple(cells)))
+        effects += hand(host, topics.PREPARE, name, Prepare(BALLOT, formations, tuple(cells)))
     plan = make_plan(cells, formations=formations)
     for name, cell in cells.items():
-        effects += hand(host, PLAN, name, plan)
+        effects += hand(host, topics.PLAN, name, plan)
         effects += feel(host, name, cell, joined=formations, accepted=BALLOT)
     return effects
 
 
 def test_events_go_to_the_vehicle_that_they_concern() -> None:
     host = make_host(A, B)
-    started = give(host, Started())
-    assert [e.parameters["vehicle"] for e in started if isinstance(e, Announce)] == [A, B]
+    started = give(host, node.Started())
+    assert [e.parameters["vehicle"] for e in started if isinstance(e, node.Announce)] == [A, B]
     effects = feel(host, B, SIDE)
     assert [each.vehicle for each in sent(effects, Command)] == [B]
     assert [each.vehicle for each in sent(effects, VehicleState)] == [B]
     feel(host, A)
-    effects = hand(host, PREPARE, A, Prepare(BALLOT, (0,), (A, B)))
+    effects = hand(host, topics.PREPARE, A, Prepare(BALLOT, (0,), (A, B)))
     assert [(s.vehicle, s.promised) for s in sent(effects, VehicleState)] == [(A, BALLOT)]
     assert feel(host, C) == []
 
@@ -146,10 +121,10 @@ def test_host_subscribes_to_all_formations_of_a_plan_while_an_agent_waits(
     host = make_host(A, B)
     cells: dict[Name, Cell] = {A: FRONT, B: rear}
     for name, cell in cells.items():
-        assert Listen(*STATES_OF_0) not in feel(host, name, cell, joined=formations)
+        assert node.Listen(*STATES_OF_0) not in feel(host, name, cell, joined=formations)
     effects = accept(host, cells, formations)
-    assert [effect for effect in effects if isinstance(effect, Listen)] == [
-        Listen(STATE, {"formation": each}) for each in formations
+    assert [effect for effect in effects if isinstance(effect, node.Listen)] == [
+        node.Listen(topics.STATE, {"formation": each}) for each in formations
     ]
     first, second = (state for state in sent(effects, VehicleState) if state.accepted)
     assert (first.formation, second.formation) == (0, formations[-1])
@@ -157,18 +132,18 @@ def test_host_subscribes_to_all_formations_of_a_plan_while_an_agent_waits(
     (state,) = sent(feel(host, A, FRONT, 2, joined=formations), VehicleState)
     assert state.go
     effects = feel(host, B, rear, 2, joined=formations)
-    assert [effect for effect in effects if isinstance(effect, Unlisten)] == [
-        Unlisten(STATE, {"formation": each}) for each in formations
+    assert [effect for effect in effects if isinstance(effect, node.Unlisten)] == [
+        node.Unlisten(topics.STATE, {"formation": each}) for each in formations
     ]
 
 
 def test_an_agent_that_lost_charge_waits_for_no_states() -> None:
     host = make_host(A)
     feel(host, A)
-    assert Listen(*STATES_OF_0) in accept(host, {A: FRONT, B: SIDE})
+    assert node.Listen(*STATES_OF_0) in accept(host, {A: FRONT, B: SIDE})
     effects = feel(host, A, FRONT, 2, attendant=9)
-    assert [e for e in effects if getattr(e, "topic", None) is not MOTION] == [
-        Unlisten(*STATES_OF_0)
+    assert [e for e in effects if getattr(e, "topic", None) is not topics.MOTION] == [
+        node.Unlisten(*STATES_OF_0)
     ]
 
 
@@ -176,9 +151,9 @@ def test_ends_when_the_last_vehicle_has_left() -> None:
     host = make_host(A, B)
     for name in (A, B):
         feel(host, name)
-    assert End() not in feel(host, A, FRONT, 2, left=True)
+    assert node.End() not in feel(host, A, FRONT, 2, left=True)
     assert feel(host, A, FRONT, 3) == []
-    assert feel(host, B, FRONT, 2, left=True).count(End()) == 1
+    assert feel(host, B, FRONT, 2, left=True).count(node.End()) == 1
 
 
 def test_what_agents_have_counted_stays_when_they_end() -> None:
@@ -202,41 +177,41 @@ def test_nothing_follows_the_end() -> None:
     feel(host, A)
     accept(host, {A: FRONT, B: SIDE})  # A waits for B's state
     effects = feel(host, A, FRONT, 2, left=True)
-    assert effects[-2:] == [Unlisten(*STATES_OF_0), End()]
+    assert effects[-2:] == [node.Unlisten(*STATES_OF_0), node.End()]
 
 
 @pytest.mark.parametrize("strangers", [[], ["ghost"]])
 def test_ends_when_no_bridge_comes(strangers: list[str]) -> None:
     host = make_host(A)
-    give(host, Started(), 10.0)
+    give(host, node.Started(), 10.0)
     for stranger in strangers:
-        give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": stranger}), 11.0)
+        give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": stranger}), 11.0)
     assert host.wakeup_s == 10.0 + NO_BRIDGE_S
-    assert give(host, Wakeup(), 10.0 + NO_BRIDGE_S) == [End()]
+    assert give(host, node.Wakeup(), 10.0 + NO_BRIDGE_S) == [node.End()]
 
 
 def test_waits_for_its_vehicle_as_long_as_the_bridge_is_there() -> None:
     host = make_host(A)
-    give(host, Started(), 10.0)
-    give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}), 11.0)
+    give(host, node.Started(), 10.0)
+    give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": "7"}), 11.0)
     assert host.wakeup_s is None
-    give(host, PeerDown(BRIDGE_ALIVE, {"incarnation": "6"}), 12.0)
+    give(host, node.PeerDown(topics.BRIDGE_ALIVE, {"incarnation": "6"}), 12.0)
     assert host.wakeup_s is None
-    give(host, PeerDown(BRIDGE_ALIVE, {"incarnation": "7"}), 100.0)
-    assert give(host, Wakeup(), 99.0 + NO_BRIDGE_S) == []
-    give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}), 99.5 + NO_BRIDGE_S)
+    give(host, node.PeerDown(topics.BRIDGE_ALIVE, {"incarnation": "7"}), 100.0)
+    assert give(host, node.Wakeup(), 99.0 + NO_BRIDGE_S) == []
+    give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": "7"}), 99.5 + NO_BRIDGE_S)
     assert host.wakeup_s is None
 
 
 def test_a_new_bridge_has_new_vehicles_of_the_same_names() -> None:
     host = make_host(shard=Shard(0, 1))
-    give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
+    give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": "7"}))
     first = census(A)
-    assert Announce(VEHICLE_ALIVE, {"vehicle": A}) in give(host, first)
+    assert node.Announce(topics.VEHICLE_ALIVE, {"vehicle": A}) in give(host, first)
     assert give(host, first) == []
-    gone = give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))
-    assert Withdraw(VEHICLE_ALIVE, {"vehicle": A}) in gone
-    assert Announce(VEHICLE_ALIVE, {"vehicle": A}) in give(host, first)
+    gone = give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": "8"}))
+    assert node.Withdraw(topics.VEHICLE_ALIVE, {"vehicle": A}) in gone
+    assert node.Announce(topics.VEHICLE_ALIVE, {"vehicle": A}) in give(host, first)
 
 
 @pytest.mark.parametrize("other", ["6", "ghost", "-1", "x"])
@@ -244,21 +219,21 @@ def test_what_is_no_newer_bridge_changes_nothing(other: str) -> None:
     """A bridge of an earlier run that was only asleep, or a stranger's token."""
     named, shard = make_host(A), make_host(shard=Shard(0, 1))
     for host in (named, shard):
-        give(host, Started(), 10.0)
-        give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}), 11.0)
+        give(host, node.Started(), 10.0)
+        give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": "7"}), 11.0)
     give(shard, census(A))
     for host in (named, shard):
-        assert give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": other}), 12.0) == []
-        assert give(host, PeerDown(BRIDGE_ALIVE, {"incarnation": other}), 13.0) == []
+        assert give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": other}), 12.0) == []
+        assert give(host, node.PeerDown(topics.BRIDGE_ALIVE, {"incarnation": other}), 13.0) == []
         assert host.wakeup_s is None
-        assert give(host, Wakeup(), 14.0 + NO_BRIDGE_S) == []
+        assert give(host, node.Wakeup(), 14.0 + NO_BRIDGE_S) == []
     assert give(shard, census(A)) == []  # it has the vehicle still
 
 
 def test_a_shard_lets_go_of_vehicles_that_the_census_lacks() -> None:
     host = make_host(shard=Shard(0, 1))
     give(host, census(A, B))
-    assert Withdraw(VEHICLE_ALIVE, {"vehicle": B}) in give(host, census(A, t_s=2.0))
+    assert node.Withdraw(topics.VEHICLE_ALIVE, {"vehicle": B}) in give(host, census(A, t_s=2.0))
     assert give(host, census(A, B, t_s=1.0)) == []  # an older one
 
 
@@ -267,15 +242,15 @@ def test_a_shard_accepts_the_census_of_its_own_bridge(other: int) -> None:
     """That of an earlier road may come late, that of a newer one before its token."""
     host = make_host(shard=Shard(0, 1))
     assert give(host, census(A, bridge=7)) == []
-    give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
+    give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": "7"}))
     assert give(host, census(B, t_s=9.0, bridge=other)) == []
-    assert Announce(VEHICLE_ALIVE, {"vehicle": A}) in give(host, census(A, bridge=7))
+    assert node.Announce(topics.VEHICLE_ALIVE, {"vehicle": A}) in give(host, census(A, bridge=7))
     # Neither does it make the next one of the right road look old.
-    assert Announce(VEHICLE_ALIVE, {"vehicle": C}) in give(host, census(A, C, bridge=7))
+    assert node.Announce(topics.VEHICLE_ALIVE, {"vehicle": C}) in give(host, census(A, C, bridge=7))
 
 
 def test_stopping_reports_for_every_vehicle() -> None:
-    reports = sent(give(make_host(A, B), Stopping()), Report)
+    reports = sent(give(make_host(A, B), node.Stopping()), Report)
     assert [report.name for report in reports] == [A, B]
 
 
@@ -284,13 +259,16 @@ def test_a_shard_takes_announced_vehicles_and_those_on_the_road_once() -> None:
     names = [Name(f"v{number}") for number in range(20)]
     up: list[str] = []
     for host in shards:
-        assert give(host, Started()) == [Watch(BRIDGE_ALIVE), Listen(CENSUS)]
+        assert give(host, node.Started()) == [
+            node.Watch(topics.BRIDGE_ALIVE),
+            node.Listen(topics.CENSUS),
+        ]
         assert host.wakeup_s is None
         for _ in range(2):
             up += [
                 effect.parameters["vehicle"]
                 for effect in give(host, census(*names[3:], on_road=names[:5]))
-                if isinstance(effect, Announce) and effect.topic is VEHICLE_ALIVE
+                if isinstance(effect, node.Announce) and effect.topic is topics.VEHICLE_ALIVE
             ]
     assert sorted(up) == sorted(names)
 
@@ -299,9 +277,9 @@ def test_a_shard_continues_without_vehicles_and_takes_none_twice() -> None:
     host = make_host(shard=Shard(0, 1))
     give(host, census(on_road=[A]))
     feel(host, A)
-    assert End() not in feel(host, A, FRONT, 2, left=True)
+    assert node.End() not in feel(host, A, FRONT, 2, left=True)
     assert give(host, census(on_road=[A])) == []
-    assert give(host, Wakeup(), 1e6) == []
+    assert give(host, node.Wakeup(), 1e6) == []
 
 
 def test_without_a_shard_the_census_is_ignored() -> None:

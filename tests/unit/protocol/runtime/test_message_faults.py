@@ -8,34 +8,12 @@ from unittest.mock import Mock
 import pytest
 from attrs import define
 
-from laneweave.protocol.runtime import message_faults
+from laneweave.protocol.runtime import message_faults, node
 from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule
 from laneweave.protocol.runtime.metrics import RouterMetrics
-from laneweave.protocol.runtime.node import (
-    Arrived,
-    Effect,
-    Event,
-    Node,
-    PeerDown,
-    PeerUp,
-    QueryArrived,
-    Send,
-    Started,
-    Stopping,
-    Wakeup,
-)
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
+from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report, RoadClock
-from laneweave.protocol.wire.topics import (
-    CLOCK,
-    COORDINATOR_ALIVE,
-    EVENT,
-    HEARTBEAT,
-    REPORT,
-    STATE,
-    Keys,
-    Topic,
-)
 from support.node_recorder import Recorder, at_start, beat
 from support.refusals import refusal
 
@@ -46,8 +24,8 @@ class Board:
     dropped: int = 0
 
 
-def arrived(number: int, topic: Topic = STATE, **parameters: str) -> Arrived:
-    return Arrived(topic, parameters, beat(number).message)
+def arrived(number: int, topic: topics.Topic = topics.STATE, **parameters: str) -> node.Arrived:
+    return node.Arrived(topic, parameters, beat(number).message)
 
 
 def faulty(
@@ -57,14 +35,14 @@ def faulty(
     return FaultyCore(listener, rules, board or Board(), receiver=receiver, seed=seed), listener
 
 
-def feed(core: FaultyCore, event: Event, now_s: float = 0.0) -> list[Effect]:
+def feed(core: FaultyCore, event: node.Event, now_s: float = 0.0) -> list[node.Effect]:
     return list(core.handle(event, now_s))
 
 
 def run_until(core: FaultyCore, end_s: float) -> None:
     """Wake the core whenever it wants to be woken."""
     while (wakeup_s := core.wakeup_s) is not None and wakeup_s <= end_s:
-        feed(core, Wakeup(), wakeup_s)
+        feed(core, node.Wakeup(), wakeup_s)
 
 
 def received(rule: MessageRule, count: int = 2000, seed: str = "1") -> list[int]:
@@ -83,8 +61,8 @@ def test_metrics_of_the_wrapped_core_are_visible() -> None:
             return [RouterMetrics(7)]
 
     core = FaultyCore(Counting(), (), Board(), receiver="vehicle", seed="1")
-    node = Node(core, Mock(), Keys("test"), lambda _: None, Name("1"))
-    assert node.metrics()[1:] == [RouterMetrics(7)]
+    found = node.Node(core, Mock(), topics.Keys("test"), lambda _: None, Name("1")).metrics()
+    assert found[1:] == [RouterMetrics(7)]
     assert list(faulty()[0].metrics) == []
 
 
@@ -138,7 +116,7 @@ def test_jitter_longer_than_the_spacing_reorders_and_each_copy_has_its_own() -> 
     assert listener.numbers != sorted(listener.numbers)
     assert len({now_s for now_s, _ in listener.events}) == 400
     for now_s, event in listener.events:
-        assert isinstance(event, Arrived)
+        assert isinstance(event, node.Arrived)
         assert 0.1 <= now_s - 0.1 * event.message.term <= 1.1 + 1e-9
 
 
@@ -156,24 +134,24 @@ def test_a_rule_holds_in_its_window_of_road_time() -> None:
 
 def test_a_rule_is_for_its_topics() -> None:
     core, listener = faulty(MessageRule(topics=("state", "plan"), loss=1.0))
-    feed(core, arrived(1, STATE))
-    feed(core, arrived(2, HEARTBEAT))
+    feed(core, arrived(1, topics.STATE))
+    feed(core, arrived(2, topics.HEARTBEAT))
     assert listener.numbers == [2]
 
 
 @pytest.mark.parametrize(
     ("topic", "parameters", "sender"),
     [
-        (STATE, {}, "vehicle"),
-        (HEARTBEAT, {}, "coordinator"),
-        (CLOCK, {}, "bridge"),
-        (REPORT, {"role": "agent", "name": "v1"}, "vehicle"),
-        (EVENT, {"role": "coordinator", "name": "c1"}, "coordinator"),
-        (EVENT, {"role": "bridge", "name": "bridge"}, "bridge"),
+        (topics.STATE, {}, "vehicle"),
+        (topics.HEARTBEAT, {}, "coordinator"),
+        (topics.CLOCK, {}, "bridge"),
+        (topics.REPORT, {"role": "agent", "name": "v1"}, "vehicle"),
+        (topics.EVENT, {"role": "coordinator", "name": "c1"}, "coordinator"),
+        (topics.EVENT, {"role": "bridge", "name": "bridge"}, "bridge"),
     ],
 )
 def test_a_rule_is_for_its_sender_and_its_receiver(
-    topic: Topic, parameters: dict[str, str], sender: str
+    topic: topics.Topic, parameters: dict[str, str], sender: str
 ) -> None:
     for named in message_faults.SENDERS:
         for rule in (MessageRule(loss=1.0, sender=named), MessageRule(loss=1.0, receiver=named)):
@@ -192,21 +170,21 @@ def test_the_fates_of_one_topic_do_not_depend_on_another() -> None:
     rule = MessageRule(loss=0.5)
     core, listener = faulty(rule)
     for number in range(200):
-        feed(core, arrived(number, STATE))
-        feed(core, arrived(-1, HEARTBEAT))
+        feed(core, arrived(number, topics.STATE))
+        feed(core, arrived(-1, topics.HEARTBEAT))
     assert [number for number in listener.numbers if number >= 0] == received(rule, 200)
 
 
 def test_what_is_no_message_passes_untouched() -> None:
     core, listener = faulty(MessageRule(loss=1.0))
-    events: list[Event] = [
-        Started(),
-        PeerUp(COORDINATOR_ALIVE, {}),
-        PeerDown(COORDINATOR_ALIVE, {}),
+    events: list[node.Event] = [
+        node.Started(),
+        node.PeerUp(topics.COORDINATOR_ALIVE, {}),
+        node.PeerDown(topics.COORDINATOR_ALIVE, {}),
         LinkDown(),
         LinkUp(),
-        QueryArrived(1, b""),
-        Stopping(),
+        node.QueryArrived(1, b""),
+        node.Stopping(),
     ]
     for event in events:
         feed(core, event)
@@ -218,15 +196,15 @@ def test_the_core_is_woken_when_it_wants_and_not_for_delayed_messages(wanted_s: 
     core, listener = faulty(MessageRule(delay_s=1.0))
     listener.wakeup_s = wanted_s
 
-    def clear(event: Event, _: float) -> tuple[Effect, ...]:
-        if isinstance(event, Wakeup):
+    def clear(event: node.Event, _: float) -> tuple[node.Effect, ...]:
+        if isinstance(event, node.Wakeup):
             listener.wakeup_s = None
         return ()
 
     listener.on_event = clear
     feed(core, arrived(1), 0.0)
     run_until(core, 5.0)
-    expected: list[tuple[float, Event]] = [(1.0, arrived(1)), (wanted_s, Wakeup())]
+    expected: list[tuple[float, node.Event]] = [(1.0, arrived(1)), (wanted_s, node.Wakeup())]
     assert listener.events == sorted(expected, key=lambda entry: entry[0])
     assert core.wakeup_s is None
 
@@ -247,20 +225,22 @@ def test_effects_pass() -> None:
     heartbeat = Heartbeat(Name("c1"), 1, 1, leading=False, formations=0)
     event = LogEvent(Name("agent"), Name("v1"), 0.0, Name("kind"))
     report = Report(Name("agent"), Name("v1"), solves=3)
-    effects: list[Effect] = [
-        Send(HEARTBEAT, heartbeat),
-        Send(EVENT, event, {"role": "agent"}),
-        Send(REPORT, report, {"role": "agent"}),
+    effects: list[node.Effect] = [
+        node.Send(topics.HEARTBEAT, heartbeat),
+        node.Send(topics.EVENT, event, {"role": "agent"}),
+        node.Send(topics.REPORT, report, {"role": "agent"}),
     ]
     listener.on_event = lambda *_: effects
-    assert feed(core, Started()) == effects
+    assert feed(core, node.Started()) == effects
 
 
 def test_the_bridge_tells_the_road_time() -> None:
     board = Board()
     core, listener = faulty(board=board, receiver="bridge")
-    listener.on_event = at_start(Send(CLOCK, RoadClock(125, 12.5, 3, 2, 1, 1, ended=False)))
-    feed(core, Started())
+    listener.on_event = at_start(
+        node.Send(topics.CLOCK, RoadClock(125, 12.5, 3, 2, 1, 1, ended=False))
+    )
+    feed(core, node.Started())
     assert board.road_s == 12.5
 
 

@@ -45,23 +45,12 @@ from laneweave.protocol.runtime.transport import (
     TokenUp,
     Transport,
 )
+from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.codec import MAX_BYTES, decode, encode
 from laneweave.protocol.wire.messages import Census, Heartbeat, Name, Report, RoadClock
-from laneweave.protocol.wire.topics import (
-    CENSUS,
-    CLOCK,
-    COORDINATOR_ALIVE,
-    HEARTBEAT,
-    REPORT,
-    SERVICE,
-    STATE,
-    VEHICLE_ALIVE,
-    Keys,
-    Quality,
-)
 from support.node_recorder import Recorder, at_start
 
-KEYS = Keys("r")
+KEYS = topics.Keys("r")
 BEAT = Heartbeat(Name("c1"), 7, 2, leading=True, formations=1)
 BEAT_KEY = "laneweave/r/heartbeat/c1"
 
@@ -96,7 +85,7 @@ def bench() -> Bench:
 
 def test_a_message_arrives_typed(bench: Bench) -> None:
     bench.node.deliver(Received(BEAT_KEY, encode(BEAT)), 3.5)
-    assert bench.core.events == [(3.5, Arrived(HEARTBEAT, {"coordinator": "c1"}, BEAT))]
+    assert bench.core.events == [(3.5, Arrived(topics.HEARTBEAT, {"coordinator": "c1"}, BEAT))]
     assert bench.node.rejected == 0
 
 
@@ -108,11 +97,11 @@ def test_a_message_arrives_typed(bench: Bench) -> None:
         (Query("any/key", b"q", 4), QueryArrived(4, b"q")),
         (
             TokenUp("laneweave/r/alive/vehicle/v1"),
-            PeerUp(VEHICLE_ALIVE, {"vehicle": "v1"}),
+            PeerUp(topics.VEHICLE_ALIVE, {"vehicle": "v1"}),
         ),
         (
             TokenDown("laneweave/r/alive/coordinator/c1/17"),
-            PeerDown(COORDINATOR_ALIVE, {"coordinator": "c1", "incarnation": "17"}),
+            PeerDown(topics.COORDINATOR_ALIVE, {"coordinator": "c1", "incarnation": "17"}),
         ),
     ],
 )
@@ -177,17 +166,17 @@ def test_a_message_on_a_topic_without_messages_is_counted(bench: Bench, key: str
 def test_effects_reach_the_transport(bench: Bench) -> None:
     work = Compute(1, lambda: 2)
     calls = bench.carry_out(
-        Listen(STATE, {"formation": 3}),
-        Listen(CENSUS),
-        Unlisten(STATE, {"formation": 3}),
-        Announce(VEHICLE_ALIVE, {"vehicle": "v1"}),
-        Withdraw(VEHICLE_ALIVE, {"vehicle": "v1"}),
-        Watch(VEHICLE_ALIVE),
-        Serve(SERVICE),
+        Listen(topics.STATE, {"formation": 3}),
+        Listen(topics.CENSUS),
+        Unlisten(topics.STATE, {"formation": 3}),
+        Announce(topics.VEHICLE_ALIVE, {"vehicle": "v1"}),
+        Withdraw(topics.VEHICLE_ALIVE, {"vehicle": "v1"}),
+        Watch(topics.VEHICLE_ALIVE),
+        Serve(topics.SERVICE),
         Reply(5, b"a"),
         Reply(6, b"e", ok=False, encoding="application/json"),
         Decline(7),
-        Send(HEARTBEAT, BEAT, {"coordinator": "c1"}),
+        Send(topics.HEARTBEAT, BEAT, {"coordinator": "c1"}),
         work,
     )
     assert calls == [
@@ -201,7 +190,7 @@ def test_effects_reach_the_transport(bench: Bench) -> None:
         call.answer(5, b"a", ok=True, encoding=""),
         call.answer(6, b"e", ok=False, encoding="application/json"),
         call.decline(7),
-        call.publish(BEAT_KEY, encode(BEAT), Quality.LATEST),
+        call.publish(BEAT_KEY, encode(BEAT), topics.Quality.LATEST),
     ]
     assert bench.jobs == [work]
 
@@ -209,12 +198,12 @@ def test_effects_reach_the_transport(bench: Bench) -> None:
 def test_a_report_gets_the_counters_of_the_node(bench: Bench) -> None:
     for _ in range(4):
         bench.node.deliver(Received(BEAT_KEY, b"x"), 1.0)
-    beat = Send(HEARTBEAT, BEAT, {"coordinator": "c1"})
+    beat = Send(topics.HEARTBEAT, BEAT, {"coordinator": "c1"})
     report = Report(
         Name("coordinator"), Name("c1"), published=99, solves=5, unusable=1, solve_ms=b"\0" * 4
     )
     calls = bench.carry_out(
-        beat, beat, beat, Send(REPORT, report, {"role": "coordinator", "name": "c1"})
+        beat, beat, beat, Send(topics.REPORT, report, {"role": "coordinator", "name": "c1"})
     )
     sent = decode(calls[-1].args[1], Report)
     assert sent == evolve(report, process=Name("n1"), published=4, rejected=4)
@@ -223,7 +212,7 @@ def test_a_report_gets_the_counters_of_the_node(bench: Bench) -> None:
 
 def test_a_node_tells_what_it_has_counted(bench: Bench) -> None:
     node = bench.node
-    bench.core.on_event = at_start(Send(HEARTBEAT, BEAT, {"coordinator": "c1"}))
+    bench.core.on_event = at_start(Send(topics.HEARTBEAT, BEAT, {"coordinator": "c1"}))
     node.dispatch(Started(), 0.0)
     node.deliver(Received(BEAT_KEY, encode(BEAT)), 1.0)
     node.deliver(Received(BEAT_KEY, b"nonsense"), 1.0)
@@ -251,8 +240,8 @@ def test_nothing_is_sent_before_the_first_event(bench: Bench) -> None:
 
 def test_census_and_clock_have_no_parameters(bench: Bench) -> None:
     bench.node.deliver(Received("laneweave/r/census", encode(Census(1.0, (), ()))), 1.0)
-    assert bench.core.events == [(1.0, Arrived(CENSUS, {}, Census(1.0, (), ())))]
-    assert CLOCK.parameters == ()
+    assert bench.core.events == [(1.0, Arrived(topics.CENSUS, {}, Census(1.0, (), ())))]
+    assert topics.CLOCK.parameters == ()
 
 
 # --- computations -----------------------------------------------------------------------------

@@ -14,26 +14,7 @@ from unittest.mock import Mock
 import pytest
 from attrs import define, field
 
-from laneweave.protocol.runtime.node import (
-    Announce,
-    Arrived,
-    Compute,
-    Computed,
-    Core,
-    Effect,
-    End,
-    Event,
-    Listen,
-    PeerDown,
-    PeerUp,
-    QueryArrived,
-    Reply,
-    Send,
-    Serve,
-    Started,
-    Wakeup,
-    Watch,
-)
+from laneweave.protocol.runtime import node
 from laneweave.protocol.runtime.transport import (
     Answer,
     Delivery,
@@ -121,21 +102,21 @@ class Recorder:
     """A core that turns events back into the deliveries that they came from."""
 
     got: list[Delivery] = field(factory=list)
-    first: tuple[Effect, ...] = ()
+    first: tuple[node.Effect, ...] = ()
     wakeup_s: float | None = None
 
-    def handle(self, event: Event, now_s: float) -> Iterable[Effect]:
+    def handle(self, event: node.Event, now_s: float) -> Iterable[node.Effect]:
         del now_s
         match event:
-            case Started():
+            case node.Started():
                 return self.first
-            case Arrived(topic, parameters, message):
+            case node.Arrived(topic, parameters, message):
                 self.got.append(Received(KEYS.key(topic, **parameters), encode(message)))
-            case PeerUp(topic, parameters):
+            case node.PeerUp(topic, parameters):
                 self.got.append(TokenUp(KEYS.key(topic, **parameters)))
-            case PeerDown(topic, parameters):
+            case node.PeerDown(topic, parameters):
                 self.got.append(TokenDown(KEYS.key(topic, **parameters)))
-            case QueryArrived(token, payload):
+            case node.QueryArrived(token, payload):
                 self.got.append(Query(PLAN_SERVICE, payload, token))
             case LinkUp() | LinkDown():
                 self.got.append(event)
@@ -154,14 +135,15 @@ class SimulatedBed:
     def join(self, name: str) -> Party:
         """Add a participant."""
         core = Recorder()
-        node = self.network.add(name, core, REALM)
-        party = Party(node._transport, core.got)
+        party = Party(self.network.add(name, core, REALM)._transport, core.got)
         self._names[id(party)] = name
         return party
 
     def join_process(self, name: str) -> None:
         """Add a participant in its own process that serves and shows the token of its name."""
-        core = Recorder(first=(Serve(SERVICE), Announce(VEHICLE_ALIVE, {"vehicle": name})))
+        core = Recorder(
+            first=(node.Serve(SERVICE), node.Announce(VEHICLE_ALIVE, {"vehicle": name}))
+        )
         self.network.add(name, core, REALM)
         self.network.run(self.network.now_s)
 
@@ -732,28 +714,28 @@ def test_a_service_that_does_not_answer_is_a_timeout(router: Router) -> None:
 class Errand:
     """A core that beats itself awake, computes, serves itself, and ends when all is done."""
 
-    events: list[Event] = field(factory=list)
+    events: list[node.Event] = field(factory=list)
     wakeup_s: float | None = None
 
-    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
+    def handle(self, event: node.Event, now_s: float) -> Iterator[node.Effect]:
         self.events.append(event)
         match event:
-            case Started():
-                yield Listen(HEARTBEAT)
-                yield Watch(VEHICLE_ALIVE)
-                yield Serve(SERVICE)
-                yield Announce(VEHICLE_ALIVE, {"vehicle": "errand"})
+            case node.Started():
+                yield node.Listen(HEARTBEAT)
+                yield node.Watch(VEHICLE_ALIVE)
+                yield node.Serve(SERVICE)
+                yield node.Announce(VEHICLE_ALIVE, {"vehicle": "errand"})
                 self.wakeup_s = now_s + 0.05
-            case Wakeup():
+            case node.Wakeup():
                 self.wakeup_s = None
                 message = Heartbeat(Name("c"), 1, 1, leading=False, formations=0)
-                yield Send(HEARTBEAT, message, {"coordinator": "errand"})
-                yield Compute(1, lambda: "done")
-            case Computed(1, "done"):
+                yield node.Send(HEARTBEAT, message, {"coordinator": "errand"})
+                yield node.Compute(1, lambda: "done")
+            case node.Computed(1, "done"):
                 self.wakeup_s = None
-            case QueryArrived(token):
-                yield Reply(token, b"yes")
-                yield End()
+            case node.QueryArrived(token):
+                yield node.Reply(token, b"yes")
+                yield node.End()
             case _:
                 pass
 
@@ -767,19 +749,19 @@ def test_a_core_runs_over_zenoh_until_it_ends(router: Router) -> None:
     client.transport.watch(TOKENS)
 
     def ask_at_last() -> None:
-        watcher.until(lambda: any(isinstance(event, Computed) for event in core.events))
+        watcher.until(lambda: any(isinstance(event, node.Computed) for event in core.events))
         assert isinstance(client.transport, ZenohTransport)
         answers.append(client.transport.query(PLAN_SERVICE, b"?", WAIT_S).result(WAIT_S))
 
     thread = threading.Thread(target=ask_at_last, daemon=True)
     thread.start()
-    a_core: Core = core
+    a_core: node.Core = core
     run_core(a_core, Access(router.endpoint, REALM, LEASE_S))
     thread.join(WAIT_S)
     watcher.until(lambda: client.tokens() == ["+errand", "-errand"])
     watcher.close()
     assert [given and (given.payload, given.ok) for given in answers] == [(b"yes", True)]
     kinds = [type(event) for event in core.events]
-    assert kinds[0] is Started
-    for kind in (Wakeup, Arrived, Computed, PeerUp, QueryArrived):
+    assert kinds[0] is node.Started
+    for kind in (node.Wakeup, node.Arrived, node.Computed, node.PeerUp, node.QueryArrived):
         assert kinds.count(kind) == 1

@@ -9,86 +9,77 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from laneweave.protocol.field_validators import NAME_PATTERN
+from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.codec import KINDS
-from laneweave.protocol.wire.topics import (
-    CLOCK,
-    COMMAND,
-    STATE,
-    TOPICS,
-    VEHICLE_ALIVE,
-    Keys,
-    Topic,
-    matches,
-)
 from support.refusals import refusal
 
-KEYS = Keys("r-1")
+KEYS = topics.Keys("r-1")
 NAMES = st.from_regex(NAME_PATTERN, fullmatch=True)
 BAD_PARTS = ("", "a/b", "a*", "**", "$*", "a#b", "a?b", "a b", "é", "x" * 65, "a\n", "{x}", "@")
 
 
-def filled(topic: Topic, text: str = "x") -> dict[str, str]:
+def filled(topic: topics.Topic, text: str = "x") -> dict[str, str]:
     return {name: f"{text}{index}" for index, name in enumerate(topic.parameters)}
 
 
-@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
-def test_what_is_built_is_read_back(topic: Topic) -> None:
+@pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda topic: topic.name)
+def test_what_is_built_is_read_back(topic: topics.Topic) -> None:
     @given(st.tuples(*(NAMES for _ in topic.parameters)), NAMES)
     @example(tuple("y" * 64 for _ in topic.parameters), "x" * 64)
     def check(texts: tuple[str, ...], realm: str) -> None:
-        keys = Keys(realm)
+        keys = topics.Keys(realm)
         parameters = dict(zip(topic.parameters, texts, strict=True))
         key = keys.key(topic, **parameters)
         assert keys.read(key) == (topic, parameters)
-        assert matches(keys.all_of(topic), key)
+        assert topics.matches(keys.all_of(topic), key)
         assert not re.search(r"[*$?#\s{}]|//|^/|/$", key)
 
     check()
 
 
 def test_numbers_become_text() -> None:
-    key = KEYS.key(STATE, formation=-3, vehicle="v1")
+    key = KEYS.key(topics.STATE, formation=-3, vehicle="v1")
     assert key == "laneweave/r-1/state/-3/v1"
-    assert KEYS.read(key) == (STATE, {"formation": "-3", "vehicle": "v1"})
+    assert KEYS.read(key) == (topics.STATE, {"formation": "-3", "vehicle": "v1"})
     # Equal numbers with different texts stay apart.
-    keys = [KEYS.key(COMMAND, vehicle=vehicle) for vehicle in (1, True, 1.0, "1")]
+    keys = [KEYS.key(topics.COMMAND, vehicle=vehicle) for vehicle in (1, True, 1.0, "1")]
     assert [key.rpartition("/")[2] for key in keys] == ["1", "True", "1.0", "1"]
 
 
 def test_who_reads_a_key_cannot_change_what_others_read() -> None:
-    key = KEYS.key(COMMAND, vehicle="v1")
+    key = KEYS.key(topics.COMMAND, vehicle="v1")
     known = KEYS.read(key)
     assert known is not None
     with pytest.raises(TypeError):
         known[1]["vehicle"] = "v2"  # type: ignore[index]
-    assert KEYS.read(key) == (COMMAND, {"vehicle": "v1"})
+    assert KEYS.read(key) == (topics.COMMAND, {"vehicle": "v1"})
 
 
 def test_topics_are_distinct() -> None:
-    assert len({topic.name for topic in TOPICS}) == len(TOPICS)
-    shapes = {re.sub(r"{\w+}", "*", topic.pattern) for topic in TOPICS}
-    assert len(shapes) == len(TOPICS)
-    keys = [KEYS.key(topic, **filled(topic)) for topic in TOPICS]
-    for topic, key in zip(TOPICS, keys, strict=True):
-        assert [other for other in keys if matches(KEYS.all_of(topic), other)] == [key]
+    assert len({topic.name for topic in topics.TOPICS}) == len(topics.TOPICS)
+    shapes = {re.sub(r"{\w+}", "*", topic.pattern) for topic in topics.TOPICS}
+    assert len(shapes) == len(topics.TOPICS)
+    keys = [KEYS.key(topic, **filled(topic)) for topic in topics.TOPICS]
+    for topic, key in zip(topics.TOPICS, keys, strict=True):
+        assert [other for other in keys if topics.matches(KEYS.all_of(topic), other)] == [key]
 
 
 def test_every_message_kind_has_one_topic() -> None:
-    carried = [topic.kind for topic in TOPICS if topic.kind is not None]
+    carried = [topic.kind for topic in topics.TOPICS if topic.kind is not None]
     assert sorted(kind.__name__ for kind in carried) == sorted(KINDS)
 
 
-@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
-def test_the_grammar_has_no_reserved_characters(topic: Topic) -> None:
+@pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda topic: topic.name)
+def test_the_grammar_has_no_reserved_characters(topic: topics.Topic) -> None:
     assert re.fullmatch(r"([a-z]+|{[a-z]+})(/([a-z]+|{[a-z]+}))*", topic.pattern)
     assert re.fullmatch(r"[a-z-]+", topic.name)
 
 
-@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
-def test_a_foreign_realm_is_not_understood(topic: Topic) -> None:
+@pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda topic: topic.name)
+def test_a_foreign_realm_is_not_understood(topic: topics.Topic) -> None:
     key = KEYS.key(topic, **filled(topic))
-    assert Keys("r-2").read(key) is None
-    assert Keys("r").read(key) is None
+    assert topics.Keys("r-2").read(key) is None
+    assert topics.Keys("r").read(key) is None
     assert KEYS.read(key.replace("laneweave/", "other/")) is None
     assert KEYS.read("/" + key) is None
     assert KEYS.read(key + "/") is None
@@ -120,20 +111,20 @@ def test_any_text_is_read_or_refused(text: str) -> None:
 
 @pytest.mark.parametrize("part", BAD_PARTS)
 def test_what_is_no_key_part_is_refused(part: str) -> None:
-    assert refusal(KEYS.key, COMMAND, vehicle=part).field == "vehicle"
-    assert refusal(Keys, part).field == "network.realm"
-    assert refusal(Keys, "*").field == "network.realm"
+    assert refusal(KEYS.key, topics.COMMAND, vehicle=part).field == "vehicle"
+    assert refusal(topics.Keys, part).field == "network.realm"
+    assert refusal(topics.Keys, "*").field == "network.realm"
 
 
 def test_expressions_leave_parameters_open() -> None:
-    assert KEYS.all_of(CLOCK) == "laneweave/r-1/clock"
-    assert KEYS.all_of(VEHICLE_ALIVE) == "laneweave/r-1/alive/vehicle/*"
-    assert KEYS.key(STATE, formation=2, vehicle="*") == "laneweave/r-1/state/2/*"
+    assert KEYS.all_of(topics.CLOCK) == "laneweave/r-1/clock"
+    assert KEYS.all_of(topics.VEHICLE_ALIVE) == "laneweave/r-1/alive/vehicle/*"
+    assert KEYS.key(topics.STATE, formation=2, vehicle="*") == "laneweave/r-1/state/2/*"
 
 
 def test_a_missing_parameter_is_a_mistake_of_the_caller() -> None:
     with pytest.raises(KeyError):
-        KEYS.key(COMMAND)
+        KEYS.key(topics.COMMAND)
 
 
 @pytest.mark.parametrize(
@@ -155,4 +146,4 @@ def test_a_missing_parameter_is_a_mistake_of_the_caller() -> None:
     ],
 )
 def test_matching_follows_zenohs_rules(expression: str, key: str, *, expected: bool) -> None:
-    assert matches(expression, key) is expected
+    assert topics.matches(expression, key) is expected

@@ -6,23 +6,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from laneweave.protocol.runtime.node import (
-    Arrived,
-    Compute,
-    Computed,
-    Effect,
-    End,
-    Event,
-    Listen,
-    PeerDown,
-    Serve,
-    Started,
-    Stopping,
-    Unlisten,
-    Wakeup,
-    Watch,
-    Withdraw,
-)
+from laneweave.protocol.runtime import node
 from laneweave.protocol.runtime.transport import Answer, LinkDown, LinkUp
 from laneweave.protocol.transports.simulated.network import (
     KILL_SEEN_S,
@@ -59,7 +43,7 @@ def test_without_faults_each_message_arrives_once_and_in_order() -> None:
     send(network, "a", *range(100))
     network.run(1.0)
     assert receiver.numbers == list(range(100))
-    assert receiver.times(Arrived) == pytest.approx([0.102] * 100)
+    assert receiver.times(node.Arrived) == pytest.approx([0.102] * 100)
     assert network.dropped == 0
 
 
@@ -95,7 +79,7 @@ def test_messages_overtake_each_other_with_jitter() -> None:
     network.run(1.0)
     assert sorted(receiver.numbers) == list(range(100))
     assert receiver.numbers != sorted(receiver.numbers)
-    assert all(0.102 <= now_s <= 0.112 + 1e-9 for now_s in receiver.times(Arrived))
+    assert all(0.102 <= now_s <= 0.112 + 1e-9 for now_s in receiver.times(node.Arrived))
 
 
 def test_messages_may_take_seconds_and_still_arrive() -> None:
@@ -146,15 +130,15 @@ def test_a_message_arrives_as_the_same_object_or_an_equal_one(*, skip_codec: boo
     network.add("b", receiver, REALM)
     network.add("a", Recorder(at_start(sent)), REALM)
     network.run(0.2)
-    (arrived,) = receiver.of(Arrived)
-    assert isinstance(arrived, Arrived)
+    (arrived,) = receiver.of(node.Arrived)
+    assert isinstance(arrived, node.Arrived)
     assert arrived.message == sent.message
     assert (arrived.message is sent.message) == skip_codec
     # An object on a key where it does not belong is refused, as its bytes would be.
     for key in (f"{KEY}/b", Keys(REALM).key(COMMAND, vehicle="a")):
         network.inject(key, Parcel(sent.message) if skip_codec else BEAT)
     network.run(0.3)
-    assert receiver.of(Arrived) == [arrived]
+    assert receiver.of(node.Arrived) == [arrived]
 
 
 def test_all_who_receive_the_same_bytes_share_one_message() -> None:
@@ -162,7 +146,7 @@ def test_all_who_receive_the_same_bytes_share_one_message() -> None:
     network = network_of(Conditions(jitter_s=1.0, duplication=1.0), more=receivers, a=Recorder())
     send(network, "a", 1, 2)
     network.run(3.0)
-    arrived = [event for core in receivers.values() for event in core.of(Arrived)]
+    arrived = [event for core in receivers.values() for event in core.of(node.Arrived)]
     assert all(sorted(core.numbers) == [1, 1, 2, 2] for core in receivers.values())
     assert len({id(event.message) for event in arrived}) == 2  # type: ignore[union-attr]
 
@@ -186,9 +170,9 @@ def test_subscriptions_may_change_between_messages() -> None:
     receivers = {name: listener() for name in ("b", "c")}
     network = network_of(more=receivers, a=Recorder())
     send(network, "a", 1)
-    perform(network, "b", Unlisten(HEARTBEAT))
+    perform(network, "b", node.Unlisten(HEARTBEAT))
     send(network, "a", 2)
-    perform(network, "b", Listen(HEARTBEAT, {"coordinator": "a"}))
+    perform(network, "b", node.Listen(HEARTBEAT, {"coordinator": "a"}))
     send(network, "a", 3)
     send(network, "c", 4)
     network.run(0.2)
@@ -208,7 +192,9 @@ def test_nothing_is_sent_to_who_has_left() -> None:
 # --- who is there -----------------------------------------------------------------------------
 
 
-def watched(*more: Effect, jitter_s: float = 0.0) -> tuple[SimulatedNetwork, Recorder, Recorder]:
+def watched(
+    *more: node.Effect, jitter_s: float = 0.0
+) -> tuple[SimulatedNetwork, Recorder, Recorder]:
     """Return a network in which `a` watches and `v` shows a token, and the two cores."""
     watcher, shown = listener(), Recorder(at_start(token("v"), *more))
     conditions = Conditions(delay_s=CALM.delay_s, jitter_s=jitter_s)
@@ -218,16 +204,16 @@ def watched(*more: Effect, jitter_s: float = 0.0) -> tuple[SimulatedNetwork, Rec
 @pytest.mark.parametrize("how", ["kill", "stop", "end"])
 def test_a_node_that_has_gone_is_missed_at_once(how: str) -> None:
     network, watcher, leaver = watched()
-    leaver.on_event = lambda event, _: [beat(9, "v")] if isinstance(event, Stopping) else []
+    leaver.on_event = lambda event, _: [beat(9, "v")] if isinstance(event, node.Stopping) else []
     if how == "end":
-        perform(network, "v", End())
+        perform(network, "v", node.End())
     else:
         getattr(network, how)("v")
     assert "v" not in network
     network.run(0.1 + KILL_SEEN_S + 0.002 + 1e-9)
     assert watcher.tokens == ["+v", "-v"]
     # Only a node that is asked to stop may still send something.
-    assert len(leaver.of(Stopping)) == (how == "stop")
+    assert len(leaver.of(node.Stopping)) == (how == "stop")
     assert watcher.numbers == ([9] if how == "stop" else [])
 
 
@@ -236,7 +222,7 @@ def test_a_watcher_that_comes_later_learns_who_is_there(*, paused: bool) -> None
     network, _, _ = watched()
     if paused:
         network.pause("v")
-    late = Recorder(at_start(Watch(VEHICLE_ALIVE)))
+    late = Recorder(at_start(node.Watch(VEHICLE_ALIVE)))
     network.add("late", late, REALM)
     network.run(0.3)
     network.resume("v")
@@ -269,20 +255,20 @@ def test_what_a_watcher_sees_of_a_node(steps: list[str | float], seen: str) -> N
 
 
 def test_a_short_pause_is_not_noticed_and_loses_nothing() -> None:
-    network, watcher, sleeper = watched(Listen(HEARTBEAT))
+    network, watcher, sleeper = watched(node.Listen(HEARTBEAT))
     network.pause("v")
     send(network, "a", 1, 2)
     network.run(0.3)
     assert sleeper.numbers == []
     network.resume("v")
     assert sleeper.numbers == [1, 2]
-    assert sleeper.times(Arrived) == [0.3, 0.3]
+    assert sleeper.times(node.Arrived) == [0.3, 0.3]
     network.run(2.0)
     assert watcher.tokens == ["+v"]
 
 
 def test_a_node_that_is_silent_for_its_lease_is_given_up_and_comes_back_as_a_zombie() -> None:
-    network, watcher, zombie = watched(Listen(HEARTBEAT))
+    network, watcher, zombie = watched(node.Listen(HEARTBEAT))
     zombie.wakeup_s = 0.2
     network.pause("v")
     network.run(0.1 + CALM.lease_s - 0.001)
@@ -295,7 +281,7 @@ def test_a_node_that_is_silent_for_its_lease_is_given_up_and_comes_back_as_a_zom
     assert zombie.numbers == [1]
     network.run(3.1)
     assert watcher.tokens == ["+v", "-v", "+v"]
-    assert zombie.times(Wakeup)[0] == 3.0
+    assert zombie.times(node.Wakeup)[0] == 3.0
 
 
 def test_a_paused_node_obeys_stop_when_it_wakes() -> None:
@@ -304,14 +290,14 @@ def test_a_paused_node_obeys_stop_when_it_wakes() -> None:
     network.stop("v")
     network.run(0.2)
     assert "v" in network
-    assert sleeper.of(Stopping) == []
+    assert sleeper.of(node.Stopping) == []
     network.resume("v")
     assert "v" not in network
-    assert len(sleeper.of(Stopping)) == 1
+    assert len(sleeper.of(node.Stopping)) == 1
 
 
 def test_a_disconnected_node_and_the_others_lose_each_other_and_find_each_other() -> None:
-    start = (Listen(HEARTBEAT), Watch(VEHICLE_ALIVE))
+    start = (node.Listen(HEARTBEAT), node.Watch(VEHICLE_ALIVE))
     cores = {name: Recorder(at_start(*start, token(name))) for name in ("a", "b")}
     network = network_of(more=cores)
     assert sorted(cores["a"].tokens) == ["+a", "+b"]
@@ -344,7 +330,7 @@ def test_link_down_may_come_anywhere_among_the_vanished_tokens() -> None:
             seed=seed, a=core, b=Recorder(at_start(token("b"))), c=Recorder(at_start(token("c")))
         )
         network.disconnect("a")
-        news = core.of(LinkDown, PeerDown)
+        news = core.of(LinkDown, node.PeerDown)
         places.add(next(i for i, event in enumerate(news) if isinstance(event, LinkDown)))
     assert places == {0, 1, 2}
 
@@ -368,7 +354,7 @@ def test_news_of_a_token_never_overtake_each_other(seed: int) -> None:
     watcher = listener()
     network = network_of(Conditions(jitter_s=0.05), seed=seed, a=watcher, v=Recorder())
     for _ in range(5):
-        perform(network, "v", token("v"), Withdraw(VEHICLE_ALIVE, {"vehicle": "v"}))
+        perform(network, "v", token("v"), node.Withdraw(VEHICLE_ALIVE, {"vehicle": "v"}))
     perform(network, "v", token("v"))
     network.run(1.0)
     assert watcher.tokens == ["+v", "-v"] * 5 + ["+v"]
@@ -390,8 +376,8 @@ def test_a_token_of_two_nodes_vanishes_with_the_last() -> None:
 def test_a_node_started_again_under_its_name_gets_nothing_of_the_old_one() -> None:
     watcher = listener()
 
-    def order(event: Event, _: float) -> Iterable[Effect]:
-        start = at_start(token("v"), Listen(HEARTBEAT), Compute(1, lambda: "old"))
+    def order(event: node.Event, _: float) -> Iterable[node.Effect]:
+        start = at_start(token("v"), node.Listen(HEARTBEAT), node.Compute(1, lambda: "old"))
         return start(event, 0.0)
 
     old = Recorder(order)
@@ -402,11 +388,11 @@ def test_a_node_started_again_under_its_name_gets_nothing_of_the_old_one() -> No
     network.run(0.1)
     send(network, "a", 1)
     network.kill("v")
-    new = Recorder(at_start(token("v"), Listen(HEARTBEAT)))
+    new = Recorder(at_start(token("v"), node.Listen(HEARTBEAT)))
     network.add("v", new, REALM)
     network.run(1.0)
-    assert new.of(Computed, Arrived, Wakeup) == []
-    assert old.of(Computed) == []
+    assert new.of(node.Computed, node.Arrived, node.Wakeup) == []
+    assert old.of(node.Computed) == []
     # The new node shows the token before the old one is missed.
     assert watcher.tokens[-1] == "+v"
     network.kill("v")
@@ -424,12 +410,18 @@ def test_faults_of_nodes_that_have_left_are_harmless_and_names_are_unique() -> N
         network.add("a", Recorder(), REALM)
 
 
-@pytest.mark.parametrize("moment", [LinkDown, LinkUp, PeerDown, Arrived, Computed])
+@pytest.mark.parametrize("moment", [LinkDown, LinkUp, node.PeerDown, node.Arrived, node.Computed])
 def test_a_node_may_end_at_any_moment(moment: type) -> None:
-    def end(event: Event, _: float) -> Iterable[Effect]:
+    def end(event: node.Event, _: float) -> Iterable[node.Effect]:
         if isinstance(event, moment):
-            return [End(), token("late"), Watch(VEHICLE_ALIVE), Listen(HEARTBEAT), beat(1, "v")]
-        return at_start(token("v"), Listen(HEARTBEAT), Watch(VEHICLE_ALIVE))(event, 0.0)
+            return [
+                node.End(),
+                token("late"),
+                node.Watch(VEHICLE_ALIVE),
+                node.Listen(HEARTBEAT),
+                beat(1, "v"),
+            ]
+        return at_start(token("v"), node.Listen(HEARTBEAT), node.Watch(VEHICLE_ALIVE))(event, 0.0)
 
     core, watcher = Recorder(end), listener()
     network = network_of(a=watcher, v=core, b=Recorder(at_start(token("b"))))
@@ -439,7 +431,7 @@ def test_a_node_may_end_at_any_moment(moment: type) -> None:
     if "v" in network:
         network.pause("v")
         send(network, "a", 1)
-        perform(network, "v", Compute(1, lambda: 1))
+        perform(network, "v", node.Compute(1, lambda: 1))
         network.run(0.2)
         network.resume("v")
         network.run(0.3)
@@ -456,7 +448,7 @@ def crowd(seed: int = 1) -> tuple[SimulatedNetwork, dict[str, Recorder]]:
     """Return a network in which everybody shows a token, watches all, and hears all beats."""
     names = ("a", "b", "c", "d")
     cores = {
-        name: Recorder(at_start(Listen(HEARTBEAT), Watch(VEHICLE_ALIVE), token(name)))
+        name: Recorder(at_start(node.Listen(HEARTBEAT), node.Watch(VEHICLE_ALIVE), token(name)))
         for name in names
     }
     network = network_of(seed=seed, more=cores)
@@ -473,7 +465,7 @@ def test_without_the_router_everybody_loses_everybody_at_once() -> None:
     network.lose_router()
     for name, core in cores.items():
         assert sorted(core.tokens) == ["-a", "-b", "-c", "-d"]
-        assert core.times(PeerDown) == [0.1] * 4
+        assert core.times(node.PeerDown) == [0.1] * 4
         assert core.times(LinkDown) == [0.1]
         send(network, name, 2)
     network.run(5.0)
@@ -550,10 +542,10 @@ def test_nobody_connects_while_the_router_is_lost() -> None:
     network.disconnect("a")
     network.lose_router()
     network.reconnect("a")
-    late = Recorder(at_start(Listen(HEARTBEAT), Watch(VEHICLE_ALIVE), token("late")))
+    late = Recorder(at_start(node.Listen(HEARTBEAT), node.Watch(VEHICLE_ALIVE), token("late")))
     network.add("late", late, REALM)
     network.run(2.0)
-    assert [type(event) for _, event in late.events] == [Started, LinkDown]
+    assert [type(event) for _, event in late.events] == [node.Started, LinkDown]
     assert cores["a"].of(LinkUp) == []
     network.restore_router()
     network.run(4.0)
@@ -583,8 +575,8 @@ def test_a_node_may_be_killed_or_end_while_the_router_is_lost() -> None:
     network, cores = crowd()
     network.lose_router()
     network.kill("a")
-    perform(network, "b", End())
-    cores["c"].on_event = lambda event, _: [End()] if isinstance(event, LinkUp) else []
+    perform(network, "b", node.End())
+    cores["c"].on_event = lambda event, _: [node.End()] if isinstance(event, LinkUp) else []
     network.restore_router()
     network.run(3.0)
     assert network.names == ("d",)
@@ -613,7 +605,7 @@ def test_a_node_that_goes_while_it_looks_for_the_router_never_finds_it(
 
 def test_a_node_may_end_when_it_loses_the_router() -> None:
     network, cores = crowd()
-    cores["b"].on_event = lambda event, _: [End()] if isinstance(event, LinkDown) else []
+    cores["b"].on_event = lambda event, _: [node.End()] if isinstance(event, LinkDown) else []
     network.lose_router()
     assert network.names == ("a", "c", "d")
     network.restore_router()
@@ -628,7 +620,7 @@ def test_a_node_may_end_when_it_loses_the_router() -> None:
 def test_a_question_is_settled_when_no_server_can_answer_it(fault: str) -> None:
     network = SimulatedNetwork(1, Conditions(lease_s=0.5))
     for name in "ab":
-        network.add(name, Recorder(at_start(Serve(SERVICE))), REALM)
+        network.add(name, Recorder(at_start(node.Serve(SERVICE))), REALM)
     network.run(0.1)
     answers: list[Answer | None] = []
     network.query(Keys(REALM).key(SERVICE), b"?", answers.append)
