@@ -1,4 +1,4 @@
-"""The methods of control, and the labels of a sweep: each names a method and its settings."""
+"""Control methods, and the labels that sweeps give to methods with settings."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import PAPERS_FORMATIONS, FormationSettings, Scenario
 
 FORMATION: Final = "formation"
-"""Formation control, by this project's agents and coordinators."""
+"""Formation control by agents and coordinators."""
 RULE: Final = "rule"
 LC2013: Final = "lc2013"
-"""The two reference methods: the paper's rules, and SUMO's own lane changing."""
+"""Reference methods: the rules of the paper, and SUMO's own lane changing."""
 
 MAX_TAPPA_VEHICLES: Final = 6
-"""Larger formations are planned by branching."""
+"""Formations with more vehicles are planned by branching."""
 
 
 class KeepTrajectories(StrEnum):
-    """Which runs of a sweep keep their trajectories."""
+    """The runs of a sweep whose trajectories are kept."""
 
     none = "none"
     first_seed = "first-seed"
@@ -32,19 +32,18 @@ class KeepTrajectories(StrEnum):
 
 @frozen
 class LabelledMethod:
-    """A method with settings."""
+    """A control method with settings of the scenario."""
 
     method: str
-    """As `laneweave run --method` names it."""
-    meaning: str
+    """Value of `laneweave run --method`."""
     overrides: Mapping[str, object] = field(factory=dict)
-    """`table.field` -> value that replaces the scenario's."""
+    """Values that replace those of the scenario, by `table.field`."""
 
     def settings(self, base: Scenario) -> Scenario:
-        """Return a scenario with these settings.
+        """Return the scenario with these settings.
 
         Raises:
-            BadInputError: they do not fit the rest of the scenario.
+            BadInputError: the settings contradict the rest of the scenario.
         """
         tables = to_tables(base)
         for name, value in self.overrides.items():
@@ -57,11 +56,10 @@ _FORMATIONS: Final = FormationSettings()
 
 
 def _default() -> LabelledMethod:
-    """Return formations with the default settings, whatever the scenario sets."""
+    """Return formation control with the default settings, regardless of the scenario."""
     names = ("operation", "entry", "close", "cycle_s", "move_s", "max_vehicles", "max_columns")
     return LabelledMethod(
         FORMATION,
-        f"formations of at most {_FORMATIONS.max_vehicles} vehicles, as long as traffic makes them",
         {f"formation.{name}": getattr(_FORMATIONS, name) for name in names}
         | _solver(_FORMATIONS.max_vehicles),
     )
@@ -71,7 +69,6 @@ def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
     """Return the paper's formations of at most `max_vehicles` in `block_columns` columns."""
     return LabelledMethod(
         FORMATION,
-        f"the paper's formations, of at most {max_vehicles} vehicles in {block_columns} columns",
         {
             "formation.operation": "formations",
             **{f"formation.{name}": value for name, value in PAPERS_FORMATIONS.items()},
@@ -89,40 +86,32 @@ def _solver(max_vehicles: int) -> dict[str, object]:
 
 
 METHODS: Final[dict[str, LabelledMethod]] = {
-    "formation": LabelledMethod(FORMATION, "formation control as the scenario says"),
+    "formation": LabelledMethod(FORMATION),
     "formations": _default(),
-    "rolling": LabelledMethod(
-        FORMATION, "the whole stream, planned anew in each slot", {"formation.operation": "rolling"}
-    ),
+    "rolling": LabelledMethod(FORMATION, {"formation.operation": "rolling"}),
     "paper-6": _paper(6, 4),
     "paper-12": _paper(12, 8),
     "paper-18": _paper(18, 12),
-    "rule": LabelledMethod(RULE, "the paper's rules, d_R from front to front"),
-    "rule-net": LabelledMethod(RULE, "the paper's rules, d_R as a net gap", {"rule.gap": "net"}),
-    "rule-yielding": LabelledMethod(
-        RULE, "the paper's rules, every vehicle yields", {"rule.yielding": "all"}
-    ),
-    "lc2013": LabelledMethod(LC2013, "SUMO's own lane changing and Krauss following"),
-    "lc2013-4s": LabelledMethod(
-        LC2013, "the same with lane changes of 4 s", {"lc2013.lane_change_s": 4.0}
-    ),
+    "rule": LabelledMethod(RULE),
+    "rule-net": LabelledMethod(RULE, {"rule.gap": "net"}),
+    "rule-yielding": LabelledMethod(RULE, {"rule.yielding": "all"}),
+    "lc2013": LabelledMethod(LC2013),
+    "lc2013-4s": LabelledMethod(LC2013, {"lc2013.lane_change_s": 4.0}),
 }
-"""By label, in the order of tables and figures."""
-
+"""Methods by label, in the order of tables and figures."""
 
 _READ_BY_ALL = ("schema", "seed", "road", "demand", "vehicle", "runtime", "formation.speed_mps")
-"""Tables and fields of a scenario that any method may read."""
-
+"""Tables and fields of a scenario that every method may read."""
 _WITHOUT_EFFECT = ("security", "service", "observation")
-"""Tables that do not change any run."""
+"""Tables of a scenario that do not affect the results of runs."""
 
 
 def affects(field_name: str, method: str) -> bool:
-    """Tell whether a field of a scenario can change the results of a method.
+    """Return whether a field of a scenario can change the results of a method.
 
     Args:
         field_name: `table.field`, or the name of a field outside tables.
-        method: as `laneweave run --method` names it.
+        method: value of `laneweave run --method`.
     """
     table = field_name.partition(".")[0]
     if table in _WITHOUT_EFFECT:
@@ -136,7 +125,7 @@ def parse_methods(text: str) -> tuple[str, ...]:
     """Return the labels of a comma-separated list.
 
     Raises:
-        BadInputError: a label is unknown or named twice.
+        BadInputError: a label is unknown or repeated.
     """
     labels = tuple(text.split(","))
     for number, label in enumerate(labels):
@@ -148,6 +137,6 @@ def parse_methods(text: str) -> tuple[str, ...]:
 
 
 def rank(label: str) -> tuple[int, str]:
-    """Return the sort key of a label: its place in `METHODS`, unknown labels last."""
+    """Return the sort key of a label: the order of `METHODS`, unknown labels last."""
     known = list(METHODS)
     return (known.index(label) if label in METHODS else len(known), label)

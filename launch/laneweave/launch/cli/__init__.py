@@ -1,5 +1,5 @@
 """The command line `laneweave`: one module per group of commands.
 
-Entry point: `entry.main`. Commands import what they need when they run. Nothing imports it but
-the installed script.
+Entry point: `main.main`. Commands import their dependencies when they run. Imported by the
+installed script only.
 """

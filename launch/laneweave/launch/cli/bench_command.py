@@ -16,7 +16,7 @@ from laneweave.protocol.errors import BadInputError
 
 
 class Benchmark(StrEnum):
-    """Subject of a benchmark."""
+    """What a benchmark measures."""
 
     runtime = "runtime"
     planner = "planner"
@@ -33,12 +33,12 @@ def bench(
         int, typer.Option("--vehicles-per-process", min=1, help="runtime: agents per process.")
     ] = 1,
     seconds: Annotated[
-        float, typer.Option("--seconds", min=5.0, max=3600.0, help="runtime: road time measured.")
+        float, typer.Option("--seconds", min=5.0, max=3600.0, help="runtime: measured road time.")
     ] = 60.0,
     families: Annotated[
         str,
         typer.Option(
-            "--families", help="planner: of node-edge, following, geometric, block, traffic."
+            "--families", help="planner: some of node-edge, following, geometric, block, traffic."
         ),
     ] = "node-edge,following,geometric",
     instances: Annotated[
@@ -54,7 +54,7 @@ def bench(
         float, typer.Option("--deadline", min=0.01, max=3600.0, help="planner: s per instance.")
     ] = 4.0,
     solver: Annotated[
-        str, typer.Option("--solver", metavar="NAME", help=f"planner: {SOLVER_NAMES}, alone.")
+        str, typer.Option("--solver", metavar="NAME", help=f"planner: {SOLVER_NAMES}.")
     ] = "branching",
     seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
@@ -69,7 +69,7 @@ def bench(
         checked_solver(solver, "--solver")
         sizes, chosen = _parse_sizes(vehicles, "6,9,12,18,24,36"), families.split(",")
         if not set(chosen) <= set(FAMILIES):
-            allowed = f"some of {', '.join(FAMILIES)}, with commas between"
+            allowed = f"some of {', '.join(FAMILIES)}, separated by commas"
             raise BadInputError("--families", families, allowed)
         found = bench_planner(
             sizes, chosen, instances=instances, seed=seed, deadline_s=deadline, solver=solver
@@ -95,5 +95,5 @@ def bench(
 def _parse_sizes(text: str | None, default: str) -> list[int]:
     sizes = (default if text is None else text).split(",")
     if not all(re.fullmatch(r"[1-9][0-9]?|1[0-9][0-9]|200", size) for size in sizes):
-        raise BadInputError("--vehicles", text, "numbers from 1 to 200 with commas between")
+        raise BadInputError("--vehicles", text, "numbers from 1 to 200, separated by commas")
     return [int(size) for size in sizes]

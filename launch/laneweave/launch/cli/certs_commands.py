@@ -26,7 +26,7 @@ Hosts = Annotated[
     list[str] | None,
     typer.Option("--host", metavar="NAME_OR_IP", help="Host of the router; repeatable."),
 ]
-Days = Annotated[float, typer.Option("--days", metavar="N", help="Validity.")]
+Days = Annotated[float, typer.Option("--days", metavar="N", help="Validity in days.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 
 
@@ -103,7 +103,7 @@ def add(
     _check_days(days)
     wanted = parse_identity(identity, "IDENTITY")
     if host and wanted.party is not Party.ROUTER:
-        raise BadInputError("--host", host[0], "nothing, hosts are the router's only")
+        raise BadInputError("--host", host[0], "only for the router")
     issue(load_authority(folder), folder, wanted, days=days, hosts=host or (), replace=force)
     typer.echo(f"{folder}: a certificate of {wanted.common_name}")
 
@@ -129,7 +129,7 @@ def _wanted(settings: Scenario, clients: list[str], vehicles: list[str]) -> Iter
 
 
 def _hosts(settings: Scenario) -> Iterator[str]:
-    """Yield the hosts that a configuration's endpoints name."""
+    """Yield the hosts of a configuration's endpoints."""
     for endpoint in (settings.network.endpoint, *settings.network.listen):
         host = host_of(endpoint)
         if host:

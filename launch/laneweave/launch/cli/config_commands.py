@@ -1,4 +1,4 @@
-"""`laneweave config`: check a configuration before it is used."""
+"""`laneweave config`: check a configuration before use."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def check(
     role: Annotated[
         Party | None, typer.Option("--role", help="Also check the certificate of this role.")
     ] = None,
-    name: Annotated[str, typer.Option("--name", metavar="NAME", help="Name in that role.")] = "",
+    name: Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the role.")] = "",
 ) -> None:
-    """Check a configuration, and with --role the files that this role uses here."""
+    """Check a configuration; with --role also the certificate files of that role on this host."""
     settings = load_scenario(file)
     if name and role is None:
-        raise BadInputError("--name", name, "a name beside --role")
+        raise BadInputError("--name", name, "only with --role")
     identity = None
     if role is not None:
         identity = parse_identity(Identity(role, name).common_name, "--role and --name")

@@ -1,12 +1,12 @@
 """The command line `laneweave`.
 
-Exit status: 0 done; 1 the run failed or a promise was broken; 2 bad input, with one line on stderr
-that names the field, the value and the allowed values.
+Exit status: 0 success; 1 the run failed or violated a guarantee; 2 invalid input, reported in one
+line on stderr with the field, its value and the allowed values.
 
-Importing this module loads nothing, so that `main` sets up signals before anything else. SIGINT is
-forwarded as SIGTERM: while OSQP solves, it installs its own handler for SIGINT in the whole
-process, and loses signals that arrive late in a solution (measured: one in eight during continuous
-solving). Therefore only one thread receives SIGINT, and forwards it.
+Importing this module imports no other packages, so that `main` sets up signals first. One thread
+receives SIGINT and forwards it as SIGTERM, because OSQP replaces the SIGINT handler of the process
+while it solves, and loses signals that arrive late in a solve (measured: one in eight during
+continuous solving).
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ if TYPE_CHECKING:
 
 TYPER_INTERRUPTED = 130
 """Exit status of typer after Ctrl-C."""
-MISSING_SIM = "the simulation packages: install laneweave[sim]"
-MISSING_WATCH = "the web server: install laneweave[watch]"
-MISSING = {
+SIM_HINT = "the simulation packages: install laneweave[sim]"
+WATCH_HINT = "the web server: install laneweave[watch]"
+INSTALL_HINTS = {
     "distributed": "Dask: install laneweave[dask]",
-    "osqp": "the solver of agents: install laneweave[agent]",
+    "osqp": "the quadratic-program solver: install laneweave[agent]",
     "cryptography": "the package for certificates: install laneweave[certs]",
     "prometheus_client": "the package for metrics: install laneweave[metrics]",
-    "starlette": MISSING_WATCH,
-    "uvicorn": MISSING_WATCH,
-    "websockets": MISSING_WATCH,
+    "starlette": WATCH_HINT,
+    "uvicorn": WATCH_HINT,
+    "websockets": WATCH_HINT,
 }
-"""What to install for each missing package; `MISSING_SIM` for all others."""
+"""Installation hint for each missing package; `SIM_HINT` for all others."""
 
 
 def main() -> None:
     """Run the command line with the arguments of this process."""
-    # Respect a parent that lets this process ignore SIGINT.
+    # If the parent made this process ignore SIGINT, keep ignoring it.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         # Threads and processes that start later inherit the mask.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -88,8 +88,8 @@ def _status(arguments: list[str]) -> int:
     from laneweave.launch.run.logs import log_to_terminal
     from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 
-    # Handle SIGTERM like Ctrl-C, so that files are completed and temporary folders removed. Roles
-    # install their own handlers.
+    # Handle SIGTERM like Ctrl-C, to complete files and remove temporary folders. Roles install
+    # their own handlers.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     log_to_terminal()
     command = typer.main.get_command(app)
@@ -98,13 +98,13 @@ def _status(arguments: list[str]) -> int:
             arguments or ["--help"], prog_name="laneweave", standalone_mode=False
         )
     except (BadInputError, RefusedError) as error:
-        return _refuse(str(error))
+        return _bad_input(str(error))
     except (typer.Abort, KeyboardInterrupt):
         sys.stderr.write("interrupted\n")
         return 1
     except typer.TyperException as error:
-        # Unknown options and arguments; the library's own report takes several lines.
-        return _refuse(getattr(error, "format_message", error.__str__)())
+        # Unknown option or argument; print one line instead of typer's report of several lines.
+        return _bad_input(getattr(error, "format_message", error.__str__)())
     except BrokenPipeError:
         return 1
     except CommandFailedError as error:
@@ -113,14 +113,14 @@ def _status(arguments: list[str]) -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("laneweave"):
             raise
-        missing = MISSING.get((error.name or "").partition(".")[0], MISSING_SIM)
-        return _refuse(f"{error.name}: not installed; allowed: {missing}")
+        hint = INSTALL_HINTS.get((error.name or "").partition(".")[0], SIM_HINT)
+        return _bad_input(f"{error.name}: not installed; allowed: {hint}")
     if result == TYPER_INTERRUPTED:
         sys.stderr.write("interrupted\n")
         return 1
     return result if isinstance(result, int) else 0
 
 
-def _refuse(line: str) -> int:
+def _bad_input(line: str) -> int:
     sys.stderr.write(" ".join(line.split()) + "\n")
     return 2

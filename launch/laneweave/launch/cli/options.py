@@ -1,4 +1,4 @@
-"""Options that several commands share: their declarations, checks and values."""
+"""Options that several commands share, with their checks."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ Duration = Annotated[
     float | None, typer.Option("--duration", help="Seconds during which vehicles arrive.")
 ]
 Seeds = Annotated[
-    str, typer.Option("--seeds", metavar="A:B", help="Seeds to run; B is not included.")
+    str, typer.Option("--seeds", metavar="A:B", help="Range of seeds; B is excluded.")
 ]
 Jobs = Annotated[
-    int | None, typer.Option("--jobs", metavar="N", help="Processes; default: all cores.")
+    int | None, typer.Option("--jobs", metavar="N", help="Processes; default: one per core.")
 ]
 NoProgress = Annotated[bool, typer.Option("--no-progress", help="Show no progress bar.")]
 RunFolder = Annotated[
@@ -50,7 +50,7 @@ Metrics = Annotated[
     typer.Option(
         "--metrics",
         metavar="HOST:PORT",
-        help="Serve metrics over HTTP there; overrides the configuration.",
+        help="Serve metrics over HTTP at this address; overrides the configuration.",
     ),
 ]
 Log = Annotated[
@@ -67,15 +67,15 @@ Level = Annotated[
 
 
 def load_deployment(config: Path | None, endpoint: str | None, **overrides: object) -> Scenario:
-    """Return the configuration of a deployment, which has the endpoint of its router.
+    """Return the configuration of a deployment.
 
     Args:
-        config: path of a DEPLOYMENT.toml; None: the defaults.
+        config: path of a DEPLOYMENT.toml; None: the default configuration.
         endpoint: endpoint of the router; overrides that of the file.
         **overrides: see `load_scenario`.
 
     Raises:
-        BadInputError: the file is not valid, or there is no endpoint.
+        BadInputError: the file is invalid, or no endpoint is given.
     """
     settings = load_scenario(config, network__endpoint=endpoint, **overrides)
     if not settings.network.endpoint:
@@ -86,10 +86,10 @@ def load_deployment(config: Path | None, endpoint: str | None, **overrides: obje
 
 
 def parse_seeds(text: str, max_seeds: int = MAX_SEEDS) -> range:
-    """Return the seeds of `A:B`, B excluded.
+    """Return the range of seeds `A:B`, B excluded.
 
     Raises:
-        BadInputError: the text is not such a range, or the range is empty or too long.
+        BadInputError: the text is malformed, or the range is empty or too long.
     """
     match = re.fullmatch(r"(\d{1,12}):(\d{1,12})", text)
     seeds = range(int(match[1]), int(match[2])) if match else range(0)
@@ -102,7 +102,7 @@ def check_jobs(jobs: int | None) -> int:
     """Return the number of processes to use; by default the number of cores.
 
     Raises:
-        BadInputError: it is out of range.
+        BadInputError: the number is out of range.
     """
     if jobs is None:
         return len(os.sched_getaffinity(0))
@@ -115,21 +115,21 @@ def check_pace(pace: float | None) -> None:
     """Check the option `--pace`.
 
     Raises:
-        BadInputError: it is out of range.
+        BadInputError: the pace is out of range.
     """
     if pace is not None and not 0.01 <= pace <= 1000:
         raise BadInputError("--pace", pace, "[0.01, 1000]")
 
 
 def reject_unused_options(where: str, **options: object) -> None:
-    """Refuse options that would have no effect.
+    """Reject options that would have no effect.
 
     Args:
-        where: the reason, such as `with --method rule`.
-        **options: values by the names of the options, with underscores; None: not given.
+        where: circumstance in which they have no effect, such as `with --method rule`.
+        **options: value of each option, by its name with underscores; None: not given.
 
     Raises:
-        BadInputError: one of them is given.
+        BadInputError: one of the options is given.
     """
     for name, value in options.items():
         if value is not None:

@@ -1,4 +1,4 @@
-"""Answers of `laneweave plan`: a request is read, planned or explained, printed and drawn."""
+"""`laneweave plan`: read a request, plan or explain it, print and draw the result."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ ANSWER_MARGIN_S = 8.0
 def access_for(
     endpoint: str | None, realm: str | None, config: Path | None, client: str | None
 ) -> Access | None:
-    """Return the access to a coordinator; None: plan here.
+    """Return how to connect to a coordinator; None: plan in this process.
 
     Args:
         endpoint: endpoint of the router; overrides that of the configuration.
-        realm: realm of the coordinators without a configuration; None: the default realm.
+        realm: realm of the coordinator if there is no configuration; None: the default realm.
         config: configuration of the deployment.
         client: client name in a secured deployment; None: `plan`.
 
     Raises:
-        BadInputError: the configuration is not valid or has no endpoint, or an argument would have
-            no effect.
+        BadInputError: the configuration is invalid or has no endpoint, or an argument would have no
+            effect.
     """
     if config is not None:
         if realm is not None:
-            raise BadInputError("--realm", realm, "nothing, as --config has network.realm")
+            raise BadInputError("--realm", realm, "only without --config, which has network.realm")
         return client_access(config, client or "plan", endpoint)
     if client is not None:
         raise BadInputError("--client", client, "only with --config")
@@ -73,15 +73,15 @@ def answer_request(
     scenario: Scenario | None = None,
     wait_s: float = 0.0,
 ) -> None:
-    """Read a request, plan it here or with `access` at a coordinator, print and draw the answer.
+    """Read and plan a request, then print and draw the response; with `access` a coordinator plans.
 
     `drawing` shows the relative coordinate system, `road_drawing` the road of `scenario`. `wait_s`
     is the time to wait for a coordinator. A deadline and a solver override those of the request.
 
     Raises:
-        BadInputError: the request cannot be read or is not valid, no coordinator is reachable, or
-            the drawing cannot be written.
-        RefusedError: the coordinator refused the request.
+        BadInputError: the request is unreadable or invalid, no coordinator is reachable, or a
+            drawing cannot be written.
+        RefusedError: the coordinator rejected the request.
         CommandFailedError: the coordinator failed or did not answer in time, or writing the drawing
             failed.
     """
@@ -108,11 +108,11 @@ def answer_request(
 
 
 def explain_request(path: Path, deadline_s: float | None, drawing: Path | None = None) -> None:
-    """Read a request, run TAPPA on it here, print its steps and draw them.
+    """Read a request, run TAPPA on it, then print the steps and draw them.
 
     Raises:
-        BadInputError: the request cannot be read or is not valid, or the drawing cannot be written
-            or is not a PNG file.
+        BadInputError: the request is unreadable or invalid, or the drawing cannot be written or is
+            not a PNG file.
         CommandFailedError: writing the drawing failed.
     """
     if drawing is not None:
@@ -142,7 +142,7 @@ def _request(path: Path, deadline_s: float | None, solver: str | None = None) ->
 
 
 _Drawer = tuple[Callable[[PlanRequest, PlanResponse], None], Path]
-"""Function that draws an answer, and its file."""
+"""Function that draws a response, and the file that it writes."""
 
 
 def _checked_drawer(out: Path) -> _Drawer:
@@ -170,13 +170,14 @@ def _checked_road_drawer(out: Path, scenario: Scenario, mode: int) -> _Drawer:
 
 
 def _table(request: PlanRequest, response: PlanResponse) -> str:
-    verdict = f"{response.status}, cost {response.cost}, lower bound {response.lower_bound}"
+    bound = f"lower bound {response.lower_bound}"
     if not response.paths:
-        return f"{response.status}, lower bound {response.lower_bound}\n"
+        return f"{response.status}, {bound}\n"
     by = f"{response.solver}{' (fallback)' if response.fallback else ''}"
-    return (
-        f"{verdict}, {response.steps} steps, planned by {by}\n\n{response.path_map(request.ids)}\n"
+    line = (
+        f"{response.status}, cost {response.cost}, {bound}, {response.steps} steps, planned by {by}"
     )
+    return f"{line}\n\n{response.path_map(request.ids)}\n"
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -196,9 +197,9 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _ask(access: Access, request: PlanRequest, wait_s: float) -> PlanResponse:
     timeout_s = request.deadline_s + ANSWER_MARGIN_S + wait_s
-    patient = attrs.evolve(access, connect_timeout_s=max(wait_s, access.connect_timeout_s))
+    access = attrs.evolve(access, connect_timeout_s=max(wait_s, access.connect_timeout_s))
     try:
-        with PlanClient(patient, max(ABSENT_S, wait_s)) as client:
+        with PlanClient(access, max(ABSENT_S, wait_s)) as client:
             return client.plan(request, timeout_s)
     except RequestRefusedError as error:
         raise RefusedError(str(error)) from error

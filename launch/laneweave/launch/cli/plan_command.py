@@ -1,4 +1,4 @@
-"""`laneweave plan`: one plan request."""
+"""`laneweave plan`: plan one request."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ class OutputFormat(StrEnum):
 
 
 def plan(
-    request: Annotated[Path, typer.Argument(metavar="REQUEST.json", help="- reads stdin.")],
+    request: Annotated[Path, typer.Argument(metavar="REQUEST.json", help="-: read stdin.")],
     deadline: Annotated[
-        float | None, typer.Option("--deadline", help="Seconds; overrides the request's.")
+        float | None, typer.Option("--deadline", help="In seconds; overrides the request's.")
     ] = None,
     connect: Annotated[
         str | None, typer.Option("--connect", metavar="ENDPOINT", help="Ask a coordinator there.")
     ] = None,
     realm: Annotated[
-        str | None, typer.Option("--realm", help="Realm of that coordinator; default: default.")
+        str | None, typer.Option("--realm", help="Realm of the coordinator; default: default.")
     ] = None,
     wait: Annotated[
-        float, typer.Option("--wait", help="Seconds to wait for a router and a coordinator there.")
+        float, typer.Option("--wait", help="Seconds to wait for router and coordinator.")
     ] = 0.0,
     config: Annotated[
         Path | None,
@@ -64,7 +64,7 @@ def plan(
         typer.Option(
             "--draw-road",
             metavar="FILE",
-            help="Draw vehicles that drive the plan: FILE.png or FILE.gif; road: --config.",
+            help="Draw vehicles that drive the plan, as FILE.png or FILE.gif; road: --config.",
         ),
     ] = None,
     explained: Annotated[
@@ -75,7 +75,7 @@ def plan(
         ),
     ] = False,
 ) -> None:
-    """Plan one request here, or ask a running coordinator."""
+    """Plan one request in this process, or have a running coordinator plan it."""
     from laneweave.launch.cli.plan_answers import access_for, answer_request, explain_request
 
     settings = load_scenario(config)

@@ -1,6 +1,6 @@
-"""The commands that run one role of a deployment each.
+"""Commands that each run one role of a deployment.
 
-Each command imports what it needs when it runs: an agent starts without SUMO, a coordinator without
+A command imports its dependencies when it runs: an agent starts without SUMO, a coordinator without
 OSQP.
 """
 
@@ -62,7 +62,7 @@ def router(
 
 
 def ping(config: Config = None, endpoint: Endpoint = None) -> None:
-    """Open a session at a router and close it: the health check of a deployment."""
+    """Check that the router of a deployment accepts a session (a health check)."""
     from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 
     access = access_of(load_deployment(config, endpoint), "observer.ping")
@@ -111,7 +111,7 @@ def agent(
     log_format: Log = LogFormat.text,
     log_level: Level = None,
 ) -> None:
-    """Run the agents of named vehicles, or of all that are announced."""
+    """Run the agents of the named vehicles, or of all announced vehicles."""
     from laneweave.agents.driving.trajectory import check_moves
     from laneweave.agents.process import run_agents
     from laneweave.launch.deploy.assigned_vehicles import assigned_vehicles
@@ -157,7 +157,7 @@ def bridge(
 def watch(
     folder: Annotated[
         Path | None,
-        typer.Argument(metavar="[DIR]", help="Folder of a run; default: the deployment."),
+        typer.Argument(metavar="[DIR]", help="Folder of a run; default: the live road."),
     ] = None,
     config: Config = None,
     endpoint: Endpoint = None,
@@ -165,7 +165,7 @@ def watch(
         str, typer.Option("--listen", metavar="HOST:PORT", help="Port 0: any free port.")
     ] = "127.0.0.1:8080",
 ) -> None:
-    """Serve a page that shows a deployment's road live, or a recorded run, until Ctrl-C."""
+    """Serve a page that shows the road of a deployment or of a recorded run, until Ctrl-C."""
     from laneweave.launch.watch.process import watch_live, watch_recorded
 
     if folder is None:
@@ -179,7 +179,7 @@ def watch(
 def _as_role(
     role: str, name: str, settings: Scenario, form: LogFormat, level: LogLevel | None
 ) -> Iterator[Observe]:
-    """Log as a role, and serve its metrics if the configuration says so."""
+    """Configure the log of a role, and serve its metrics if an address is configured."""
     log_role(role, name, form, level)
     network, address = settings.network, settings.observation.metrics
     log.info("starting", endpoint=network.endpoint, realm=network.realm, metrics=address)

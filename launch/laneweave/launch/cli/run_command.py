@@ -1,4 +1,4 @@
-"""`laneweave run`: one run on this machine."""
+"""`laneweave run`: run a scenario on this machine."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def run(
     ] = None,
     solver: Solver = None,
     vehicles_per_process: Annotated[
-        int | None, typer.Option("--vehicles-per-process", help="Agents that share a process.")
+        int | None, typer.Option("--vehicles-per-process", help="Number of agents per process.")
     ] = None,
     coordinators: Annotated[
         int | None, typer.Option("--coordinators", help="Number of coordinators.")
@@ -87,7 +87,7 @@ def run(
     ] = None,
     no_progress: NoProgress = False,
 ) -> None:
-    """Run a scenario on this machine and write its folder."""
+    """Run a scenario on this machine, and write the results to a folder."""
     settings = load_scenario(
         scenario,
         seed=seed,

@@ -1,4 +1,4 @@
-"""`laneweave simulate`: the search for faults that break a promise."""
+"""`laneweave simulate`: search for faults that violate a guarantee."""
 
 from __future__ import annotations
 
@@ -30,13 +30,11 @@ def simulate(
     ] = False,
     verbose: Annotated[
         bool,
-        typer.Option(
-            "--verbose", help="Print the timeline of the first failed seed, or of one seed."
-        ),
+        typer.Option("--verbose", help="Print the timeline of the only or the first failed seed."),
     ] = False,
     no_progress: NoProgress = False,
 ) -> None:
-    """Simulate runs with far more faults than occur in practice, and check each of them."""
+    """Simulate and check runs with far more faults than occur in practice."""
     from laneweave.launch.fault_search import profiles, search
 
     chosen = profiles.profile_named(profile)

@@ -1,4 +1,4 @@
-"""`laneweave status`: the state of a deployment, and whether it is healthy."""
+"""`laneweave status`: state and health of a deployment."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import json
 import time
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -14,7 +13,7 @@ from attrs import evolve
 from rich.console import Console
 from rich.table import Table
 
-from laneweave.launch.cli.options import load_deployment
+from laneweave.launch.cli.options import Config, Endpoint, load_deployment
 from laneweave.launch.observe.observer import Observer
 from laneweave.launch.observe.road_view import Coordinator, RoadView
 from laneweave.launch.observe.status import (
@@ -36,11 +35,11 @@ from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.wire.topics import Keys
 
 WAIT_S = 0.1
-"""Longest wait for a message before the end of listening is checked."""
+"""Maximum wait for a message between two checks for the end of listening."""
 
 
 class Role(StrEnum):
-    """Kind of the process whose health is checked."""
+    """Role of the process whose health is checked."""
 
     coordinator = COORDINATOR
     bridge = BRIDGE
@@ -48,16 +47,11 @@ class Role(StrEnum):
 
 
 def status(
-    config: Annotated[
-        Path | None,
-        typer.Option("--config", metavar="DEPLOYMENT.toml", help="Scenario and network."),
-    ] = None,
-    endpoint: Annotated[
-        str | None, typer.Option("--endpoint", help="Zenoh endpoint of the router.")
-    ] = None,
+    config: Config = None,
+    endpoint: Endpoint = None,
     realm: Annotated[str | None, typer.Option("--realm", help="Realm to observe.")] = None,
     seconds: Annotated[
-        float, typer.Option("--seconds", min=0.1, max=60.0, help="How long to listen.")
+        float, typer.Option("--seconds", min=0.1, max=60.0, help="Time to listen.")
     ] = 2.0,
     role: Annotated[Role | None, typer.Option("--role", help="Check one process only.")] = None,
     name: Annotated[
@@ -69,7 +63,7 @@ def status(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Listen to a deployment and print its state; exit status 1: it is not healthy."""
+    """Listen to a deployment and print its state; exit status 1: the deployment is unhealthy."""
     settings = load_deployment(config, endpoint, network__realm=realm)
     health = _role_health(role, name, shard)
     found = listen(settings, seconds, health)
@@ -86,7 +80,7 @@ def status(
 def _role_health(role: Role | None, name: str | None, shard: str | None) -> RoleHealth | None:
     if shard is not None:
         if role is not Role.agent or name is not None:
-            raise BadInputError("--shard", shard, "only --role agent, and no --name")
+            raise BadInputError("--shard", shard, "only with --role agent and without --name")
         return RoleHealth(AGENT, shard, parse_shard(shard, "--shard").takes, is_shard=True)
     if name is not None and (role in (None, Role.bridge) or not NAME_PATTERN.fullmatch(name)):
         raise BadInputError("--name", name, f"with --role coordinator or agent: {NAME_RULE}")
@@ -101,8 +95,8 @@ def listen(settings: Scenario, seconds: float, health: RoleHealth | None = None)
 
     Args:
         settings: the deployment.
-        seconds: how long to listen; a health check of one process ends once it succeeds.
-        health: the check of one process; None: the whole deployment is checked.
+        seconds: time to listen; a health check of one process ends when it succeeds.
+        health: check of one process; None: check the whole deployment.
 
     Raises:
         BadInputError: there is no router at the endpoint.
@@ -119,7 +113,7 @@ def listen(settings: Scenario, seconds: float, health: RoleHealth | None = None)
     access, view = access_of(settings, "observer.status"), observer.view
 
     def problem() -> str | None:
-        assert health is not None  # noqa: S101 (asked only then)
+        assert health is not None  # noqa: S101 (called only then)
         return health.problem(view, began_s, now_s, network.election_s)
 
     with contextlib.closing(ZenohTransport(access, observer.inbox.put)) as transport:
@@ -131,7 +125,7 @@ def listen(settings: Scenario, seconds: float, health: RoleHealth | None = None)
                 now_s = time.monotonic()
                 view.update(event, now_s)
                 if now_s >= end_s:
-                    break  # more messages than can be processed must not delay the end
+                    break  # a flood of messages must not delay the end
             now_s = time.monotonic()
             if health is not None and health.may_end_early(view) and problem() is None:
                 break
@@ -178,7 +172,7 @@ def _rows(found: Status) -> list[tuple[str, str]]:
         )
         drivers = (
             f"{vehicles.attended} attended, {vehicles.unattended} unattended, "
-            f"{vehicles.unheard} not heard; {vehicles.agents} agents"
+            f"{vehicles.unheard} not heard from; {vehicles.agents} agents"
         )
         rows += [("road", f"{road.t_s:.1f} s, {pace}; {counts}"), ("vehicles", drivers)]
     rates = ", ".join(f"{topic} {rate:.1f}" for topic, rate in found.messages_per_s.items())
@@ -190,7 +184,7 @@ def _rows(found: Status) -> list[tuple[str, str]]:
 
 def _candidate(one: Coordinator) -> str:
     if one.heard_s_ago is None:
-        return f"{one.coordinator} not heard"
+        return f"{one.coordinator} not heard from"
     leads = ", claims to lead" if one.leading else ""
     token = "" if one.token else ", without a token"
     return f"{one.coordinator} term {one.term}, {one.heard_s_ago:.2f} s ago{leads}{token}"

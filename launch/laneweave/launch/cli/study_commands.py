@@ -1,4 +1,4 @@
-"""`laneweave sweep` makes many runs, `laneweave report` shows finished ones."""
+"""`laneweave sweep`: make many runs; `laneweave report`: report finished ones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,14 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from laneweave.launch.cli.options import check_jobs, parse_seeds
+from laneweave.launch.cli.options import (
+    Duration,
+    Jobs,
+    ScenarioArgument,
+    Seeds,
+    check_jobs,
+    parse_seeds,
+)
 from laneweave.launch.run_methods import METHODS, KeepTrajectories
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
@@ -21,34 +28,26 @@ VOLUMES = "1000,1150,1300,1450,1600"
 
 
 def sweep(
-    scenario: Annotated[
-        Path | None, typer.Argument(metavar="[SCENARIO.toml]", help="Default: the paper's road.")
-    ] = None,
+    scenario: ScenarioArgument = None,
     methods: Annotated[
         str, typer.Option("--methods", metavar="LIST", help=f"Some of {', '.join(METHODS)}.")
     ] = "formation",
     volumes: Annotated[
         str, typer.Option("--volumes", metavar="LIST", help="Vehicles per lane and hour.")
     ] = VOLUMES,
-    seeds: Annotated[
-        str, typer.Option("--seeds", metavar="A:B", help="Seeds to run; B is not included.")
-    ] = "1:4",
-    duration: Annotated[
-        float | None, typer.Option("--duration", help="Seconds during which vehicles arrive.")
-    ] = None,
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", metavar="N", help="Processes; default: all cores.")
-    ] = None,
+    seeds: Seeds = "1:4",
+    duration: Duration = None,
+    jobs: Jobs = None,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
             metavar="DIR",
-            help="Default: a new folder in runs/. The folder of a sweep: continue it.",
+            help="Default: a new folder in runs/. A sweep in this folder is continued.",
         ),
     ] = None,
     keep_trajectories: Annotated[
-        KeepTrajectories, typer.Option("--keep-trajectories", help="Which runs keep them.")
+        KeepTrajectories, typer.Option("--keep-trajectories", help="Runs that keep theirs.")
     ] = KeepTrajectories.first_seed,
     dask: Annotated[
         str | None,
@@ -78,7 +77,7 @@ def sweep(
         run = partial(run_locally, workers=check_jobs(jobs))
     else:
         if jobs is not None:
-            raise BadInputError("--jobs", jobs, "only without --dask; a cluster has workers")
+            raise BadInputError("--jobs", jobs, "only without --dask")
         from laneweave.launch.sweep.dask_workers import run_on_dask
 
         run = partial(run_on_dask, address=dask)
@@ -100,7 +99,7 @@ def report(
         typer.Option(
             "--formation",
             metavar="N",
-            help="Draw its path map; default: the one with the most moves.",
+            help="Formation whose path map is drawn; default: the one with the most moves.",
         ),
     ] = None,
     out: Annotated[
@@ -108,11 +107,11 @@ def report(
         typer.Option(
             "--out",
             metavar="DIR",
-            help="Folder of a comparison; default: a new folder in runs/.",
+            help="Folder of a comparison; default: a new one in runs/.",
         ),
     ] = None,
 ) -> None:
-    """Draw finished runs: figures and a page for each run, and for a sweep or several runs."""
+    """Write figures and a page for each finished run, and for a sweep or several runs together."""
     from laneweave.launch.recordings.runs import Comparison, is_sweep, runs_of, single_run
     from laneweave.launch.report.build import REPORT_DPI, report_comparison, report_run
 
