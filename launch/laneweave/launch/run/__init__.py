@@ -1,4 +1,4 @@
-"""One run: over processes (`local_run`), over the simulated network, or of a reference method.
+"""Runs: over processes, over the simulated network, or of a reference method.
 
 Entry points: `local_run.LocalRun`, `simulated_run.SimulatedRun` and `reference_run.ReferenceRun`,
 whose `run` returns an `outcome.Outcome`. Imported by `cli`, `sweep`, `bench` and `fault_search`;

@@ -1,7 +1,7 @@
-"""A run on this machine with router, coordinators, bridge and agents as processes over Zenoh.
+"""A run over Zenoh with router, coordinators, bridge and agents as processes of this machine.
 
-The launcher starts them, starts an agent for each announced vehicle, watches all processes, applies
-faults, and ends everything: on success, on failure, on Ctrl-C, and when a process dies.
+The launcher starts them and an agent for each announced vehicle, monitors them, applies faults, and
+ends all of them on success, failure, Ctrl-C, or the death of a process.
 """
 
 from __future__ import annotations
@@ -42,38 +42,38 @@ from laneweave.protocol.wire.topics import Keys
 from laneweave.sim_bridge.road.demand import arrivals
 
 MAX_TEMPORARY_BYTES = 70
-"""Sockets are up to 37 characters below TMPDIR, and their paths have at most 107 bytes."""
+"""Maximum length of TMPDIR: socket paths are up to 37 bytes longer, and limited to 107 bytes."""
 ROUTER_START_S = 20.0
 STALL_S = 90.0
-"""A run fails if its road clock stands still for longer than this."""
+"""Time without progress of the road clock after which a run fails."""
 MAX_FAILED_AGENTS = 5
-"""A run is given up if more agents than this end with an error."""
+"""Number of agents that may end with an error before the run is aborted."""
 LEADER_S = 5.0
-"""Time to wait for a leader, beyond the election time, before the run starts without one."""
+"""Maximum time to wait for a leader, beyond two election timeouts, before the bridge is started."""
 POLL_S = 0.1
 _GROUP_OF_SENDER = {sender: group for group, sender in SENDER_OF_GROUP.items()}
 
 
 @define
 class _StallDetector:
-    """Detects a road clock that stands still."""
+    """Detector of a road clock that does not advance."""
 
     scenario: Scenario
     advanced_s: float
     road_s: float = -1.0
 
     def is_stalled(self, road_s: float, now_s: float) -> bool:
-        """Return whether the clock has stood still for too long."""
+        """Return whether the clock has not advanced for too long."""
         if road_s != self.road_s:
             self.road_s, self.advanced_s = road_s, now_s
-        # The clock also waits for the agent of a vehicle that is about to enter.
-        patience_s = max(STALL_S, 2 * self.scenario.runtime.agent_start_s)
-        return now_s - self.advanced_s > patience_s
+        # The clock also waits until the agent of an entering vehicle has started.
+        limit_s = max(STALL_S, 2 * self.scenario.runtime.agent_start_s)
+        return now_s - self.advanced_s > limit_s
 
 
 @define
 class LocalRun:
-    """One run with its own processes; call `run` once."""
+    """A run whose roles are processes; call `run` once."""
 
     scenario: Scenario
     folder: Path
@@ -82,21 +82,21 @@ class LocalRun:
     show_progress: bool = True
     pace: float | None = None
     watch: Callable[[RoadView, Mapping[str, int]], None] | None = None
-    """Called ten times per second with the view of the run and the process ids of the roles."""
+    """Called ten times per second with the observed state and the process ids of the roles."""
     _processes: RoleProcesses = field(init=False)
     _options: dict[str, Any] = field(init=False)
     """Options of all roles."""
     _injection: FaultInjection | None = None
     _board: SharedBoard = field(init=False)
     _group_of: dict[str, int] = field(init=False)
-    """Group of each vehicle; a group of successive arrivals shares a process."""
+    """Group of each vehicle; successive arrivals form a group, which shares an agent process."""
     _started_groups: set[int] = field(factory=set)
     _problems: list[str] = field(factory=list)
     _failed_agents: int = 0
     _stop: bool = False
 
     def __attrs_post_init__(self) -> None:
-        """Group the vehicles of the demand."""
+        """Assign the vehicles of the demand to groups."""
         per_process = self.scenario.runtime.vehicles_per_process
         self._group_of = {
             arrival.vehicle: index // per_process
@@ -107,10 +107,10 @@ class LocalRun:
         """Run the scenario and return its outcome.
 
         Raises:
-            BadInputError: the environment does not allow the run.
+            BadInputError: the run is not possible in this environment.
         """
         check_temporary_folder()
-        warm_up()  # compile once, not in each coordinator
+        warm_up()  # compile once instead of in each coordinator
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
             tempfile.TemporaryDirectory(prefix="laneweave-") as temporary,
@@ -122,7 +122,7 @@ class LocalRun:
                 endpoint=f"unixsock-stream/{temporary}/router.sock",
                 listen=(),
             )
-            # No encryption is needed: only this user can reach a socket in this folder.
+            # Encryption is unnecessary: only this user can access sockets in this folder.
             self.scenario = attrs.evolve(self.scenario, network=network, security=Security())
             self._options = {
                 "folder": str(self.folder),
@@ -149,11 +149,11 @@ class LocalRun:
                 self.folder, problems=self._problems, processes=processes, **results
             )
 
-    def _prepare(self, order: RoleStart) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return the tables of the scenario and the options for a start of a role."""
-        tables, options = to_tables(self.scenario), self._options | dict(order.options)
+    def _prepare(self, start: RoleStart) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return the scenario tables and the options with which to start a role."""
+        tables, options = to_tables(self.scenario), self._options | dict(start.options)
         if self._injection is not None:
-            add_faults(self._injection, self._board, order, tables, options)
+            add_faults(self._injection, self._board, start, tables, options)
         return tables, options
 
     # --- supervision --------------------------------------------------------------------------
@@ -166,7 +166,7 @@ class LocalRun:
             observer.subscribe(transport)
             for name in processes.coordinators:
                 processes.start("coordinator", name)
-            # Road time must not begin before a coordinator can plan.
+            # Road time must not start before a coordinator can plan.
             self._await_leader(observer)
             processes.start("bridge", "bridge")
             stall = _StallDetector(self.scenario, time.monotonic())
@@ -179,12 +179,12 @@ class LocalRun:
                 road_s = view.t_s
                 if injection is not None:
                     injection.step(self._board.road_s, now, view)
-                    # A fault may keep the road clock's messages from the launcher.
+                    # Faults may drop clock messages on their way to the launcher.
                     road_s = max(road_s, self._board.road_s)
                 if self.watch is not None:
                     self.watch(view, processes.ids)
                 if stall.is_stalled(road_s, now):
-                    self._problems.append(f"the road clock stands still at {view.t_s:.1f} s")
+                    self._problems.append(f"the road clock stopped at {view.t_s:.1f} s")
                     return
             if self._stop:
                 self._problems.append("interrupted")
@@ -210,7 +210,7 @@ class LocalRun:
             observer.wait(POLL_S)
 
     def _check_processes(self) -> bool:
-        """Record processes that ended; return False if the run is over."""
+        """Record the processes that have ended; return whether the run continues."""
         for end in self._processes.ended():
             if end.name in ("bridge", ROUTER):
                 if end.status != 0 or end.name == ROUTER:
@@ -220,7 +220,7 @@ class LocalRun:
                 self._record_end(end.name, end)
                 self._failed_agents += end.name.startswith("agent-")
         if self._failed_agents > MAX_FAILED_AGENTS:
-            self._problems.append("agents cannot start or stay up")
+            self._problems.append("too many agents failed")
             return False
         return True
 
@@ -230,7 +230,7 @@ class LocalRun:
         self._problems.append(f"{subject} ended with status {end.status}{reason}")
 
     def _agents_to_start(self, observer: Observer) -> Iterator[list[str]]:
-        """Yield each group of vehicles when its first vehicle is announced."""
+        """Yield each group of vehicles once its first vehicle has been announced."""
         census = observer.view.census
         for announced in census.announced if census is not None else ():
             index = self._group_of.get(announced.vehicle)
@@ -245,10 +245,10 @@ class LocalRun:
 def fault_injection(
     faults: FaultSpec, scenario: Scenario, processes: RoleProcesses
 ) -> FaultInjection:
-    """Return the fault engine of a run, before its processes are started.
+    """Return the fault engine of a run whose processes have not been started.
 
     Raises:
-        BadInputError: a partition requires namespaces, and they cannot be created.
+        BadInputError: a partition requires network namespaces, which cannot be created.
     """
     network, reason = open_network(faults, processes.context)
     lease_s = scenario.network.lease_s
@@ -258,13 +258,13 @@ def fault_injection(
 def add_faults(
     injection: FaultInjection,
     board: SharedBoard,
-    order: RoleStart,
+    start: RoleStart,
     tables: dict[str, Any],
     options: dict[str, Any],
 ) -> None:
-    """Add message faults and the network namespace to the tables and options of a role."""
-    network, sender = injection.network, SENDER_OF_ROLE.get(order.role)
-    if network is not None and order.role == ROUTER:
+    """Add the message faults and the network namespace of a role to its tables and options."""
+    network, sender = injection.network, SENDER_OF_ROLE.get(start.role)
+    if network is not None and start.role == ROUTER:
         options |= {"namespace": network.process_id(HUB), "listen": (network.listen,)}
     if sender is None:
         return
@@ -277,7 +277,7 @@ def add_faults(
         board.path,
         board.new_word(),
         receiver=sender,
-        seed=injection.seed_of_start(order.name),
+        seed=injection.seed_of_start(start.name),
     )
 
 
@@ -285,7 +285,7 @@ def check_temporary_folder() -> None:
     """Check that the path of the temporary folder is short enough for sockets in it.
 
     Raises:
-        BadInputError: it is too long.
+        BadInputError: the path is too long.
     """
     folder = tempfile.gettempdir()
     if len(os.fsencode(folder)) > MAX_TEMPORARY_BYTES:

@@ -1,4 +1,4 @@
-"""Structured logs as JSON lines, in the run's folder or for a log collector, or as text."""
+"""Structured logs, as text or as JSON lines for the folder of a run or a log collector."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class LogFormat(StrEnum):
 
 
 class LogLevel(StrEnum):
-    """Lowest level of the entries that a role logs."""
+    """Minimum level of log entries."""
 
     debug = "debug"
     info = "info"
@@ -34,7 +34,7 @@ class LogLevel(StrEnum):
 
 
 def log_role(role: str, name: str, form: LogFormat, level: LogLevel | None) -> None:
-    """Write a role's log to stderr; the default level is `info` as JSON, `warning` as text."""
+    """Write the log of a role to stderr; default level: `info` for JSON, `warning` for text."""
     if form is LogFormat.text:
         log_to_terminal(level or LogLevel.warning)
         return
@@ -44,7 +44,7 @@ def log_role(role: str, name: str, form: LogFormat, level: LogLevel | None) -> N
     def on_failure(kind: type[BaseException], error: BaseException | None, trace: Any) -> None:  # noqa: ANN401 (a traceback)
         log.error("role failed", exc_info=(kind, error, trace))
 
-    # Uncaught exceptions become one line too, because a collector does not join lines.
+    # Log uncaught exceptions as one line, too, because collectors do not join lines.
     sys.excepthook = on_failure
     threading.excepthook = lambda args: on_failure(
         args.exc_type, args.exc_value, args.exc_traceback
@@ -52,7 +52,7 @@ def log_role(role: str, name: str, form: LogFormat, level: LogLevel | None) -> N
 
 
 def log_to_terminal(level: LogLevel = LogLevel.warning) -> None:
-    """Write log entries from `level` on to stderr, one readable line each."""
+    """Write log entries of at least `level` to stderr, one readable line each."""
     structlog.configure(
         processors=[
             structlog.processors.TimeStamper(fmt="%H:%M:%S"),
@@ -61,20 +61,20 @@ def log_to_terminal(level: LogLevel = LogLevel.warning) -> None:
             structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(_number(level)),
-        # Look stderr up for each entry: it may have been replaced.
+        # Look up stderr for each entry, because it may be replaced.
         logger_factory=lambda *_: _stderr_logger(),
         cache_logger_on_first_use=False,
     )
 
 
 def last_error(path: Path, name: str) -> str:
-    """Return the last error logged by a process of a run as one line; empty if there is none."""
+    """Return the last error that a process of a run has logged, in one line; empty: none."""
     found = ""
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     for line in lines:
         try:
             entry = json.loads(line)
-        except ValueError:  # cut off when the process was killed
+        except ValueError:  # truncated when the process was killed
             continue
         if entry.get("level") == "error" and entry.get("name") == name:
             text = entry.get("reason") or entry.get("exception") or entry.get("event") or ""
@@ -84,20 +84,20 @@ def last_error(path: Path, name: str) -> str:
 
 def log_to_file(path: Path, role: str, name: str) -> None:
     """Append JSON lines to a file that all processes of a run share."""
-    # Appended lines of several processes do not mix, since each is one write.
+    # Lines of different processes do not interleave, because each line is one write.
     stream = path.open("a", buffering=1, encoding="utf-8")
     _log_json(lambda *_: structlog.WriteLogger(_lossy(stream)), role, name, LogLevel.info)
 
 
 class _LossyStream(io.TextIOBase):
-    """Stream that ignores write errors: a full disk must not end a role that logs."""
+    """Stream that ignores write errors, so that a full disk does not end a role."""
 
     def __init__(self, stream: TextIO) -> None:
         """Write to `stream`."""
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write the text; ignore errors."""
+        """Write text; ignore errors."""
         with contextlib.suppress(OSError, ValueError):
             self._stream.write(text)
         return len(text)
@@ -132,7 +132,7 @@ def _log_json(make_logger: Callable[..., Any], role: str, name: str, level: LogL
 
 
 def _with_origin(role: str, name: str) -> Processor:
-    """Return a processor that adds role and name to the entries of all threads."""
+    """Return a processor that adds role and name to log entries of all threads."""
 
     def add(_logger: object, _method: str, entry: EventDict) -> EventDict:
         entry.setdefault("role", role)

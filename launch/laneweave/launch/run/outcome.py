@@ -1,4 +1,4 @@
-"""The outcome of a run: its summary, completed by the launcher, and the problems that failed it."""
+"""The outcome of a run: its summary, completed by the launcher, and the reasons of its failure."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from laneweave.protocol.summary import RunSummary, read_summary, write_summary
 
 @frozen
 class Outcome:
-    """A finished run."""
+    """Result of a finished run."""
 
     folder: Path
     summary: RunSummary | None
-    """None: the run ended before it was written."""
+    """None: the run ended before its summary was written."""
     problems: tuple[str, ...]
-    """Why it failed; empty: it did not."""
+    """Reasons of a failure; empty: the run succeeded."""
 
     @property
     def exit_status(self) -> int:
-        """0: done; 1: the run failed or a promise was broken."""
+        """Exit status: 0 success; 1 the run failed or violated a guarantee."""
         return 1 if self.problems else 0
 
 
@@ -40,19 +40,19 @@ def complete_summary(
     dropped: int = 0,
     faults: dict[str, Any] | None = None,
 ) -> Outcome:
-    """Add what only the launcher knows to a run's summary, and judge the run.
+    """Complete the summary of a run with data of the launcher, and judge the run.
 
     Args:
         folder: the run's folder.
-        problems: problems that are already known.
-        processes: highest number of role processes at one time; None: not known.
-        failover: measured recoveries from faults of the leader; None: there were no faults.
+        problems: problems known so far.
+        processes: maximum number of simultaneous role processes; None: unknown.
+        failover: measured recoveries from faults of the leader; None: no faults.
         dropped: messages that faults dropped.
-        faults: record of the injected faults; None: none were asked for.
+        faults: record of the injected faults; None: no faults.
     """
     summary = read_summary(folder)
     if summary is None:
-        return Outcome(folder, None, (*problems, "the run left no summary"))
+        return Outcome(folder, None, (*problems, "the run wrote no summary"))
     measured = summary.failover
     if failover is not None:
         measured = evolve(
@@ -68,24 +68,24 @@ def complete_summary(
         faults=faults if faults is not None else summary.faults,
     )
     write_summary(folder, summary)
-    return Outcome(folder, summary, (*problems, *_broken_promises(summary)))
+    return Outcome(folder, summary, (*problems, *_violations(summary)))
 
 
-def _broken_promises(summary: RunSummary) -> list[str]:
+def _violations(summary: RunSummary) -> list[str]:
     vehicles, safety = summary.vehicles, summary.safety
-    broken = []
+    found = []
     if safety.overlaps:
-        broken.append(f"{safety.overlaps} pairs of vehicles overlapped")
+        found.append(f"{safety.overlaps} pairs of vehicles overlapped")
     if summary.ending != "complete":
-        broken.append(f"the run is not complete: {summary.ending}")
+        found.append(f"the run is not complete: {summary.ending}")
     if vehicles.left < vehicles.demanded:
         missing = vehicles.demanded - vehicles.left
-        broken.append(f"{missing} of {vehicles.demanded} vehicles did not leave the road")
-    return broken
+        found.append(f"{missing} of {vehicles.demanded} vehicles did not leave the road")
+    return found
 
 
 def print_outcome(outcome: Outcome, console: Console) -> None:
-    """Print the table at the end of a run."""
+    """Print the results and the problems of a run."""
     summary = outcome.summary
     if summary is not None:
         table = Table(title=f"laneweave run: {outcome.folder}", show_header=False)

@@ -1,11 +1,9 @@
 """Preparation of the fork server before its first fork; only the fork server imports this module.
 
-It loads libraries, generates the code that reads and writes messages and scenarios, and computes
+The import loads libraries, generates the code that converts messages and scenarios, and computes
 the reference motions for the default limits, once for all role processes. It opens no session,
-thread or file.
-
-Finally it excludes all existing objects from garbage collection: a collection writes to every
-object it visits, so each process would soon have its own copy of all of them.
+thread or file. Finally it excludes all objects from garbage collection, which writes to every
+object that it visits, so that each process would copy all of them.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ class RunProgress(Progress):
     """Progress bar with simulated time, vehicles on the road, leader and real-time factor."""
 
     def __init__(self, scenario: Scenario, *, show: bool) -> None:
-        """Create a bar up to the time at which the last vehicle can leave; hidden if not `show`."""
+        """Create a bar that ends when the last vehicle can leave; hidden if not `show`."""
         super().__init__(
             TextColumn("{task.fields[now]}"),
             BarColumn(bar_width=None),

@@ -1,4 +1,4 @@
-"""A run of a reference method in this process: no agents, no coordinators, no messages."""
+"""A run of a reference method in this process, without agents, coordinators and messages."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PROGRESS_EVERY_TICKS = 50
 
 @define
 class ReferenceRun:
-    """One run of a reference method, as fast as possible; call `run` once."""
+    """A run of a reference method, as fast as possible; call `run` once."""
 
     scenario: Scenario
     folder: Path
@@ -64,7 +64,7 @@ class ReferenceRun:
 
 
 def check_reference(scenario: Scenario, method: str) -> None:
-    """Check the requirements of a reference method on a scenario.
+    """Check that a reference method supports a scenario.
 
     Raises:
         BadInputError: the method does not support the value of a field.

@@ -1,4 +1,4 @@
-"""The role processes of a local run: starts, watches, kills, pauses and ends them by name."""
+"""Control of the role processes of a local run by name."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from laneweave.launch.run.roles import start_role
 log = structlog.get_logger(__name__)
 
 STOP_S = 5.0
-"""Time for processes to end after SIGTERM, before they are killed."""
+"""Time that processes have to end after SIGTERM; then they are killed."""
 ROUTER = "router"
 
 
 @frozen
 class RoleStart:
-    """Arguments with which a role is started and restarted."""
+    """Arguments of the start and of restarts of a role."""
 
     role: str
     name: str
@@ -41,16 +41,16 @@ class RoleExit:
 
 @define
 class RoleProcesses:
-    """All role processes of a run by name; the `RoleControl` of faults."""
+    """All role processes of a run by name; implements `RoleControl`."""
 
     context: ForkServerContext
     prepare: Callable[[RoleStart], tuple[dict[str, Any], dict[str, Any]]]
-    """Returns the tables of the scenario and the options for a start of a role."""
+    """Returns the scenario tables and the options with which to start a role."""
     coordinators: tuple[str, ...]
     peak: int = 0
-    """Largest number of simultaneous processes."""
+    """Maximum number of simultaneous processes."""
     _running: dict[str, ForkServerProcess] = field(factory=dict)
-    _orders: dict[str, RoleStart] = field(factory=dict)
+    _starts: dict[str, RoleStart] = field(factory=dict)
     _process_of: dict[str, str] = field(factory=dict)
     """Name of the agent process of each vehicle."""
     _paused: set[str] = field(factory=set)
@@ -60,22 +60,22 @@ class RoleProcesses:
 
         Args:
             role: `router`, `coordinator`, `bridge` or `agent`.
-            name: name of the process; no other process of this name may run.
-            **options: options of this role only, such as the `vehicles` of an agent.
+            name: name of the process, unique among running processes.
+            **options: options of the role, such as the `vehicles` of an agent.
 
         Raises:
-            CommandFailedError: no process can be created.
+            CommandFailedError: the process cannot be created.
         """
-        order = self._orders[name] = RoleStart(role, name, options)
-        for vehicle in order.options.get("vehicles", ()):
+        start = self._starts[name] = RoleStart(role, name, options)
+        for vehicle in start.options.get("vehicles", ()):
             self._process_of[vehicle] = name
-        tables, all_options = self.prepare(order)
+        tables, all_options = self.prepare(start)
         self._running[name] = start_role(self.context, role, name, tables, all_options)
         self.peak = max(self.peak, len(self._running))
 
     @property
     def ids(self) -> dict[str, int]:
-        """Process ids by name."""
+        """Process id of each role by name."""
         return {name: process.pid or 0 for name, process in self._running.items()}
 
     def is_alive(self, name: str) -> bool:
@@ -84,7 +84,7 @@ class RoleProcesses:
         return process is not None and process.is_alive()
 
     def ended(self) -> Iterator[RoleExit]:
-        """Yield the processes that have ended on their own since the last call."""
+        """Yield the processes that have ended by themselves since the last call."""
         names = {process.sentinel: name for name, process in self._running.items()}
         for sentinel in wait_for_sentinels(list(names), timeout=0):
             assert isinstance(sentinel, int)  # noqa: S101 (narrows the type)
@@ -98,11 +98,11 @@ class RoleProcesses:
 
     @property
     def running(self) -> Collection[str]:
-        """Roles that run, as far as is known."""
+        """Names of the roles not known to have ended."""
         return self._running.keys()
 
     def agent_of(self, vehicle: str) -> str | None:
-        """Return the agent process of a vehicle; None: it has not been started."""
+        """Return the agent process of a vehicle; None: not started."""
         return self._process_of.get(vehicle)
 
     def kill(self, name: str) -> None:
@@ -124,13 +124,13 @@ class RoleProcesses:
             self._signal(name, signal.SIGCONT)
 
     def restart(self, name: str) -> None:
-        """Start a role that has ended with its original arguments.
+        """Start an ended role again with its original arguments.
 
         Raises:
-            CommandFailedError: no process can be created.
+            CommandFailedError: the process cannot be created.
         """
-        order = self._orders[name]
-        self.start(order.role, name, **order.options)
+        start = self._starts[name]
+        self.start(start.role, name, **start.options)
 
     def _signal(self, name: str, number: signal.Signals) -> None:
         process = self._running.get(name)

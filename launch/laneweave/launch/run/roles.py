@@ -1,7 +1,7 @@
-"""Role processes from the inside: how a role is started in a process of its own, and runs there.
+"""Start of a role in a new process, and its execution there.
 
-A fork server has imported and prepared what agents need (`preload`), so that a process for one more
-vehicle costs a fork and not the start of an interpreter.
+The processes are forked from a server that has imported and prepared what roles need (`preload`),
+which is much cheaper than the start of an interpreter.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that limit the threads of linear algebra libraries."""
 AGENT_NICENESS = 5
 RECONNECT_S = 0.1
-"""Time after which a role that cannot connect tries again, in runs with faults."""
+"""Time between attempts to connect in runs with faults."""
 ORPHAN_S = 5.0
-"""Time for an orderly end of a process whose launcher has died."""
+"""Time that a process has to shut down cleanly after the death of its launcher."""
 GC_THRESHOLD = 50_000
-"""New objects between garbage collections; the default of 700 costs a run 6 % of its time."""
+"""New objects between garbage collections; the default of 700 slows a run down by 6 %."""
 _PR_SET_NAME = 15
 
 
 def tune_garbage_collector() -> None:
-    """Exclude existing objects from garbage collection, and collect new ones rarely.
+    """Exclude existing objects from garbage collection, and raise the threshold.
 
-    The garbage collector looks for reference cycles, and the roles make hardly any.
+    Roles create almost no reference cycles, for which the garbage collector searches.
     """
     gc.collect()
     gc.freeze()
@@ -60,13 +60,13 @@ def tune_garbage_collector() -> None:
 def fork_server() -> ForkServerContext:
     """Return a context that forks processes from a prepared server.
 
-    Linear algebra uses one thread in every process, because many processes share few cores.
+    Linear algebra is limited to one thread per process, because many processes share few cores.
     """
     for name in THREAD_LIMITS:
         os.environ.setdefault(name, "1")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([PRELOADED])
-    # Ctrl-C reaches the whole process group. Role processes inherit that they ignore it, because
+    # Ctrl-C reaches the whole process group. Role processes inherit that SIGINT is ignored, because
     # the launcher ends them in the right order.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -90,18 +90,18 @@ def start_role(
         role: `router`, `coordinator`, `bridge` or `agent`.
         name: name for logs and process lists.
         tables: the scenario, as returned by `to_tables`.
-        options: further settings: `folder` of the log, `temporary` for temporary files, and
-            optionally `namespace`, a process whose network namespace the role joins, and `faults`,
-            its `MessageFaults`.
+        options: `folder` of the log; `temporary`, folder for temporary files; optionally
+            `namespace`, id of a process whose network namespace the role joins, and `faults`, the
+            `MessageFaults` of the role.
 
     Raises:
-        CommandFailedError: the fork server has ended, or no process can be created.
+        CommandFailedError: the fork server has ended, or the process cannot be created.
     """
     process = context.Process(target=run_role, args=(role, name, tables, options), name=name)
     try:
         process.start()
     except (EOFError, OSError) as error:
-        reason = str(error) or "the fork server is gone"
+        reason = str(error) or "the fork server has ended"
         raise CommandFailedError(f"cannot start {name}: {reason}") from error
     return process
 
@@ -110,7 +110,7 @@ def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, An
     """Run a role in this process until it ends; the target of `start_role`."""
     die_with_parent()
     if "namespace" in options:
-        # Namespaces belong to threads: join before other threads start.
+        # Namespaces are properties of threads: join before other threads start.
         join_namespace(options["namespace"])
     die_with_supervisor()
     ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
@@ -128,11 +128,11 @@ def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, An
 
 
 def _run_once(role: str, name: str, tables: dict[str, Any], options: dict[str, Any]) -> bool:
-    """Run a role; return False if it could not connect because of a fault and should try again."""
+    """Run a role; return False to retry, because a fault prevented the connection."""
     try:
         _ROLES[role](name, tables, options)
     except BadInputError as error:
-        # The router may be down, or the link to it cut. The bridge starts before all faults.
+        # A fault may have killed the router or cut the link; the bridge starts before all faults.
         if "faults" not in options or role == "bridge" or error.field != "network.endpoint":
             raise
         return False
@@ -140,9 +140,9 @@ def _run_once(role: str, name: str, tables: dict[str, Any], options: dict[str, A
 
 
 def die_with_supervisor() -> None:
-    """End this process when the launcher dies in any way.
+    """End this process when the launcher ends for any reason.
 
-    The parent is the fork server, which runs as long as one of its child processes does.
+    The parent process is the fork server, which runs until its last child process has ended.
     """
     supervisor = multiprocessing.parent_process()
     if supervisor is None:
@@ -162,7 +162,7 @@ def die_with_supervisor() -> None:
 
 
 def resume_children(parent: int) -> None:
-    """Resume processes that a fault has paused, so that they notice the death of the launcher."""
+    """Resume processes paused by faults, so that they detect the death of the launcher."""
     with contextlib.suppress(OSError):
         children = Path(f"/proc/{parent}/task/{parent}/children").read_text(encoding="ascii")
         for child in children.split():
@@ -203,7 +203,7 @@ def _bridge(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
 def _agent(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     from laneweave.agents.process import run_agents
 
-    # All roles wait for bridge, router and coordinators, which get a higher priority.
+    # Bridge, router and coordinators get a higher priority, because all roles wait for them.
     os.nice(AGENT_NICENESS)
     scenario, vehicles = parse_scenario(tables), options["vehicles"]
     run_agents(

@@ -15,10 +15,10 @@ LOG = "log.jsonl"
 
 @contextmanager
 def new_folder(out: Path | None, settings: Scenario, method: str) -> Iterator[Path]:
-    """Yield a folder that holds no other run; remove it if the run is refused before it begins.
+    """Yield a new or empty folder; remove it if the run is rejected before it begins.
 
     Raises:
-        BadInputError: the folder is in use, or cannot be created.
+        BadInputError: the folder is not empty, or cannot be created.
     """
     folder = _free_name(settings, method) if out is None else out
     existed = folder.is_dir()
@@ -50,7 +50,7 @@ def _claim(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise BadInputError("--out", str(folder), "a new or empty folder")
-        # Of two runs that start at the same time, the second one fails here.
+        # If two runs start simultaneously, the second one fails here.
         (folder / LOG).touch(exist_ok=False)
     except FileExistsError as error:
         raise BadInputError("--out", str(folder), "a new or empty folder") from error

@@ -1,4 +1,4 @@
-"""A run in this process: the same cores over the simulated network, in virtual time, repeatable."""
+"""A repeatable run in this process: all cores over the simulated network, in virtual time."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 
 STALL_S = 600.0
-"""A run fails if its road clock stands still for this much virtual time."""
+"""Virtual time without progress of the road clock after which a run fails."""
 STRIDE_S = 0.02
-"""Virtual time between two checks of the run without faults.
+"""Virtual time between checks of a run without faults.
 
-The network may go on for this long after the bridge has ended, which changes no result."""
+The network may run for this long after the end of the bridge, which does not affect the results."""
 PROGRESS_EVERY_TICKS = 20
 AGENT_PREFIX = "agent-"
 
 
 class _ObserverCore:
-    """Core that updates a view and calls `on_message` after each message."""
+    """Core that updates a view, and calls `on_message` after each message."""
 
     wakeup_s = None
 
@@ -62,29 +62,29 @@ class _ObserverCore:
 
 @define
 class SimulatedRoles:
-    """The roles of a simulated run by name; the `RoleControl` of faults."""
+    """The roles of a simulated run by name; implements `RoleControl`."""
 
     network: SimulatedNetwork
     coordinators: tuple[str, ...]
     start: Callable[[str], None]
-    """Starts a coordinator or an agent by name."""
+    """Starts the coordinator or agent of a name."""
     agents: dict[str, str] = field(factory=dict)
     """Name of the agent of each vehicle."""
     _router_runs: bool = True
 
     @property
     def running(self) -> Collection[str]:
-        """Roles that run."""
+        """Names of the running roles."""
         router = (ROUTER,) if self._router_runs else ()
         roles = (*self.coordinators, *self.agents.values())
         return [*(name for name in roles if name in self.network), *router]
 
     def agent_of(self, vehicle: str) -> str | None:
-        """Return the agent of a vehicle; None: it has not been started."""
+        """Return the agent of a vehicle; None: not started."""
         return self.agents.get(vehicle)
 
     def kill(self, name: str) -> None:
-        """End a role at once, without cleaning up."""
+        """End a role immediately, without clean-up."""
         if name == ROUTER:
             self._router_runs = False
             self.network.lose_router()
@@ -111,7 +111,7 @@ class SimulatedRoles:
 
 @define
 class SimulatedRun:
-    """One run over the simulated network; call `run` once."""
+    """A run over the simulated network; call `run` once."""
 
     scenario: Scenario
     folder: Path
@@ -124,9 +124,9 @@ class SimulatedRun:
     _injection: FaultInjection | None = None
     _board: LocalBoard = field(factory=LocalBoard)
     _injected_road_s: float = -1.0
-    """Road time up to which faults have been applied."""
+    """Road time of the newest application of faults."""
     _incarnations: Iterator[int] = field(factory=lambda: count(1))
-    """Unique incarnations of agents and caretakers."""
+    """Unique incarnation numbers of agents and caretakers."""
     _coordinator_incarnations: Iterator[int] = field(factory=lambda: count(1))
     _problems: list[str] = field(factory=list)
 
@@ -186,14 +186,14 @@ class SimulatedRun:
             if bridge.tick != advanced_tick:
                 advanced_tick, advanced_s = bridge.tick, network.now_s
             elif network.now_s - advanced_s > STALL_S:
-                self._problems.append(f"the road clock stands still at tick {bridge.tick}")
+                self._problems.append(f"the road clock stopped at tick {bridge.tick}")
                 return
             if bridge.tick >= shown + PROGRESS_EVERY_TICKS:
                 shown = bridge.tick
                 progress.show(self._view)
 
     def _inject(self, injection: FaultInjection, now_s: float) -> None:
-        """Apply faults if the road time has advanced or a role is to resume or restart."""
+        """Apply faults if the road time has advanced, or a resume or restart is due."""
         wakeup_s, road_s = injection.wakeup_s, self._board.road_s
         if road_s != self._injected_road_s or (wakeup_s is not None and wakeup_s <= now_s):
             self._injected_road_s = road_s

@@ -93,7 +93,7 @@ def test_a_run_without_a_summary_failed(tmp_path: Path) -> None:
     outcome = complete_summary(tmp_path, problems=["the bridge ended"], processes=3)
     assert outcome.exit_status == 1
     assert outcome.summary is None
-    assert outcome.problems == ("the bridge ended", "the run left no summary")
+    assert outcome.problems == ("the bridge ended", "the run wrote no summary")
 
 
 def printed(outcome: Outcome) -> str:

@@ -29,7 +29,7 @@ class _DeadServer:
 @pytest.mark.parametrize(
     ("error", "reason"),
     [
-        (EOFError(), "the fork server is gone"),
+        (EOFError(), "the fork server has ended"),
         (ConnectionRefusedError(111, "Connection refused"), "Connection refused"),
     ],
 )
