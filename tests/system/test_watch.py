@@ -179,7 +179,7 @@ def test_what_fails_is_shown_and_recovered_from(lab: Lab, page: Page) -> None:
         page.wait_until(lambda: page.text("pill") == "live")
         assert page.run("banner.hidden")
         assert health(address)[0] == 200
-    page.wait_until(lambda: page.text("pill") == "standing still")
+    page.wait_until(lambda: page.text("pill") == "clock stopped")
     # Another bridge is another road.
     with traffic(endpoint, 4, bridge=2).flowing():
         page.wait_until(lambda: page.text("count") == "4")

@@ -1,7 +1,7 @@
-"""What is sent to the page: one scene, then frames. All of it is compact JSON.
+"""Messages between server and page: one scene, then frames, all as compact JSON.
 
-Lengths are in m, speeds in m/s, `t` is road time and `w` the wall clock, both in s. A frame is
-complete in itself, so that any of them may be skipped.
+Lengths are in m, speeds in m/s; `t` is road time and `w` wall-clock time in s. Frames do not depend
+on earlier frames, so any of them may be skipped.
 
 **Scene**, the first message: `{"scene": {...}}`
 
@@ -9,42 +9,42 @@ complete in itself, so that any of them may be skipped.
 |---|---|
 | `format` | `laneweave.watch/1` |
 | `kind` | `live` or `recorded` |
-| `title` | what is shown |
-| `session` | identifies this server; frames of another session are unrelated |
-| `step_s` | time between two frames: on the wall clock if live, road time if recorded |
-| `first`, `last` | numbers of the frames that can be requested now; `last` < `first`: none |
-| `road`, `body_m`, `lattice`, `shade`, `colours`, `names` | how to draw the road |
+| `title` | name of the realm or of the run |
+| `session` | unique identifier of the server; frames of other sessions are unrelated |
+| `step_s` | time between two frames: wall-clock time if live, road time if recorded |
+| `first`, `last` | numbers of the available frames; `last` < `first`: none |
+| `road`, `body_m`, `lattice`, `shade`, `colours`, `names` | parameters for drawing the road |
 | `rolling` | vehicles own cells; otherwise formations own columns |
 | `losses` | recorded: message counts of the summary; live: null |
 
-**Frame**: pushed if live, whenever something has changed, at most every `step_s`; requested if
-recorded, as are earlier frames if live.
+**Frame**: live frames are pushed on changes, at most every `step_s`; recorded frames and earlier
+live frames are sent on request.
 
 | field | meaning |
 |---|---|
-| `n` | its number |
-| `run` | number of the road; a new run has a new number, and its time begins at 0 |
-| `t`, `w` | road time, null before the first clock; wall clock, null if recorded |
+| `n` | number of the frame |
+| `run` | number of the run; the road time of each run begins at 0 |
+| `t`, `w` | road time, null before the first clock; wall-clock time, null if recorded |
 | `status` | `lost`: no router; `waiting`: no road; `still`: no clock; `live`, `ended`, `recorded` |
-| `since` | wall clock at which the status began; null if recorded |
+| `since` | wall-clock time at which the status began; null if recorded |
 | `leader` | [name, term], or null |
-| `candidates` | [name, term, leading, silent] each |
+| `candidates` | list of [name, term, leading, silent] |
 | `counts` | [demanded, entered, on the road, left], or null |
-| `loss` | [expected, lost] states of the last 100 ticks, or null |
-| `plan` | [t, vehicles, solve ms, solver or null, fallback] of the newest plan, or null |
-| `news` | the newest events, oldest first: [t, process, kind, details] |
-| `formations` | the closed ones on the road: [number, rear column, front column] each |
-| `joined` | formations that plan together, at least two: lists of their numbers |
-| `vehicles` | one row each, below |
+| `loss` | numbers of [expected, lost] states in the last 100 ticks, or null |
+| `plan` | newest plan: [t, vehicles, solve ms, solver or null, fallback], or null |
+| `news` | newest events, oldest first: list of [t, process, kind, details] |
+| `formations` | closed formations on the road: list of [number, rear column, front column] |
+| `joined` | lists of the numbers of formations that plan together |
+| `vehicles` | list of rows, one per vehicle |
 
-**Row** of a vehicle: `[name, s, y, speed, lane, formation, hold, target, flags, owned]`: front
-bumper and body centre, preferred lane (-1: not known), number of its formation (-1: none, or not
-closed yet), hold cell and target cell as [column, lane] or 0, flags (1 moves, 2 has no agent, 4 is
-not heard, 8 is overdue), and the other cells that it owns: column, lane, column, lane, ... The
-*target* is the last cell of the plan that the vehicle has accepted and not completed, else 0.
+**Row** of a vehicle: `[name, s, y, speed, lane, formation, hold, target, flags, owned]`: s of the
+front bumper, y of the body centre, preferred lane (-1: unknown), number of the closed formation
+(-1: none), hold cell and target cell as [column, lane] or 0, sum of flags (1 moves, 2 has no agent,
+4 not heard from, 8 overdue), and the other owned cells as column, lane, column, lane, ... The
+target is the last cell of the plan that the vehicle has accepted and not completed.
 
-**From the page**: `{"want": [from, to]}`, numbers of frames, at most `MAX_REQUESTED` of them. The
-answer is `{"reel": [from, to], "first": n, "last": n, "frames": [...]}` with those that exist.
+**Request** of the page: `{"want": [from, to]}`, at most `MAX_REQUESTED` frame numbers. The response
+is `{"reel": [from, to], "first": n, "last": n, "frames": [...]}` with the available ones.
 """
 
 from __future__ import annotations
@@ -69,12 +69,12 @@ from laneweave.protocol.wire.events import (
 
 FORMAT: Final = "laneweave.watch/1"
 MAX_REQUESTED: Final = 50
-"""Frames in one answer."""
+"""Maximum number of frames in a response."""
 MOVING, UNATTENDED, UNHEARD, OVERDUE = 1, 2, 4, 8
 """Flags of vehicles."""
 
 MAX_FRAMES: Final = 3000
-"""Five minutes at ten frames a second."""
+"""Five minutes at ten frames per second."""
 MAX_CHARACTERS: Final = 48_000_000
 
 MAX_EVENTS: Final = 8
@@ -83,31 +83,31 @@ MAX_NUMBER: Final = 1e12
 FREQUENT_EVENTS: Final = (
     *PLAN_EVENTS, PLAN_IN_FORCE, FORMATION_CLOSED, ENTERED, LEFT,
 )  # fmt: skip
-"""Events that are not shown, because they would displace all others."""
+"""Events that are not shown because they would displace all others."""
 
 
 class FrameSource(Protocol):
-    """Frames that can be requested by their numbers."""
+    """Source of frames that can be requested by number."""
 
     @property
     def scene(self) -> dict[str, Any]:
-        """The scene; see the module."""
+        """The scene, without the fields `session`, `first` and `last`."""
 
     @property
     def first(self) -> int:
-        """Number of the first frame that exists."""
+        """Number of the first available frame."""
 
     @property
     def last(self) -> int:
-        """Number of the last frame that exists; less than `first`: none does."""
+        """Number of the last available frame; less than `first` if there are none."""
 
     def frames(self, begin: int, end: int) -> list[str]:
-        """Return the frames from `begin` to `end` (included), as far as they exist."""
+        """Return the available frames from `begin` to `end`, both included."""
 
 
 @define
 class FrameBuffer:
-    """The newest frames of a live road, bounded in number and in size; a `FrameSource`."""
+    """`FrameSource` of the newest frames of a live road, limited in number and total size."""
 
     scene: dict[str, Any]
     max_frames: int = MAX_FRAMES
@@ -138,7 +138,7 @@ class FrameBuffer:
         return self.next - 1
 
     def frames(self, begin: int, end: int) -> list[str]:
-        """Return the frames from `begin` to `end` (included), as far as they exist."""
+        """Return the available frames from `begin` to `end`, both included."""
         first = self.first
         return [
             self._frames[number - first]
@@ -148,23 +148,23 @@ class FrameBuffer:
 
 @define
 class EventFeed:
-    """The newest events of a run, without the frequent ones."""
+    """The newest events of a run except `FREQUENT_EVENTS`."""
 
     _rows: deque[list[Any]] = field(factory=lambda: deque(maxlen=MAX_EVENTS))
 
     def add(self, t_s: float, process: str, kind: str, data: Mapping[str, Any]) -> None:
-        """Add an event."""
+        """Add an event, unless its kind is frequent."""
         if kind not in FREQUENT_EVENTS:
             self._rows.append([round(t_s, 1), process, kind, _details(data)])
 
     @property
     def rows(self) -> list[list[Any]]:
-        """All of them, oldest first: [t, process, kind, details]."""
+        """[t, process, kind, details] of each event, oldest first."""
         return list(self._rows)
 
 
 def _details(data: Mapping[str, Any]) -> str:
-    """Return an event's data in one short line."""
+    """Return the data of an event as one short line."""
     text = ", ".join(f"{name} {_brief(value)}" for name, value in data.items())
     if len(text) <= MAX_EVENT_CHARACTERS:
         return text
@@ -180,7 +180,7 @@ def _brief(value: object) -> str:
 
 
 def plan_row(t_s: float, kind: str, data: Mapping[str, Any]) -> list[Any] | None:
-    """Return the `plan` field of a frame from an event; None if no plan was made."""
+    """Return the `plan` field of a frame for an event; None: the event is not that of a plan."""
     if kind not in PLAN_EVENTS:
         return None
     return [
@@ -193,7 +193,7 @@ def plan_row(t_s: float, kind: str, data: Mapping[str, Any]) -> list[Any] | None
 
 
 def _number(value: object) -> float:
-    """Return a number that can be shown; 0 for any other value."""
+    """Return the rounded number, or 0 for a value that is no number or too large."""
     if isinstance(value, (int, float)) and abs(value) < MAX_NUMBER:
         return round(float(value), 2)
     return 0.0
@@ -201,7 +201,7 @@ def _number(value: object) -> float:
 
 @frozen
 class Row:
-    """One vehicle in a frame."""
+    """State of a vehicle in a frame."""
 
     name: str
     s_m: float
@@ -231,7 +231,7 @@ class Row:
 
 
 def scene_of(scenario: Scenario, kind: str, title: str, step_s: float) -> dict[str, Any]:
-    """Return the scene of a scenario, without the numbers of frames."""
+    """Return the scene of a scenario; see `FrameSource.scene`."""
     return {
         "format": FORMAT,
         "kind": kind,
@@ -245,12 +245,12 @@ def scene_of(scenario: Scenario, kind: str, title: str, step_s: float) -> dict[s
 
 
 def compact(value: object) -> str:
-    """Return compact JSON; raise an error for values that JSON does not have."""
+    """Return compact JSON; raise ValueError for NaN and infinity."""
     return json.dumps(value, separators=(",", ":"), allow_nan=False)
 
 
 def batch(source: FrameSource, begin: int, end: int) -> str:
-    """Return the answer to a request for some frames."""
+    """Return the response to a request for frames."""
     end = min(end, begin + MAX_REQUESTED - 1)
     frames = ",".join(source.frames(begin, end))
     head = compact({"reel": [begin, end], "first": source.first, "last": source.last})
@@ -258,6 +258,6 @@ def batch(source: FrameSource, begin: int, end: int) -> str:
 
 
 def opening(source: FrameSource, session: str) -> str:
-    """Return the first message; `session` distinguishes this server from an earlier one."""
+    """Return the first message of a server with the identifier `session`."""
     bounds = {"first": source.first, "last": source.last, "session": session}
     return compact({"scene": source.scene | bounds})

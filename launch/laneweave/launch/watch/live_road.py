@@ -1,9 +1,9 @@
-"""The live road: what an observer knows of a deployment, and the frames made of it.
+"""The live road: observed state of a deployment, and the frames that show it.
 
-A pure core: messages and times go in, frames come out. Every vehicle publishes its state in each
-tick; between two states, and while single ones are lost, it is drawn where its speed has taken it.
-A vehicle that was not heard for `UNHEARD_S` is drawn in its cell and marked: a vehicle without new
-information holds its cell, but its real position is not known.
+A pure core that turns messages and times into frames. Every vehicle publishes its state in each
+tick; until the next state arrives, its position is extrapolated with its speed. After `UNHEARD_S`
+without a state it is drawn in its cell and marked: a vehicle without new information holds its
+cell, but its position is unknown.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ from laneweave.protocol.wire.messages import (
 from laneweave.protocol.wire.topics import CENSUS, CLOCK, EVENT, HEARTBEAT, PLAN, STATE
 
 TOPICS = (STATE, CLOCK, CENSUS, HEARTBEAT, PLAN, EVENT)
-"""Subscribed topics; the most frequent one first."""
+"""Subscribed topics, the most frequent first."""
 UNHEARD_S = 1.0
-"""Road time after which a vehicle counts as not heard."""
+"""Road time without a state after which a vehicle counts as not heard from."""
 STILL_S = 2.0
-"""Wall-clock time without a clock message after which the road is shown as standing still."""
+"""Wall-clock time without a clock message after which the road clock counts as stopped."""
 MAX_PLANS = 500
 MAX_COORDINATORS = 32
 LOSS_WINDOW_TICKS = 100
 
 
 class LiveRoad:
-    """What is known of a deployment."""
+    """Observed state of a deployment."""
 
     def __init__(self, scenario: Scenario, wall_s: float) -> None:
-        """Begin to observe at a wall-clock time, connected to the router."""
+        """Start at a wall-clock time, connected to the router."""
         self.scenario = scenario
         self.view = RoadView(loss_window_ticks=LOSS_WINDOW_TICKS)
         self._targets: dict[Ballot, dict[Name, Cell]] = {}
-        """For each plan the last cell of every vehicle that moves."""
+        """Last cell of each moving vehicle, by plan."""
         self._events = EventFeed()
         self._plan: list[Any] | None = None
         self._status, self._since_s = "waiting", wall_s
@@ -61,7 +61,7 @@ class LiveRoad:
         """Run, status and tick of the last frame."""
 
     def update(self, event: object, wall_s: float) -> None:
-        """Process a message or a change of the link, at a wall-clock time."""
+        """Process a message or a change of the connection at a wall-clock time."""
         roads = self.view.roads
         self.view.update(event, wall_s)
         if 0 < roads < self.view.roads:
@@ -84,11 +84,11 @@ class LiveRoad:
             del self._targets[next(iter(self._targets))]
 
     def changed(self, wall_s: float) -> bool:
-        """Tell whether there is a tick or a status that the last frame did not contain."""
+        """Return whether tick or status have changed since the last frame."""
         return self._shown != self._identity(wall_s)
 
     def frame(self, number: int, wall_s: float) -> dict[str, Any]:
-        """Return what is known as a frame; see `frames`."""
+        """Return the current state as a frame; see `frames`."""
         self._shown = self._identity(wall_s)
         self._update_status(wall_s)
         view = self.view
@@ -115,7 +115,7 @@ class LiveRoad:
         }
 
     def _leadership(self, wall_s: float) -> dict[str, Any]:
-        """Return the fields `leader` and `candidates`: of each name the newest process."""
+        """Return the fields `leader` and `candidates`, for the newest process of each name."""
         election_s = self.scenario.network.election_s
         newest = {one.coordinator: one for one in self.view.coordinators(wall_s, election_s)}
         coordinators = list(newest.values())[:MAX_COORDINATORS]
@@ -156,7 +156,7 @@ class LiveRoad:
         view.states = {
             name: state
             for name, state in view.states.items()
-            # A vehicle that was heard after the census may have entered after it.
+            # A vehicle with a state newer than the census may have entered after the census.
             if name in listed or state.t_s > view.census.t_s
         }
 
@@ -216,7 +216,7 @@ class LiveRoad:
         )
 
     def _target_of(self, state: VehicleState) -> Cell | None:
-        """Return the last cell of the vehicle's plan; None: it has none, or it was not heard."""
+        """Return the last cell of the plan that a vehicle executes; None: no known plan."""
         if state.promised is None or not state.accepted or state.done:
             return None
         return self._targets.get(state.promised, {}).get(state.vehicle)

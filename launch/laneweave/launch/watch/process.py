@@ -1,7 +1,7 @@
-"""`laneweave watch` as a process: the socket, the signals, and the observer's thread.
+"""The process of `laneweave watch`: socket, signals, observer thread.
 
-The thread processes what Zenoh delivers and makes frames; the event loop serves browsers. Only
-whole frames go from the thread to the loop.
+The thread processes deliveries of Zenoh and makes frames; the event loop serves browsers. Only
+complete frames are passed from the thread to the loop.
 """
 
 from __future__ import annotations
@@ -35,30 +35,30 @@ from laneweave.protocol.wire.topics import Keys
 log = structlog.get_logger(__name__)
 
 STEP_S: Final = 0.1
-"""Time between two frames; wall clock."""
+"""Wall-clock time between two frames."""
 SLACK_S: Final = 0.02
-"""A frame may be early by this much, so that slightly irregular ticks each have a frame."""
+"""Tolerance by which a frame may be early, so that each slightly irregular tick has a frame."""
 IDLE_S: Final = 1.0
-"""Longest time between two frames, also when nothing has changed."""
+"""Maximum time between two frames if nothing changes."""
 POLL_S: Final = 0.02
 MAX_BATCH: Final = 5_000
-"""Messages that are processed before the next frame is made."""
+"""Maximum number of messages that are processed between two frames."""
 IDENTITY: Final = "observer.watch"
-"""The process's identity in a secured network."""
+"""Identity of the process in a secured network."""
 MAX_QUEUED: Final = 20_000
-"""Messages that wait to be processed; further ones are dropped."""
+"""Maximum number of queued messages; further ones are dropped."""
 END_S: Final = 1.0
-"""Time that browsers have to disconnect at the end."""
-LISTEN_RULE: Final = "HOST:PORT, an address of this machine; port 0: any free one"
+"""Time that browsers have to disconnect at shutdown."""
+LISTEN_RULE: Final = "HOST:PORT, an address of this machine; port 0: any free port"
 
 
 def watch_live(scenario: Scenario, listen: str, ready: Callable[[str], None]) -> None:
     """Serve the page of a deployment until SIGINT or SIGTERM.
 
     Args:
-        scenario: road and network, as of the deployment's roles.
+        scenario: configuration of the deployment.
         listen: HOST:PORT.
-        ready: called with the page's address when it is served.
+        ready: called with the URL when the page is served.
 
     Raises:
         BadInputError: there is no router at the endpoint, or the address cannot be used.
@@ -72,7 +72,7 @@ def watch_recorded(folder: Path, listen: str, ready: Callable[[str], None]) -> N
     """Serve the page of a recorded run until SIGINT or SIGTERM.
 
     Raises:
-        BadInputError: it is not the folder of a finished run, or the address cannot be used.
+        BadInputError: the folder is not that of a finished run, or the address cannot be used.
     """
     from laneweave.launch.watch.recorded_run import Recording  # noqa: PLC0415 (needs pyarrow)
 
@@ -89,7 +89,7 @@ def open_socket(listen: str) -> socket.socket:
     """Return a socket that listens at an address.
 
     Raises:
-        BadInputError: it is not an address, or it cannot be used.
+        BadInputError: the address is malformed or cannot be used.
     """
     host, colon, port = listen.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
@@ -104,10 +104,10 @@ def open_socket(listen: str) -> socket.socket:
 
 
 class _LiveObserver:
-    """Observes a deployment and makes frames, in a thread of its own."""
+    """Observer of a deployment that makes frames in a separate thread."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Connect, waiting some time for the router.
+        """Connect to the router, with retries.
 
         Raises:
             BadInputError: there is no router at the endpoint.
@@ -116,10 +116,11 @@ class _LiveObserver:
         self.buffer = FrameBuffer(scene_of(scenario, "live", scenario.network.realm, STEP_S))
         self._observer = Observer(Keys(scenario.network.realm), topics=TOPICS)
         self._transport = connect_blocking(access_of(scenario, IDENTITY), self._deliver)
-        # Seconds that do not jump when the system clock is set.
+        # Wall-clock time that does not jump when the system clock is set.
         self._offset_s = time.time() - time.monotonic()
         self._road = LiveRoad(scenario, self._wall_s())
         self._made_s = self._wall_s()
+        self._number = 0  # of the next frame
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
         self._failure: BaseException | None = None
@@ -127,24 +128,24 @@ class _LiveObserver:
         self._abort: Callable[[], None] = lambda: None
 
     def __enter__(self) -> _LiveObserver:
-        """Return itself; the context ends with a closed connection."""
+        """Return this observer."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop listening."""
+        """Stop the thread and close the connection."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(END_S)
         self._transport.close()
 
     def start(self, abort: Callable[[], None]) -> None:
-        """Subscribe and start the thread; call from the event loop. `abort` ends the process."""
+        """Subscribe and start the thread (in the event loop); `abort` ends the process."""
         self._loop, self._abort = asyncio.get_running_loop(), abort
         self._observer.subscribe(self._transport)
         self._thread.start()
 
     def check(self) -> None:
-        """Raise the error that ended the thread, if there was one."""
+        """Raise the error that ended the thread, if any."""
         if self._failure is not None:
             raise self._failure
 
@@ -184,27 +185,24 @@ class _LiveObserver:
             self._number += 1
             self._call(self._publish, compact(frame))
 
-    _number = 0
-    """Of the next frame."""
-
     def _publish(self, frame: str) -> None:
-        """Offer a frame to all browsers; runs in the event loop."""
+        """Send a frame to all browsers (in the event loop)."""
         self.buffer.append(frame)
         self.browsers.offer(frame)
 
     def _call(self, function: Callable[..., None], *arguments: object) -> None:
         assert self._loop is not None  # noqa: S101 (set before the thread starts)
-        # The loop is closed when the process ends at this very moment.
+        # The loop is already closed if the process is ending.
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(function, *arguments)
 
 
 class _Server(uvicorn.Server):
-    """A server that leaves signals to its caller."""
+    """Server without signal handlers."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Capture none: the library's own handler would end the process by the signal."""
+        """Capture no signals: the handler of uvicorn would raise them again."""
         yield
 
 
@@ -219,7 +217,7 @@ def _serve(
     config = uvicorn.Config(
         make_app(source, browsers, health),
         log_config=None,
-        # Connecting and disconnecting browsers are of no interest on a terminal.
+        # Do not log connects and disconnects of browsers on the terminal.
         log_level="critical",
         access_log=False,
         lifespan="off",
@@ -230,7 +228,7 @@ def _serve(
         ws_max_queue=4,
         ws_ping_interval=5.0,
         ws_ping_timeout=10.0,
-        # Costs more time than it saves on a local network.
+        # Compression costs more time than it saves on a local network.
         ws_per_message_deflate=False,
     )
     server = _Server(config)
@@ -241,7 +239,7 @@ def _serve(
     async def main() -> None:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
-            # What is ignored stays ignored.
+            # Keep ignored signals ignored.
             if signal.getsignal(number) is not signal.SIG_IGN:
                 loop.add_signal_handler(number, end)
         start(end)

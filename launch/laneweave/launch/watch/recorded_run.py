@@ -1,7 +1,8 @@
-"""A recorded run as frames, made on request.
+"""Frames of a recorded run, made on request.
 
-The files of a run contain no owned cells, no plans beyond a vehicle's current cell or move, and no
-lost messages, so the frames do not either. The scene has the summary's message counts.
+The files of a run contain the current cell or move of each vehicle, but neither owned cells nor
+further plans nor lost messages; the frames lack these, too. The scene contains the message counts
+of the summary.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from laneweave.protocol.wire.events import ENTERED, FORMATIONS_JOINED, LEADER, L
 STEP_S = 0.2
 """Road time between two frames; the page interpolates."""
 STILL_M = 0.25
-"""A vehicle at a greater lateral distance from the middle of its cell is moving."""
+"""Lateral distance from the centre of its cell above which a vehicle is moving."""
 
 
 @frozen
@@ -41,17 +42,17 @@ class _Moment:
     entered: int = 0
     left: int = 0
     joined: tuple[tuple[int, ...], ...] = ()
-    """Groups of blocks that plan together."""
+    """Groups of blocks whose formations plan together."""
 
 
 class Recording:
-    """A finished run's folder as a `FrameSource`."""
+    """`FrameSource` of a finished run."""
 
     def __init__(self, folder: Path) -> None:
-        """Read a run's folder.
+        """Read the folder of a run.
 
         Raises:
-            BadInputError: it is not the folder of a finished run with trajectories.
+            BadInputError: the folder is not that of a finished run with trajectories.
         """
         run = single_run(folder)
         try:
@@ -70,7 +71,7 @@ class Recording:
         self._step_s = stride * tick_s
         self._numbers, self._rows = _frames_of(self._tracks, tick_s, stride)
         self.first = 0
-        # The last frame is after the last recorded one: all vehicles have left.
+        # The last frame follows the last recorded one, and has no vehicles.
         self.last = int(self._numbers[-1]) + 1 if len(self._numbers) else 0
         demands_s = [float(trip["demanded_s"]) for trip in self._trips.values()]
         self._demands_s = np.sort(np.array(demands_s, dtype=np.float64))
@@ -83,12 +84,12 @@ class Recording:
         }
 
     def frames(self, begin: int, end: int) -> list[str]:
-        """Return the frames from `begin` to `end` (included), as far as the run goes."""
+        """Return the available frames from `begin` to `end`, both included."""
         numbers = range(max(begin, self.first), min(end, self.last) + 1)
         return [compact(self.frame(number)) for number in numbers]
 
     def frame(self, number: int) -> dict[str, Any]:
-        """Return one frame; see `frames`."""
+        """Return the frame of a number; see `frames`."""
         t_s = number * self._step_s
         moment = self._moments[max(0, bisect_right(self._times_s, t_s + 1e-6) - 1)]
         rows = list(self._vehicles(number, t_s))
@@ -145,7 +146,7 @@ class Recording:
 def _frames_of(
     tracks: Tracks, tick_s: float, stride: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the frame number of each sampled row, ascending, and (row, vehicle) pairs."""
+    """Return the sampled rows: frame numbers (ascending), and pairs of (row, vehicle)."""
     ticks = np.rint(tracks.t_s / tick_s).astype(np.int64)
     rows = np.flatnonzero(ticks % stride == 0)
     numbers = ticks[rows] // stride
@@ -155,7 +156,7 @@ def _frames_of(
 
 
 def _moments(folder: Path) -> Iterator[_Moment]:
-    """Yield the state after each event in order of time, beginning with an empty one."""
+    """Yield the initial state and the state after each event, in chronological order."""
     events = []
     for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines():
         event = json.loads(line)
@@ -177,6 +178,6 @@ def _moments(folder: Path) -> Iterator[_Moment]:
 
 
 def _losses(run: Run) -> dict[str, int]:
-    """Return the summary's counts of messages published, and dropped by injected faults."""
+    """Return the numbers of published messages and of messages dropped by injected faults."""
     names = ("published", "dropped_by_faults")
     return {name: getattr(run.summary.messages, name) if run.summary else 0 for name in names}

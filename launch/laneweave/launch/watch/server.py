@@ -1,7 +1,7 @@
-"""The page, its websocket, and the health check, as one ASGI application.
+"""ASGI application with the page, its websocket, and the health check.
 
-A browser that is slower than the road gets fewer frames: for each browser only the newest frame and
-its newest request are kept.
+Slow browsers get fewer frames: only the newest frame and the newest request of each browser are
+kept.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from laneweave.launch.web import road_script, text_of
 
 MAX_BROWSERS: Final = 50
 MAX_REQUEST_CHARACTERS: Final = 200
-"""The page sends no longer messages."""
+"""Maximum length of messages from the page."""
 POLICY_VIOLATION, TRY_LATER = 1008, 1013
 """Websocket status codes."""
 HEADERS: Final = {
@@ -50,27 +50,27 @@ _FILES: Final = {
 
 @define(eq=False)
 class Browser:
-    """Pending output of one browser: at most one frame and one request."""
+    """Pending output for one browser: at most one frame and one request."""
 
     frame: str | None = None
     request: tuple[int, int] | None = None
     skipped: int = 0
-    """Frames that newer ones have replaced."""
+    """Number of unsent frames that newer ones have replaced."""
     _pending: asyncio.Event = field(factory=asyncio.Event)
 
     def offer(self, frame: str) -> None:
-        """Set the next frame; it replaces one that was not sent yet."""
+        """Set the next frame, which replaces an unsent one."""
         self.skipped += self.frame is not None
         self.frame = frame
         self._pending.set()
 
-    def ask(self, request: tuple[int, int]) -> None:
-        """Set the next request; it replaces one that was not answered yet."""
+    def set_request(self, request: tuple[int, int]) -> None:
+        """Set the next request, which replaces an unanswered one."""
         self.request = request
         self._pending.set()
 
     async def next(self, source: FrameSource) -> str:
-        """Wait for the next message to send; answers to requests come first."""
+        """Return the next message to send once there is one; responses precede live frames."""
         while self.request is None and self.frame is None:
             self._pending.clear()
             await self._pending.wait()
@@ -78,33 +78,33 @@ class Browser:
             (begin, end), self.request = self.request, None
             return batch(source, begin, end)
         frame, self.frame = self.frame, None
-        assert frame is not None  # noqa: S101 (there is one or the other)
+        assert frame is not None  # noqa: S101 (there is a request or a frame)
         return frame
 
 
 @define
 class Browsers:
-    """All connected browsers."""
+    """The connected browsers."""
 
     connected: set[Browser] = field(factory=set)
 
     def offer(self, frame: str) -> None:
-        """Offer a frame to every browser."""
+        """Set the next frame of every browser."""
         for browser in self.connected:
             browser.offer(frame)
 
 
 Health = Callable[[], tuple[bool, dict[str, Any]]]
-"""Returns whether the server is healthy, and facts about it."""
+"""Returns whether the server is healthy, and details."""
 
 
 def make_app(source: FrameSource, browsers: Browsers, health: Health) -> Starlette:
     """Return the application.
 
     Args:
-        source: the frames that can be requested.
-        browsers: the browsers that get live frames.
-        health: called at each health check.
+        source: frames that browsers can request.
+        browsers: set of browsers that receive live frames.
+        health: callback for health checks.
     """
     scene = partial(opening, source, uuid4().hex)
 
@@ -133,16 +133,16 @@ def make_app(source: FrameSource, browsers: Browsers, health: Health) -> Starlet
 
 
 def same_origin(socket: WebSocket) -> bool:
-    """Tell whether the socket was opened by a page of this server, or outside a browser.
+    """Return whether the socket was opened by a page of this server, or outside a browser.
 
-    A browser lets any page open a websocket to any server, and sends the origin of the page.
+    Browsers let any page open a websocket to any server, and send the origin of the page.
     """
     origin = socket.headers.get("origin")
     return origin is None or urlsplit(origin).netloc == socket.headers.get("host")
 
 
 def request_of(text: str | None) -> tuple[int, int] | None:
-    """Return the frame numbers that a message of the page requests; None: it is malformed."""
+    """Return the frame numbers that a message of the page requests; None: malformed."""
     if text is None or len(text) > MAX_REQUEST_CHARACTERS:
         return None
     with contextlib.suppress(ValueError, TypeError, KeyError, RecursionError):
@@ -168,11 +168,11 @@ async def _serve(
 
 
 async def _send(socket: WebSocket, browser: Browser, source: FrameSource, scene: str) -> None:
-    # The listener, too, notices that a browser has disconnected, and cancels this task.
+    # If the browser disconnects, the listener cancels this task.
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):
         await socket.send_text(scene)
         while True:
-            # Waits while the browser does not read: then frames are skipped, not queued.
+            # This waits while the browser does not read; meanwhile frames are skipped, not queued.
             await socket.send_text(await browser.next(source))
 
 
@@ -186,7 +186,7 @@ async def _listen(socket: WebSocket, browser: Browser) -> None:
             if socket.application_state is WebSocketState.CONNECTED:
                 await socket.close(POLICY_VIOLATION)
             return
-        browser.ask(request)
+        browser.set_request(request)
 
 
 def _file(path: str, name: str, kind: str) -> Route:

@@ -1,4 +1,4 @@
-"""The script that draws a road on a canvas (`road.js`), shared by reports and the live page."""
+"""The script `road.js`, which draws a road on a canvas for reports and the live page."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from importlib.resources import files
 
 @lru_cache(maxsize=32)
 def text_of(package: str, name: str) -> str:
-    """Return a text file that is part of a package."""
+    """Return the text of a file in a package."""
     return files(package).joinpath(name).read_text(encoding="utf-8")
 
 
 def road_script() -> str:
-    """Return the script that draws roads; it defines `laneweaveRoad`."""
+    """Return the script that draws roads and defines `laneweaveRoad`."""
     return text_of(__name__, "road.js")

@@ -2,14 +2,14 @@
 // Draws a road on a canvas, in reports and on the live page. Lengths in m, speeds in m/s.
 //
 // A scene has `road` {length_m, lanes, lane_width_m, sorting_start_m}, `body_m` [length, width],
-// `lattice` {speed_mps, pitch_m}, `shade` {span_mps, strength}, and `colours`, one for each lane. A body has `name`, `lane` (its colour; -1: none), `s`, `y`, `v`, `slope`, and may be
-// `faint`: drawn as an outline only.
+// `lattice` {speed_mps, pitch_m}, `shade` {span_mps, strength}, and `colours`, one per lane. A body has
+// `name`, `lane` (index of its colour; -1: unknown), `s`, `y`, `v`, `slope`, `faint` (draw an outline).
 
 const laneweaveRoad = (() => {
-  const ACROSS = 1.8; // scale across the road over the scale along it
+  const ACROSS = 1.8; // scale across the road relative to the scale along it
   const ABOVE_PX = 13; // for names of vehicles on the left lane
-  const GAP_PX = 30; // between two stretches, for the scale in metres
-  const NAMED_FROM = 6; // pixels for each metre
+  const GAP_PX = 30; // below each stretch, for the scale in metres
+  const NAMED_FROM = 6; // minimum scale at which names are drawn, in pixels per metre
   const UNKNOWN = "#8a8f96";
   const LIGHT = {
     asphalt: "#e9eaec",
@@ -28,7 +28,7 @@ const laneweaveRoad = (() => {
     glass: "rgba(255,255,255,.75)",
   };
 
-  /** Return a colour, darker below the lattice's speed and lighter above it. */
+  /** Return a colour, darkened for slow vehicles and lightened for fast ones. */
   function shade(colour, over, span, strength) {
     const share = Math.max(-1, Math.min(1, over / span));
     const end = share > 0 ? 255 : 0;
@@ -40,20 +40,20 @@ const laneweaveRoad = (() => {
     return `rgb(${mixed.join(",")})`;
   }
 
-  /** Return stretches [from, to] of a whole road, to be shown below each other. */
+  /** Split a whole road into stretches [from, to], which are drawn below each other. */
   function wholeRoad(length) {
     const count = Math.max(1, Math.min(6, Math.round(length / 250)));
     return Array.from({ length: count }, (_, i) => [(length * i) / count, (length * (i + 1)) / count]);
   }
 
-  /** Return a stretch of a road around a place, which may be near an end or beyond it. */
+  /** Return the stretch of a road around a position, shifted into the road at its ends. */
   function windowAround(length, centre, size) {
     const half = Math.min(size, length) / 2;
     const middle = Math.max(half, Math.min(length - half, centre));
     return [middle - half, middle + half];
   }
 
-  /** Return rear and front of some columns at a time, with half of the gap around them. */
+  /** Return [rear, front] of a range of columns at a time, with half of the gaps around it. */
   function columnsAt(scene, rear, front, t) {
     const { pitch_m: pitch, speed_mps: speed } = scene.lattice;
     const margin = (pitch - scene.body_m[0]) / 2;
@@ -75,7 +75,7 @@ const laneweaveRoad = (() => {
       this.theme = theme;
     }
 
-    /** Draw bodies on stretches of the road; `layers` are drawn below them, one after the other. */
+    /** Draw stretches of the road with layers, and bodies on top of them. */
     paint(strips, bodies, layers = []) {
       const { canvas, scene } = this;
       const width = canvas.clientWidth;
@@ -104,27 +104,27 @@ const laneweaveRoad = (() => {
       });
     }
 
-    /** Return where a stretch begins on the canvas. */
+    /** Return the vertical canvas position of a stretch. */
     top(number) {
       return ABOVE_PX + number * (this.roadPx + GAP_PX);
     }
 
-    /** Return the place on the canvas of a place along the road. */
+    /** Return the horizontal canvas position of a position along the road. */
     x(s) {
       return (s - this.from) * this.scale;
     }
 
-    /** Return the place below the left edge of the road. */
+    /** Return the canvas position of a lateral position, relative to the left edge of the road. */
     y(place) {
       return this.roadPx - place * this.scale * ACROSS;
     }
 
-    /** Return whether part of [rear, front] is on the stretch that is being drawn. */
+    /** Return whether [rear, front] overlaps the stretch that is being drawn. */
     shows(rear, front) {
       return front >= this.from && rear <= this.to;
     }
 
-    /** Return the position on the road of a place of the canvas, {s, y} in m; null: between two stretches. */
+    /** Return the road position {s, y} in m of a canvas position; null: between two stretches. */
     placeAt(canvasX, canvasY) {
       if (!this.strips) return null;
       for (let number = 0; number < this.strips.length; number += 1) {
@@ -161,7 +161,7 @@ const laneweaveRoad = (() => {
       pen.fillRect(0, 0, width, roadPx);
       pen.strokeStyle = theme.paint;
       pen.lineWidth = 2;
-      // Dashes are fixed to the road, so they move with it.
+      // Fix the dashes to the road, not to the canvas.
       pen.setLineDash([6 * scale, 6 * scale]);
       pen.lineDashOffset = from * scale;
       for (let lane = 1; lane < road.lanes; lane += 1) {
@@ -194,7 +194,7 @@ const laneweaveRoad = (() => {
       }
     }
 
-    /** Return a vehicle's colour at a speed. */
+    /** Return the colour of a vehicle at a speed. */
     colour(lane, speed) {
       const { colours, shade: how, lattice } = this.scene;
       const own = lane < 0 ? UNKNOWN : colours[lane % colours.length];

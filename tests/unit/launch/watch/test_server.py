@@ -256,7 +256,7 @@ def test_nothing_queues_for_a_browser() -> None:
     browser = Browser()
     for number in range(1000):
         browser.offer(str(number))
-        browser.ask((number, number))
+        browser.set_request((number, number))
     assert (browser.frame, browser.request, browser.skipped) == ("999", (999, 999), 999)
 
 

@@ -1,6 +1,6 @@
-// The controls of the moving road; needs a browser.
+// Controls of the animated road; requires a browser.
 
-const WINDOW_M = 150; // length of road shown when something is followed
+const WINDOW_M = 150; // length of the road shown while following
 const MAX_FOLLOWED = 400;
 
 class Player {

@@ -1,9 +1,9 @@
 "use strict";
-// The data of the moving road (laneweave/launch/report/animation.py). Times in s, lengths in m.
-// It is drawn by laneweave/launch/web/road.js.
+// Data of the animated road (laneweave/launch/report/animation.py), drawn by
+// laneweave/launch/web/road.js. Times in s, lengths in m.
 
 const laneweave = (() => {
-  /** Decode integers of `bytes` bytes each, little-endian, from base64. */
+  /** Decode little-endian integers of `bytes` bytes from base64. */
   function unpack(text, bytes) {
     const raw = Uint8Array.from(atob(text), (char) => char.charCodeAt(0));
     if (bytes === 1) return raw;
@@ -28,7 +28,7 @@ const laneweave = (() => {
     };
   }
 
-  /** Return the state of a vehicle, {s, y, v, slope}; null when it is not on the road. */
+  /** Return the state {s, y, v, slope} of a vehicle; null: not on the road. */
   function stateAt(run, vehicle, t) {
     const place = t / run.step_s - vehicle.first;
     if (place < -1e-9 || place > vehicle.count - 1 + 1e-9) return null;
@@ -58,14 +58,14 @@ const laneweave = (() => {
     return found;
   }
 
-  /** Return the middle of a formation's columns at a time, on the road or not. */
+  /** Return the position of the centre of a formation, which may be off the road. */
   function formationCentre(run, formation, t) {
     const [, rear, front] = run.formations.find(([number]) => number === formation);
     const column = (rear + front) / 2;
     return run.lattice.speed_mps * t + column * run.lattice.pitch_m - run.body_m[0] / 2;
   }
 
-  /** Return the stretches [from, to] of road to show below each other; `follow` null: all of it. */
+  /** Return the stretches [from, to] of the road to draw; `follow` null: the whole road. */
   function stretches(run, follow, t, windowLength) {
     const length = run.road.length_m;
     if (follow === null) return laneweaveRoad.wholeRoad(length);
@@ -76,7 +76,7 @@ const laneweave = (() => {
     return [laneweaveRoad.windowAround(length, centre, windowLength)];
   }
 
-  /** Return what can be followed: formations, or vehicles where there are none. */
+  /** Return the formations that can be followed, or the vehicles if there are none. */
   function followable(run, max) {
     const shown = new Set(run.vehicles.map((vehicle) => vehicle.formation));
     const formations = run.formations.map(([number]) => number).filter((number) => shown.has(number));
@@ -88,7 +88,7 @@ const laneweave = (() => {
     return run.vehicles.slice(0, max).map((vehicle) => ({ name: vehicle.name, vehicle }));
   }
 
-  /** Return the time at which the followed object is at the beginning of lane sorting. */
+  /** Return the time at which the followed formation reaches lane sorting, or the vehicle enters. */
   function arrivalTime(run, follow) {
     if (follow.vehicle) return follow.vehicle.first * run.step_s;
     const ahead = run.road.sorting_start_m - 20 - formationCentre(run, follow.formation, 0);

@@ -3,10 +3,10 @@
 // Messages of the websocket: laneweave/launch/watch/frames.py.
 
 const laneweaveFrames = (() => {
-  const KEPT = 3000; // frames, as text
-  const PARSED = 16; // of them, ready to be painted
-  const BATCH = 50; // frames in one answer of the server
-  const JUMP_M = 40; // no vehicle drives this far between two frames
+  const KEPT = 3000; // number of stored frames, as text
+  const PARSED = 16; // number of parsed frames
+  const BATCH = 50; // frames per response of the server
+  const JUMP_M = 40; // no vehicle drives farther between two frames
   const UNSURE_M = 0.05; // lateral measurement error
   const [MOVING, UNATTENDED, UNHEARD, OVERDUE] = [1, 2, 4, 8];
 
@@ -21,9 +21,9 @@ const laneweaveFrames = (() => {
       this.parsed = new Map();
       this.first = 0;
       this.last = -1;
-      this.newest = null; // the frame that was pushed last, and the one before
+      this.newest = null; // the last two pushed frames
       this.before = null;
-      this.waiting = false; // for an answer
+      this.waiting = false; // for a response
     }
 
     /** Process a message of the server; return "scene", "frame" or "reel". */
@@ -61,7 +61,7 @@ const laneweaveFrames = (() => {
       if (this.texts.size > KEPT) this.texts.delete(this.texts.keys().next().value);
     }
 
-    /** Return the frame of a number; null: it has not arrived. */
+    /** Return the frame of a number; null: not received. */
     get(number) {
       let frame = this.parsed.get(number);
       if (frame) return frame;
@@ -100,7 +100,7 @@ const laneweaveFrames = (() => {
     };
   }
 
-  /** Interpolate between two frames, of which the second may be null: {t, bodies}. */
+  /** Interpolate between two frames; the second may be null. Return {t, bodies}. */
   function between(one, next, share) {
     if (!next || next.run !== one.run || one.t === null || next.t === null || next.t < one.t) {
       return { t: one.t, bodies: one.vehicles.map(body) };

@@ -28,7 +28,7 @@ const laneweaveLayers = (() => {
     return body.lane < 0 ? painter.theme.faint : colours[body.lane % colours.length];
   }
 
-  /** Draw the hold cells of vehicles, framed, and the other cells that they own. */
+  /** Draw the hold cells of vehicles with a frame, their other owned cells without. */
   function cells(bodies, t) {
     return (painter) => {
       const { pen } = painter;
@@ -69,7 +69,7 @@ const laneweaveLayers = (() => {
     return [...found.values()].sort((a, b) => b.front - a.front);
   }
 
-  /** Draw the columns of formations, framed, with their numbers above. */
+  /** Draw the columns of formations with a frame, and their numbers above. */
   function blocks(formations, joined, t) {
     return (painter) => {
       const { pen, theme, scene } = painter;
@@ -96,7 +96,7 @@ const laneweaveLayers = (() => {
     };
   }
 
-  /** Draw a line from each vehicle to a ring in its target, unless it has arrived. */
+  /** Draw a line from each vehicle that has not arrived to a ring in its target cell. */
   function targets(bodies, t) {
     return (painter) => {
       const { pen, scene } = painter;

@@ -1,9 +1,9 @@
 "use strict";
 // The page: connection, controls, figures. Tests read its counters in `window.laneweaveWatch`.
 
-const PAINT_MS = 28; // minimum time between two paintings
+const PAINT_MS = 28; // minimum time between two repaints
 const NUMBERS_MS = 200; // minimum time between two updates of the figures
-const WINDOW_M = 150; // length of road shown when something is followed
+const WINDOW_M = 150; // length of the road shown while following
 const AHEAD = 40; // frames fetched in advance
 const RETRY_MS = [300, 600, 1200, 2500];
 const PACES = [0.5, 1, 2, 5, 10];
@@ -21,7 +21,7 @@ class Watch {
     this.place = null; // number of the shown frame, with a fraction; null: the newest
     this.playing = false; // recorded only
     this.pace = 1;
-    this.stale = true; // must be painted again although the time has not changed
+    this.stale = true; // repaint even if the time has not changed
     this.painted = 0;
     this.counted = 0;
     this.tries = 0;
@@ -150,7 +150,7 @@ class Watch {
     part("pause").textContent = running ? "Pause" : this.live ? "Go live" : "Play";
   }
 
-  /** Offer what can be followed now as options of the view. */
+  /** List the formations and vehicles that can be followed as options of the view. */
   offer() {
     const { bodies } = this.picture ?? { bodies: [] };
     const shown = laneweaveLayers.groups(this.current?.formations ?? [], []);
@@ -225,7 +225,7 @@ class Watch {
     }
   }
 
-  /** Advance the playback, unless the frames have not arrived. */
+  /** Advance the playback if the next frames have arrived. */
   advance(seconds) {
     const { store } = this;
     const next = this.place + (this.pace * Math.min(seconds, 0.2)) / store.scene.step_s;
@@ -291,7 +291,7 @@ class Watch {
       if (element.textContent !== text) element.textContent = text;
     };
     say("time", frame.t === null ? "–" : `${frame.t.toFixed(1)} s`);
-    say("run", frame.run > 1 ? `run ${frame.run} since this page's server began` : "");
+    say("run", frame.run > 1 ? `run ${frame.run} since the server started` : "");
     const [demanded, entered, , left] = frame.counts ?? [0, 0, 0, 0];
     say("count", frame.counts ? `${this.picture.bodies.length}` : "–");
     say("counts", frame.counts ? `${entered} of ${demanded} entered, ${left} left` : "");
@@ -318,7 +318,7 @@ class Watch {
       const chip = document.createElement("span");
       chip.className = `chip${leading ? " leading" : ""}${silent ? " silent" : ""}`;
       chip.textContent = name;
-      chip.title = `${silent ? "not heard now; " : leading ? "leads; " : "stands by; "}term ${term}`;
+      chip.title = `${silent ? "not heard from; " : leading ? "leader; " : "standby; "}term ${term}`;
       return chip;
     });
     part("candidates").replaceChildren(...chips);
@@ -381,13 +381,13 @@ class Watch {
       words = {
         lost: `Connection to the router lost at ${since}. Reconnecting.`,
         waiting: "Connected. No road yet: waiting for a bridge.",
-        still: `The road's clock has stood still since ${since}.`,
+        still: `The road clock stopped at ${since}.`,
         ended: `The run ended at ${since}. Waiting for the next one.`,
         live: "",
       }[pill];
     }
     const paused = this.live && this.place !== null && pill === "live";
-    const shown = { waiting: "no road", lost: "connection lost", still: "standing still" }[pill];
+    const shown = { waiting: "no road", lost: "connection lost", still: "clock stopped" }[pill];
     part("pill").textContent = paused ? "paused" : (shown ?? pill);
     part("pill").dataset.status = paused ? "paused" : pill;
     const banner = part("banner");
@@ -417,7 +417,7 @@ class Watch {
       ...(rolling ? [] : [entry({ kind: "block" }, "columns of a formation")]),
     ];
     if (this.live) {
-      rest.push(entry({ kind: "ghost" }, "not heard: expected position"));
+      rest.push(entry({ kind: "ghost" }, "not heard from: expected position"));
       rest.push(entry({ kind: "odd" }, "without agent, or overdue"));
     }
     part("legend").replaceChildren(...own.reverse(), ...rest);
