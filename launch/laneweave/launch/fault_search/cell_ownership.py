@@ -1,10 +1,10 @@
-"""Cell ownership in a simulated run of the rolling operation; part of the checker.
+"""Checks of cell ownership in the rolling operation; part of the checker.
 
-It reads the motion controllers. A vehicle whose newest transfer is pending does not know what it
-owns, but the checker does: the result of the transfer if any vehicle of its roster has taken
-possession, otherwise the cells before it. Therefore the checker always expects at most one owner
-per cell. (An agent that opens its gate and ends before its controller knows of it has not moved,
-and no cell has been transferred.)
+The checks read the motion controllers. A vehicle with a pending transfer does not know its owned
+cells, but the checker does: those after the transfer if any vehicle of its roster has taken
+possession, otherwise those before. Therefore every cell must have at most one owner at any time. If
+an agent opens its gate and ends before its controller is informed, its vehicle has not moved, and
+no cell has been transferred.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from laneweave.protocol.wire.messages import Ballot, PendingTransfer
 
 Cells = frozenset[Cell]
 Report = Callable[[str, float, list[str], str], None]
-"""Receives a violation: kind, virtual time, vehicles, text."""
+"""Callback for a violation: kind, virtual time, vehicles, text."""
 
 
 @frozen
 class Holding:
-    """Owned cells and newest transfer of one vehicle, as its motion controller shows them."""
+    """Owned cells and newest transfer of a vehicle, according to its motion controller."""
 
     cells: Cells
     transfer: PendingTransfer | None
 
     def owned(self, opened: set[Ballot]) -> Cells:
-        """Return the owned cells, given the ballots under which possession has been taken."""
+        """Return the owned cells, given the ballots under which a vehicle has taken possession."""
         transfer = self.transfer
         if transfer is None or transfer.open or transfer.ballot not in opened:
             return self.cells
@@ -37,10 +37,10 @@ class Holding:
 
 
 class CellOwnership:
-    """Checks the ownership of all cells of a run."""
+    """Checker of the ownership of all cells in a run."""
 
     def __init__(self, report: Report) -> None:
-        """Start without vehicles; `report` receives each violation once."""
+        """Start without vehicles; `report` is called once for each violation."""
         self._report = report
         self._reported: set[tuple[str, str, str]] = set()
         self._holdings: dict[str, Holding] = {}
@@ -57,14 +57,14 @@ class CellOwnership:
         transfer: PendingTransfer | None,
         body: Cells | None = None,
     ) -> None:
-        """Update what a motion controller shows.
+        """Update owned cells and newest transfer of a vehicle.
 
         Args:
             t_s: virtual time.
             vehicle: name of the vehicle.
-            cells: its owned cells.
-            transfer: its newest transfer.
-            body: cells that its body occupies from now on; None: unchanged.
+            cells: owned cells.
+            transfer: newest transfer.
+            body: cells that the body occupies from now on; None: unchanged.
         """
         holding = Holding(frozenset(cells), transfer)
         if body is not None:
@@ -84,7 +84,7 @@ class CellOwnership:
     def move(self, t_s: float, vehicle: str, ballot: Ballot) -> None:
         """Check the start of a motion under a ballot."""
         if ballot not in self._opened:
-            self._report("gate", t_s, [vehicle], "moves, but no vehicle has taken possession")
+            self._report("gate", t_s, [vehicle], "moves although no vehicle has taken possession")
 
     def leave(self, vehicle: str) -> None:
         """Remove a vehicle that has left the road, and free its cells."""

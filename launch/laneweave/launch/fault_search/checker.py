@@ -1,20 +1,20 @@
-"""The checker: properties that hold in every run, whatever happens to the network.
+"""The checker: safety properties that every run must satisfy, regardless of faults.
 
-It observes the bodies on the road and every message when it is sent. It does not know the state
-machines inside the processes and shares no code with them.
+The checker observes the bodies on the road and every sent message. It does not know the state
+machines of the processes, and shares no code with them.
 
 | kind | violation |
 |---|---|
-| `overlap` | two bodies, as rectangles, overlap |
-| `cell` | two vehicles occupy one cell: both ends of a motion and its corners, or the cell held |
-| `motion` | a body begins a motion that is not the next move of the plan that its agent shows |
+| `overlap` | two bodies (rectangles) overlap |
+| `cell` | two vehicles occupy a cell: the hold cell, or the bounding box of a motion |
+| `motion` | a body begins a motion that is not the next move in the published plan of its agent |
 | `interleaved` | two plans with a common vehicle have motions at the same time |
-| `owner` | a cell has two owners (rolling operation; see `cell_ownership`) |
-| `trespass` | a body is in a cell that its vehicle does not own (likewise) |
-| `gate` | a body begins a motion of a plan under which no vehicle has taken possession (likewise) |
-| `monotone` | a process revokes a promise, an acceptance, progress, joined formations or charge |
+| `owner` | a cell has two owners (rolling operation, see `cell_ownership`) |
+| `trespass` | a body is in a cell that its vehicle does not own (rolling operation) |
+| `gate` | a motion begins before any vehicle of the plan has taken possession (rolling operation) |
+| `monotone` | a process revokes a promise, an acceptance, progress, joined formations, or charge |
 | `two-plans` | two different plans are sent under one ballot |
-| `stuck` | a vehicle is not on its preferred lane long after all faults have ended |
+| `stuck` | a vehicle is not on its preferred lane long after the end of all faults |
 """
 
 from __future__ import annotations
@@ -50,26 +50,28 @@ class Violation:
     text: str
 
     def __str__(self) -> str:
-        """Return one readable line."""
+        """Return the violation as one line."""
         return f"{self.t_s:8.3f} s  {self.kind}: {', '.join(self.vehicles)}: {self.text}"
 
 
 @define
-class _Run:
-    """The motions of one plan."""
+class _PlanMotions:
+    """Motions under one plan."""
 
     roster: frozenset[str]
     first_s: float
-    under_way: int = 0
+    """Time of the first motion."""
+    active: int = 0
+    """Number of motions in progress."""
 
 
 class Checker:
-    """Checks one run and collects its violations."""
+    """Checker of one run, which collects the violations."""
 
     def __init__(
         self,
         geometry: Geometry,
-        note: Callable[[float, str], None] | None = None,
+        on_event: Callable[[float, str], None] | None = None,
         *,
         rolling: bool = False,
     ) -> None:
@@ -77,34 +79,34 @@ class Checker:
 
         Args:
             geometry: sizes of cells and bodies.
-            note: callback for events on the road.
+            on_event: callback for events on the road: time, text.
             rolling: whether vehicles own cells.
         """
         self._ownership = CellOwnership(self._report) if rolling else None
         self.violations: list[Violation] = []
         self.motions = 0
         self.plans: dict[Ballot, Plan] = {}
-        """Every plan sent so far."""
+        """All plans sent so far."""
         self._geometry = geometry
-        self._note = note
+        self._on_event = on_event
         self._bodies: dict[str, Body] = {}
         self._moving: dict[str, tuple[float, Cell, Ballot | None]] = {}
         """End time, target cell and ballot of the motion of each moving body."""
         self._checked_s = 0.0
         self._states: dict[str, dict[int, VehicleState]] = {}
-        """Newest published state of each vehicle, by the incarnation of the process."""
+        """Newest published state of each vehicle by the incarnation of the process."""
         self._begun: dict[tuple[str, int, Cell], Ballot | None] = {}
-        """Ballot under which (vehicle, process, cell) has been published as a move."""
+        """Ballot of each published move: (vehicle, incarnation, target cell)."""
         self._done: dict[tuple[Ballot, str], int] = {}
-        """Number of motions of a plan that each vehicle has begun."""
-        self._runs: dict[Ballot, _Run] = {}
+        """Number of motions begun by each vehicle under each plan."""
+        self._motions_of: dict[Ballot, _PlanMotions] = {}
         self._charge: dict[str, tuple[int, frozenset[int]]] = {}
-        """Newest attendant and joined formations of each motion controller."""
+        """Process in charge and joined formations of each motion controller."""
 
     # --- the road -----------------------------------------------------------------------------
 
     def enter(self, t_s: float, vehicle: str, cell: Cell) -> None:
-        """Record that a vehicle enters the road."""
+        """Record the entry of a vehicle."""
         self._log(t_s, f"{vehicle} enters in {cell}")
         self.advance(t_s)
         self._bodies[vehicle] = Body.standing(self._geometry, cell, t_s)
@@ -113,12 +115,12 @@ class Checker:
     def own(
         self, t_s: float, vehicle: str, owned: tuple[Cell, ...], transfer: PendingTransfer | None
     ) -> None:
-        """Record what a motion controller shows as owned."""
+        """Record the owned cells and the newest transfer of a motion controller."""
         if self._ownership is not None:
             self._ownership.show(t_s, vehicle, owned, transfer)
 
     def leave(self, t_s: float, vehicle: str) -> None:
-        """Record that a vehicle leaves the road."""
+        """Record that a vehicle has left the road."""
         self._log(t_s, f"{vehicle} leaves the road")
         self.advance(t_s)
         self._end_motion(vehicle)
@@ -129,13 +131,13 @@ class Checker:
     def begin(
         self, t_s: float, vehicle: str, incarnation: int, move: tuple[Cell, Cell], lasts_s: float
     ) -> None:
-        """Record that a body begins to move.
+        """Record the start of a motion.
 
         Args:
             t_s: virtual time.
             vehicle: name of the vehicle.
             incarnation: incarnation of the process that commands the motion.
-            move: the cell that the vehicle held, and the cell that it will hold.
+            move: previous and next hold cell.
             lasts_s: duration of the motion.
         """
         self._log(t_s, f"{vehicle} moves from {move[0]} to {move[1]} in {lasts_s:.2f} s")
@@ -143,7 +145,9 @@ class Checker:
         self.motions += 1
         body = self._bodies[vehicle]
         if vehicle in self._moving:
-            self._report("motion", t_s, [vehicle], f"turned off to {move[1]} before it had arrived")
+            self._report(
+                "motion", t_s, [vehicle], f"changed its target to {move[1]} before arrival"
+            )
             self._end_motion(vehicle)
         body.go(move[1], t_s, lasts_s)
         self._check_cells(t_s, vehicle)
@@ -162,7 +166,7 @@ class Checker:
             self._check_members(t_s, vehicle, ballot)
 
     def advance(self, t_s: float) -> None:
-        """Check for overlaps of bodies since the last call."""
+        """Check for overlaps since the last call, and end completed motions."""
         from_s = self._checked_s
         self._checked_s = t_s
         movers = [name for name, body in self._bodies.items() if body.end_s > from_s]
@@ -170,17 +174,17 @@ class Checker:
             return
         for vehicle in movers:
             body = self._bodies[vehicle]
-            for other, its in self._bodies.items():
+            for other, other_body in self._bodies.items():
                 if other == vehicle or (other < vehicle and other in movers):
                     continue
-                at_s = overlap_between(body, its, from_s, t_s)
+                at_s = overlap_between(body, other_body, from_s, t_s)
                 if at_s is not None:
                     self._report("overlap", at_s, [vehicle, other], "their bodies overlap")
         for vehicle in [name for name, (end_s, _, _) in self._moving.items() if end_s <= t_s]:
             self._end_motion(vehicle)
 
     def stuck(self, t_s: float, vehicle: str, text: str) -> None:
-        """Record that a vehicle has not arrived though there have been no faults for long."""
+        """Record that a vehicle has not arrived long after the end of all faults."""
         self._report("stuck", t_s, [vehicle], text)
 
     def _end_motion(self, vehicle: str) -> None:
@@ -189,16 +193,16 @@ class Checker:
             self._bodies[vehicle].rest(cell)
             if self._ownership is not None:
                 self._ownership.occupy(self._checked_s, vehicle, self._bodies[vehicle].cells)
-            if ballot in self._runs:
-                self._runs[ballot].under_way -= 1
+            if ballot in self._motions_of:
+                self._motions_of[ballot].active -= 1
 
     def _check_cells(self, t_s: float, vehicle: str) -> None:
-        mine = self._bodies[vehicle].cells
+        own = self._bodies[vehicle].cells
         if self._ownership is not None:
-            self._ownership.occupy(t_s, vehicle, mine)
+            self._ownership.occupy(t_s, vehicle, own)
         for other, body in self._bodies.items():
-            if other != vehicle and not mine.isdisjoint(body.cells):
-                shared = sorted(mine & body.cells)
+            if other != vehicle and not own.isdisjoint(body.cells):
+                shared = sorted(own & body.cells)
                 self._report("cell", t_s, [vehicle, other], f"both occupy {shared}")
 
     def _check_order(
@@ -212,23 +216,24 @@ class Checker:
             self._report("motion", t_s, [vehicle], text)
 
     def _check_serial(self, t_s: float, vehicle: str, ballot: Ballot) -> None:
-        run = self._runs.get(ballot)
-        if run is None:
-            run = self._runs[ballot] = _Run(frozenset(self.plans[ballot].roster), t_s)
-        for other, its in self._runs.items():
-            if its is run or its.roster.isdisjoint(run.roster):
+        motions = self._motions_of.get(ballot)
+        if motions is None:
+            roster = frozenset(self.plans[ballot].roster)
+            motions = self._motions_of[ballot] = _PlanMotions(roster, t_s)
+        for other_ballot, other in self._motions_of.items():
+            if other is motions or other.roster.isdisjoint(motions.roster):
                 continue
-            if its.under_way or its.first_s > run.first_s:
-                text = f"a motion of {short(ballot)} amid those of {short(other)}"
+            if other.active or other.first_s > motions.first_s:
+                text = f"a motion of {short(ballot)} among those of {short(other_ballot)}"
                 self._report("interleaved", t_s, [vehicle], text)
-        run.under_way += 1
+        motions.active += 1
 
     def _check_members(self, t_s: float, vehicle: str, ballot: Ballot) -> None:
-        """Check the motions of the other vehicles in the roster of a plan (rolling operation)."""
+        """Check that no vehicle of the roster executes an earlier plan (rolling operation)."""
         for other in self.plans[ballot].roster:
-            _, _, its = self._moving.get(other, (0.0, (0, 0), ballot))
-            if its is not None and its < ballot:
-                text = f"a motion of {short(ballot)}, and {other} is in one of {short(its)}"
+            _, _, earlier = self._moving.get(other, (0.0, (0, 0), ballot))
+            if earlier is not None and earlier < ballot:
+                text = f"a motion of {short(ballot)} during one of {other} of {short(earlier)}"
                 self._report("interleaved", t_s, [vehicle, other], text)
 
     # --- the network --------------------------------------------------------------------------
@@ -254,7 +259,7 @@ class Checker:
             text = f"{sense.attendant} is in charge after {attendant}"
             self._report("monotone", t_s, [sense.vehicle], text)
         if not joined.issubset(sense.joined):
-            text = f"its controller has joined {sense.joined} after {sorted(joined)}"
+            text = f"its controller reports joined {sense.joined} after {sorted(joined)}"
             self._report("monotone", t_s, [sense.vehicle], text)
         if sense.attendant != attendant or len(joined) != len(sense.joined):
             self._charge[sense.vehicle] = sense.attendant, frozenset(sense.joined)
@@ -264,14 +269,14 @@ class Checker:
         before = states.get(state.incarnation)
         states[state.incarnation] = state
         if before is None:
-            # A new process inherits the joined formations of earlier ones.
+            # A new process inherits the joined formations of earlier processes.
             earlier = [one for number, one in states.items() if number < state.incarnation]
             joined = {number for one in earlier for number in one.joined}
         else:
             joined = set(before.joined)
         texts = []
         if not joined.issubset(state.joined):
-            texts.append(f"it has joined {state.joined} after {sorted(joined)}")
+            texts.append(f"it reports joined {state.joined} after {sorted(joined)}")
         if before is not None:
             texts += _revoked(before, state)
             if state.moving and before.hold_cell != state.hold_cell:
@@ -281,8 +286,8 @@ class Checker:
             self._report("monotone", t_s, [state.vehicle], text)
 
     def _log(self, t_s: float, event: str) -> None:
-        if self._note is not None:
-            self._note(t_s, f"*** {event}")
+        if self._on_event is not None:
+            self._on_event(t_s, f"*** {event}")
 
     def _report(self, kind: str, t_s: float, vehicles: Iterable[str], text: str) -> None:
         if len(self.violations) < MAX_VIOLATIONS:
@@ -290,18 +295,18 @@ class Checker:
 
 
 def _revoked(before: VehicleState, state: VehicleState) -> Iterator[str]:
-    """Yield what of its previous state a process has revoked."""
+    """Yield descriptions of what a process has revoked of its previous state."""
     if before.promised is None:
         return
     if state.promised is None or state.promised < before.promised:
         yield f"it promises {short(state.promised)} after {short(before.promised)}"
     elif state.promised == before.promised:
         if before.accepted and not state.accepted:
-            yield f"it has not accepted {short(state.promised)} any more"
+            yield f"it no longer accepts {short(state.promised)}"
         if state.completed < before.completed:
             yield f"it has completed {state.completed} moves after {before.completed}"
         if before.go and not state.go:
-            yield f"its gate for {short(state.promised)} closes again"
+            yield f"its gate for {short(state.promised)} closed again"
 
 
 def short(ballot: Ballot | None) -> str:

@@ -1,7 +1,7 @@
-"""The checker's own geometry of bodies: rectangles in metres that move in straight lines.
+"""Geometry of the checker: bodies are rectangles that move in straight lines.
 
-Positions are relative to the moving lattice, so that a vehicle which holds its cell stands still:
-x = column * pitch, y = (lane + 1/2) * lane width.
+Positions are in m relative to the moving lattice, so the body of a vehicle that holds its cell does
+not move: x = column * pitch, y = (lane + 1/2) * lane width.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ Cells = frozenset[tuple[int, int]]
 
 DONE_ALONG_M = 1.0
 DONE_ACROSS_M = 0.5
-"""The checker considers a motion ended at this distance from its end, twice the tolerance of the
-agents."""
+"""Distance from its end at which the checker considers a motion ended: twice that of agents."""
 
 
 @frozen
@@ -34,10 +33,10 @@ class Geometry:
         return cell[0] * self.pitch_m, (cell[1] + 0.5) * self.lane_width_m
 
     def swept(self, origin: Point, target: Point) -> Cells:
-        """Return all cells of the bounding box of a path from one point to another."""
+        """Return the cells in the bounding box of a straight path."""
         low = [min(pair) for pair in zip(origin, target, strict=True)]
         high = [max(pair) for pair in zip(origin, target, strict=True)]
-        # A body that has nearly arrived occupies only its target cell.
+        # A body close to its target occupies only the target cell.
         columns = range(
             math.floor((low[0] + DONE_ALONG_M) / self.pitch_m),
             math.ceil((high[0] - DONE_ALONG_M) / self.pitch_m) + 1,
@@ -51,14 +50,14 @@ class Geometry:
 
 @define(eq=False)
 class Body:
-    """One vehicle's body and its current motion."""
+    """Body of a vehicle with its current motion."""
 
     geometry: Geometry
     origin: Point
     target: Point
     begin_s: float
     end_s: float
-    """Arrival time at the target; `begin_s` if the body has never moved."""
+    """Time of arrival at the target; `begin_s` if the body has never moved."""
     cells: Cells
     """Occupied cells."""
 
@@ -85,12 +84,12 @@ class Body:
         self.cells = self.geometry.swept(self.origin, self.target)
 
     def rest(self, cell: tuple[int, int]) -> None:
-        """Occupy only the cell in which the body has (nearly) arrived."""
+        """Occupy only the target cell, at or close to the end of a motion."""
         self.cells = frozenset({cell})
 
     @property
     def done_s(self) -> float:
-        """Time at which the body is close enough to the target to end the motion."""
+        """Time at which the body is close enough to the target for the motion to end."""
         shares = [
             tolerance_m / abs(path_m)
             for tolerance_m, path_m in (
@@ -104,11 +103,11 @@ class Body:
 
 
 def overlap_between(mine: Body, other: Body, from_s: float, to_s: float) -> float | None:
-    """Return the first time at which two bodies overlap, or None.
+    """Return the first time at which two bodies overlap; None: they do not.
 
     Neither body may begin a motion between `from_s` and `to_s`; motions may end. The result is
-    exact: two rectangles that move in straight lines overlap along the road during one interval,
-    and across the road during another.
+    exact: rectangles that move in straight lines overlap in x during one interval, and in y during
+    another one.
     """
     ends = sorted({end for end in (mine.end_s, other.end_s) if from_s < end < to_s})
     starts = [from_s, *ends]

@@ -1,7 +1,7 @@
-"""One simulated run with many faults: real cores, a light road, random faults, and the checker.
+"""A run of the fault search: real cores, a light road, random faults, and the checker.
 
-During the fault phase, preferred lanes change so that there is always something to plan. After it
-all faults end, and all vehicles must arrive. Equal seeds give equal runs.
+During the fault phase, preferred lanes change repeatedly, which requires new plans. Then all faults
+end, and all vehicles must arrive. Equal seeds give equal runs.
 """
 
 from __future__ import annotations
@@ -41,29 +41,30 @@ from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare, Sense
 from laneweave.protocol.wire.topics import Keys
 
 TWIN = ".2"
-"""Suffix of the name of a second process of a vehicle."""
+"""Suffix of the name of the second process of a vehicle."""
 COORDINATORS = ("c1", "c2", "c3")
 MAX_MOTION_SLOTS = 3.0
-"""Maximum duration of a slow motion in slots."""
+"""Maximum duration of a slow motion, in slots."""
 NEW_PREFERENCES_S = (0.8, 3.0)
-"""Interval between changes of the preferred lanes during the fault phase."""
+"""Range of the time between changes of the preferred lanes during the fault phase."""
 PATIENCE_S = 90.0
-"""Time for all vehicles to arrive after the fault phase."""
+"""Maximum time after the fault phase in which all vehicles must arrive."""
 MAX_FUTILE_PLANS = 5
-"""A vehicle that does not move though this many plans move it is stuck."""
+"""A vehicle that does not execute this number of plans that move it is stuck."""
 HEALTHY_SLOTS = 8
-"""Slots after the fault phase of a run of the rolling operation."""
+"""Number of slots after the fault phase (rolling operation)."""
 CHECK_S = 0.5
-"""Interval between checks whether a run is over."""
-KEPT = 400
-"""Number of old messages that may be replayed or damaged."""
+"""Virtual time between checks for the end of a run."""
+MAX_OLD_MESSAGES = 400
+"""Number of old messages that are kept to be replayed or damaged."""
 KEEP_EVERY = 7
+"""Each message with a multiple of this number is kept."""
 _REPLAYABLE = (Prepare, Plan, VehicleState, Command, Sense)
 
 
 @frozen
 class Totals:
-    """What one run, or many of them, consisted of."""
+    """Totals of one or more runs."""
 
     runs: int = 0
     virtual_s: float = 0.0
@@ -73,14 +74,14 @@ class Totals:
     plans: int = 0
     joint_plans: int = 0
     takeovers: int = 0
-    """Number of times that a caretaker has taken charge of a vehicle."""
+    """Number of takeovers by caretakers."""
     delivered: int = 0
     dropped: int = 0
     longest_recovery_s: float = 0.0
     faults: Counter[str] = field(factory=Counter)
 
     def __add__(self, other: Totals) -> Totals:
-        """Return the sum, with the maximum of the healing times."""
+        """Return the sums, and the maximum of the recovery times."""
         names = [attribute.name for attribute in attrs.fields(Totals)]
         sums = {name: getattr(self, name) + getattr(other, name) for name in names}
         sums["longest_recovery_s"] = max(self.longest_recovery_s, other.longest_recovery_s)
@@ -99,7 +100,7 @@ class SeedResult:
 
 
 class _ListenedCore:
-    """A core that passes the messages it sends to a listener."""
+    """Core that passes its sent messages to a listener."""
 
     def __init__(self, core: Core, name: str, listener: Callable[[str, Send], None]) -> None:
         self.core = core
@@ -119,7 +120,7 @@ class _ListenedCore:
 
 
 class FaultRun:
-    """One run; call `run` once."""
+    """A run of one seed; call `run` once."""
 
     coordinators: tuple[str, ...] = COORDINATORS
 
@@ -136,11 +137,11 @@ class FaultRun:
         """Draw the setup and start all processes.
 
         Args:
-            seed: determines all draws, together with the name of the profile.
+            seed: seed; determines all draws together with the name of the profile.
             profile: profile from which the setup is drawn.
-            vehicle_rules: rules of plan execution; others plant a bug.
-            leader_rules: rules of leaders; others plant a bug.
-            timeline: log to write.
+            vehicle_rules: rules of plan execution, which tests replace by faulty ones.
+            leader_rules: rules of leaders, which tests replace by faulty ones.
+            timeline: timeline to which events are added.
             digest: whether to compute a digest of all delivered messages.
         """
         self.seed = seed
@@ -163,17 +164,17 @@ class FaultRun:
         self._timeline = timeline
         self._keys = Keys(scenario.network.realm)
         self._incarnations = count(1)
-        self._kept: deque[Send] = deque(maxlen=KEPT)
+        self._old_messages: deque[Send] = deque(maxlen=MAX_OLD_MESSAGES)
         self._sent = 0
         self.faults = RandomFaults(
             self.network, self, mix, self._rng, scenario.network.realm, self._log
         )
         self._proposed: Counter[str] = Counter()
-        """Number of plans since the fault phase in which each vehicle moves or is held."""
+        """Number of plans since the fault phase that move or hold each vehicle."""
         self._first_cells: dict[Name, Cell] = {}
         """First cell of each vehicle after the fault phase (rolling operation)."""
         self._moved: set[Name] = set()
-        """Vehicles that have moved since then."""
+        """Vehicles that have moved since the fault phase."""
         self._preferences = self.setup.preferences(self._rng, last=False)
         self.road = LightRoad(
             scenario,
@@ -218,7 +219,7 @@ class FaultRun:
 
     @property
     def agents(self) -> tuple[str, ...]:
-        """Processes of the vehicles that have not left."""
+        """Agents of the vehicles that have not left."""
         now_s = self.network.now_s
         return tuple(
             visit.vehicle
@@ -232,13 +233,13 @@ class FaultRun:
         return tuple(name for name in COORDINATORS if self._leads(name))
 
     def start_twin(self, name: str) -> str:
-        """Start a second process for an agent's vehicle and return the name of its node."""
+        """Start a second process for the vehicle of an agent, and return its name."""
         twin = f"{name}{TWIN}"
         self.start(twin)
         return twin
 
     def start(self, name: str) -> None:
-        """Start a process if it does not run."""
+        """Start a process unless it is running."""
         if name in self.network:
             return
         vehicle = Name(name.removesuffix(TWIN))
@@ -257,8 +258,9 @@ class FaultRun:
         self.network.add(name, _ListenedCore(core, name, self._on_message), scenario.network.realm)
 
     def _make_planner(self, scenario: Scenario) -> Planner:
-        """Return a planner that records the vehicles that it moves or holds after the healing."""
-        planner = stream_planner(scenario) if self.setup.thorough else LightPlanner(scenario).plan
+        """Return a planner that counts its plans for each vehicle after the fault phase."""
+        exact = self.setup.uses_stream_planner
+        planner = stream_planner(scenario) if exact else LightPlanner(scenario).plan
 
         def plan(
             slot: int,
@@ -278,10 +280,10 @@ class FaultRun:
         return plan
 
     def old_payload(self, rng: random.Random) -> tuple[str, bytes] | None:
-        """Return key and payload of a message sent some time ago."""
-        if not self._kept:
+        """Return key and payload of a random old message; None: there are none."""
+        if not self._old_messages:
             return None
-        old = rng.choice(self._kept)
+        old = rng.choice(self._old_messages)
         return self._keys.key(old.topic, **old.parameters), encode(old.message)
 
     def _leads(self, name: str) -> bool:
@@ -324,7 +326,7 @@ class FaultRun:
         self.checker.sent(now_s, effect.message)
         self._sent += 1
         if self._sent % KEEP_EVERY == 0 and isinstance(effect.message, _REPLAYABLE):
-            self._kept.append(effect)
+            self._old_messages.append(effect)
         if self._timeline is not None:
             self._timeline.add_message(now_s, sender, effect)
 
@@ -348,7 +350,7 @@ class FaultRun:
         return PATIENCE_S
 
     def _not_arrived(self) -> list[Name]:
-        """Return the vehicles on the road that are not at rest on their preferred lane."""
+        """Return the vehicles that should be at rest on their preferred lanes, but are not."""
         if self.checker.violations or not self.faults.healed:
             return []
         now_s = self.network.now_s
@@ -360,18 +362,18 @@ class FaultRun:
         ]
         if not self.profile.rolling:
             return not_arrived
-        return [name for name in not_arrived if not self._is_not_stuck(name)]
+        return [name for name in not_arrived if self._is_stuck(name)]
 
-    def _is_not_stuck(self, name: Name) -> bool:
-        """Return whether a vehicle of the rolling operation has moved, or no plan moves it.
+    def _is_stuck(self, name: Name) -> bool:
+        """Return whether a vehicle has not moved although plans move it (rolling operation).
 
-        It need not be on its preferred lane: it may have made room for others, or the lane is full.
+        A vehicle that has moved need not be on its preferred lane, which may be full.
         """
         cell = self.road.vehicles[name].controller.hold_cell
         moved = self._first_cells.setdefault(name, cell) != cell
         if moved:
             self._moved.add(name)
-        return name in self._moved or self._proposed[name] < MAX_FUTILE_PLANS
+        return name not in self._moved and self._proposed[name] >= MAX_FUTILE_PLANS
 
     def _result(self, cpu_s: float) -> SeedResult:
         network, checker = self.network, self.checker

@@ -1,4 +1,4 @@
-"""Random faults of a simulated run: drawn from its seed, applied to its network, and counted."""
+"""Random faults of a run: drawn from its seed, applied to its network, and counted."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from laneweave.protocol.wire.codec import decode
 from laneweave.protocol.wire.topics import TOPICS
 
 ROAD = "road"
-"""Node of the road."""
+"""Name of the road's node."""
 FIRST_S = 0.3
 """Earliest time of a fault event."""
 SHORT_S = (0.05, 2.5)
-"""Duration of the absence of a process or node."""
+"""Range of the time for which a process is killed, paused or disconnected."""
 LONG_S = (0.3, 4.0)
-"""Duration of a fault of the network."""
+"""Range of the duration of network faults."""
 NO_RESTART = 0.25
 """Share of killed agents that are not restarted during the fault phase."""
 LEASE_S = 0.5
 COMPUTE_S = 0.05
 GARBAGE = 20
-"""Malformed payloads in one event."""
+"""Number of malformed payloads per event."""
 REPLAYED = 20
-"""Old messages in one event."""
+"""Number of old messages per event."""
 _TARGETED = ("leader", "coordinator", "agent", "cut")
-"""Prefixes of the kinds that have one target."""
+"""Prefixes of the kinds of events with a target."""
 CLOCK_OFFSET_S = 0.05
 CLOCK_DRIFT = 0.05
 
 
 @frozen
 class FaultMix:
-    """The lasting faults of one run, and the number of its fault events."""
+    """Permanent faults of a run, and the number of its fault events."""
 
     conditions: Conditions
     command_loss: float
@@ -72,7 +72,7 @@ class FaultMix:
         )
 
     def kinds(self) -> Counter[str]:
-        """Return the kinds of lasting faults, each with count 1."""
+        """Return the kinds of permanent faults, each with count 1."""
         conditions = self.conditions
         present = {
             "loss": conditions.loss,
@@ -92,30 +92,30 @@ HEALTHY = Conditions(lease_s=LEASE_S, compute_s=COMPUTE_S)
 
 
 class Processes(Protocol):
-    """The processes of a run, as fault events need them."""
+    """Operations on processes that fault events require."""
 
     coordinators: tuple[str, ...]
 
     @property
     def agents(self) -> tuple[str, ...]:
-        """Processes of the vehicles that have not left."""
+        """Agents of the vehicles that have not left."""
 
     @property
     def leaders(self) -> tuple[str, ...]:
         """Coordinators that consider themselves the leader."""
 
     def start(self, name: str) -> None:
-        """Start a process if it does not run."""
+        """Start a process unless it is running."""
 
     def start_twin(self, name: str) -> str:
-        """Start a second process for an agent's vehicle and return the name of its node."""
+        """Start a second process for the vehicle of an agent, and return its name."""
 
     def old_payload(self, rng: random.Random) -> tuple[str, bytes] | None:
-        """Return key and payload of a message sent some time ago."""
+        """Return key and payload of a random old message; None: there are none."""
 
 
 class RandomFaults:
-    """Applies fault events to the network and its nodes, and ends all of them."""
+    """Fault events of a run, applied to the network and its nodes."""
 
     def __init__(
         self,
@@ -141,13 +141,13 @@ class RandomFaults:
         self._twins: list[str] = []
 
     def plan(self, kinds: Sequence[str]) -> None:
-        """Draw the kinds and times of the fault events."""
+        """Draw kinds and times of the fault events."""
         for _ in range(self._mix.events):
             time_s = self._rng.uniform(FIRST_S, self._mix.fault_s - 0.3)
             self._network.at(time_s, self._apply, self._rng.choice(kinds))
 
     def heal(self) -> None:
-        """End all faults; only clocks stay wrong."""
+        """End all faults except wrong clocks."""
         self.healed = True
         self._log("--- all faults end")
         network = self._network
@@ -157,7 +157,7 @@ class RandomFaults:
         for name in self._twins:
             network.kill(name)
         for name in network.names:
-            # A resumed node handles its queued messages, and may end.
+            # A resumed node processes its queued messages, and may end.
             network.resume(name)
             self._if_present(name, network.reconnect)
         for name in (*self._processes.coordinators, *self._processes.agents):
@@ -187,7 +187,7 @@ class RandomFaults:
             case "replay":
                 done = self._replay()
             case _:
-                raise ValueError(f"no such fault: {kind}")
+                raise ValueError(f"unknown fault: {kind}")
         self.counts[kind] += done
 
     def _target(self, kind: str) -> str:
@@ -201,7 +201,7 @@ class RandomFaults:
         return rng.choice(processes.coordinators)
 
     def _later(self, span_s: tuple[float, float], action: Callable[[], None], what: str) -> None:
-        """End a fault after a while, unless all faults have ended before."""
+        """Schedule the end of a fault, unless all faults end before."""
         time_s = self._network.now_s + self._rng.uniform(*span_s)
         self._network.at(time_s, self._undo, action, what)
 
@@ -229,7 +229,7 @@ class RandomFaults:
         return True
 
     def _start_twin(self, name: str) -> bool:
-        """Start a second process for a vehicle; the first one continues without SENSE messages."""
+        """Start a second process for a vehicle; the first one receives no more SENSE messages."""
         if name not in self._network:
             return False
         twin = self._processes.start_twin(name)
@@ -261,7 +261,7 @@ class RandomFaults:
     # --- the network --------------------------------------------------------------------------
 
     def _partition(self) -> bool:
-        """Separate the nodes into two groups, in both directions or in one."""
+        """Block messages between two groups of nodes, in one direction or both."""
         rng = self._rng
         names = self._network.names
         inside = frozenset(rng.sample(names, rng.randint(1, len(names) - 1)))
@@ -274,8 +274,8 @@ class RandomFaults:
 
         self._cuts.append(blocked)
         self._apply_cuts()
-        relation = "not heard by" if one_way else "separated from"
-        self._log(f"--- {relation} the others: {' '.join(sorted(inside))}")
+        relation = "cannot send to" if one_way else "separated from"
+        self._log(f"--- {' '.join(sorted(inside))}: {relation} the others")
         self._later(LONG_S, partial(self._join, blocked), "a partition ends")
         return True
 
@@ -290,7 +290,7 @@ class RandomFaults:
         )
 
     def _blackout(self) -> bool:
-        """Drop every message for a while."""
+        """Drop all messages for some time."""
         self._blackouts += 1
         self._network.conditions = attrs.evolve(self._mix.conditions, loss=1.0)
         self._later(LONG_S, self._end_blackout, "a blackout ends")
@@ -313,10 +313,10 @@ class RandomFaults:
         return True
 
     def _malformed(self) -> tuple[str, bytes]:
-        """Return random bytes, or a real message that has been damaged until it is invalid.
+        """Return random bytes, or a real message that has been made invalid.
 
-        A damaged message that is still valid would be a forgery. The protocol trusts its senders
-        and does not tolerate forgeries (docs/SAFETY.md).
+        A modified message that is still valid would be a forgery, which the protocol does not
+        tolerate, because it trusts its senders (docs/SAFETY.md).
         """
         rng = self._rng
         old = self._processes.old_payload(rng)
@@ -344,7 +344,7 @@ class RandomFaults:
         return "/".join(("laneweave", self._realm, *parts))
 
     def _replay(self) -> bool:
-        """Deliver old messages again, like a network with very late duplicates."""
+        """Deliver old messages again, as very late duplicates."""
         done = False
         for _ in range(REPLAYED):
             old = self._processes.old_payload(self._rng)

@@ -1,9 +1,9 @@
 """The light road: a bridge without SUMO that does not wait for agents.
 
-At each tick every vehicle gets its SENSE; a COMMAND counts whenever it arrives; and a body moves in
-a straight line to the cell that its motion controller holds. The real `MotionController`, `Answers`
-and `Attendance` decide who may command a vehicle, which agents are silent, and what a caretaker
-publishes.
+Every vehicle gets a SENSE in each tick, COMMANDs are executed whenever they arrive, and bodies move
+in straight lines to the hold cells of their motion controllers. The real `MotionController`,
+`Answers` and `Attendance` decide which process may command a vehicle, which agents are silent, and
+what caretakers publish.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ from laneweave.sim_bridge.road.roadside import CENSUS_EVERY_TICKS
 
 CLOCK_EVERY_TICKS = 2
 AGENT_START_S = 1.0
-"""Time after its entry at which the caretaker of a vehicle without an agent takes charge."""
+"""Time after the entry of a vehicle without an agent at which its caretaker takes charge."""
 NONE_CLOSED = -(2**31)
-"""Less than the number of any block."""
+"""Lower bound of the numbers of blocks."""
 
 
 class LightRoad:
-    """The core of the road."""
+    """Core of the road."""
 
     def __init__(
         self,
@@ -68,25 +68,25 @@ class LightRoad:
         formations: Iterable[ClosedFormation] = (),
         grants: Iterable[Grant] = (),
     ) -> None:
-        """Create a road without vehicles, which enter at their times.
+        """Create an empty road, on which vehicles enter later.
 
         Args:
             scenario: lattice and timing.
-            visits: the vehicles and their times.
-            preferred_lanes: preferred lane of each vehicle when it enters.
-            checker: observes the events on the road.
-            new_incarnation: returns incarnations for caretakers.
+            visits: the vehicles with their times of entry and exit.
+            preferred_lanes: preferred lane of each vehicle at its entry.
+            checker: checker, to be informed about events on the road.
+            new_incarnation: returns the incarnation number of a caretaker.
             move_lasts_s: draws the duration of the next motion.
             lost: draws whether the next SENSE or COMMAND is lost, in addition to network loss.
             formations: blocks and closing time of each formation.
-            grants: owners of the empty cells, and their times.
+            grants: assignments of the empty cells to owners.
         """
         self.tick = -1
         self.vehicles: dict[Name, LightVehicle] = {}
         self.takeovers = 0
-        """Number of times that a caretaker has taken charge."""
+        """Number of takeovers by caretakers."""
         self.refused = 0
-        """Number of COMMANDs refused by motion controllers."""
+        """Number of COMMANDs rejected by motion controllers."""
         self._scenario = scenario
         self._tick_s = scenario.runtime.tick_s
         self._visits = sorted(visits, key=lambda visit: (visit.enters_s, visit.vehicle))
@@ -103,7 +103,7 @@ class LightRoad:
 
     @property
     def wakeup_s(self) -> float:
-        """The next tick."""
+        """Time of the next tick."""
         return (self.tick + 1) * self._tick_s
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:

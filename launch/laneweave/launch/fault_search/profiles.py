@@ -1,7 +1,7 @@
 """Profiles: kinds and severity of the faults in the runs of a search.
 
-A profile has the ranges or choices from which each seed draws. Shares are probabilities, times are
-in virtual seconds.
+A profile defines the ranges and choices from which each seed draws. Shares are probabilities; times
+are in virtual seconds.
 """
 
 from __future__ import annotations
@@ -25,45 +25,45 @@ class Profile:
 
     name: str
     text: str
-    """Purpose in one line."""
+    """Description in one line."""
     rolling: bool = False
-    """Use the rolling operation: vehicles own cells and are planned as one stream."""
+    """Whether to use the rolling operation, in which vehicles own cells."""
     density: tuple[float, float] = (0.3, 0.7)
-    """Share of the cells of a stretch in which vehicles enter (rolling operation)."""
+    """Occupied share of the cells in which vehicles may enter (rolling operation)."""
     vehicles: Span = (2, 16)
     blocks: Span = (1, 4)
     lanes: Span = (2, 4)
     growing: float = 0.5
-    """Share of runs in which formations have different lengths."""
+    """Share of runs with formations of different lengths."""
     max_joined: Span = (1, 2)
     crowding: float = 0.5
-    """Share of runs in which more vehicles may prefer a lane of a block than it has cells."""
+    """Share of runs in which more vehicles of a block may prefer a lane than it has cells there."""
     leavers: float = 0.15
     """Share of vehicles that leave the road during the fault phase."""
     loss: tuple[float, ...] = (0.0, 0.0, 0.1, 0.3, 0.5, 0.8)
-    """Probability that a receiver does not get a message."""
+    """Probability that a receiver loses a message."""
     duplication: tuple[float, ...] = (0.0, 0.0, 0.3)
     jitter_s: tuple[float, ...] = (0.003, 0.003, 0.003, 0.05, 0.05, 0.3, 0.3, 1.0, 5.0)
     """Maximum delay of a message; the minimum is 2 ms."""
     command_loss: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
     """Additional loss of SENSE and COMMAND messages."""
     slow_moves: tuple[float, ...] = (0.0, 0.2, 0.5)
-    """Share of motions that take up to three slots."""
+    """Share of motions that last up to three slots."""
     compute_failure: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
     compute_jitter_s: tuple[float, ...] = (0.0, 0.0, 0.3, 2.0)
     """Maximum additional planning time."""
     wrong_clocks: float = 0.7
     """Share of runs with wrong clocks: offsets up to 50 ms, rate errors up to 5 %."""
     event_kinds: tuple[str, ...] = ()
-    """Kinds of fault events, equally likely; see `faults`. A kind may be named twice."""
+    """Kinds of fault events, equally likely; kinds may be repeated. See `faults`."""
     events: Span = (0, 12)
     """Number of fault events in a run."""
     fault_s: tuple[float, float] = (10.0, 12.0)
-    """Length of the fault phase, after which all vehicles must arrive."""
+    """Duration of the fault phase, after which all vehicles must arrive."""
 
 
 def _load() -> Iterator[Profile]:
-    """Yield the profiles of `profiles.toml`; each has the values of its base where it has none."""
+    """Yield the profiles of `profiles.toml`, completed with the values of their bases."""
     text = files("laneweave.launch.fault_search").joinpath("profiles.toml").read_text("utf-8")
     tables = tomllib.loads(text)
     for name, table in tables.items():

@@ -1,4 +1,4 @@
-"""The search: runs many seeds on several processes, and describes the results."""
+"""The search: runs many seeds in several processes, and describes the results."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class SearchResult:
 
     totals: Totals = field(factory=Totals)
     failed: tuple[SeedResult, ...] = ()
-    """Results of the seeds with violations, in ascending order."""
+    """Results of the seeds with violations, by ascending seed."""
     digests: dict[int, str] = field(factory=dict)
     """Digest of each seed, if requested."""
 
@@ -49,7 +49,7 @@ class SearchResult:
 
     @property
     def digest(self) -> str:
-        """Digest of all seeds."""
+        """Digest over all seeds."""
         lines = "".join(f"{seed} {digest}\n" for seed, digest in sorted(self.digests.items()))
         return hashlib.blake2b(lines.encode(), digest_size=16).hexdigest()
 
@@ -62,7 +62,7 @@ def run_seeds(seeds: Sequence[int], profile: Profile, *, digest: bool = False) -
 def _run_seed(seed: int, profile: Profile, *, digest: bool) -> SeedResult:
     try:
         return FaultRun(seed, profile, digest=digest).run()
-    except Exception as error:  # noqa: BLE001 (the search continues whatever a core raises)
+    except Exception as error:  # noqa: BLE001 (the search continues after any error of a core)
         text = f"{type(error).__name__}: {error}"
         return SeedResult(seed, (Violation("crash", 0.0, (), text),), Totals(runs=1))
 
@@ -74,9 +74,9 @@ def search(
 
     Args:
         seeds: seeds to run.
-        profile: profile from which they draw.
+        profile: profile from which the seeds draw.
         jobs: number of processes.
-        digest: whether to compute digests of the delivered messages.
+        digest: whether to compute a digest of the delivered messages of each seed.
         show: whether to show a progress bar.
     """
     result = SearchResult()
@@ -107,13 +107,13 @@ def _batches(
         for batch in batches:
             yield run_seeds(batch, profile, digest=digest)
         return
-    # A fork would copy locks that the thread of the progress bar holds.
+    # A fork would copy locks held by the thread of the progress bar.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(batches)), context, _quiet) as pool:
         waiting = iter(batches)
         running: set[Future[list[SeedResult]]] = set()
         try:
-            # Submit only a few batches at a time, so that a long search starts and ends fast.
+            # Submit only a few batches at a time, so that long searches start and end quickly.
             for batch in islice(waiting, 2 * jobs):
                 running.add(pool.submit(run_seeds, batch, profile, digest=digest))
             while running:
@@ -141,7 +141,7 @@ def _quiet() -> None:
 
 
 def silence_logs() -> None:
-    """Log only critical errors, since a search consists of refused messages and failed plans."""
+    """Log only critical errors: rejected messages and failed plans are normal in a search."""
     structlog.configure(
         wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL),
         logger_factory=structlog.PrintLoggerFactory(sys.stderr),
@@ -161,15 +161,15 @@ def _with(result: SearchResult, outcomes: Sequence[SeedResult]) -> SearchResult:
 
 
 def describe(result: SearchResult, profile: Profile) -> Iterator[str]:
-    """Yield the lines that describe the result of a search, with the counts in the last one."""
+    """Yield lines that describe the result of a search; the last one has the counts."""
     for outcome in result.failed[:SHOWN_SEEDS]:
         yield f"seed {outcome.seed} failed:"
         for violation in outcome.violations[:SHOWN_VIOLATIONS]:
             yield f"  {violation}"
-        yield f"  again: {replay_command(outcome.seed, profile)}"
+        yield f"  replay: {replay_command(outcome.seed, profile)}"
     if len(result.failed) > SHOWN_SEEDS:
         others = [str(outcome.seed) for outcome in result.failed[SHOWN_SEEDS:]]
-        yield f"failed as well: seeds {' '.join(others[:200])}"
+        yield f"further failed seeds: {' '.join(others[:200])}"
     yield from describe_totals(result.totals)
     yield f"{result.passed} passed, {len(result.failed)} failed"
 
@@ -180,7 +180,7 @@ def replay_command(seed: int, profile: Profile) -> str:
 
 
 def describe_totals(totals: Totals) -> Iterator[str]:
-    """Yield lines that show how much happened in a search."""
+    """Yield lines with the totals of a search."""
     pace = totals.virtual_s / totals.cpu_s if totals.cpu_s else 0.0
     yield (
         f"{totals.runs} runs, {totals.virtual_s:.0f} s of virtual time in {totals.cpu_s:.0f} s of "
@@ -192,7 +192,7 @@ def describe_totals(totals: Totals) -> Iterator[str]:
     )
     yield (
         f"{totals.delivered} messages delivered, {totals.dropped} lost, "
-        f"{totals.takeovers} times a caretaker took charge, "
+        f"{totals.takeovers} takeovers by caretakers, "
         f"longest recovery {totals.longest_recovery_s:.1f} s"
     )
     faults = ", ".join(f"{kind} {count}" for kind, count in sorted(totals.faults.items()))

@@ -1,7 +1,7 @@
-"""The setup of a run, drawn from its seed: road, vehicles, faults, and preferred lanes.
+"""Setup of a run, drawn from its seed: road, vehicles, faults, and preferred lanes.
 
-Rolling operation: the road is short, because its whole rest is planned in each slot. Some vehicles
-are in S3 at the start, the others enter behind them, and all leave at its end.
+In the rolling operation the road is short, because each slot plans up to its end. Some vehicles are
+in S3 at the start, the others enter behind them, and all leave at the end of the road.
 """
 
 from __future__ import annotations
@@ -22,39 +22,39 @@ from laneweave.protocol.wire.messages import ClosedFormation, Name
 
 TICK_S = 0.1
 LEAVES_S = (2.0, 9.0)
-"""Time on the road of a vehicle that leaves during the fault phase."""
+"""Range of the time on the road of vehicles that leave during the fault phase."""
 
 # Operation in formations
 SLOT_S, MOVE_S = 1.0, 0.8
 LAST_COLUMNS = (1, 1, -3, -7)
-"""Rear column of the rearmost formation. Columns above 0 are on the road at the start; the others
-enter cell by cell, so that the formation closes after 3 or 7 s."""
+"""Choices of the rear column of the rearmost formation. Vehicles in columns above 0 are on the road
+at the start; the others enter one after the other, and the formation closes after 3 or 7 s."""
 BLOCK_COLUMNS = 4
 LENGTHS = (2, 7)
-"""Range of columns of formations with different lengths."""
+"""Range of the lengths of formations with different lengths, in columns."""
 GAPS = (0, 0, 1)
-"""Columns between two such formations."""
+"""Choices of the number of columns between two such formations."""
 MAX_SIZE = 6
-"""Vehicles in a formation; that of the paper's largest formation."""
+"""Maximum number of vehicles in a formation."""
 MAX_JOINED_SIZE = 10
-"""Vehicles in two formations that may join; more often take the planner too long."""
+"""Maximum number of vehicles in two formations that may join, because of the planning time."""
 
 # Rolling operation
 SLOTS_S = (1.0, 1.0, 1.0, 2.0)
-"""Choice of slot lengths. In the shortest one, ballots are often aborted."""
+"""Choices of the slot length. Ballots are often aborted in the shortest one."""
 MODES = (1, 1, 2)
 MOVE_SHARE = 0.8
-"""Share of a slot that a move takes."""
+"""Duration of a move as a share of the slot."""
 SLOTS_ON_ROAD = 45
-"""Slots in which a column passes the road."""
+"""Length of the road: slots in which a column passes it."""
 MAX_BEHIND = 3
-"""Empty columns behind the last vehicle of a lane that become its own."""
-THOROUGH = 0.05
-"""Share of runs with the stream planner, which takes ten times as long as all the rest."""
+"""Number of empty columns that the last vehicle of a lane owns."""
+STREAM_PLANNER = 0.05
+"""Share of runs with the stream planner, which takes ten times as long as the rest of a run."""
 
 
 def make_scenario(lanes: int, max_joined: int, *, growing: bool = False) -> Scenario:
-    """Return a scenario with formations: a long road, and short times so that runs are cheap.
+    """Return a scenario with formations: a long road, and short times for cheap runs.
 
     Args:
         lanes: number of lanes.
@@ -68,7 +68,7 @@ def make_scenario(lanes: int, max_joined: int, *, growing: bool = False) -> Scen
         cycle_s=SLOT_S,
         move_s=MOVE_S,
         max_joined=max_joined,
-        # The number of nodes limits a search, since a deadline would depend on the machine.
+        # Limit planning by the number of nodes: a deadline would depend on the machine.
         planning_deadline_s=3600.0,
         max_nodes=500,
     )
@@ -100,25 +100,25 @@ def _scenario(road: Road, formation: FormationSettings) -> Scenario:
 
 @frozen
 class Setup:
-    """Everything that is fixed before a run starts."""
+    """Setup of a run."""
 
     scenario: Scenario
     mix: FaultMix
     formations: tuple[ClosedFormation, ...]
-    """Foremost first."""
+    """Formations, the foremost first."""
     visits: tuple[Visit, ...]
     crowded: bool
-    """Sometimes more vehicles prefer a lane of a block than it has cells."""
+    """Whether more vehicles of a block may prefer a lane than it has cells there."""
     grants: tuple[Grant, ...] = ()
-    """Owners of the empty cells (rolling operation)."""
+    """Assignments of empty cells to owners (rolling operation)."""
     stretch_columns: int = 0
-    """Length of the stretch in which vehicles enter (rolling operation)."""
-    thorough: bool = False
-    """Use the stream planner instead of the light one (rolling operation)."""
+    """Number of columns in which vehicles enter (rolling operation)."""
+    uses_stream_planner: bool = False
+    """Whether the stream planner replaces `LightPlanner` (rolling operation)."""
 
     @property
     def adjoin(self) -> bool:
-        """Whether there are two formations without a column between them, which can join."""
+        """Whether there are two adjacent formations, which can join."""
         if len(self.formations) != 2:
             return False
         ahead, behind = self.formations
@@ -158,14 +158,14 @@ class Setup:
             rng.random() < profile.crowding,
             tuple(_grants(scenario, first, columns, visits)),
             columns,
-            rng.random() < THOROUGH,
+            rng.random() < STREAM_PLANNER,
         )
 
     def preferences(self, rng: random.Random, *, last: bool) -> dict[Name, int]:
         """Draw the preferred lane of each vehicle.
 
-        The last preferences can be satisfied: in each block at most as many vehicles prefer a lane
-        as it has cells there. If two formations may join, this holds for both together.
+        The last preferences can be satisfied: no lane is preferred by more vehicles of a formation
+        (or of two formations that may join) than it has cells there.
         """
         lanes, lattice = self.scenario.road.lanes, self.scenario.lattice
         columns = [len(one.columns(lattice)) for one in self.formations]
@@ -176,10 +176,10 @@ class Setup:
             return _draw_lanes(vehicles, room, weights, rng)
         may_join = self.adjoin and self.scenario.formation.max_joined >= 2
         if self.crowded and (may_join or not last):
-            # One lane is more popular than the others.
+            # One lane is preferred more often than the others.
             room = [sum(columns)] * lanes if last else [99] * lanes
-            favourite = rng.randrange(lanes)
-            weights = [6.0 if lane == favourite else 1.0 for lane in range(lanes)]
+            frequent = rng.randrange(lanes)
+            weights = [6.0 if lane == frequent else 1.0 for lane in range(lanes)]
             return _draw_lanes([visit.vehicle for visit in self.visits], room, weights, rng)
         preferences: dict[Name, int] = {}
         for formation, length in zip(self.formations, columns, strict=True):
@@ -209,7 +209,7 @@ def _draw_lanes(
 def _draw_formations(
     profile: Profile, scenario: Scenario, rng: random.Random
 ) -> list[ClosedFormation]:
-    """Draw the columns of each formation, from the rearmost to the foremost one."""
+    """Draw the formations from the rearmost to the foremost; return the foremost first."""
     lattice, growing = scenario.lattice, scenario.formation.closes_by_vehicles
     rear, formations = rng.choice(LAST_COLUMNS), []
     for _ in range(rng.randint(*profile.blocks)):
@@ -228,7 +228,7 @@ def _draw_visits(
     mix: FaultMix,
     rng: random.Random,
 ) -> Iterator[Visit]:
-    """Draw the vehicles: each formation has at least one and is at most half full."""
+    """Draw the vehicles: at least one per formation, in at most half of its cells."""
     lattice = scenario.lattice
     cells = [
         [(column, lane) for column in one.columns(lattice) for lane in range(lattice.lanes)]
@@ -248,7 +248,7 @@ def _draw_visits(
     for block in blocks:
         for index, cell in enumerate(rng.sample(cells[block], counts[block])):
             number += 1
-            # The first one stays, because a formation without vehicles does not exist.
+            # The first vehicle stays, because formations are never empty.
             leaves = index > 0 and rng.random() < profile.leavers
             yield _visit(Name(f"v{number:02}"), cell, leaves, scenario, mix, rng)
 
@@ -271,10 +271,10 @@ def _visit(
 def _grants(
     scenario: Scenario, first: int, columns: int, visits: Sequence[Visit]
 ) -> Iterator[Grant]:
-    """Yield the owners of the empty cells: the vehicle that entered last on their lane.
+    """Yield the owners of empty cells: the vehicle that last entered on their lane.
 
-    A cell is granted when no vehicle can enter in it any more. Cells ahead of all vehicles belong
-    to the first one; on a real road they would have no owner, but a short stretch needs the room.
+    A cell is granted when vehicles can no longer enter in it. Cells ahead of all vehicles belong to
+    the first one: the bridge would leave them without owners, but this stretch is short.
     """
     lattice, spread_s = scenario.lattice, scenario.formation.entry_spread_s
     by_cell = {visit.cell: visit for visit in visits}

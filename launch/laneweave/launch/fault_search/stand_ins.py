@@ -1,6 +1,6 @@
 """Fast stand-ins for the costly parts of a run: bodies, trajectory drivers, the rolling planner.
 
-Safety depends on none of them.
+Safety does not depend on any of them.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 UNNEEDED_MOVES = 0.4
-"""Probability that a vehicle on its preferred lane is moved nevertheless."""
+"""Probability with which the planner moves a vehicle that is on its preferred lane."""
 SYNC_S = 1.0
-"""Interval between synchronizations of a vehicle's clock, which drifts in between."""
+"""Interval between synchronizations of a vehicle's clock, between which the clock drifts."""
 
 
 @frozen
 class Visit:
-    """One vehicle's visit to the road."""
+    """Times and place of entry and exit of a vehicle, and errors of its clock."""
 
     vehicle: Name
     cell: Cell
-    """Cell in which it enters."""
+    """Cell in which the vehicle enters."""
     enters_s: float
     leaves_s: float | None
-    """None: it stays until the end."""
+    """None: the vehicle stays until the end."""
     clock_offset_s: float = 0.0
     clock_drift: float = 0.0
-    """Seconds that its clock gains per second."""
+    """Error of the clock rate: seconds gained per second."""
 
 
 @frozen
 class Grant:
-    """Assignment of an empty cell to an owner, as by the roadside (rolling operation)."""
+    """Assignment of an empty cell to an owner (rolling operation)."""
 
     t_s: float
     owner: Name
@@ -55,7 +55,7 @@ class Grant:
 
 
 class LightBody(Plant):
-    """A body that moves in a straight line of the lattice in a given time."""
+    """Body that moves between cells in straight lines in a given time."""
 
     def __init__(self, scenario: Scenario, cell: Cell) -> None:
         """Start at rest in a cell."""
@@ -82,7 +82,7 @@ class LightBody(Plant):
         self._begin_s, self._end_s = now_s, now_s + lasts_s
 
     def has_arrived(self, now_s: float) -> bool:
-        """Return whether it is in the centre of its target cell."""
+        """Return whether the body is in the centre of its target cell."""
         return now_s >= self._end_s
 
     def _place(self, t_s: float) -> tuple[float, float]:
@@ -94,7 +94,7 @@ class LightBody(Plant):
 
 
 class LightVehicle(RoadVehicle):
-    """A vehicle with a light body, its own clock, and a preferred lane that changes."""
+    """Vehicle with a light body, an individual clock, and a variable preferred lane."""
 
     def __init__(self, visit: Visit, preferred_lane: int, scenario: Scenario) -> None:
         """Start in the cell of a visit."""
@@ -116,7 +116,7 @@ class LightVehicle(RoadVehicle):
         return self.admission.arrival.preferred_lane
 
     def leaves_by(self, t_s: float) -> bool:
-        """Return whether it leaves the road by a time."""
+        """Return whether the vehicle leaves the road at or before a time."""
         return self._visit.leaves_s is not None and t_s >= self._visit.leaves_s
 
     def prefer(self, lane: int) -> None:
@@ -125,10 +125,10 @@ class LightVehicle(RoadVehicle):
         self.admission = attrs.evolve(self.admission, arrival=arrival)
 
     def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
-        """Return its SENSE message, by its own clock.
+        """Return the SENSE message according to the clock of the vehicle.
 
-        It knows its position in the lattice from the vehicles around it: a wrong clock makes it act
-        late or early, but does not shift its cell.
+        The vehicle knows its position in the lattice from its neighbours: a wrong clock makes it
+        act early or late, but does not shift its cell.
         """
         sense = super().sense(tick, caretaker=caretaker, left=left)
         visit = self._visit
@@ -141,7 +141,7 @@ class LightVehicle(RoadVehicle):
 
 
 class LightDriver:
-    """Driver of an agent without trajectories; it only names cells and ticks.
+    """Driver without trajectories, whose commands contain only cells and ticks.
 
     Like `TrackingDriver`, it considers a motion ended when its time is over and the body is in the
     target cell.
@@ -156,16 +156,16 @@ class LightDriver:
 
     @property
     def solver_stats(self) -> SolverStats:
-        """Empty statistics: nothing is solved."""
+        """Empty statistics, because nothing is solved."""
         return SolverStats()
 
     def take_over(self, sense: Sense) -> None:
-        """Continue the motion that the motion controller performs."""
+        """Continue the current motion of the motion controller."""
         self._origin, self._goal = sense.motion_origin, sense.hold_cell
         self._end_tick, self._ticks = sense.motion_end_tick, sense.motion_ticks
 
     def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
-        """Begin a move of `ticks` ticks at a tick."""
+        """Begin a move at a tick; it takes `ticks` ticks."""
         _, self._origin, self._goal = move
         self._end_tick, self._ticks = tick + ticks, ticks
 
@@ -181,17 +181,17 @@ class LightDriver:
         return Drive(end_tick, self._origin, self._ticks, b"")
 
     def motion(self, tick: int) -> None:
-        """Announce no motions: they would only slow the search down."""
+        """Publish no motions, which would only slow down the search."""
 
     def on_motion(self, motion: Motion) -> None:
         """Ignore motions of other vehicles."""
 
 
 class LightPlanner:
-    """Rolling planner for one slot, towards the preferred lanes or at random.
+    """Planner of one slot of the rolling operation: moves to preferred lanes, or random ones.
 
-    It moves as many vehicles as it can, so that more cells are transferred than with the stream
-    planner. Equal arguments give equal plans.
+    It moves as many vehicles as possible, to transfer more cells than the stream planner would.
+    Equal arguments give equal plans.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -208,7 +208,7 @@ class LightPlanner:
         before: StreamPlan | None = None,
         blocked: Collection[Cell] = (),
     ) -> StreamPlan:
-        """Return the cells of all vehicles at the beginning and at the end of the next slot."""
+        """Return the cells of all vehicles at the start and the end of the next slot."""
         del before
         rng = random.Random(f"{self._seed}/{slot}")  # noqa: S311 (simulation, no secrets)
         taken = {vehicle.cell for vehicle in vehicles} | set(blocked)

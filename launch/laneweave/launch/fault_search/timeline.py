@@ -16,15 +16,15 @@ from laneweave.protocol.wire.messages import (
 )
 
 BEFORE_S = 4.0
-"""Time before a violation from which the timeline is printed."""
+"""Length of the printed timeline before a violation."""
 AFTER_S = 0.2
 
 
 class Timeline:
-    """Collects lines, without repeated states and commands."""
+    """Log of events and messages, without repetitions."""
 
     def __init__(self) -> None:
-        """Start without lines."""
+        """Start with an empty log."""
         self._lines: list[tuple[float, str]] = []
         self._last: dict[tuple[str, str], str] = {}
 
@@ -33,7 +33,7 @@ class Timeline:
         self._lines.append((t_s, text))
 
     def add_message(self, t_s: float, sender: str, effect: Send) -> None:
-        """Add a message, unless the sender has just sent the same one."""
+        """Add a message, unless it repeats the last one of this sender and key."""
         text = _text_of(effect)
         if text is None:
             return
@@ -93,7 +93,7 @@ def _text_of(effect: Send) -> str | None:
 
 
 def _ownership(state: VehicleState) -> str:
-    """Return the owned cells and the pending transfer of a vehicle (rolling operation)."""
+    """Return owned cells and newest transfer of a vehicle as text (rolling operation)."""
     transfer = state.transfer
     if transfer is None:
         return f" owns {list(state.owned)}" if state.owned else ""

@@ -101,7 +101,7 @@ def test_faults_end_by_themselves(world: FaultRun) -> None:
 
 
 def test_an_unknown_fault_is_an_error(world: FaultRun) -> None:
-    with pytest.raises(ValueError, match="no such fault: rain"):
+    with pytest.raises(ValueError, match="unknown fault: rain"):
         harm(world, "rain")
 
 

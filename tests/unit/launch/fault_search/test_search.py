@@ -88,7 +88,7 @@ def test_failures_are_described_with_the_command_that_replays_them() -> None:
     assert lines[:3] == [
         "seed 17 failed:",
         "     3.250 s  cell: v01, v02: both occupy [(0, 0)]",
-        "  again: laneweave simulate --seeds 17:18 --profile calm --verbose",
+        "  replay: laneweave simulate --seeds 17:18 --profile calm --verbose",
     ]
     assert lines[-1] == "19 passed, 1 failed"
 
