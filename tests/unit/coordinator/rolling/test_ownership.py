@@ -1,150 +1,95 @@
-"""Closed transfers: which cells are certain, which promises are needed, and which vehicles move."""
+"""Which cells a vehicle owns, as far as its state and those of others tell."""
 
 from __future__ import annotations
-
-from collections.abc import Collection, Sequence
-from itertools import count
 
 import pytest
 from attrs import evolve
 
-from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
-from laneweave.coordinator.rolling.operation import RollingOperation
 from laneweave.coordinator.rolling.ownership import certain_cells, owned_cells, partners
-from laneweave.protocol.lattice import Cell
-from laneweave.protocol.runtime.node import Computed
-from laneweave.protocol.scenario.fields import FormationSettings, Road, Scenario
-from laneweave.protocol.wire.messages import (
-    Ballot,
-    Census,
-    CensusEntry,
-    Name,
-    PendingTransfer,
-    VehicleState,
-)
-from support.states import holding
+from laneweave.protocol.wire.messages import Ballot, Name, PendingTransfer, VehicleState
+from support.rolling_samples import AFTER, BEFORE, HIGH, LOW, MID, A, B, C, pending, state
 
-A, B, C = Name("a"), Name("b"), Name("c")
-SCENARIO = Scenario(
-    road=Road(s1_m=0.0, s2_m=0.0, s3_m=600.0), formation=FormationSettings(operation="rolling")
-)
+OWNED_BEFORE, OWNED_AFTER = frozenset(BEFORE[A]), frozenset(AFTER[A])
+SURE = OWNED_BEFORE & OWNED_AFTER
+BETWEEN = Ballot(2, Name("c1"), 10, 2)
+"""Above MID, below HIGH."""
+OPEN = PendingTransfer(MID, open=True)
+TRANSFER = pending(A, MID, (A, B, C))
+CLOSED = state(A, HIGH, TRANSFER)
+"""A has promised more, and its gate was closed then."""
 
 
-def ballot(seq: int) -> Ballot:
-    return Ballot(1, Name("c1"), 1, seq)
+def test_without_a_transfer_or_with_an_open_one_the_state_shows_the_owned_cells() -> None:
+    assert owned_cells(state(A, HIGH), {}) == OWNED_BEFORE
+    taken = state(A, HIGH, OPEN, owned=AFTER[A])
+    assert owned_cells(taken, {}) == OWNED_AFTER
 
 
-def transfer(seq: int, before: tuple[Cell, ...], after: tuple[Cell, ...]) -> PendingTransfer:
-    return PendingTransfer(ballot(seq), before, after, (A, B))
+def test_one_that_knows_the_open_gate_is_enough() -> None:
+    knows = state(C, MID, OPEN)
+    assert owned_cells(CLOSED, {C: knows}) == OWNED_AFTER
+    # Also while A still could open its own gate.
+    assert owned_cells(state(A, MID, TRANSFER), {C: knows}) == OWNED_AFTER
 
 
-def state(vehicle: Name, promised: int, *owned: Cell, **more: object) -> VehicleState:
-    return holding(vehicle, ballot(promised), owned[0], owned=owned, **more)
-
-
-TAKES = transfer(1, ((3, 0),), ((3, 0), (3, 1)))
-GIVES = transfer(1, ((4, 1), (3, 1)), ((4, 1),))
-TAKER = state(A, 1, (3, 0), transfer=TAKES, accepted=True, ready=True)
-GIVER = state(B, 1, (4, 1), (3, 1), transfer=GIVES, accepted=True, ready=True, done=True)
-
-
-def owned(giver: VehicleState, *others: VehicleState) -> frozenset[Cell] | None:
-    return owned_cells(giver, {other.vehicle: other for other in (giver, *others)})
-
-
-def test_ownership_is_unknown_while_both_may_open_their_gates() -> None:
-    assert owned(GIVER, TAKER) is None
-    assert certain_cells(GIVER, {A: TAKER, B: GIVER}) == {(4, 1)}
-    assert partners(GIVER, {A: TAKER, B: GIVER}) == {A, B}
+@pytest.mark.parametrize("older", [None, PendingTransfer(LOW, open=True)])
+def test_a_higher_promise_without_the_transfer_keeps_the_gate_closed(
+    older: PendingTransfer | None,
+) -> None:
+    assert owned_cells(CLOSED, {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
+    assert owned_cells(state(A, MID, TRANSFER), {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
 
 
 @pytest.mark.parametrize(
-    ("taker", "cells"),
+    "silent",
     [
-        (state(A, 1, (3, 0), (3, 1), transfer=PendingTransfer(ballot(1), open=True)), {(4, 1)}),
-        (state(A, 2, (3, 0)), {(4, 1), (3, 1)}),  # it has never had the transfer
-        (evolve(TAKER, promised=ballot(2), accepted=False), {(4, 1), (3, 1)}),
-        (
-            state(A, 3, (3, 0), transfer=PendingTransfer(ballot(2), open=True)),
-            {(4, 1)},
-        ),  # it shows a newer one
+        state(C, MID),  # it may accept yet
+        state(C, LOW),
+        state(C, None),
+        state(C, BETWEEN, owned=()),  # its controller has not noted the promise
+        state(C, MID, TRANSFER),  # it may open its gate yet
     ],
-)
-def test_the_state_of_one_vehicle_tells_what_the_other_owns(
-    taker: VehicleState, cells: set[Cell]
+)  # fmt: skip
+def test_states_that_may_still_change_tell_nothing(silent: VehicleState) -> None:
+    others = {B: state(B, HIGH, TRANSFER), C: silent}
+    assert owned_cells(CLOSED, others) is None
+    assert certain_cells(CLOSED, others) == SURE
+    assert partners(CLOSED, others) == {B, C}
+
+
+def test_when_all_have_promised_more_with_closed_gates_the_old_cells_are_owned() -> None:
+    others = {B: state(B, BETWEEN, TRANSFER), C: state(C, HIGH, TRANSFER)}
+    assert owned_cells(CLOSED, others) == certain_cells(CLOSED, others) == OWNED_BEFORE
+    assert partners(CLOSED, others) == frozenset()
+    assert owned_cells(state(A, MID, TRANSFER), others) is None  # A may open its own gate
+    assert owned_cells(evolve(CLOSED, owned=()), others) is None
+
+
+@pytest.mark.parametrize("newer", [None, state(C, HIGH, PendingTransfer(BETWEEN, open=True))])
+def test_cells_owned_either_way_are_certain(
+    newer: VehicleState | None,
 ) -> None:
-    giver = evolve(GIVER, promised=ballot(2), accepted=False)
-    assert owned(giver, taker) == frozenset(cells)
+    """A member may have opened the gate; it has left, or has had another plan since."""
+    there = {} if newer is None else {C: newer}
+    gone = {C} if newer is None else set[Name]()
+    assert owned_cells(CLOSED, {B: state(B, HIGH, TRANSFER), **there}, gone) == SURE
+    assert owned_cells(CLOSED, {B: state(B, MID, TRANSFER), **there}, gone) == SURE
+    assert owned_cells(CLOSED, {B: state(B, HIGH, OPEN), **there}, gone) == OWNED_AFTER
+    assert owned_cells(CLOSED, {B: state(B, HIGH), **there}, gone) == OWNED_BEFORE
+    assert partners(CLOSED, {B: state(B, HIGH, TRANSFER), **there}) == {B, *there}
+    # Under way it may still be in a cell that it is about to give.
+    moving = evolve(CLOSED, moving=True)
+    assert owned_cells(moving, there, gone) is None
+    assert certain_cells(moving, there, gone) == SURE
 
 
-def test_a_vehicle_that_has_left_is_not_waited_for() -> None:
-    giver = evolve(GIVER, promised=ballot(2), accepted=False)
-    assert owned(giver) is None  # it may be there, and was not heard yet
-    assert owned_cells(giver, {B: giver}, {A}) == frozenset({(4, 1)})
-    assert partners(giver, {B: giver}) == {B}
+def test_states_of_other_vehicles_and_own_older_ones_are_ignored() -> None:
+    stranger, others = Name("X"), {B: state(B, MID, TRANSFER), C: state(C, MID, TRANSFER)}
+    assert owned_cells(CLOSED, {stranger: state(stranger, HIGH), **others}) is None
+    assert owned_cells(CLOSED, {A: state(A, HIGH, OPEN), **others}) is None
 
 
-def test_a_moving_vehicle_may_need_the_cells_that_it_gives() -> None:
-    giver = evolve(GIVER, promised=ballot(2), accepted=False, moving=True)
-    assert owned(giver) is None
-
-
-class Orders:
-    """A planner with given moves that records which vehicles are held."""
-
-    def __init__(self, moves: dict[Name, Cell]) -> None:
-        """Plan these moves in each slot."""
-        self.moves = moves
-        self.held: set[str] = set()
-
-    def plan(
-        self,
-        slot: int,
-        vehicles: Sequence[StreamVehicle],
-        before: StreamPlan | None = None,
-        blocked: Collection[Cell] = (),
-    ) -> StreamPlan:
-        del before, blocked
-        self.held = {vehicle.vehicle for vehicle in vehicles if vehicle.held}
-        ways = {
-            vehicle.vehicle: (vehicle.cell, self.moves.get(Name(vehicle.vehicle), vehicle.cell))
-            for vehicle in vehicles
-        }
-        return StreamPlan(slot, ways, ())
-
-
-def plan_once(planner: Orders, *states: VehicleState) -> RollingOperation:
-    """Let a leader receive states and plan one slot."""
-    numbers = count(10)
-    control = RollingOperation(SCENARIO, lambda _: ballot(next(numbers)), lambda: 1, planner.plan)
-    entries = tuple(CensusEntry(each.vehicle, each.hold_cell, 0, 0.0) for each in states)
-    control.on_census(Census(0.0, entries, ()))
-    for each in states:
-        control.on_state(each, 0.0)
-    assert not list(control.order(0.0, 0.0))
-    (order,) = control.order(9.5, 9.5)
-    list(control.finish(Computed(order.job, order.work()), 9.6, 9.6))
-    return control
-
-
-def test_vehicles_that_may_know_what_a_member_owns_are_in_the_roster() -> None:
-    other = state(C, 1, (5, 1), (5, 0))
-    giver = evolve(GIVER, transfer=transfer(1, ((4, 1), (3, 1), (4, 0)), ((4, 1), (4, 0))))
-    giver = evolve(giver, owned=((4, 1), (3, 1), (4, 0)))
-    control = plan_once(Orders({B: (4, 0)}), TAKER, giver, other)
-    assert [transfer.roster for transfer in control.transfers] == [(A, B)]
-
-
-def test_a_vehicle_at_a_gate_that_never_opens_is_planned_for() -> None:
-    taker = evolve(TAKER, owned=((3, 0), (2, 0)))
-    taker = evolve(taker, transfer=transfer(1, ((3, 0), (2, 0)), ((3, 0), (2, 0), (3, 1))))
-    planner = Orders({A: (2, 0)})
-    control = plan_once(planner, taker, GIVER)
-    assert not planner.held
-    assert [set(transfer.moves) for transfer in control.transfers] == [{A}]
-
-
-def test_a_vehicle_that_is_about_to_move_is_held() -> None:
-    planner = Orders({})
-    plan_once(planner, evolve(TAKER, go=True), GIVER)
-    assert planner.held == {A}
+def test_a_single_member_of_a_plan_knows_what_it_owns() -> None:
+    alone = pending(A, MID, (A,))
+    assert owned_cells(state(A, HIGH, alone), {}) == OWNED_BEFORE
+    assert owned_cells(state(A, MID, alone), {}) is None

@@ -1,4 +1,4 @@
-"""One cell transfer: promises, ownership, the plan, and when it is given up."""
+"""One cell transfer: promises, the plan, and when it is given up."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import pytest
 from attrs import evolve
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
-from laneweave.coordinator.rolling.ownership import certain_cells, owned_cells, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.plans import ownership_problems, plan_problems
 from laneweave.protocol.wire.messages import (
-    Ballot,
     Name,
     PendingTransfer,
     Plan,
@@ -30,16 +28,11 @@ from support.rolling_samples import (
     B,
     C,
     make_plan,
-    pending,
     state,
 )
 from support.rule_books import RuleRecorder
 
 RESEND_S = 0.2
-OWNED_BEFORE, OWNED_AFTER = frozenset(BEFORE[A]), frozenset(AFTER[A])
-SURE = OWNED_BEFORE & OWNED_AFTER
-BETWEEN = Ballot(2, Name("c1"), 10, 2)
-"""Above MID, below HIGH."""
 
 
 def make_transfer(moves: dict[Name, tuple[Cell, Cell]] | None = None) -> CellTransfer:
@@ -67,90 +60,6 @@ def issued() -> CellTransfer:
     hear(transfer, state(A, MID), state(B, MID))
     assert transfer.phase is BallotPhase.ISSUING
     return transfer
-
-
-# --- what a vehicle owns -----------------------------------------------------------------------
-
-OPEN = PendingTransfer(MID, open=True)
-TRANSFER = pending(A, MID, (A, B, C))
-CLOSED = state(A, HIGH, TRANSFER)
-"""A has promised more, and its gate was closed then."""
-
-
-def test_without_a_transfer_or_with_an_open_one_the_state_shows_the_owned_cells() -> None:
-    assert owned_cells(state(A, HIGH), {}) == OWNED_BEFORE
-    taken = state(A, HIGH, OPEN, owned=AFTER[A])
-    assert owned_cells(taken, {}) == OWNED_AFTER
-
-
-def test_one_that_knows_the_open_gate_is_enough() -> None:
-    knows = state(C, MID, OPEN)
-    assert owned_cells(CLOSED, {C: knows}) == OWNED_AFTER
-    # Also while A still could open its own gate.
-    assert owned_cells(state(A, MID, TRANSFER), {C: knows}) == OWNED_AFTER
-
-
-@pytest.mark.parametrize("older", [None, PendingTransfer(LOW, open=True)])
-def test_a_higher_promise_without_the_transfer_keeps_the_gate_closed(
-    older: PendingTransfer | None,
-) -> None:
-    assert owned_cells(CLOSED, {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
-    assert owned_cells(state(A, MID, TRANSFER), {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
-
-
-@pytest.mark.parametrize(
-    "silent",
-    [
-        state(C, MID),  # it may accept yet
-        state(C, LOW),
-        state(C, None),
-        state(C, BETWEEN, owned=()),  # its controller has not noted the promise
-        state(C, MID, TRANSFER),  # it may open its gate yet
-    ],
-)  # fmt: skip
-def test_states_that_may_still_change_tell_nothing(silent: VehicleState) -> None:
-    others = {B: state(B, HIGH, TRANSFER), C: silent}
-    assert owned_cells(CLOSED, others) is None
-    assert certain_cells(CLOSED, others) == SURE
-    assert partners(CLOSED, others) == {B, C}
-
-
-def test_when_all_have_promised_more_with_closed_gates_the_old_cells_are_owned() -> None:
-    others = {B: state(B, BETWEEN, TRANSFER), C: state(C, HIGH, TRANSFER)}
-    assert owned_cells(CLOSED, others) == certain_cells(CLOSED, others) == OWNED_BEFORE
-    assert partners(CLOSED, others) == frozenset()
-    assert owned_cells(state(A, MID, TRANSFER), others) is None  # A may open its own gate
-    assert owned_cells(evolve(CLOSED, owned=()), others) is None
-
-
-@pytest.mark.parametrize("newer", [None, state(C, HIGH, PendingTransfer(BETWEEN, open=True))])
-def test_cells_owned_either_way_are_certain(
-    newer: VehicleState | None,
-) -> None:
-    """A member may have opened the gate; it has left, or has had another plan since."""
-    there = {} if newer is None else {C: newer}
-    gone = {C} if newer is None else set[Name]()
-    assert owned_cells(CLOSED, {B: state(B, HIGH, TRANSFER), **there}, gone) == SURE
-    assert owned_cells(CLOSED, {B: state(B, MID, TRANSFER), **there}, gone) == SURE
-    assert owned_cells(CLOSED, {B: state(B, HIGH, OPEN), **there}, gone) == OWNED_AFTER
-    assert owned_cells(CLOSED, {B: state(B, HIGH), **there}, gone) == OWNED_BEFORE
-    assert partners(CLOSED, {B: state(B, HIGH, TRANSFER), **there}) == {B, *there}
-    # Under way it may still be in a cell that it is about to give.
-    moving = evolve(CLOSED, moving=True)
-    assert owned_cells(moving, there, gone) is None
-    assert certain_cells(moving, there, gone) == SURE
-
-
-def test_states_of_other_vehicles_and_own_older_ones_are_ignored() -> None:
-    stranger, others = Name("X"), {B: state(B, MID, TRANSFER), C: state(C, MID, TRANSFER)}
-    assert owned_cells(CLOSED, {stranger: state(stranger, HIGH), **others}) is None
-    assert owned_cells(CLOSED, {A: state(A, HIGH, OPEN), **others}) is None
-
-
-def test_a_single_member_of_a_plan_knows_what_it_owns() -> None:
-    alone = pending(A, MID, (A,))
-    assert owned_cells(state(A, HIGH, alone), {}) == OWNED_BEFORE
-    assert owned_cells(state(A, MID, alone), {}) is None
 
 
 # --- promises ---------------------------------------------------------------------------------
