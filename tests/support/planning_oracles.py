@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import heapq
 import itertools
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Sequence
 from random import Random
 from typing import Any
 
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.coordinator.planning.problem import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
-from laneweave.protocol.lattice import Cell, Mode
+from laneweave.protocol.lattice import Mode
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS, SOLVERS
+from oracles import joint_search
 from oracles.moving_bodies import Bodies, drive
 from oracles.path_rules import check_paths
 
@@ -26,71 +24,12 @@ DEADLINE_S = 60.0
 """Comparisons are about costs, not about times."""
 
 
-def moves_from(cell: Cell, grid: Grid, mode: Mode) -> list[Move]:
-    found = []
-    for column, lane in itertools.product((-1, 0, 1), repeat=2):
-        if mode == 1 and column and lane:
-            continue
-        to = cell[0] + column, cell[1] + lane
-        if 0 <= to[0] < grid.columns and 0 <= to[1] < grid.lanes and to not in grid.blocked:
-            found.append((cell, to))
-    return found
-
-
-@lru_cache(maxsize=200_000)
-def conflict(model: ConflictModel, a: Move, b: Move) -> bool:
-    return model.kind(a, b) is not None
-
-
-def joint_moves(
-    options: Sequence[Sequence[Move]], model: ConflictModel, chosen: tuple[Move, ...] = ()
-) -> Iterator[tuple[Move, ...]]:
-    if len(chosen) == len(options):
-        yield chosen
-        return
-    for move in options[len(chosen)]:
-        if not any(conflict(model, move, other) for other in chosen):
-            yield from joint_moves(options, model, (*chosen, move))
-
-
 def cheapest_plan(request: PlanRequest, fixed: Sequence[int] | None = None) -> int | None:
-    """Return the optimal cost by Dijkstra's algorithm over all joint states, or None.
-
-    A vehicle on a target that nobody else has taken may declare that it has arrived for good; each
-    other vehicle pays one per step.
-    """
-    model = request.conflict_model
-    choices = [frozenset({j}) for j in fixed] if fixed is not None else request.choices()
-    start = tuple(v.cell for v in request.vehicles)
-    moving = (-1,) * len(start)
-    best = {(start, moving): 0}
-    heap = [(0, start, moving)]
-    while heap:
-        cost, cells, parked = heapq.heappop(heap)
-        if best[cells, parked] < cost:
-            continue
-        if all(j >= 0 for j in parked):
-            return cost
-        following: list[tuple[int, tuple[Cell, ...], tuple[int, ...]]] = [
-            (cost, cells, (*parked[:i], j, *parked[i + 1 :]))
-            for i, cell in enumerate(cells)
-            for j in choices[i]
-            if parked[i] < 0 and request.targets[j] == cell and j not in parked
-        ]
-        options = [
-            [(cell, cell)] if parked[i] >= 0 else moves_from(cell, request.grid, request.mode)
-            for i, cell in enumerate(cells)
-        ]
-        paid = cost + parked.count(-1)
-        following += [
-            (paid, tuple(to for _, to in joint), parked) for joint in joint_moves(options, model)
-        ]
-        for entry in following:
-            key = entry[1], entry[2]
-            if key not in best or entry[0] < best[key]:
-                best[key] = entry[0]
-                heapq.heappush(heap, entry)
-    return None
+    """Return the minimum cost, or None; `fixed`: the target of each vehicle."""
+    document = request.to_dict()
+    for vehicle, target in zip(document["vehicles"], fixed or (), strict=False):
+        vehicle["eligible"] = [target]
+    return joint_search.optimal_cost(document)
 
 
 def faults(request: dict[str, Any], cost: int | None, solver: str) -> list[str]:
