@@ -25,20 +25,15 @@ from laneweave.protocol.wire.topics import CENSUS, STATE
 from support.paper import PAPER, closed_blocks
 from support.states import holding
 
-SCENARIO = PAPER
-LATTICE, ELECTION_S = SCENARIO.lattice, SCENARIO.network.election_s
 T_S = 20.0
 """Road time: block 0 has closed and is on the way to S3."""
-A, B, C, D, E, F = (Name(letter) for letter in "ABCDEF")
 Cells = dict[Name, Cell]
 
 
 class Desk:
     """A coordinator under test, its clock and its effects."""
 
-    def __init__(
-        self, name: str = "c1", incarnation: int = 1, scenario: Scenario = SCENARIO
-    ) -> None:
+    def __init__(self, name: str = "c1", incarnation: int = 1, scenario: Scenario = PAPER) -> None:
         """Start a coordinator."""
         self.core = CoordinatorCore(Name(name), incarnation, scenario)
         self.now_s = 0.0
@@ -58,7 +53,7 @@ class Desk:
         return self.give(Wakeup())
 
     def lead(self) -> list[Effect]:
-        return self.wait(ELECTION_S)
+        return self.wait(PAPER.network.election_s)
 
     def watch(self, seconds: float) -> None:
         """Let time pass without a pause."""
@@ -113,7 +108,7 @@ def leading(
     cells: Cells,
     lanes: dict[Name, int] | None = None,
     t_s: float = T_S,
-    scenario: Scenario = SCENARIO,
+    scenario: Scenario = PAPER,
 ) -> Desk:
     """Return a coordinator that leads and has received a census."""
     desk = Desk(scenario=scenario)
@@ -138,7 +133,7 @@ def state(
     t_s: float = 0.0,
     joined: tuple[int, ...] | None = None,
 ) -> VehicleState:
-    formation = LATTICE.block_of(cell[0]) if -8 < cell[0] <= 0 else 0
+    formation = PAPER.lattice.block_of(cell[0]) if -8 < cell[0] <= 0 else 0
     return holding(
         name,
         promised,

@@ -14,6 +14,7 @@ from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Sense,
 from support.paper import PAPER
 
 T = TypeVar("T")
+A, B, C, D, E, F = (Name(letter) for letter in "ABCDEF")
 BALLOT = Ballot(1, Name("c1"), 1, 1)
 
 

@@ -58,26 +58,9 @@ from laneweave.protocol.wire.topics import (
     SERVICE,
     STATE,
 )
-from support.service_desk import (
-    ELECTION_S,
-    LATTICE,
-    SCENARIO,
-    T_S,
-    A,
-    B,
-    C,
-    Cells,
-    D,
-    Desk,
-    E,
-    F,
-    census,
-    jobs,
-    leading,
-    logged,
-    messages,
-    state,
-)
+from support.paper import PAPER
+from support.service_desk import T_S, Cells, Desk, census, jobs, leading, logged, messages, state
+from support.states import A, B, C, D, E, F
 
 # --- starting, bridges, election --------------------------------------------------------------
 
@@ -132,30 +115,18 @@ def road(desk: Desk) -> tuple[list[Name], float]:
 
 
 @pytest.mark.parametrize("index", [0, 1], ids=["census", "clock"])
-def test_messages_of_an_earlier_bridge_are_ignored(index: int) -> None:
-    """They come late, and their road time is ahead of the new one's."""
+def test_a_newer_bridge_is_met_by_its_news_before_its_token_is_seen(index: int) -> None:
     desk = Desk()
     desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
-    for message in of_bridge(7, {A: (0, 0)}, T_S):
-        desk.tell(message)
-    desk.tell(of_bridge(6, {B: (0, 0)}, 9 * T_S)[index])
-    assert road(desk) == ([A], T_S)
-
-
-def test_a_newer_bridge_is_met_by_its_news_before_its_token_is_seen() -> None:
-    for index in range(2):
-        desk = Desk()
-        desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
-        desk.collect_promises({A: (0, 0)}, {A: 1})
-        newer = of_bridge(8, {B: (0, 0)}, 1.0)
-        desk.tell(newer[index])
-        assert (desk.leaders, desk.core.t_s) == ({}, 1.0)
-        desk.tell(newer[1 - index])
-        assert road(desk) == ([B], 1.0)
-        desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))  # nothing new
-        assert road(desk) == ([B], 1.0)
-        desk.tell(of_bridge(7, {A: (0, 0)}, 9 * T_S)[index])
-        assert road(desk) == ([B], 1.0)
+    desk.collect_promises({A: (0, 0)}, {A: 1})
+    newer = of_bridge(8, {B: (0, 0)}, 1.0)
+    desk.tell(newer[index])
+    assert (desk.leaders, desk.core.t_s) == ({}, 1.0)
+    desk.tell(newer[1 - index])
+    assert road(desk) == ([B], 1.0)
+    desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))  # nothing new
+    desk.tell(of_bridge(7, {A: (0, 0)}, 9 * T_S)[index])  # late, and ahead in road time
+    assert road(desk) == ([B], 1.0)
 
 
 def test_states_of_vehicles_that_the_census_does_not_list_are_ignored() -> None:
@@ -182,7 +153,7 @@ def test_heartbeats_are_periodic_and_name_the_leader() -> None:
         desk.now_s = desk.core.wakeup_s or 0.0
         desk.give(Wakeup())
     beats = [send.message for send in messages(desk.effects, Heartbeat)]
-    assert len(beats) == pytest.approx(desk.now_s / SCENARIO.network.heartbeat_s, abs=2)
+    assert len(beats) == pytest.approx(desk.now_s / PAPER.network.heartbeat_s, abs=2)
     assert (beats[0].leading, beats[0].term) == (False, 0)
     assert (beats[-1].leading, beats[-1].term) == (True, 1)
 
@@ -207,12 +178,12 @@ def test_tokens_and_links_reach_the_election() -> None:
     desk = Desk("c2")
     peer = {"coordinator": "c1", "incarnation": "7"}
     desk.give(PeerUp(COORDINATOR_ALIVE, peer))
-    assert logged(desk.wait(ELECTION_S - 0.01)) == []
+    assert logged(desk.wait(PAPER.network.election_s - 0.01)) == []
     desk.give(PeerDown(COORDINATOR_ALIVE, peer))
     assert logged(desk.wait(0.01)) == ["leader-elected"]
     assert logged(desk.give(LinkDown())) == ["leader-stepped-down"]
     assert logged(desk.give(LinkUp())) == []
-    assert logged(desk.wait(ELECTION_S)) == ["leader-elected"]
+    assert logged(desk.wait(PAPER.network.election_s)) == ["leader-elected"]
     desk.give(PeerDown(COORDINATOR_ALIVE, {"coordinator": "c1", "incarnation": "strange"}))
 
 
@@ -232,6 +203,8 @@ def test_an_older_census_is_ignored() -> None:
     assert list(desk.leaders[0].formation.roster) == [A, B]
     desk.tell(census({B: (-1, 1)}, t_s=T_S + 0.1))
     assert list(desk.leaders[0].formation.roster) == [B]
+    desk.tell(RoadClock(1, T_S - 5.0, 0, 0, 0, 0, ended=False))
+    assert desk.core.t_s == T_S + 0.1
 
 
 def test_a_formation_that_is_not_closed_is_not_touched() -> None:
@@ -246,14 +219,6 @@ def test_a_formation_that_has_left_is_forgotten() -> None:
     desk = leading({A: (0, 0)})
     desk.tell(census({}, t_s=T_S + 1.0))
     assert desk.leaders == {}
-
-
-def test_road_time_never_goes_back() -> None:
-    desk = Desk()
-    desk.tell(RoadClock(1, 50.0, 0, 0, 0, 0, ended=False))
-    desk.tell(RoadClock(1, 40.0, 0, 0, 0, 0, ended=False))
-    desk.tell(census({}, t_s=45.0))
-    assert desk.core.t_s == 50.0
 
 
 # --- from the promise to the plan -------------------------------------------------------------
@@ -272,27 +237,14 @@ def test_prepare_promise_plan_acceptance() -> None:
     assert [(s.topic, s.parameters["vehicle"]) for s in plans] == [(PLAN, A), (PLAN, B)]
     assert plans[0].message == plans[1].message
     assert plans[0].message.formations == (0,)
-    told: list[Effect] = []
-    for name, cell in cells.items():
-        told += desk.tell(state(name, cell, desk.ballot, accepted=True, t_s=2.0))
+    told = desk.accept(cells)
     assert desk.leaders[0].phase is BallotPhase.IN_FORCE
+    assert desk.accept(cells, t_s=2.1) == []
     (note,) = messages(told, LogEvent)
-    assert (note.message.kind, note.message.data) == (
-        "plan-in-force", {"formation": 0, "closed_s": 4.5}
-    )  # fmt: skip
+    assert note.message.kind == "plan-in-force"
+    assert note.message.data == {"formation": 0, "closed_s": 4.5}
     desk.wait(1.0)
     assert messages(desk.wait(10.0), Plan) == []
-
-
-def test_adoption_sends_nothing() -> None:
-    desk = leading({A: (0, 0), B: (-1, 1)}, {B: 1})
-    theirs = Ballot(4, Name("c0"), 3, 2)
-    for name, cell in ((A, (0, 0)), (B, (-1, 1))):
-        desk.tell(state(name, cell, theirs, accepted=True))
-    for _ in range(10):
-        desk.wait(0.5)
-    assert messages(desk.effects, Prepare) == messages(desk.effects, Plan) == []
-    assert jobs(desk.effects) == []
 
 
 def test_a_result_for_an_older_ballot_is_dropped() -> None:
@@ -314,10 +266,15 @@ def test_a_result_for_an_older_ballot_is_dropped_while_the_newer_one_is_planned(
     desk = Desk()
     cells: Cells = {A: (0, 0), B: (-1, 1)}
     (old,) = jobs(desk.collect_promises(cells, {A: 1, B: 0}))
+    before = old.work()
+    assert isinstance(before, Sorting)
     desk.tell(census(cells, {A: 2, B: 0}, t_s=T_S + 1.0))
     assert jobs(desk.promise(cells)) == []
     assert desk.leaders[0].phase is BallotPhase.PLANNING
-    effects = desk.give(run_job(old))
+    result = run_job(old)  # in another thread; it depends on its order only
+    assert isinstance(result.result, Sorting)
+    assert result.result.moves == before.moves
+    effects = desk.give(result)
     assert messages(effects, LogEvent) == []
     (new,) = jobs(effects)
     plan: Plan = messages(desk.give(run_job(new)), Plan)[0].message
@@ -338,7 +295,7 @@ APART: Cells = {A: (0, 0), B: (-5, 0)}
 
 def promise(desk: Desk, name: Name, t_s: float = 1.0) -> list[Effect]:
     cell = APART[name]
-    ballot = desk.leaders[LATTICE.block_of(cell[0])].ballot
+    ballot = desk.leaders[PAPER.lattice.block_of(cell[0])].ballot
     return desk.tell(state(name, cell, ballot, t_s=t_s))
 
 
@@ -370,32 +327,20 @@ def test_an_order_of_an_outbid_leader_is_not_computed() -> None:
     assert jobs(desk.give(run_job(first))) == []
 
 
-def test_a_computation_depends_on_its_order_only() -> None:
-    """It runs in another thread, beside a core that goes on."""
-    desk = Desk()
-    cells: Cells = {A: (0, 0), B: (-1, 1)}
-    (old,) = jobs(desk.collect_promises(cells, {A: 1, B: 0}))
-    before = old.work()
-    assert isinstance(before, Sorting)
-    desk.tell(census(cells, {A: 2, B: 0}, t_s=T_S + 1.0))
-    desk.promise(cells)
-    assert old.work().moves == before.moves
-
-
-def test_a_result_that_comes_while_the_leader_backs_off_is_dropped() -> None:
-    desk = Desk()
-    (job,) = jobs(desk.collect_promises({A: (0, 0)}, {A: 1}))
-    desk.tell(state(A, promised=desk.ballot._replace(term=9), t_s=2.0))
-    assert desk.leaders[0].phase is BallotPhase.BACKING_OFF
-    effects = desk.give(run_job(job))
-    assert messages(effects, Plan) == messages(effects, LogEvent) == []
-
-
-def test_a_result_after_stepping_down_is_dropped() -> None:
+@pytest.mark.parametrize(
+    "news",
+    [
+        Heartbeat(Name("c1"), 1, 1, leading=True, formations=0),
+        state(A, promised=Ballot(9, Name("c1"), 1, 1), t_s=2.0),
+    ],
+    ids=["stepped down", "outbid"],
+)
+def test_a_result_that_no_leader_waits_for_is_dropped(news: object) -> None:
     desk = Desk("c2")
     (job,) = jobs(desk.collect_promises({A: (0, 0)}, {}))
-    desk.tell(Heartbeat(Name("c1"), 1, 1, leading=True, formations=0))
-    assert messages(desk.give(run_job(job)), Plan) == []
+    desk.tell(news)
+    effects = desk.give(run_job(job))
+    assert messages(effects, Plan) == messages(effects, LogEvent) == []
 
 
 @pytest.mark.parametrize("spoil", ["error", "nothing found", "unsafe paths"])
@@ -452,7 +397,7 @@ def test_too_late_for_any_step_settles() -> None:
 
 def test_failed_planning_searches_further_each_time() -> None:
     """The bound on nodes doubles, so hard tasks are solved eventually."""
-    few = evolve(SCENARIO, formation=evolve(SCENARIO.formation, solver="branching", max_nodes=1))
+    few = evolve(PAPER, formation=evolve(PAPER.formation, solver="branching", max_nodes=1))
     desk = Desk(scenario=few)
     cells: Cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
     effects = desk.collect_promises(cells, dict(zip(cells, (2, 2, 1, 0, 0, 1), strict=True)))
@@ -467,9 +412,9 @@ def test_failed_planning_searches_further_each_time() -> None:
 
 @st.composite
 def rosters(draw: st.DrawFn) -> tuple[Cells, dict[Name, int]]:
-    block = sorted(LATTICE.block_cells(0))
+    block = sorted(PAPER.lattice.block_cells(0))
     cells = draw(st.lists(st.sampled_from(block), min_size=1, max_size=6, unique=True))
-    fit = [lane for lane in range(LATTICE.lanes) for _ in range(LATTICE.block_columns)]
+    fit = [lane for lane in range(PAPER.lattice.lanes) for _ in range(PAPER.lattice.block_columns)]
     lanes = draw(st.permutations(fit))
     names = [Name(f"v{index}") for index in range(len(cells))]
     return dict(zip(names, cells, strict=True)), dict(zip(names, lanes, strict=False))
@@ -482,7 +427,7 @@ def test_every_plan_is_executable_and_serves_all_preferences(
 ) -> None:
     cells, lanes = roster
     # However slow the machine is.
-    patient = evolve(SCENARIO, formation=evolve(SCENARIO.formation, planning_deadline_s=3600.0))
+    patient = evolve(PAPER, formation=evolve(PAPER.formation, planning_deadline_s=3600.0))
     desk = Desk(scenario=patient)
     desk.core.t_s = t_s
     (job,) = jobs(desk.collect_promises(cells, lanes))
@@ -490,10 +435,10 @@ def test_every_plan_is_executable_and_serves_all_preferences(
     assert plan_problems(plan) == []
     assert plan.roster == tuple(cells)
     assert plan.start_cells == cells
-    assert set(plan.territory) <= LATTICE.block_cells(0)
-    assert plan.slot_s == SCENARIO.cycles_s[0]
+    assert set(plan.territory) <= PAPER.lattice.block_cells(0)
+    assert plan.slot_s == PAPER.cycles_s[0]
     now_s = max(t_s, T_S)
-    assert plan.t0_s == start_time_s(cells.values(), now_s + START_MARGIN_S, SCENARIO) > now_s
+    assert plan.t0_s == start_time_s(cells.values(), now_s + START_MARGIN_S, PAPER) > now_s
     for name, moves in plan.moves.items():
         end = moves[-1][2] if moves else cells[name]
         assert end[1] == lanes[name]
@@ -513,8 +458,8 @@ def test_planning_may_last_until_the_first_move(
         return sort_lanes(task, max_nodes, plan)
 
     monkeypatch.setattr(formation_planner, "sort_lanes", record)
-    formation = evolve(SCENARIO.formation, planning_deadline_s=given_s)
-    desk = Desk(scenario=evolve(SCENARIO, formation=formation))
+    formation = evolve(PAPER.formation, planning_deadline_s=given_s)
+    desk = Desk(scenario=evolve(PAPER, formation=formation))
     desk.core.t_s = t_s
     desk.lead()
     desk.tell(census({A: (0, 0)}, {A: 1}, t_s=t_s))
@@ -542,7 +487,7 @@ def test_ballots_never_repeat() -> None:
                 assert ballot is not None
                 seen.append(ballot)
             desk.tell(Heartbeat(Name("c1"), 1, 9, leading=True, formations=0))
-            desk.wait(2 * ELECTION_S)
+            desk.wait(2 * PAPER.network.election_s)
     assert len(set(seen)) == len(seen) == 24
 
 

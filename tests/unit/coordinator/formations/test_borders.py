@@ -13,10 +13,11 @@ from laneweave.protocol.runtime.node import Compute, Effect, run_job
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
 from laneweave.protocol.wire.messages import Ballot, LogEvent, Name, Plan
-from support.service_desk import SCENARIO as DESK_SCENARIO
-from support.service_desk import A, B, C, Cells, D, Desk, E, F, jobs, leading, messages, state
+from support.paper import FORMATIONS, PAPER
+from support.service_desk import Cells, Desk, jobs, leading, messages, state
+from support.states import A, B, C, D, E, F, make_plan
 
-SCENARIO = evolve(DESK_SCENARIO, formation=evolve(DESK_SCENARIO.formation, solver="branching"))
+SCENARIO = evolve(PAPER, formation=evolve(FORMATIONS, solver="branching"))
 """Of the plans with equal cost, those of branching close up across the border."""
 SLOT_S, MOVE_S = SCENARIO.cycles_s[0], SCENARIO.move_s
 SLACK_S = SCENARIO.formation.slack_s
@@ -26,18 +27,8 @@ MAX_STEPS = 9
 
 
 def plan_of(*moves: tuple[PlannedMove, ...], t0_s: float = T0_S) -> Plan:
-    roster = tuple(Name(letter) for letter in "ABCDEF"[: len(moves)])
-    return Plan(
-        ballot=Ballot(1, Name("c1"), 1, 1),
-        formations=(1,),
-        roster=roster,
-        incarnations=dict.fromkeys(roster, 1),
-        start_cells={name: each[0][1] for name, each in zip(roster, moves, strict=True)},
-        moves=dict(zip(roster, moves, strict=True)),
-        t0_s=t0_s,
-        slot_s=SLOT_S,
-        territory=(),
-    )
+    each = dict(zip((A, B, C), moves, strict=False))
+    return make_plan({name: steps[0][1] for name, steps in each.items()}, each, t0_s=t0_s)
 
 
 def closing_pairs(one: Plan, other: Plan) -> list[tuple[PlannedMove, PlannedMove]]:

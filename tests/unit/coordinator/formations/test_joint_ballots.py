@@ -11,29 +11,11 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
 from laneweave.protocol.wire.messages import Ballot, LogEvent, Name, Plan, Prepare, RoadClock
 from laneweave.protocol.wire.topics import BRIDGE_ALIVE
-from support.paper import closing_time_s
-from support.service_desk import (
-    ELECTION_S,
-    LATTICE,
-    SCENARIO,
-    T_S,
-    A,
-    B,
-    C,
-    Cells,
-    D,
-    Desk,
-    E,
-    F,
-    census,
-    jobs,
-    leading,
-    logged,
-    messages,
-    state,
-)
+from support.paper import PAPER, closing_time_s
+from support.service_desk import T_S, Cells, Desk, census, jobs, leading, logged, messages, state
+from support.states import A, B, C, D, E, F
 
-JOINING = evolve(SCENARIO, formation=evolve(SCENARIO.formation, max_joined=2))
+JOINING = evolve(PAPER, formation=evolve(PAPER.formation, max_joined=2))
 FULL: Cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (-2, 2)}
 """Block 0: all five want lane 1, which has four cells."""
 NEXT: Cells = {F: (-5, 1)}
@@ -85,7 +67,7 @@ def behind_of_one(desk: Desk, t_s: float) -> list[Effect]:
 
 
 def test_without_joining_all_but_one_get_their_lane_and_that_is_logged() -> None:
-    desk, job = overfull(SCENARIO)
+    desk, job = overfull(PAPER)
     effects = desk.give(run_job(job))
     plan = plan_of(effects)
     assert plan_problems(plan) == []
@@ -119,7 +101,7 @@ def test_an_overfull_lane_is_sorted_by_a_joint_ballot_of_two_formations() -> Non
     plan = plan_of(effects)
     assert plan_problems(plan) == []
     assert (plan.ballot, plan.formations, plan.roster) == (desk.ballot, (0, 1), tuple(members))
-    assert set(plan.territory) <= LATTICE.block_cells(0) | LATTICE.block_cells(1)
+    assert set(plan.territory) <= PAPER.lattice.block_cells(0) | PAPER.lattice.block_cells(1)
     for name, moves in plan.moves.items():
         assert (moves[-1][2] if moves else members[name])[1] == LANES[name]
     assert notes(effects, "lane-out-of-reach") == []
@@ -208,7 +190,7 @@ def test_a_group_is_learned_from_a_state_of_any_member() -> None:
 
 
 def test_a_ballot_is_widened_when_a_promise_shows_more_formations() -> None:
-    desk, _ = overfull(SCENARIO)
+    desk, _ = overfull(PAPER)
     ballot = desk.ballot
     desk.tell(state(A, FULL[A], ballot, joined=(0, 1), t_s=2.0))
     for name, cell in (FULL | NEXT).items():
@@ -286,7 +268,7 @@ def just_closed(number: int = 0) -> float:
 def test_a_formation_that_this_leader_saw_close_is_prepared_at_once() -> None:
     desk = Desk()
     desk.lead()
-    desk.watch(ELECTION_S + 0.1)
+    desk.watch(PAPER.network.election_s + 0.1)
     prepares = messages(desk.tell(census({A: (0, 0), B: (-1, 1)}, t_s=just_closed())), Prepare)
     assert [send.parameters["vehicle"] for send in prepares] == [A, B]
 
@@ -294,7 +276,7 @@ def test_a_formation_that_this_leader_saw_close_is_prepared_at_once() -> None:
 def test_a_formation_that_closed_before_the_leader_saw_it_is_observed() -> None:
     desk = Desk()
     desk.lead()
-    desk.watch(ELECTION_S + 0.1)
+    desk.watch(PAPER.network.election_s + 0.1)
     seen_s = closing_time_s(0) + JUST_CLOSED_S + 0.1
     assert messages(desk.tell(census({A: (0, 0)}, t_s=seen_s)), Prepare) == []
     theirs = Ballot(4, Name("c0"), 3, 2)
@@ -305,7 +287,7 @@ def test_a_formation_that_closed_before_the_leader_saw_it_is_observed() -> None:
 
 def test_a_leader_that_has_just_begun_observes_every_formation() -> None:
     desk = Desk()
-    desk.watch(2 * ELECTION_S - 0.2)  # of which it has led for the last 0.8 s
+    desk.watch(2 * PAPER.network.election_s - 0.2)  # of which it has led for the last 0.8 s
     assert desk.core.election.leading
     assert messages(desk.tell(census({A: (0, 0)}, t_s=just_closed())), Prepare) == []
     assert desk.leaders[0].phase is BallotPhase.OBSERVING
@@ -315,11 +297,11 @@ def test_a_leader_that_was_paused_observes_every_formation() -> None:
     """Another one may have led and planned meanwhile."""
     desk = Desk()
     desk.lead()
-    desk.watch(2 * ELECTION_S)
-    desk.wait(ELECTION_S)
+    desk.watch(2 * PAPER.network.election_s)
+    desk.wait(PAPER.network.election_s)
     assert messages(desk.tell(census({A: (0, 0)}, t_s=just_closed())), Prepare) == []
     assert desk.leaders[0].phase is BallotPhase.OBSERVING
-    desk.watch(ELECTION_S + 0.1)
+    desk.watch(PAPER.network.election_s + 0.1)
     later = census({A: (0, 0), B: (-4, 0)}, t_s=just_closed(1))
     assert [send.parameters["vehicle"] for send in messages(desk.tell(later), Prepare)] == [B]
 

@@ -10,31 +10,20 @@ from laneweave.coordinator.formations.pacing import MIN_RESERVE_S, RESERVE_S, st
 from laneweave.coordinator.formations.roster import start_time_s, time_left_s
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import FormationSettings, Scenario
-from laneweave.protocol.wire.messages import Ballot, Name, Plan
+from laneweave.protocol.wire.messages import Plan
+from support.states import A, make_plan
 
 SCENARIO = Scenario()
 LATTICE = SCENARIO.lattice
-A = Name("A")
 FRONT = 0
 
 
 def climbing(steps: int) -> Plan:
     """Return a plan of one vehicle that makes a step in each slot, up and down between lanes."""
     cells: list[Cell] = [(FRONT, step % 2) for step in range(steps + 1)]
-    moves: tuple[PlannedMove, ...] = tuple(
-        (step, cells[step], cells[step + 1]) for step in range(steps)
-    )
-    return Plan(
-        ballot=Ballot(1, Name("c1"), 1, 1),
-        formations=(0,),
-        roster=(A,),
-        incarnations={A: 1},
-        start_cells={A: cells[0]},
-        moves={A: moves},
-        t0_s=start_time_s(cells, 0.0, SCENARIO),
-        slot_s=SCENARIO.cycles_s[0],
-        territory=tuple(sorted(set(cells))),
-    )
+    moves = tuple((step, cells[step], cells[step + 1]) for step in range(steps))
+    t0_s = start_time_s(cells, 0.0, SCENARIO)
+    return make_plan({A: cells[0]}, {A: moves}, t0_s=t0_s, slot_s=SCENARIO.cycles_s[0])
 
 
 def paced(plan: Plan, scenario: Scenario = SCENARIO) -> Plan:
