@@ -63,7 +63,7 @@ def test_status_of_a_deployment(lab: Lab) -> None:
     assert nobody.complaints[0].startswith("network.endpoint: got ")
 
     router = start_router(lab, config)
-    assert seen(config).problem == "there is no leader: no coordinator is there"
+    assert seen(config).problem == "there is no leader: no coordinators found"
     first = lab.start("coordinator", "--config", config, "--name", "c1")
     second = lab.start("coordinator", "--config", config, "--name", "c2")
     shards = [lab.start("agent", "--config", config, "--shard", f"{i}/2") for i in range(2)]
@@ -72,7 +72,7 @@ def test_status_of_a_deployment(lab: Lab) -> None:
     bridge = lab.start("bridge", "--config", config, "--pace", "5", "--out", "out")
     ended = status(lab, config, "--role", "coordinator", "--name", "c3")
     assert (ended.status, ended.out) == (1, "")
-    assert ended.complaints == ["not healthy: coordinator c3 is not there"]
+    assert ended.complaints == ["not healthy: no coordinator c3 found"]
 
     def flows(found: Status) -> bool:
         """Tell whether the road advances, with messages of some vehicles, few of them lost."""

@@ -1,4 +1,4 @@
-"""Faults of a run: their specification, when each one is due, and how they are applied.
+"""Faults of a run: specification, schedule, injection, and recovery times.
 
 Entry points: `specification.load_faults` reads a fault file, `injection.FaultInjection` applies it
 to the processes of a local run or the roles of a simulated one. `presets/` has the named fault

@@ -1,8 +1,8 @@
 """Failover times: from a fault of the leader to the next leader and to the next plan.
 
-The next plan is that of the first formation whose plan comes into force after the fault. If that
-formation closed only after the fault, the time counts from its closing, because there was nothing
-to plan before.
+The next plan is the first plan of a formation that comes into force after the fault. If its
+formation closed after the fault, the time is measured from the closing, because there was no work
+to do before.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from laneweave.protocol.wire.messages import LogEvent
 
 IN_FORCE = "plan-in-force"
 IN_FLIGHT_S = 0.05
-"""Time within which messages that a paused leader has sent before its pause arrive."""
+"""Maximum delay of messages that a leader has sent before a pause."""
 
 
 @define
 class Failover:
-    """Measures recovery from faults of leaders; all times are on one clock, in seconds."""
+    """Measurement of recovery from faults of leaders; all times are on one clock, in seconds."""
 
     lease_s: float
     recovery_s: list[float] = field(factory=list)
@@ -30,20 +30,20 @@ class Failover:
     plan_recovery_s: list[float] = field(factory=list)
     """Time to the next plan in force, for each leader killed or paused."""
     _lost: tuple[str | None, int] | None = None
-    """Name and incarnation of the leader without a successor so far."""
+    """Name and incarnation of the failed leader; None: there is a new leader."""
     _lost_s: float = 0.0
     _awake_s: float = math.inf
     _target: str | None = None
-    """Target of the last fault that no plan has followed yet."""
+    """Target of the newest fault; None: a plan has followed."""
     _target_s: float = 0.0
     _killed: bool = False
     _led_again: bool = False
     _road_s: list[float] = field(factory=list)
     _seen_s: list[float] = field(factory=list)
-    """Time at which the road clock first showed each of these road times."""
+    """Time at which each road time of `_road_s` was first observed."""
 
     def on_leader_fault(self, view: RoadView, now_s: float, for_s: float | None) -> None:
-        """Note that the leader was killed (`for_s` is None) or paused."""
+        """Record that the leader was killed (`for_s` is None) or paused."""
         self._target, self._target_s = view.leader, now_s
         self._killed, self._led_again = for_s is None, False
         if for_s is not None and for_s <= self.lease_s:
@@ -55,7 +55,7 @@ class Failover:
         view.leader = None
 
     def update(self, view: RoadView, now_s: float) -> None:
-        """Update leader and plans from the current view."""
+        """Update leader and plans from the observed state."""
         if not self._road_s or view.t_s > self._road_s[-1]:
             self._road_s.append(view.t_s)
             self._seen_s.append(now_s)
@@ -73,7 +73,7 @@ class Failover:
             self._lost = None
             self._led_again = True
         elif now_s >= self._awake_s:
-            self._lost = None  # it resumed before another coordinator took over
+            self._lost = None  # the leader resumed before another coordinator took over
         else:
             view.leader = None  # a heartbeat that was in flight
 

@@ -1,8 +1,8 @@
-"""The fault engine: applies a fault specification to a run, real or simulated.
+"""The fault engine, which applies a fault specification to a local or a simulated run.
 
-Kills and pauses act on roles through `RoleControl`, which the processes of a local run and the
-roles of a simulated run implement. Message faults and partitions are rules that each role gets when
-it starts; a local run may instead make partitions with network namespaces.
+Kills and pauses affect roles through `RoleControl`, which both kinds of runs implement. Message
+faults and partitions are rules that roles receive at their start; in local runs, network namespaces
+may implement partitions instead.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ log = structlog.get_logger(__name__)
 
 
 class RoleControl(Protocol):
-    """The roles of a run by name, and what faults can do to them."""
+    """Operations of faults on the roles of a run, which are identified by name."""
 
     @property
     def running(self) -> Collection[str]:
-        """Roles that run; paused ones included, killed ones not."""
+        """Names of the running roles, including paused ones."""
 
     @property
     def coordinators(self) -> Collection[str]:
-        """All coordinators, running or not."""
+        """Names of all coordinators, running or not."""
 
     def agent_of(self, vehicle: str) -> str | None:
-        """Return the role that drives a vehicle; None: it has not been started."""
+        """Return the role that drives a vehicle; None: not started."""
 
     def kill(self, name: str) -> None:
-        """End a role at once, without cleaning up."""
+        """End a role immediately, without clean-up."""
 
     def pause(self, name: str) -> None:
         """Suspend a role."""
 
     def resume(self, name: str) -> None:
-        """Resume a paused role; do nothing if it has ended meanwhile."""
+        """Resume a paused role, unless it has ended."""
 
     def restart(self, name: str) -> None:
         """Start a killed role again with an empty memory."""
@@ -61,34 +61,35 @@ class RoleControl(Protocol):
 
 @define
 class FaultInjection:
-    """The faults of one run."""
+    """Fault engine of a run."""
 
     specification: FaultSpec
     seed: int
-    """Seed of the scenario; that of the specification takes precedence."""
+    """Seed of the scenario; a seed in the specification takes precedence."""
     roles: RoleControl
     lease_s: float
     network: GroupNetwork | None = None
-    """Namespaces for the partitions that use them; None: messages are dropped instead."""
+    """Namespaces for partitions; None: partitions drop messages."""
     no_network_reason: str = ""
+    """Reason why there are no namespaces."""
     injected: list[dict[str, Any]] = field(factory=list)
-    """Applied faults: road time, name of the fault, and what happened to which target."""
+    """Applied faults: road time, name of the fault, and the effect with its target."""
     failover: Failover = field(init=False)
     schedule: FaultSchedule = field(init=False)
     _starts: dict[str, int] = field(factory=dict)
     """Number of starts of each role."""
     _waiting: list[FaultEvent] = field(factory=list)
-    """Due events without a target so far."""
+    """Due events that wait for a target."""
     _recoveries: list[tuple[float, str, Callable[[str], None]]] = field(factory=list)
-    """Resumes and restarts that are due later: time on the node clock, role, and what to do."""
+    """Future resumes and restarts: time on the clock of `now_s`, role, and action."""
     _targets: dict[str, set[str]] = field(factory=dict)
-    """Targets of each fault; a fault hits each agent only once."""
+    """Targets of each fault; a fault affects each agent at most once."""
     _paused: set[str] = field(factory=set)
     _in_force: set[str] = field(factory=set)
     """Names of the partitions in force."""
 
     def __attrs_post_init__(self) -> None:
-        """Draw the schedule."""
+        """Draw the schedule of the faults."""
         self.failover = Failover(self.lease_s)
         self.schedule = FaultSchedule(self.specification, self.seed)
 
@@ -98,7 +99,7 @@ class FaultInjection:
         return min((due_s for due_s, _, _ in self._recoveries), default=None)
 
     def message_rules(self) -> tuple[MessageRule, ...]:
-        """Return the rules for messages, including those that make partitions."""
+        """Return the message rules, including those that implement partitions."""
         partitions = (
             rule
             for partition in self.specification.partition
@@ -118,11 +119,11 @@ class FaultInjection:
 
         Args:
             road_s: road time.
-            now_s: the node's clock: wall-clock time, or time of the simulated network.
-            view: leader and census; a leader that becomes a target is removed from it.
+            now_s: wall-clock time, or virtual time of the simulated network.
+            view: observed leader and census; the leader is removed when it becomes a target.
 
         Raises:
-            CommandFailedError: a role cannot be restarted, or a link not be changed.
+            CommandFailedError: a role cannot be restarted, or a link cannot be changed.
         """
         self._recover(now_s)
         self.failover.update(view, now_s)
@@ -137,13 +138,13 @@ class FaultInjection:
         self._partition(road_s)
 
     def unused_faults(self) -> list[str]:
-        """Return one line for each fault that has had no effect."""
+        """Return a line for each fault without effect."""
         return self.schedule.unused_faults(set(self._targets))
 
     def results(self, dropped: int) -> dict[str, Any]:
-        """Return the arguments of `complete_summary` that concern faults.
+        """Return the fault-related arguments of `complete_summary`.
 
-        `dropped` is the number of messages that faults have dropped.
+        `dropped` is the number of messages dropped by faults.
         """
         methods = {
             name: NAMESPACES if self._uses_links(partition) else MESSAGES
@@ -155,7 +156,7 @@ class FaultInjection:
         return {"failover": self.failover, "dropped": dropped, "faults": faults}
 
     def close(self) -> None:
-        """Release the network namespaces; to be called when all roles have ended."""
+        """Release the network namespaces; to be called after the end of all roles."""
         if self.network is not None:
             self.network.close()
 

@@ -3,12 +3,12 @@
 The namespaces form a star. The router runs in the hub, which has the same address for all groups. A
 pair of virtual Ethernet devices (veth) connects each group to the hub; setting the hub's end down
 disconnects the group: packets are lost, connections end with their leases, and the group loses the
-liveliness tokens of all others. The launcher reaches the router through a Unix socket, which
-namespaces do not affect.
+liveliness tokens of all others. The launcher reaches the router through a Unix socket, which is
+independent of namespaces.
 
-A process of the run holds each namespace, which has no name. The kernel removes the namespace with
-its devices and addresses when the last process in it ends, so that no run leaves anything behind.
-This requires CAP_SYS_ADMIN and the program `ip`.
+The namespaces have no names; each is held by a process of the run. The kernel removes a namespace
+with its devices and addresses when its last process ends, so nothing remains after a run. This
+requires CAP_SYS_ADMIN and the program `ip`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PORT = 7447
 HUB_ADDRESS = "10.77.255.1"
 """Address of the hub on every link, so that all groups can share one configuration."""
 ANSWER_S = 10.0
-"""Longest time to create a namespace or to run a command in it."""
+"""Maximum time to create a namespace or to run a command in it."""
 HUB = "hub"
 _CLONE_NEWNET = 0x40000000
 _PATH = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"))
@@ -41,11 +41,11 @@ _UPLINK = "uplink"
 
 
 class NamespacesUnavailableError(RuntimeError):
-    """Network namespaces cannot be created or used here; the message says why."""
+    """Network namespaces cannot be created or used; the message has the reason."""
 
 
 def join_namespace(process_id: int) -> None:
-    """Move this process into the network namespace of another one; call it with a single thread.
+    """Move this process, which must have a single thread, into the namespace of another process.
 
     Raises:
         OSError: permission is missing, or the other process does not exist.
@@ -56,16 +56,16 @@ def join_namespace(process_id: int) -> None:
 
 
 def hold_namespace(connection: Connection) -> None:
-    """Create a network namespace and run commands in it until the connection is closed.
+    """Create a network namespace, and run commands in it until the connection is closed.
 
-    Sends an empty text on success, or else the reason: once for the namespace, then for each
-    command received as a list of words.
+    Receives each command as a list of words. Sends an error text, empty on success, for the
+    creation of the namespace and for each command.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         _check(ctypes.CDLL(None, use_errno=True).unshare(_CLONE_NEWNET))
     except OSError as error:
-        connection.send(f"cannot make a network namespace: {error.strerror}")
+        connection.send(f"cannot create a network namespace: {error.strerror}")
         return
     connection.send("")
     while True:
@@ -115,7 +115,7 @@ class _Namespace:
         """Run `ip` in this namespace."""
         program = shutil.which("ip", path=_PATH)
         if program is None:
-            raise NamespacesUnavailableError("there is no program `ip`")
+            raise NamespacesUnavailableError("the program `ip` is not installed")
         try:
             self.connection.send([program, *words])
         except OSError as error:
@@ -140,7 +140,7 @@ class _Namespace:
 
 @define
 class GroupNetwork:
-    """The namespaces of a run: the hub with the router, and one per group."""
+    """Namespaces of a run: the hub with the router, and one per group."""
 
     context: ForkServerContext
     groups: tuple[str, ...]
@@ -151,7 +151,7 @@ class GroupNetwork:
         """Create the namespaces and their links.
 
         Raises:
-            NamespacesUnavailableError: this is not possible here; nothing is left behind.
+            NamespacesUnavailableError: the creation failed; nothing remains.
         """
         try:
             for name in (HUB, *self.groups):
@@ -175,25 +175,25 @@ class GroupNetwork:
         leaf.ip("route", "add", "default", "via", f"{self._network(group)}.1")
 
     def _network(self, group: str) -> str:
-        """Return the first three bytes of the addresses on a group's link."""
+        """Return the first three bytes of the addresses on the link of a group."""
         return f"10.77.{self.groups.index(group)}"
 
     def process_id(self, name: str) -> int:
-        """Return the id of a process in the namespace of a group or of the hub."""
+        """Return the id of a process in the namespace of a group or the hub."""
         return self._namespaces[name].process_id
 
     @property
     def listen(self) -> str:
-        """Zenoh endpoint at which the router listens for the groups."""
+        """Zenoh endpoint on which the router listens for the groups."""
         return f"tcp/0.0.0.0:{PORT}"
 
     @property
     def endpoint(self) -> str:
-        """Zenoh endpoint of the router for every group."""
+        """Zenoh endpoint of the router for all groups."""
         return f"tcp/{HUB_ADDRESS}:{PORT}"
 
     def cut_off(self, groups: Collection[str]) -> set[str]:
-        """Set the links of exactly these groups down, and return the groups that changed.
+        """Set the links of these groups down and all others up; return the changed groups.
 
         Raises:
             NamespacesUnavailableError: a command failed.
@@ -207,7 +207,7 @@ class GroupNetwork:
         return changed
 
     def close(self) -> None:
-        """Release the namespaces; to be called when the roles in them have ended."""
+        """Release the namespaces; to be called after the end of the roles in them."""
         for namespace in self._namespaces.values():
             namespace.close()
         self._namespaces.clear()
@@ -219,10 +219,10 @@ def open_network(
     """Create the namespaces that partitions use.
 
     Returns:
-        The namespaces, or None and the reason; the reason is empty if no partition needs them.
+        (namespaces, ""), or (None, reason); the reason is empty if no partition needs namespaces.
 
     Raises:
-        BadInputError: a partition requires namespaces, and they cannot be created.
+        BadInputError: a partition requires namespaces, which cannot be created.
     """
     partitions = specification.partition
     groups = dict.fromkeys(part.between[0] for part in partitions if part.may_use_links)
@@ -234,7 +234,7 @@ def open_network(
     except NamespacesUnavailableError as error:
         for name, partition in specification.partitions():
             if partition.method == NAMESPACES:
-                allowed = f"messages, since there can be none here ({error})"
+                allowed = f"messages, because namespaces cannot be created ({error})"
                 raise BadInputError(f"{name}.method", NAMESPACES, allowed) from error
         return None, str(error)
     return network, ""

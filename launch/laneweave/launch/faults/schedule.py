@@ -1,7 +1,7 @@
-"""Fault events: when each kill and pause of a fault specification is due.
+"""Schedule of the kills and pauses of a fault specification.
 
-Each fault of the specification draws from its own random generators, so that adding a fault does
-not change the times of the others.
+Each fault has separate random generators, so that adding a fault does not change the times of
+others.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class FaultEvent:
     """One kill or pause of one role."""
 
     fault_name: str
-    """Name of its fault in the file, such as `kill[0]`."""
+    """Name of the fault in the file, such as `kill[0]`."""
     fault: RoleFault
     due_s: float
     """Road time."""
@@ -42,10 +42,10 @@ class FaultEvent:
 
 
 class FaultSchedule:
-    """All fault events of a run in the order of their times; some faults repeat without end."""
+    """All fault events of a run in chronological order; there may be infinitely many."""
 
     def __init__(self, specification: FaultSpec, seed: int) -> None:
-        """Draw the events with the seed of the specification, or else with `seed`."""
+        """Draw the events with the seed of the specification, or with `seed` if it has none."""
         seed = seed if specification.seed is None else specification.seed
         self._specification = specification
         self._reached_s = 0.0
@@ -63,9 +63,9 @@ class FaultSchedule:
             self._next = next(self._coming, None)
 
     def unused_faults(self, applied: set[str]) -> list[str]:
-        """Return one line for each fault that has had no effect when the run ends.
+        """Return a line for each fault that had no effect before the end of the run.
 
-        `applied` has the names of the faults of which at least one event has found a target.
+        `applied` contains the names of the faults with an applied event.
         """
         lines = [
             f"the run ended before {fault.target} was {fault.verb} at {fault.from_s:g} s"
@@ -85,14 +85,14 @@ class FaultSchedule:
 
 
 def _events(seed: int, name: str, fault: RoleFault) -> Iterator[FaultEvent]:
-    """Yield the events of one fault in the order of their times."""
+    """Yield the events of a fault in chronological order."""
     for number, due_s in enumerate(_times(seed, name, fault)):
         draw = random.Random(f"{seed}/{name}/{number}")  # noqa: S311 (no secrets)
         for_s = restart_after_s = None
         if isinstance(fault, Pause):
             for_s = draw.uniform(*fault.for_s) if isinstance(fault.for_s, tuple) else fault.for_s
         elif isinstance(fault, Kill):
-            # Restarts are spread evenly, so that the share holds for any number of kills.
+            # Distribute restarts evenly, so that the share is right after any number of kills.
             before, after = (int(fault.restart_share * (number + n) + 1e-9) for n in (0, 1))
             if after > before:
                 restart_after_s = fault.restart_after_s
@@ -100,7 +100,7 @@ def _events(seed: int, name: str, fault: RoleFault) -> Iterator[FaultEvent]:
 
 
 def _times(seed: int, name: str, fault: RoleFault) -> Iterator[float]:
-    """Yield the times of a fault in order, each as often as the fault has targets."""
+    """Yield the times of a fault in ascending order, each repeated for every target."""
     if fault.between_s is not None:
         draw = random.Random(f"{seed}/{name}")  # noqa: S311 (no secrets)
         drawn = fault.count * (fault.times or 1)

@@ -1,7 +1,7 @@
-"""The fault board: road time and message loss counters that the processes of a run share.
+"""The fault board: road time and counters of dropped messages, shared by the processes of a run.
 
-Messages could not carry this, because faults drop them. The board of real processes is a file that
-all of them map: road time as a float64, then one 8-byte counter per process, in native byte order.
+The board cannot use messages, because faults drop them. Real processes map a shared file: road time
+as a float64, then one 8-byte counter per process, in native byte order.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ WORD = 8
 
 @define
 class LocalBoard:
-    """Board of a run in one process; a `FaultBoard`."""
+    """`FaultBoard` of a run in one process."""
 
     road_s: float = 0.0
     dropped: int = 0
 
 
 class SharedBoard:
-    """The launcher's side of the shared file: assigns counters to processes and reads them all."""
+    """The shared file in the launcher, which assigns the counters and reads all of them."""
 
     def __init__(self, path: Path) -> None:
         """Create the file with road time 0."""
@@ -35,7 +35,7 @@ class SharedBoard:
         path.write_bytes(bytes(WORD))
 
     def new_word(self) -> int:
-        """Return the index of a new counter, for one process."""
+        """Create a counter for a process, and return its index."""
         with self.path.open("ab") as file:
             index = file.tell() // WORD
             file.write(bytes(WORD))
@@ -49,14 +49,14 @@ class SharedBoard:
 
     @property
     def dropped(self) -> int:
-        """Number of messages dropped by faults in all processes, including those that ended."""
+        """Number of messages dropped by faults in all current and ended processes."""
         content = self.path.read_bytes()[WORD:]
         return sum(struct.unpack(f"={len(content) // WORD}Q", content))
 
 
 @define
 class BoardWord:
-    """One role process's side of the shared file; a `FaultBoard`."""
+    """`FaultBoard` of a role process: its counter in the shared file."""
 
     path: Path
     index: int
@@ -93,7 +93,7 @@ class BoardWord:
 
 @frozen
 class MessageFaults:
-    """Message faults of one role process; passed to it as an option."""
+    """Message faults of a role process, passed to it as an option."""
 
     rules: tuple[MessageRule, ...]
     board: Path
@@ -104,6 +104,6 @@ class MessageFaults:
     seed: str
 
     def wrap(self, core: Core) -> Core:
-        """Return the core behind message faults."""
+        """Return the core wrapped by message faults."""
         board = BoardWord(self.board, self.word)
         return FaultyCore(core, self.rules, board, receiver=self.receiver, seed=self.seed)

@@ -1,8 +1,8 @@
-"""The fault specification of a run: the format of fault files. docs/FAULTS.md is its reference.
+"""The fault specification of a run: the format of fault files (reference: docs/FAULTS.md).
 
 A file has any number of tables `[[messages]]`, `[[kill]]`, `[[pause]]` and `[[partition]]`. Faults
-begin at a road time; durations are wall-clock time. Files that ship with the package are presets,
-which are selected by name.
+begin at a road time; durations are wall-clock time. The package contains preset files, which are
+selected by name.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from laneweave.protocol.runtime.message_faults import SENDERS, MessageRule
 
 LEADER, COORDINATOR, ROUTER, AGENT = "leader", "coordinator", "router", "agent"
 SENDER_OF_GROUP = dict(zip(("vehicles", "coordinators", "bridge"), SENDERS, strict=True))
-"""The groups that a partition may separate, with the sender name that message rules use."""
+"""Groups that a partition may separate, with their sender names in message rules."""
 GROUPS = tuple(SENDER_OF_GROUP)
 OTHERS = "others"
 AUTO, NAMESPACES, MESSAGES = "auto", "namespaces", "messages"
 MAX_S = 1e6
 MAX_TIMES = 10_000
 MIN_EVERY_S = 0.1
-"""Due faults are looked for about ten times per second."""
+"""Minimum of `every_s`: due faults are applied about ten times per second."""
 
 
 def _range(_: object, attribute: attrs.Attribute[Any], value: tuple[float, float]) -> None:
@@ -52,7 +52,7 @@ def _duration(_: object, attribute: attrs.Attribute[Any], value: NumberOrRange) 
 
 @frozen(kw_only=True)
 class RoleFault:
-    """Target and times of a fault of a role: the fields that kills and pauses have in common.
+    """Fields that kills and pauses have in common: target and times.
 
     Raises:
         BadInputError: a value is not allowed, or values contradict each other.
@@ -65,7 +65,7 @@ class RoleFault:
     """`leader`, `router`, `coordinator` (any), `agent` (any on the road), or the name of a
     coordinator or a vehicle."""
     count: int = field(default=1, validator=within(1, 10_000))
-    """Number of different targets; only for `agent` and `coordinator`."""
+    """Number of different targets; above 1 only for `agent` and `coordinator`."""
     at_s: float | None = field(default=None, validator=optional(within(0.0, MAX_S)))
     """Road time; this or `between_s` is required."""
     between_s: tuple[float, float] | None = field(default=None, validator=optional(_range))
@@ -88,11 +88,11 @@ class RoleFault:
         if self.count * (self.times or 1) > MAX_TIMES:
             raise BadInputError("times", self.times, f"count * times of at most {MAX_TIMES}")
         if self.count > 1 and self.target not in (AGENT, COORDINATOR):
-            raise BadInputError("count", self.count, f"1 for any target but {AGENT}, {COORDINATOR}")
+            raise BadInputError("count", self.count, f"1, or a target {AGENT} or {COORDINATOR}")
 
     @property
     def from_s(self) -> float:
-        """Earliest road time of the fault."""
+        """Road time of the first event, or its lower bound."""
         return self.at_s if self.at_s is not None else (self.between_s or (0.0, 0.0))[0]
 
 
@@ -105,7 +105,7 @@ class Kill(RoleFault):
     restart_after_s: float | None = field(default=None, validator=optional(within(0.0, 600.0)))
     """Wall-clock seconds; None: the role is not restarted."""
     restart_share: float = field(default=1.0, validator=within(0.0, 1.0))
-    """Share of the killed roles that is restarted."""
+    """Share of killed roles that are restarted."""
 
     def __attrs_post_init__(self) -> None:
         """Check that the fields do not contradict each other."""
@@ -116,7 +116,7 @@ class Kill(RoleFault):
 
 @frozen(kw_only=True)
 class Pause(RoleFault):
-    """Stop roles with SIGSTOP and resume them later with SIGCONT, with outdated knowledge."""
+    """Pause roles with SIGSTOP, and resume them later with SIGCONT and outdated state."""
 
     verb = "paused"
 
@@ -126,14 +126,14 @@ class Pause(RoleFault):
 
 @frozen(kw_only=True)
 class Partition:
-    """Separate one group from all others, or two groups from each other, for some road time.
+    """Separate one group from all others, or two groups from each other, during some road time.
 
     Raises:
         BadInputError: a value is not allowed, or values contradict each other.
     """
 
     between: tuple[str, str]
-    """Two groups, or a group and `others`, which are all processes outside it."""
+    """Two groups, or a group and `others` (all processes outside the group)."""
     from_s: float = field(default=0.0, validator=within(0.0, MAX_S))
     until_s: float | None = field(default=None, validator=optional(within(0.0, MAX_S)))
     """Road time; None: the end of the run."""
@@ -148,7 +148,7 @@ class Partition:
         if self.until_s is not None and self.until_s <= self.from_s:
             raise BadInputError("until_s", self.until_s, f"more than from_s, {self.from_s:g}")
         if self.method == NAMESPACES and second != OTHERS:
-            # All messages pass through one router: a link separates a group from all others.
+            # All messages pass through one router, so a link separates a group from all others.
             raise BadInputError("method", NAMESPACES, f"{MESSAGES}, or {OTHERS} in between")
 
     def holds(self, road_s: float) -> bool:
@@ -157,11 +157,11 @@ class Partition:
 
     @property
     def may_use_links(self) -> bool:
-        """Whether taking a network link down can make this partition."""
+        """Whether setting a network link down can implement this partition."""
         return self.between[1] == OTHERS and self.method != MESSAGES
 
     def message_rules(self) -> Iterator[MessageRule]:
-        """Yield rules that drop every message from one side to the other."""
+        """Yield rules that drop all messages between the two sides."""
         first, second = self.between
         others = [group for group in GROUPS if group != first] if second == OTHERS else [second]
         one = SENDER_OF_GROUP[first]
@@ -178,10 +178,10 @@ class Partition:
 
 @frozen(kw_only=True)
 class FaultSpec:
-    """All faults of a run, as its fault file describes them."""
+    """All faults of a run."""
 
     seed: int | None = field(default=None, validator=optional(within(0, 2**63 - 1)))
-    """Seed of all draws; None: that of the scenario."""
+    """Seed of all draws; None: the seed of the scenario."""
     messages: tuple[MessageRule, ...] = ()
     kill: tuple[Kill, ...] = ()
     pause: tuple[Pause, ...] = ()
@@ -206,7 +206,7 @@ class FaultSpec:
         """Check that the simulated network supports these faults.
 
         Raises:
-            BadInputError: it does not support one of them.
+            BadInputError: a fault is not supported.
         """
         where = "with --transport simulated"
         for name, fault in self.role_faults():
@@ -232,7 +232,7 @@ def load_faults(
     Args:
         choice: path of a file, or the name of a preset if no such file exists; None: no faults.
         coordinators: names of the run's coordinators.
-        vehicles: names of the run's vehicles; None: accept every name as that of a vehicle.
+        vehicles: names of the run's vehicles; None: accept every name of a vehicle.
 
     Raises:
         BadInputError: the file or preset does not exist, or a value is not allowed.

@@ -1,4 +1,4 @@
-"""The columns of formations, from a census or from a recorded run."""
+"""The columns of formations, from a census or a recorded run."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ class FormationColumns:
 
     number: int
     rear: int
+    """First column."""
     front: int
-    """The last of its columns; `rear` is the first."""
+    """Last column."""
     closed_s: float = -math.inf
-    """Road time at which it closed; recordings without such events: -inf."""
+    """Road time at which the formation closed; -inf: unknown."""
 
     @classmethod
     def of(cls, closed: ClosedFormation, lattice: Lattice) -> FormationColumns:
-        """Return the columns of a formation of the census."""
+        """Return the columns of a formation in a census."""
         columns = closed.columns(lattice)
         return cls(closed.first_block, columns.start, columns.stop - 1, closed.closed_s)
 
@@ -41,31 +42,31 @@ def _rearmost_first(found: Iterable[FormationColumns]) -> tuple[FormationColumns
 
 @frozen
 class Formations:
-    """Formations without common columns."""
+    """Formations with disjoint columns."""
 
     listed: tuple[FormationColumns, ...] = field(converter=_rearmost_first, default=())
-    """The rearmost first."""
+    """Formations, the rearmost first."""
 
     @classmethod
     def of_census(cls, closed: Iterable[ClosedFormation], lattice: Lattice) -> Formations:
-        """Return the formations that a census lists."""
+        """Return the formations of a census."""
         return cls(FormationColumns.of(one, lattice) for one in closed)
 
     @property
     def by_number(self) -> dict[int, FormationColumns]:
-        """The formations by their numbers, the foremost first."""
+        """Formations by number, the foremost first."""
         return {one.number: one for one in reversed(self.listed)}
 
     def at(self, column: int) -> FormationColumns | None:
-        """Return the formation of a column; None: it belongs to none of these."""
+        """Return the formation that contains a column; None: there is none."""
         return next((one for one in self.listed if one.rear <= column <= one.front), None)
 
     def joined(self, groups: Iterable[Collection[int]], lattice: Lattice) -> list[list[int]]:
-        """Return groups of at least two formations that plan together, by their numbers.
+        """Return the numbers of formations that plan together, in groups of at least two.
 
         Args:
-            groups: numbers of blocks whose vehicles plan together; groups may overlap.
-            lattice: defines the blocks.
+            groups: numbers of blocks that plan together; groups may overlap.
+            lattice: lattice with the blocks.
         """
         found: list[set[int]] = []
         for blocks in groups:
@@ -79,7 +80,7 @@ class Formations:
 
 
 def read_events(folder: Path, *kinds: str) -> Iterator[Mapping[str, Any]]:
-    """Yield a recorded run's events of some kinds, in the order in which they were written.
+    """Yield the recorded events of some kinds, in the order in which they were written.
 
     Raises:
         OSError, ValueError, TypeError: the events cannot be read.
@@ -101,10 +102,10 @@ def closed_formations(folder: Path, scenario: Scenario) -> Formations:
 
 
 def recorded_formations(folder: Path, lattice: Lattice) -> Formations:
-    """Return the formations of a recorded run that had vehicles.
+    """Return the formations with vehicles of a recorded run.
 
-    In recordings without `formation-closed` events, and in those of the rolling operation, each
-    block of the lattice counts as a formation.
+    In recordings without `formation-closed` events and of the rolling operation, each block of the
+    lattice counts as a formation.
 
     Raises:
         OSError, ValueError, KeyError, TypeError: a file of the run cannot be read.

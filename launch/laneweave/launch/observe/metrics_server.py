@@ -23,23 +23,23 @@ log = structlog.get_logger(__name__)
 
 FIELD = "observation.metrics"
 PROCESS = "laneweave_process_info"
-PROCESS_MEANING = "1, with what this process is"
+PROCESS_MEANING = "1, with labels that describe this process"
 REQUEST_S = 5.0
 """Timeout for reading a request."""
 POLL_S = 0.05
-"""Period at which the server checks whether it is to end."""
+"""Period at which the server checks for shutdown."""
 
 
 class MetricsCollector(Collector):
-    """Reads the metrics of a process at each request."""
+    """Collector that reads the metrics of a process at each request."""
 
     def __init__(self, labels: dict[str, str]) -> None:
-        """Begin without a source; `labels` describe the process."""
+        """Start without a source; `labels` describe the process."""
         self._labels = labels
         self._source: Source | None = None
 
     def register(self, source: Source) -> None:
-        """Read metrics from a source from now on; called when the process is up."""
+        """Set the source of metrics; called when the process has started."""
         self._source = source
 
     def collect(self) -> Iterator[Metric]:
@@ -71,24 +71,24 @@ class _Server(ThreadingHTTPServer):
         super().__init__((host, port), Handler)
 
     def server_bind(self) -> None:
-        # The base class also looks up this machine's name, which may be slow.
+        # The base class would also look up the host name, which may be slow.
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
     def handle_error(self, *_: object) -> None:
-        # A client that disconnects is no reason to log a traceback.
+        # Log no traceback when a client disconnects.
         log.warning("metrics not sent", reason=repr(sys.exc_info()[1]))
 
 
 @contextlib.contextmanager
 def serve_metrics(address: str, **labels: str) -> Iterator[Observe]:
-    """Serve metrics while the context lasts.
+    """Serve metrics until the end of the context.
 
-    All its threads are daemons, so that no client, active or idle, keeps the process from ending.
+    All threads are daemons, so that clients do not delay the end of the process.
 
     Args:
-        address: HOST:PORT, the only address that it listens at.
-        labels: describe the process.
+        address: HOST:PORT to listen on.
+        labels: labels that describe the process.
 
     Yields:
         A function that registers the source of the metrics.

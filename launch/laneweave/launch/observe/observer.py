@@ -1,4 +1,4 @@
-"""A node that listens to a deployment and publishes nothing."""
+"""Observer of a deployment, which publishes nothing."""
 
 from __future__ import annotations
 
@@ -28,30 +28,30 @@ TOPICS = (CLOCK, CENSUS, HEARTBEAT, EVENT)
 
 @define
 class Observer:
-    """Reads a transport's deliveries, and can collect them in a view."""
+    """Reader of the deliveries of a transport, which can update a view."""
 
     keys: Keys
     inbox: queue.SimpleQueue[Delivery] = field(factory=queue.SimpleQueue)
     view: RoadView = field(factory=RoadView)
     topics: tuple[Topic, ...] = TOPICS
-    """Topics that are subscribed to."""
+    """Subscribed topics."""
     tokens: tuple[Topic, ...] = ()
-    """Liveliness tokens that are watched."""
+    """Watched liveliness tokens."""
 
     def subscribe(self, transport: Transport) -> None:
-        """Subscribe to the topics, and watch the tokens."""
+        """Subscribe to the topics and watch the tokens."""
         for topic in self.tokens:
             transport.watch(self.keys.all_of(topic))
         for topic in self.topics:
             transport.subscribe(self.keys.all_of(topic))
 
     def wait(self, timeout_s: float) -> None:
-        """Wait for event for at most `timeout_s`, then collect all of it in the view."""
+        """Wait at most `timeout_s` for events, then update the view with all of them."""
         for event in self.receive(timeout_s):
             self.view.update(event, time.monotonic())
 
     def receive(self, timeout_s: float) -> Iterator[NetworkEvent]:
-        """Wait for event for at most `timeout_s`, then yield all of it."""
+        """Wait at most `timeout_s` for events, then yield all of them."""
         try:
             delivery = self.inbox.get(timeout=timeout_s)
             while True:

@@ -1,7 +1,7 @@
-"""The observed state of a deployment: its newest road, its coordinators, and its processes.
+"""Observed state of a deployment: newest road, coordinators, processes.
 
-Every bridge process numbers itself (its incarnation). A clock or census of a newer bridge begins a
-new road; those of an older one are ignored.
+Bridge processes are numbered (their incarnations). A clock or census of a newer bridge starts a new
+road; those of older bridges are ignored.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from laneweave.protocol.wire.topics import (
 NetworkEvent = Arrived | PeerUp | PeerDown | LinkUp | LinkDown
 
 MAX_EVENTS = 1000
-"""Log events that are kept until they are taken."""
+"""Maximum number of log events that are kept for `take_events`."""
 FORGET_S = 5.0
-"""A state further from the clock than this belongs to an earlier road."""
+"""Difference from the road clock above which a state belongs to an earlier road."""
 REMEMBERED_S = 60.0
-"""A heartbeat that is older is forgotten."""
+"""Age at which heartbeats are removed."""
 
 Process = tuple[Name, int]
 """Name and incarnation of a coordinator."""
@@ -45,24 +45,24 @@ Process = tuple[Name, int]
 
 @frozen
 class Coordinator:
-    """A coordinator process, as an observer sees it."""
+    """Observed state of a coordinator process."""
 
     coordinator: Name
     incarnation: int
     leading: bool
-    """It claims to lead, and was heard within the election time."""
+    """Whether it claims to lead, and its last heartbeat is newer than the election timeout."""
     term: int | None
-    """None, as in the next two: no heartbeat was heard."""
+    """None here and in the next two fields: no heartbeat was received."""
     plans_in_force: int | None
     heard_s_ago: float | None
     token: bool
-    """Its liveliness token exists."""
+    """Whether its liveliness token exists."""
 
 
 def claims_of(coordinators: Sequence[Coordinator]) -> list[Coordinator]:
     """Return the coordinators that claim to lead; the first one leads.
 
-    The protocol's rule: the highest term leads, the lowest name among equals.
+    The highest term leads; among equal terms, the lowest name leads.
     """
     return sorted(
         (one for one in coordinators if one.leading),
@@ -72,20 +72,20 @@ def claims_of(coordinators: Sequence[Coordinator]) -> list[Coordinator]:
 
 @define
 class RoadView:
-    """What is known from messages and liveliness tokens."""
+    """State of a deployment according to messages and liveliness tokens."""
 
     clock: RoadClock | None = None
-    """The newest one."""
+    """Newest clock."""
     census: Census | None = None
     leader: Name | None = None
-    """The coordinator that was last heard to lead, however long ago."""
+    """Coordinator that last claimed to lead."""
     incarnation: int = 0
-    """Of the leader."""
+    """Incarnation of the leader."""
     term: int = 0
     loss_window_ticks: int = 0
-    """Ticks over which message loss is measured; 0: it is not."""
+    """Number of ticks over which message loss is measured; 0: no measurement."""
     states: dict[Name, VehicleState] = field(factory=dict)
-    """The newest state of each vehicle."""
+    """Newest state of each vehicle."""
     loss: LossMeter = field(init=False)
     bridge: int = -1
     """Incarnation of the newest bridge."""
@@ -93,21 +93,21 @@ class RoadView:
     """Number of roads observed so far."""
     clock_heard_s: float = 0.0
     first_clock: RoadClock | None = None
-    """The one with the lowest tick."""
+    """Clock with the lowest tick."""
     first_clock_heard_s: float = 0.0
     heartbeats: dict[Process, tuple[Heartbeat, float]] = field(factory=dict)
-    """The newest one of each process, and when it was heard."""
+    """Newest heartbeat of each process, and its time of arrival."""
     linked: bool = True
     """Whether the observer is connected to the router."""
     message_counts: Counter[str] = field(factory=Counter)
-    """By topic."""
+    """Number of received messages by topic."""
     coordinator_tokens: set[Process] = field(factory=set)
     departed: set[Process] = field(factory=set)
-    """Coordinators whose tokens have vanished."""
+    """Coordinators whose tokens have disappeared."""
     agent_tokens: set[Name] = field(factory=set)
     """Vehicles whose agents have tokens."""
     bridge_tokens: set[int] = field(factory=set)
-    """Incarnations of bridges."""
+    """Incarnations of the bridges with tokens."""
     _events: deque[LogEvent] = field(factory=lambda: deque(maxlen=MAX_EVENTS))
 
     @loss.default
@@ -120,11 +120,11 @@ class RoadView:
         return self.clock.t_s if self.clock is not None else 0.0
 
     def update(self, event: object, now_s: float) -> None:
-        """Process a message or other `NetworkEvent`; messages older than what is known are ignored.
+        """Process a message or another `NetworkEvent`; ignore messages older than known ones.
 
         Args:
-            event: what arrived.
-            now_s: when, on the observer's clock.
+            event: message or event.
+            now_s: time of arrival on the clock of the observer.
         """
         match event:
             case Arrived(topic, _, message):
@@ -150,16 +150,16 @@ class RoadView:
                 pass
 
     def take_events(self) -> Iterator[LogEvent]:
-        """Yield the log events that arrived since the last call."""
+        """Yield the log events that have arrived since the last call."""
         while self._events:
             yield self._events.popleft()
 
     def coordinators(self, now_s: float, election_s: float) -> list[Coordinator]:
-        """Return the coordinators that have a token or were heard, by name and incarnation.
+        """Return the coordinators with a token or a heartbeat, sorted by name and incarnation.
 
         Args:
-            now_s: now, on the observer's clock.
-            election_s: a coordinator that was not heard for this long does not lead.
+            now_s: current time on the clock of the observer.
+            election_s: time without a heartbeat after which a coordinator does not lead.
         """
         self.heartbeats = {
             process: (heartbeat, heard_s)
@@ -188,7 +188,7 @@ class RoadView:
         return found
 
     def _is_of_newest_road(self, bridge: int) -> bool:
-        """Tell whether a message is not of an earlier road; begin anew with a newer one."""
+        """Return whether a message belongs to the newest road; start a new road if necessary."""
         if bridge > self.bridge:
             if self.roads:
                 self.clock = self.first_clock = self.census = None
@@ -199,7 +199,7 @@ class RoadView:
 
     def _on_clock(self, clock: RoadClock, now_s: float) -> None:
         if self.clock is None:
-            # States that arrived before the first clock may be of an earlier road.
+            # States that arrived before the first clock may belong to an earlier road.
             self.states = {
                 name: state
                 for name, state in self.states.items()

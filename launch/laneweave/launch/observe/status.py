@@ -1,4 +1,4 @@
-"""The state of a deployment, and whether it or one of its processes is healthy."""
+"""State of a deployment, and health checks of the deployment and of single processes."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ SCHEMA = "laneweave.status/1"
 LISTENED = tuple(
     topic for topic in TOPICS if topic.kind is not None and topic.quality is Quality.LATEST
 )
-"""Topics whose publishers do not wait for slow subscribers: an observer must not slow them down."""
+"""Topics whose publishers do not wait for slow subscribers, so the observer cannot delay them."""
 TOKENS = (COORDINATOR_ALIVE, VEHICLE_ALIVE, BRIDGE_ALIVE)
 LOSS_WINDOW_TICKS = 10_000
-"""More than `laneweave status` listens."""
+"""More ticks than `laneweave status` can observe."""
 
 COORDINATOR, BRIDGE, AGENT = "coordinator", "bridge", "agent"
 
@@ -35,13 +35,13 @@ class Plans:
     """The plans in force."""
 
     in_force: int
-    """As the leader publishes."""
+    """Number that the leader publishes."""
     operation: str | None
-    """`formations` or `rolling`, derived from vehicle states; None: they do not tell."""
+    """`formations` or `rolling`, derived from vehicle states; None: unknown."""
     formations: int | None
-    """Closed formations on the road, as the census lists them; None: there is no such list."""
+    """Number of closed formations in the census; None: unknown."""
     formations_with_plan: int | None
-    """Formations of which a vehicle has accepted a plan."""
+    """Number of these formations in which a vehicle has accepted a plan."""
 
 
 @frozen
@@ -50,7 +50,7 @@ class Road:
 
     t_s: float
     advanced_s: float
-    """Road time between the first and the last clock that were heard."""
+    """Road time between the first and the last received clock."""
     pace: float | None
     """Road seconds per second."""
     ended: bool
@@ -62,21 +62,21 @@ class Road:
 
 @frozen
 class Vehicles:
-    """The vehicles on the road, as the census lists them, by the source of their states."""
+    """Numbers of vehicles in the census, by the sender of their states."""
 
     attended: int
-    """Driven by an agent."""
+    """Vehicles driven by an agent."""
     unattended: int
-    """Without an agent; the bridge's caretaker publishes its state."""
+    """Vehicles without an agent, whose states are published by caretakers."""
     unheard: int
-    """No state was heard."""
+    """Vehicles of which no state was received."""
     agents: int
-    """Agents with a token, of vehicles on the road or announced."""
+    """Agents with a token, of vehicles on the road or announced ones."""
 
 
 @frozen
 class Loss:
-    """Shares of expected messages that did not reach this observer; None: none was expected."""
+    """Shares of expected messages that were not received; None: none were expected."""
 
     clock: float | None
     state: float | None
@@ -84,25 +84,25 @@ class Loss:
 
 @frozen
 class Status:
-    """A deployment as one observer sees it."""
+    """Observed state and health of a deployment."""
 
     healthy: bool
     problem: str | None
-    """Why it is not."""
+    """Reason why the deployment is unhealthy."""
     endpoint: str
     realm: str
     listened_s: float
     leader: str | None
     term: int | None
-    """The leader's."""
+    """Term of the leader."""
     claims: tuple[str, ...]
-    """Coordinators that claim to lead; with more than one, they have not heard each other yet."""
+    """Coordinators that claim to lead; several until they have received each other's heartbeats."""
     candidates: tuple[Coordinator, ...]
     plans: Plans
     road: Road | None
     vehicles: Vehicles
     messages_per_s: dict[str, float]
-    """By topic, of those that are listened to."""
+    """Rate of received messages by topic."""
     loss: Loss
 
     def to_dict(self) -> dict[str, Any]:
@@ -121,12 +121,12 @@ def status_of(
     """Return the status of a deployment.
 
     Args:
-        view: what was heard.
-        began_s: when listening began, on the observer's clock.
-        now_s: when listening ended.
-        election_s: a coordinator that was not heard for this long does not lead.
-        endpoint: where the observer listened.
-        realm: in which realm.
+        view: observed state.
+        began_s: start of the observation on the clock of the observer.
+        now_s: end of the observation.
+        election_s: time without a heartbeat after which a coordinator does not lead.
+        endpoint: endpoint of the router.
+        realm: realm of the deployment.
     """
     candidates = [
         one
@@ -160,34 +160,34 @@ def status_of(
 
 @frozen
 class RoleHealth:
-    """The health check of one process."""
+    """Health check of a process or of the agents of a shard."""
 
     role: str
     """`COORDINATOR`, `BRIDGE` or `AGENT`."""
     name: str = ""
-    """Of the coordinator, the vehicle or the shard."""
+    """Name of the coordinator, the vehicle or the shard."""
     takes: Callable[[str], bool] = field(default=lambda _: False)
-    """Tells whether a vehicle belongs to the shard; unused for a single vehicle."""
+    """Returns whether a vehicle belongs to the shard."""
     is_shard: bool = False
 
     def problem(
         self, view: RoadView, began_s: float, now_s: float, election_s: float
     ) -> str | None:
-        """Return what is wrong so far; None: nothing. Arguments as of `status_of`."""
+        """Return a description of the problem, or None; arguments as in `status_of`."""
         if not view.linked:
             return LINK_LOST
         if self.role == COORDINATOR:
             return self._coordinator_problem(view, now_s, election_s)
         if self.role == BRIDGE:
             if not view.bridge_tokens:
-                return "no bridge is there"
+                return "no bridge found"
             return _road_problem(view, now_s - began_s)
         if self.is_shard:
             return self._shard_problem(view)
-        return None if self.name in view.agent_tokens else f"{self.name}: its agent is not there"
+        return None if self.name in view.agent_tokens else f"no agent of {self.name} found"
 
     def may_end_early(self, view: RoadView) -> bool:
-        """Tell whether enough was heard to conclude that nothing is wrong."""
+        """Return whether the observed state suffices to conclude that there is no problem."""
         return not self.is_shard or view.census is not None
 
     def _coordinator_problem(self, view: RoadView, now_s: float, election_s: float) -> str | None:
@@ -197,13 +197,13 @@ class RoleHealth:
             if one.token and one.coordinator == self.name
         ]
         if not found:
-            return f"coordinator {self.name} is not there"
+            return f"no coordinator {self.name} found"
         if any(one.heard_s_ago is not None and one.heard_s_ago < election_s for one in found):
             return None
-        return f"coordinator {self.name} is there, but was not heard for {election_s:g} s"
+        return f"no heartbeat of coordinator {self.name} for {election_s:g} s"
 
     def _shard_problem(self, view: RoadView) -> str | None:
-        """Return what is wrong with a shard; one without vehicles on the road is healthy."""
+        """Return the problem of a shard; a shard without vehicles on the road is healthy."""
         unattended = [
             entry.vehicle
             for entry in (view.census.on_road if view.census is not None else ())
@@ -216,7 +216,7 @@ class RoleHealth:
         if not unattended:
             return None
         count = len(unattended)
-        return f"shard {self.name}: {count} vehicles are unattended, {unattended[0]} among them"
+        return f"shard {self.name}: {count} vehicles without agent, such as {unattended[0]}"
 
 
 LINK_LOST = "the connection to the router was lost"
@@ -233,9 +233,9 @@ def _problem(
         return LINK_LOST
     if leader is None:
         count = len(candidates)
-        found = f"{count} coordinators are there" if count != 1 else "one coordinator is there"
-        return f"there is no leader: {found if count else 'no coordinator is there'}"
-    # The token of a killed process may outlast it, so only processes that were heard count.
+        found = "one coordinator" if count == 1 else f"{count or 'no'} coordinators"
+        return f"there is no leader: {found} found"
+    # The token of a killed process may persist, so only processes with heartbeats count.
     heard = Counter(
         one.coordinator
         for one in candidates
@@ -243,23 +243,23 @@ def _problem(
     )
     for name, processes in heard.items():
         if processes > 1:
-            return f"{processes} coordinators are called {name}: names must differ"
+            return f"{processes} coordinators have the name {name}, which must be unique"
     return _road_problem(view, listened_s)
 
 
 def _road_problem(view: RoadView, listened_s: float) -> str | None:
-    """Return what is wrong with the road, if there is one."""
+    """Return the problem of the road; None: no problem, or no road."""
     first, newest = view.first_clock, view.clock
     if first is None or newest is None:
         if view.bridge_tokens:
-            return f"a bridge is there, but its clock was not heard for {listened_s:.1f} s"
+            return f"no clock of the bridge for {listened_s:.1f} s"
         return None
     if newest.ended:
         return None
     if newest.tick == first.tick:
-        return f"the road stands still at {newest.t_s:.1f} s for {listened_s:.1f} s"
+        return f"the road clock has not advanced beyond {newest.t_s:.1f} s for {listened_s:.1f} s"
     if not view.bridge_tokens:
-        return f"the bridge has gone at {newest.t_s:.1f} s, before its road had ended"
+        return f"the bridge disappeared at {newest.t_s:.1f} s, before the end of its road"
     return None
 
 

@@ -137,7 +137,7 @@ def test_a_healthy_deployment(healthy: Listener) -> None:
 
 def test_nothing_was_heard(listener: Listener) -> None:
     found = listener.status()
-    assert found.problem == "there is no leader: no coordinator is there"
+    assert found.problem == "there is no leader: no coordinators found"
     assert (found.road, found.loss.clock, found.loss.state) == (None, None, None)
 
 
@@ -165,7 +165,7 @@ def test_two_coordinators_of_one_name_are_a_problem_unless_one_was_restarted(
     listener.heartbeat("c1", 3, 1.9, leading=True, incarnation=2)
     assert listener.status().healthy
     listener.heartbeat("c1", 3, 1.9, leading=True)
-    assert listener.status().problem == "2 coordinators are called c1: names must differ"
+    assert listener.status().problem == "2 coordinators have the name c1, which must be unique"
 
 
 def test_a_coordinator_whose_token_vanished_is_no_candidate(listener: Listener) -> None:
@@ -190,9 +190,9 @@ def _gone(listener: Listener) -> None:
 @pytest.mark.parametrize(
     ("happens", "problem"),
     [
-        (Listener.bridge, "a bridge is there, but its clock was not heard for 2.0 s"),
-        (_standing, "the road stands still at 0.5 s for 2.0 s"),
-        (_gone, "the bridge has gone at 0.6 s, before its road had ended"),
+        (Listener.bridge, "no clock of the bridge for 2.0 s"),
+        (_standing, "the road clock has not advanced beyond 0.5 s for 2.0 s"),
+        (_gone, "the bridge disappeared at 0.6 s, before the end of its road"),
         (
             lambda listener: listener.view.update(LinkDown(), 1.0),
             "the connection to the router was lost",
@@ -268,17 +268,17 @@ def problem(listener: Listener, health: RoleHealth) -> str | None:
 def test_health_of_a_coordinator(listener: Listener) -> None:
     health = RoleHealth(COORDINATOR, "c2")
     listener.heartbeat("c1", 1, 1.9, leading=True)
-    assert problem(listener, health) == "coordinator c2 is not there"
+    assert problem(listener, health) == "no coordinator c2 found"
     listener.coordinator("c2")
     listener.heartbeat("c2", 1, 1.2)
-    assert problem(listener, health) == "coordinator c2 is there, but was not heard for 0.7 s"
+    assert problem(listener, health) == "no heartbeat of coordinator c2 for 0.7 s"
     listener.heartbeat("c2", 1, 1.4)
     assert problem(listener, health) is None
 
 
 def test_health_of_a_bridge(listener: Listener) -> None:
     health = RoleHealth(BRIDGE)
-    assert problem(listener, health) == "no bridge is there"
+    assert problem(listener, health) == "no bridge found"
     listener.bridge()
     listener.clock(5)
     assert problem(listener, health) is not None
@@ -288,16 +288,16 @@ def test_health_of_a_bridge(listener: Listener) -> None:
 
 def test_health_of_agents(listener: Listener) -> None:
     alone = RoleHealth(AGENT, "a")
-    assert problem(listener, alone) == "a: its agent is not there"
+    assert problem(listener, alone) == "no agent of a found"
     shard = RoleHealth(AGENT, "0/2", lambda vehicle: vehicle in "ab", is_shard=True)
     assert problem(listener, shard) is None
     assert not shard.may_end_early(listener.view)
     listener.census(10, a=0.0, b=0.0, c=0.0)
     assert shard.may_end_early(listener.view)
-    assert problem(listener, shard) == "shard 0/2: 2 vehicles are unattended, a among them"
+    assert problem(listener, shard) == "shard 0/2: 2 vehicles without agent, such as a"
     listener.agent("a")
     listener.agent("b")
     assert problem(listener, alone) is None
     assert problem(listener, shard) is None
     listener.states("b", [10], attended=False)
-    assert problem(listener, shard) == "shard 0/2: 1 vehicles are unattended, b among them"
+    assert problem(listener, shard) == "shard 0/2: 1 vehicles without agent, such as b"
