@@ -28,8 +28,8 @@ from attrs import define, field, frozen
 
 from laneweave.launch import cli
 from laneweave.launch.cli.main import main
+from support.commands import LANEWEAVE
 
-LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
 MARK = "LANEWEAVE_TEST_MARK"
 LOADED = (
     *(

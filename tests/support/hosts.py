@@ -31,11 +31,11 @@ from laneweave.launch.faults.network_namespaces import (
     NamespacesUnavailableError,
 )
 from laneweave.launch.run.roles import fork_server
+from support.commands import LANEWEAVE
 
 ROOT = Path(__file__).resolve().parents[2]
 CERTIFICATES = "/certs"
 """Where containers have them."""
-LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
 PROGRAMS = {"laneweave": LANEWEAVE, "python": sys.executable}
 LINKS = ("vehicles", "coordinators", "simulation")
 """Hosts beside the hub, each at the end of a link."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 from typing import Any
 
 import pytest
+
+from support.commands import run
 
 NODE = shutil.which("node")
 needs_node = pytest.mark.skipif(
@@ -17,13 +18,6 @@ needs_node = pytest.mark.skipif(
 
 def printed_json(program: str, data: object = None) -> Any:  # noqa: ANN401 - any JSON
     """Return the JSON that a program prints; it reads `data` as JSON from its standard input."""
-    done = subprocess.run(
-        [str(NODE), "-e", program],
-        input=json.dumps(data),
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
+    done = run(NODE, "-e", program, input=json.dumps(data))
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

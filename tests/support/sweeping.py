@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 
-LANEWEAVE = Path(sys.executable).with_name("laneweave")
+from support.commands import LANEWEAVE, run
 
 SHORT_ROAD = """
 [road]
@@ -41,9 +40,7 @@ def command(scenario: Path, out: Path, *options: object) -> list[str]:
 
 def sweep(scenario: Path, out: Path, *options: object) -> subprocess.CompletedProcess[str]:
     """Run a sweep to its end."""
-    return subprocess.run(
-        command(scenario, out, *options), capture_output=True, text=True, timeout=120, check=False
-    )
+    return run(*command(scenario, out, *options))
 
 
 def results(out: Path) -> list[dict[str, Any]]:

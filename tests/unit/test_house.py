@@ -5,11 +5,12 @@ from __future__ import annotations
 import importlib
 import re
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+
+from support.commands import python
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOTS = ("agents", "coordinator", "protocol", "sim_bridge", "launch")
@@ -47,6 +48,8 @@ def test_constraints_are_names_and_versions_only() -> None:
         assert re.fullmatch(r"[A-Za-z0-9._-]+==[0-9][A-Za-z0-9.]*", line), line
 
 
+CASE_STUDY = "docs/examples/case-study.json"
+ROUTER = "router --endpoint tcp/127.0.0.1:1"
 BASE_INSTALL = """
 import sys
 extras = "osqp libsumo pyarrow matplotlib psutil distributed prometheus_client cryptography"
@@ -61,70 +64,40 @@ main()
 
 
 def run_base_install(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", BASE_INSTALL, *arguments],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-        cwd=ROOT,
-    )
+    return python(BASE_INSTALL, *arguments, cwd=ROOT)
 
 
-def test_base_install_plans() -> None:
-    done = run_base_install("plan", "docs/examples/case-study.json", "--format", "table")
+def test_base_install_plans_and_checks_a_configuration() -> None:
+    done = run_base_install("plan", CASE_STUDY, "--format", "table")
     assert (done.returncode, done.stderr) == (0, "")
     assert "cost 7" in done.stdout
-
-
-def test_base_install_names_the_extra_for_runs() -> None:
-    done = run_base_install("run", "--duration", "5")
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-    assert "not installed" in done.stderr
-
-
-def test_base_install_names_the_extra_for_metrics() -> None:
-    done = run_base_install("router", "--endpoint", "tcp/127.0.0.1:1", "--metrics", "127.0.0.1:1")
-    assert (done.returncode, done.stdout) == (2, "")
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("prometheus_client: not installed")
-    assert line.endswith("install laneweave[metrics]")
-
-
-def test_base_install_names_the_extra_for_drawings() -> None:
-    done = run_base_install("plan", "docs/examples/case-study.json", "--draw", "plan.png")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "not installed" in done.stderr
-
-
-def test_base_install_names_the_extras_for_drawings_of_the_road() -> None:
-    done = run_base_install("plan", "docs/examples/case-study.json", "--draw-road", "road.png")
-    assert (done.returncode, done.stdout) == (2, "")
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("--draw-road: got 'road.png'")
-    assert "laneweave[agent] and laneweave[sim]" in line
-
-
-def test_base_install_names_the_extra_for_certificates(tmp_path: Path) -> None:
-    done = run_base_install("certs", "init", str(tmp_path / "certs"))
-    assert (done.returncode, done.stdout) == (2, "")
-    assert len(done.stderr.splitlines()) == 1
-    assert "laneweave[certs]" in done.stderr
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_base_install_checks_a_configuration() -> None:
     done = run_base_install("config", "check", "scenarios/compose.toml")
     assert done.returncode == 0
     assert "tls/router:7447" in done.stdout
 
 
-def test_base_install_names_the_extra_for_the_live_page() -> None:
-    done = run_base_install("watch", "--endpoint", "tcp/127.0.0.1:1")
+@pytest.mark.parametrize(
+    ("command", "begins", "names"),
+    [
+        ("run --duration 5", "", "not installed"),
+        (f"{ROUTER} --metrics 127.0.0.1:1", "prometheus_client: not installed", "[metrics]"),
+        (f"plan {CASE_STUDY} --draw plan.png", "", "not installed"),
+        (
+            f"plan {CASE_STUDY} --draw-road road.png",
+            "--draw-road: got 'road.png'",
+            "laneweave[agent] and laneweave[sim]",
+        ),
+        ("certs init new-folder", "", "laneweave[certs]"),
+        ("watch --endpoint tcp/127.0.0.1:1", "", "laneweave[watch]"),
+    ],
+)
+def test_base_install_names_the_missing_extra(command: str, begins: str, names: str) -> None:
+    done = run_base_install(*command.split())
     assert (done.returncode, done.stdout) == (2, "")
-    assert len(done.stderr.splitlines()) == 1
-    assert "laneweave[watch]" in done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(begins)
+    assert names in line
+    assert not (ROOT / "new-folder").exists()
 
 
 def test_makefile_and_containerfile_import_what_exists() -> None:

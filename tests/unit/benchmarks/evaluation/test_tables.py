@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from evaluation.statements import PAPER_VOLUMES, statements_table
 from evaluation.tables import document_parts
 from evaluation.trials import Agreement, AgreementRow, CostRow, FactorRow
 from laneweave.protocol.errors import BadInputError
+from support.commands import run
 from unit.benchmarks.evaluation.recorded import TRACED, evidence, point
 
 DRIVER = Path(__file__).resolve().parents[4] / "benchmarks" / "evaluate.py"
@@ -238,13 +238,7 @@ def test_parts_that_are_not_there_anew_stay() -> None:
     ],
 )
 def test_bad_options_are_refused_in_one_line(options: tuple[str, ...], tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, DRIVER, "--out", tmp_path, *options],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = run(sys.executable, DRIVER, "--out", tmp_path, *options)
     assert done.returncode == 2
     assert options[-2] in done.stderr
     assert done.stderr.splitlines()[-1].count("allowed: ") == 1

@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 import subprocess
-import sys
 import time
-from pathlib import Path
 
 import psutil
 import pytest
@@ -26,30 +24,16 @@ from laneweave.launch.fault_search.search import (
     timeline_of,
 )
 from laneweave.protocol.errors import BadInputError
+from support.commands import LANEWEAVE, laneweave
 
 CALM = PROFILES["calm"]
-LANEWEAVE = Path(sys.executable).with_name("laneweave")
 WELL_UNDER_WAY_S = 2.5
 """Loading everything takes half of it."""
 
 
-def simulate(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [LANEWEAVE, "simulate", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-
-
-@pytest.mark.parametrize(("text", "seeds"), [("0:1", range(1)), ("5:20", range(5, 20))])
-def test_seeds(text: str, seeds: range) -> None:
-    assert parse_seeds(text) == seeds
-
-
 @pytest.mark.parametrize("text", ["", "5", "3:3", "4:3", "-1:3", "a:b", "0:1:2", "0:99999999999"])
 def test_bad_seeds(text: str) -> None:
+    assert parse_seeds("5:20") == range(5, 20)
     with pytest.raises(BadInputError, match="A:B with A < B"):
         parse_seeds(text)
 
@@ -97,20 +81,12 @@ def test_timeline_of_a_run() -> None:
     lines = list(timeline_of(1, CALM))
     assert lines[0] == "seed 1, profile calm:"
     told = "\n".join(lines)
-    for word in (
-        "PREPARE",
-        "PLAN",
-        "STATE",
-        "COMMAND",
-        "moves",
-        "all faults end",
-        "*** v01",
-    ):
-        assert word in told
+    for words in ("PREPARE", "PLAN", "STATE", "COMMAND", "moves", "all faults end", "*** v01"):
+        assert words in told
 
 
 def test_the_command() -> None:
-    done = simulate("--seeds", "0:4", "--profile", "calm", "--jobs", "2", "--digest")
+    done = laneweave("simulate", "--seeds", "0:4", "--profile", "calm", "--jobs", "2", "--digest")
     assert done.returncode == 0
     lines = done.stdout.splitlines()
     assert lines[0].startswith("digest ")
@@ -128,7 +104,7 @@ def test_the_command() -> None:
     ],
 )
 def test_bad_input_is_one_line(arguments: list[str], line: str) -> None:
-    done = simulate(*arguments)
+    done = laneweave("simulate", *arguments)
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr.startswith(line)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import pytest
+
+from support.commands import python
 
 PROGRAM = """
 import sys, threading, structlog
@@ -26,18 +26,8 @@ raise RuntimeError("not caught")
 """
 
 
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", PROGRAM, *arguments],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-
-
 def test_json_lines() -> None:
-    done = run("json")
+    done = python(PROGRAM, "json")
     assert (done.returncode, done.stdout) == (1, "")
     entries = [json.loads(line) for line in done.stderr.splitlines()]
     assert [(entry["event"], entry["level"]) for entry in entries] == [
@@ -63,7 +53,7 @@ def test_json_lines() -> None:
     ],
 )
 def test_levels(arguments: tuple[str, ...], said: set[str]) -> None:
-    err = run(*arguments).stderr
+    err = python(PROGRAM, *arguments).stderr
     assert {one for one in ("detail", "begun", "from a thread") if one in err} == said
 
 
@@ -77,12 +67,5 @@ structlog.get_logger().warning("into a full disk")
 print("goes on")
 """
     with open("/dev/full", "w", encoding="utf-8") as full:  # noqa: PTH123 (a device)
-        done = subprocess.run(
-            [sys.executable, "-c", program, form],
-            stdout=subprocess.PIPE,
-            stderr=full,
-            text=True,
-            timeout=60,
-            check=False,
-        )
+        done = python(program, form, stderr=full)
     assert done.stdout == "goes on\n"

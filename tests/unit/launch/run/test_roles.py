@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from typing import NoReturn
 
 import pytest
 
 from laneweave.launch.run.roles import PRELOADED, THREAD_LIMITS, start_role
 from laneweave.protocol.errors import CommandFailedError
+from support.commands import python
 
 
 class _DeadServer:
@@ -49,11 +48,5 @@ print(gc.get_count()[2], gc.get_freeze_count() > len(gc.get_objects()))
 
 
 def test_the_fork_server_has_one_thread_and_nothing_open_and_leaves_nothing_to_collect() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", LOOK_AROUND, PRELOADED],
-        env=os.environ | dict.fromkeys(THREAD_LIMITS, "1"),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = python(LOOK_AROUND, PRELOADED, env=os.environ | dict.fromkeys(THREAD_LIMITS, "1"))
     assert done.stdout.split() == ["1", "0", "0", "True"], done.stderr

@@ -1,0 +1,37 @@
+"""Commands that tests run to their end."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
+
+
+def run(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:  # noqa: ANN401
+    """Run a command; its output is text."""
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
+    return subprocess.run(list(map(str, words)), text=True, timeout=120, check=False, **streams)
+
+
+def laneweave(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run `laneweave ARGUMENTS`."""
+    return run(LANEWEAVE, *arguments)
+
+
+def python(program: str, *arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:  # noqa: ANN401
+    """Run a program in an interpreter of its own."""
+    return run(sys.executable, "-c", program, *arguments, **options)
+
+
+def loads(module: str, other: str) -> bool:
+    """Return whether the import of a module imports another one, too."""
+    path = [entry for entry in sys.path if entry]
+    program = (
+        f"import sys; sys.path[:0] = {path!r}; import {module}; print({other!r} in sys.modules)"
+    )
+    done = python(program)
+    assert done.returncode == 0, done.stderr
+    return done.stdout == "True\n"
