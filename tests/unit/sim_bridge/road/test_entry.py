@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -13,6 +14,8 @@ from laneweave.protocol.lattice import Lattice
 from laneweave.sim_bridge.road.demand import Arrival, arrivals
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
 from laneweave.sim_bridge.road.formation_building import ColumnBlocks
+
+COLUMN_S, SMALL_S = 1.0, 1e-6
 
 
 def lattice(lanes: int = 3, block_columns: int = 4) -> Lattice:
@@ -42,42 +45,47 @@ def interlaced_meter(grid: Lattice, most: int = 6, spread_s: float = 0.0) -> Ent
     return EntryMeter(grid, spread_s, ColumnBlocks(grid, most, spread_s), interlaced=True)
 
 
-def check(grid: Lattice, most: int, admissions: list[Admission]) -> None:
-    """Check every rule of the entry."""
+def check(grid: Lattice, spread_s: float, admissions: list[Admission]) -> None:
+    """Check the rules of every entry."""
     assert len({admission.cell for admission in admissions}) == len(admissions)
-    taken: Counter[int] = Counter()
-    preferring: Counter[tuple[int, int]] = Counter()
     for admission in admissions:
         column, lane = admission.cell
-        assert grid.interlaced(admission.cell)
+        passing_s = grid.passing_time_s(column)
         assert lane == admission.arrival.lane
-        assert admission.t_s == grid.passing_time_s(column)
+        assert abs(passing_s - admission.t_s) <= spread_s + SMALL_S
+        assert admission.offset_m == pytest.approx(15.0 * (passing_s - admission.t_s))
         assert admission.t_s >= admission.arrival.t_s
-        block = grid.block_of(column)
-        taken[block] += 1
-        preferring[block, admission.arrival.preferred_lane] += 1
-    assert all(count <= most for count in taken.values())
-    assert all(count <= grid.block_columns for count in preferring.values())
     assert [a.t_s for a in admissions] == sorted(a.t_s for a in admissions)
     for lane in range(grid.lanes):
         mine = [admission for admission in admissions if admission.cell[1] == lane]
-        columns = [admission.cell[0] for admission in mine]
-        assert columns == sorted(set(columns), reverse=True)
-        times = [admission.arrival.t_s for admission in mine]
-        assert times == sorted(times)
+        for first, second in pairwise(mine):
+            assert second.cell[0] < first.cell[0]
+            assert second.t_s >= first.t_s + COLUMN_S - SMALL_S
+            assert second.arrival.t_s >= first.arrival.t_s
 
 
-@given(demands())
-@settings(max_examples=150, deadline=None)
-def test_rules_hold_and_everyone_enters(case: tuple[Lattice, int, list[Arrival]]) -> None:
-    grid, most, stream = case
-    meter = interlaced_meter(grid, most)
+@given(
+    demands(), st.sampled_from([(0.0, True), (0.25, True), (1.0, True), (0.5, False), (0.7, False)])
+)
+@settings(max_examples=250, deadline=None)
+def test_rules_hold_and_everyone_enters(
+    case: tuple[Lattice, int, list[Arrival]], how: tuple[float, bool]
+) -> None:
+    (grid, most, stream), (spread_s, interlaced) = case, how
+    meter = interlaced_meter(grid, most, spread_s) if interlaced else EntryMeter(grid, spread_s)
     for arrival in stream:
         meter.demand(arrival)
     admissions = meter.admit(60.0 + 10.0 * grid.block_columns * len(stream) + 10.0)
-    check(grid, most, admissions)
+    check(grid, spread_s, admissions)
     assert {admission.arrival for admission in admissions} == set(stream)
     assert meter.waiting == ()
+    if interlaced:
+        assert all(grid.interlaced(admission.cell) for admission in admissions)
+        blocks = [grid.block_of(admission.cell[0]) for admission in admissions]
+        assert all(count <= most for count in Counter(blocks).values())
+        wishes = (admission.arrival.preferred_lane for admission in admissions)
+        preferring = Counter(zip(blocks, wishes, strict=True))
+        assert all(count <= grid.block_columns for count in preferring.values())
 
 
 @given(demands(), st.floats(0.05, 7.0))
