@@ -41,6 +41,7 @@ from laneweave.sim_bridge.core import BRIDGE, BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from support.paper import EXACT
+from support.road_vehicles import known
 from support.states import jerks, make_plan, sent
 
 ROAD = {"lanes": 2, "s1_m": 20.0, "s2_m": 20.0, "s3_m": 160.0}
@@ -193,7 +194,7 @@ class Desk:
         name = Name(vehicle)
         controller = self.core.vehicles[name].controller
         cared_for = name in self.core._attendance
-        known: dict[str, Any] = {
+        unchanged: dict[str, Any] = {
             "vehicle": name,
             "incarnation": max(controller.attendant + cared_for, 1),
             "tick": self.core.tick,
@@ -202,21 +203,10 @@ class Desk:
             "motion_origin": controller.hold_cell,
             "jerks": jerks((0.0, 0.0), ticks=self.scenario.horizon_ticks),
         }
-        return Command(**(known | changes))
+        return Command(**(unchanged | changes))
 
     def known(self, vehicle: str) -> tuple[object, ...]:
-        """Return all that a motion controller knows."""
-        controller = self.core.vehicles[Name(vehicle)].controller
-        return (
-            controller.command_tick,
-            controller.attendant,
-            controller.joined,
-            controller.accepted,
-            controller.hold_cell,
-            controller.motion_origin,
-            controller.motion_end_tick,
-            controller._jerks.tobytes(),
-        )
+        return known(self.core.vehicles[Name(vehicle)].controller)
 
     def report(self, role: str, name: str, **counters: Any) -> list[Effect]:  # noqa: ANN401
         message = Report(Name(role), Name(name), **counters)

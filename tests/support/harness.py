@@ -161,8 +161,7 @@ class Lab:
         context.set_forkserver_preload(["__main__", *LOADED])
         written = [self.folder.with_name(f"{self.mark}.{name}") for name in ("out", "err")]
         process = context.Process(
-            target=_become,
-            args=(list(map(str, arguments)), self.folder, self.environment, written),
+            target=_become, args=(list(map(str, arguments)), self.folder, self.environment, written)
         )
         process.start()
         process.join(within_s)

@@ -262,10 +262,7 @@ def _configuration(changes: Mapping[str, Mapping[str, object]]) -> str:
     lines = [f"{key} = {json.dumps(value)}" for key, value in top.items()]
     for name, table in tables.items():
         if isinstance(table, dict):
-            lines += [
-                f"[{name}]",
-                *(f"{key} = {_value(value)}" for key, value in table.items()),
-            ]
+            lines += [f"[{name}]", *(f"{key} = {_value(value)}" for key, value in table.items())]
     return "\n".join(lines) + "\n"
 
 

@@ -32,6 +32,20 @@ def controller_in(
     return controller
 
 
+def known(controller: MotionController) -> tuple[object, ...]:
+    """Return all that a motion controller knows."""
+    return (
+        controller.attendant,
+        controller.joined,
+        controller.accepted,
+        controller.command_tick,
+        controller.hold_cell,
+        controller.motion_origin,
+        controller.motion_end_tick,
+        controller._jerks.tobytes(),
+    )
+
+
 def vehicle_in(
     cell: Cell,
     name: str = "A",

@@ -24,11 +24,7 @@ def rule_scenario(**rule: Any) -> Scenario:  # noqa: ANN401 (fields)
 
 
 def vehicle(
-    name: str,
-    s_m: float,
-    lane: int = 0,
-    preferred_lane: int | None = None,
-    speed_mps: float = 15.0,
+    name: str, s_m: float, lane: int = 0, preferred_lane: int | None = None, speed_mps: float = 15.0
 ) -> ReferenceVehicle:
     wanted = lane if preferred_lane is None else preferred_lane
     return ReferenceVehicle(

@@ -112,8 +112,7 @@ def random_switch(
         # Noise is drawn from seed and name.
         names = tuple(Name(f"s{index}v{i}") for i in range(rng.randint(*vehicles)))
         response = plan(
-            _request(rng, scenario, names, Grid(rng.randint(*columns), lanes)),
-            max_nodes=_MAX_NODES,
+            _request(rng, scenario, names, Grid(rng.randint(*columns), lanes)), max_nodes=_MAX_NODES
         )
         if response.paths:
             return _legal(Switch(scenario, names, response.paths, skipped))
@@ -177,10 +176,7 @@ def _ticks(scenario: Scenario) -> tuple[int, int]:
 
 
 def switch_result(
-    seed: int,
-    index: int,
-    vehicles: tuple[int, int] = VEHICLES,
-    columns: tuple[int, int] = COLUMNS,
+    seed: int, index: int, vehicles: tuple[int, int] = VEHICLES, columns: tuple[int, int] = COLUMNS
 ) -> SwitchResult:
     """Make, drive and measure a switch; see `random_switch`."""
     switch = random_switch(seed, index, vehicles, columns)

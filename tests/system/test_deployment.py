@@ -15,15 +15,7 @@ from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import BRIDGE_ALIVE, Keys
 from support.deployments import REALM, ask, deployment, free_tcp, ping, start_router, stop
-from support.harness import (
-    END_S,
-    RUN_S,
-    Lab,
-    check_safe_and_complete,
-    events,
-    final_lanes,
-    summary,
-)
+from support.harness import END_S, RUN_S, Lab, check_safe_and_complete, events, final_lanes, summary
 from support.service_lab import request, slow_request
 from system.conftest import FinishedRun
 

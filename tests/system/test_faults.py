@@ -170,10 +170,7 @@ def test_a_leader_that_is_paused_is_replaced_and_comes_back(
 
 
 def test_the_router_is_killed_and_started_again(lab: Lab, short: Path) -> None:
-    faults = lab.path(
-        "faults.toml",
-        '[[kill]]\ntarget = "router"\nat_s = 9\nrestart_after_s = 1\n',
-    )
+    faults = lab.path("faults.toml", '[[kill]]\ntarget = "router"\nat_s = 9\nrestart_after_s = 1\n')
 
     found = run_with(lab, short, faults, "--pace", "6")
 

@@ -16,14 +16,7 @@ import pytest
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.codec import KINDS, MAX_BYTES, VERSION, encode
-from laneweave.protocol.wire.messages import (
-    Census,
-    Heartbeat,
-    LogEvent,
-    Name,
-    Report,
-    RoadClock,
-)
+from laneweave.protocol.wire.messages import Census, Heartbeat, LogEvent, Name, Report, RoadClock
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     COORDINATOR_ALIVE,
@@ -186,8 +179,7 @@ def test_nonsense_changes_nothing(
 ) -> None:
     folder = lab.folder / "out"
     process = lab.start(
-        *("run", road, *DEMAND, "--vehicles-per-process", "8"),
-        *("--pace", "8", "--out", folder),
+        *("run", road, *DEMAND, "--vehicles-per-process", "8"), *("--pace", "8", "--out", folder)
     )
     lab.wait_until(lambda: len(events(folder, "entered")) > 0)
     large = huge_payloads()
@@ -225,8 +217,7 @@ def test_forged_messages_crash_no_process(
 ) -> None:
     folder = lab.folder / "out"
     process = lab.start(
-        *("run", road, *DEMAND, "--vehicles-per-process", "4"),
-        *("--pace", "10", "--out", folder),
+        *("run", road, *DEMAND, "--vehicles-per-process", "4"), *("--pace", "10", "--out", folder)
     )
     lab.wait_until(lambda: len(plans(folder)) > 0)
     known = [Name(event["vehicle"]) for event in events(folder, "entered")]

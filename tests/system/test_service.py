@@ -325,10 +325,7 @@ def test_an_end_while_requests_are_in_flight(processes: ServiceLab) -> None:
         return processes.for_one(name, slow_request("", 3.0))
 
     children = psutil.Process(processes.coordinators[name].pid).children(recursive=True)
-    with (
-        PlanClient(processes.access) as client,
-        Load(client.plan, threads=3, make=slow) as load,
-    ):
+    with PlanClient(processes.access) as client, Load(client.plan, threads=3, make=slow) as load:
         processes.lab.wait_until(lambda: load.asked == 3, END_S)
         load.over.set()
         took_s = processes.stop(name)

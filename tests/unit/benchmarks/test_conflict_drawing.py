@@ -11,14 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from PIL import Image
 
-from conflict_drawing import (
-    PANELS,
-    Judge,
-    Verdict,
-    conflict_figure,
-    counts,
-    draw_conflicts,
-)
+from conflict_drawing import PANELS, Judge, Verdict, conflict_figure, counts, draw_conflicts
 from laneweave.coordinator.planning.conflict_model import Pair
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry

@@ -56,7 +56,7 @@ def agent(street: Street) -> Sleeper:
     return agent
 
 
-def seen_in_cell(street: Street, first_tick: int = 1) -> list[tuple[float, float]]:
+def seen_in_cell(street: Street) -> list[tuple[float, float]]:
     """Return where A was shown after each tick: m from its first cell along and across."""
     column, lane = HOME
     return [
@@ -65,7 +65,7 @@ def seen_in_cell(street: Street, first_tick: int = 1) -> list[tuple[float, float
             poses[A][1] - LATTICE.cell_y_m(lane),
         )
         for index, poses in enumerate(street.world.shown)
-        if A in poses and index + 1 >= first_tick
+        if A in poses
     ]
 
 

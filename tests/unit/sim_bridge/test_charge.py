@@ -94,13 +94,6 @@ def test_the_first_agent_is_in_charge_with_its_first_command(desk: Desk) -> None
     assert read_events(desk.folder, "agent-took-over") == []
 
 
-def test_what_the_controller_has_joined_is_confirmed(attended: Desk) -> None:
-    block = attended.core.vehicles[B].block
-    attended.answer(B, incarnation=AGENT, joined=(block + 1,))
-    next_tick(attended, A)
-    assert sensed(attended, B).joined == (block, block + 1)
-
-
 def test_an_agent_that_restarts_takes_charge_and_its_zombie_does_not(attended: Desk) -> None:
     attended.answer(B, incarnation=AGENT + 1)
     before = attended.known(B)
@@ -136,7 +129,8 @@ def test_what_is_new_to_the_controller_is_confirmed_at_once(attended: Desk) -> N
     again = attended.answer(B, incarnation=AGENT, joined=(block + 1,), accepted=BALLOT)
     assert sent(again, Sense) == []  # the next tick confirms it
     next_tick(attended, A)
-    assert sensed(attended, B).accepted == BALLOT
+    sense = sensed(attended, B)
+    assert (sense.joined, sense.accepted) == ((block, block + 1), BALLOT)
 
 
 def test_it_is_confirmed_at_once_whatever_the_tick_and_then_not_played(attended: Desk) -> None:

@@ -30,7 +30,6 @@ from laneweave.protocol.wire.topics import (
     REPORT,
     VEHICLE_ALIVE,
 )
-from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import pose_of
 from laneweave.sim_bridge.core import SHUT_DOWN_S, TickPhase
 from laneweave.sim_bridge.road.attendance import LEFT_REPEATS
@@ -133,39 +132,25 @@ def test_ticks_keep_the_pace_and_do_not_make_up_for_lost_time(desk: Desk) -> Non
     assert desk.now_s == pytest.approx(late_s + TICK_S)  # only one
 
 
-def one_behind_the_other(folder: Path, scenario: Scenario) -> tuple[Desk, dict[Name, Sense]]:
-    """Let B enter behind A; return what both sense then."""
-    desk = Desk(scenario, folder, [arrival(A, 0.1), arrival(B, 2.1)])
+def test_measurement_errors_are_the_same_in_repeated_senses(tmp_path: Path) -> None:
+    """B has entered behind A."""
+    desk = Desk(make_scenario(sensing={}), tmp_path, [arrival(A, 0.1), arrival(B, 2.1)])
     desk.start(A, B)
     desk.drive_to_entry(B)
     desk.answer(A)
     desk.answer(B)
-    return desk, {sense.vehicle: sense for sense in sent(desk.wake(), Sense)}
-
-
-def test_every_vehicle_senses_the_one_ahead(tmp_path: Path) -> None:
-    _, senses = one_behind_the_other(tmp_path, SCENARIO)
-    assert senses[A].ahead == ()
-    ((lane, gap_m, speed_mps),) = [(n.lane, n.gap_m, n.speed_mps) for n in senses[B].ahead]
-    assert (lane, speed_mps) == (0, 15.0)
-    assert gap_m == pytest.approx(30.0 - SCENARIO.vehicle.length_m)
-    (behind,) = senses[A].behind
-    assert behind.lane == 0
-    assert behind.gap_m == pytest.approx(gap_m)
-    assert senses[B].behind == ()
-
-
-def test_measurement_errors_are_the_same_in_repeated_senses(tmp_path: Path) -> None:
-    desk, senses = one_behind_the_other(tmp_path, make_scenario(sensing={}))
+    senses = {sense.vehicle: sense for sense in sent(desk.wake(), Sense)}
     for name, sense in senses.items():
         true = desk.core.vehicles[name].state
         assert sense.state != true
         assert sense.state == pytest.approx(true, abs=0.4)
         controller = desk.core.vehicles[name].controller
         assert (sense.state, sense.ahead) == (controller.measured, controller.around.ahead)
-    (other,) = senses[B].ahead
-    assert other.gap_m != 25.0
-    assert other.gap_m == pytest.approx(25.0, abs=0.4)
+        assert sense.behind == controller.around.behind
+    assert senses[A].ahead == senses[B].behind == ()
+    for (other,) in (senses[B].ahead, senses[A].behind):
+        assert other.gap_m != 25.0
+        assert other.gap_m == pytest.approx(25.0, abs=0.4)
     assert {sense.vehicle: sense for sense in sent(desk.wake(), Sense)} == senses
 
 
@@ -185,20 +170,6 @@ def test_only_agents_that_have_not_answered_are_asked_again(desk: Desk) -> None:
         assert sent(effects, Sense)[0].tick == tick
     desk.answer(B)
     assert desk.core.tick == tick + 1
-
-
-def test_a_vehicle_without_an_answer_continues_its_trajectory(desk: Desk) -> None:
-    pairs = [(2.0, 0.0), (-1.0, 0.0), (0.0, 0.0)]
-    before = desk.core.vehicles[B].controller.plant.setpoint[0]
-    desk.answer(A)
-    desk.answer(B, jerks=jerks(*pairs))
-    desk.wake()
-    tick = desk.core.tick
-    desk.answer(A)
-    desk.drive(lambda: desk.core.tick > tick, B)
-    controller = desk.core.vehicles[B].controller
-    assert controller.plant.setpoint[0] == pytest.approx(before + 1.0 * TICK_S)
-    assert controller.rung is Rung.EXECUTE
 
 
 def test_an_agent_without_answers_is_awaited_to_each_deadline_until_it_is_silent(
@@ -297,16 +268,6 @@ def test_a_dead_agent_is_not_waited_for(desk: Desk) -> None:
     assert read_events(desk.folder, "agent-silent") == []
 
 
-def test_a_new_agent_of_a_silent_one_is_waited_for(desk: Desk) -> None:
-    desk.drive_to_silence(B)
-    assert desk.core._answers.awaited == {A}
-    desk.down(B)
-    desk.up(B)
-    desk.answer(A)
-    desk.wake()
-    assert desk.core._answers.awaited == {A, B}
-
-
 def test_a_network_without_any_answers_does_not_stop_the_road(tmp_path: Path) -> None:
     """All tokens are there and no message comes through: the first vehicles pay, once."""
     names = [f"v{number:02d}" for number in range(12)]
@@ -326,16 +287,6 @@ def test_a_network_without_any_answers_does_not_stop_the_road(tmp_path: Path) ->
     silent = [event["vehicle"] for event in read_events(tmp_path, "agent-silent")]
     assert sorted(silent) == names
     assert {e["reason"] for e in read_events(tmp_path, "caretaker-took-over")} == {"silent"}
-
-
-def test_the_network_may_come_back(desk: Desk) -> None:
-    desk.drive(lambda: desk.core._answers.all_silent and desk.core.phase is TickPhase.PACE, A, B)
-    desk.wake()
-    assert desk.core.phase is TickPhase.PACE  # no agent was awaited
-    for name in (A, B):
-        desk.answer(name, tick=desk.core.tick - 1)
-    desk.wake()
-    assert desk.core._answers.awaited == {A, B}
 
 
 # --- the entrance -----------------------------------------------------------------------------

@@ -12,13 +12,7 @@ import pytest
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.network_namespaces import GroupNetwork, NamespacesUnavailableError
 from laneweave.launch.faults.shared_counters import MessageFaults, SharedBoard
-from laneweave.launch.faults.specification import (
-    FaultSpec,
-    Kill,
-    Partition,
-    Pause,
-    load_faults,
-)
+from laneweave.launch.faults.specification import FaultSpec, Kill, Partition, Pause, load_faults
 from laneweave.launch.run.local_run import add_faults, fault_injection
 from laneweave.launch.run.outcome import Outcome
 from laneweave.launch.run.role_processes import RoleProcesses, RoleStart
@@ -214,10 +208,7 @@ def test_a_simulated_run_supports_almost_all_faults(
 @pytest.mark.parametrize(
     ("faults", "name"),
     [
-        (
-            FaultSpec(pause=(Pause(at_s=1.0, target="router", for_s=1.0),)),
-            "pause[0].target",
-        ),
+        (FaultSpec(pause=(Pause(at_s=1.0, target="router", for_s=1.0),)), "pause[0].target"),
         (
             FaultSpec(
                 partition=(CUT, Partition(between=("bridge", "others"), method="namespaces"))
@@ -227,10 +218,7 @@ def test_a_simulated_run_supports_almost_all_faults(
     ],
 )
 def test_unsupported_faults_are_refused(
-    simulate: Callable[[str, FaultSpec], Outcome],
-    tmp_path: Path,
-    faults: FaultSpec,
-    name: str,
+    simulate: Callable[[str, FaultSpec], Outcome], tmp_path: Path, faults: FaultSpec, name: str
 ) -> None:
     with pytest.raises(BadInputError) as caught:
         simulate("out", faults)

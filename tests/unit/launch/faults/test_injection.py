@@ -140,9 +140,7 @@ def test_a_restart_comes_after_wall_clock_time() -> None:
 def test_a_pause_ends_after_wall_clock_time_and_a_paused_role_is_no_target() -> None:
     roles, view = FakeRoles(), on_road()
     faults = injection(
-        roles,
-        pause=(Pause(at_s=5.0, target="c2", for_s=2.0),),
-        kill=(Kill(at_s=5.5, target="c2"),),
+        roles, pause=(Pause(at_s=5.0, target="c2", for_s=2.0),), kill=(Kill(at_s=5.5, target="c2"),)
     )
     faults.step(5.0, 100.0, view)
     faults.step(5.5, 100.5, view)

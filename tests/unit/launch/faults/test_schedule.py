@@ -46,11 +46,7 @@ def test_a_fault_may_repeat_until_the_end_of_the_run() -> None:
 
 
 def test_several_targets_at_one_time_are_several_events() -> None:
-    assert times_s(FaultSpec(kill=(Kill(at_s=5.0, target="agent", count=3),))) == [
-        5.0,
-        5.0,
-        5.0,
-    ]
+    assert times_s(FaultSpec(kill=(Kill(at_s=5.0, target="agent", count=3),))) == [5.0, 5.0, 5.0]
 
 
 def test_times_are_drawn_between_bounds_in_order() -> None:

@@ -137,10 +137,7 @@ def test_a_file_may_have_every_field(tmp_path: Path) -> None:
         ('[[partition]]\nbetween = ["bridge", "bridge"]', "partition[0].between"),
         ('[[partition]]\nbetween = ["others", "bridge"]', "partition[0].between"),
         ('[[partition]]\nbetween = ["router", "others"]', "partition[0].between"),
-        (
-            '[[partition]]\nbetween = ["bridge", "others"]\nmethod = "magic"',
-            "partition[0].method",
-        ),
+        ('[[partition]]\nbetween = ["bridge", "others"]\nmethod = "magic"', "partition[0].method"),
         (
             '[[partition]]\nbetween = ["bridge", "vehicles"]\nmethod = "namespaces"',
             "partition[0].method",

@@ -35,17 +35,6 @@ def test_a_vehicle_that_does_not_wait_enters_where_it_would_have_driven() -> Non
     assert entered.speed_mps == 15.0
 
 
-def test_a_lone_vehicle_takes_as_long_as_the_road_is() -> None:
-    road = RuleRoad(PAPER)
-    road.entrance.queue(arrival("v1", 0.04, 0, 2))
-    road.step()
-    road.run(100.0)
-    (one,) = road.left
-    left_s = road.t_s - (one.s_m - 1000.0) / one.speed_mps
-    assert left_s - one.entered_s == pytest.approx(1000.0 / 15.0, abs=1e-6)
-    assert one.lane == 2
-
-
 def test_a_vehicle_without_room_waits_as_briefly_as_possible() -> None:
     road = RuleRoad(rule_scenario(gap="net"))
     road.entrance.queue(arrival("v1", 0.1))
@@ -180,10 +169,7 @@ def test_no_vehicle_slides_sideways() -> None:
     [
         ({"rule": {"stop_distance_m": 600.0}}, "rule.stop_distance_m"),
         ({"rule": {"stop_distance_m": 20.0}}, "rule.stop_distance_m"),
-        (
-            {"road": {"s3_m": 150.0}, "formation": {"operation": "paper"}},
-            "rule.stop_distance_m",
-        ),
+        ({"road": {"s3_m": 150.0}, "formation": {"operation": "paper"}}, "rule.stop_distance_m"),
         ({"road": {"lanes": 8}, "rule": {"lane_change_s": 5.0}}, "rule.lane_change_s"),
     ],
 )

@@ -14,7 +14,7 @@ from laneweave.protocol.wire.messages import Ballot, Command, Name
 from laneweave.sim_bridge.bodies.motion_controller import MAX_COLUMN, MotionController, Rung
 from support import states
 from support.paper import PAPER
-from support.road_vehicles import controller_in
+from support.road_vehicles import controller_in, known
 
 SCENARIO = PAPER
 LATTICE, TICK_S = SCENARIO.lattice, SCENARIO.runtime.tick_s
@@ -102,19 +102,6 @@ def test_a_command_without_jerks_leaves_the_motion_as_it_is_unless_it_names_anot
 
 
 # --- the process in charge --------------------------------------------------------------------
-
-
-def known(controller: MotionController) -> tuple[object, ...]:
-    return (
-        controller.attendant,
-        controller.joined,
-        controller.accepted,
-        controller.command_tick,
-        controller.hold_cell,
-        controller.motion_origin,
-        controller.motion_end_tick,
-        plays(controller, 3),
-    )
 
 
 def test_a_new_vehicle_has_no_process_in_charge() -> None:

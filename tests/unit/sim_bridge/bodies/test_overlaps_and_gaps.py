@@ -84,14 +84,6 @@ def test_touching_is_not_overlapping() -> None:
     assert pairs((20.0, 1.75, 0.0, 15.0)) == [("a", "b")]
 
 
-def test_rotation_counts() -> None:
-    straight = (20.0, 1.75, 0.0, 15.0)
-    beside = (20.0, 1.75 + WIDTH_M + 0.1, 0.0, 15.0)
-    turned = (20.0, 1.75 + WIDTH_M + 0.1, 0.2, 15.0)
-    assert bodies({"a": straight, "b": beside}).overlapping_pairs() == []
-    assert bodies({"a": straight, "b": turned}).overlapping_pairs() == [("a", "b")]
-
-
 def test_corners_of_a_rotated_body_match_its_pose() -> None:
     pose = (20.0, 5.0, 0.3, 15.0)
     shape = np.array(corners(pose, LENGTH_M, WIDTH_M))
@@ -172,45 +164,12 @@ def sense(
     }
 
 
-def test_sensing_sees_the_nearest_in_its_own_and_adjacent_lanes() -> None:
-    road = {
-        "ego": (100.0, 1.75, 0.0, 15.0),
-        "ahead": (120.0, 1.75, 0.0, 14.0),
-        "far ahead": (140.0, 1.75, 0.0, 13.0),
-        "left behind": (97.0, 5.25, 0.0, 16.0),
-        "two lanes over": (110.0, 8.75, 0.0, 12.0),
-    }
-    seen = sense(road)
-    assert seen["ego"].ahead == (Neighbour(0, 15.0, 14.0),)
-    assert seen["left behind"].ahead == (Neighbour(0, -2.0, 15.0), Neighbour(2, 8.0, 12.0))
-    assert seen["far ahead"].ahead == seen["two lanes over"].ahead == ()
-    assert seen["ego"].behind == (Neighbour(1, -2.0, 16.0),)
-    assert seen["left behind"].behind == ()
-    assert seen["far ahead"].behind == (Neighbour(0, 15.0, 14.0), Neighbour(1, 38.0, 16.0))
-    assert seen["two lanes over"].behind == (Neighbour(1, 8.0, 16.0),)
-
-
 def test_sensing_sees_how_others_accelerate() -> None:
     road = {"first": (120.0, 1.75, 0.0, 14.0), "ego": (100.0, 1.75, 0.0, 15.0)}
     seen = sense(road, {"first": -2.5, "ego": 1.5})
     assert seen["ego"].ahead == (Neighbour(0, 15.0, 14.0, -2.5),)
     assert seen["first"].behind == (Neighbour(0, 15.0, 15.0, 1.5),)
     assert sense(road)["ego"].ahead == (Neighbour(0, 15.0, 14.0, 0.0),)
-
-
-def test_a_vehicle_between_lanes_is_seen_in_both_and_sees_further() -> None:
-    road = {
-        "changing": (100.0, 3.5, 0.1, 15.0),
-        "right": (80.0, 1.75, 0.0, 15.0),
-        "left": (80.0, 8.75, 0.0, 15.0),
-        "far ahead": (140.0, 8.75, 0.0, 15.0),
-    }
-    seen = sense(road)
-    assert [other.lane for other in seen["right"].ahead] == [0, 1]
-    assert [other.lane for other in seen["left"].ahead] == [1, 2]
-    assert [other.lane for other in seen["changing"].ahead] == [2]
-    assert [other.lane for other in seen["changing"].behind] == [0, 2]
-    assert [other.lane for other in seen["far ahead"].behind] == [1, 2]
 
 
 @given(ROADS)

@@ -59,12 +59,6 @@ def within(state: State, limits: Vehicle = LIMITS) -> bool:
 # --- how it follows -------------------------------------------------------------------------------
 
 
-def test_without_lag_a_jerk_within_the_limits_is_integrated_exactly() -> None:
-    plant = Plant(CRUISE, RIGID, TICK_S)
-    assert plant.step(3.0, -2.0) == pytest.approx(integrate(CRUISE, (3.0, -2.0), TICK_S))
-    assert plant.setpoint == pytest.approx((0.3, -0.2))
-
-
 @given(SMALL, st.floats(0.05, 1.0), st.floats(0.05, 1.0))
 @settings(max_examples=25, deadline=None)
 def test_it_follows_its_set_point_as_a_first_order_lag_does(
@@ -100,13 +94,6 @@ def test_what_it_pursues_moves_as_if_there_were_no_lag(
     s, v, _, y, v_y, _ = plant.state
     assert relative[0] - s == pytest.approx(lag_s * (v - speed_mps), abs=1e-9)
     assert relative[3] - y == pytest.approx(lateral_lag_s * v_y, abs=1e-9)
-
-
-def test_a_body_at_rest_in_the_lattice_is_at_its_commanded_position() -> None:
-    assert commanded_state(CRUISE, (0.0, 0.0), LIMITS, V_F) == CRUISE
-    assert commanded_state((0.0, 16.0, 1.0, 2.0, 0.5, -1.0), (2.0, 0.3), LIMITS, V_F) == (
-        pytest.approx((0.2, 16.2, 2.0, 2.05, 0.4, 0.3))
-    )
 
 
 # --- limits ---------------------------------------------------------------------------------------

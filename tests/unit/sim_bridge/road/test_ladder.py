@@ -69,9 +69,7 @@ def track() -> Track:
 # --- the rungs ------------------------------------------------------------------------------------
 
 
-def test_it_plays_a_command_as_long_as_it_could_still_brake(
-    track: Track,
-) -> None:
+def test_it_plays_a_command_as_long_as_it_could_still_brake(track: Track) -> None:
     """Four metres behind one that is as fast: nothing that it would do by itself."""
     track.put_ahead(4.0, V_F)
     track.command(*[(0.0, 0.0)] * 40)

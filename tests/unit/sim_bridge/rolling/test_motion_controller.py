@@ -57,8 +57,6 @@ PROMISE = order(MID)
 ACCEPTANCE = order(MID, pending(A), MID)
 POSSESSION = order(MID, OPEN, MID)
 """Successive commands of an agent, each with everything that it requests."""
-NEXT_PROMISE = order(HIGH, OPEN)
-"""It has taken possession, and then promised more."""
 
 
 def kept(controller: MotionController) -> tuple[object, ...]:
