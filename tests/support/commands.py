@@ -1,4 +1,4 @@
-"""Commands that tests run to their end."""
+"""Commands that tests run to their end, in a process of their own or in this one."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+
+import pytest
+from attrs import frozen
+
+from laneweave.launch.cli import main as cli
 
 LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
 
@@ -35,3 +40,22 @@ def loads(module: str, other: str) -> bool:
     done = python(program)
     assert done.returncode == 0, done.stderr
     return done.stdout == "True\n"
+
+
+@frozen
+class Here:
+    """Runs `laneweave ARGUMENTS` in this process."""
+
+    _capsys: pytest.CaptureFixture[str]
+
+    def __call__(self, *arguments: object) -> tuple[int, str, list[str]]:
+        """Return the exit status, the output, and the lines of stderr."""
+        status = cli._status(list(map(str, arguments)))
+        written = self._capsys.readouterr()
+        return status, written.out, written.err.splitlines()
+
+    def refused(self, *arguments: object) -> str:
+        """Return the one line with which a command is refused."""
+        status, out, errors = self(*arguments)
+        assert (status, out, len(errors)) == (2, "", 1), errors
+        return errors[0]

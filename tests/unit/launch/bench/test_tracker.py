@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 
-import pytest
-
 from laneweave.agents.driving.tracker import Tracker
 from laneweave.launch.bench.tracker import SITUATIONS, bench_tracker, drive, tracker_table
-from laneweave.launch.cli import main as cli
 from laneweave.protocol.scenario.fields import Scenario
+from support.commands import Here
 
 SCENARIO = Scenario()
 
@@ -33,8 +31,8 @@ def test_episodes_repeat() -> None:
         assert jerks[0] == jerks[1]
 
 
-def test_json_has_a_result_for_each_situation(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli._status(["bench", "tracker", "--instances", "1", "--seed", "3", "--json"]) == 0
-    shown = json.loads(capsys.readouterr().out)
+def test_json_has_a_result_for_each_situation(laneweave: Here) -> None:
+    _, out, _ = laneweave("bench", "tracker", "--instances", 1, "--seed", 3, "--json")
+    shown = json.loads(out)
     assert shown["benchmark"] == "tracker"
     assert len(shown["results"]) == len(SITUATIONS)

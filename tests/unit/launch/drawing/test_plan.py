@@ -15,13 +15,13 @@ from PIL import Image
 
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.launch.cli import main as cli
 from laneweave.launch.cli import plan_answers
 from laneweave.launch.cli.plan_answers import answer_request
 from laneweave.launch.drawing import plan as plan_drawing
 from laneweave.launch.drawing.plan import check_drawing, plan_figure, write_gif, write_png
 from laneweave.launch.run import logs
 from laneweave.protocol.errors import BadInputError
+from support.commands import Here
 
 CASE_STUDY = Path(__file__).resolve().parents[4] / "docs" / "examples" / "case-study.json"
 REQUEST = PlanRequest.from_dict(json.loads(CASE_STUDY.read_text(encoding="utf-8")))
@@ -58,12 +58,6 @@ def cell_of(body: FancyBboxPatch) -> tuple[int, int]:
 def outlines(axes: Axes, label: str) -> list[Rectangle]:
     found = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
     return [patch for patch in found if patch.get_label() == label]
-
-
-@pytest.fixture(autouse=True)
-def _logs_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command would bind them to a stream that ends with the test."""
-    monkeypatch.setattr(logs, "log_to_terminal", lambda: None)
 
 
 def test_a_panel_per_time_point_shows_all_vehicles() -> None:
@@ -186,20 +180,14 @@ def test_names_are_short_and_harmless() -> None:
     ],
 )
 def test_bad_places_are_refused_before_planning(
-    name: str,
-    allowed: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    laneweave: Here, name: str, allowed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "file").touch()
     monkeypatch.setattr(plan_answers, "plan", None)
-    assert cli._status(["plan", str(CASE_STUDY), "--draw", str(tmp_path / name)]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("--draw: got ")
-    assert allowed in captured.err
+    line = laneweave.refused("plan", CASE_STUDY, "--draw", tmp_path / name)
+    assert line.startswith("--draw: got ")
+    assert allowed in line
 
 
 def test_the_check_leaves_nothing_behind(tmp_path: Path) -> None:
@@ -217,33 +205,27 @@ def test_a_read_only_folder_is_refused() -> None:
 
 @pytest.mark.parametrize("endpoint", [None, "tcp/127.0.0.1:1"])
 def test_the_answer_is_printed_and_drawn(
-    endpoint: str | None,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    laneweave: Here, endpoint: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plan_answers, "plan", lambda *_, **__: PLAN)
     monkeypatch.setattr(plan_answers, "_ask", lambda *_: PLAN)
-    arguments = ["plan", str(CASE_STUDY), "--draw", str(tmp_path / "plan.png")]
-    arguments += [] if endpoint is None else ["--connect", endpoint]
-    assert cli._status(arguments) == 0
-    assert json.loads(capsys.readouterr().out) == PLAN.to_dict()
+    connect = () if endpoint is None else ("--connect", endpoint)
+    status, out, _ = laneweave("plan", CASE_STUDY, "--draw", tmp_path / "plan.png", *connect)
+    assert (status, json.loads(out)) == (0, PLAN.to_dict())
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_failed_drawing_is_reported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    laneweave: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(plan_answers, "plan", lambda *_, **__: PLAN)
     monkeypatch.setattr(plan_drawing, "draw_plan", full)
-    assert cli._status(["plan", str(CASE_STUDY), "--draw", str(tmp_path / "plan.png")]) == 1
-    captured = capsys.readouterr()
-    assert json.loads(captured.out)["cost"] == 7
-    assert "not drawn" in captured.err
-    assert len(captured.err.splitlines()) == 1
+    status, out, (line,) = laneweave("plan", CASE_STUDY, "--draw", tmp_path / "plan.png")
+    assert (status, json.loads(out)["cost"]) == (1, 7)
+    assert "not drawn" in line
 
 
 def test_without_draw_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from PIL import Image
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
-from laneweave.launch.cli import main as cli
 from laneweave.launch.cli import plan_answers
 from laneweave.launch.drawing import figures as drawing
 from laneweave.launch.drawing import plan_on_road as road_drawing
@@ -33,6 +32,7 @@ from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import cell_state
+from support.commands import Here
 
 EXAMPLES = Path(__file__).resolve().parents[4] / "docs" / "examples"
 CASE_STUDY = EXAMPLES / "case-study.json"
@@ -41,12 +41,6 @@ NAMES = [vehicle.id for vehicle in REQUEST.vehicles]
 PLAN = plan(REQUEST)
 NO_PLAN = PlanResponse("infeasible", None, None, None, (), (), 1.0, 1, 1)
 SCENARIO = Scenario()
-
-
-@pytest.fixture(autouse=True)
-def _logs_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command would bind them to a stream that ends with the test."""
-    monkeypatch.setattr(logs, "log_to_terminal", lambda: None)
 
 
 @pytest.fixture(scope="module")
@@ -162,10 +156,10 @@ def test_an_animation_has_a_frame_for_each_tick(tmp_path: Path) -> None:
     ("scenario", "shown"), [(None, "3 steps of 4 s"), ("[formation]\ncycle_s = 6.0", "of 6 s")]
 )
 def test_the_road_is_drawn_beside_the_answer(
+    laneweave: Here,
     scenario: str | None,
     shown: str,
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A configuration that names no router says how the road is; the plan is made here."""
@@ -176,12 +170,10 @@ def test_the_road_is_drawn_beside_the_answer(
         drawing.save(figure, out, dpi)
 
     monkeypatch.setattr(road_drawing, "save", noted)
-    arguments = ["plan", str(CASE_STUDY), "--draw-road", str(tmp_path / "road.png")]
-    if scenario is not None:
-        (tmp_path / "road.toml").write_text(scenario, encoding="utf-8")
-        arguments += ["--config", str(tmp_path / "road.toml")]
-    assert cli._status(arguments) == 0
-    assert json.loads(capsys.readouterr().out)["cost"] == 7
+    (tmp_path / "road.toml").write_text(scenario or "", encoding="utf-8")
+    config = () if scenario is None else ("--config", tmp_path / "road.toml")
+    status, out, _ = laneweave("plan", CASE_STUDY, "--draw-road", tmp_path / "road.png", *config)
+    assert (status, json.loads(out)["cost"]) == (0, 7)
     assert (tmp_path / "road.png").read_bytes().startswith(b"\x89PNG")
     assert shown in titles[0]
 
@@ -195,16 +187,9 @@ def test_the_road_is_drawn_beside_the_answer(
     ],
 )
 def test_what_cannot_be_drawn_is_refused_in_one_line(
-    options: list[str],
-    line: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    laneweave: Here, options: list[str], line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "fast.toml").write_text("[formation]\nmove_s = 1.0", encoding="utf-8")
     monkeypatch.setattr(plan_answers, "plan", None)
-    assert cli._status(["plan", str(CASE_STUDY), *options]) == 2
-    captured = capsys.readouterr()
-    assert (captured.out, len(captured.err.splitlines())) == ("", 1)
-    assert captured.err.startswith(line)
+    assert laneweave.refused("plan", CASE_STUDY, *options).startswith(line)

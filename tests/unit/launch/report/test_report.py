@@ -14,29 +14,15 @@ import pytest
 from attrs import evolve
 from PIL import Image
 
-from laneweave.launch.cli import main as cli
 from laneweave.launch.recordings.runs import POINT_FILE, Comparison, runs_of
 from laneweave.launch.report.page import Animation, Section, render_page
 from laneweave.launch.report.tables import Table, tables_of
+from support.commands import Here
 from support.summaries import make_summary
 
-FIGURES = {
-    "travel_times.png",
-    "flows.png",
-    "speeds.png",
-    "road-formation.png",
-    "path_map.png",
-    "spacing.png",
-    "comfort.png",
-}
-RUN_FIGURES = {
-    "travel_time.png",
-    "speed.png",
-    "road.png",
-    "path_map.png",
-    "spacing.png",
-    "comfort.png",
-}
+ALWAYS = {"path_map.png", "spacing.png", "comfort.png"}
+FIGURES = ALWAYS | {"travel_times.png", "flows.png", "speeds.png", "road-formation.png"}
+RUN_FIGURES = ALWAYS | {"travel_time.png", "speed.png", "road.png"}
 
 
 class Reader(HTMLParser):
@@ -89,14 +75,10 @@ def check_page(page: Path, pictures: int) -> Reader:
     return reader
 
 
-def report(*arguments: object) -> int:
-    return cli._status(["report", *map(str, arguments)])
-
-
-def test_of_a_sweep(swept: Path, tmp_path: Path) -> None:
+def test_of_a_sweep(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     folder = tmp_path / "a <b> & 'c'"  # a name that needs escaping
     shutil.copytree(swept, folder)
-    assert report(folder) == 0
+    assert laneweave("report", folder)[0] == 0
     assert {path.name for path in (folder / "figures").iterdir()} == FIGURES
     for name in FIGURES:
         with Image.open(folder / "figures" / name) as image:
@@ -107,17 +89,17 @@ def test_of_a_sweep(swept: Path, tmp_path: Path) -> None:
     assert [one["title"] for one in reader.data] == ["formation, 1600 veh/(lane·h), seed 1"]
 
 
-def test_of_a_run(swept: Path, tmp_path: Path) -> None:
+def test_of_a_run(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(swept / "formation-1600-1", folder)
-    assert report(folder, "--formation", 2) == 0
+    assert laneweave("report", folder, "--formation", 2)[0] == 0
     assert {path.name for path in folder.glob("*.png")} == RUN_FIGURES
     reader = check_page(folder / "report.html", len(RUN_FIGURES))
     assert "laneweave run: run" in reader.texts
     assert len(reader.data) == 1
 
 
-def test_of_a_run_without_formations(swept: Path, tmp_path: Path) -> None:
+def test_of_a_run_without_formations(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(swept / "formation-1000-1", folder)
     for file, name in (("trips.parquet", "formation"), ("trajectories.parquet", "column")):
@@ -125,18 +107,18 @@ def test_of_a_run_without_formations(swept: Path, tmp_path: Path) -> None:
         place = whole.schema.get_field_index(name)
         nothing = pa.nulls(whole.num_rows, whole.schema.field(name).type)
         pq.write_table(whole.set_column(place, whole.schema.field(name), nothing), folder / file)
-    assert report(folder) == 0
+    assert laneweave("report", folder)[0] == 0
     assert {path.name for path in folder.glob("*.png")} == RUN_FIGURES - {"path_map.png"}
     reader = check_page(folder / "report.html", len(RUN_FIGURES) - 1)
     assert {vehicle["formation"] for vehicle in reader.data[0]["vehicles"]} == {None}
 
 
-def test_of_several_runs(swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_of_several_runs(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     folders = [tmp_path / "first", tmp_path / "second"]
     for folder in folders:
         shutil.copytree(swept / "formation-1600-1", folder)
-    assert report(*folders, "--out", tmp_path / "both") == 0
-    assert capsys.readouterr().out.count(": written") == 3
+    status, out, _ = laneweave("report", *folders, "--out", tmp_path / "both")
+    assert (status, out.count(": written")) == (0, 3)
     texts = check_page(tmp_path / "both" / "report.html", len(FIGURES) + 1).texts
     # Same method, volume and seed: only their folders tell them apart.
     assert {"first", "second"} <= set(texts)
@@ -169,10 +151,10 @@ def test_runs_that_failed_are_listed_and_not_averaged(swept: Path, tmp_path: Pat
     ],
 )
 def test_one_line_says_what_is_wrong(
+    laneweave: Here,
     swept: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
     arguments: list[str],
     said: str,
 ) -> None:
@@ -188,21 +170,18 @@ def test_one_line_says_what_is_wrong(
         Path(name).mkdir()
     Path("torn", "trajectories.parquet").write_bytes(b"PAR1")
     Path("begun", "sweep.json").touch()
-    assert report(*arguments) == 2
-    shown = capsys.readouterr()
-    assert (shown.out, len(shown.err.splitlines())) == ("", 1)
-    assert said in shown.err
+    assert said in laneweave.refused("report", *arguments)
 
 
 def test_an_error_of_the_report_is_not_reported_as_bad_input(
-    swept: Path, monkeypatch: pytest.MonkeyPatch
+    laneweave: Here, swept: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object, **__: object) -> None:
         raise KeyError("a bug")
 
     monkeypatch.setattr("laneweave.launch.report.build.report_run", fail)
     with pytest.raises(KeyError, match="a bug"):
-        report(swept / "formation-1000-1")
+        laneweave("report", swept / "formation-1000-1")
 
 
 def test_a_page_escapes_its_texts() -> None:

@@ -7,20 +7,18 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from typer.testing import CliRunner
 
-from laneweave.launch.cli.main import command_line
 from laneweave.launch.run.outcome import Outcome
 from laneweave.launch.run.reference_run import ReferenceRun, check_reference
 from laneweave.launch.run_methods import LC2013, RULE
 from laneweave.protocol.config.loading import parse_scenario, to_tables
-from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines import reference_road as road
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from support.bridge_bench import read_events, read_summary
+from support.commands import Here
 
 METHODS = (RULE, LC2013)
 each_method = pytest.mark.parametrize("method", METHODS)
@@ -148,25 +146,13 @@ def test_an_interrupted_run_leaves_its_summary(
 
 
 @each_method
-def test_the_command_leaves_all_files(tmp_path: Path, method: str) -> None:
+def test_the_command_leaves_all_files(laneweave: Here, tmp_path: Path, method: str) -> None:
     out = tmp_path / "run"
-    options = ("--duration", "5", "--volume", "600", "--out", str(out))
-    done = CliRunner().invoke(command_line(), ["run", "--method", method, *options])
-    assert done.exit_code == 0
+    options = ("--duration", 5, "--volume", 600, "--out", out)
+    assert laneweave("run", "--method", method, *options)[0] == 0
     assert {path.name for path in out.iterdir()} == {
         *("events.jsonl", "log.jsonl", "summary.json"),
         *("ticks.parquet", "trajectories.parquet", "trips.parquet"),
         *("road.png", "speed.png", "travel_time.png"),
         *("comfort.png", "spacing.png", "report.html"),
     }
-
-
-@each_method
-def test_faults_are_refused(tmp_path: Path, method: str) -> None:
-    out = tmp_path / "run"
-    done = CliRunner().invoke(
-        command_line(), ["run", "--method", method, "--faults", "lossy10", "--out", str(out)]
-    )
-    assert isinstance(done.exception, BadInputError)
-    assert done.exception.field == "--faults"
-    assert not out.exists()

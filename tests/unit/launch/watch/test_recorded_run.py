@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from laneweave.launch.cli.main import command_line
 from laneweave.launch.recordings.runs import single_run
 from laneweave.launch.recordings.trajectories import read_tracks
 from laneweave.launch.watch.frames import MOVING
 from laneweave.launch.watch.recorded_run import Recording
 from laneweave.protocol.errors import BadInputError
+from support.commands import Here
 from support.older_recordings import older_recording
 
 
@@ -139,6 +139,5 @@ def test_a_run_with_damaged_events_is_refused(recorded: Path, tmp_path: Path) ->
         (["--endpoint", "udp/127.0.0.1:1"], "network.endpoint"),
     ],
 )
-def test_bad_input_of_the_command(arguments: list[str], words: str) -> None:
-    with pytest.raises(BadInputError, match=words):
-        command_line()(["watch", *arguments, "--listen", "127.0.0.1:0"], standalone_mode=False)
+def test_bad_input_of_the_command(laneweave: Here, arguments: list[str], words: str) -> None:
+    assert words in laneweave.refused("watch", *arguments, "--listen", "127.0.0.1:0")
