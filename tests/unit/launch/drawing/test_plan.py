@@ -19,7 +19,6 @@ from laneweave.launch.cli import plan_answers
 from laneweave.launch.cli.plan_answers import answer_request
 from laneweave.launch.drawing import plan as plan_drawing
 from laneweave.launch.drawing.plan import check_drawing, plan_figure, write_gif, write_png
-from laneweave.launch.run import logs
 from laneweave.protocol.errors import BadInputError
 from support.commands import Here
 

@@ -27,7 +27,6 @@ from laneweave.launch.drawing.plan_on_road import (
     drive_plan,
     road_figure,
 )
-from laneweave.launch.run import logs
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
