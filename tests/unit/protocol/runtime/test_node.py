@@ -47,7 +47,7 @@ from laneweave.protocol.runtime.transport import (
 )
 from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.codec import MAX_BYTES, decode, encode
-from laneweave.protocol.wire.messages import Census, Heartbeat, Name, Report, RoadClock
+from laneweave.protocol.wire.messages import Heartbeat, Name, Report, RoadClock
 from support.node_recorder import Recorder, at_start
 
 KEYS = topics.Keys("r")
@@ -83,15 +83,10 @@ def bench() -> Bench:
 # --- what comes in ----------------------------------------------------------------------------
 
 
-def test_a_message_arrives_typed(bench: Bench) -> None:
-    bench.node.deliver(Received(BEAT_KEY, encode(BEAT)), 3.5)
-    assert bench.core.events == [(3.5, Arrived(topics.HEARTBEAT, {"coordinator": "c1"}, BEAT))]
-    assert bench.node.rejected == 0
-
-
 @pytest.mark.parametrize(
     ("delivery", "event"),
     [
+        (Received(BEAT_KEY, encode(BEAT)), Arrived(topics.HEARTBEAT, {"coordinator": "c1"}, BEAT)),
         (LinkUp(), LinkUp()),
         (LinkDown(), LinkDown()),
         (Query("any/key", b"q", 4), QueryArrived(4, b"q")),
@@ -230,18 +225,6 @@ def test_end_closes_the_transport_and_nothing_is_handled_any_more(bench: Bench) 
     bench.node.deliver(LinkDown(), 2.0)
     assert bench.core.events == events
     assert bench.transport.mock_calls == [call.close()]
-
-
-def test_nothing_is_sent_before_the_first_event(bench: Bench) -> None:
-    assert bench.transport.mock_calls == []
-    bench.node.dispatch(Started(), 0.0)
-    assert bench.core.events == [(0.0, Started())]
-
-
-def test_census_and_clock_have_no_parameters(bench: Bench) -> None:
-    bench.node.deliver(Received("laneweave/r/census", encode(Census(1.0, (), ()))), 1.0)
-    assert bench.core.events == [(1.0, Arrived(topics.CENSUS, {}, Census(1.0, (), ())))]
-    assert topics.CLOCK.parameters == ()
 
 
 # --- computations -----------------------------------------------------------------------------

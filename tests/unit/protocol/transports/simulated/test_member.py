@@ -177,15 +177,7 @@ def test_a_wakeup_that_moves_again_and_again_does_not_fill_the_queue(shift_s: fl
 
 
 def test_a_wakeup_is_not_lost_in_a_pause() -> None:
-    cores = {name: Recorder() for name in ("a", "b")}
-    for core, due_s in zip(cores.values(), (0.5, 2.5), strict=True):
-
-        def clear(event: Event, _: float, core: Recorder = core) -> Iterable[Effect]:
-            if isinstance(event, Wakeup):
-                core.wakeup_s = None
-            return ()
-
-        core.wakeup_s, core.on_event = due_s, clear
+    cores = {"a": alarmed(0.5), "b": alarmed(2.5)}
     network = network_of(more=cores)
     for name in cores:
         network.pause(name)
@@ -273,13 +265,3 @@ def test_computations_fail_at_the_given_rate_without_being_done(share: float) ->
     assert sorted([*done, *failed]) == list(range(1000))
     # Four standard deviations.
     assert abs(len(failed) - 1000 * share) <= 4 * (1000 * share * (1 - share)) ** 0.5
-
-
-def test_the_result_of_a_killed_node_goes_nowhere() -> None:
-    core = Recorder(at_start(Compute(1, lambda: 1)))
-    network = SimulatedNetwork(1, CALM)
-    network.add("a", core, REALM)
-    network.run(0.01)
-    network.kill("a")
-    network.run(1.0)
-    assert core.of(Computed) == []

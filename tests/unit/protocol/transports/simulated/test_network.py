@@ -82,16 +82,6 @@ def test_messages_overtake_each_other_with_jitter() -> None:
     assert all(0.102 <= now_s <= 0.112 + 1e-9 for now_s in receiver.times(node.Arrived))
 
 
-def test_messages_may_take_seconds_and_still_arrive() -> None:
-    receiver = listener()
-    network = network_of(Conditions(jitter_s=5.0), a=Recorder(), b=receiver)
-    send(network, "a", *range(200))
-    network.run(2.6)
-    assert 50 < len(receiver.numbers) < 150
-    network.run(5.2)
-    assert sorted(receiver.numbers) == list(range(200))
-
-
 def test_a_cut_loses_messages_where_it_says_until_it_heals() -> None:
     receivers = {name: listener() for name in ("b", "c")}
     network = network_of(more=receivers, a=Recorder())
@@ -166,29 +156,6 @@ def test_realms_in_one_network_do_not_mix() -> None:
     assert network.node("a").rejected == network.node("b").rejected == 0
 
 
-def test_subscriptions_may_change_between_messages() -> None:
-    receivers = {name: listener() for name in ("b", "c")}
-    network = network_of(more=receivers, a=Recorder())
-    send(network, "a", 1)
-    perform(network, "b", node.Unlisten(HEARTBEAT))
-    send(network, "a", 2)
-    perform(network, "b", node.Listen(HEARTBEAT, {"coordinator": "a"}))
-    send(network, "a", 3)
-    send(network, "c", 4)
-    network.run(0.2)
-    assert receivers["b"].numbers == [1, 3]
-    assert receivers["c"].numbers == [1, 2, 3, 4]
-
-
-def test_nothing_is_sent_to_who_has_left() -> None:
-    network = network_of(a=Recorder(), b=listener(), c=listener())
-    send(network, "a", 1)
-    network.kill("b")
-    network.conditions = Conditions(loss=1.0)
-    send(network, "a", 2)
-    assert network.dropped == 1
-
-
 # --- who is there -----------------------------------------------------------------------------
 
 
@@ -254,19 +221,6 @@ def test_what_a_watcher_sees_of_a_node(steps: list[str | float], seen: str) -> N
     assert watcher.tokens == [f"{sign}v" for sign in seen]
 
 
-def test_a_short_pause_is_not_noticed_and_loses_nothing() -> None:
-    network, watcher, sleeper = watched(node.Listen(HEARTBEAT))
-    network.pause("v")
-    send(network, "a", 1, 2)
-    network.run(0.3)
-    assert sleeper.numbers == []
-    network.resume("v")
-    assert sleeper.numbers == [1, 2]
-    assert sleeper.times(node.Arrived) == [0.3, 0.3]
-    network.run(2.0)
-    assert watcher.tokens == ["+v"]
-
-
 def test_a_node_that_is_silent_for_its_lease_is_given_up_and_comes_back_as_a_zombie() -> None:
     network, watcher, zombie = watched(node.Listen(HEARTBEAT))
     zombie.wakeup_s = 0.2
@@ -277,8 +231,10 @@ def test_a_node_that_is_silent_for_its_lease_is_given_up_and_comes_back_as_a_zom
     assert watcher.tokens == ["+v", "-v"]
     send(network, "a", 1)
     network.run(3.0)
+    assert zombie.numbers == []
     network.resume("v")
     assert zombie.numbers == [1]
+    assert zombie.times(node.Arrived) == [3.0]
     network.run(3.1)
     assert watcher.tokens == ["+v", "-v", "+v"]
     assert zombie.times(node.Wakeup)[0] == 3.0
@@ -358,19 +314,6 @@ def test_news_of_a_token_never_overtake_each_other(seed: int) -> None:
     perform(network, "v", token("v"))
     network.run(1.0)
     assert watcher.tokens == ["+v", "-v"] * 5 + ["+v"]
-
-
-def test_a_token_of_two_nodes_vanishes_with_the_last() -> None:
-    watcher = listener()
-    network = network_of(
-        a=watcher, b=Recorder(at_start(token("v"))), c=Recorder(at_start(token("v")))
-    )
-    network.kill("b")
-    network.run(0.5)
-    assert watcher.tokens == ["+v"]
-    network.kill("c")
-    network.run(1.0)
-    assert watcher.tokens == ["+v", "-v"]
 
 
 def test_a_node_started_again_under_its_name_gets_nothing_of_the_old_one() -> None:
@@ -458,7 +401,7 @@ def crowd(seed: int = 1) -> tuple[SimulatedNetwork, dict[str, Recorder]]:
     return network, cores
 
 
-def test_without_the_router_everybody_loses_everybody_at_once() -> None:
+def test_without_the_router_all_lose_all_at_once_and_find_it_one_after_the_other() -> None:
     network, cores = crowd()
     send(network, "a", 1)
     network.lose_router()
@@ -473,35 +416,17 @@ def test_without_the_router_everybody_loses_everybody_at_once() -> None:
         assert core.numbers == []
         assert core.of(LinkUp) == []
         assert len(core.tokens) == 4
-
-
-def test_the_nodes_find_the_router_again_one_after_the_other() -> None:
-    network, cores = crowd()
-    network.lose_router()
-    network.run(2.0)
     network.restore_router()
     network.restore_router()
-    network.run(2.0 + REJOIN_S[1] + 0.01)
+    network.run(5.0 + REJOIN_S[1] + 0.01)
     times = [core.times(LinkUp) for core in cores.values()]
-    assert all(len(one) == 1 and 2.2 <= one[0] <= 2.9 for one in times)
+    assert all(len(one) == 1 and 5.2 <= one[0] <= 5.9 for one in times)
     assert len({one[0] for one in times}) == len(cores)
     for core in cores.values():
         assert sorted(core.tokens[4:]) == ["+a", "+b", "+c", "+d"]
     send(network, "a", 3)
-    network.run(4.0)
+    network.run(7.0)
     assert [core.numbers for core in cores.values()] == [[3]] * 4
-
-
-def test_nodes_find_the_router_at_times_drawn_from_the_seed() -> None:
-    def join_times(seed: int) -> list[list[float]]:
-        network, cores = crowd(seed)
-        network.lose_router()
-        network.restore_router()
-        network.run(3.0)
-        return [core.times(LinkUp) for core in cores.values()]
-
-    assert join_times(1) == join_times(1)
-    assert join_times(1) != join_times(2)
 
 
 def test_a_router_that_is_lost_again_is_not_found() -> None:
@@ -573,9 +498,10 @@ def test_a_sleeper_looks_for_the_router_when_it_wakes() -> None:
 
 def test_a_node_may_be_killed_or_end_while_the_router_is_lost() -> None:
     network, cores = crowd()
+    cores["b"].on_event = lambda event, _: [node.End()] if isinstance(event, LinkDown) else []
     network.lose_router()
+    assert network.names == ("a", "c", "d")
     network.kill("a")
-    perform(network, "b", node.End())
     cores["c"].on_event = lambda event, _: [node.End()] if isinstance(event, LinkUp) else []
     network.restore_router()
     network.run(3.0)
@@ -601,16 +527,6 @@ def test_a_node_that_goes_while_it_looks_for_the_router_never_finds_it(
     assert cores["a"].of(LinkUp) == []
     for name in ("b", "c", "d"):
         assert sorted(cores[name].tokens[4:]) == ["+b", "+c", "+d"]
-
-
-def test_a_node_may_end_when_it_loses_the_router() -> None:
-    network, cores = crowd()
-    cores["b"].on_event = lambda event, _: [node.End()] if isinstance(event, LinkDown) else []
-    network.lose_router()
-    assert network.names == ("a", "c", "d")
-    network.restore_router()
-    network.run(3.0)
-    assert sorted(cores["a"].tokens[4:]) == ["+a", "+c", "+d"]
 
 
 # --- queries ----------------------------------------------------------------------------------
