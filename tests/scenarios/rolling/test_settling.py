@@ -112,20 +112,14 @@ def entering(offset_m: float) -> RoadVehicle:
     return vehicle
 
 
-@pytest.mark.parametrize("offset_m", [-7.5, 4.0, 7.5])
-def test_a_vehicle_enters_beside_its_cell_and_moves(offset_m: float) -> None:
+@pytest.mark.parametrize("offset_m", [-7.5, 0.0, 4.0, 7.5])
+def test_a_vehicle_that_enters_beside_its_cell_moves(offset_m: float) -> None:
     vehicle = entering(offset_m)
     controller = vehicle.controller
     assert vehicle.state == pytest.approx(beside(offset_m))
     assert (controller.hold_cell, controller.motion_origin) == (CELL, CELL)
-    assert controller.motion_end_tick == END_TICK
-    assert controller.moving(END_TICK - 1)
-
-
-def test_a_vehicle_that_enters_in_its_cell_holds() -> None:
-    controller = entering(0.0).controller
-    assert controller.motion_end_tick == 0
-    assert not controller.moving(BEGIN_TICK)
+    assert controller.motion_end_tick == (END_TICK if offset_m else 0)
+    assert controller.moving(BEGIN_TICK) is bool(offset_m)
 
 
 def drive(driver: TrackingDriver, plant: Plant, ticks: range) -> list[State]:

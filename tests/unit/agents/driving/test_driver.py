@@ -156,19 +156,20 @@ def test_a_motion_under_way_is_taken_over_where_it_is(scenario: Scenario, ticks:
     assert heir.motion(10 + 2 * REPEAT_TICKS) == (HOME, MOVE[2], 10, ticks)
 
 
-@pytest.mark.parametrize("end_tick", [0, 9, 10])
-def test_a_motion_whose_time_is_over_is_taken_over_as_a_hold(end_tick: int) -> None:
-    made = TrackingDriver(SCENARIO)
-    made.take_over(sense(motion_end_tick=end_tick, motion_origin=(-2, 1), motion_ticks=MOVE_TICKS))
-    assert made.at_rest(sense())
-    assert made.drive(sense(), moving=False).motion_origin == HOME
-
-
-@pytest.mark.parametrize("ticks", [0, MOVE_TICKS - 1, 2**63 - 1, -1])
-def test_a_move_of_an_impossible_duration_is_taken_over_as_a_hold(ticks: int) -> None:
-    heir = TrackingDriver(SCENARIO)
-    heir.take_over(sense(25, MOVE[2], motion_end_tick=48, motion_origin=HOME, motion_ticks=ticks))
-    drive = heir.drive(sense(25, MOVE[2]), moving=False)
+@pytest.mark.parametrize(
+    ("end_tick", "ticks"),
+    [*((end_tick, MOVE_TICKS) for end_tick in (0, 9, 25)),
+     *((48, ticks) for ticks in (0, MOVE_TICKS - 1, 2**63 - 1, -1))],
+)  # fmt: skip
+def test_a_motion_that_is_over_or_of_an_impossible_duration_is_taken_over_as_a_hold(
+    end_tick: int, ticks: int
+) -> None:
+    made, felt = TrackingDriver(SCENARIO), sense(25, MOVE[2])
+    made.take_over(
+        attrs.evolve(felt, motion_end_tick=end_tick, motion_origin=HOME, motion_ticks=ticks)
+    )
+    assert made.at_rest(felt)
+    drive = made.drive(felt, moving=False)
     assert (drive.motion_origin, drive.motion_ticks) == (MOVE[2], 0)
 
 
@@ -222,38 +223,17 @@ def test_the_commanded_state_is_tracked_and_not_the_bodys() -> None:
 LEAST_M = SCENARIO.tracking.min_gap_m
 
 
-@pytest.mark.parametrize(
-    ("ahead", "gap_m"),
-    [
-        ((), None),
-        ((Neighbour(1, 4.0, 15.0),), 4.0),
-        ((Neighbour(0, 3.5, 15.0), Neighbour(2, 4.0, 15.0)), None),
-        ((Neighbour(0, 3.5, 15.0), Neighbour(1, 4.5, 15.0), Neighbour(2, 4.0, 15.0)), 4.5),
-    ],
-    ids=["none", "own lane", "beside", "own lane counts only"],
-)
-def test_a_holding_vehicle_keeps_gaps_on_its_own_lane(
-    ahead: tuple[Neighbour, ...], gap_m: float | None
+@pytest.mark.parametrize(("moving", "gap_m"), [(False, 4.5), (True, 4.0)])
+def test_gaps_are_kept_on_the_own_lane_and_from_the_start_of_a_move_on_the_target_lane(
+    *, moving: bool, gap_m: float
 ) -> None:
     made, probe = probed()
-    felt = sense(ahead=ahead, behind=ahead)
-    made.drive(felt, moving=False)
-    if gap_m is None:
-        assert probe.gaps is NO_GAPS
-    else:
-        assert probe.gaps.latest is not None
-        assert probe.gaps.latest[0] == pytest.approx(felt.state[0] + gap_m - LEAST_M)
-        assert probe.gaps.earliest is not None
-        assert probe.gaps.earliest[0] == pytest.approx(felt.state[0] - gap_m + LEAST_M)
-
-
-def test_a_lane_change_keeps_gaps_on_the_target_lane_from_the_start() -> None:
-    made, probe = probed()
-    made.begin(MOVE, 10, MOVE_TICKS)
+    if moving:
+        made.begin(MOVE, 10, MOVE_TICKS)
     felt = sense(ahead=(Neighbour(0, 3.0, 15.0), Neighbour(1, 4.5, 15.0), Neighbour(2, 4.0, 15.0)))
-    made.drive(felt, moving=True)
+    made.drive(felt, moving=moving)
     assert probe.gaps.latest is not None
-    assert probe.gaps.latest[0] == pytest.approx(felt.state[0] + 4.0 - LEAST_M)
+    assert probe.gaps.latest[0] == pytest.approx(felt.state[0] + gap_m - LEAST_M)
 
 
 # --- when tracking fails ----------------------------------------------------------------------

@@ -108,18 +108,6 @@ def test_equal_seeds_give_equal_emergencies() -> None:
     assert emergencies.outcome(3, 5) != emergencies.outcome(4, 5)
 
 
-def test_one_vehicle_brakes_while_others_move() -> None:
-    chosen = (emergencies.random_situation(0, number) for number in range(1, 300, 3))
-    situation = next(one for one in chosen if 15 <= one.braking_tick - emergencies.MOVE_TICK <= 20)
-    assert situation.kind == "closing"
-    states = np.array(emergencies.play(situation).record.states)
-    ahead, follower = states[:, 0], states[:, 1]
-    before = situation.braking_tick + 1
-    assert ahead[:before, 1] == pytest.approx(15.0, abs=0.2)
-    assert (np.diff(ahead[before - 1 : before + 10, 1]) < 0.0).all()
-    assert follower[:before, 1].max() > 18.0
-
-
 # --- closing up -----------------------------------------------------------------------------------
 
 

@@ -79,13 +79,6 @@ def test_an_agent_that_is_not_in_charge_publishes_no_motion() -> None:
     ]
 
 
-def test_a_light_driver_publishes_no_motion() -> None:
-    rig = up_and_running(LightDriver)
-    rig.accept((0, HOME, (-1, 2)))
-    assert published(rig, 20) == []
-    assert rig.shown[-1].moving
-
-
 # --- subscriptions of a host ----------------------------------------------------------------------
 
 
@@ -381,9 +374,3 @@ def test_a_known_motion_makes_the_follower_brake_earlier_and_less(seed: int) -> 
     assert warned.min() > 0.85 * surprised.min()
     early = slice(BEGIN, BEGIN + 10)
     assert warned[early].min() < surprised[early].min() - 0.3
-
-
-def test_equal_seeds_give_equal_runs() -> None:
-    one, other, different = (follow(seed, broadcast=True)[0] for seed in (3, 3, 4))
-    assert (one == other).all()
-    assert (one != different).any()

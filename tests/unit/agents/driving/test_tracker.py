@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -109,42 +108,6 @@ def test_ideal_move_ends_in_the_target_cell_within_limits(dx: int, dy: int) -> N
         assert excess(state, first_jerk(result)) <= 1e-6
         assert result.iterations <= 25
     assert np.abs(error(log[-1][0], (dx, 1 + dy), 43)).max() < 0.01
-
-
-@pytest.mark.parametrize(("dx", "dy"), MOVES)
-def test_without_error_the_jerk_is_the_references(dx: int, dy: int) -> None:
-    reference = Reference.move(SCENARIO, (0, 1), (dx, 1 + dy), 0)
-    tracker = Tracker(SCENARIO)
-    for tick in (0, 7, 20, 37):
-        window = reference.window(tick)
-        state: State = tuple(window.states[0].tolist())
-        result = tracker.solve(state, window)
-        np.testing.assert_allclose(result.jerk, window.jerks, atol=1e-6)
-
-
-def test_moves_follow_one_another() -> None:
-    """The tracker has the reference of one move at a time, as in operation."""
-    state, tracker = cell_state(LATTICE, (0, 0), 0.0), Tracker(SCENARIO)
-    cells: list[Cell] = [(0, 0), (1, 1), (1, 2), (0, 1)]
-    for step, (origin, target) in enumerate(pairwise(cells)):
-        reference = Reference.move(SCENARIO, origin, target, 40 * step)
-        for tick in range(40 * step, 40 * step + 40):
-            result = tracker.solve(state, reference.window(tick))
-            state = integrate(state, first_jerk(result), TICK_S)
-            assert excess(state, first_jerk(result)) <= 1e-6
-        assert np.abs(error(state, target, 40 * step + 40)).max() < 0.01
-
-
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-@pytest.mark.parametrize(("dx", "dy"), [(0, 0), (1, 1), (-1, -1), (-1, 0), (0, 1)])
-def test_disturbed_start_converges(dx: int, dy: int, sign: float) -> None:
-    reference = Reference.move(SCENARIO, (0, 1), (dx, 1 + dy), 0)
-    start = shifted(
-        cell_state(LATTICE, (0, 1), 0.0), *(sign * e for e in (0.5, 0.5, 0, 0.5, 0.5, 0))
-    )
-    log = drive(reference, start, 90)
-    assert max(excess(state, first_jerk(result)) for state, result in log) <= 1e-3
-    assert np.abs(error(log[-1][0], (dx, 1 + dy), 90)).max() < 0.01
 
 
 @settings(max_examples=12, deadline=None)

@@ -171,13 +171,6 @@ def test_who_is_too_close_falls_back() -> None:
     assert end[1] == pytest.approx(SPEED_MPS, abs=0.1)
 
 
-def test_soft_brakes_begin_earlier() -> None:
-    limits = evolve(LIMITS, min_accel_mps2=-2.0, max_jerk_mps3=1.0)
-    history, _, least_accel = row(at_speed(0.0), [250.0], limits=limits, seconds=60.0)
-    assert least(history) >= MIN_GAP_M - 0.2
-    assert least_accel >= -1.2 - 1e-9
-
-
 def test_nobody_ahead_changes_nothing() -> None:
     state = body(0.0, 12.0)
     jerk = hold_law(state, body(3.0), LIMITS, TICK_S)

@@ -355,30 +355,25 @@ def test_a_field_whose_name_is_no_text_is_refused(sample: object, key: object) -
     )
 
 
+NEIGHBOUR = {"lane": 0, "gap_m": 1.0, "speed_mps": 1.0}
+
+
 @pytest.mark.parametrize(
-    ("name", "wrong", "field"),
+    ("name", "wrong", "path"),
     [
-        ("ahead", [{"lane": 0, "gap_m": 1.0}], "Sense.ahead[0].speed_mps"),
-        (
-            "ahead",
-            [{"lane": 0, "gap_m": 1.0, "speed_mps": 1.0}, {"lane": 0, "gap_m": "1"}],
-            "Sense.ahead[1].gap_m",
-        ),
-        ("ahead", [{"lane": 0, "gap_m": 1.0, "speed_mps": 1.0, "x": 1}], "Sense.ahead[0].x"),
-        ("ahead", [[0, 1.0, 1.0]], "Sense.ahead[0]"),
-        (
-            "behind",
-            [{"lane": 0, "gap_m": 1.0, "speed_mps": 1.0, "accel_mps2": None}],
-            "Sense.behind[0].accel_mps2",
-        ),
-        ("setpoint", [0.0, math.inf], "Sense.setpoint[1]"),
-        ("state", [0.0, 0.0, math.nan, 0.0, 0.0, 0.0], "Sense.state[2]"),
-        ("hold_cell", [0, "1"], "Sense.hold_cell[1]"),
+        ("ahead", [{"lane": 0, "gap_m": 1.0}], "[0].speed_mps"),
+        ("ahead", [NEIGHBOUR, NEIGHBOUR | {"gap_m": "1"}], "[1].gap_m"),
+        ("ahead", [NEIGHBOUR | {"x": 1}], "[0].x"),
+        ("ahead", [[0, 1.0, 1.0]], "[0]"),
+        ("behind", [NEIGHBOUR | {"accel_mps2": None}], "[0].accel_mps2"),
+        ("setpoint", [0.0, math.inf], "[1]"),
+        ("hold_cell", [0, "1"], "[1]"),
     ],
 )
-def test_the_path_leads_to_the_wrong_part(name: str, wrong: object, field: str) -> None:
+def test_the_path_leads_to_the_wrong_part(name: str, wrong: object, path: str) -> None:
     version, kind, body = envelope(SAMPLES[Sense])
-    assert refusal(decode, pack(version, kind, body | {name: wrong})).field == field
+    error = refusal(decode, pack(version, kind, body | {name: wrong}))
+    assert error.field == f"Sense.{name}{path}"
 
 
 def test_the_path_leads_into_maps() -> None:
@@ -433,16 +428,6 @@ def test_flipped_bits_never_give_wrong_types(sample: object) -> None:
             accepts_only_well_typed(bytes(flipped))
 
 
-def test_mixed_up_messages_never_give_wrong_types() -> None:
-    rng = random.Random(3)
-    parts = [value for sample in SAMPLES.values() for value in envelope(sample)[2].values()]
-    for _ in range(5000):
-        version, kind, body = envelope(rng.choice(list(SAMPLES.values())))
-        for name in rng.sample(list(body), k=min(len(body), 2)):
-            body[name] = rng.choice(parts)
-        accepts_only_well_typed(pack(version, kind, body))
-
-
 JUNK = st.recursive(
     st.none() | st.booleans() | INTS | st.floats() | st.text(max_size=5) | st.binary(max_size=5),
     lambda inner: (
@@ -459,10 +444,3 @@ def test_junk_in_a_field_never_gives_wrong_types(sample: object, data: st.DataOb
     version, kind, body = envelope(sample)
     name = data.draw(st.sampled_from(sorted(body)))
     accepts_only_well_typed(pack(version, kind, body | {name: data.draw(JUNK)}))
-
-
-@settings(max_examples=100, deadline=None)
-@given(JUNK)
-def test_junk_is_never_a_message(junk: object) -> None:
-    packed: bytes = msgpack.packb(junk)
-    assert not accepts_only_well_typed(packed)

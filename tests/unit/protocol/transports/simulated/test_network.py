@@ -156,6 +156,29 @@ def test_realms_in_one_network_do_not_mix() -> None:
     assert network.node("a").rejected == network.node("b").rejected == 0
 
 
+def test_subscriptions_may_change_between_messages() -> None:
+    receivers = {name: listener() for name in ("b", "c")}
+    network = network_of(more=receivers, a=Recorder())
+    send(network, "a", 1)
+    perform(network, "b", node.Unlisten(HEARTBEAT))
+    send(network, "a", 2)
+    perform(network, "b", node.Listen(HEARTBEAT, {"coordinator": "a"}))
+    send(network, "a", 3)
+    send(network, "c", 4)
+    network.run(0.2)
+    assert receivers["b"].numbers == [1, 3]
+    assert receivers["c"].numbers == [1, 2, 3, 4]
+
+
+def test_nothing_is_sent_to_who_has_left() -> None:
+    network = network_of(a=Recorder(), b=listener(), c=listener())
+    send(network, "a", 1)
+    network.kill("b")
+    network.conditions = Conditions(loss=1.0)
+    send(network, "a", 2)
+    assert network.dropped == 1
+
+
 # --- who is there -----------------------------------------------------------------------------
 
 
@@ -500,7 +523,7 @@ def test_a_node_may_be_killed_or_end_while_the_router_is_lost() -> None:
     network, cores = crowd()
     cores["b"].on_event = lambda event, _: [node.End()] if isinstance(event, LinkDown) else []
     network.lose_router()
-    assert network.names == ("a", "c", "d")
+    assert "b" not in network
     network.kill("a")
     cores["c"].on_event = lambda event, _: [node.End()] if isinstance(event, LinkUp) else []
     network.restore_router()
