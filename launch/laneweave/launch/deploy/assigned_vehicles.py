@@ -1,4 +1,4 @@
-"""The vehicles that an agent process drives and its identity, from the command line."""
+"""Vehicles and identity of an agent process, from the command line."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ ALL_VEHICLES = "0/1"
 
 @frozen
 class AssignedVehicles:
-    """The vehicles that an agent process drives."""
+    """Vehicles and identity of an agent process."""
 
     identity: str
     """Identity of the process."""
     vehicles: tuple[str, ...]
-    """Their names; empty: those of the shard, as they are announced."""
+    """Names of the vehicles; empty: the announced vehicles of the shard."""
     shard: Shard | None
 
 
 def assigned_vehicles(
     security: Security, vehicles: Sequence[str], shard: str | None, fleet: str | None
 ) -> AssignedVehicles:
-    """Return the vehicles that an agent process drives.
+    """Return vehicles and identity of an agent process.
 
     Args:
-        security: table of the configuration, with the fleets.
+        security: table of the configuration that contains the fleets.
         vehicles: names on the command line.
         shard: value of `--shard`.
         fleet: value of `--fleet`.
 
     Raises:
-        BadInputError: these contradict each other, or a secured deployment has no such fleet.
+        BadInputError: arguments contradict each other, or a secured deployment has no such fleet.
     """
     for vehicle in vehicles:
         if not NAME_PATTERN.fullmatch(vehicle):
@@ -50,8 +50,7 @@ def assigned_vehicles(
             raise BadInputError(
                 "VEHICLE",
                 list(vehicles),
-                "one vehicle, or more of them with the --fleet as which they take part, as "
-                "security.mode is mtls",
+                "one vehicle, or several with --fleet, because security.mode is mtls",
             )
         return AssignedVehicles(_vehicle(vehicles[0]), tuple(vehicles), None)
     taken = parse_shard(shard or ALL_VEHICLES, "--shard")
@@ -62,10 +61,10 @@ def _of_fleet(
     security: Security, vehicles: Sequence[str], shard: str | None, fleet: str
 ) -> AssignedVehicles:
     if shard is not None:
-        raise BadInputError("--shard", shard, "nothing beside --fleet")
+        raise BadInputError("--shard", shard, "only without --fleet")
     members = security.fleets.get(fleet)
     if members is None:
-        known = ", ".join(security.fleets) or "there are none"
+        known = ", ".join(security.fleets) or "none"
         raise BadInputError("--fleet", fleet, f"one of security.fleets: {known}")
     taken = _shard(members)
     for vehicle in vehicles:
@@ -77,13 +76,15 @@ def _of_fleet(
 
 
 def _fleet_of_shard(security: Security, shard: Shard) -> str:
-    """Return the name of the fleet that consists of a shard; any name without security."""
+    """Return the name of the fleet that consists of a shard, or any name without security."""
     for name, members in security.fleets.items():
         if _shard(members) == shard:
             return name
     text = f"{shard.index}/{shard.count}"
     if security.mode != "off":
-        raise BadInputError("--shard", text, "a shard of security.fleets, as security.mode is mtls")
+        raise BadInputError(
+            "--shard", text, "a shard of security.fleets, because security.mode is mtls"
+        )
     return f"{shard.index}-of-{shard.count}"
 
 

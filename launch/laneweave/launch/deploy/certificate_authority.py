@@ -1,7 +1,7 @@
-"""A certificate authority for tests: X.509 certificates with P-256 keys, as PEM files.
+"""A certificate authority for tests: X.509 certificates with P-256 keys as PEM files.
 
-The holder of its key can impersonate every process. Use it to try out a deployment or for a test
-bed; if you already have an authority, use that one with the same common names.
+The key of the authority permits the impersonation of every process. It is intended for trials and
+test beds; otherwise use an existing authority with the same common names.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from laneweave.protocol.wire.topics import Party
 CA_NAME = "laneweave test authority"
 CA_DAYS = 3650.0
 CLOCKS_APART = dt.timedelta(minutes=10)
-"""Certificates are valid from this long before now, because the clocks of hosts differ."""
+"""Time before now at which validity begins, because the clocks of hosts differ."""
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 
 
 @frozen
 class Authority:
-    """The certificate and private key of an authority."""
+    """Certificate and private key of an authority."""
 
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
 
 
 def make_authority(folder: Path, *, days: float = CA_DAYS, replace: bool = False) -> Authority:
-    """Make an authority and write its files.
+    """Create an authority and write its files.
 
     Args:
         folder: folder of the files; created if necessary.
-        days: validity of its certificate.
-        replace: replace an existing authority, which invalidates all its certificates.
+        days: validity of the certificate in days.
+        replace: whether to replace an existing authority, which invalidates all its certificates.
 
     Raises:
         BadInputError: an authority exists, or the files cannot be written.
@@ -73,7 +73,7 @@ def load_authority(folder: Path) -> Authority:
     """Read the authority of a folder.
 
     Raises:
-        BadInputError: there is no authority, or it cannot be read.
+        BadInputError: the folder has no authority, or it cannot be read.
     """
     path = ca_path(folder)
     try:
@@ -81,9 +81,9 @@ def load_authority(folder: Path) -> Authority:
         path = authority_key_path(folder)
         key = serialization.load_pem_private_key(path.read_bytes(), password=None)
     except OSError as error:
-        raise BadInputError("DIR", str(path), f"a file to read ({error.strerror})") from error
+        raise BadInputError("DIR", str(path), f"a readable file ({error.strerror})") from error
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        raise BadInputError("DIR", str(path), "what `laneweave certs init` wrote") from error
+        raise BadInputError("DIR", str(path), "a file of `laneweave certs init`") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey) or (
         key.public_key() != certificate.public_key()
     ):
@@ -100,15 +100,15 @@ def issue(
     hosts: Sequence[str] = (),
     replace: bool = False,
 ) -> None:
-    """Make a certificate and its key, and write their files.
+    """Create a certificate and its key, and write their files.
 
     Args:
-        authority: the authority that signs it.
+        authority: authority that signs the certificate.
         folder: folder of the files.
         identity: identity of the process.
-        days: validity.
+        days: validity in days.
         hosts: names and addresses of the router; ignored for other processes.
-        replace: replace an existing certificate.
+        replace: whether to replace an existing certificate.
 
     Raises:
         BadInputError: a certificate exists, or the files cannot be written.
@@ -137,7 +137,7 @@ def issue(
 
 
 def authority_key_path(folder: Path) -> Path:
-    """Return the path of the authority's key, which no role needs."""
+    """Return the path of the key of the authority, which roles do not need."""
     return folder / "ca.key"
 
 
@@ -177,10 +177,10 @@ def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
 
 
 def host_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
-    """Return hosts as the alternative names of a certificate.
+    """Return the subject alternative name of a certificate for some hosts.
 
     Raises:
-        BadInputError: one of them is not a host.
+        BadInputError: a name is not that of a host.
     """
     return x509.SubjectAlternativeName([_general_name(host) for host in dict.fromkeys(hosts)])
 
@@ -217,5 +217,5 @@ def _write(
                 file.write(content)
     except OSError as error:
         raise BadInputError(
-            "DIR", str(certificate_file.parent), f"a folder to write to ({error.strerror})"
+            "DIR", str(certificate_file.parent), f"a writable folder ({error.strerror})"
         ) from error

@@ -1,4 +1,4 @@
-"""Checks of a deployment's configuration: problems, warnings, and the values in use."""
+"""Checks of the configuration of a deployment: problems, warnings, effective settings."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ from laneweave.protocol.wire.topics import Party
 
 @define
 class Report:
-    """Result of a check, with one line per item."""
+    """Result of a check; problems and warnings are lines of text."""
 
     problems: list[str] = field(factory=list)
     warnings: list[str] = field(factory=list)
     facts: list[tuple[str, str]] = field(factory=list)
-    """Names and values of settings in use."""
+    """Names and values of effective settings."""
 
 
 def check_deployment(
     scenario: Scenario, identity: Identity | None, environment: Mapping[str, str] = os.environ
 ) -> Report:
-    """Check what loading a configuration does not check.
+    """Check properties of a configuration that loading does not check.
 
     Args:
-        scenario: the deployment.
-        identity: identity whose files are checked too; None: no files.
+        scenario: configuration of the deployment.
+        identity: identity whose certificate files are checked; None: no files.
         environment: environment variables, which may contain secrets.
     """
     report = Report()
@@ -67,18 +67,20 @@ def _check_network(scenario: Scenario, report: Report) -> None:
             f"network.endpoint: {network.endpoint} is not reachable by other roles"
         )
     if scenario.security.mode == "off" and _leaves_the_host(scenario):
-        report.warnings.append("security.mode: off, all who reach the router have all rights")
+        report.warnings.append(
+            "security.mode: off, so every process that reaches the router has all rights"
+        )
     report.facts += [
         ("realm", network.realm),
         ("router at", network.endpoint),
         ("listens at", ", ".join(network.listens_at)),
-        ("given up after", f"{network.lease_s:g} s"),
+        ("lease", f"{network.lease_s:g} s"),
         ("security", scenario.security.mode),
     ]
 
 
 def _check_moves(scenario: Scenario, report: Report) -> None:
-    """Check what agents check at their start, if the extra `agent` is installed."""
+    """Make the checks of agents at their start, if the extra `agent` is installed."""
     try:
         from laneweave.agents.driving.trajectory import check_moves  # noqa: PLC0415 (an extra)
     except ModuleNotFoundError:
@@ -103,7 +105,7 @@ def _shared_vehicles(scenario: Scenario) -> Iterator[str]:
     )
     shared = sorted(vehicle for vehicle, count in drivers.items() if count > 1)
     if shared:
-        yield f"security.fleets: {len(shared)} vehicles are in several, {shared[0]} among them"
+        yield f"security.fleets: {len(shared)} vehicles are in several fleets, such as {shared[0]}"
 
 
 def _check_role(
@@ -113,7 +115,7 @@ def _check_role(
     report: Report,
 ) -> None:
     name = identity.common_name
-    report.facts.append(("takes part as", name))
+    report.facts.append(("identity", name))
     if scenario.security.mode == "off":
         return
     if identity not in set(identities_of(scenario)):

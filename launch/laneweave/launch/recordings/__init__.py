@@ -1,6 +1,6 @@
-"""What finished runs and sweeps left on disk.
+"""Readers of the folders of finished runs and sweeps.
 
-Entry points: `runs.single_run` and `runs.runs_of` (folders of runs and sweeps), `results` (one
-table over runs, aggregated over seeds), `trajectories.read_tracks`. Imported by `sweep`, `watch`,
+Entry points: `runs.single_run`, `runs.runs_of` (folders of runs and sweeps), `results_over_seeds`
+(a table over runs, and its aggregation), `trajectories.read_tracks`. Imported by `sweep`, `watch`,
 `report`, `run`, `cli` and the benchmarks.
 """

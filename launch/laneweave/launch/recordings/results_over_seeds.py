@@ -1,7 +1,7 @@
-"""One table over runs: a row per run, a column per number of its summary; and its aggregation.
+"""A table over runs, with a row per run and a column per number of the summaries; its aggregation.
 
-The column of a number has its path in the summary as name: `travel_time_s.mean` is
-`travel_time_s_mean`. A sweep writes the table as `results.parquet`.
+Columns are named after the path in the summary: `travel_time_s_mean` contains `travel_time_s.mean`.
+A sweep writes the table as `results.parquet`.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from laneweave.protocol.summary import RunSummary
 
 SCHEMA_KEY, SCHEMA = b"laneweave.schema", b"laneweave.sweep.results/1"
 KEYS = ["label", "volume_veh_per_lane_h"]
-"""Runs with the same values differ by their seeds only."""
+"""Columns that identify the runs that differ only in their seeds."""
 PREFERRED = "preferred_percent"
-"""Column of the share of vehicles that left on their preferred lane."""
+"""Column with the share of vehicles that left on their preferred lanes [%]."""
 
 
 def results_table(runs: Iterable[Run]) -> pa.Table:
-    """Return the table of some runs, in their order.
+    """Return the table of some runs, in the given order.
 
-    Columns of counts are integers, the others floats; figures that a run does not have are null.
+    Counts are integers, other numbers floats; missing numbers are null.
     """
     listed = list(runs)
     arrays = {
@@ -56,15 +56,15 @@ def write_results(runs: Iterable[Run], path: Path) -> None:
 
 
 def over_seeds(table: pa.Table, wanted: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
-    """Aggregate a table of results over seeds: a row for each label and volume, in their order.
+    """Aggregate results over seeds: one row per label and volume, in order of appearance.
 
     Args:
-        table: as of `results_table`.
-        wanted: columns, each with an aggregation function of pyarrow; `stddev` is that of a sample.
+        table: result of `results_table`.
+        wanted: (column, aggregation function of pyarrow) pairs; `stddev` is that of a sample.
 
     Returns:
-        Rows with `KEYS`, `runs` (their number), and `COLUMN_FUNCTION` for each column and function:
-        null where no run has the figure.
+        Rows with `KEYS`, `runs` (number of runs), and `COLUMN_FUNCTION` for each pair: None if no
+        run has the number.
     """
     pairs = list(wanted)
     for column in dict.fromkeys(column for column, _ in pairs):
@@ -80,7 +80,7 @@ def over_seeds(table: pa.Table, wanted: Iterable[tuple[str, str]]) -> list[dict[
 
 
 def flatten(tables: Mapping[str, Any], separator: str) -> dict[str, Any]:
-    """Return all values of nested tables by their path."""
+    """Return all values of nested tables by path."""
     flat: dict[str, Any] = {}
     for key, value in tables.items():
         if isinstance(value, Mapping):
@@ -92,7 +92,7 @@ def flatten(tables: Mapping[str, Any], separator: str) -> dict[str, Any]:
 
 
 def _figures(summary: RunSummary) -> dict[str, float | int | None]:
-    """Return all numbers of a summary; null stays null."""
+    """Return all numbers of a summary by path; unknown ones are None."""
     return {
         name: value
         for name, value in flatten(summary.to_json(), "_").items()

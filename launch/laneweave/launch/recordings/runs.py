@@ -1,4 +1,4 @@
-"""The runs in folders of runs and sweeps, and several of them side by side."""
+"""Runs in the folders of runs and sweeps, and comparisons of runs."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from laneweave.protocol.summary import RunSummary, read_summary
 from laneweave.sim_bridge.recording.trips import SCENARIO_KEY
 
 SWEEP_FILE, POINT_FILE = "sweep.json", "point.json"
-"""They mark the folder of a sweep, and of a point in it."""
+"""Files that identify the folders of sweeps and of their points."""
 POINT_SCHEMA = "laneweave.sweep.point/1"
 TRAJECTORIES = "trajectories.parquet"
 
 
 @frozen
 class Run:
-    """A run that has ended."""
+    """A finished run."""
 
     folder: Path
     label: str
-    """Its method with settings, as sweeps name it; of other runs the method."""
+    """Label of the method with settings in sweeps; for other runs the method."""
     method: str
-    """As `laneweave run --method` names it."""
+    """Value of `laneweave run --method`."""
     scenario: Scenario
     summary: RunSummary | None
-    """None: the run failed and left none."""
+    """None: the run failed without a summary."""
     reason: str = ""
-    """Why it failed; empty: it did not."""
+    """Reason of the failure; empty: success."""
     wall_s: float | None = None
-    """How long its process ran; None: not known."""
+    """Run time of its process; None: unknown."""
 
     @property
     def status(self) -> str:
@@ -48,31 +48,31 @@ class Run:
 
     @property
     def volume_veh_per_lane_h(self) -> float:
-        """The demand on each lane."""
+        """Demand per lane."""
         return self.scenario.demand.volume_veh_per_lane_h
 
     @property
     def has_trajectories(self) -> bool:
-        """Whether its trajectories were kept."""
+        """Whether trajectories were kept."""
         return (self.folder / TRAJECTORIES).is_file()
 
     @property
     def order(self) -> tuple[tuple[int, str], float, int]:
-        """The sort key of runs: label, volume, seed."""
+        """Sort key: label, volume, seed."""
         return rank(self.label), self.volume_veh_per_lane_h, self.scenario.seed
 
 
 @frozen
 class Comparison:
-    """Runs of one or several labels and volumes, sorted."""
+    """Sorted runs of one or more labels and volumes."""
 
     runs: tuple[Run, ...]
-    """Those that did not fail."""
+    """Successful runs."""
     failed: tuple[Run, ...]
 
     @classmethod
     def of(cls, runs: Iterable[Run]) -> Comparison:
-        """Sort runs; those of the same label, volume and seed are labelled by their folders."""
+        """Sort runs; the labels of runs with equal settings are the names of their folders."""
         listed = list(runs)
         counts = Counter(run.order for run in listed)
         named = [
@@ -87,16 +87,16 @@ class Comparison:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """All labels, in their order."""
+        """All labels, sorted."""
         return tuple(dict.fromkeys(run.label for run in self.runs))
 
     @property
     def volumes(self) -> tuple[float, ...]:
-        """All volumes in vehicles/(lane h), ascending."""
+        """All volumes, ascending [vehicles/(lane h)]."""
         return tuple(sorted({run.volume_veh_per_lane_h for run in self.runs}))
 
     def at(self, label: str, volume_veh_per_lane_h: float) -> tuple[Run, ...]:
-        """Return the runs of a label at a volume, one for each seed."""
+        """Return the runs of a label at a volume, one per seed."""
         return tuple(
             run
             for run in self.runs
@@ -104,18 +104,18 @@ class Comparison:
         )
 
     def representative(self, label: str, volume_veh_per_lane_h: float) -> Run | None:
-        """Return the run that represents a label at a volume: the first with trajectories."""
+        """Return the first run with trajectories of a label at a volume; None: there is none."""
         runs = self.at(label, volume_veh_per_lane_h)
         return next((run for run in runs if run.has_trajectories), None)
 
     def busiest(self, label: str) -> Run | None:
-        """Return the run that represents a label at its highest volume with trajectories."""
+        """Return the representative run of a label at its highest volume with trajectories."""
         found = (self.representative(label, volume) for volume in reversed(self.volumes))
         return next((run for run in found if run is not None), None)
 
 
 def scenario_of(path: Path) -> Scenario:
-    """Return the scenario in the metadata of a run's Parquet file; without it the default one."""
+    """Return the scenario in the metadata of a Parquet file of a run; by default `Scenario()`."""
     metadata = pq.read_schema(path).metadata or {}
     text = metadata.get(SCENARIO_KEY)
     data: dict[str, Any] = json.loads(text) if text else {}
@@ -123,7 +123,7 @@ def scenario_of(path: Path) -> Scenario:
 
 
 def is_sweep(folder: Path) -> bool:
-    """Return whether a folder is that of a sweep."""
+    """Return whether a folder belongs to a sweep."""
     return (folder / SWEEP_FILE).is_file()
 
 
@@ -131,7 +131,7 @@ def single_run(folder: Path) -> Run:
     """Return the run in a folder.
 
     Raises:
-        BadInputError: it is not the folder of a finished run with trajectories.
+        BadInputError: the folder is not that of a finished run with trajectories.
     """
     if not (folder / TRAJECTORIES).is_file():
         raise BadInputError("DIR", str(folder), "the folder of a run, with trajectories.parquet")
@@ -147,10 +147,10 @@ def single_run(folder: Path) -> Run:
 
 
 def runs_of(folders: Sequence[Path]) -> Iterator[Run]:
-    """Yield the runs in some folders of runs and sweeps.
+    """Yield the runs in folders of runs and sweeps.
 
     Raises:
-        BadInputError: a folder is neither, or a sweep has no finished run.
+        BadInputError: a folder has no finished run.
     """
     for folder in folders:
         if not is_sweep(folder):
@@ -163,16 +163,16 @@ def runs_of(folders: Sequence[Path]) -> Iterator[Run]:
 
 
 def sweep_runs(out: Path) -> list[Run]:
-    """Return the runs of a sweep, by the names of their folders.
+    """Return the runs of a sweep, sorted by the names of their folders.
 
     Raises:
-        BadInputError: a point's record cannot be read.
+        BadInputError: the record of a point cannot be read.
     """
     return [_read_point(path) for path in sorted(out.glob(f"*/{POINT_FILE}"))]
 
 
 def write_point(run: Run, folder: Path) -> None:
-    """Write the record of a sweep's run into a folder."""
+    """Write the record of a run of a sweep to a folder."""
     data = {
         "schema": POINT_SCHEMA,
         "label": run.label,
@@ -198,7 +198,7 @@ def _read_point(path: Path) -> Run:
             wall_s=float(data["wall_s"]),
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise BadInputError(str(path), "something else", f"a point's record ({error})") from error
+        raise BadInputError(str(path), "invalid", f"the record of a point ({error})") from error
 
 
 def _not_a_run(folder: Path, why: object) -> BadInputError:

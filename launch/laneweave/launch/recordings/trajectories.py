@@ -1,4 +1,4 @@
-"""A run's trajectories as arrays, vehicle by vehicle; and its trips."""
+"""Trajectories of a run as arrays, sorted by vehicle; trips of a run."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 OFF_LATTICE = np.iinfo(np.int64).min
-"""Column of a vehicle off the lattice."""
+"""Value of `Tracks.column` for a vehicle off the lattice."""
 
 
 @frozen
 class Tracks:
-    """All rows of trajectories.parquet, sorted by vehicle, then time; arrays of shape (rows,)."""
+    """All rows of trajectories.parquet, sorted by vehicle and time; arrays of shape (rows,)."""
 
     names: tuple[str, ...]
     """Names of the vehicles."""
     starts: Ints
-    """The first row of each vehicle, and last of all the number of rows."""
+    """Index of the first row of each vehicle, followed by the number of rows."""
     t_s: Floats
     s_m: Floats
     y_m: Floats
     speed_mps: Floats
     accel_mps2: Floats
     column: Ints
-    """`OFF_LATTICE`: none."""
+    """Column of the cell, or `OFF_LATTICE`."""
     lane: Ints
 
     @property
     def vehicle(self) -> Ints:
-        """Number of each row's vehicle."""
+        """Index of the vehicle of each row."""
         return np.repeat(np.arange(len(self.names)), np.diff(self.starts))
 
     @property
     def changed(self) -> Bools:
-        """Whether each row is the first one of its vehicle in another cell."""
+        """Whether the cell of the vehicle differs from that in the previous row."""
         changed = np.zeros(len(self.t_s), dtype=np.bool_)
         changed[1:] = (np.diff(self.column) != 0) | (np.diff(self.lane) != 0)
         changed[self.starts[:-1]] = False
@@ -56,25 +56,25 @@ class Tracks:
         return slice(int(self.starts[number]), int(self.starts[number + 1]))
 
     def sampled(self, number: int, name: str, times_s: Floats) -> Floats:
-        """Return a column of a vehicle, interpolated at some times."""
+        """Return a column of a vehicle, interpolated at the given times."""
         rows = self.rows(number)
         return np.asarray(np.interp(times_s, self.t_s[rows], getattr(self, name)[rows]))
 
 
 def read_trips(folder: Path) -> dict[str, dict[str, Any]]:
-    """Return a run's trips, by vehicle.
+    """Return the trips of a run by vehicle.
 
     Raises:
-        OSError, ValueError: they cannot be read.
+        OSError, ValueError: the trips cannot be read.
     """
     return {trip["vehicle"]: trip for trip in pq.read_table(folder / "trips.parquet").to_pylist()}
 
 
 def read_tracks(folder: Path) -> Tracks:
-    """Return a run's trajectories.
+    """Return the trajectories of a run.
 
     Raises:
-        BadInputError: it has none that can be read.
+        BadInputError: the trajectories cannot be read.
     """
     columns = ["vehicle", "t_s", "s_m", "y_m", "speed_mps", "accel_mps2", "column", "lane"]
     try:

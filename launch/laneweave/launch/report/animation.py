@@ -1,9 +1,9 @@
-"""The moving road: a run's trajectories as compact data for the player (`templates/player.js`).
+"""The animated road: trajectories as compact data for the player (`templates/player.js`).
 
-Every vehicle is sampled on a common grid of times, `step_s` apart, from its first to its last
-sample. A sample is three integers, little-endian: longitudinal and lateral position (16 bits each)
-and speed (8 bits), each in a unit of its own. The samples of all vehicles follow each other; each
-of the three columns is one base64 text. The player interpolates between samples.
+All vehicles are sampled at common times, `step_s` apart. A sample consists of three little-endian
+integers: longitudinal and lateral position (16 bits each) and speed (8 bits), each with a separate
+unit. Each of these columns is one base64 text with the samples of all vehicles, one vehicle after
+the other. The player interpolates between samples.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from laneweave.launch.recordings.trajectories import Floats, Tracks, read_trips
 
 FORMAT: Final = "laneweave.animation/1"
 KINDS: Final = {"s_m": "<u2", "y_m": "<u2", "speed_mps": "u1"}
-"""The columns and their data types."""
+"""Data types of the columns."""
 STEPS_S: Final = (0.2, 0.5, 1.0)
 MAX_SAMPLES: Final = 600_000
-"""They take 4 MB of text. A longer run is sampled more coarsely, or ends earlier."""
+"""Maximum number of samples (4 MB of text); longer runs are sampled more coarsely, or cut."""
 
 
 def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
@@ -33,8 +33,8 @@ def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
 
     Args:
         run: the run.
-        tracks: its trajectories.
-        title: of the run on the page.
+        tracks: trajectories of the run.
+        title: title of the run on the page.
     """
     scenario, road = run.scenario, run.scenario.road
     formations = closed_formations(run.folder, scenario)
@@ -62,17 +62,17 @@ def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
 
 @frozen
 class _Samples:
-    """What is packed, vehicle by vehicle in order of entry."""
+    """Sampled trajectories of the vehicles in order of entry."""
 
     step_s: float
     end_s: float
     vehicles: list[dict[str, Any]]
     columns: dict[str, list[Floats]]
-    """For each vehicle an array of shape (its samples,)."""
+    """One array per vehicle, shape (samples of the vehicle,)."""
 
 
 def _sample(run: Run, tracks: Tracks, formations: Formations) -> _Samples:
-    """Sample all vehicles on a common grid of times."""
+    """Sample all vehicles at common times."""
     trips, known = read_trips(run.folder), formations.by_number
     driven_s = len(tracks.t_s) * run.scenario.runtime.tick_s
     step_s = next((step for step in STEPS_S if driven_s / step <= MAX_SAMPLES), STEPS_S[-1])
@@ -87,7 +87,7 @@ def _sample(run: Run, tracks: Tracks, formations: Formations) -> _Samples:
         if count < 1:
             continue
         if samples + count > MAX_SAMPLES:
-            # Vehicles are in order of entry, so all are complete up to here.
+            # Vehicles are in order of entry, so the data are complete up to this time.
             end_s = first * step_s
             break
         samples += count
@@ -108,7 +108,7 @@ def _sample(run: Run, tracks: Tracks, formations: Formations) -> _Samples:
 
 
 def _busy_s(run: Run, end_s: float) -> float:
-    """Return a road time at which the whole road is in use, or the middle of a short run."""
+    """Return when the first vehicle reaches the end of the road, at most half of `end_s`."""
     return min(run.scenario.road.length_m / run.scenario.formation.speed_mps, 0.5 * end_s)
 
 

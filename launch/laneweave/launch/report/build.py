@@ -1,6 +1,6 @@
-"""The report of one run, or of many side by side: pictures and a page.
+"""The report of a run, or of several runs side by side: pictures and a page.
 
-The report of one run is a comparison of one.
+The report of one run is a comparison with a single run.
 """
 
 from __future__ import annotations
@@ -24,38 +24,38 @@ from laneweave.protocol.errors import CommandFailedError
 
 REPORT_DPI = 300
 PAPER_STRETCH_M = (500.0, 800.0)
-"""The stretch of the paper's snapshots (Section 5.2.3)."""
+"""Stretch of road in the paper's snapshots (Section 5.2.3) [m]."""
 
 TRAVEL_CAPTION = (
-    "Travel times of the counted vehicles of all seeds, waiting to enter included: boxes from the "
-    "lower to the upper quartile with the median, whiskers up to 1.5 times as far; dots and lines "
-    "are means. Where a method jams, the axis is broken."
+    "Travel times of the counted vehicles of all seeds, including the wait at the entrance. Boxes: "
+    "quartiles and median; whiskers: at most 1.5 interquartile ranges; dots and lines: means. The "
+    "axis is broken if only some methods jam."
 )
 FLOW_CAPTION = (
     "Left: rate at which vehicles pass the end of the road, between the first and the last "
-    "counted one. Right: share of the vehicles that left on the lane that they prefer. Small dots "
-    "are runs; bars are standard deviations over seeds."
+    "counted one. Right: share of vehicles that left on their preferred lanes. Small dots: runs; "
+    "bars: standard deviations over seeds."
 )
 SPEED_CAPTION = (
-    "Mean speed in bins of 20 m and 5 s, the first run with trajectories of each method and "
-    "volume; one scale for all. Grey: no vehicle. Dashed: lane sorting begins."
+    "Mean speed in bins of 20 m and 5 s, in the first run with trajectories of each method and "
+    "volume. Grey: no vehicle. Dashed: start of lane sorting."
 )
 SPACING_CAPTION = (
-    "Spacing: front bumper to front bumper of the next vehicle ahead on the lane, sampled every "
-    "second. Time headway: spacing over the speed of the following vehicle, where it moves. "
-    "Dashed: the pitch d_F of the lattice, and the time that it takes at v_F. Counted from 60 s to "
-    "the end of the demand, the whole run where that is too short."
+    "Spacing: distance between the front bumpers of successive vehicles on a lane, sampled every "
+    "second. Time headway: spacing divided by the speed of the following, moving vehicle. "
+    "Dashed: pitch d_F of the lattice, and the headway d_F / v_F. Samples from 60 s to the end of "
+    "the demand, or of the whole run if that time is too short."
 )
 COMFORT_CAPTION = (
-    "Share of the driving time above each value. Dashed: the limits of the vehicles. Jerk is "
-    "the change of acceleration from tick to tick; lateral acceleration the second difference of "
-    "the lateral position. Counted at the same times as spacings."
+    "Share of the driving time above each value. Dashed: limits of the vehicles. Jerk: difference "
+    "quotient of the acceleration; lateral acceleration: second difference quotient of the lateral "
+    "position. Samples of the same time as for spacings."
 )
 
 
 @define
 class _Report:
-    """A report in progress."""
+    """Report under construction."""
 
     figures: Path
     """Folder of the pictures."""
@@ -65,7 +65,7 @@ class _Report:
     def draw(
         self, name: str, draw: Callable[[Path, int], None], caption: str, alt: str
     ) -> list[Picture]:
-        """Draw a picture."""
+        """Draw a picture, and return it as a list of one."""
         path = self.figures / name
         draw(path, self.dpi)
         return [Picture(path, self.dpi, caption, alt)]
@@ -73,7 +73,7 @@ class _Report:
     def add(
         self, title: str, name: str, draw: Callable[[Path, int], None], caption: str, alt: str
     ) -> None:
-        """Draw a picture, and add a section with it."""
+        """Add a section with one picture."""
         self.sections.append(Section(title, pictures=self.draw(name, draw, caption, alt)))
 
 
@@ -90,9 +90,9 @@ def draw_report(folder: Path) -> None:
 
 
 def report_run(run: Run, *, formation: int | None = None, dpi: int = DPI) -> Path:
-    """Write the pictures and the page of one run into its folder; return the page.
+    """Write pictures and page of a run to its folder; return the path of the page.
 
-    Arguments and errors as of `report_comparison`.
+    For arguments and errors see `report_comparison`.
     """
     road, title = run.scenario.road, f"laneweave run: {run.folder.resolve().name}"
     lead = (
@@ -109,16 +109,16 @@ def report_run(run: Run, *, formation: int | None = None, dpi: int = DPI) -> Pat
 def report_comparison(
     comparison: Comparison, out: Path, title: str, *, formation: int | None = None
 ) -> Path:
-    """Write the pictures and the page of many runs; return the page.
+    """Write pictures and page of several runs; return the path of the page.
 
     Args:
-        comparison: the runs; at least one that did not fail.
-        out: folder of the page; the pictures go to `figures` in it.
-        title: of the page.
-        formation: whose path map is drawn; None: the one with the most moves.
+        comparison: the runs, at least one of them without failure.
+        out: folder of the page and of the folder `figures`.
+        title: title of the page.
+        formation: formation whose path map is drawn; None: the one with the most moves.
 
     Raises:
-        BadInputError: the run that is shown has no such formation.
+        BadInputError: the run has no such formation.
         OSError: a file cannot be read or written.
         ValueError, KeyError: a folder is not that of a finished run.
     """
@@ -132,11 +132,11 @@ def report_comparison(
 def _sections(
     comparison: Comparison, report: _Report, names: Mapping[str, str], formation: int | None
 ) -> list[Section]:
-    """Return all sections; `names` maps names of pictures to those in the folder of a run."""
+    """Return all sections; `names` replaces names of pictures (report of one run)."""
     several = not names
     busiest = [run for run in map(comparison.busiest, comparison.labels) if run is not None]
     shown = [(run, read_tracks(run.folder)) for run in busiest]
-    # First, because it raises an error for an unknown formation.
+    # Do this first, because it raises an error for an unknown formation.
     maps = (
         driven_map(run, tracks, formation)
         for run, tracks in shown
@@ -172,20 +172,20 @@ def _sections(
         _add_path_map(report, driven)
         _add_distributions(report, comparison, busiest[0])
         animations = [Animation(animation_data(run, tracks, _title(run))) for run, tracks in shown]
-        report.sections.append(Section("The moving road", animations=animations))
+        report.sections.append(Section("Animation", animations=animations))
     return report.sections
 
 
 def _snapshots(report: _Report, run: Run, names: Mapping[str, str]) -> list[Picture]:
     name = f"road-{run.label}.png"
-    # A comparison shows the same stretch of all methods: the paper's, where the road has it.
+    # A comparison shows the stretch of the paper for all methods, if the road is long enough.
     fits = name not in names and run.scenario.road.length_m >= PAPER_STRETCH_M[1]
     stretch_m = PAPER_STRETCH_M if fits else None
     return report.draw(
         names.get(name, name),
         lambda path, dpi: road_snapshots(run.folder, path, stretch_m=stretch_m, dpi=dpi),
-        f"{_title(run)}. Four instants, the shortest T_F apart. Colours are the lanes that "
-        "vehicles prefer; the faster, the lighter.",
+        f"{_title(run)}. Four times at intervals of the shortest T_F. Colours show the preferred "
+        "lanes; faster vehicles are lighter.",
         f"Four strips of road with vehicles coloured by preferred lane, {run.label}",
     )
 
@@ -197,15 +197,15 @@ def _add_path_map(report: _Report, driven: DrivenMap | None) -> None:
         "Relative path map",
         "path_map.png",
         partial(draw_path_map, driven),
-        f"The cells (column, lane) of {driven.vehicles} at the ends of slots, as driven. "
-        "The box before a name has the colour of the preferred lane; cells have the colour of "
-        "their lane, strong where that is the preferred one; bold: moved in the slot before.",
+        f"Cells (column, lane) of {driven.vehicles} at the ends of slots, as driven. The box "
+        "before a name has the colour of the preferred lane; cells have the colour of their lane, "
+        "strong if it is the preferred one; bold: moved in the slot before.",
         f"Table of the cells of {driven.name} by vehicle and slot",
     )
 
 
 def _add_distributions(report: _Report, comparison: Comparison, example: Run) -> None:
-    """Add the distributions over all runs with trajectories, read one at a time."""
+    """Add the distributions over all runs with trajectories, read one after the other."""
     counted: dict[tuple[str, float], distributions.Counts] = {}
     for run in comparison.runs:
         if run.has_trajectories:

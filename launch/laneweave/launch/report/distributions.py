@@ -1,7 +1,7 @@
-"""Distributions over a run: spacing and headway, deceleration and comfort; counts and figures.
+"""Distributions of spacing, headway, deceleration and comfort over runs: histograms and figures.
 
-Counted are the times of steady traffic: from the end of the warm-up (`trips.py: WARM_UP_S`) to
-the end of the demand; the whole run where that is too short.
+The samples are those of steady traffic, from the end of the warm-up (`trips.py: WARM_UP_S`) to the
+end of the demand, or of the whole run if that time is too short.
 """
 
 from __future__ import annotations
@@ -30,70 +30,70 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SAMPLE_S: Final = 1.0
-"""Period at which spacings are sampled; they change slowly."""
+"""Sampling period of spacings, which change slowly."""
 MIN_STEADY_S: Final = 10.0
-"""A shorter time between warm-up and last arrival has too few samples."""
+"""Minimum time of steady traffic for enough samples."""
 STANDING_MPS: Final = 0.5
-"""A slower vehicle has no time headway."""
+"""Speed below which a vehicle has no time headway."""
 
 
 @frozen(eq=False)
 class Quantity:
-    """A quantity that is counted, and how it is shown."""
+    """A quantity with its histogram bins, and how it is shown."""
 
     name: str
     unit: str
     edges: Floats
-    """Edges of its bins; the last bin contains all larger values, too."""
+    """Edges of the bins; the last bin also contains all larger values."""
     exceedance: bool
-    """Shown as the share of driving time with at least this value; else as the share of vehicles
-    with less."""
+    """Whether to show the share of driving time with larger values; otherwise the share of vehicles
+    with smaller values is shown."""
 
 
 def _centred(step: float, last: float) -> Floats:
-    """Return edges of bins whose centres are the multiples of a step."""
+    """Return edges of bins whose centres are multiples of a step."""
     return np.asarray(np.arange(-0.5, last / step + 1.0) * step, dtype=np.float64)
 
 
 SPACING: Final = Quantity("spacing", "m", _centred(0.5, 90.0), exceedance=False)
-"""Front bumper to front bumper of the next vehicle ahead on the lane."""
+"""Distance between the front bumpers of successive vehicles on a lane."""
 HEADWAY: Final = Quantity("time headway", "s", _centred(0.05, 6.0), exceedance=False)
-"""Spacing over the speed of the following vehicle."""
+"""Spacing divided by the speed of the following vehicle."""
 DECELERATION: Final = Quantity("deceleration", "m/s²", np.linspace(0.0, 10.0, 201), exceedance=True)
 JERK: Final = Quantity("jerk", "m/s³", np.linspace(0.0, 20.0, 201), exceedance=True)
-"""Change of acceleration along the road from tick to tick."""
+"""Difference quotient of the longitudinal acceleration."""
 LATERAL: Final = Quantity(
     "lateral acceleration", "m/s²", np.linspace(0.0, 5.0, 201), exceedance=True
 )
-"""Second difference of the lateral position over three ticks."""
+"""Second difference quotient of the lateral position."""
 
 
 @frozen
 class Counts:
-    """The counts of each quantity in its bins."""
+    """Histogram of each quantity."""
 
     of: dict[str, Floats] = field(factory=dict)
 
     def __add__(self, other: Counts) -> Counts:
-        """Return the sums of both counts."""
+        """Return the sums of both histograms."""
         names = dict.fromkeys([*self.of, *other.of])
         return Counts(
             {name: np.asarray(self.of.get(name, 0.0) + other.of.get(name, 0.0)) for name in names}
         )
 
     def cumulative(self, quantity: Quantity) -> Floats:
-        """Return the share that is less than each upper edge but the last."""
+        """Return the share of values below each edge except the first and the last."""
         counts = self.of[quantity.name]
         return np.asarray(np.cumsum(counts)[:-1] / max(1.0, counts.sum()))
 
     def exceedance(self, quantity: Quantity) -> Floats:
-        """Return the share that is at least as large as each edge but the last."""
+        """Return the share of values not below each edge except the last."""
         counts = self.of[quantity.name]
         return np.asarray(np.cumsum(counts[::-1])[::-1] / max(1.0, counts.sum()))
 
 
 def count(tracks: Tracks, scenario: Scenario) -> Counts:
-    """Count all quantities over a run."""
+    """Return the histograms of a run."""
     steady = _steady(tracks, scenario)
     spacing_m, headway_s = _spacings(tracks, scenario, steady)
     same = (np.diff(tracks.vehicle) == 0) & steady[1:] & steady[:-1]
@@ -121,7 +121,7 @@ def _steady(tracks: Tracks, scenario: Scenario) -> Bools:
 
 
 def _spacings(tracks: Tracks, scenario: Scenario, steady: Bools) -> tuple[Floats, Floats]:
-    """Return (spacings m, time headways s) of all vehicles with another one ahead on their lane."""
+    """Return spacings [m] and time headways [s] of all vehicles that follow another one."""
     sample = np.rint(tracks.t_s / SAMPLE_S)
     chosen = steady & (np.abs(tracks.t_s - sample * SAMPLE_S) < 0.5 * scenario.runtime.tick_s)
     lane = np.clip(tracks.y_m // scenario.road.lane_width_m, 0, scenario.road.lanes - 1)
@@ -142,19 +142,19 @@ def _histogram(values: Floats, edges: Floats) -> Floats:
 
 
 Counted = Mapping[tuple[str, float], Counts]
-"""The counts of each label and volume."""
+"""Histograms of each label and volume."""
 
 MIN_SHARE = 1e-5
-"""Lower end of the exceedance scale."""
+"""Lower limit of the exceedance scale."""
 
 
 def draw_spacings(counted: Counted, scenario: Scenario, out: Path, dpi: int) -> None:
-    """Draw spacings and time headways: quantities below each other, volumes side by side."""
+    """Draw spacings and time headways: a row per quantity, a column per volume."""
     _draw(counted, (SPACING, HEADWAY), scenario, out, dpi)
 
 
 def draw_comfort(counted: Counted, scenario: Scenario, out: Path, dpi: int) -> None:
-    """Draw decelerations, jerks and lateral accelerations, arranged likewise."""
+    """Draw decelerations, jerks and lateral accelerations in the same arrangement."""
     _draw(counted, (DECELERATION, JERK, LATERAL), scenario, out, dpi)
 
 
@@ -164,7 +164,7 @@ def _draw(
     labels = list(dict.fromkeys(label for label, _ in counted))
     volumes = spread_evenly(sorted({volume for _, volume in counted}))
     colours, single = label_colours(labels), len(volumes) == 1
-    # With one volume, quantities are side by side: a single column of panels would be too tall.
+    # With one volume, put the quantities side by side, because one column would be too tall.
     size_in = (3.2 * len(quantities), 3.0)
     if not single:
         size_in = (1.0 + 2.1 * len(volumes), 0.6 + 1.95 * len(quantities))
@@ -203,7 +203,7 @@ def _draw_one(axes: Axes, counts: Counts, quantity: Quantity, label: str, colour
 
 
 def _set_value(quantity: Quantity, scenario: Scenario) -> float:
-    """Return the upper limit of a quantity, or the formation's set value."""
+    """Return the upper limit of a quantity, or the nominal value of formations."""
     vehicle, formation = scenario.vehicle, scenario.formation
     return {
         SPACING.name: formation.gap_m,

@@ -1,4 +1,4 @@
-"""Figures with labels side by side: travel times, throughput and shares, speeds."""
+"""Figures that compare labels: travel times, throughput and shares, speeds."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 JAMMED = 1.25
-"""A box belongs to a jam if its upper quartile exceeds the lowest median by this factor."""
+"""Travel times count as jammed if their upper quartile exceeds the lowest median by this factor."""
 MARGIN = 0.04
-"""Part of the scale that is free below the shortest travel time."""
+"""Margin below the shortest travel time, as a share of the scale."""
 LOWER_SHARE = 0.66
-"""Part of the height below the break, for the methods that do not jam."""
+"""Share of the height below the break of the axis, for methods without jams."""
 BIN_M, BIN_S = 20.0, 5.0
-"""Size of the bins of mean speeds."""
+"""Sizes of the bins of mean speeds."""
 
 
 def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
-    """Draw boxes of the counted vehicles' travel times, all seeds together, by volume.
+    """Draw box plots of travel times over all seeds, by volume.
 
-    Where a method jams, the axis is broken: jams are much longer than other differences.
+    If only some methods jam, the axis is broken, because travel times in jams are much longer.
     """
     labels, volumes = comparison.labels, comparison.volumes
     times = {
@@ -92,7 +92,7 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
 
 
 def _break(times_s: Iterable[Floats]) -> float | None:
-    """Return the travel time at which the axis is broken; None: there is no jam, or only jams."""
+    """Return the travel time at which to break the axis; None: no jams, or only jams."""
     shapes = [np.percentile(one, [50.0, 75.0, 99.0]) for one in times_s if len(one)]
     limit_s = JAMMED * min((median_s for median_s, _, _ in shapes), default=0.0)
     ends_s = [end_s for _, upper_s, end_s in shapes if upper_s <= limit_s]
@@ -102,7 +102,7 @@ def _break(times_s: Iterable[Floats]) -> float | None:
 
 
 def _break_axis(upper: Axes, lower: Axes, break_s: float) -> None:
-    """Show times above the break on the upper axes, with a scale of its own, the others below."""
+    """Show times above the break in the upper axes with a separate scale, the others below."""
     lowest_s, top_s = lower.dataLim.ymin, lower.get_ylim()[1]
     lower.set_ylim(lowest_s - MARGIN * (break_s - lowest_s), break_s)
     upper.set_ylim(break_s, top_s)
@@ -115,16 +115,16 @@ def _break_axis(upper: Axes, lower: Axes, break_s: float) -> None:
 
 
 def _places(labels: int, volumes: int, width: float = 0.8) -> Floats:
-    """Return places along the axis, shape (labels, volumes): the labels of a volume side by side.
+    """Return positions along the axis, shape (labels, volumes), with labels side by side.
 
-    `width` is that of all labels at a volume; volumes are 1 apart.
+    `width` is the total width of the labels of a volume; the distance of volumes is 1.
     """
     shifts = (np.arange(labels) - 0.5 * (labels - 1)) * width / max(1, labels)
     return np.asarray(np.arange(volumes) + shifts[:, None])
 
 
 def _draw_boxes(axes: Axes, times_s: Mapping[str, Sequence[Floats]]) -> None:
-    """Draw the boxes of each label, one for each volume, and a line through their means."""
+    """Draw the boxes of each label by volume, and a line through their means."""
     volumes = len(next(iter(times_s.values())))
     all_places, colours = _places(len(times_s), volumes), label_colours(times_s)
     for places, (label, times) in zip(all_places, times_s.items(), strict=True):
@@ -151,7 +151,7 @@ def _free_flow_s(run: Run) -> float:
 
 
 def _travel_times(runs: Iterable[Run]) -> Floats:
-    """Return the travel times in s of the counted vehicles."""
+    """Return the travel times [s] of the counted vehicles."""
     found = [np.empty(0)]
     for run in runs:
         table = pq.read_table(run.folder / "trips.parquet", columns=["travel_time_s", "counted"])
@@ -187,9 +187,9 @@ def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
 def _draw_seeds(
     axes: Axes, comparison: Comparison, value: Callable[[RunSummary], float | None], apart: float
 ) -> None:
-    """Draw each run as a dot, and the mean over seeds with its standard deviation as a line.
+    """Draw each run as a dot, and means over seeds with standard deviations as a line.
 
-    Dots and lines of labels are a little apart, since several labels may have the same value.
+    The labels are shifted, because several labels may have the same values.
     """
     colours, labels, nothing = label_colours(comparison.labels), comparison.labels, True
     for number, label in enumerate(labels):
@@ -211,7 +211,7 @@ def _draw_seeds(
 
 
 def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
-    """Draw the mean speed over space and time, a panel for each label and volume."""
+    """Draw the mean speed over space and time, in a panel per label and volume."""
     labels, volumes = comparison.labels, spread_evenly(comparison.volumes)
     shown = {
         (label, volume): comparison.representative(label, volume)
@@ -264,7 +264,7 @@ class MeanSpeeds:
     edges_s: Floats
     """Edges of the bins in time."""
     speed_mps: np.ma.MaskedArray[Any, np.dtype[np.float64]]
-    """Shape (bins along the road, bins in time); masked where no vehicle was."""
+    """Shape (bins along the road, bins in time); bins without vehicles are masked."""
 
 
 def mean_speeds(run: Run) -> MeanSpeeds:

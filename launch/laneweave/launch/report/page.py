@@ -1,4 +1,4 @@
-"""The page of a report: one HTML file that needs no other file and no network."""
+"""The page of a report: a self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ PAGE_FILE: Final = "report.html"
 _PACKAGE: Final = "laneweave.launch.report"
 _PACES: Final = (0.5, 1, 2, 5, 10)
 _CSS_PIXELS_PER_IN = 110
-"""A little more than the standard 96, so that text of 8 pt is readable."""
+"""Slightly more than the standard 96, so that text of 8 pt is legible."""
 
 
 @frozen
 class Picture:
-    """A PNG file, embedded in the page in its natural size."""
+    """A PNG file that is embedded in the page in its natural size."""
 
     path: Path
     dpi: float
@@ -47,20 +47,20 @@ class Picture:
 
 @frozen
 class Animation:
-    """A moving road: its data, as of `animation.animation_data`."""
+    """An animated road, with data of `animation.animation_data`."""
 
     data: Mapping[str, Any]
 
     @property
     def lanes(self) -> list[tuple[str, str]]:
-        """(colour, name) of each lane, from the left."""
+        """(colour, name) of each lane, starting with the left lane."""
         names = lane_names(self.data["road"]["lanes"])
         return list(zip(self.data["colours"], names, strict=False))[::-1]
 
 
 @frozen
 class Section:
-    """A part of the page."""
+    """A section of the page."""
 
     title: str
     tables: Sequence[Table] = ()
@@ -69,12 +69,12 @@ class Section:
 
 
 def render_page(title: str, lead: str, sections: Sequence[Section]) -> str:
-    """Return the HTML of a page; all texts are escaped."""
+    """Return the HTML of a page with escaped texts."""
     environment = Environment(
         loader=PackageLoader(_PACKAGE), autoescape=True, undefined=StrictUndefined
     )
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
-    # "use strict" is in two of the scripts; the second one is a string without effect.
+    # Two scripts contain "use strict"; the second one has no effect.
     scripts = road_script() + _file("player.js") + _file("controls.js")
     return environment.get_template("page.html").render(
         title=title,

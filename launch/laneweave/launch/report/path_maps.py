@@ -1,9 +1,9 @@
-"""The relative path map (paper, Section 3.3) of a formation as it was driven, and its figure.
+"""The driven relative path map (paper, Section 3.3) of a formation, and its figure.
 
-One row per vehicle, one column per fixed time point, T_F apart. The first time point and T_F are
-those of the plan that was driven. In recordings without them, the map begins with the first move,
-and T_F is that of the scenario. A vehicle's cell is the one that it holds or, while it moves, the
-one that it moves to: at the end of each slot it is in that cell.
+The map has a row per vehicle and a column per time point at intervals of T_F. The first time point
+and T_F are those of the driven plan; in recordings without them, the map begins with the first move
+and uses T_F of the scenario. The cell of a moving vehicle is the target of its move, which it
+reaches by the end of the slot.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ _MAX_LISTED = 8
 
 @frozen
 class DrivenMap:
-    """A formation's relative path map as it was driven."""
+    """Driven relative path map of a formation."""
 
     formation: int
     rolling: bool
-    """The run had no formations; the vehicles are those that entered in the columns of a block."""
+    """Whether the run had no formations; the vehicles are those that entered in a block."""
     path_map: RelativePathMap
-    """Columns count from the formation's rearmost one."""
+    """Path map with columns relative to the rearmost one of the formation."""
     preferred_lanes: tuple[int, ...]
-    """Of the vehicles, in the order of rows."""
+    """Preferred lane of the vehicle in each row."""
     start_s: float
     """Road time of the first time point."""
     slot_s: float
@@ -54,27 +54,24 @@ class DrivenMap:
 
     @property
     def name(self) -> str:
-        """Its name in figures."""
+        """Name of the formation in figures."""
         return f"{'block' if self.rolling else 'formation'} {self.formation}"
 
     @property
     def vehicles(self) -> str:
-        """Description of its vehicles."""
+        """Description of the vehicles."""
         if self.rolling:
             return "the vehicles that entered in the columns of a block"
         return "a formation's vehicles"
 
 
 def driven_map(run: Run, tracks: Tracks, formation: int | None) -> DrivenMap | None:
-    """Return the path map of a formation.
+    """Return the driven path map of a formation; None: the run has no formations.
 
     Args:
         run: the run.
-        tracks: its trajectories.
-        formation: number of the formation; None: the one whose vehicles move most.
-
-    Returns:
-        None if the run has no formations.
+        tracks: trajectories of the run.
+        formation: number of the formation; None: the one with the most moves.
 
     Raises:
         BadInputError: the run has no such formation.
@@ -113,16 +110,16 @@ def _map_of(
     last_s = max(changes_s, default=entered_s)
     start_s, slot_s = _driven_slots(run, formation.number, entered_s, changes_s)
     steps = max(0, int(np.ceil((last_s - start_s + 0.5 * tick_s) / slot_s)))
-    # Moves begin with a tick, and show their target from that tick on.
+    # Moves begin with a tick; their target is recorded from that tick on.
     times_s = start_s - 0.5 * tick_s + slot_s * np.arange(steps + 1, dtype=np.float64)
     rows = []
     for part in parts:
-        # The vehicle's row at each time, the nearest one before it.
+        # Row of the vehicle at or before each time.
         places = np.searchsorted(tracks.t_s[part], times_s, side="right") - 1
         places = np.maximum(places, 0)
         columns, lanes = tracks.column[part][places] - formation.rear, tracks.lane[part][places]
         rows.append(tuple(zip(columns.tolist(), lanes.tolist(), strict=True)))
-    # As in the paper's table: from the front backwards, and from the right.
+    # Order of the paper's table: from front to rear, then from right to left.
     order = sorted(range(len(rows)), key=lambda row: (-rows[row][0][0], rows[row][0][1]))
     return DrivenMap(
         formation.number,
@@ -141,15 +138,15 @@ def _map_of(
 def _driven_slots(
     run: Run, formation: int, entered_s: float, changes_s: list[float]
 ) -> tuple[float, float]:
-    """Return when the slots of a formation begin (road time), and how long each is.
+    """Return road time of the first slot of a formation, and length of the slots.
 
-    They are those of the last of its plans of which a move was driven, if any was.
+    They are those of the last plan under which the formation moved, if any.
 
     Args:
         run: the run.
         formation: number of the formation.
-        entered_s: when its last vehicle entered.
-        changes_s: times at which its vehicles began to move to other cells.
+        entered_s: entry time of its last vehicle.
+        changes_s: times at which its vehicles started to move to other cells.
     """
     tick_s, slot_s = run.scenario.runtime.tick_s, run.scenario.cycles_s[0]
     last_s = max(changes_s, default=math.inf) + 0.5 * tick_s
@@ -164,13 +161,13 @@ def _driven_slots(
             found = slots if slots[0] <= last_s and slots[1] > 0.0 else found
     if found is not None:
         return found
-    # The first one to move may be late already, by no more than the slack of a slot.
+    # The first move may be late by at most the slack of a slot.
     slack_s = run.scenario.formation.slack_s
     return min(changes_s, default=entered_s + slack_s + tick_s) - slack_s, slot_s
 
 
 def draw_path_map(driven: DrivenMap, out: Path, dpi: int) -> None:
-    """Draw the table; cells have the colour of their lane, strong where it is the preferred one."""
+    """Draw the table; cells have the colour of their lane, strong if it is the preferred one."""
     path_map = driven.path_map
     rows, points = len(path_map.rows), path_map.steps + 1
     with picture(2.3 + 1.12 * points, 0.8 + 0.36 * (rows + 1), out, dpi) as figure:
@@ -192,7 +189,7 @@ def draw_path_map(driven: DrivenMap, out: Path, dpi: int) -> None:
 
 
 def _draw_row(axes: Axes, row: int, driven: DrivenMap) -> None:
-    """Draw a vehicle's row: its name with the colour of its lane, then its cells."""
+    """Draw the row of a vehicle: name with the colour of the preferred lane, then the cells."""
     from matplotlib.patches import FancyBboxPatch, Rectangle  # noqa: PLC0415 - lazily
 
     colours, preferred = lane_colours(driven.lanes), driven.preferred_lanes[row]
@@ -201,7 +198,7 @@ def _draw_row(axes: Axes, row: int, driven: DrivenMap) -> None:
     colour = colours[preferred % len(colours)]
     axes.add_patch(FancyBboxPatch((-1.25, row + 0.2), 0.3, 0.6, fc=colour, **style))
     shown = name if len(name) <= _MAX_NAME else name[: _MAX_NAME - 1] + "…"
-    # Names come from files; a dollar sign must not begin a formula.
+    # Names come from files; a dollar sign must not start a formula.
     axes.text(-0.85, row + 0.5, shown, va="center", fontsize=8.5, parse_math=False)
     for point, (cell, before) in enumerate(zip(cells, (cells[0], *cells), strict=False)):
         colour, alpha = colours[cell[1] % len(colours)], 0.62 if cell[1] == preferred else 0.16
@@ -212,5 +209,5 @@ def _draw_row(axes: Axes, row: int, driven: DrivenMap) -> None:
 
 
 def _write(axes: Axes, point: int, y: float, text: str, **style: Any) -> None:  # noqa: ANN401
-    """Write into the middle of a time point's column."""
+    """Write into the centre of the column of a time point."""
     axes.text(point + 0.5, y, text, ha="center", va="center", **{"fontsize": 8.5} | style)

@@ -1,4 +1,4 @@
-"""Snapshots of the road: all vehicles at some instants, drawn from a run's Parquet files."""
+"""Snapshots of the road at some times, drawn from the Parquet files of a run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ASPHALT, _PAINT = "#eeeff1", "#ffffff"
 _OWNED = ("#e2e4e8", "#d5d8dd")
 """Alternating colours of the columns of formations."""
 _ACROSS_SCALE = 1.8
-"""Scale across the road over the scale along it: to scale, lanes would be too thin."""
+"""Scale across the road relative to the scale along it; lanes would be too thin otherwise."""
 _HEADROOM_M = 4.5
 """Space above the road for the numbers of formations."""
 
@@ -42,19 +42,19 @@ def road_snapshots(
     stretch_m: tuple[float, float] | None = None,
     dpi: int = DPI,
 ) -> None:
-    """Draw the same stretch of road at some instants, one strip below the other.
+    """Draw a stretch of road at some times, one strip below the other.
 
-    Vehicles have the colour of the lane that they prefer; the faster, the lighter. Left lanes are
-    on top, traffic goes to the right. The columns of formations have alternating shades of grey,
-    and the formations' numbers above the road.
+    Vehicles have the colour of their preferred lane; faster vehicles are lighter. Left lanes are on
+    top, traffic moves to the right. The columns of formations have alternating shades of grey, with
+    the numbers of the formations above the road.
 
     Args:
-        folder: a run's folder.
-        out: the picture to write; its suffix defines the format.
-        times: road times in s; empty: the four instants, the shortest T_F apart, at which most
+        folder: folder of the run.
+        out: file of the picture; its suffix defines the format.
+        times: road times [s]; empty: the four times at intervals of the shortest T_F at which most
             vehicles are between two lanes.
-        stretch_m: (from m, to m); None: from 20 m before lane sorting begins to
-            300 m behind that point.
+        stretch_m: (from m, to m); None: from 20 m before lane sorting begins to 300 m behind that
+            point.
         dpi: resolution in dots per inch.
     """
     scenario = scenario_of(folder / "trajectories.parquet")
@@ -86,7 +86,7 @@ def road_snapshots(
 
 
 def _pose(tracks: Tracks, number: int, t_s: float) -> tuple[float, float, float, float] | None:
-    """Return (s m, y m, heading rad, speed m/s) of a vehicle; None: it is not on the road."""
+    """Return (s m, y m, heading rad, speed m/s) of a vehicle; None: not on the road."""
     times_s, y_m = tracks.t_s[tracks.rows(number)], tracks.y_m[tracks.rows(number)]
     if not times_s[0] - 1e-6 <= t_s <= times_s[-1] + 1e-6:
         return None
@@ -128,7 +128,7 @@ def _draw_formations(
     formations: Formations,
     t_s: float,
 ) -> None:
-    """Shade the columns of formations, and write their numbers above."""
+    """Shade the columns of formations, and write their numbers above the road."""
     lattice = scenario.lattice
     width_m = lattice.lanes * lattice.lane_width_m
     margin_m = 0.5 * (lattice.pitch_m - scenario.vehicle.length_m)
@@ -154,7 +154,7 @@ def _draw_formations(
 def _draw_vehicle(
     axes: Axes, pose: tuple[float, float, float, float], preferred: int, scenario: Scenario
 ) -> None:
-    """Draw a vehicle's body, and a pale windscreen at its front."""
+    """Draw the body of a vehicle with a pale windscreen."""
     from matplotlib.patches import Polygon  # noqa: PLC0415 - lazily, see above
 
     s_m, y_m, heading, speed_mps = pose
@@ -163,7 +163,7 @@ def _draw_vehicle(
     centre = np.array([s_m - 0.5 * length_m * np.cos(heading), y_m])
 
     def shape(rear: float, front: float, half: float) -> Floats:
-        """Return corners of a part of the body, shape (4, 2); shares of length and width."""
+        """Return the corners of a part of the body, shape (4, 2), from shares of its size."""
         box = np.array([[rear, -half], [front, -half], [front, half], [rear, half]])
         return np.asarray((box * [length_m, width_m]) @ turn + centre, dtype=np.float64)
 
@@ -176,7 +176,7 @@ def _draw_vehicle(
 
 
 def _draw_legend(figure: Figure, scenario: Scenario) -> None:
-    """Draw a legend of the colours above the strips."""
+    """Draw the legend of colours above the strips."""
     from matplotlib.patches import Patch  # noqa: PLC0415 - lazily, see above
 
     speed_mps = scenario.formation.speed_mps
@@ -198,7 +198,7 @@ def _draw_legend(figure: Figure, scenario: Scenario) -> None:
 
 
 def _shade(colour: str, over_mps: float) -> tuple[float, float, float]:
-    """Return a colour, darker below the lattice's speed and lighter above it."""
+    """Return a colour, darkened below the speed of the lattice and lightened above it."""
     from matplotlib.colors import to_rgb  # noqa: PLC0415 - lazily, see above
 
     share = float(np.clip(over_mps / SPEED_SPAN_MPS, -1.0, 1.0))
@@ -209,10 +209,10 @@ def _shade(colour: str, over_mps: float) -> tuple[float, float, float]:
 
 
 def _instants(tracks: Tracks, scenario: Scenario, stretch_m: tuple[float, float]) -> list[float]:
-    """Return four times, the shortest T_F apart, at which most vehicles are between two lanes.
+    """Return four times at intervals of the shortest T_F at which most vehicles change lanes.
 
-    There are fewer if the recording ends earlier. A vehicle counts by its distance from the nearest
-    lane centre, and a little for being on the stretch.
+    There are fewer if the recording ends earlier. A vehicle on the stretch counts with its distance
+    from the nearest lane centre, plus a small constant.
     """
     t_s, s_m, y_m = tracks.t_s, tracks.s_m, tracks.y_m
     if not len(t_s):

@@ -1,4 +1,4 @@
-"""The style of a report's figures: colours of labels, axes, legends, panels."""
+"""Style of the figures of reports: colours of labels, axes, legends, panels."""
 
 from __future__ import annotations
 
@@ -49,16 +49,16 @@ _STYLE: Final[Any] = {
     "ytick.major.size": 3,
 }
 REFERENCE: Final[dict[str, Any]] = {"color": "#8a9099", "linewidth": 1.0, "linestyle": "--"}
-"""The style of lines for limits and set values."""
+"""Style of lines for limits and nominal values."""
 SMALL_TEXT: Final[dict[str, Any]] = {"fontsize": 7.5, "color": FAINT_INK}
-"""The style of small texts."""
+"""Style of small texts."""
 MAX_COLUMNS: Final = 6
-"""Volumes that fit side by side."""
+"""Maximum number of volumes side by side."""
 
 
 @contextlib.contextmanager
 def picture(width_in: float, height_in: float, out: Path, dpi: float) -> Iterator[Figure]:
-    """Yield an empty figure in the style of reports, and write it to a file at the end."""
+    """Yield an empty figure in the style of reports, and save it at the end of the context."""
     import matplotlib as mpl  # noqa: PLC0415 - lazily
 
     with mpl.rc_context(_STYLE):
@@ -68,9 +68,9 @@ def picture(width_in: float, height_in: float, out: Path, dpi: float) -> Iterato
 
 
 def label_colours(labels: Iterable[str]) -> dict[str, str]:
-    """Return the colour of each label, by its place in the table of methods.
+    """Return a colour for each label; those of `METHODS` always have the same colours.
 
-    Other labels have unused colours, as long as there are some.
+    Other labels get unused colours, which repeat if there are too few.
     """
     colours = dict(zip(METHODS, _PALETTE, strict=False))
     chosen = {label: colours[label] for label in labels if label in colours}
@@ -80,7 +80,7 @@ def label_colours(labels: Iterable[str]) -> dict[str, str]:
 
 
 def spread_evenly(volumes: Sequence[float]) -> tuple[float, ...]:
-    """Return at most `MAX_COLUMNS` volumes, the first and the last among them."""
+    """Return at most `MAX_COLUMNS` volumes, including the first and the last."""
     if len(volumes) <= MAX_COLUMNS:
         return tuple(volumes)
     step = (len(volumes) - 1) / (MAX_COLUMNS - 1)
@@ -93,7 +93,7 @@ def volume_title(volume_veh_per_lane_h: float) -> str:
 
 
 def legend_above(figure: Figure) -> None:
-    """Put one legend for all panels above them."""
+    """Draw one legend above all panels."""
     entries: dict[str, Any] = {}
     for axes in figure.axes:
         handles, labels = axes.get_legend_handles_labels()
@@ -105,5 +105,5 @@ def legend_above(figure: Figure) -> None:
 
 
 def explain_empty_axes(axes: Axes, text: str) -> None:
-    """Write the reason into the middle of empty axes."""
+    """Write the reason into the centre of empty axes."""
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", **SMALL_TEXT)

@@ -1,4 +1,4 @@
-"""The table of one run, as text: printed at its end, and part of its report."""
+"""The result table of a run, printed at its end and contained in its report."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from laneweave.protocol.scenario.fields import COMFORT_MPS2
 from laneweave.protocol.summary import Planning, RunSummary, Safety
 
 MAX_LISTED = 5
-"""Up to this number of recovery times are listed one by one."""
+"""Maximum number of recovery times that are listed individually."""
 
 
 def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
-    """Return the rows of a run's table: (figure, value)."""
+    """Return the rows (figure, value) of the table of a run."""
     return [*_traffic_rows(summary), *_control_rows(summary), *_fault_rows(summary)]
 
 
@@ -25,7 +25,7 @@ def _traffic_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ("demand", f"{summary.volume_veh_per_lane_h:g} vehicles/(lane h), seed {summary.seed}"),
         ("simulated time", f"{summary.simulated_s:.1f} s"),
         ("vehicles left / entered", f"{vehicles.left} / {vehicles.entered}"),
-        ("most at one time", f"{vehicles.peak}"),
+        ("maximum at one time", f"{vehicles.peak}"),
         ("on their preferred lane", f"{vehicles.on_preferred_lane} ({share:.2%})"),
         ("travel time mean / p95 / max", _join(travel_s.mean, travel_s.p95, travel_s.max) + " s"),
         ("ticks driven without an agent", _count(tracking.hold_law_ticks)),
@@ -40,7 +40,7 @@ def _traffic_rows(summary: RunSummary) -> list[tuple[str, str]]:
 
 
 def _discomfort(safety: Safety) -> str:
-    """Return a remark about accelerations beyond comfort; empty: there were none."""
+    """Return a remark about accelerations beyond comfort; empty: none."""
     found = (safety.min_accel_mps2, safety.max_accel_mps2)
     if all(value is None or round(abs(value), 2) <= COMFORT_MPS2 for value in found):
         return ""
@@ -70,7 +70,7 @@ def _control_rows(summary: RunSummary) -> list[tuple[str, str]]:
 
 
 def _recoveries(seconds: list[float]) -> str:
-    """Return the times without a leader in brackets; median and maximum if there are many."""
+    """Return the times without a leader in brackets, or their median and maximum if many."""
     if not seconds:
         return ""
     if len(seconds) <= MAX_LISTED:
@@ -79,7 +79,7 @@ def _recoveries(seconds: list[float]) -> str:
 
 
 def _by_solver(planning: Planning) -> str:
-    """Return the number of plans of each solver; summaries of earlier versions have none."""
+    """Return the number of plans of each solver; "-" for summaries of earlier versions."""
     if planning.by_solver is None:
         return "-"
     made = [f"{solver} {plans}" for solver, plans in planning.by_solver.items() if plans]
@@ -101,7 +101,7 @@ def _fault_rows(summary: RunSummary) -> list[tuple[str, str]]:
     if methods:
         how = ", ".join(dict.fromkeys(methods.values()))
         why = faults.get("why_no_namespaces")
-        rows.append(("partitions made with", f"{how} ({why})" if why else how))
+        rows.append(("partitions implemented by", f"{how} ({why})" if why else how))
     return rows
 
 

@@ -17,7 +17,7 @@ from laneweave.launch.recordings.runs import Comparison, Run
 from laneweave.launch.report.summary_table import summary_rows
 
 _Column = tuple[str, str, str, int]
-"""Heading, column of the results, its aggregation over seeds (empty: a text), digits."""
+"""Heading, column of the results, aggregation over seeds (empty: text), number of digits."""
 
 _TRAFFIC: Final[tuple[_Column, ...]] = (
     ("runs", "runs", "", 0),
@@ -47,18 +47,18 @@ _BY_SOLVER: Final = "planning_by_solver_"
 
 @frozen
 class Table:
-    """A table of a page; without rows it is not shown."""
+    """A table of a page, which is shown only if it has rows."""
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
-    """Cells as text; the first one is the heading of its row."""
+    """Texts of the cells; the first cell of a row is its heading."""
     caption: str
     text_columns: int = 1
-    """The first columns are text, the others numbers."""
+    """Number of leading columns with text; the others are numbers."""
 
 
 def tables_of(comparison: Comparison) -> list[Table]:
-    """Return the tables of a report: of its only run, or of runs side by side."""
+    """Return the tables of a report: of a single run, or of runs side by side."""
     if len(comparison.runs) == 1 and not comparison.failed:
         return [run_table(comparison.runs[0])]
     results = results_table(comparison.runs)
@@ -69,32 +69,32 @@ def tables_of(comparison: Comparison) -> list[Table]:
     rows = [row | {"solvers": _solvers(row)} for row in over_seeds(results, wanted)]
     planned = [row for row in rows if row["planning_plans_sum"]]
     return [
-        _table(rows, _TRAFFIC, "Means over the seeds, ± their standard deviation."),
-        _table(rows, _SAFETY, "Extremes or sums over the seeds, not means."),
+        _table(rows, _TRAFFIC, "Means over the seeds ± standard deviation."),
+        _table(rows, _SAFETY, "Extremes or sums over the seeds."),
         _table(planned, _PLANNING, "Planning: sums over the seeds; sizes and times are maxima."),
         failed_table(comparison),
     ]
 
 
 def run_table(run: Run) -> Table:
-    """Return the figures of one run."""
+    """Return the table of one run."""
     rows = summary_rows(run.summary) if run.summary else []
     caption = "Results of the run; summary.json has all figures."
     return Table(("", "value"), [("method", run.label), *rows], caption, 2)
 
 
 def failed_table(comparison: Comparison) -> Table:
-    """Return the runs that failed."""
+    """Return the table of the failed runs."""
     rows = [
         (run.label, f"{run.volume_veh_per_lane_h:g}", str(run.scenario.seed), run.reason)
         for run in comparison.failed
     ]
-    caption = "Runs that failed; no figure and no mean contains them."
+    caption = "Failed runs, which are excluded from all figures and means."
     return Table(("label", "veh/(lane·h)", "seed", "reason"), rows, caption, 4)
 
 
 def _table(rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column], caption: str) -> Table:
-    """Return a table with a row for each label and volume."""
+    """Return a table with one row per label and volume."""
     cells = [
         [row[KEYS[0]], f"{row[KEYS[1]]:g}", *(_cell(row, column) for column in columns)]
         for row in rows
@@ -103,7 +103,7 @@ def _table(rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column], captio
 
 
 def _cell(row: Mapping[str, Any], wanted: _Column) -> str:
-    """Return a text or a figure; a mean with its standard deviation where there is one."""
+    """Return the text of a cell; means have their standard deviation if known."""
     _, column, function, digits = wanted
     if not function:
         return str(row[column])

@@ -1,8 +1,8 @@
 """The points of a sweep as tasks of an existing Dask cluster.
 
-Workers need laneweave, but no shared disk: the task returns a point's files, and the client writes
-them. Each task starts a process, as a local sweep does: a worker may run several tasks in one
-process, and SUMO may crash.
+Workers need laneweave, but no shared disk: tasks return the files of their points, which the client
+writes. Like a local sweep, each task starts a process, because a worker may run several tasks in
+one process, and SUMO may crash.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ CONNECT_S = 10.0
 
 
 TaskResult = tuple[PointResult, dict[str, bytes]]
-"""The result of a task: the point as it ended on its worker, and its files."""
+"""Result of a task: result of the point on the worker, and the contents of its files."""
 
 
 def run_on_dask(
     points: Sequence[Point], unfinished: Path, address: str
 ) -> Generator[PointResult, None, None]:
-    """Run all points on a cluster, and yield each at its end; closing the generator ends them.
+    """Run all points on a cluster, and yield their results; closing the generator ends them.
 
     Args:
         points: the points.
-        unfinished: folder on this machine in which the points' folders are created.
-        address: of the cluster's scheduler.
+        unfinished: folder on this machine for the folders of the points.
+        address: address of the scheduler.
 
     Raises:
         BadInputError: there is no scheduler at the address.
         OSError: files cannot be written.
     """
     sweep = f"laneweave-{uuid.uuid4().hex}"
-    # A client that does not connect logs a second error when it is garbage-collected.
+    # Check first: an unconnected client logs another error when it is garbage-collected.
     try:
         asyncio.run(_check_connection(address))
     except (OSError, ValueError) as error:
@@ -59,12 +59,12 @@ def run_on_dask(
             for future in as_completed(futures, loop=client.loop):
                 yield _received(future, futures[future], unfinished)
         finally:
-            # Waiting tasks are cancelled with their futures; running ones check this event.
+            # Queued tasks are cancelled with their futures; running tasks check this event.
             stop.set()
 
 
 def run_as_task(point: Point, sweep: str) -> TaskResult:
-    """Run a point on a worker (the task)."""
+    """Run a point on a worker; the function of the tasks."""
     stop = Event(sweep)
     with tempfile.TemporaryDirectory(prefix="laneweave-point-") as temporary:
         result = run_in_process(point, Path(temporary) / point.name, stop.is_set)
@@ -78,7 +78,7 @@ async def _check_connection(address: str) -> None:
 
 
 def _received(future: Future[TaskResult], point: Point, unfinished: Path) -> PointResult:
-    """Write the files that a task returned; a failed task is a failed run."""
+    """Write the files that a task has returned; a failed task is a failed run."""
     folder = unfinished / point.name
     folder.mkdir(parents=True)
     if future.status != "finished":
@@ -87,7 +87,7 @@ def _received(future: Future[TaskResult], point: Point, unfinished: Path) -> Poi
         future.release()
         return PointResult(point, folder, (f"its task failed: {' '.join(reason.split())}",), 0.0)
     result, files = future.result()
-    # Lets the cluster drop the result.
+    # Allow the cluster to drop the result.
     future.release()
     for name, content in files.items():
         (folder / name).write_bytes(content)

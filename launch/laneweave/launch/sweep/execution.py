@@ -1,7 +1,7 @@
-"""Runs points, each in a process of its own: libsumo holds one simulation, and may crash.
+"""Execution of points in separate processes: libsumo supports one simulation, and may crash.
 
-The process reads its job from `job.json` in its folder, and writes the run's files there, last of
-all `result.json`. A process that ends without a result is a failed run with a reason.
+A process reads its job from `job.json` in its folder, and writes the files of the run there,
+`result.json` last. If the process ends without a result, the run has failed.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from laneweave.protocol.summary import SUMMARY_FILE
 JOB_FILE, RESULT_FILE, LOG_FILE = "job.json", "result.json", "log.txt"
 POINT_PROCESS = "laneweave.launch.sweep.point_process"
 POLL_S = 0.2
-"""Period at which a worker checks whether the sweep was stopped."""
+"""Period at which workers check whether the sweep has been stopped."""
 END_S = 10.0
-"""Time that a process has to end after SIGTERM."""
+"""Time that processes have to end after SIGTERM."""
 
 
 @frozen
 class PointResult:
-    """A point that was run; its files are in `folder`."""
+    """Result of a point; its files are in `folder`."""
 
     point: Point
     folder: Path
     problems: tuple[str, ...]
-    """Why it failed; empty: it did not."""
+    """Reasons of a failure; empty: success."""
     wall_s: float
 
 
 def kept_files(point: Point) -> tuple[str, ...]:
-    """Return the names of the files of a point that are kept; if it fails, `LOG_FILE` is, too."""
+    """Return the names of the files of a point to keep, apart from `LOG_FILE` after a failure."""
     kept = (SUMMARY_FILE, "trips.parquet", "events.jsonl")
     return (*kept, TRAJECTORIES) if point.keep_trajectories else kept
 
 
 class StoppedError(Exception):
-    """The sweep was stopped before this run was finished."""
+    """The sweep has been stopped before the end of this run."""
 
 
 def run_in_process(point: Point, folder: Path, stopped: Callable[[], bool]) -> PointResult:
@@ -59,11 +59,11 @@ def run_in_process(point: Point, folder: Path, stopped: Callable[[], bool]) -> P
 
     Args:
         point: the point.
-        folder: where its files go; it is created.
-        stopped: returns whether the sweep was stopped.
+        folder: folder of the files, which is created.
+        stopped: returns whether the sweep has been stopped.
 
     Raises:
-        StoppedError: the sweep was stopped, and the process has ended.
+        StoppedError: the sweep has been stopped, and the process has ended.
         OSError: files or processes cannot be created.
     """
     if stopped():
@@ -73,13 +73,13 @@ def run_in_process(point: Point, folder: Path, stopped: Callable[[], bool]) -> P
     (folder / JOB_FILE).write_text(json.dumps(job), encoding="utf-8")
     began_s = time.monotonic()
     with (folder / LOG_FILE).open("wb") as log:
-        process = subprocess.Popen(  # noqa: S603 - this package, with arguments of its own
+        process = subprocess.Popen(  # noqa: S603 (no input from outside)
             [sys.executable, "-m", POINT_PROCESS, str(folder), str(os.getpid())],
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
             env=_environment(folder),
-            # Ctrl-C would reach the whole group; the sweep ends its processes itself.
+            # Keep Ctrl-C from the process: the sweep ends its processes.
             process_group=0,
         )
     wait_for_exit(process, point.name, stopped)
@@ -90,12 +90,12 @@ def run_in_process(point: Point, folder: Path, stopped: Callable[[], bool]) -> P
 def run_locally(
     points: Sequence[Point], unfinished: Path, workers: int
 ) -> Generator[PointResult, None, None]:
-    """Run all points on this machine, and yield each at its end; closing the generator ends them.
+    """Run all points on this machine, and yield their results; closing the generator ends them.
 
     Args:
         points: the points.
-        unfinished: folder in which the points' folders are created.
-        workers: number of processes at a time.
+        unfinished: folder for the folders of the points.
+        workers: maximum number of simultaneous processes.
 
     Raises:
         OSError: files or processes cannot be created.
@@ -115,15 +115,15 @@ def run_locally(
 
 
 def wait_for_exit(process: subprocess.Popen[bytes], name: str, stopped: Callable[[], bool]) -> None:
-    """Wait for a process; it has ended when this returns or raises.
+    """Wait for the end of a process, which is ended if an error is raised.
 
     Args:
         process: the process.
-        name: of its run.
-        stopped: returns whether the result is no longer wanted.
+        name: name of its run.
+        stopped: returns whether to stop the process.
 
     Raises:
-        StoppedError: it is no longer wanted, and the process was ended.
+        StoppedError: the process has been stopped.
     """
     try:
         while process.poll() is None:
@@ -137,7 +137,7 @@ def wait_for_exit(process: subprocess.Popen[bytes], name: str, stopped: Callable
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    """Return an environment: single-threaded linear algebra, temporary files in the folder."""
+    """Return the environment: one thread for linear algebra, temporary files in the folder."""
     limits = dict.fromkeys(THREAD_LIMITS, "1")
     return {**os.environ, **limits, "TMPDIR": str(folder.absolute())}
 

@@ -1,16 +1,15 @@
 """The folder of a sweep.
 
-    sweep.json              marks the folder; locked while a sweep is running in it
-    results.parquet         one row for each point that was run
-    LABEL-VOLUME-SEED/      one folder for each of them
-        point.json          its settings and result
-        summary.json        as of any run
-        trips.parquet, events.jsonl
+    sweep.json              identifies the folder; locked while a sweep is running
+    results.parquet         one row per completed point
+    LABEL-VOLUME-SEED/      one folder per completed point
+        point.json          settings and result
+        summary.json, trips.parquet, events.jsonl
         trajectories.parquet    if it is kept
         log.txt                 if the point failed
-    unfinished/             points that are running
+    unfinished/             folders of running points
 
-A point's folder appears atomically: it is renamed when all its files are written.
+The folder of a point appears atomically: it is renamed after all its files have been written.
 """
 
 from __future__ import annotations
@@ -42,13 +41,13 @@ SCHEMA = {"schema": "laneweave.sweep/1"}
 
 
 class SweepFolder:
-    """A sweep's folder, written by one sweep at a time; use it as a context manager."""
+    """Context manager of the folder of a sweep, which one sweep at a time may write."""
 
     def __init__(self, out: Path) -> None:
         """Open the folder of a new or an interrupted sweep.
 
         Raises:
-            BadInputError: it holds something else, or another sweep runs in it.
+            BadInputError: the folder has other content, or another sweep is running in it.
         """
         self.out = out
         try:
@@ -74,28 +73,28 @@ class SweepFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Remove unfinished points, and release the folder."""
+        """Remove unfinished points and release the folder."""
         shutil.rmtree(self.unfinished, ignore_errors=True)
         self._mark.close()
 
     @property
     def unfinished(self) -> Path:
-        """Folder in which points run."""
+        """Folder of the running points."""
         return self.out / "unfinished"
 
     @property
     def runs(self) -> Mapping[str, Run]:
-        """The points that were run, by name."""
+        """Completed points by name."""
         return self._runs
 
     def check_settings(self, base: Scenario) -> None:
-        """Check that the recorded points were run with the same settings.
+        """Check that the completed points have the same settings.
 
         Args:
-            base: the scenario of this sweep; its volume and seed are ignored.
+            base: scenario of this sweep; its volume and seed are ignored.
 
         Raises:
-            BadInputError: a setting that affects their method was different.
+            BadInputError: a setting that affects the method of a point differs.
         """
         for name, run in self._runs.items():
             labelled = METHODS.get(run.label)
@@ -106,14 +105,14 @@ class SweepFolder:
             tables["demand"]["volume_veh_per_lane_h"] = run.volume_veh_per_lane_h
             expected = flatten(to_tables(labelled.settings(parse_scenario(tables))), ".")
             recorded = flatten(to_tables(run.scenario), ".")
-            where = f"as recorded in {self.out / name}; a sweep with other settings needs a new one"
+            where = f"as recorded in {self.out / name}; other settings require a new folder"
             for field in dict.fromkeys([*recorded, *expected]):
                 value, own = recorded.get(field), expected.get(field)
                 if value != own and affects(field, run.method):
                     raise BadInputError(field, own, f"{value}, {where}")
 
     def is_finished(self, point: Point) -> bool:
-        """Return whether a point is done, with all files that are to be kept."""
+        """Return whether a point has succeeded, and all its files to keep exist."""
         run = self._runs.get(point.name)
         return (
             run is not None
@@ -124,10 +123,10 @@ class SweepFolder:
         )
 
     def add(self, result: PointResult) -> Run:
-        """Move a point that was run into the folder, and update the table of results.
+        """Move a completed point into the folder, and update the table of results.
 
         Raises:
-            CommandFailedError: it cannot be written.
+            CommandFailedError: the folder cannot be written.
         """
         point = result.point
         run = Run(
@@ -157,6 +156,6 @@ class SweepFolder:
         return run
 
     def write_results(self) -> None:
-        """Write the table of all points that were run."""
+        """Write the table of all completed points."""
         runs = sorted(self._runs.values(), key=lambda run: run.order)
         write_results(runs, self.out / RESULTS_FILE)

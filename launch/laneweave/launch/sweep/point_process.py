@@ -20,13 +20,13 @@ from laneweave.protocol.runtime.processes import die_with_parent
 
 
 def main(folder: Path, parent: int) -> None:
-    """Run the job in a folder, repeatably; failures end this process with a status and a log.
+    """Run the job in a folder; failures end this process with a status and a log.
 
     Args:
-        folder: contains `job.json`.
-        parent: process id of the process that ordered the run; the run ends with it.
+        folder: folder with `job.json`.
+        parent: id of the process that started this one; the run ends with it.
     """
-    # As with Ctrl-C, files are completed and temporary folders removed.
+    # Handle SIGTERM like Ctrl-C, to complete files and remove temporary folders.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     die_with_parent()
     if os.getppid() != parent:

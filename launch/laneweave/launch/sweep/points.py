@@ -1,4 +1,4 @@
-"""The points of a sweep: one run each."""
+"""The points of a sweep, each of which is a run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Point:
 
     @property
     def volume_veh_per_lane_h(self) -> float:
-        """The demand on each lane."""
+        """Demand per lane."""
         return self.scenario.demand.volume_veh_per_lane_h
 
     @property
@@ -36,7 +36,7 @@ class Point:
 
 
 def volume_text(volume_veh_per_lane_h: float) -> str:
-    """Return a volume as it is written in names."""
+    """Return a volume as text for names."""
     return f"{volume_veh_per_lane_h:.10g}"
 
 
@@ -44,7 +44,7 @@ def parse_volumes(text: str, base: Scenario) -> tuple[float, ...]:
     """Return the volumes of a comma-separated list, in vehicles/(lane h).
 
     Raises:
-        BadInputError: one is not a number, not possible in this scenario, or named twice.
+        BadInputError: a volume is not a number, impossible in this scenario, or repeated.
     """
     volumes: list[float] = []
     for entry in text.split(","):
@@ -69,10 +69,10 @@ def plan_points(
     seeds: Sequence[int],
     keep: KeepTrajectories,
 ) -> tuple[Point, ...]:
-    """Return all points in the order in which they are run: seed by seed.
+    """Return all points in the order of execution: seed by seed.
 
     Raises:
-        BadInputError: there are too many, or a label's settings do not fit the scenario.
+        BadInputError: there are too many points, or settings of a label contradict the scenario.
     """
     count = len(labels) * len(volumes) * len(seeds)
     if count > MAX_POINTS:

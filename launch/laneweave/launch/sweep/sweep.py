@@ -1,4 +1,4 @@
-"""A sweep from its points to its table, with progress."""
+"""A sweep: execution of its points with progress, and a table of results."""
 
 from __future__ import annotations
 
@@ -20,37 +20,37 @@ from laneweave.launch.sweep.points import Point, volume_text
 from laneweave.protocol.errors import CommandFailedError
 
 Runner = Callable[[Sequence[Point], Path], Generator[PointResult, None, None]]
-"""Runs points in a folder and yields each at its end; closing the generator ends all of them."""
+"""Runs points in a folder, and yields their results; closing the generator ends all of them."""
 
 
 def run_sweep(points: Sequence[Point], folder: SweepFolder, run: Runner, *, show: bool) -> int:
     """Run the points that are not finished, and return the number of failed points.
 
     Args:
-        points: the sweep.
-        folder: where the points are recorded.
-        run: runs points.
+        points: all points of the sweep.
+        folder: folder of the sweep.
+        run: function that runs points.
         show: whether to show progress on stderr.
 
     Raises:
-        CommandFailedError: files or processes cannot be made.
+        CommandFailedError: files or processes cannot be created.
     """
     waiting = [point for point in points if not folder.is_finished(point)]
     folder.write_results()
     try:
         with (
             _Progress(len(points), len(points) - len(waiting), show=show) as progress,
-            closing(run(waiting, folder.unfinished)) as ends,
+            closing(run(waiting, folder.unfinished)) as results,
         ):
-            for ended in ends:
-                progress.count(folder.add(ended))
+            for result in results:
+                progress.count(folder.add(result))
     except OSError as error:
-        raise CommandFailedError(f"the sweep cannot go on: {error}") from error
+        raise CommandFailedError(f"the sweep cannot continue: {error}") from error
     return sum(bool(folder.runs[point.name].reason) for point in points)
 
 
 class _Progress(Progress):
-    """A bar on a terminal; elsewhere a line for each point."""
+    """Progress bar on a terminal; otherwise a line per point."""
 
     def __init__(self, total: int, finished: int, *, show: bool) -> None:
         console = Console(stderr=True)
@@ -68,10 +68,10 @@ class _Progress(Progress):
         self._failed = 0
         self._task = self.add_task("sweep", total=total, completed=finished, failed=0)
         if show and finished:
-            console.print(f"{finished} of {total} runs were finished before", highlight=False)
+            console.print(f"{finished} of {total} runs were already finished", highlight=False)
 
     def count(self, run: Run) -> None:
-        """Count a point that has ended."""
+        """Count a completed point."""
         self._failed += bool(run.reason)
         self.update(self._task, advance=1, failed=self._failed)
         if self._show:
@@ -81,7 +81,7 @@ class _Progress(Progress):
 
 
 def print_results(points: Sequence[Point], folder: SweepFolder, console: Console) -> None:
-    """Print the results of a sweep: means over its seeds, and the reasons of failed runs."""
+    """Print the means of a sweep over its seeds, and the reasons of failed runs."""
     runs = [folder.runs[point.name] for point in points]
     done = [folder.runs[point.name] for point in points if folder.is_finished(point)]
     columns = ("travel_time_s_mean", "throughput_veh_per_lane_h", PREFERRED)

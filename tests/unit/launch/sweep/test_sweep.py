@@ -83,7 +83,7 @@ def test_an_interrupted_sweep_is_continued(whole: Path, scenario: Path, tmp_path
     done = sweep(scenario, out, *LISTS, "--jobs", 1)
 
     assert done.returncode == 0, done.stderr
-    assert f"{len(finished)} of 4 runs were finished before" in done.stderr
+    assert f"{len(finished)} of 4 runs were already finished" in done.stderr
     for name, time_ns in times.items():
         assert (out / name / "summary.json").stat().st_mtime_ns == time_ns
     assert results(out) == results(whole)
@@ -142,7 +142,7 @@ def test_settings_that_do_not_affect_a_method_may_differ(whole: Path, tmp_path: 
     scenario.write_text(scenario.read_text() + '\n[rule]\ngap = "net"\n')
     done = sweep(scenario, whole, *LISTS)
     assert done.returncode == 0, done.stderr
-    assert "4 of 4 runs were finished before" in done.stderr
+    assert "4 of 4 runs were already finished" in done.stderr
 
 
 @pytest.mark.parametrize(
