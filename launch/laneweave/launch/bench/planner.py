@@ -1,7 +1,7 @@
 """`laneweave bench planner`: seeded formations of growing size (`request_families`).
 
-Measures the CPU time of one thread, with the compiled parts loaded: median and 95th percentile over
-the instances of a size and family. Instances that reach the deadline count with it.
+Measures the CPU time of one thread with loaded compiled parts: median and 95th percentile over the
+instances of a size and family. Instances that reach the deadline count with the deadline.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Family:
         """Return an instance.
 
         Raises:
-            BadInputError: so many vehicles do not fit into a block.
+            BadInputError: the vehicles do not fit into a block.
         """
         try:
             return self.make(
@@ -84,7 +84,7 @@ def bench_planner(
         vehicles: formation sizes.
         families: some of `FAMILIES`.
         instances: number of instances per size and family.
-        seed: of the first of them.
+        seed: of the first instance; each further one adds 1.
         deadline_s: of each request.
         solver: runs without a fallback; see `plan`.
 

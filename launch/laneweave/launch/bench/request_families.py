@@ -1,9 +1,9 @@
 """Seeded families of planning requests, for `laneweave bench planner` and for tests.
 
-Vehicles prefer a random lane, and the targets are parallel: as many on each lane as vehicles prefer
-it. In `block_request` and `formation_request` vehicles start interlaced (on a checkerboard) and the
-targets are in the middle columns; in `traffic_request` vehicles start where traffic puts them, and
-`targets.placements` chooses as it does for a formation on the road.
+Vehicles prefer random lanes, and the targets are parallel: as many on each lane as vehicles prefer
+it. In `block_request` and `formation_request` vehicles start interlaced (on a checkerboard), and
+the targets are in the middle columns. In `traffic_request` the starts are those of random traffic,
+and `targets.placements` places the targets as for a formation on the road.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ def block_request(
     conflicts: Sequence[str] | None = None,
     deadline_s: float = 4.0,
 ) -> PlanRequest:
-    """Return a formation in a block without spare columns, so with few empty cells."""
+    """Return a formation in a block without spare columns, that is, with few empty cells."""
     rng = random.Random(seed)  # noqa: S311
     starts = _checkerboard(vehicles, columns, lanes, first_column=0)
-    preferred = _preferred_lanes(rng, vehicles, lanes, most=columns)
+    preferred = _preferred_lanes(rng, vehicles, lanes, columns=columns)
     return _request(Grid(columns, lanes), starts, preferred, mode, conflicts, deadline_s)
 
 
@@ -59,13 +59,13 @@ def formation_request(
     conflicts: Sequence[str] | None = None,
     deadline_s: float = 4.0,
 ) -> PlanRequest:
-    """Return a formation with 2 to 4 spare columns in front and behind."""
+    """Return a formation with 2 to 4 spare columns in front of it and behind it."""
     rng = random.Random(seed)  # noqa: S311
     behind, ahead = rng.randint(*_SPARE_COLUMNS), rng.randint(*_SPARE_COLUMNS)
     occupied = -(-2 * vehicles // lanes)
     columns = behind + occupied + ahead
     starts = _checkerboard(vehicles, columns, lanes, first_column=behind)
-    preferred = _preferred_lanes(rng, vehicles, lanes, most=columns)
+    preferred = _preferred_lanes(rng, vehicles, lanes, columns=columns)
     return _request(Grid(columns, lanes), starts, preferred, mode, conflicts, deadline_s)
 
 
@@ -77,7 +77,7 @@ def traffic_request(
     conflicts: Sequence[str] = TRAFFIC_KINDS,
     deadline_s: float = 4.0,
 ) -> PlanRequest:
-    """Return a formation of at most so many vehicles as traffic fills one on three lanes.
+    """Return a formation of at max_vehicles so many vehicles as traffic fills one on three lanes.
 
     The volume is between 1000 and 2000 veh/(lane h). A formation has 3 to 7 columns: it ends with
     its last vehicle, or before a column that would bring too many, or with its seventh column. The
@@ -110,21 +110,21 @@ class _Vehicle:
 
 
 class _Arrivals:
-    """Vehicles that arrive on each lane while one column of cells passes in a second.
+    """Vehicles that arrive on each lane while one column of cells passes per second.
 
-    Headways are 1 s and an exponentially distributed rest.
+    A headway is 1 s plus an exponentially distributed time.
     """
 
-    def __init__(self, rng: random.Random, volume: float, most: int) -> None:
+    def __init__(self, rng: random.Random, volume: float, max_vehicles: int) -> None:
         self._rng = rng
-        self._most = most
+        self._max_vehicles = max_vehicles
         self._mean_rest_s = 3600.0 / volume - _MIN_HEADWAY_S
         self._column = 0
         self._waiting: list[deque[_Vehicle]] = [deque() for _ in range(_TRAFFIC_LANES)]
         self._last_s = [0.0] * _TRAFFIC_LANES
 
     def _first_vehicles(self) -> list[tuple[int, _Vehicle]]:
-        """Return lane and vehicle of those that may enter the next column, first come first."""
+        """Return lane and vehicle of those that may enter the next column, in order of arrival."""
         first = []
         for lane, queue in enumerate(self._waiting):
             while not queue or self._last_s[lane] <= self._column:
@@ -143,16 +143,16 @@ class _Arrivals:
         )
         entered: list[tuple[int, int, int]] = []
         columns = 0
-        while columns < longest and (len(entered) < self._most or columns < shortest):
+        while columns < longest and (len(entered) < self._max_vehicles or columns < shortest):
             max_per_lane = max(shortest, columns + 1)
             preferred = [preferred_lane for _, _, preferred_lane in entered]
             entering = []
             for lane, vehicle in self._first_vehicles():
-                # A vehicle for whose lane the formation is too short waits.
+                # A vehicle waits if the formation is too short for all who prefer its lane.
                 if preferred.count(vehicle.preferred_lane) < max_per_lane:
                     preferred.append(vehicle.preferred_lane)
                     entering.append(lane)
-            free_places = self._most - len(entered)
+            free_places = self._max_vehicles - len(entered)
             if len(entering) > free_places and columns >= shortest:
                 break
             entered += [
@@ -166,7 +166,7 @@ class _Arrivals:
         ]
 
     def _nonempty_queues(self) -> list[deque[_Vehicle]]:
-        """Return the queues, each with at least one vehicle."""
+        """Fill the queues and return them, each with at least one vehicle."""
         self._first_vehicles()
         return self._waiting
 
@@ -183,13 +183,13 @@ def _checkerboard(vehicles: int, columns: int, lanes: int, first_column: int) ->
     return board[:vehicles]
 
 
-def _preferred_lanes(rng: random.Random, vehicles: int, lanes: int, most: int) -> list[int]:
+def _preferred_lanes(rng: random.Random, vehicles: int, lanes: int, columns: int) -> list[int]:
     """Draw preferred lanes until no lane is preferred by more vehicles than it has columns."""
-    if vehicles > most * lanes:
-        raise ValueError(f"{vehicles} vehicles do not fit on {lanes} lanes of {most} columns")
+    if vehicles > columns * lanes:
+        raise ValueError(f"{vehicles} vehicles do not fit on {lanes} lanes of {columns} columns")
     while True:
         preferred = [rng.randrange(lanes) for _ in range(vehicles)]
-        if all(preferred.count(lane) <= most for lane in range(lanes)):
+        if all(preferred.count(lane) <= columns for lane in range(lanes)):
             return preferred
 
 

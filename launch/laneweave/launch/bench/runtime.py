@@ -1,6 +1,6 @@
-"""`laneweave bench runtime`: what a road full of processes costs.
+"""`laneweave bench runtime`: CPU time and memory of the processes of a run.
 
-Machines differ and are noisy: medians, and rates within one run.
+Reports medians, and rates within one run, since other load on the machine varies.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from laneweave.sim_bridge.recording.trips import percentiles_of
 ROLES = ("router", "coordinator", "bridge", "agent")
 CPU_PERIOD_S = 0.3
 WARM_UP_S = 10.0
-"""Road seconds after the road has filled before anything is measured."""
+"""Time on the road between the filled road and the first measurement."""
 
 
 @define
 class _Window:
-    """Processes seen at the beginning and the end of the measured part of a run."""
+    """CPU time and memory of all processes during the measured part of a run."""
 
     begin_s: float
     end_s: float
     seen: dict[str, tuple[psutil.Process, float]] = field(factory=dict)
-    """Each process, and its CPU time when it was last looked at."""
+    """Each process, and its CPU time at the last measurement."""
     measured_s: float = 0.0
     began: tuple[float, float] | None = None
     ended: tuple[float, float] | None = None
@@ -58,7 +58,7 @@ class _Window:
                 self._measure_cpu(process_ids, count=True)
                 self._measure_memory(process_ids)
             elif now_s >= self.measured_s + CPU_PERIOD_S:
-                # Vehicles leave, and their agents' accounts with them: look often.
+                # The CPU time of an agent is lost when its vehicle leaves: measure often.
                 self.measured_s = now_s
                 self._measure_cpu(process_ids, count=True)
 
@@ -80,7 +80,7 @@ class _Window:
 
 
 def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int) -> dict[str, Any]:
-    """Measure a run with about `vehicles` on the road, one process for `per_process` of them.
+    """Measure a run with about `vehicles` on the road and `per_process` of them per process.
 
     Returns:
         Real-time factor, tick time, CPU and memory per role, over `seconds` of road time.
@@ -117,7 +117,7 @@ def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int)
 
 
 def machine() -> dict[str, Any]:
-    """Return what the figures depend on."""
+    """Return the properties of the machine that the figures depend on."""
     return {
         "cores": os.cpu_count(),
         "python": platform.python_version(),

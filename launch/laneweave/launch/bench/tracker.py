@@ -1,8 +1,8 @@
 """`laneweave bench tracker`: CPU time of one tick of tracking.
 
-Ticks are recorded in seeded closed loops with small errors of measurement: situations in which
-another vehicle limits the motion, and undisturbed holds and moves. They are then solved again, in
-order, several times; the median of each tick counts. CPU time of one thread.
+Ticks are recorded in seeded closed loops with small measurement errors: situations in which another
+vehicle limits the motion, and undisturbed holds and moves. They are then solved again in order,
+several times; the result is the median of each tick. CPU time of one thread.
 """
 
 from __future__ import annotations
@@ -36,23 +36,23 @@ _PUSH_TICKS = 20
 
 @frozen(eq=False)
 class Episode:
-    """A situation to drive through."""
+    """One simulation of a situation."""
 
     reference: Reference
     ticks: int
     rear_m: Callable[[Array], Array] | None = None
     """Rear bumper of the vehicle ahead at given times [s]."""
     seen_s: float = 0.0
-    """When that vehicle is first seen."""
+    """Time at which that vehicle is first seen."""
     planned: bool = True
     """Whether its motion is known; otherwise it is sensed and extrapolated."""
     pushes: tuple[tuple[float, float], ...] = ()
-    """By how much the body is displaced [m] and accelerated [m/s] every `_PUSH_TICKS`."""
+    """Changes of position [m] and speed [m/s] that are applied to the body every `_PUSH_TICKS`."""
 
 
 @frozen(eq=False)
 class Tick:
-    """Input and answer of the tracker at one tick."""
+    """Input and result of the tracker at one tick."""
 
     state: State
     window: Window
@@ -61,7 +61,7 @@ class Tick:
 
 
 def drive(tracker: Tracker, scenario: Scenario, name: str, seed: str) -> Iterator[Tick]:
-    """Drive through an episode of a situation, in closed loop with an exact plant.
+    """Simulate an episode of a situation in closed loop with an exact plant.
 
     Args:
         tracker: a new one.
@@ -98,7 +98,7 @@ def bench_tracker(
         scenario: limits, tick and horizon.
         instances: episodes per situation.
         seed: of all episodes.
-        repeats: how often each tick is measured.
+        repeats: number of measurements of each tick.
 
     Returns:
         One row per situation.
@@ -128,7 +128,7 @@ def bench_tracker(
 
 
 def _replay(scenario: Scenario, ticks: Sequence[Tick]) -> Array:
-    """Return the CPU time [ms] of each tick of an episode, solved again."""
+    """Solve the ticks of an episode again; return the CPU time [ms] of each."""
     tracker = Tracker(scenario)
     tracker.program.set_up()
     times_s = [time.thread_time()]
@@ -162,7 +162,7 @@ def tracker_table(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def _predicted(episode: Episode, now_s: float, ahead_s: Array) -> Array | None:
-    """Return the positions of the rear bumper ahead that the tracker is given."""
+    """Return the predicted positions of the rear bumper ahead; None: no vehicle is seen."""
     if episode.rear_m is None or now_s < episode.seen_s:
         return None
     if episode.planned:
@@ -186,7 +186,7 @@ def _braking(
     Args:
         scenario: v_F.
         gap_m: initial distance from the front bumper of a vehicle in column 0.
-        start_s: when it begins to brake.
+        start_s: time at which it begins to brake.
         decel: its deceleration [m/s2].
         speed_mps: its final speed.
     """
@@ -229,7 +229,7 @@ def _falling_back(scenario: Scenario, rng: random.Random) -> Episode:
 
 
 def _close_behind(scenario: Scenario, rng: random.Random) -> Episode:
-    """Return a hold behind a vehicle at little more than the minimum gap."""
+    """Return a hold slightly above the minimum gap behind a vehicle."""
     gap_m = scenario.tracking.min_gap_m + rng.uniform(0.1, 2.0)
     rear = _braking(scenario, gap_m, 0.0, 1.0, scenario.lattice.speed_mps)
     reference = Reference.hold(scenario, (0, 1))
@@ -251,12 +251,12 @@ def _entering(scenario: Scenario, rng: random.Random) -> Episode:
 
 
 def _is_planned(rng: random.Random) -> bool:
-    # A vehicle that is only sensed is noticed late: that is where gap rows become active.
+    # A vehicle that is only sensed is noticed late, which makes gap constraints active.
     return rng.random() < 0.3
 
 
 def _undisturbed(scenario: Scenario, rng: random.Random) -> Episode:
-    """Return a hold or a move, every other time with a vehicle in the cell before the next one."""
+    """Return a hold or a move, in half of the episodes with a vehicle two cells ahead."""
     dx, dy = rng.choice([(0, 0), (0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
     reference = Reference.move(scenario, (0, 1), (dx, 1 + dy), 10) if dx or dy else None
     reference = reference or Reference.hold(scenario, (0, 1))

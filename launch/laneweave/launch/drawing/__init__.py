@@ -1,4 +1,4 @@
-"""Figures of plans, and the parts that all figures share: colours and figure files.
+"""Figures of plans; colours and helpers shared by all figures.
 
 Entry points: `plan` (relative coordinate system), `plan_on_road` (driven by vehicles),
 `tappa_process` and `tappa_text` (explanation), `figures`, `colours`. Imported by `cli`, `report`

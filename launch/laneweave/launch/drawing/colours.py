@@ -1,4 +1,4 @@
-"""The look of a road in figures, reports and on the live page: lane colours, names, scene."""
+"""Colours and names of lanes, and the scene of a road, for figures and the live page."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MORE_LANES = (
     "#808080",
 )
 SPEED_SPAN_MPS = 5.0
-"""Difference from the lattice speed with the darkest or lightest shade."""
+"""Difference from the lattice speed at which the shade is darkest or lightest."""
 SHADE_STRENGTH = 0.45
 
 

@@ -1,6 +1,6 @@
-"""What all pictures share: figures, and how they are saved.
+"""Create figures, write texts into them, and save them.
 
-matplotlib is imported when the first picture is drawn, so that the command line starts fast.
+matplotlib is imported when the first figure is drawn, so that the command line starts fast.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ INK, FAINT_INK = "#30343a", "#6a7078"
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure that needs no display."""
+    """Return an empty figure; no display is needed."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - lazily
     from matplotlib.figure import Figure  # noqa: PLC0415 - lazily
 
@@ -28,7 +28,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def save(figure: Figure, out: Path, dpi: float) -> None:
-    """Write a picture."""
+    """Save a figure to a file."""
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=dpi)
 
@@ -40,7 +40,7 @@ def write(
     size_pt: float,
     **style: Any,  # noqa: ANN401 (properties of a text)
 ) -> Text:
-    """Write a text; a dollar sign in it does not start a formula."""
+    """Write a text, in which a dollar sign does not start a formula."""
     found = axes.text(*point, text, size=size_pt, color=INK, va="center", parse_math=False)
     found.set(**style)
     return found

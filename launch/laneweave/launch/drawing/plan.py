@@ -29,21 +29,21 @@ Position = tuple[float, float]
 
 SUFFIXES: Final = (".png", ".gif")
 MAX_PANELS: Final = 120
-"""Longer plans are drawn up to this number of time points."""
+"""Maximum number of time points that are drawn."""
 FRAMES_PER_STEP: Final = 10
 MAX_MOVING_FRAMES: Final = 300
-"""Longer plans have fewer frames per step, because all frames are in memory at once."""
+"""Limit on frames, which are all in memory at once; long plans have fewer frames per step."""
 FRAMES_PER_S: Final = 12
 HELD_FRAMES: Final = (4, 18)
 """Additional frames for the start and for the end."""
 
 _PALETTE = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442")
-"""The colour-blind safe palette of Okabe and Ito."""
+"""The palette of Okabe and Ito, which is safe for colour-blind readers."""
 _SHADES = ((0.0, 0.0), (0.45, 0.0), (0.5, 1.0))
-"""Shades of the palette (plain, darker, lighter): share and brightness of the grey mixed in."""
+"""Shades of the palette (plain, darker, lighter): fraction and brightness of added grey."""
 _CELL, _BORDER, _BLOCKED = "#f1f2f4", "#d3d6db", "#a3a9b1"
 _LANE_HEIGHT, _BODY_LENGTH, _BODY_WIDTH, _OUTLINE = 0.8, 0.68, 0.46, 0.9
-"""In lengths of a cell; the outline is a share of the cell."""
+"""In lengths of a cell; the outline as a fraction of the cell."""
 _MAX_PANEL_COLUMNS, _MAX_WIDTH_IN, _MIN_WIDTH_IN = 4, 12.0, 5.6
 _MIN_CELL_IN, _MAX_CELL_IN = 0.34, 0.62
 _LEFT_IN, _BETWEEN_IN, _TITLE_IN = 0.32, 0.5, 0.64
@@ -59,10 +59,10 @@ def check_drawing(out: Path, option: str = "--draw") -> None:
 
     Args:
         out: the file.
-        option: that names it, for errors.
+        option: command-line option for error messages.
 
     Raises:
-        BadInputError: the ending is unknown, or nothing can be written there.
+        BadInputError: the suffix is unknown, or the file cannot be written.
     """
     if out.suffix.lower() not in SUFFIXES:
         raise BadInputError(option, str(out), "a file that ends with " + " or ".join(SUFFIXES))
@@ -80,7 +80,7 @@ def check_drawing(out: Path, option: str = "--draw") -> None:
 
 
 def draw_plan(request: PlanRequest, response: PlanResponse, out: Path) -> None:
-    """Write a figure or an animation, depending on the suffix of `out`."""
+    """Write a figure or an animation, as the suffix of `out` selects."""
     (write_gif if out.suffix.lower() == ".gif" else write_png)(request, response, out)
 
 
@@ -91,12 +91,12 @@ def write_png(request: PlanRequest, response: PlanResponse, out: Path, dpi: int 
 
 
 def write_gif(request: PlanRequest, response: PlanResponse, out: Path, dpi: int = 100) -> None:
-    """Write an animation of the plan in an endless loop."""
+    """Write a looping animation of the plan."""
     figure, (axes,), cell_in = _new_panels(request, response, 1)
     vehicles = _Vehicles.draw(axes, request, cell_in)
     _label_time(axes, 0)
     figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # the panel keeps its position
+    figure.set_layout_engine("none")  # keep the position of the panel
     writer = PillowWriter(fps=FRAMES_PER_S)
     with writer.saving(figure, str(out), _limited_dpi(figure, dpi, _MAX_FRAME_PIXELS)):
         for time in _frame_times(_steps(response)):
@@ -121,7 +121,7 @@ def plan_figure(request: PlanRequest, response: PlanResponse) -> Figure:
 
 
 def team_colours(request: PlanRequest) -> dict[frozenset[int], str]:
-    """Return the colour of each team: the vehicles with the same eligible targets."""
+    """Return a colour for each set of eligible targets, that is, for each team."""
     teams = dict.fromkeys(request.choices())
     return {choice: _colour(number) for number, choice in enumerate(teams)}
 
@@ -193,7 +193,7 @@ def _steps(response: PlanResponse) -> int:
 
 
 def _positions(request: PlanRequest, response: PlanResponse, time: float) -> list[Position]:
-    """Return the positions of the vehicles at a time in steps; after the end they do not change."""
+    """Return the positions of the vehicles at a time [steps]; after the end they are constant."""
     if not response.paths:
         return [vehicle.cell for vehicle in request.vehicles]
     step = min(math.floor(time), _steps(response))
@@ -208,7 +208,7 @@ def _positions(request: PlanRequest, response: PlanResponse, time: float) -> lis
 
 
 def _frame_times(steps: int) -> Iterator[float]:
-    """Yield the time in steps of each frame; vehicles start and stop gently."""
+    """Yield the time [steps] of each frame; vehicles accelerate and brake smoothly."""
     if steps == 0:
         yield 0.0
         return
@@ -273,7 +273,7 @@ def _draw_target(axes: Axes, cell: Position, colours: Sequence[str]) -> None:
 
 
 def _draw_moves(axes: Axes, here: Sequence[Position], there: Sequence[Position]) -> None:
-    """Draw arrows that do not cover the names of vehicles."""
+    """Draw an arrow for each move, clear of the names of vehicles."""
     for a, b in zip(here, there, strict=True):
         if a == b:
             continue
@@ -299,13 +299,13 @@ def _rectangle(
 
 
 def short_name(name: str) -> str:
-    """Return a short name; of long names the end is kept, which usually differs most."""
+    """Return a short name: the end of a long name, which usually differs most."""
     plain = "".join(char if char.isprintable() else "?" for char in name)
     return plain if len(plain) <= _MAX_LABEL_LENGTH else "…" + plain[1 - _MAX_LABEL_LENGTH :]
 
 
 def _colour(team: int) -> str:
-    """Return a colour; there are 21."""
+    """Return one of 21 colours."""
     shade, number = divmod(team, len(_PALETTE))
     strength, grey = _SHADES[shade % len(_SHADES)]
     parts = to_rgb(_PALETTE[number])
@@ -320,7 +320,7 @@ def _ink_on(colour: str) -> str:
 
 
 def _limited_dpi(figure: Figure, dpi: float, max_pixels: float) -> float:
-    """Return a resolution that limits the memory of figures of long roads."""
+    """Return a resolution that limits the number of pixels of large figures."""
     width_in, height_in = map(float, figure.get_size_inches())
     by_area = math.sqrt(max_pixels / (width_in * height_in))
     return min(dpi, by_area, _MAX_SIDE_PIXELS / max(width_in, height_in))

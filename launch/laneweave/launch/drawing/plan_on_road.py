@@ -1,13 +1,13 @@
-"""A plan on the road as the vehicles' own controllers drive it, and figures of it.
+"""Simulation of a plan on the road with the vehicles' controllers, and figures of it.
 
-Step k begins at k T_F. Each vehicle follows its path as an agent drives it: the reference of
-`agents.driving`, its tracker, and the simulated body (`sim_bridge.bodies.plant`). All hold their
-start cells at time 0. There is no noise, no other traffic and no gap control: what is driven is the
-plan, with everything that its conflict kinds allow.
+Step k begins at k T_F. Each vehicle follows its path with the reference and the tracker of
+`agents.driving` and a simulated body (`sim_bridge.bodies.plant`), and holds its start cell at time
+0. There is no noise, no other traffic and no gap control, so that the motions show exactly what the
+conflict kinds of the plan allow.
 
 The upper panels of a figure show the road in the geodetic coordinate system after each step, with
-the path of each vehicle since the start; the lower ones the vehicles' positions over time, along
-the road relative to the moving formation, and across it. An animation shows the road alone.
+the path of each vehicle since the start. The lower panels show the positions over time: along the
+road relative to the moving formation, and across it. An animation shows only the road.
 
 This module needs matplotlib and OSQP; import it only to draw.
 """
@@ -43,7 +43,7 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, corners, pose_
 from laneweave.sim_bridge.bodies.plant import Plant
 
 MAX_INSTANTS: Final = 8
-"""Plans with more steps are drawn at only this number of instants."""
+"""Maximum number of instants at which the road is drawn."""
 MAX_FRAMES: Final = 240
 GIF_DPI: Final = 90
 _HELD_FRAMES: Final = 8
@@ -57,14 +57,14 @@ _ROAD, _MARKING = "#e3e5e8", "#ffffff"
 
 @attrs.frozen(eq=False)
 class Drive:
-    """Motions of all vehicles from the start until a plan has ended.
+    """Motions of all vehicles from the start to the end of a plan.
 
     states: (vehicles, ticks + 1, 6): s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2] on the
         road; s is the front bumper, 0 where the rear column is at time 0; y is the body's centre,
         from the right road edge.
     slot_ticks: ticks of a step.
     overlaps: pairs of vehicles whose bodies overlapped.
-    min_gap_m: shortest gap of two bodies in line; infinite: no two were in line.
+    min_gap_m: shortest gap between bodies on one lane; infinite: there was none.
     """
 
     scenario: Scenario
@@ -75,12 +75,12 @@ class Drive:
 
     @property
     def ticks(self) -> int:
-        """Ticks that it lasts."""
+        """Duration [ticks]."""
         return int(self.states.shape[1]) - 1
 
     @property
     def steps(self) -> int:
-        """Steps of the plan."""
+        """Number of steps of the plan."""
         return self.ticks // self.slot_ticks
 
     def time_s(self, tick: int) -> float:
@@ -100,7 +100,7 @@ def scenario_in_mode(scenario: Scenario, mode: int) -> Scenario:
 
 
 def drive_plan(scenario: Scenario, names: Sequence[str], paths: Sequence[Sequence[Cell]]) -> Drive:
-    """Drive a plan.
+    """Simulate a plan.
 
     Args:
         scenario: v_F, d_F, T_F, lane width, vehicles and tracking; see `scenario_in_mode`.
@@ -124,7 +124,7 @@ def drive_plan(scenario: Scenario, names: Sequence[str], paths: Sequence[Sequenc
 def _drive_vehicle(
     scenario: Scenario, path: Sequence[Cell], slot_ticks: int, ticks: int
 ) -> NDArray[np.float64]:
-    """Return the states of one vehicle, (ticks + 1, 6)."""
+    """Simulate one vehicle; return its states (ticks + 1, 6)."""
     reference, tracker = Reference.hold(scenario, path[0]), Tracker(scenario)
     start = cell_state(scenario.lattice, path[0], 0.0)
     plant = Plant(start, scenario.vehicle, scenario.runtime.tick_s)
@@ -140,9 +140,9 @@ def _drive_vehicle(
 
 
 def draw_road(request: PlanRequest, response: PlanResponse, scenario: Scenario, out: Path) -> None:
-    """Drive a plan and draw it as a figure or an animation, depending on the suffix of `out`.
+    """Simulate a plan and draw a figure or an animation, as the suffix of `out` selects.
 
-    Without a plan the start is drawn. `scenario` has the road, speeds and vehicles.
+    Without a plan the start is drawn. `scenario` defines the road, speeds and vehicles.
     """
     picture = _Picture.of(request, response, scenario)
     if out.suffix.lower() == ".gif":
@@ -153,7 +153,7 @@ def draw_road(request: PlanRequest, response: PlanResponse, scenario: Scenario, 
 
 @attrs.frozen(eq=False)
 class _Picture:
-    """The driven plan, with labels and colours of the vehicles."""
+    """The simulated plan, with labels and colours of the vehicles."""
 
     drive: Drive
     labels: list[str]
@@ -184,7 +184,7 @@ class _Picture:
 
 
 def road_figure(picture: _Picture) -> Figure:
-    """Return the road at successive instants, and positions over time below."""
+    """Return a figure of the road at successive instants and of positions over time."""
     drive, steps = picture.drive, picture.drive.steps
     count = min(steps, MAX_INSTANTS - 1) + 1
     instants = [round(number * steps / max(1, count - 1)) for number in range(count)]
@@ -217,7 +217,7 @@ def _draw_instant(axes: Axes, picture: _Picture, tick: int) -> None:
 
 
 def _draw_empty_road(axes: Axes, picture: _Picture, *, label_axis: bool) -> None:
-    """Draw the lanes, and if `label_axis` what the axis shows."""
+    """Draw the lanes, and the label of the axis if `label_axis`."""
     width_m = picture.drive.scenario.road.lane_width_m
     axes.set_xlim(*picture.extent_m)
     axes.set_ylim(-0.3, picture.lanes * width_m + 0.3)
@@ -239,7 +239,7 @@ def _label_time(axes: Axes, time_s: float) -> None:
 
 @attrs.frozen(eq=False)
 class _Body:
-    """One vehicle on a drawing of the road."""
+    """A vehicle in a drawing of the road."""
 
     shape: Polygon
     label: Annotation
@@ -271,7 +271,7 @@ class _Body:
 def _draw_over_time(
     axes: Axes, picture: _Picture, values: NDArray[np.float64], meaning: str
 ) -> None:
-    """Draw values (vehicles, ticks + 1) over time, with names where each line begins and ends."""
+    """Draw values (vehicles, ticks + 1) over time, with names at both ends of each line."""
     drive = picture.drive
     times_s = drive.scenario.runtime.tick_s * np.arange(drive.ticks + 1)
     ticks = range(0, drive.ticks + 1, drive.slot_ticks * math.ceil(max(1, drive.steps) / 10))
@@ -297,7 +297,7 @@ def _label_vehicles(
     offset_pt: tuple[float, float],
     alignment: str,
 ) -> None:
-    """Write names beside positions at a time; vehicles in the same position share a text."""
+    """Write names beside positions; vehicles at the same position share a text."""
     names: dict[int, list[str]] = {}
     for name, position in zip(labels, positions, strict=True):
         names.setdefault(round(position), []).append(name)
@@ -334,7 +334,7 @@ def _title(response: PlanResponse, drive: Drive) -> str:
 
 
 def _write_gif(picture: _Picture, out: Path) -> None:
-    """Write an animation of the road in an endless loop."""
+    """Write a looping animation of the road."""
     drive = picture.drive
     figure = new_figure(_WIDTH_IN, 0.8 + 1.6 * picture.lanes * _LANE_IN)
     figure.suptitle(picture.title, fontsize=9, color=INK)

@@ -30,7 +30,7 @@ _WIDTH_IN, _MARGIN_IN, _TITLE_IN, _CHAIN_IN, _HEADING_IN = 12.0, 0.25, 0.55, 1.7
 _LAYER_GAP_IN, _LINE_IN, _PAD_IN = 0.45, 0.165, 0.09
 _RADIUS_IN = 0.34
 _SPACING: Final = 1.5
-"""Line spacing of a text whose lines are `_LINE_IN` high."""
+"""Line spacing that makes lines `_LINE_IN` high."""
 _COLOURS: Final = {"expanded": "#f1f2f4", "solution": "#cdebd9", "open": "#fbf3dc"}
 _ASSIGNMENT, _PATHS, _BEST = "#f3c9c4", "#d9d2ec", "#8b74c9"
 _SMALL, _NORMAL = 7.5, 9.0
@@ -42,7 +42,7 @@ _ARROW: Final[dict[str, Any]] = {
 }
 
 Layer = tuple[list[ExplainedNode], int]
-"""Nodes of one depth of a tree, and how many are left out."""
+"""Drawn nodes of one depth of a tree, and the number of nodes that are left out."""
 
 
 def draw_explanation(explanation: Explanation, out: Path) -> None:
@@ -82,7 +82,7 @@ def explanation_figure(explanation: Explanation) -> Figure:
 def _best_assignment(
     assignments: Sequence[ExplainedAssignment],
 ) -> tuple[int, ExplainedAssignment] | None:
-    """Return k and A_k of the best path set, else of the first tree."""
+    """Return k and A_k of the best path set; without a path set, of the first tree."""
     found = [(k, one) for k, one in enumerate(assignments, start=1) if one.best_cost is not None]
     if not found:
         return (1, assignments[0]) if assignments and assignments[0].nodes else None
@@ -127,7 +127,7 @@ def _draw_circle(axes: Axes, centre: tuple[float, float], text: str, mfc: str) -
 
 
 def _layers(nodes: Sequence[ExplainedNode]) -> list[Layer]:
-    """Return the first layers of a tree; solutions and their ancestors are not left out."""
+    """Return the first layers of a tree; solutions and their ancestors are always included."""
     parents = {node.number: node.parent for node in nodes}
     ancestor = next((node.number for node in nodes if node.status == "solution"), 0)
     kept = set()
@@ -158,7 +158,7 @@ def _node_lines(node: ExplainedNode) -> list[str]:
 
 
 def _short(entry: str) -> str:
-    """Return an entry that fits into a box."""
+    """Return an entry, shortened to fit into a box."""
     return entry if len(entry) <= 30 else entry[:14] + "…" + entry[-14:]
 
 

@@ -14,7 +14,7 @@ from laneweave.coordinator.planning.paper.explanation import (
 )
 
 MAX_NODES_PRINTED: Final = 40
-"""Of one tree."""
+"""Maximum number of printed nodes of a tree."""
 MAX_TREES_PRINTED: Final = 12
 
 LITERAL = "the paper's constraint trees: one child for each entry of a node's conflict list"
@@ -30,7 +30,7 @@ _COUNTING = (
 
 
 def explanation_text(explanation: Explanation) -> str:
-    """Return a table of all assignments, the reason for the end, and the constraint trees."""
+    """Return the table of assignments, the stop reason, and the constraint trees."""
     lines = [
         f"TAPPA with {trees_shown(explanation)}.",
         _COUNTING,
@@ -48,7 +48,7 @@ def explanation_text(explanation: Explanation) -> str:
 
 
 def trees_shown(explanation: Explanation) -> str:
-    """Return a description of the kind of the constraint trees."""
+    """Return a description of the constraint trees: literal or improved."""
     return LITERAL if explanation.literal else IMPROVED
 
 
@@ -86,7 +86,7 @@ def _assignments(assignments: Sequence[ExplainedAssignment]) -> list[str]:
 
 
 def _tree(k: int, assignment: ExplainedAssignment) -> Iterator[str]:
-    """Yield the constraint tree of A_k, indented by depth, up to a number of nodes."""
+    """Yield the lines of the constraint tree of A_k, up to `MAX_NODES_PRINTED` nodes."""
     ending = "no path set below C'*" if assignment.best_cost is None else "solution"
     yield f"Constraint tree of A_{k}: {len(assignment.nodes)} nodes, {ending}"
     shown = assignment.nodes[:MAX_NODES_PRINTED]
@@ -103,7 +103,7 @@ def _tree(k: int, assignment: ExplainedAssignment) -> Iterator[str]:
 def _branch(
     nodes: Sequence[ExplainedNode], node: ExplainedNode, lead: str, below: str
 ) -> Iterator[str]:
-    """Yield a node and its descendants."""
+    """Yield the lines of a node and of its descendants, indented by depth."""
     added = f"  {node.constraint}" if node.constraint else ""
     conflicts = "; ".join(node.conflicts) if node.conflicts else "no conflicts"
     solution = ", solution" if node.status == "solution" else ""
