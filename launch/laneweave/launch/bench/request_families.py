@@ -77,11 +77,11 @@ def traffic_request(
     conflicts: Sequence[str] = TRAFFIC_KINDS,
     deadline_s: float = 4.0,
 ) -> PlanRequest:
-    """Return a formation of at max_vehicles so many vehicles as traffic fills one on three lanes.
+    """Return a formation that random traffic forms on three lanes.
 
     The volume is between 1000 and 2000 veh/(lane h). A formation has 3 to 7 columns: it ends with
-    its last vehicle, or before a column that would bring too many, or with its seventh column. The
-    second formation of the stream is the one that is taken.
+    its last vehicle, before a column with too many vehicles, or with its seventh column. The second
+    formation of the stream is returned.
     """
     rng = random.Random(seed)  # noqa: S311
     stream = _Arrivals(rng, rng.uniform(*_TRAFFIC_VOLUMES), vehicles)
