@@ -1,16 +1,16 @@
-"""What an agent costs per tick without the network: `python benchmarks/agent_core.py [--json]`.
+"""CPU time of an agent per tick without the network: `python benchmarks/agent_core.py [--json]`.
 
-Formations drive from the entrance to the end of the road and sort their lanes on the way, in a
-closed loop with real bodies and motion controllers and without disturbances. Each vehicle has a
-node and an agent host of its own, as in a process of its own, and is handed bytes as the transport
-hands them over. CPU time of this thread, garbage collection included:
+Formations drive from the entrance to the end of the road and sort their lanes, in a closed loop
+with the real bodies and motion controllers and without disturbances. Each vehicle has its own node
+and agent host, as in a separate process, and receives bytes as from the transport. CPU time of this
+thread, including garbage collection:
 
     total      from the bytes of a SENSE to those of the COMMAND and the STATE that answer it
-    tracking   of it `Driver.drive`
+    tracking   `Driver.drive`, a part of the total
     rest       the difference: decode, decide, encode
-    states     what other vehicles show, where an agent listens to it; not in the total
+    states     processing the states of other vehicles; not in the total
 
-The caches of a machine are warmer here than in a process that wakes up once per tick.
+CPU caches are warmer here than in a process that wakes up once per tick.
 """
 
 from __future__ import annotations
@@ -58,17 +58,17 @@ REPEATS = 5
 KEYS = Keys("bench")
 WEIGHTS = Weights.for_mode(1)
 SHIFT = (1, 2, 0)
-"""Lane that the vehicles of each lane prefer: all have to move."""
+"""Preferred lane of the vehicles of each lane, so that all have to move."""
 
 
 @define
 class Clock:
-    """CPU time that was spent on one thing."""
+    """Accumulated CPU time of an activity."""
 
     spent_ns: int = 0
 
     def call(self, work: Callable[..., Any], *args: object, **named: object) -> Any:  # noqa: ANN401
-        """Do some work and add up what it takes."""
+        """Call a function and add its CPU time."""
         began_ns = time.thread_time_ns()
         result = work(*args, **named)
         self.spent_ns += time.thread_time_ns() - began_ns
@@ -76,10 +76,10 @@ class Clock:
 
 
 class TimedDriver(TrackingDriver):
-    """The real driver, with a clock on `drive`."""
+    """The real driver with measured `drive`."""
 
     def __init__(self, scenario: Scenario, clock: Clock) -> None:
-        """Make a driver whose cost is added to a clock."""
+        """Create a driver that adds its CPU time to a clock."""
         super().__init__(scenario)
         self._clock = clock
 
@@ -90,28 +90,28 @@ class TimedDriver(TrackingDriver):
 
 
 class Outbox:
-    """A transport that only keeps what is sent, and what is listened to."""
+    """A transport that records sent messages and subscriptions."""
 
     def __init__(self) -> None:
-        """Begin empty."""
+        """Start without messages and subscriptions."""
         self.sent: list[tuple[str, bytes]] = []
         self.expressions: set[str] = set()
 
     def publish(self, key: str, payload: bytes, quality: Quality) -> None:
-        """Keep a payload."""
+        """Record a message."""
         del quality
         self.sent.append((key, payload))
 
     def subscribe(self, key_expression: str) -> None:
-        """Keep an expression."""
+        """Record a subscription."""
         self.expressions.add(key_expression)
 
     def unsubscribe(self, key_expression: str) -> None:
-        """Forget an expression."""
+        """Remove a subscription."""
         self.expressions.discard(key_expression)
 
     def announce(self, key: str) -> None:
-        """Do nothing, as all that follow."""
+        """Do nothing."""
 
     withdraw = watch = serve = announce
 
@@ -126,13 +126,13 @@ class Outbox:
 
 
 @define
-class Meadow:
-    """A world that shows bodies where they are put, and a record that keeps nothing."""
+class BodyStore:
+    """A world that stores the states of bodies, and a record that discards everything."""
 
     at: dict[str, State] = field(factory=dict)
 
     def place(self, vehicle: str, state: State) -> None:
-        """Say where a vehicle is."""
+        """Set the state of a vehicle."""
         self.at[vehicle] = state
 
     add = place
@@ -141,53 +141,53 @@ class Meadow:
         """Do nothing."""
 
     def positions(self) -> dict[str, Pose]:
-        """Return where each vehicle is."""
+        """Return the pose of each vehicle."""
         return {vehicle: pose_of(state) for vehicle, state in self.at.items()}
 
     def collisions(self) -> list[tuple[str, str]]:
-        """Return none."""
+        """Return no collisions."""
         return []
 
     def remove(self, vehicle: str) -> None:
-        """Take a vehicle away."""
+        """Remove a vehicle."""
         del self.at[vehicle]
 
     def on_positions(self, t_s: float, vehicles: object, **measured: object) -> None:
-        """Keep nothing."""
+        """Discard the measurements."""
 
 
 @define
 class Stand:
-    """A vehicle and the node of its agent."""
+    """A vehicle with the node and the messages of its agent."""
 
     vehicle: RoadVehicle
     node: Node
     outbox: Outbox
 
     def take(self) -> list[tuple[str, bytes]]:
-        """Return what was sent since the last call."""
+        """Return the messages that were sent since the last call."""
         sent, self.outbox.sent = self.outbox.sent, []
         return sent
 
 
 @define
 class Road:
-    """Some formations in a closed loop with their agents."""
+    """Formations in a closed loop with their agents."""
 
     scenario: Scenario
     stands: dict[Name, Stand] = field(factory=dict)
     tick: int = 0
-    world: Meadow = field(factory=Meadow)
+    world: BodyStore = field(factory=BodyStore)
     total: Clock = field(factory=Clock)
     tracking: Clock = field(factory=Clock)
     states: Clock = field(factory=Clock)
     senses: list[tuple[str, bytes]] = field(factory=list)
     answers: list[tuple[str, bytes]] = field(factory=list)
     moving: int = 0
-    """Vehicle ticks in motion."""
+    """Number of vehicle ticks in which the vehicle moves."""
 
     def __attrs_post_init__(self) -> None:
-        """Put the vehicles into interlaced cells of the first blocks, and start their agents."""
+        """Place the vehicles in interlaced cells of the first blocks, and start their agents."""
         lattice = self.scenario.lattice
         numbers = count(1)
         for block in range(FORMATIONS):
@@ -227,7 +227,7 @@ class Road:
         for name, stand in self.stands.items():
             cell, preferred = stand.vehicle.controller.hold_cell, stand.vehicle.admission.arrival
             if cell[1] != preferred.preferred_lane:
-                raise RuntimeError(f"{name} did not get to its lane")
+                raise RuntimeError(f"{name} did not reach its lane")
 
     def _step(self) -> None:
         tick = self.tick
@@ -238,21 +238,21 @@ class Road:
         self.total.call(_deliver, nodes, [Received(*each) for each in now])
         shown = [sent for stand in self.stands.values() for sent in self._listen_to(stand)]
         for stand in self.stands.values():
-            heard = [
+            received = [
                 Received(*each) for each in shown if matches_any(stand.outbox.expressions, each[0])
             ]
-            self.states.call(_deliver, [stand.node] * len(heard), heard)
+            self.states.call(_deliver, [stand.node] * len(received), received)
         for stand in self.stands.values():
             self.moving += stand.vehicle.controller.motion_end_tick > tick
             stand.vehicle.step(tick)
         self.tick = tick + 1
-        self._look()
+        self._update_sensors()
 
     def _sensed(self, stand: Stand) -> bytes:
         return encode(stand.vehicle.sense(self.tick, caretaker=False))
 
     def _listen_to(self, stand: Stand) -> Iterator[tuple[str, bytes]]:
-        """Let the motion controller take the command; yield the state."""
+        """Pass the command to the motion controller; yield the state."""
         for key, payload in stand.take():
             self.answers.append((key, payload))
             message = decode(payload)
@@ -262,7 +262,7 @@ class Road:
             else:
                 yield key, payload
 
-    def _look(self) -> None:
+    def _update_sensors(self) -> None:
         """Update the sensors of all vehicles."""
         vehicles = {name: stand.vehicle for name, stand in self.stands.items()}
         record = cast("RunRecord", self.world)
@@ -270,7 +270,7 @@ class Road:
         show_bodies(self.world, vehicles, self.scenario, record, t_s)
 
     def _sort(self, block: int) -> None:
-        """Have a formation promise and accept a plan, as its leader would."""
+        """Send PREPARE and PLAN to a formation, as its leader does."""
         plan = self._plan(block)
         members = [self.stands[name] for name in plan.roster]
         prepare = Prepare(plan.ballot, plan.formations, plan.roster)
@@ -292,9 +292,11 @@ class Road:
             if stand.vehicle.formation == block
         }
         cells = {name: vehicle.controller.hold_cell for name, vehicle in members.items()}
-        wishes = {name: each.admission.arrival.preferred_lane for name, each in members.items()}
+        preferred_lanes = {
+            name: each.admission.arrival.preferred_lane for name, each in members.items()
+        }
         start_s = start_time_s(cells.values(), self.tick * scenario.runtime.tick_s, scenario)
-        task = SortingTask((block,), cells, wishes, (), scenario, LONGEST_DEADLINE_S)
+        task = SortingTask((block,), cells, preferred_lanes, (), scenario, LONGEST_DEADLINE_S)
         moves = sort_lanes(task, scenario.formation.max_nodes, partial(plan, weights=WEIGHTS)).moves
         every = [move for each in moves.values() for move in each]
         slot_s = scenario.cycles_s[0]
@@ -326,8 +328,8 @@ def _each(work: Callable[[Any], object], items: list[Any]) -> None:
 
 
 def measured() -> dict[str, float]:
-    """Return the figures of one drive, in microseconds per vehicle and tick."""
-    # As in processes that come from the fork server: what has been loaded is not collected.
+    """Return the figures of one simulation, in microseconds per vehicle and tick."""
+    # As in processes of the fork server: loaded objects are not collected.
     gc.collect()
     gc.freeze()
     road = Road(Scenario(formation=FormationSettings(entry="interlaced", close="columns")))
@@ -351,7 +353,7 @@ def measured() -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure and print medians of several drives."""
+    """Measure and print the medians of several simulations."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--repeats", type=int, default=REPEATS, help="drives")

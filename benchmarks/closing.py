@@ -1,6 +1,6 @@
-"""What it costs that vehicles may not close up: `python benchmarks/closing.py [--json FILE]`.
+"""Cost of the conflict kind `closing`: `python benchmarks/closing.py [--json FILE]`.
 
-The same formations with and without the conflict kind `closing`. CPU time of one thread.
+The same formations are planned with and without it. CPU time of one thread.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ DEADLINE_S = 20.0
 
 
 def closes_up(paths: Sequence[Sequence[Cell]]) -> bool:
-    """Tell whether two vehicles close up in any step."""
+    """Return whether two vehicles close up in any step."""
     steps = zip(*map(pairwise, paths), strict=True)
     return any(CLOSING.kind(a, b) is not None for moves in steps for a, b in combinations(moves, 2))
 
 
 def measured(name: str, vehicles: int) -> dict[str, Any]:
-    """Return what all instances of a size cost without and with `closing`.
+    """Return the figures of all instances of a size without and with `closing`.
 
-    closing_up: plans in which two vehicles close up, where that is allowed.
+    closing_up: plans without `closing` in which two vehicles close up.
     """
     free = FAMILIES[name]
     kept = attrs.evolve(free, conflicts=(*free.conflicts, "closing"))
@@ -48,7 +48,7 @@ def measured(name: str, vehicles: int) -> dict[str, Any]:
         cost, time_ms = [], []
         for index, family in enumerate((free, kept)):
             request = family.request(seed, vehicles, DEADLINE_S)
-            # Lattices are made anew for each request, so that neither profits from the other.
+            # Compute the arrays again, so that neither request profits from the other.
             move_arrays.cache_clear()
             began = time.thread_time()
             response = plan(request, solver="branching")

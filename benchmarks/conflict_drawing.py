@@ -1,8 +1,8 @@
-"""Draw the conflict table: which moves of a second vehicle conflict with a move of the first.
+"""Draw the conflict table: moves of a vehicle B that conflict with a move of a vehicle A.
 
-There is one panel for each kind of move of vehicle A; the others follow by symmetry. Around A are
-the cells from which B may start, with an arrow for each of its moves and a dot for waiting. The
-colour shows how late one of the two must be to come too close to the other.
+Each panel has one kind of move of A; the others follow by symmetry. Around A are the cells from
+which B may start, with an arrow for each of its moves and a dot for waiting. The colour shows how
+late one of the two must be to come too close to the other.
 
 Used by docs/generate.py and geometry.py; not part of the installed package.
 """
@@ -34,7 +34,7 @@ from laneweave.launch.drawing.figures import FAINT_INK, INK, new_figure, save
 from laneweave.protocol.lattice import Cell, displacements, footprint
 
 LATENESS_S: Final = 0.5
-"""Lateness that the picture and the table of counts distinguish."""
+"""Lateness used in the figure and in the table of counts."""
 
 PANELS: Final[dict[str, Cell]] = {
     "A waits": (0, 0),
@@ -44,8 +44,8 @@ PANELS: Final[dict[str, Cell]] = {
 }
 
 
-class Verdict(Enum):
-    """Lateness at which a pair of moves is too close; the value is its colour (Okabe and Ito)."""
+class Severity(Enum):
+    """Lateness at which two moves come too close; values are colours (Okabe and Ito)."""
 
     ON_TIME = "#d55e00"
     LATE = "#e69f00"
@@ -55,11 +55,11 @@ class Verdict(Enum):
 
 
 _MEANING: Final = {
-    Verdict.ON_TIME: "even if both are on time",
-    Verdict.LATE: f"if one is {LATENESS_S:g} s late",
-    Verdict.LATER: "only if one is later",
-    Verdict.FOOTPRINT: "never, though footprints meet",
-    Verdict.NEVER: "never",
+    Severity.ON_TIME: "even if both are on time",
+    Severity.LATE: f"if one is {LATENESS_S:g} s late",
+    Severity.LATER: "only if one is later",
+    Severity.FOOTPRINT: "never, though footprints meet",
+    Severity.NEVER: "never",
 }
 _CELL, _BORDER, _OWN_CELL = "#f6f7f8", "#d3d6db", "#e4e7eb"
 _WIDTH_IN, _ACROSS = 10.0, 2
@@ -77,16 +77,16 @@ def draw_conflicts(out: Path, geometry: BodyGeometry | None = None, dpi: int = 1
 
 def conflict_figure(geometry: BodyGeometry) -> Figure:
     """Return the figure."""
-    judge = Judge.of(geometry)
+    tables = ConflictTables.of(geometry)
     figure = new_figure(_WIDTH_IN, _LEGEND_IN + len(PANELS) // _ACROSS * _pitch_in()[1])
     figure.set_layout_engine("none")
     for number, (name, displacement) in enumerate(PANELS.items()):
         axes = _new_panel(figure, *divmod(number, _ACROSS))
         axes.set_title(name, fontsize=10, pad=4, color=INK)
-        _draw_panel(axes, displacement, judge)
+        _draw_panel(axes, displacement, tables)
     handles = [
-        Line2D([], [], color=verdict.value, linewidth=3, label=text)
-        for verdict, text in _MEANING.items()
+        Line2D([], [], color=severity.value, linewidth=3, label=text)
+        for severity, text in _MEANING.items()
     ]
     figure.legend(
         handles=handles,
@@ -101,7 +101,7 @@ def conflict_figure(geometry: BodyGeometry) -> Figure:
     figure.text(
         0.5,
         0.012,
-        "Where B may start, and where it moves (a dot: it waits); the colour tells when B comes "
+        "Where B may start, and where it moves (a dot: it waits); the colour shows when B comes "
         "too close to A; front to the right, left lane on top",
         ha="center",
         fontsize=7.5,
@@ -111,7 +111,7 @@ def conflict_figure(geometry: BodyGeometry) -> Figure:
 
 
 @attrs.frozen
-class Judge:
+class ConflictTables:
     """The conflict tables of one geometry, for three values of lateness."""
 
     on_time: frozenset[Pair]
@@ -119,7 +119,7 @@ class Judge:
     any_delay: frozenset[Pair]
 
     @classmethod
-    def of(cls, geometry: BodyGeometry) -> Judge:
+    def of(cls, geometry: BodyGeometry) -> ConflictTables:
         """Compute the tables."""
         tables = (
             conflict_table(attrs.evolve(geometry, lateness_s=late_s)).pairs
@@ -127,31 +127,31 @@ class Judge:
         )
         return cls(*tables)
 
-    def verdict(self, pair: Pair) -> Verdict:
-        """Return when two moves are too close."""
-        for verdict, table in (
-            (Verdict.ON_TIME, self.on_time),
-            (Verdict.LATE, self.late),
-            (Verdict.LATER, self.any_delay),
+    def severity(self, pair: Pair) -> Severity:
+        """Return the lateness at which two moves come too close."""
+        for severity, table in (
+            (Severity.ON_TIME, self.on_time),
+            (Severity.LATE, self.late),
+            (Severity.LATER, self.any_delay),
         ):
             if pair in table:
-                return verdict
-        return Verdict.FOOTPRINT if conflict(pair, "geometric") else Verdict.NEVER
+                return severity
+        return Severity.FOOTPRINT if conflict(pair, "geometric") else Severity.NEVER
 
 
 def conflict(pair: Pair, *kinds: str) -> bool:
-    """Return whether two moves are a conflict of one of these kinds, without a geometry."""
+    """Return whether two moves conflict by one of these kinds, without a geometry."""
     offset, a, b = pair
     other = offset, (offset[0] + b[0], offset[1] + b[1])
     return ConflictModel(kinds).kind(((0, 0), a), other) is not None
 
 
 def counts() -> list[tuple[str, int, int]]:
-    """Return how many pairs of moves each model forbids in mode 1 and in mode 2.
+    """Return the number of pairs of moves that each model forbids in mode 1 and in mode 2.
 
-    Only vehicles in different cells count; each pair counts twice, once for either vehicle.
+    Only vehicles in different cells count; each pair counts twice, once from either vehicle.
     """
-    judge = Judge.of(BodyGeometry())
+    tables = ConflictTables.of(BodyGeometry())
     near = range(-MAX_OFFSET, MAX_OFFSET + 1)
     offsets = [offset for offset in product(near, near) if offset != (0, 0)]
     steps = displacements(2)
@@ -172,9 +172,9 @@ def counts() -> list[tuple[str, int, int]]:
         row("node, edge, special-1", of_kinds("node", "edge", "special-1")),
         row("node, edge, special-1 to special-4", of_kinds(*PAPER_KINDS)),
         row("geometric: footprints", of_kinds("geometric")),
-        row("geometric with `geometry`, any delay", judge.any_delay),
-        row(f"geometric with `geometry`, at most {LATENESS_S:g} s late", judge.late),
-        row("geometric with `geometry`, on time", judge.on_time),
+        row("geometric with `geometry`, any delay", tables.any_delay),
+        row(f"geometric with `geometry`, at most {LATENESS_S:g} s late", tables.late),
+        row("geometric with `geometry`, on time", tables.on_time),
     ]
 
 
@@ -199,7 +199,7 @@ def _new_panel(figure: Figure, row: int, column: int) -> Axes:
     )
 
 
-def _draw_panel(axes: Axes, a: Cell, judge: Judge) -> None:
+def _draw_panel(axes: Axes, a: Cell, tables: ConflictTables) -> None:
     reach = MAX_OFFSET + 0.5
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach * _LANE_HEIGHT, reach * _LANE_HEIGHT)
@@ -217,19 +217,21 @@ def _draw_panel(axes: Axes, a: Cell, judge: Judge) -> None:
     for offset in product(near, near):
         if offset == (0, 0):
             continue
-        # The most severe verdict is drawn last, on top.
-        verdicts = [(judge.verdict((offset, a, b)), b) for b in displacements(2)]
-        order = list(Verdict)
-        for verdict, b in sorted(verdicts, key=lambda item: -order.index(item[0])):
-            _draw_move(axes, offset, b, verdict)
+        # The most severe one is drawn last, on top.
+        severities = [(tables.severity((offset, a, b)), b) for b in displacements(2)]
+        order = list(Severity)
+        for severity, b in sorted(severities, key=lambda item: -order.index(item[0])):
+            _draw_move(axes, offset, b, severity)
     _draw_a(axes, a)
 
 
-def _draw_move(axes: Axes, cell: Cell, step: Cell, verdict: Verdict) -> None:
+def _draw_move(axes: Axes, cell: Cell, step: Cell, severity: Severity) -> None:
     x, y = cell[0], cell[1] * _LANE_HEIGHT
-    plain = verdict is Verdict.NEVER
+    plain = severity is Severity.NEVER
     if step == (0, 0):
-        patch: Circle | FancyArrowPatch = Circle((x, y), _DOT, facecolor=verdict.value, linewidth=0)
+        patch: Circle | FancyArrowPatch = Circle(
+            (x, y), _DOT, facecolor=severity.value, linewidth=0
+        )
     else:
         ends = [(x + share * step[0], y + share * step[1] * _LANE_HEIGHT) for share in _ARROW]
         patch = FancyArrowPatch(
@@ -238,10 +240,10 @@ def _draw_move(axes: Axes, cell: Cell, step: Cell, verdict: Verdict) -> None:
             mutation_scale=6 if plain else 8,
             shrinkA=0,
             shrinkB=0,
-            color=verdict.value,
+            color=severity.value,
             linewidth=0.8 if plain else 1.7,
         )
-    patch.set(label=verdict.name, zorder=2 if plain else 3)
+    patch.set(label=severity.name, zorder=2 if plain else 3)
     axes.add_patch(patch)
 
 

@@ -30,11 +30,11 @@ from support import emergencies, switches
 T = TypeVar("T")
 
 
-def played(play: Callable[[int], T], numbers: Sequence[int], jobs: int) -> list[T]:
+def simulated(simulate: Callable[[int], T], numbers: Sequence[int], jobs: int) -> list[T]:
     """Return the result of each number, in order; show the progress on a terminal."""
     results = []
     with ProcessPoolExecutor(jobs) as pool:
-        for result in pool.map(play, numbers, chunksize=4):
+        for result in pool.map(simulate, numbers, chunksize=4):
             results.append(result)
             if sys.stderr.isatty():
                 sys.stderr.write(f"\r{len(results)} of {len(numbers)} ")
@@ -46,7 +46,7 @@ def played(play: Callable[[int], T], numbers: Sequence[int], jobs: int) -> list[
 
 def judge_switches(seed: int, numbers: Sequence[int], jobs: int) -> dict[str, Any]:
     """Return figures and missed goals of formation switches, by mode."""
-    results = played(partial(switches.switch_result, seed), numbers, jobs)
+    results = simulated(partial(switches.switch_result, seed), numbers, jobs)
     judged = {}
     for mode in (1, 2):
         chosen = [result for result in results if result.mode == mode]
@@ -58,7 +58,7 @@ def judge_switches(seed: int, numbers: Sequence[int], jobs: int) -> dict[str, An
 
 def judge_emergencies(seed: int, numbers: Sequence[int], jobs: int) -> dict[str, Any]:
     """Return figures and missed goals of emergencies, by kind."""
-    outcomes = played(partial(emergencies.outcome, seed), numbers, jobs)
+    outcomes = simulated(partial(emergencies.outcome, seed), numbers, jobs)
     judged = {}
     for kind in emergencies.KINDS:
         chosen = [outcome for outcome in outcomes if outcome.kind == kind]
@@ -68,7 +68,7 @@ def judge_emergencies(seed: int, numbers: Sequence[int], jobs: int) -> dict[str,
     return judged
 
 
-PROGRAMMES = {"switches": (judge_switches, 1000), "emergencies": (judge_emergencies, 2000)}
+COMMANDS = {"switches": (judge_switches, 1000), "emergencies": (judge_emergencies, 2000)}
 
 
 def lines(figures: dict[str, Any], indent: str = "  ") -> list[str]:
@@ -88,14 +88,14 @@ def lines(figures: dict[str, Any], indent: str = "  ") -> list[str]:
 def main() -> int:
     """Play, print, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("programme", choices=PROGRAMMES)
-    parser.add_argument("--count", type=int, help="how many to play; 1000 or 2000")
+    parser.add_argument("programme", choices=COMMANDS)
+    parser.add_argument("--count", type=int, help="how many to simulate; 1000 or 2000")
     parser.add_argument("--seed", type=int, default=0, help="of everything random")
     parser.add_argument("--first", type=int, default=0, help="number of the first one")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--json", action="store_true", help="print JSON")
     chosen = parser.parse_args()
-    judge, count = PROGRAMMES[chosen.programme]
+    judge, count = COMMANDS[chosen.programme]
     numbers = range(chosen.first, chosen.first + (chosen.count or count))
     judged = judge(chosen.seed, numbers, chosen.jobs)
     if chosen.json:

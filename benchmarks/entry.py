@@ -1,8 +1,8 @@
 """Entry and formation building without driving: `python benchmarks/entry.py`.
 
-For each volume: the time from a vehicle's arrival to the moment at which its cell passes the start
-of the road (negative where it takes a cell ahead), and how long and how full formations are. Where
-this time grows with the duration, more vehicles arrive than can enter.
+For each volume: the time from the arrival of a vehicle to the moment at which its cell
+passes the start of the road (negative if it takes a cell ahead), and the columns and vehicles of
+formations. If this time grows with the duration, more vehicles arrive than can enter.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from laneweave.sim_bridge.road.entry import Admission, EntryMeter
 from laneweave.sim_bridge.road.formation_building import formation_builder
 
 VOLUMES = (500, 1000, 1300, 1600, 1750, 1800, 2000, 2100, 2150, 2200, 2400)
-NOT_COUNTED_S, STEP_S, PATIENCE_S = 60.0, 0.5, 2000.0
+NOT_COUNTED_S, STEP_S, MAX_WAIT_S = 60.0, 0.5, 2000.0
 HEADINGS = ("veh/(lane h)", "wait s mean", "wait s p95", "columns", "vehicles")
 
 
@@ -39,18 +39,18 @@ def enter(scenario: Scenario) -> tuple[list[float], list[int], list[int]]:
     entered: list[Admission] = []
     closed: list[ClosedFormation] = []
     t_s = 0.0
-    while (len(entered) < len(demand) or not closed) and t_s < PATIENCE_S + demand[-1].t_s:
+    while (len(entered) < len(demand) or not closed) and t_s < MAX_WAIT_S + demand[-1].t_s:
         t_s += STEP_S
         entered += meter.admit(t_s)
         closed += builder.closed(t_s)
-    columns = [one.columns(lattice) for one in closed]
-    counts = [sum(one.cell[0] in each for one in entered) for each in columns]
+    columns = [formation.columns(lattice) for formation in closed]
+    counts = [sum(admission.cell[0] in own for admission in entered) for own in columns]
     waits_s = [
-        lattice.passing_time_s(one.cell[0]) - one.arrival.t_s
-        for one in entered
-        if one.arrival.t_s >= NOT_COUNTED_S
+        lattice.passing_time_s(admission.cell[0]) - admission.arrival.t_s
+        for admission in entered
+        if admission.arrival.t_s >= NOT_COUNTED_S
     ]
-    return waits_s, [len(each) for each in columns], counts
+    return waits_s, [len(own) for own in columns], counts
 
 
 def measure(volume: float, seeds: int, duration_s: float, operation: str) -> dict[str, Any]:

@@ -1,9 +1,9 @@
-"""What the conflict table costs or saves: `python benchmarks/geometry.py [--json FILE]`.
+"""Cost and benefit of conflict tables: `python benchmarks/geometry.py [--json FILE]`.
 
-The same formations in mode 2 with footprints, with the table at any delay, and with the table for
-vehicles that are at most so late. CPU time of one thread. And how near two bodies come that make
-moves in one step which are no conflict, with the kinds of the paper and with footprints.
-`--only nearest` measures that alone.
+The same formations are planned in mode 2 with footprints, with the table for any delay, and with
+tables for limited lateness. CPU time of one thread. Also measures the minimum gap between bodies
+whose moves do not conflict, with the paper's kinds and with footprints; `--only nearest` measures
+only this.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ DEADLINE_S = 10.0
 
 
 def measured(vehicles: int) -> Iterator[dict[str, Any]]:
-    """Yield one row for each model; `changed` counts instances cheaper than with footprints."""
+    """Yield one row for each model; `cheaper` counts instances cheaper than with footprints."""
     reference: list[int] = []
     for name, geometry in MODELS.items():
         costs, times_ms, proven = [], [], 0
@@ -86,7 +86,7 @@ def _cost(request: PlanRequest, cost: int | None) -> int:
 
 
 def table_times_ms() -> dict[str, float]:
-    """Return how long it takes to compute each table and its rows, which is done once."""
+    """Return the time to compute each table and its cliques, which are cached."""
     times_ms = {}
     for name, geometry in MODELS.items():
         if geometry is not None:
@@ -99,17 +99,17 @@ def table_times_ms() -> dict[str, float]:
 
 
 def nearest() -> list[dict[str, Any]]:
-    """Return the least gap [m] of any two moves of mode 2 that a model allows, for each lateness.
+    """Return the minimum gap [m] of moves of mode 2 that a model allows, for each lateness.
 
-    The moves are those that agents of the default scenario drive, without errors of tracking; gaps
-    are bumper to bumper between the turned bodies, negative where they overlap.
+    The moves are those of agents in the default scenario, without tracking errors; gaps are bumper
+    to bumper between the turned bodies, negative if they overlap.
     """
     tick_s, move_s = Scenario().runtime.tick_s, Scenario().move_s
     ticks_late = {f"{late_s:g} s": round(late_s / tick_s) for late_s in (0.0, 0.5, move_s)}
     gaps_m = {
         pair: _gaps_m(pair, max(ticks_late.values()))
         for pair in product(product(range(3), range(-2, 3)), displacements(2), displacements(2))
-        if pair[0] > (0, 0)  # the others are these, seen from the other vehicle
+        if pair[0] > (0, 0)  # the others follow by exchanging the vehicles
     }
     return [
         {"conflicts": name}
@@ -128,22 +128,22 @@ def nearest() -> list[dict[str, Any]]:
     ]
 
 
-def _gaps_m(pair: Pair, most_late: int) -> NDArray[np.float64]:
-    """Return the least gap (2 n + 1,) with B up to n ticks early or late."""
+def _gaps_m(pair: Pair, max_late: int) -> NDArray[np.float64]:
+    """Return the minimum gap (2 n + 1,) with B up to n ticks early or late."""
     scenario = Scenario()
     body = scenario.vehicle.length_m, scenario.vehicle.width_m
     a, b = (
-        np.pad(move_profile(scenario, *step).states, ((most_late, most_late), (0, 0)), mode="edge")
+        np.pad(move_profile(scenario, *step).states, ((max_late, max_late), (0, 0)), mode="edge")
         + cell_state(scenario.lattice, cell, 0.0)
         for cell, step in (((0, 0), pair[1]), (pair[0], pair[2]))
     )
-    gaps = np.full(2 * most_late + 1, np.inf)
-    for late in range(-most_late, most_late + 1):
+    gaps = np.full(2 * max_late + 1, np.inf)
+    for late in range(-max_late, max_late + 1):
         one, other = (a[late:], b[: len(b) - late]) if late > 0 else (a[: len(a) + late], b[-late:])
         near = np.abs(one[:, 3] - other[:, 3]) < sum(body) / 2.0
         for x, y in zip(one[near], other[near], strict=True):
             found = Bodies({"a": pose_of(x), "b": pose_of(y)}, *body).min_gaps().gap_m
-            gaps[late + most_late] = min(gaps[late + most_late], found)
+            gaps[late + max_late] = min(gaps[late + max_late], found)
     return gaps
 
 
@@ -151,7 +151,9 @@ def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, default=OUT, help="where to write")
-    parser.add_argument("--only", choices=["nearest"], help="measure no more; keep what is there")
+    parser.add_argument(
+        "--only", choices=["nearest"], help="measure only this; keep the other results"
+    )
     given = parser.parse_args()
     out: Path = given.json
     if given.only:

@@ -7,7 +7,7 @@ Each experiment is one run of the deployment of compose.yaml, as processes on ho
 namespaces (tests/support/hosts.py): a link is cut, or a service is killed and restarted with the
 same command. Roles start before their router. Figures are read from the run's folder and written to
 FOLDER/hosts.json. Finished experiments are kept, unless `--only` names them. The exit status is 1
-if two vehicles touched or a run did not finish. The script needs permission to create network
+if bodies overlapped or a run did not finish. The script needs permission to create network
 namespaces. `--plain`: without certificates, over TCP. `--short`: vehicles arrive for 20 s instead
 of 90 s.
 """
@@ -47,7 +47,7 @@ SERVICES = tuple(name for name, service in compose()["services"].items() if last
 
 @frozen
 class Experiment:
-    """One run."""
+    """A run with a fault."""
 
     name: str
     text: str
@@ -56,7 +56,7 @@ class Experiment:
 
 
 def nothing(_: Hosts) -> None:
-    """Leave the deployment alone."""
+    """Do not disturb the deployment."""
 
 
 def cut(host: str, for_s: float) -> Experiment:

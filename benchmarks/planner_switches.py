@@ -1,8 +1,8 @@
-"""What each improvement of TAPPA is worth: `python benchmarks/planner_switches.py [--json FILE]`.
+"""Effect of each improvement of TAPPA: `python benchmarks/planner_switches.py [--json FILE]`.
 
-Formations as traffic fills them, and interlaced ones of 2 to 6 vehicles in blocks of four columns,
-are planned with all improvements, without each one of them, and by the literal algorithms. CPU time
-of one thread. What has all improvements is compared with branching.
+Formations of random traffic, and interlaced ones of 2 to 6 vehicles in blocks of four columns, are
+planned with all improvements, without each of them, and by the literal algorithms. CPU time of one
+thread. Each proven cost is compared with that of branching.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from laneweave.launch.bench.request_families import TRAFFIC_KINDS, block_request
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "planner-switches.json"
 INSTANCES, FEWER_INSTANCES = 200, 60
-"""With all improvements, and without some."""
+"""Number of instances with all improvements, and without some."""
 DEADLINE_S = 4.0
 
 
@@ -44,7 +44,7 @@ FAMILIES: dict[str, Callable[[int], PlanRequest]] = {
 
 
 def switch_settings() -> Iterator[tuple[str, Improvements]]:
-    """Yield names and settings."""
+    """Yield the name and the setting of each variant."""
     yield "all", Improvements()
     for field in attrs.fields(Improvements):
         yield f"without {field.name}", attrs.evolve(Improvements(), **{field.name: False})
@@ -58,25 +58,25 @@ def planned(request: PlanRequest, improvements: Improvements) -> tuple[float, in
     weights = Weights.for_mode(request.mode)
     run = Tappa(request, request.problem(), weights, budget, improvements)
     run.run()
-    took_ms = 1e3 * (time.thread_time() - began)
-    return took_ms, run.best.cost if run.finished and run.best is not None else None
+    cpu_ms = 1e3 * (time.thread_time() - began)
+    return cpu_ms, run.best.cost if run.finished and run.best is not None else None
 
 
 def measured(family: str, name: str, improvements: Improvements, instances: int) -> dict[str, Any]:
     """Return one row.
 
     Raises:
-        RuntimeError: a cost that was claimed to be optimal is not that of branching.
+        RuntimeError: a cost that is reported as optimal differs from that of branching.
     """
     times_ms, solved = [], 0
     for seed in range(instances):
         request = FAMILIES[family](seed)
-        took_ms, cost = planned(request, improvements)
-        times_ms.append(took_ms)
+        cpu_ms, cost = planned(request, improvements)
+        times_ms.append(cpu_ms)
         solved += cost is not None
         if cost is not None and cost != plan(request).cost:
             raise RuntimeError(f"{family}, seed {seed}, {name}: {cost} is not optimal")
-    p50, p95, most = np.percentile(times_ms, [50, 95, 100]).tolist()
+    p50, p95, maximum = np.percentile(times_ms, [50, 95, 100]).tolist()
     return {
         "family": family,
         "improvements": name,
@@ -84,7 +84,7 @@ def measured(family: str, name: str, improvements: Improvements, instances: int)
         "solved": solved,
         "cpu_ms_p50": round(p50, 1),
         "cpu_ms_p95": round(p95, 1),
-        "cpu_ms_max": round(most, 1),
+        "cpu_ms_max": round(maximum, 1),
     }
 
 

@@ -31,7 +31,7 @@ TIMEOUT_S = 3600.0
 
 @frozen
 class Experiment:
-    """One run."""
+    """A run with faults."""
 
     name: str
     faults: str | None

@@ -122,9 +122,9 @@ def network(coordinators: int, workers: int) -> Iterator[Network]:
 
 
 def _until(condition: Callable[[], bool]) -> None:
-    give_up = time.monotonic() + START_S
+    deadline = time.monotonic() + START_S
     while not condition():
-        if time.monotonic() > give_up:
+        if time.monotonic() > deadline:
             raise SystemExit("the network did not start")
         time.sleep(0.1)
 
@@ -138,10 +138,10 @@ def _answers(client: PlanClient) -> bool:
 
 
 @frozen
-class Asked:
+class Exchange:
     """One request and its response, with the client's timing."""
 
-    asked_s: float
+    sent_s: float
     latency_s: float
     response: PlanResponse
 
@@ -152,11 +152,11 @@ class Asked:
         return 1e3 * self.latency_s - self.response.solve_ms - waited_ms
 
 
-async def ask(client: AsyncPlanClient, request: PlanRequest) -> Asked:
-    """Send a request and return its answer with the latency."""
+async def request_plan(client: AsyncPlanClient, request: PlanRequest) -> Exchange:
+    """Send a request and return the response with the latency."""
     begun_s = time.monotonic()
     response = await client.plan(request, timeout_s=2 * DEADLINE_S)
-    return Asked(begun_s, time.monotonic() - begun_s, response)
+    return Exchange(begun_s, time.monotonic() - begun_s, response)
 
 
 async def with_clients(
@@ -166,9 +166,6 @@ async def with_clients(
     async with contextlib.AsyncExitStack() as stack:
         clients = [await stack.enter_async_context(AsyncPlanClient(endpoint)) for _ in range(count)]
         return await work(clients)
-
-
-# --- the measurements -----------------------------------------------------------------------------
 
 
 def alone() -> dict[str, Any]:
@@ -182,24 +179,24 @@ def alone() -> dict[str, Any]:
     return {"requests": REQUESTS, "rate_per_s": REQUESTS / wall_s, "wall_s": wall_s, "cpu_s": cpu_s}
 
 
-def plan_of(asked: Asked) -> tuple[object, ...]:
-    """Return the plan in an answer, without the times."""
-    response = asked.response
+def plan_of(exchange: Exchange) -> tuple[object, ...]:
+    """Return the plan in a response, without the times."""
+    response = exchange.response
     return response.status, response.cost, response.assignment, response.paths
 
 
 def load(workers: int, solver_rate_per_s: float) -> dict[str, Any]:
     """Measure 200 requests in flight from 20 clients, each repeated with the same id."""
 
-    async def work(clients: list[AsyncPlanClient]) -> tuple[list[Asked], list[Asked], float]:
+    async def work(clients: list[AsyncPlanClient]) -> tuple[list[Exchange], list[Exchange], float]:
         requests = [instance(seed, SIZES) for seed in range(REQUESTS)]
         begun_s = time.monotonic()
         first = await asyncio.gather(
-            *(ask(clients[i % CLIENTS], request) for i, request in enumerate(requests))
+            *(request_plan(clients[i % CLIENTS], request) for i, request in enumerate(requests))
         )
         took_s = time.monotonic() - begun_s
         again = await asyncio.gather(
-            *(ask(clients[-i % CLIENTS], request) for i, request in enumerate(requests))
+            *(request_plan(clients[-i % CLIENTS], request) for i, request in enumerate(requests))
         )
         return first, again, took_s
 
@@ -226,26 +223,28 @@ def half(workers: int, sizes: Sequence[int], count: int) -> dict[str, Any]:
     mean_s = statistics.mean(plan(instance(seed, sizes)).solve_ms / 1e3 for seed in range(200))
     rng = random.Random(1)  # noqa: S311
 
-    async def work(clients: list[AsyncPlanClient]) -> list[Asked]:
+    async def work(clients: list[AsyncPlanClient]) -> list[Exchange]:
         tasks = []
         due_s = time.monotonic()
         for seed in range(count):
             due_s += rng.expovariate(0.5 * workers / mean_s)
             await asyncio.sleep(max(0.0, due_s - time.monotonic()))
-            tasks.append(asyncio.create_task(ask(clients[seed % CLIENTS], instance(seed, sizes))))
+            tasks.append(
+                asyncio.create_task(request_plan(clients[seed % CLIENTS], instance(seed, sizes)))
+            )
         return await asyncio.gather(*tasks)
 
     with network(coordinators=1, workers=workers) as net:
-        asked = asyncio.run(with_clients(net.endpoint, work))
-    added = [one.added_ms for one in asked]
+        exchanges = asyncio.run(with_clients(net.endpoint, work))
+    added = [one.added_ms for one in exchanges]
     return {
         "workers": workers,
         "sizes": [sizes[0], sizes[-1]],
         "requests": count,
         "solve_ms_mean": 1e3 * mean_s,
         "added_ms": quantiles(added),
-        "waited_ms": quantiles([one.response.waited_ms or 0.0 for one in asked]),
-        "solve_ms": quantiles([one.response.solve_ms for one in asked]),
+        "waited_ms": quantiles([one.response.waited_ms or 0.0 for one in exchanges]),
+        "solve_ms": quantiles([one.response.solve_ms for one in exchanges]),
     }
 
 
@@ -254,8 +253,8 @@ def loss() -> dict[str, Any]:
     rng = random.Random(2)  # noqa: S311
     killed_s: list[float] = []
 
-    async def work(clients: list[AsyncPlanClient], net: Network) -> list[Asked]:
-        tasks: list[asyncio.Task[Asked]] = []
+    async def work(clients: list[AsyncPlanClient], net: Network) -> list[Exchange]:
+        tasks: list[asyncio.Task[Exchange]] = []
         seed = 0
         for number in range(LOSSES):
             name = f"c{1 + number % 3}"
@@ -263,7 +262,9 @@ def loss() -> dict[str, Any]:
             while time.monotonic() < kill_s + LOSS_PAUSE_S:
                 seed += 1
                 tasks.append(
-                    asyncio.create_task(ask(clients[seed % CLIENTS], instance(seed, SMALL)))
+                    asyncio.create_task(
+                        request_plan(clients[seed % CLIENTS], instance(seed, SMALL))
+                    )
                 )
                 await asyncio.sleep(rng.expovariate(LOSS_RATE_PER_S))
                 if restart_s is None and time.monotonic() > kill_s:
@@ -276,20 +277,20 @@ def loss() -> dict[str, Any]:
         return await asyncio.gather(*tasks)
 
     with network(coordinators=3, workers=1) as net:
-        asked = asyncio.run(with_clients(net.endpoint, lambda clients: work(clients, net)))
+        exchanges = asyncio.run(with_clients(net.endpoint, lambda clients: work(clients, net)))
     hit = [
         one
-        for one in asked
+        for one in exchanges
         for at_s in killed_s
-        if one.asked_s < at_s + 1.0 and one.asked_s + one.latency_s > at_s
+        if one.sent_s < at_s + 1.0 and one.sent_s + one.latency_s > at_s
     ]
     beyond = [1e3 * one.latency_s - one.response.solve_ms for one in hit]
     return {
         "coordinators": 3,
         "rate_per_s": LOSS_RATE_PER_S,
         "killed": len(killed_s),
-        "requests": len(asked),
-        "answered": sum(one.response.status in ("optimal", "feasible") for one in asked),
+        "requests": len(exchanges),
+        "answered": sum(one.response.status in ("optimal", "feasible") for one in exchanges),
         "around_the_kills": len(hit),
         "beyond_solving_ms": quantiles(beyond),
     }

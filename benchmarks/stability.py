@@ -1,9 +1,9 @@
-"""How a disturbance of speed travels: `python benchmarks/stability.py [--json FILE]`.
+"""Propagation of a speed disturbance: `python benchmarks/stability.py [--json FILE]`.
 
-One vehicle brakes for 2 s whatever its commands, in a column that holds its cells and in formations
-that switch, with and without message loss (`tests/support/disturbances.py`). Writes peaks and
-amplification from vehicle to vehicle, a figure, and prints a table. The exit status is 1 if bodies
-overlap.
+One vehicle brakes for 2 s regardless of its commands, in a column that holds its cells and in
+formations that switch, with and without message loss (`tests/support/disturbances.py`). Writes
+peaks and amplification from vehicle to vehicle, a figure, and prints a table. The exit status is 1
+if bodies overlap.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ VEHICLES = {"column": 12, "switching": 18}
 LOSSES = (0.0, 0.5)
 SEEDS = 5
 DISTURBED_MPS = 0.5
-"""A vehicle counts as disturbed beyond this error of speed; undisturbed runs stay below 0.35."""
+"""Speed error beyond which a vehicle counts as disturbed; undisturbed runs stay below 0.35."""
 QUANTITIES = ("speed_mps", "gap_m", "accel_mps2")
 SHOWN = (
     Case("column", 3.0),
     Case("column", 6.0, 0.5),
     Case("switching", 3.0, 0.5, vehicles=VEHICLES["switching"]),
 )
-"""Panels over time."""
+"""Cases whose speeds are drawn over time."""
 COLOURS = ("#9aa0a6", "#56b4e9", "#0072b2", "#e69f00", "#d55e00")
 
 
@@ -65,7 +65,7 @@ def peaks(response: Response, quantity: str) -> NDArray[np.float64]:
 
 
 def row(case: Case, responses: Sequence[Response]) -> dict[str, Any]:
-    """Return figures of a case: the largest values of its runs, by vehicle where there are many."""
+    """Return the figures of a case: maxima over its runs, by vehicle for some quantities."""
     vehicles = min(response.speed_mps.shape[1] for response in responses)
     found = {
         name: np.array([peaks(one, name)[:vehicles] for one in responses]) for name in QUANTITIES
@@ -134,7 +134,7 @@ def draw(runs: Mapping[Case, Sequence[Response]], table: Sequence[dict[str, Any]
 
 
 def main() -> int:
-    """Drive, write, print, and return the exit status."""
+    """Simulate, write, print, and return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path, default=OUT, help="where to write")
     parser.add_argument("--seeds", type=int, default=SEEDS, help="runs of each case")

@@ -4,10 +4,9 @@ The real fork server starts a router and agent processes of one vehicle each, on
 An agent is ready when its token appears: by then it has its tracker and its subscriptions. Some
 ticks follow, in which the vehicles hold their cells. For each process:
 
-    ready_cpu_ms   CPU time of all its threads, user and system, from the fork to its token
-    first_cpu_ms   the same for the answer to its first SENSE
-    own_mb         its private memory (USS) after some ticks: not shared with the fork server or
-                   other agents
+    ready_cpu_ms   CPU time of all threads, user and system, from the fork to the token
+    first_cpu_ms   the same from the first SENSE to the COMMAND that answers it
+    own_mb         private memory (USS) after some ticks, not shared with other processes
 
 The CPU time of starting the fork server, which happens once, is reported separately.
 """
@@ -52,8 +51,8 @@ TICKS = 20
 def cpu_ms(process_id: int) -> float:
     """Return the CPU time of a process in ms.
 
-    The kernel's clock of the process has a resolution of ns, the figures in /proc 10 ms; this
-    expression is Linux's id of that clock.
+    Reads the CPU clock of the process, whose id in Linux is this expression; its resolution is 1
+    ns, that of /proc 10 ms.
     """
     return time.clock_gettime((~process_id << 3) | 2) * 1e3
 
@@ -68,7 +67,7 @@ class Fleet:
     first_ms: dict[Name, float] = field(factory=dict)
 
     def start(self, count: int, folder: str) -> None:
-        """Start a router and agents; wait for each agent and drive some ticks."""
+        """Start a router and agents; wait for each agent, then run some ticks."""
         context, network = fork_server(), self.scenario.network
         tables, options = to_tables(self.scenario), {"folder": folder, "temporary": folder}
         router = Name("router")
@@ -110,29 +109,29 @@ class Fleet:
 
 
 def _connected(endpoint: str, inbox: queue.SimpleQueue[Delivery]) -> ZenohTransport:
-    give_up = time.monotonic() + WAIT_S
+    deadline = time.monotonic() + WAIT_S
     while True:
         try:
             return ZenohTransport(Access(endpoint), inbox.put)
         except BadInputError:
-            if time.monotonic() > give_up:
+            if time.monotonic() > deadline:
                 raise
             time.sleep(0.05)
 
 
 def _await_key(inbox: queue.SimpleQueue[Delivery], key: str) -> None:
     """Wait for a token or a message on a key."""
-    give_up = time.monotonic() + WAIT_S
-    while time.monotonic() < give_up:
+    deadline = time.monotonic() + WAIT_S
+    while time.monotonic() < deadline:
         with suppress(queue.Empty):
-            news = inbox.get(timeout=1.0)
-            if isinstance(news, (TokenUp, Received)) and news.key == key:
+            delivery = inbox.get(timeout=1.0)
+            if isinstance(delivery, (TokenUp, Received)) and delivery.key == key:
                 return
     raise RuntimeError(f"no token or message on {key}")
 
 
 def measured(count: int) -> dict[str, Any]:
-    """Start agents and return their cost."""
+    """Start agents and return the cost of one more."""
     # Each process executes the main file of its supervisor: use the one of `laneweave` here, too.
     sys.modules["__main__"].__file__ = str(Path(sys.executable).with_name("laneweave"))
     with tempfile.TemporaryDirectory(prefix="laneweave-") as folder:

@@ -1,8 +1,8 @@
-"""How well the stream planner sorts: `python benchmarks/stream.py [--volumes V ...] [--seeds N]`.
+"""Results of the stream planner: `python benchmarks/stream.py [--volumes V ...] [--seeds N]`.
 
-A lattice without faults. Arrivals are those of a scenario; everybody enters the column nearest to
-its arrival that is free behind its lane predecessor. At each slot all vehicles on the road are
-planned, and the first step of every way is made. CPU time of one thread.
+A lattice without faults. Arrivals are those of a scenario; each vehicle enters the free column that
+is nearest to its arrival, behind its predecessor on the lane. In each slot all vehicles on the road
+are planned, and the first step of every path is made. CPU time of one thread.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ PITCH_M, LENGTH_M = ROAD.pitch_m, ROAD.length_m
 
 @frozen
 class Variant:
-    """A road and costs that are measured."""
+    """A road, costs and volumes to measure."""
 
     road: StreamRoad = ROAD
     costs: StreamCosts = field(factory=StreamCosts)
@@ -88,17 +88,17 @@ VARIANTS = {
 
 @frozen
 class Traveller:
-    """A vehicle with what is known of it on arrival."""
+    """A vehicle of the demand and the cell at which it enters."""
 
     vehicle: str
     column: int
     lane: int
-    wanted: int
+    target_lane: int
     arrival_s: float
 
 
 def travellers(volume: float, seed: int, duration_s: float) -> list[Traveller]:
-    """Return who comes, by time of entry, each in the free column nearest to its arrival.
+    """Return the vehicles by time of entry, each with the free column nearest to its arrival.
 
     Column c is at the beginning of the road at -c PITCH_M / SPEED_MPS.
     """
@@ -120,18 +120,18 @@ def travellers(volume: float, seed: int, duration_s: float) -> list[Traveller]:
 
 @frozen
 class Slot:
-    """What one planning did."""
+    """Figures of the plan of one slot."""
 
     cpu_ms: float
     check_ms: float
-    """CPU time of the check."""
+    """CPU time of the validator."""
     rounds: int
     missed: int
     vehicles: int
 
 
 @frozen
-class Left:
+class Departed:
     """A vehicle that has left the road."""
 
     traveller: Traveller
@@ -140,12 +140,12 @@ class Left:
 
     @property
     def travel_s(self) -> float:
-        """From arrival to the end of the road."""
+        """Time from the arrival to the end of the road."""
         return (LENGTH_M - PITCH_M * self.column) / SPEED_MPS - self.traveller.arrival_s
 
 
 class Run:
-    """A lattice that is driven slot by slot."""
+    """A simulation of the lattice, slot by slot."""
 
     def __init__(self, variant: Variant, volume: float, seed: int, duration_s: float) -> None:
         """Prepare the first slot."""
@@ -155,20 +155,22 @@ class Run:
         self.on_road: dict[str, tuple[Traveller, tuple[int, int]]] = {}
         self.plan: StreamPlan | None = None
         self.number = 0
-        self.left: list[Left] = []
+        self.left: list[Departed] = []
         self.slots: list[Slot] = []
 
     def step(self) -> bool:
-        """Plan a slot and drive it; tell whether anybody is left."""
+        """Plan and execute a slot; return whether vehicles remain."""
         front_m = self.number * self.road.advance_m
         while self.coming and self.coming[-1].column * PITCH_M + front_m >= 0:
             one = self.coming.pop()
             self.on_road[one.vehicle] = one, (one.column, one.lane)
         for name, (one, (column, lane)) in list(self.on_road.items()):
             if column * PITCH_M + front_m > self.road.length_m:
-                self.left.append(Left(one, column, lane))
+                self.left.append(Departed(one, column, lane))
                 del self.on_road[name]
-        vehicles = [StreamVehicle(v, cell, one.wanted) for v, (one, cell) in self.on_road.items()]
+        vehicles = [
+            StreamVehicle(v, cell, one.target_lane) for v, (one, cell) in self.on_road.items()
+        ]
         began = time.thread_time()
         plan = self.planner.plan(self.number, vehicles, self.plan)
         cpu_ms = (time.thread_time() - began) * 1e3
@@ -178,16 +180,16 @@ class Run:
             raise RuntimeError("; ".join(wrong))
         self.slots.append(Slot(cpu_ms, check_ms, plan.rounds, len(plan.missed), len(vehicles)))
         for name, (one, cell) in self.on_road.items():
-            way = plan.paths[name]
-            self.on_road[name] = one, way[1] if len(way) > 1 else cell
+            path = plan.paths[name]
+            self.on_road[name] = one, path[1] if len(path) > 1 else cell
         self.plan = plan
         self.number += 1
         return bool(self.coming or self.on_road)
 
 
 def measured(name: str, volume: int, seeds: int, duration_s: float) -> dict[str, Any]:
-    """Return what a volume reaches over some seeds."""
-    left: list[Left] = []
+    """Return the results of a volume over some seeds."""
+    left: list[Departed] = []
     slots: list[Slot] = []
     off = []
     for seed in range(1, seeds + 1):
@@ -195,7 +197,7 @@ def measured(name: str, volume: int, seeds: int, duration_s: float) -> dict[str,
         while run.step():
             pass
         counted = [one for one in run.left if one.traveller.arrival_s >= NOT_COUNTED_S]
-        off.append(sum(one.lane != one.traveller.wanted for one in counted))
+        off.append(sum(one.lane != one.traveller.target_lane for one in counted))
         left += counted
         slots += run.slots
     travel_s = np.array([one.travel_s for one in left])

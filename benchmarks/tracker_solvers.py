@@ -43,8 +43,8 @@ from laneweave.sim_bridge.recording.trips import percentiles_of
 Array = NDArray[np.float64]
 
 FAMILIES: Final = ("gap-rows", "yielding", "undisturbed")
-"""A gap constraint is active; the reference gives way, so that none is active; no vehicle is near.
-Other ticks are recorded as well, since they precede these."""
+"""A gap constraint is active; the reference yields, so that none is active; no vehicle is near.
+Other ticks, which precede these, are recorded as well."""
 GOALS_MS: Final = {"p50": 0.2, "p99": 1.0, "max": 4.0}
 """CPU time goals of the tracker where gap constraints are active."""
 _REPEATS = 3

@@ -5,11 +5,11 @@ time, `laneweave watch`, and Debian's Chromium. When 90 vehicles are on the road
 and observed for some seconds, several times:
 
     first_paint_ms     first contentful paint, as the browser measures it
-    first_frame_ms     the first picture of the road
-    ticks_per_s        of the road: the upper bound for the two rates below
-    updates_per_s      frames that arrived
-    drawn_per_s        frames that were drawn
-    server_cpu_share   CPU time of the page's server, of one core
+    first_frame_ms     first drawn frame of the road
+    ticks_per_s        ticks of the road, the upper bound of the next two rates
+    updates_per_s      received frames
+    drawn_per_s        drawn frames
+    server_cpu_share   CPU time of the server of the page, as a share of one core
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from selenium.webdriver.chrome.service import Service
 
 LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
 ROUNDS = 5
-LOOK_S = 5.0
+OBSERVED_S = 5.0
 TICK_S = 0.1
 START_S = 30.0
 FILL_S = 240.0
@@ -93,9 +93,9 @@ def wait_until(condition: Any, within_s: float) -> None:  # noqa: ANN401 - any c
     Raises:
         TimeoutError: it did not hold in time.
     """
-    give_up = time.monotonic() + within_s
+    deadline = time.monotonic() + within_s
     while not condition():
-        if time.monotonic() > give_up:
+        if time.monotonic() > deadline:
             message = f"the condition did not hold within {within_s:g} s"
             raise TimeoutError(message)
         time.sleep(0.1)
@@ -123,7 +123,7 @@ def measure(driver: webdriver.Chrome, address: str, server: psutil.Process) -> d
     driver.get(address)
     wait_until(lambda: driver.execute_script(STATS)["shown"] > 2, START_S)
     cpu, began, before = server.cpu_times(), time.monotonic(), driver.execute_script(STATS)
-    time.sleep(LOOK_S)
+    time.sleep(OBSERVED_S)
     after, took_s = driver.execute_script(STATS), time.monotonic() - began
     spent = server.cpu_times()
     vehicles = int(driver.execute_script("return document.getElementById('count').textContent"))

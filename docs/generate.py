@@ -254,7 +254,7 @@ def _resilience() -> str:
     """Return the table of the cost of faults, by `benchmarks/resilience.py`."""
     measured = json.loads(MEASURED.read_text(encoding="utf-8"))
     lines = [
-        "| experiment | left | on their lane | overlaps | least gap | travel time | more |",
+        "| experiment | left | on their lane | overlaps | min. gap | travel time | remarks |",
         "|---|---|---|---|---|---|---|",
     ]
     for name, run in measured.items():
@@ -286,7 +286,7 @@ def _more(name: str, run: dict[str, Any]) -> Iterator[str]:
         if times["count"]:
             yield f"{words} after {times['p50']:.2f} s (p50), {times['p99']:.2f} s (p99)"
     if run["replanned"]:
-        yield f"{run['replanned']} plans made anew"
+        yield f"{run['replanned']} repeated plans"
     if not name.startswith("rolling-"):  # these have no real time
         yield f"real-time factor {run['real_time_factor']:.2f}"
 
@@ -358,7 +358,10 @@ def _geometry() -> str:
 def _closing() -> str:
     """Return the table of the cost of `closing` conflicts, by `benchmarks/closing.py`."""
     lines = [
-        "| conflicts | vehicles | closes up | steps | dearer | more | CPU ms p50 | mean | factor |",
+        (
+            "| conflicts | vehicles | closes up | steps | more expensive | additional steps "
+            "| CPU ms p50 | mean | factor |"
+        ),
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in json.loads(CLOSING.read_text(encoding="utf-8")):
@@ -416,7 +419,7 @@ def _hosts() -> str:
     calm_s = measured["undisturbed"]["travel_time_s"]
     lines = [
         (
-            "| what happens at 40 s | left | on their lane | overlaps | least gap | travel time "
+            "| fault at 40 s | left | on their lane | overlaps | min. gap | travel time "
             "| leader changes | caretakers |"
         ),
         "|---|---|---|---|---|---|---|---|",
@@ -460,8 +463,8 @@ def _service_load(runs: list[dict[str, Any]]) -> Iterator[str]:
 def _stability() -> str:
     """Return the table of how a speed disturbance propagates, by `benchmarks/stability.py`."""
     headings = (
-        "", "speed lost, messages lost", "disturbed one", "1st behind", "2nd behind", "last",
-        "amplification", "any behind", "the last", "braked", "least gap",
+        "", "speed lost, messages lost", "disturbed", "1st behind", "2nd behind", "last",
+        "amplification", "any behind", "the last", "braked", "min. gap",
     )  # fmt: skip
     lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
     for row in json.loads(STABILITY.read_text(encoding="utf-8"))["rows"]:

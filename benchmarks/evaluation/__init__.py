@@ -1,14 +1,14 @@
-"""The evaluation: what docs/EVALUATION.md reports, from finished runs to its tables and figures.
+"""The evaluation: from finished runs to the tables and figures of docs/EVALUATION.md.
 
-programme        which methods at which volumes; the goals
-lattice_points   how far apart vehicles are at the fixed time points of the lattice
-points           one row for each label and volume, over its seeds
+programme        methods and volumes; goals
+lattice_points   distances between vehicles at the fixed time points of the lattice
+points           results of each label and volume over its seeds
 trials           single runs: over Zenoh (and their agreement with simulated ones), for
                  real-time factors, on a long road
-evidence         all of it in one JSON file
+evidence         the JSON file of all results
 tables, goals, statements
-                 from the file to Markdown
-pictures         the figures
+                 results as Markdown
+pictures         figures
 
-`benchmarks/evaluate.py` runs it all; `docs/generate.py` puts the tables into the document.
+`benchmarks/evaluate.py` runs everything; `docs/generate.py` writes the tables into the document.
 """

@@ -1,4 +1,4 @@
-"""The parts of the evaluation that take time: the sweep in rounds, the trials, the report."""
+"""The parts of the evaluation: the sweep in rounds, the trials, the report."""
 
 from __future__ import annotations
 
@@ -44,23 +44,22 @@ def say(text: str) -> None:
 
 @frozen
 class Rounds:
-    """A sweep seed by seed: each round has every method at every volume."""
+    """A sweep in rounds: each round runs every method at every volume with one seed."""
 
     seeds: Sequence[int]
     duration_s: float
-    """Vehicles arrive for this long at each point."""
+    """Duration of the arrivals at each point."""
     jobs: int
-    """Processes at a time."""
+    """Number of parallel processes."""
     end_s: float | None
-    """No round is begun that would last beyond this time (`time.monotonic`); None: no limit. The
-    first one is always run."""
+    """Time (`time.monotonic`) that no round may exceed, except the first one; None: no limit."""
 
     def run(self, out: Path) -> bool:
-        """Run the rounds that are not finished; return whether formation control kept its promises.
+        """Run the unfinished rounds; return whether formation control kept its guarantees.
 
         Raises:
-            BadInputError: the folder is another sweep's.
-            CommandFailedError: files or processes cannot be made.
+            BadInputError: the folder belongs to another sweep.
+            CommandFailedError: files or processes cannot be created.
         """
         base = load_scenario(None, demand__duration_s=self.duration_s)
         last_s, kept = 0.0, True
@@ -72,7 +71,9 @@ class Rounds:
                     continue
                 began_s = time.monotonic()
                 if self.end_s is not None and last_s and began_s + last_s > self.end_s:
-                    say(f"no time for seed {seed} and later ones; the next call goes on with them")
+                    say(
+                        f"no time for seed {seed} and later ones; the next call continues with them"
+                    )
                     break
                 say(f"sweep, seed {seed}")
                 run_sweep(points, folder, partial(run_locally, workers=self.jobs), show=True)
@@ -89,8 +90,8 @@ def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:
     Args:
         part: `zenoh`, `speed` or `length`.
         out: the evaluation's folder.
-        root: of the repository.
-        jobs: number that may run at a time, of those that share the machine.
+        root: root folder of the repository.
+        jobs: number of parallel trials, among those that may share the machine.
     """
     stop = threading.Event()
 
@@ -102,15 +103,15 @@ def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:
             say(f"FAILED: {error}")
             return False
         except StoppedError:
-            say(f"FAILED: {trial.command}: ended before it was over")
+            say(f"FAILED: {trial.command}: stopped before its end")
             return False
         return True
 
     waiting = [trial for trial in TRIALS if trial.part == part and not is_finished(trial, out)]
-    ended = [complete(trial) for trial in waiting if not trial.shares]
+    ended = [complete(trial) for trial in waiting if not trial.is_shared]
     with ThreadPoolExecutor(jobs) as pool:
         try:
-            ended += pool.map(complete, [trial for trial in waiting if trial.shares])
+            ended += pool.map(complete, [trial for trial in waiting if trial.is_shared])
         finally:
             stop.set()
     return all(ended)
@@ -121,11 +122,11 @@ def collect(out: Path, sweeps: Iterable[Path], images: Path) -> Evidence:
 
     Args:
         out: the evaluation's folder.
-        sweeps: folders of sweeps instead of its own; none: its own, if it has one.
-        images: where the figures go; earlier ones that were not drawn again are removed.
+        sweeps: folders of other sweeps; empty: the sweep in `out`, if there is one.
+        images: folder of the figures; figures that are not drawn again are removed.
 
     Raises:
-        BadInputError: a folder is not that of a sweep, or they cannot be compared.
+        BadInputError: a folder contains no sweep, or the runs cannot be compared.
         OSError, ValueError, KeyError: a run's files cannot be read.
     """
     folders = list(sweeps) or [path for path in (out / SWEEP_FOLDER,) if is_sweep(path)]
@@ -146,7 +147,7 @@ def collect(out: Path, sweeps: Iterable[Path], images: Path) -> Evidence:
     for path in images.glob(PICTURES):
         if path.name not in names:
             path.unlink()
-    return evidence.renewed(
+    return evidence.updated_with(
         Evidence(setting=setting_of(runs), points=tuple(points), pictures=pictures)
     )
 
@@ -166,4 +167,4 @@ def refresh(out: Path, sweeps: Iterable[Path], docs: Path) -> None:
     """
     path = docs / "evidence" / "evaluation.json"
     recorded = read_evidence(path)
-    write_evidence(recorded.renewed(collect(out, sweeps, docs / "images")), path)
+    write_evidence(recorded.updated_with(collect(out, sweeps, docs / "images")), path)

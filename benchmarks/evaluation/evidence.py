@@ -24,10 +24,10 @@ class Setting:
     """The settings of all points of the sweep."""
 
     duration_s: float
-    """Vehicles arrive for this long."""
+    """Duration of the arrivals."""
     road_m: float
     free_flow_s: float
-    """Time that the road takes at v_F."""
+    """Travel time at v_F."""
     pitch_m: float
     """d_F."""
     speed_mps: float
@@ -41,7 +41,7 @@ class Picture:
     """A figure of the document."""
 
     name: str
-    """Of its file in docs/images."""
+    """Name of its file in docs/images."""
     alt: str
     caption: str
 
@@ -63,8 +63,8 @@ class Evidence:
         """The points by label and volume."""
         return {(row.label, row.volume_veh_per_lane_h): row for row in self.points}
 
-    def renewed(self, new: Evidence) -> Evidence:
-        """Return a copy in which the parts of newer evidence replace the earlier ones.
+    def updated_with(self, new: Evidence) -> Evidence:
+        """Return a copy in which the parts of newer evidence replace the present ones.
 
         Points, their setting and their pictures are one part: they come from the same runs.
         """
@@ -80,10 +80,7 @@ class Evidence:
 
 
 def setting_of(runs: Sequence[Run]) -> Setting:
-    """Return what some runs share; those of the first run of formation control.
-
-    The reference methods do not read all of it.
-    """
+    """Return the settings that runs share, read from the first run of formation control."""
     scenario = next((run for run in runs if run.label in FORMATIONS), runs[0]).scenario
     formation, vehicle = scenario.formation, scenario.vehicle
     return Setting(
@@ -101,8 +98,8 @@ def read_evidence(path: Path) -> Evidence:
     """Return the recorded evidence; empty if there is no file.
 
     Raises:
-        BadInputError: the file has other contents.
-        ValueError: it is not JSON.
+        BadInputError: the file has an unknown format.
+        ValueError: the file is not JSON.
     """
     if not path.is_file():
         return Evidence()

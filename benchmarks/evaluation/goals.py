@@ -1,4 +1,4 @@
-"""The goals, each with what was measured and whether it is met."""
+"""The table of goals, measured values and verdicts."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Iterator, Sequence
 from evaluation.evidence import Evidence
 from evaluation.markdown import HOLDS, MISSED, MISSING, markdown, number
 from evaluation.points import PointRow
-from evaluation.programme import FORMATIONS, GOALS, LEAST_FACTORS, MOST_COST_RATIO, SEEDS, Goal
+from evaluation.programme import FORMATIONS, GOALS, MAX_COST_RATIO, MIN_FACTORS, SEEDS, Goal
 
 
 def goals_table(evidence: Evidence) -> str:
     """Return the table of all goals."""
     rows = [*_traffic(evidence), *_safety(evidence), *_runtime(evidence)]
-    return markdown(["goal", "asked for", "measured", ""], rows)
+    return markdown(["goal", "required", "measured", ""], rows)
 
 
 def _traffic(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
@@ -22,13 +22,13 @@ def _traffic(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
         row = evidence.by_key.get((goal.label, goal.volume_veh_per_lane_h))
         yield (
             f"`{goal.label}`, {goal.volume_veh_per_lane_h:g} veh/(lane h)",
-            ", ".join(_asked_for(goal)),
+            ", ".join(_requirements(goal)),
             MISSING if row is None else _measured(row, goal),
             "" if row is None else _verdict(meets(row, goal)),
         )
 
 
-def _asked_for(goal: Goal) -> Iterator[str]:
+def _requirements(goal: Goal) -> Iterator[str]:
     at_least = "" if goal.on_lane_percent == 100.0 else "at least "
     yield f"at most {goal.travel_s:g} s"
     yield f"{at_least}{goal.on_lane_percent:g} % on their lane"
@@ -39,13 +39,13 @@ def _asked_for(goal: Goal) -> Iterator[str]:
 
 
 def meets(row: PointRow, goal: Goal) -> bool:
-    """Tell whether a point meets a goal, which is for its label and volume."""
+    """Return whether a point meets a goal for its label and volume."""
     kept = [
         row.travel_s is not None and row.travel_s <= goal.travel_s,
         100.0 * row.on_preferred_lane >= goal.on_lane_percent * row.demanded > 0.0,
     ]
     if goal.accel_mps2 is not None:
-        # As accelerations are shown.
+        # Rounded as in the tables.
         found = (row.min_accel_mps2, row.max_accel_mps2)
         kept += [a is not None and round(abs(a), 2) <= goal.accel_mps2 for a in found]
     if goal.fallback_percent is not None:
@@ -69,7 +69,7 @@ def _measured(row: PointRow, goal: Goal) -> str:
 
 
 def _safety(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
-    """Yield what every run of formation control has promised."""
+    """Yield the guarantees of all runs of formation control."""
     rows = [row for row in evidence.points if row.label in FORMATIONS and row.seeds]
     runs = f"{sum(len(row.seeds) for row in rows)} runs of formation control"
     yield _one(
@@ -87,17 +87,17 @@ def _safety(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
         [row.within_limits for row in rows],
     )  # fmt: skip
     traced = [row.traced for row in rows if row.traced is not None]
-    least = [one.lattice_least_m for one in traced if one.lattice_least_m is not None]
-    looked_at = f"{sum(one.lattice_pairs for one in traced):,} in {sum(one.runs for one in traced)}"
+    minimum = [one.lattice_least_m for one in traced if one.lattice_least_m is not None]
+    examined = f"{sum(one.lattice_pairs for one in traced):,} in {sum(one.runs for one in traced)}"
     yield _one(
         "spacing at lattice points", "never below d_F",
-        f"{number(min(least, default=None), 2)} m, least of {looked_at} runs",
+        f"{number(min(minimum, default=None), 2)} m, minimum of {examined} runs",
         [one.lattice_kept for one in traced],
     )  # fmt: skip
 
 
 def _runtime(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
-    """Yield the goals for the network and for speed."""
+    """Yield the goals for runs over Zenoh and for execution speed."""
     agreements = evidence.agreements
     differ = sum(not row.agreement.holds for row in agreements)
     yield _one(
@@ -110,24 +110,24 @@ def _runtime(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
         "zenoh-50": "50 vehicles per process",
         "simulated": "one process, simulated network",
     }
-    for trial, least in LEAST_FACTORS.items():
+    for trial, minimum in MIN_FACTORS.items():
         factor = factors.get(trial)
         yield _one(
-            f"real-time factor at 1600, {names[trial]}", f"at least {least:g}",
-            number(factor, 2), [] if factor is None else [factor >= least],
+            f"real-time factor at 1600, {names[trial]}", f"at least {minimum:g}",
+            number(factor, 2), [] if factor is None else [factor >= minimum],
         )  # fmt: skip
     cost_ms = {row.trial: row.cost_ms for row in evidence.costs}
     known = "short" in cost_ms and "long" in cost_ms
     ratio = cost_ms["long"] / cost_ms["short"] if known else 1.0
     yield _one(
         "cost of a vehicle on 10 km, 1,000 vehicles, against 1 km",
-        f"at most {MOST_COST_RATIO:g} times", f"{ratio:.2f} times",
-        [ratio <= MOST_COST_RATIO] if known else [],
+        f"at most {MAX_COST_RATIO:g} times", f"{ratio:.2f} times",
+        [ratio <= MAX_COST_RATIO] if known else [],
     )  # fmt: skip
 
 
 def _one(what: str, asked: str, measured: str, kept: Sequence[bool]) -> tuple[str, str, str, str]:
-    """Return a row; without measurements, a row that says so."""
+    """Return a row of the table; `MISSING` stands for missing measurements."""
     if not kept:
         return what, asked, MISSING, ""
     return what, asked, measured, _verdict(all(kept))

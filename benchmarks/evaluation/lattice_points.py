@@ -1,14 +1,14 @@
 """Distances between vehicles at the lattice's fixed time points, from a run's trajectories.
 
-At the end of each slot the vehicles that moved in it are at rest in a cell, and two vehicles of a
-lane are at least d_F apart, front to front. Between those points they may be closer, by design: one
-falls back into a cell while another leaves it.
+At the end of each slot the vehicles that moved in it are at rest in a cell, and two vehicles on a
+lane are at least d_F apart, front to front. Between those points they may be closer by design, for
+example when one falls back into a cell while another leaves it.
 
-Each plan has its own slots. The ticks examined are those before a vehicle begins a move, and one
-tick of each shortest T_F. Of the vehicles, those are examined that are at rest: on the road for at
-least `formation.settle_s`, and either about to begin a move or in the same cell for at least the
-longest time of a move. Lanes and distances are those of the bodies, not of the cells that they
-should be in, so that a body in the wrong place is found.
+Slots differ between plans. Examined are the ticks before a vehicle begins a move, and one tick per
+shortest T_F. In these ticks vehicles at rest are examined: those on the road for at least
+`formation.settle_s` that are about to begin a move, or have been in the same cell for at least the
+longest time of a move. Lanes and distances are the true ones of the bodies, so that a body outside
+its cell is detected.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from laneweave.launch.recordings.trajectories import OFF_LATTICE, Bools, Floats,
 from laneweave.protocol.scenario.fields import Scenario
 
 TOLERANCE_M: Final = 0.3
-"""Two bodies may be closer than d_F by this much: each is tracked to within 0.1 m at lattice points
-with sensors that err by 0.05 m (standard deviation), and both may err towards each other."""
+"""Permitted error of a distance: each body is tracked to within 0.1 m at lattice points, its sensors
+err by 0.05 m (standard deviation), and the errors of both bodies may add up."""
 
 
 @frozen
@@ -31,19 +31,19 @@ class LatticeSpacing:
     """Distances at the lattice points of a run."""
 
     least_m: float | None
-    """Smallest distance from front bumper to front bumper; None: never two on a lane."""
+    """Minimum distance from front bumper to front bumper; None: no two vehicles on a lane."""
     pairs: int
     """Number of distances examined."""
     worst_off_m: float | None
-    """Greatest distance of a settled vehicle from its cell along the road."""
+    """Maximum distance of a vehicle at rest from its cell along the road."""
 
     def keeps(self, pitch_m: float) -> bool:
-        """Tell whether no distance is below the pitch d_F, apart from the tolerance."""
+        """Return whether all distances are at least the pitch d_F, within the tolerance."""
         return self.least_m is None or self.least_m >= pitch_m - TOLERANCE_M
 
 
 def lattice_spacing(tracks: Tracks, scenario: Scenario) -> LatticeSpacing:
-    """Return the distances between settled vehicles at the ends of slots.
+    """Return the distances between vehicles at rest at the ends of slots.
 
     Args:
         tracks: the run's trajectories.
@@ -78,8 +78,8 @@ def _settled(tracks: Tracks, ticks: Ints, scenario: Scenario) -> Bools:
     at_end |= np.isin(ticks, ticks[about_to_move])
     on_road_s = tracks.t_s - _since(tracks.t_s, first)
     held_s = tracks.t_s - _since(tracks.t_s, first | changed)
-    least_s = np.where(about_to_move, shortest_s, longest_s) - formation.slack_s
-    rests: Bools = held_s >= least_s - 0.5 * tick_s
+    min_held_s = np.where(about_to_move, shortest_s, longest_s) - formation.slack_s
+    rests: Bools = held_s >= min_held_s - 0.5 * tick_s
     rests &= on_road_s >= formation.settle_s - 0.5 * tick_s
     rests &= tracks.column != OFF_LATTICE
     return rests & at_end
@@ -88,7 +88,7 @@ def _settled(tracks: Tracks, ticks: Ints, scenario: Scenario) -> Bools:
 def _slot_phase(changes: Ints, period: int) -> int:
     """Return the tick of a period at which slots end: most cells change in the tick after it.
 
-    A vehicle shows its next cell in the first tick of its move.
+    A vehicle reports its next cell in the first tick of its move.
     """
     if not len(changes):
         return 0
@@ -96,6 +96,6 @@ def _slot_phase(changes: Ints, period: int) -> int:
 
 
 def _since(t_s: Floats, marks: Bools) -> Floats:
-    """Return for each row the time of the last mark up to it; the first row is one."""
+    """Return the time of the last mark up to each row; the first row counts as marked."""
     places = np.maximum.accumulate(np.where(marks, np.arange(len(t_s)), 0))
     return np.asarray(t_s[places])

@@ -6,14 +6,14 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 MISSING: Final = "missing"
-"""Text for a measurement that is planned and missing."""
+"""Text for a planned measurement that is not available yet."""
 NOT_RUN: Final = "-"
 """Text for a measurement that is not planned."""
 HOLDS, MISSED = "holds", "**missed**"
 
 
 def markdown(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table; without rows, one row that says so."""
+    """Return a table; without rows, a table with one row `MISSING`."""
     listed = list(rows) or [[MISSING, *[""] * (len(headings) - 1)]]
     lines = [" | ".join(cells) for cells in (headings, *listed)]
     rule = "|" + "---|" * len(headings)
@@ -22,5 +22,5 @@ def markdown(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def number(value: float | None, digits: int) -> str:
-    """Return a number as text, `-` where it is not known."""
+    """Return a number as text, or `-` if it is unknown."""
     return "-" if value is None else f"{value:.{digits}f}"

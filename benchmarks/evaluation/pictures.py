@@ -19,27 +19,27 @@ from laneweave.launch.report.snapshots import road_snapshots
 
 DPI: Final = 110
 SHOWN_VOLUME: Final = 1600.0
-"""The paper's highest, in vehicles/(lane h)."""
+"""The highest volume of the paper, in vehicles/(lane h)."""
 
 
 @frozen
 class _Plan:
-    """A figure and the runs that it shows."""
+    """A figure, and the labels and volumes of its runs."""
 
     picture: Picture
     labels: tuple[str, ...]
     volumes: tuple[float, ...]
     draw: Callable[[Comparison, Path, int], None]
     traced: bool = False
-    """It needs trajectories."""
+    """Whether it needs trajectories."""
 
 
 def draw_pictures(runs: Sequence[Run], folder: Path) -> tuple[Picture, ...]:
-    """Draw every figure for which there are runs, and return those that were drawn.
+    """Draw every figure that has runs, and return the drawn figures.
 
     Args:
-        runs: of the sweep; failed ones are left out.
-        folder: where the pictures go.
+        runs: of the sweep; failed ones are excluded.
+        folder: folder of the figures.
     """
     drawn = []
     for plan in _PLANS:
@@ -69,12 +69,12 @@ def _draw_spacings(comparison: Comparison, out: Path, dpi: int) -> None:
     draw_spacings(counted, comparison.runs[0].scenario, out, dpi)
 
 
-def _snapshots(label: str, what: str) -> _Plan:
+def _snapshots(label: str, description: str) -> _Plan:
     picture = Picture(
         f"evaluation-road-{label}.png",
         f"Four strips of road from 500 to 800 m, {label}",
-        f"The road from 500 to 800 m at 1600 veh/(lane h), {what}: four instants, 4 s apart. "
-        "Colours are preferred lanes; the faster, the lighter.",
+        f"The road from 500 to 800 m at 1600 veh/(lane h), {description}: four instants, 4 s "
+        "apart. Colours are preferred lanes; the faster, the lighter.",
     )
     return _Plan(picture, (label,), (SHOWN_VOLUME,), _draw_snapshots, traced=True)
 
@@ -85,8 +85,8 @@ _PLANS: Final = (
             "evaluation-paper.png",
             "Box plots of travel times at the paper's volumes",
             "Travel times at the paper's volumes: the default formations and the paper's, both of "
-            "at most six, beside two readings of its rules. Boxes: quartiles over the vehicles of "
-            "all seeds; lines: means. The axis is broken where a method jams.",
+            "at most six, and two interpretations of its rules. Boxes: quartiles over the vehicles "
+            "of all seeds; lines: means. The axis is broken where a method jams.",
         ),
         ("formations", "paper-6", "rule", "rule-net"),
         PAPER_VOLUMES,

@@ -1,4 +1,4 @@
-"""From the runs of a sweep to one row for each label and volume."""
+"""Results of each label and volume over the seeds of a sweep."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from laneweave.sim_bridge.recording.trips import WARM_UP_S
 
 SLOW_BIN_M: Final = 50.0
 SLOW_SHARE: Final = 0.5
-"""Where traffic is slower than this share of v_F on average, it is congested."""
+"""Traffic is congested where its mean speed is below this share of v_F."""
 LIMIT_ERROR: Final = 0.001
-"""Summaries are rounded to this."""
+"""Rounding error of summaries."""
 SOLVER: Final = {PLAN_MADE: "branching", STREAM_PLANNED: "stream"}
-"""The solver of a kind of event, where the event does not name it."""
+"""The solver of plans whose events do not name it, by kind of event."""
 Key = tuple[str, float]
 """(label, volume in vehicles/(lane h))."""
 
@@ -35,16 +35,16 @@ class Traced:
 
     runs: int
     lattice_least_m: float | None
-    """Smallest spacing at lattice points; None: no lattice, or never two on a lane."""
+    """Minimum spacing at lattice points; None: no lattice, or no two vehicles on a lane."""
     lattice_pairs: int
     lattice_worst_off_m: float | None
-    """Greatest distance from the own cell there."""
+    """Maximum distance of a vehicle from its cell at lattice points."""
     lattice_kept: bool
-    """Whether no spacing there is below the pitch, apart from the tolerance."""
+    """Whether all spacings are at least the pitch, within the tolerance."""
     slow_m: tuple[float, float] | None
-    """Congested stretch of road, from and to: mean speed below half of v_F; None: nowhere."""
+    """Start and end of the congested stretch of road; None: there is none."""
     slowest_mps: float | None
-    """Lowest mean speed of a bin of the road; None: no vehicle drove."""
+    """Lowest mean speed of a bin of the road; None: there were no vehicles."""
 
 
 @frozen
@@ -60,14 +60,14 @@ class PlanningTimes:
 
 @frozen
 class PointRow:
-    """A label at a volume, over all seeds whose runs are complete; None: not known."""
+    """Results of a label at a volume over all complete runs; None: unknown."""
 
     label: str
     volume_veh_per_lane_h: float
     seeds: tuple[int, ...]
-    """Of the runs whose vehicles have all left: the figures are theirs."""
+    """Seeds of the complete runs, in which all vehicles have left."""
     failed: tuple[tuple[int, str], ...]
-    """(seed, why) of runs that failed; an overlap alone does not keep a run out of the figures."""
+    """(seed, reason) of failed runs; complete runs with overlaps are included in the figures."""
     demanded: int
     left: int
     on_preferred_lane: int
@@ -93,16 +93,16 @@ class PointRow:
     planning_p95_ms: float | None
     """Worst over the seeds."""
     traced: Traced | None
-    """Figures from trajectories; None: none were kept."""
+    """Figures from trajectories; None: no trajectories were stored."""
     plans: int = 0
-    """Over all seeds, as the next ones."""
+    """Over all seeds, like the following fields."""
     fallbacks: int = 0
     """Plans of the fallback planner."""
     planning: tuple[PlanningTimes, ...] = ()
 
     @property
     def on_lane_percent(self) -> float | None:
-        """Share of those who left that left on their preferred lane."""
+        """Share of vehicles that left on their preferred lane, among all that left."""
         return 100.0 * self.on_preferred_lane / self.left if self.left else None
 
 
@@ -110,7 +110,7 @@ def point_rows(runs: Iterable[Run]) -> list[PointRow]:
     """Return the rows of all labels and volumes, in the order of labels.
 
     Raises:
-        BadInputError: runs cannot be compared: other roads or demands, or one twice.
+        BadInputError: runs differ in road or demand, or one occurs twice.
         OSError, ValueError, KeyError: a run's files cannot be read.
     """
     listed = sorted(runs, key=lambda run: run.order)
@@ -122,10 +122,10 @@ def point_rows(runs: Iterable[Run]) -> list[PointRow]:
 
 
 def check_comparable(runs: Sequence[Run]) -> None:
-    """Check that runs have the same road and demand, except volume and seed, each run once.
+    """Check that runs are distinct and differ in method, volume and seed only.
 
     Raises:
-        BadInputError: they do not.
+        BadInputError: they differ in road or demand, or one occurs twice.
     """
     seen: set[tuple[str, float, int]] = set()
     for run in runs:
@@ -184,7 +184,7 @@ def _row(key: Key, runs: Sequence[Run]) -> PointRow:
 
 
 def planning_times(runs: Iterable[Run]) -> tuple[PlanningTimes, ...]:
-    """Return the planning times of each solver in some runs, by their events.
+    """Return the planning times of each solver, read from the events of runs.
 
     Raises:
         OSError, ValueError, TypeError: events cannot be read.
@@ -203,17 +203,17 @@ def planning_times(runs: Iterable[Run]) -> tuple[PlanningTimes, ...]:
 
 
 def _spread(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the median, the 95th percentile and the greatest value."""
+    """Return the median, the 95th percentile and the maximum."""
     p50, p95 = np.percentile(values, [50.0, 95.0])
     return float(p50), float(p95), max(values)
 
 
 def within_limits(low: float | None, high: float | None, scenario: Scenario) -> bool:
-    """Tell whether accelerations are within the limits of the vehicles.
+    """Return whether accelerations are within the limits of the vehicles.
 
     Args:
-        low: hardest braking in m/s2; None: no vehicle drove.
-        high: greatest acceleration in m/s2.
+        low: minimum acceleration [m/s2]; None: there were no vehicles.
+        high: maximum acceleration [m/s2].
         scenario: of the run.
     """
     vehicle = scenario.vehicle
@@ -223,7 +223,7 @@ def within_limits(low: float | None, high: float | None, scenario: Scenario) -> 
 
 
 def _traced(runs: Sequence[Run]) -> Traced | None:
-    """Return the figures of the trajectories of some runs together."""
+    """Return the combined figures of the trajectories of several runs."""
     found = [trace(read_tracks(run.folder), run.scenario) for run in runs]
     if not found:
         return None
@@ -265,7 +265,7 @@ def trace(tracks: Tracks, scenario: Scenario) -> Traced:
 def slow_stretch(
     tracks: Tracks, scenario: Scenario
 ) -> tuple[tuple[float, float] | None, float | None]:
-    """Return the congested stretch of road (from m, to m) and the least mean speed in m/s.
+    """Return the congested stretch of road (start, end) [m] and the minimum mean speed [m/s].
 
     Speeds are means over bins of the road, from the end of the warm-up to the last arrival.
     """

@@ -1,4 +1,4 @@
-"""Which methods are run at which volumes, and what is asked of them."""
+"""Methods and volumes of the evaluation, and their goals."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from laneweave.protocol.scenario.fields import Scenario
 
 SEEDS: Final = range(1, 6)
 DURATION_S: Final = 600.0
-"""Vehicles arrive for this long at each point."""
+"""Duration of the arrivals at each point."""
 VOLUMES: Final = (
     500.0, 750.0, 1000.0, 1150.0, 1300.0, 1450.0, 1600.0, 1750.0, 1800.0, 2000.0, 2200.0, 2400.0
 )  # fmt: skip
-"""In vehicles/(lane h): the paper's, below and beyond them."""
+"""In vehicles/(lane h): those of the paper, lower and higher ones."""
 
 
 def paper_bound(speed_mps: float, pitch_m: float) -> float:
-    """Return the most vehicles/(lane h) that interlaced formations can carry (the paper's V_u).
+    """Return the capacity of interlaced formations in vehicles/(lane h) (the paper's V_u).
 
     Args:
         speed_mps: v_F.
@@ -29,8 +29,8 @@ def paper_bound(speed_mps: float, pitch_m: float) -> float:
     return 3600.0 * speed_mps / (2.0 * pitch_m)
 
 
-def _up_to(most_veh_per_lane_h: float) -> tuple[float, ...]:
-    return tuple(volume for volume in VOLUMES if volume <= most_veh_per_lane_h)
+def _up_to(max_veh_per_lane_h: float) -> tuple[float, ...]:
+    return tuple(volume for volume in VOLUMES if volume <= max_veh_per_lane_h)
 
 
 @frozen
@@ -47,23 +47,23 @@ PARTS: Final = (
     Part(("rolling",), VOLUMES, KeepTrajectories.all),
     Part(("formations",), _up_to(2000.0), KeepTrajectories.all),
     Part(("paper-6", "paper-12"), _up_to(1800.0), KeepTrajectories.all),
-    # Jams only grow with the volume, and cost more time than all the rest.
+    # Jams only grow with the volume, and take longer to simulate than everything else.
     Part(("rule", "rule-yielding"), _up_to(1800.0), KeepTrajectories.first_seed),
     Part(("rule-net",), _up_to(1600.0), KeepTrajectories.first_seed),
     Part(("lc2013", "lc2013-4s"), _up_to(1800.0), KeepTrajectories.first_seed),
 )
-"""Most expensive first: short runs fill the gaps at the end."""
+"""Longest runs first, so that short ones fill the idle cores at the end."""
 LABELS: Final = (
     "formations", "paper-6", "paper-12", "rolling",
     "rule", "rule-net", "rule-yielding", "lc2013", "lc2013-4s",
 )  # fmt: skip
 """In the order of tables."""
 FORMATIONS: Final = ("formations", "paper-6", "paper-12", "rolling")
-"""Labels of formation control: these have promises to keep."""
+"""Labels of formation control, whose runs must keep the guarantees."""
 
 
 def planned(label: str, volume_veh_per_lane_h: float) -> bool:
-    """Tell whether a label is run at a volume."""
+    """Return whether a label is run at a volume."""
     return any(label in part.labels and volume_veh_per_lane_h in part.volumes for part in PARTS)
 
 
@@ -84,18 +84,18 @@ def _keep(part: Part, seed: int) -> KeepTrajectories:
 
 @frozen
 class Goal:
-    """What is asked of a label at a volume; travel times are means over the seeds."""
+    """Requirements on a label at a volume; travel times are means over the seeds."""
 
     label: str
     volume_veh_per_lane_h: float
     travel_s: float
-    """Greatest travel time."""
+    """Maximum travel time."""
     on_lane_percent: float = 100.0
-    """Smallest share that leaves on its preferred lane."""
+    """Minimum share of vehicles that leave on their preferred lane."""
     accel_mps2: float | None = None
-    """Greatest acceleration or braking; None: only the vehicles' limits."""
+    """Maximum acceleration and braking; None: no requirement beyond the vehicles' limits."""
     fallback_percent: float | None = None
-    """Greatest share of plans of the fallback planner; None: nothing is asked."""
+    """Maximum share of plans by the fallback solver; None: no requirement."""
 
 
 GOALS: Final = (
@@ -114,7 +114,7 @@ GOALS: Final = (
     Goal("rolling", 2200.0, 67.0, 99.95),
     Goal("rolling", 2400.0, 67.0, 99.9),
 )
-LEAST_FACTORS: Final = {"zenoh": 2.0, "zenoh-50": 5.0, "simulated": 6.0}
-"""Real-time factors asked for at 1600 vehicles/(lane h), by trial."""
-MOST_COST_RATIO: Final = 1.2
-"""A vehicle may cost so many times as much on the long road as on the short one."""
+MIN_FACTORS: Final = {"zenoh": 2.0, "zenoh-50": 5.0, "simulated": 6.0}
+"""Minimum real-time factors at 1600 vehicles/(lane h), by trial."""
+MAX_COST_RATIO: Final = 1.2
+"""Maximum cost of a vehicle on the long road relative to the short one."""

@@ -1,6 +1,6 @@
-"""The paper's statements about its results (Section 5.2), beside what was measured here.
+"""The paper's statements about its results (Section 5.2), compared with measurements.
 
-Each statement has a rule that computes its verdict from the data.
+The verdict of each statement is computed from the data.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from evaluation.points import PointRow
 from evaluation.programme import SEEDS, VOLUMES, paper_bound, planned
 
 PAPER_VOLUMES: Final = (1000.0, 1150.0, 1300.0, 1450.0, 1600.0)
-"""At which the paper compares, in vehicles/(lane h)."""
-READINGS: Final = ("rule", "rule-net", "rule-yielding")
-"""The readings of its rules."""
+"""Volumes of the paper's comparison, in vehicles/(lane h)."""
+INTERPRETATIONS: Final = ("rule", "rule-net", "rule-yielding")
+"""Labels of the interpretations of the paper's rules."""
 OWN: Final = "paper-6"
-"""Formation control as the paper runs it: at most six vehicles."""
+"""Formation control with the paper's settings: at most six vehicles."""
 CLOSED: Final = ("formations", OWN, "paper-12")
-"""Closed formations: the default ones, and the paper's."""
+"""Labels with closed formations: the default and those of the paper."""
 ALIKE_S: Final = 1.0
-"""Methods are alike if their mean travel times differ by at most this."""
+"""Maximum difference of the mean travel times of methods that are alike."""
 STABLE: Final = 1.05
-"""Travel times are stable if they grow by no more than this factor from 1000 to 1600."""
+"""Maximum growth of stable travel times from 1000 to 1600."""
 CONGESTED: Final = 1.25
 """A method is congested if its mean travel time exceeds this multiple of free flow."""
 UNDISTURBED: Final = 0.9
 """Speeds are undisturbed if no stretch of road is below this share of v_F on average."""
 CARRIED: Final = 0.97
-"""A volume is carried if the throughput is at least this share of it."""
+"""Minimum throughput, relative to the volume, at which a volume is carried."""
 PAPER_STRETCH_M: Final = (500.0, 800.0)
 STRETCH_ERROR_M: Final = 50.0
-"""One bin of the road more or less."""
+"""Tolerance: one bin of the road."""
 
-FAILS, DEPENDS, OTHERWISE = "**does not hold**", "depends on the reading", ""
+FAILS, DEPENDS, NOT_JUDGED = "**does not hold**", "depends on the interpretation", ""
 
 
 @frozen
@@ -54,7 +54,7 @@ def statements_table(evidence: Evidence) -> str:
     rows = [(one.text, one.measured, one.verdict) for one in _Judge(evidence).statements()]
     table = markdown(["the paper", "here", ""], rows)
     few = any(len(row.seeds) < len(SEEDS) for row in evidence.points)
-    note = f"Not all of this rests on {len(SEEDS)} seeds yet: see the table of runs."
+    note = f"Not all points have {len(SEEDS)} seeds yet: see the table of runs."
     return f"{table}\n\n{note}" if few else table
 
 
@@ -101,10 +101,10 @@ class _Judge:
         return Statement(text, "; ".join(parts), _all(kept))
 
     def _rules_grow(self) -> Statement:
-        text = "The travel time under the rules goes up with the volume"
+        text = "The travel time under the rules increases with the volume"
         parts: list[str] = []
         kept: list[bool | None] = []
-        for label in READINGS:
+        for label in INTERPRETATIONS:
             times = [self._travel_s(label, volume) for volume in PAPER_VOLUMES]
             known = [t_s for t_s in times if t_s is not None]
             parts.append(f"`{label}` {_series([number(t_s, 1) for t_s in times], known)}")
@@ -140,9 +140,9 @@ class _Judge:
         text = "Severe congestion under the rules at 1450 and 1600, none with formation control"
         parts: list[str] = []
         kept: list[bool | None] = []
-        for label in (*READINGS, *CLOSED, "lc2013"):
+        for label in (*INTERPRETATIONS, *CLOSED, "lc2013"):
             first, below = self._congested_from(label)
-            if label in READINGS:
+            if label in INTERPRETATIONS:
                 known = self._row(label, 1450.0) is not None
                 kept.append(first is not None and first <= 1450.0 if known else None)
             parts.append(f"`{label}` {_onset(first, below)}")
@@ -152,7 +152,7 @@ class _Judge:
         text = "The congestion is at 500 to 800 m"
         parts: list[str] = []
         kept: list[bool | None] = []
-        for label in READINGS:
+        for label in INTERPRETATIONS:
             first, _ = self._congested_from(label)
             row = None if first is None else self._row(label, first)
             if row is None or row.traced is None or row.traced.slow_m is None:
@@ -181,7 +181,7 @@ class _Judge:
         text = "Formation control is faster than the rules at these volumes"
         parts: list[str] = []
         kept: list[bool | None] = []
-        for label in READINGS:
+        for label in INTERPRETATIONS:
             gains = []
             for volume in PAPER_VOLUMES:
                 rule_s, own_s = self._travel_s(label, volume), self._travel_s(OWN, volume)
@@ -197,12 +197,12 @@ class _Judge:
         parts: list[str] = []
         kept: list[bool | None] = []
         for volume in (500.0, 750.0):
-            times = [self._travel_s(label, volume) for label in (OWN, *READINGS)]
+            times = [self._travel_s(label, volume) for label in (OWN, *INTERPRETATIONS)]
             known = [t_s for t_s in times if t_s is not None]
             parts.append(f"at {volume:g}: {_series([number(t_s, 1) for t_s in times], known)}")
             whole = len(known) == len(times)
             kept.append(max(known) - min(known) <= ALIKE_S if whole else None)
-        whose = ", ".join(f"`{label}`" for label in (OWN, *READINGS))
+        whose = ", ".join(f"`{label}`" for label in (OWN, *INTERPRETATIONS))
         return Statement(text, f"{whose} {'; '.join(parts)}", _all(kept))
 
     def _bound(self) -> Statement:
@@ -221,12 +221,12 @@ class _Judge:
             if found is not None and (found.throughput_veh_per_lane_h or 0.0) > bound
         ]
         if beyond:
-            measured += "; the bound is one of the interlaced entry, not of the lattice: "
+            measured += "; the bound applies to the interlaced entry, not to the lattice: "
             measured += ", ".join(beyond)
         return Statement(text, measured, _all([rate >= CARRIED * 1750.0]))
 
     def _safe(self) -> Statement:
-        text = "Formation control plans ways without collisions, to the preferred lanes"
+        text = "Formation control plans paths without collisions to the preferred lanes"
         rows, missing = self._rows(*CLOSED)
         if not rows:
             return Statement(text, MISSING, "")
@@ -237,12 +237,12 @@ class _Judge:
         return Statement(text, measured, _all([not overlaps and not off, *missing]))
 
     def _rules_complete(self) -> Statement:
-        text = "The rules bring everybody to the preferred lane, whatever the traffic"
-        rows, missing = self._rows(*READINGS)
+        text = "The rules bring all vehicles to their preferred lanes in any traffic"
+        rows, missing = self._rows(*INTERPRETATIONS)
         if not rows:
             return Statement(text, MISSING, "")
         off = sum(row.demanded - row.on_preferred_lane for row in rows)
-        measured = f"{off} of {sum(row.demanded for row in rows):,} did not get there"
+        measured = f"{off} of {sum(row.demanded for row in rows):,} did not reach their lane"
         return Statement(text, measured, _all([not off, *missing]))
 
     def _sumo_blocks(self) -> Statement:
@@ -253,10 +253,10 @@ class _Judge:
         off = sum(row.demanded - row.on_preferred_lane for row in rows)
         last = rows[-1]
         measured = (
-            f"`lc2013`: {off} of {sum(row.demanded for row in rows):,} did not get to their lane; "
+            f"`lc2013`: {off} of {sum(row.demanded for row in rows):,} did not reach their lane; "
             f"{number(last.travel_s, 1)} s at {last.volume_veh_per_lane_h:g}"
         )
-        return Statement(text, measured, _so_far("not seen" if not off else HOLDS, missing))
+        return Statement(text, measured, _provisional("not seen" if not off else HOLDS, missing))
 
     def _six(self) -> Statement:
         text = "Formations have at most six vehicles, for computational reasons"
@@ -265,34 +265,34 @@ class _Judge:
             row = self._row(label, 1600.0)
             found = None if row is None else row.planning_p95_ms
             parts.append(f"`{label}` {MISSING if found is None else f'{found:.0f} ms'}")
-        return Statement(text, "planning at 1600, p95: " + ", ".join(parts), OTHERWISE)
+        return Statement(text, "planning at 1600, p95: " + ", ".join(parts), NOT_JUDGED)
 
 
 def _onset(first: float | None, below: float | None) -> str:
-    """Return the volume from which on a method is congested, as far as it was measured."""
+    """Return as text the lowest congested volume, and the highest measured one below it."""
     if first is None:
         return MISSING if below is None else f"not up to {below:g}"
     return f"at {first:g}" + ("" if below is None else f", not yet at {below:g}")
 
 
 def _series(texts: Sequence[str], known: Sequence[float]) -> str:
-    """Return numbers at the paper's volumes; one word where there are none."""
+    """Return numbers at the paper's volumes as text, or `MISSING`."""
     return f"{', '.join(texts)} s" if known else MISSING
 
 
 def _all(kept: Sequence[bool | None]) -> str:
-    """Return the verdict of a statement that holds if all findings agree; None: missing."""
+    """Return the verdict of a statement that holds if all findings are true; None: missing."""
     known = [one for one in kept if one is not None]
     if not known:
         return ""
-    return _so_far(HOLDS if all(known) else FAILS, kept)
+    return _provisional(HOLDS if all(known) else FAILS, kept)
 
 
 def _some(kept: Sequence[bool | None]) -> str:
-    """Return the verdict of a statement that may hold for some readings of the rules only."""
+    """Return the verdict of a statement that may hold for some interpretations only."""
     known = [one for one in kept if one is not None]
-    return _so_far(DEPENDS, kept) if any(known) and not all(known) else _all(kept)
+    return _provisional(DEPENDS, kept) if any(known) and not all(known) else _all(kept)
 
 
-def _so_far(verdict: str, kept: Sequence[bool | None]) -> str:
+def _provisional(verdict: str, kept: Sequence[bool | None]) -> str:
     return f"so far: {verdict}" if None in kept else verdict

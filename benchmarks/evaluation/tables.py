@@ -1,4 +1,4 @@
-"""The generated parts of docs/EVALUATION.md as Markdown; what is missing says so."""
+"""The generated parts of docs/EVALUATION.md as Markdown."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _by_volume(evidence: Evidence, text: Callable[[PointRow], str]) -> str:
 
 
 def _runs_table(evidence: Evidence) -> str:
-    """Return how many runs there are, and how long they are."""
+    """Return the numbers of runs, and the duration of their arrivals."""
     setting = evidence.setting
     arrivals = MISSING if setting is None else f"{setting.duration_s:g} s"
     return f"{_by_volume(evidence, _runs)}\n\nArrivals in each run: {arrivals}."
@@ -137,7 +137,7 @@ def _lattice(evidence: Evidence) -> str:
             ]
         )
     headings = [
-        "", "veh/(lane h)", "runs looked at", "spacings", "least", "worst place in a cell", "d_F",
+        "", "veh/(lane h)", "runs examined", "spacings", "minimum", "max. error in a cell", "d_F",
         "accelerations of all runs", "limits",
     ]  # fmt: skip
     return markdown(headings, rows)
@@ -160,7 +160,7 @@ def _agreement(evidence: Evidence) -> str:
     ]
     headings = [
         "veh/(lane h)", "arrivals", "processes", "vehicles", "in one run only", "on another lane",
-        "travel times differ by at most", "overlaps", "",
+        "max. difference of travel times", "overlaps", "",
     ]  # fmt: skip
     return markdown(headings, rows)
 
@@ -176,7 +176,7 @@ def _factors(evidence: Evidence) -> str:
         ]
         for row in evidence.factors
     ]
-    headings = ["", "processes", "vehicles, at most", "real-time factor", "tick p50 / p99"]
+    headings = ["", "processes", "peak vehicles", "real-time factor", "tick p50 / p99"]
     return markdown(headings, rows)
 
 
@@ -190,7 +190,7 @@ def _costs(evidence: Evidence) -> str:
         ]
         for row in evidence.costs
     ]
-    headings = ["road", "", "vehicles, at most", "per vehicle and tick"]
+    headings = ["road", "", "peak vehicles", "per vehicle and tick"]
     return markdown(headings, rows)
 
 

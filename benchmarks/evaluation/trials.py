@@ -1,6 +1,6 @@
-"""Single runs beside the sweep, each a `laneweave run` in processes of its own.
+"""Single runs in addition to the sweep, each a separate `laneweave run`.
 
-zenoh     points of the sweep over Zenoh, one process per vehicle, each beside a simulated run
+zenoh     points of the sweep over Zenoh, one process per vehicle, and the same points simulated
 speed     the same demand in three deployments, for real-time factors
 length    a short and a long road, for the cost of a vehicle
 """
@@ -28,9 +28,9 @@ from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.summary import RunSummary, read_summary
 
 ZENOH_VOLUMES: Final = (1000, 1600, 2000)
-"""Those that are repeated over Zenoh, in vehicles/(lane h)."""
+"""Volumes that are repeated over Zenoh, in vehicles/(lane h)."""
 TIMEOUT_S: Final = 3600.0
-"""A run that takes longer is ended."""
+"""Maximum duration of a run."""
 COMMAND_FILE: Final = "command.json"
 
 
@@ -39,18 +39,18 @@ _ROUNDING_S = 1e-6
 
 @frozen
 class Agreement:
-    """How well two runs agree."""
+    """Comparison of two runs of the same demand."""
 
     vehicles: int
-    """That left the road in both."""
+    """Number that left the road in both runs."""
     missing: int
-    """That left it in one only."""
+    """Number that left the road in one run only."""
     other_lane: int
-    """That left it on different lanes."""
+    """Number that left on different lanes."""
     over_a_tick: int
-    """Whose travel times differ by more than a tick."""
+    """Number whose travel times differ by more than a tick."""
     worst_s: float
-    """Greatest difference of travel times."""
+    """Maximum difference of travel times."""
 
     @property
     def holds(self) -> bool:
@@ -59,10 +59,10 @@ class Agreement:
 
 
 def read_trips(folder: Path) -> list[dict[str, Any]]:
-    """Return a run's trips, with what is compared.
+    """Return the compared columns of a run's trips.
 
     Raises:
-        OSError, ValueError: there are none that can be read.
+        OSError, ValueError: the trips cannot be read.
     """
     columns = ["vehicle", "final_lane", "travel_time_s"]
     return pq.read_table(folder / "trips.parquet", columns=columns).to_pylist()
@@ -76,7 +76,7 @@ def agreement(
     Args:
         one: trips of a run.
         other: trips of another run of the same demand.
-        tick_s: travel times may differ by this much.
+        tick_s: permitted difference of travel times.
     """
     first, second = ({trip["vehicle"]: trip for trip in trips} for trips in (one, other))
     gone = [
@@ -96,46 +96,46 @@ def agreement(
 
 @frozen
 class Trial:
-    """One run."""
+    """A single run."""
 
     part: str
     name: str
     options: tuple[str, ...]
-    """Of `laneweave run`."""
+    """Options of `laneweave run`."""
     ending: str = "complete"
-    """As in summary.json; a run with another one has failed."""
-    shares: bool = False
-    """It needs one core, its times are not evaluated, and similar ones may run beside it."""
+    """Expected ending in summary.json; a run with another ending has failed."""
+    is_shared: bool = False
+    """Whether other trials may run at the same time; its times are not evaluated."""
 
     @property
     def command(self) -> str:
-        """The command line, without the folder."""
+        """The command line without the output folder."""
         return shlex.join(("laneweave", "run", *self.options))
 
 
 @frozen
 class AgreementRow:
-    """A point over Zenoh beside the same point simulated."""
+    """A point over Zenoh compared with the same point simulated."""
 
     volume_veh_per_lane_h: float
     seed: int
     duration_s: float
     overlaps: int
-    """Over Zenoh."""
+    """In the run over Zenoh."""
     processes: int | None
     agreement: Agreement
 
 
 @frozen
 class FactorRow:
-    """How fast a deployment runs."""
+    """Execution speed of a deployment."""
 
     trial: str
     command: str
     processes: int | None
     vehicles_peak: int
     real_time_factor: float
-    """Over the whole run, in which the road fills and empties."""
+    """Over the whole run, including the time in which the road fills and empties."""
     tick_p50_ms: float | None
     tick_p99_ms: float | None
 
@@ -163,13 +163,13 @@ TRIALS: Final = (
         for volume in ZENOH_VOLUMES
         for trial in (
             Trial("zenoh", f"zenoh-{volume}", _demand(volume, 120)),
-            Trial("zenoh", f"simulated-{volume}", _demand(volume, 120, *SIMULATED), shares=True),
+            Trial("zenoh", f"simulated-{volume}", _demand(volume, 120, *SIMULATED), is_shared=True),
         )
     ),
     Trial("speed", "zenoh", _demand(1600, 300)),
     Trial("speed", "zenoh-50", _demand(1600, 300, "--vehicles-per-process", "50")),
     Trial("speed", "simulated", _demand(1600, 300, *SIMULATED)),
-    # Ended when the road has been full for a while; the time until it is empty is not needed.
+    # Stops after the road has been full for a while; the time until it is empty is not needed.
     Trial("length", "long", ("benchmarks/long-road.toml", *SIMULATED), ending="limit"),
     Trial("length", "short", _demand(1800, 600, "--operation", "rolling", *SIMULATED)),
 )
@@ -181,12 +181,12 @@ def run_trial(trial: Trial, out: Path, root: Path, stopped: Callable[[], bool]) 
     Args:
         trial: the run.
         out: the evaluation's folder.
-        root: where the names of scenario files begin.
-        stopped: returns whether the evaluation was ended.
+        root: folder that scenario files are relative to.
+        stopped: returns whether the evaluation was stopped.
 
     Raises:
-        CommandFailedError: the run failed, or took too long and was ended.
-        StoppedError: the evaluation was ended, and the run with it.
+        CommandFailedError: the run failed or timed out.
+        StoppedError: the evaluation was stopped, and the run with it.
     """
     folder = out.resolve() / trial.part / trial.name
     if is_finished(trial, out):
@@ -195,13 +195,13 @@ def run_trial(trial: Trial, out: Path, root: Path, stopped: Callable[[], bool]) 
         shutil.rmtree(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     program = str(Path(sys.executable).with_name("laneweave"))
-    with tempfile.TemporaryFile() as words:
+    with tempfile.TemporaryFile() as output:
         process = subprocess.Popen(  # noqa: S603 - this package, with options of its own
             [program, "run", *trial.options, "--no-progress", "--out", str(folder)],
             cwd=root,
             stdin=subprocess.DEVNULL,
-            stdout=words,
-            stderr=words,
+            stdout=output,
+            stderr=output,
             process_group=0,
         )
         end_s = time.monotonic() + TIMEOUT_S
@@ -210,18 +210,18 @@ def run_trial(trial: Trial, out: Path, root: Path, stopped: Callable[[], bool]) 
         except StoppedError as error:
             if stopped():
                 raise
-            late = f"{trial.command}: not over after {TIMEOUT_S:g} s"
+            late = f"{trial.command}: not finished after {TIMEOUT_S:g} s"
             raise CommandFailedError(late) from error
-        words.seek(0)
-        said = " ".join(words.read().decode(errors="replace").split())
+        output.seek(0)
+        message = " ".join(output.read().decode(errors="replace").split())
     summary = read_summary(folder)
     if summary is None or summary.ending != trial.ending:
-        raise CommandFailedError(f"{trial.command}: status {process.returncode}: {said[-400:]}")
+        raise CommandFailedError(f"{trial.command}: status {process.returncode}: {message[-400:]}")
     (folder / COMMAND_FILE).write_text(json.dumps(trial.options), encoding="utf-8")
 
 
 def is_finished(trial: Trial, out: Path) -> bool:
-    """Tell whether a trial has been run with the same options."""
+    """Return whether a trial has been run with the same options."""
     path = out / trial.part / trial.name / COMMAND_FILE
     try:
         return tuple(json.loads(path.read_text(encoding="utf-8"))) == trial.options
@@ -230,7 +230,7 @@ def is_finished(trial: Trial, out: Path) -> bool:
 
 
 def agreement_rows(out: Path) -> list[AgreementRow]:
-    """Return how far runs over Zenoh agree with simulated ones, of those that are there.
+    """Return the comparisons of finished runs over Zenoh with simulated ones.
 
     Raises:
         OSError, ValueError, KeyError: a run's files cannot be read.
@@ -257,7 +257,7 @@ def agreement_rows(out: Path) -> list[AgreementRow]:
 
 
 def factor_rows(out: Path) -> list[FactorRow]:
-    """Return how fast the deployments run, of those that are there.
+    """Return the execution speeds of the finished deployments.
 
     Raises:
         OSError, ValueError, KeyError: a run's files cannot be read.
@@ -281,7 +281,7 @@ def factor_rows(out: Path) -> list[FactorRow]:
 
 
 def cost_rows(out: Path) -> list[CostRow]:
-    """Return what a vehicle costs on each road, of those that are there.
+    """Return the cost of a vehicle on each finished road.
 
     Raises:
         OSError, ValueError, KeyError: a run's files cannot be read.

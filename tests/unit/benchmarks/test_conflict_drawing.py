@@ -11,7 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from PIL import Image
 
-from conflict_drawing import PANELS, Judge, Verdict, conflict_figure, counts, draw_conflicts
+from conflict_drawing import (
+    PANELS,
+    ConflictTables,
+    Severity,
+    conflict_figure,
+    counts,
+    draw_conflicts,
+)
 from laneweave.coordinator.planning.conflict_model import Pair
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
@@ -26,33 +33,33 @@ def pairs_of(a: Cell) -> list[Pair]:
 
 
 def drawn(axes: Axes) -> Counter[str]:
-    names = [verdict.name for verdict in Verdict]
+    names = [severity.name for severity in Severity]
     marks = [patch for patch in axes.patches if patch.get_label() in names]
     for mark in marks:
-        colour = Verdict[str(mark.get_label())].value
+        colour = Severity[str(mark.get_label())].value
         assert to_hex(mark.get_facecolor()) == colour
     return Counter(str(mark.get_label()) for mark in marks)
 
 
 @pytest.mark.parametrize("geometry", [BodyGeometry(), BodyGeometry(clearance_along_m=7.0)])
 def test_each_pair_is_drawn_once_in_the_colour_of_its_verdict(geometry: BodyGeometry) -> None:
-    judge = Judge.of(geometry)
+    tables = ConflictTables.of(geometry)
     panels = conflict_figure(geometry).axes
     assert [axes.get_title() for axes in panels] == list(PANELS)
     for axes, a in zip(panels, PANELS.values(), strict=True):
-        expected = Counter(judge.verdict(pair).name for pair in pairs_of(a))
+        expected = Counter(tables.severity(pair).name for pair in pairs_of(a))
         assert drawn(axes) == expected
         assert sum(expected.values()) == 24 * 9
 
 
 def test_verdicts() -> None:
-    judge = Judge.of(BodyGeometry())
+    tables = ConflictTables.of(BodyGeometry())
     found = {
-        judge.verdict(((1, 0), (1, 0), (-1, 0))): Verdict.ON_TIME,
-        judge.verdict(((0, 1), (0, 1), (0, 1))): Verdict.LATE,
-        judge.verdict(((1, 0), (1, 0), (1, 0))): Verdict.LATER,
-        judge.verdict(((-1, 1), (1, 1), (1, 1))): Verdict.FOOTPRINT,
-        judge.verdict(((0, 1), (1, 0), (1, 0))): Verdict.NEVER,
+        tables.severity(((1, 0), (1, 0), (-1, 0))): Severity.ON_TIME,
+        tables.severity(((0, 1), (0, 1), (0, 1))): Severity.LATE,
+        tables.severity(((1, 0), (1, 0), (1, 0))): Severity.LATER,
+        tables.severity(((-1, 1), (1, 1), (1, 1))): Severity.FOOTPRINT,
+        tables.severity(((0, 1), (1, 0), (1, 0))): Severity.NEVER,
     }
     assert list(found) == list(found.values())
 

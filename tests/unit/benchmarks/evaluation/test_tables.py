@@ -129,7 +129,7 @@ def test_goals() -> None:
     assert cells(table, "`formations`, 1000")[3] == "holds"
     assert cells(table, "`paper-12`, 1600")[3] == "holds"
     runs = sum(planned(label, volume) for label in FORMATIONS for volume in VOLUMES)
-    spacing = f"14.93 m, least of {20_000 * runs:,} in {5 * runs} runs"
+    spacing = f"14.93 m, minimum of {20_000 * runs:,} in {5 * runs} runs"
     assert cells(table, "spacing")[2:] == [spacing, "holds"]
     assert cells(table, "real-time factor at 1600, one process, s")[2:] == ["5.90", "**missed**"]
     assert cells(table, "cost")[2:] == ["1.10 times", "holds"]
@@ -193,7 +193,7 @@ def test_statements_follow_the_data() -> None:
     assert cells(table, "Below 1000")[2] == "**does not hold**"
 
 
-def test_readings_of_the_rules_may_differ() -> None:
+def test_interpretations_of_the_rules_may_differ() -> None:
     rows = [point("paper-6", volume, 68.0) for volume in PAPER_VOLUMES]
     rows += [point("rule", volume, 67.0) for volume in PAPER_VOLUMES]
     rows += [point("rule-net", volume, 200.0) for volume in PAPER_VOLUMES]
@@ -202,7 +202,7 @@ def test_readings_of_the_rules_may_differ() -> None:
     assert "seeds yet" not in table
     assert "5 seeds yet" in statements_table(evidence(evolve(rows[0], seeds=(1,))))
     for statement in ("Severe congestion", "Formation control is faster"):
-        assert cells(table, statement)[2] == "so far: depends on the reading"
+        assert cells(table, statement)[2] == "so far: depends on the interpretation"
     assert "`rule` minus `paper-6` -1.0, -1.0, -1.0, -1.0, -1.0 s" in table
 
 
@@ -219,11 +219,11 @@ def test_evidence_is_what_was_written(tmp_path: Path) -> None:
 def test_parts_that_are_not_there_anew_stay() -> None:
     old = full()
     new = Evidence(factors=old.factors[:1])
-    assert old.renewed(new) == evolve(old, factors=old.factors[:1])
+    assert old.updated_with(new) == evolve(old, factors=old.factors[:1])
     points = evidence(point("rule", 1000.0, 70.0))
-    renewed = old.renewed(points)
-    assert (renewed.points, renewed.pictures) == (points.points, ())
-    assert renewed.costs == old.costs
+    updated_with = old.updated_with(points)
+    assert (updated_with.points, updated_with.pictures) == (points.points, ())
+    assert updated_with.costs == old.costs
 
 
 @pytest.mark.parametrize(
