@@ -22,8 +22,8 @@ from laneweave.launch.recordings.trajectories import OFF_LATTICE, Bools, Floats,
 from laneweave.protocol.scenario.fields import Scenario
 
 TOLERANCE_M: Final = 0.3
-"""Permitted error of a distance: each body is tracked to within 0.1 m at lattice points, sensors err
-by 0.05 m (standard deviation), and the errors of both bodies may add up."""
+"""Permitted error of a distance: each body is tracked to within 0.1 m at lattice points, sensors
+err by 0.05 m (standard deviation), and the errors of both bodies may add up."""
 
 
 @frozen
