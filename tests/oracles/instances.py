@@ -55,9 +55,7 @@ def random_request(seed: int, chosen: Variant | None = None) -> dict[str, Any]:
         columns, lanes = rng.randint(3, 7), rng.randint(2, 4)
         if columns * lanes < count + 3:
             continue
-        request = _draw(rng, columns, lanes, count, mode)
-        if conflicts is not None:
-            request["conflicts"] = conflicts
+        request = _draw(rng, columns, lanes, count, mode, conflicts)
         problem = Problem.of(request)
         # More crowded than this they are sliding puzzles, which the oracle proves slowly.
         enough = 3 * count - (0 if lanes == 2 else 2)
@@ -73,9 +71,7 @@ def large_request(seed: int) -> dict[str, Any]:
     while True:
         lanes = rng.randint(3, 5)
         columns = -(-5 * count // lanes) + rng.randint(0, 3)
-        request = _draw(rng, columns, lanes, count, mode)
-        if conflicts is not None:
-            request["conflicts"] = conflicts
+        request = _draw(rng, columns, lanes, count, mode, conflicts)
         if _is_connected(Problem.of(request)):
             return request
 
@@ -122,13 +118,12 @@ def small_request(
     seed: int, *, columns: int, lanes: int, count: int, mode: int, conflicts: list[str] | None
 ) -> dict[str, Any]:
     """A request of the size asked for, with or without a solution."""
-    request = _draw(Random(seed), columns, lanes, count, mode)
-    if conflicts is not None:
-        request["conflicts"] = conflicts
-    return request
+    return _draw(Random(seed), columns, lanes, count, mode, conflicts)
 
 
-def _draw(rng: Random, columns: int, lanes: int, count: int, mode: int) -> dict[str, Any]:
+def _draw(
+    rng: Random, columns: int, lanes: int, count: int, mode: int, conflicts: list[str] | None
+) -> dict[str, Any]:
     grid = [(c, lane) for c in range(columns) for lane in range(lanes)]
     spare = len(grid) - count
     rng.shuffle(grid)
@@ -146,6 +141,7 @@ def _draw(rng: Random, columns: int, lanes: int, count: int, mode: int) -> dict[
         "schema": "laneweave.plan.request/1",
         "grid": {"columns": columns, "lanes": lanes, "blocked": [list(cell) for cell in blocked]},
         "mode": mode,
+        **({} if conflicts is None else {"conflicts": conflicts}),
         "vehicles": vehicles,
         "targets": [list(cell) for cell in targets],
         "deadline_s": 60.0,

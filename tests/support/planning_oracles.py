@@ -11,7 +11,7 @@ from typing import Any
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
-from laneweave.coordinator.planning.problem import Grid
+from laneweave.coordinator.planning.problem import Bans, Grid, Path
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.lattice import Mode
@@ -30,6 +30,24 @@ def cheapest_plan(request: PlanRequest, fixed: Sequence[int] | None = None) -> i
     for vehicle, target in zip(document["vehicles"], fixed or (), strict=False):
         vehicle["eligible"] = [target]
     return joint_search.optimal_cost(document)
+
+
+def move_at(path: Path, target: int, step: int) -> int:
+    """Return the move that a path makes in a step; after its end it stays at the target."""
+    return path[step] if step < len(path) else target
+
+
+def obeys(path: Path, target: int, bans: Bans) -> bool:
+    """Return whether a path to a target makes no banned move, and is as long as it may be."""
+    if len(path) < bans.earliest or (bans.latest is not None and len(path) > bans.latest):
+        return False
+    for step in range(max([len(path), *bans.at, *bans.since]) + 1):
+        banned = bans.at.get(step, 0)
+        for since, mask in bans.since.items():
+            banned |= mask if step >= since else 0
+        if banned >> move_at(path, target, step) & 1:
+            return False
+    return True
 
 
 def faults(request: dict[str, Any], cost: int | None, solver: str) -> list[str]:

@@ -124,42 +124,6 @@ def conflicts(model: ConflictModel, a: Move, b: Move) -> bool:
     return bool(conflict_kinds(a, b, model.kinds))
 
 
-def least_cost_of_two(
-    road: StreamRoad, slot: int, one: StreamVehicle, other: StreamVehicle
-) -> float:
-    """Return the least cost in mode 1, by dynamic programming over the cells of both."""
-    best = {(one.cell, other.cell): 0.0}
-    done = []
-    s = slot
-    while best:
-        following: dict[tuple[Cell, Cell], float] = {}
-        for cells, cost in best.items():
-            moves = []
-            for vehicle, cell in zip((one, other), cells, strict=True):
-                left = place_m(road, s, cell) > road.length_m
-                moves.append([(cell, cell)] if left else moves_from(road, s, vehicle, cell))
-            for pair in product(*moves):
-                total = cost
-                on_road = [place_m(road, s, move[0]) <= road.length_m for move in pair]
-                if all(on_road) and conflicts(road.model, *pair):
-                    continue
-                for vehicle, move, here in zip((one, other), pair, on_road, strict=True):
-                    total += step_cost(vehicle, move) if here else 0.0
-                ends = pair[0][1], pair[1][1]
-                if total < following.get(ends, np.inf):
-                    following[ends] = total
-        s += 1
-        best = {}
-        for ends, cost in following.items():
-            if all(place_m(road, s, cell) > road.length_m for cell in ends):
-                pairs = zip((one, other), ends, strict=True)
-                off = sum(missing(road, slot, v) * (cell[1] != v.lane) for v, cell in pairs)
-                done.append(cost + off)
-            else:
-                best[ends] = cost
-    return min(done)
-
-
 class Programme:
     """The least cost in mode 1 with node, edge and following conflicts: a flow for each vehicle.
 

@@ -81,14 +81,17 @@ def test_start() -> None:
 def test_a_new_bridge_has_a_new_road() -> None:
     desk = Desk()
     desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
-    (order,) = jobs(desk.collect_promises({A: (0, 0)}, {A: 1}))
-    assert desk.leaders
+    (order,) = jobs(desk.collect_promises({A: (0, 0), B: (-4, 0)}, {A: 1}))
+    desk.tell(state(A, joined=(0, 1)))
+    assert sorted(desk.leaders) == [0]
     desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))
     assert (desk.leaders, desk.core.census, desk.core.t_s) == ({}, None, 0.0)
     assert desk.give(run_job(order)) == []  # a plan for the road that is no more
     desk.tell(census({}, t_s=1.0))  # of an earlier road time than what it knew
     assert desk.core.census is not None
     assert desk.core.t_s == 1.0
+    desk.tell(census({A: (0, 0), B: (-4, 0)}))
+    assert sorted(desk.leaders) == [0, 1]
 
 
 @pytest.mark.parametrize("other", ["7", "6", "ghost", "-1"])

@@ -6,11 +6,10 @@ from attrs import evolve
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.formations.operation import JUST_CLOSED_S
-from laneweave.protocol.runtime.node import Compute, Effect, PeerUp, run_job
+from laneweave.protocol.runtime.node import Compute, Effect, run_job
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
 from laneweave.protocol.wire.messages import Ballot, LogEvent, Name, Plan, Prepare, RoadClock
-from laneweave.protocol.wire.topics import BRIDGE_ALIVE
 from support.paper import PAPER, closing_time_s
 from support.service_desk import T_S, Cells, Desk, census, jobs, leading, logged, messages, state
 from support.states import A, B, C, D, E, F
@@ -246,18 +245,6 @@ def test_the_remaining_vehicles_of_a_group_stay_joined() -> None:
     assert (control.formation.numbers, control.formation.roster) == ((0, 1), (B,))
 
 
-def test_another_road_has_other_groups() -> None:
-    desk = Desk()
-    desk.lead()
-    desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
-    desk.tell(census({A: (0, 0), B: (-4, 0)}))
-    desk.tell(state(A, joined=(0, 1)))
-    assert sorted(desk.leaders) == [0]
-    desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))
-    desk.tell(census({A: (0, 0), B: (-4, 0)}))
-    assert sorted(desk.leaders) == [0, 1]
-
-
 # --- which formations are observed first ------------------------------------------------------
 
 
@@ -304,18 +291,6 @@ def test_a_leader_that_was_paused_observes_every_formation() -> None:
     desk.watch(PAPER.network.election_s + 0.1)
     later = census({A: (0, 0), B: (-4, 0)}, t_s=just_closed(1))
     assert [send.parameters["vehicle"] for send in messages(desk.tell(later), Prepare)] == [B]
-
-
-def test_a_plan_in_force_is_logged_with_the_time_at_which_its_formation_had_closed() -> None:
-    desk = Desk()
-    cells: Cells = {A: (0, 0), B: (-1, 1)}
-    (job,) = jobs(desk.collect_promises(cells, {A: 1, B: 0}))
-    desk.give(run_job(job))
-    told: list[Effect] = []
-    for name, cell in cells.items():
-        told += desk.tell(state(name, cell, desk.ballot, accepted=True, t_s=2.0))
-        told += desk.tell(state(name, cell, desk.ballot, accepted=True, t_s=2.1))
-    assert notes(told, "plan-in-force") == [{"formation": 0, "closed_s": closing_time_s(0)}]
 
 
 # --- members without agents -------------------------------------------------------------------

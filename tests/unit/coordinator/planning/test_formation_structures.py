@@ -212,25 +212,6 @@ def test_targets_of_another_structure_are_detected() -> None:
     assert not problems_of_response(request, response)
 
 
-def test_a_formation_changes_its_structure_twice_in_a_row() -> None:
-    """A lane ends, and begins again: the paper's upper level, environment to structure."""
-    vehicles = [dict(vehicle) for vehicle in LANE_DROP["vehicles"]]
-    cells = []
-    for structure, lanes in (("parallel", [0, 1]), ("interlaced", [0, 1, 2])):
-        request = LANE_DROP | {"vehicles": vehicles, "structure": structure, "lanes": lanes}
-        response = plan(PlanRequest.from_dict(request))
-        assert response.status == "optimal"
-        cells.append({path[-1] for path in response.paths})
-        for vehicle, path in zip(vehicles, response.paths, strict=True):
-            assert path[0] == tuple(vehicle["cell"])
-            vehicle["cell"] = list(path[-1])
-    narrow, wide = cells
-    assert narrow == set(product((2, 3, 4), (0, 1)))
-    assert {lane for _, lane in wide} == {0, 1, 2}
-    assert len({sum(cell) % 2 for cell in wide}) == 1
-    assert len(wide) == 6
-
-
 @pytest.mark.parametrize(
     ("changes", "line"),
     [

@@ -20,10 +20,7 @@ from laneweave.coordinator.planning.paper.assignments import (
 from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvements, Node
 from laneweave.coordinator.planning.paper.explanation import entries
 from laneweave.coordinator.planning.path_map import RelativePathMap
-from laneweave.coordinator.planning.plan_validator import problems_of_response
 from laneweave.coordinator.planning.problem import Grid, Problem, Solution
-from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
-from laneweave.coordinator.planning.solve import plan
 
 CELLS = ((0, 0), (0, 2), (1, 1), (2, 0), (2, 2))
 VEHICLE_GROUPS = (1, 1, 2, 2, 3)
@@ -118,14 +115,3 @@ def test_relative_path_map_of_the_root(problem: Problem) -> None:
         "4           (2,0)   (2,1)   (2,2)",
         "5           (2,2)   (1,1)   (1,1)",
     ]
-
-
-def test_planner_proves_7() -> None:
-    vehicles = tuple(
-        VehicleRequest(f"{i + 1}", cell, eligible=CHOICES[i]) for i, cell in enumerate(CELLS)
-    )
-    request = PlanRequest(Grid(3, 3), 2, KINDS, vehicles, CELLS, deadline_s=60.0)
-    response = plan(request)
-    assert (response.status, response.cost, response.lower_bound) == ("optimal", 7, 7)
-    assert [j + 1 for j in response.assignment] == [1, 4, 2, 5, 3]
-    assert problems_of_response(request, response) == []

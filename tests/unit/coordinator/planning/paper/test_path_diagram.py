@@ -13,6 +13,7 @@ from laneweave.coordinator.planning.shortest_paths import (
     conflicting_moves,
     shortest_paths,
 )
+from support.planning_oracles import obeys
 
 MODEL = ConflictModel(["node", "edge", "special-1"])
 TABLES = [
@@ -32,30 +33,14 @@ def _walks(table: MoveTable, start: int, steps: int) -> Iterator[Path]:
             yield (bit, *rest)
 
 
-def _obeys(path: Path, target: int, bans: Bans) -> bool:
-    if len(path) < bans.earliest or (bans.latest is not None and len(path) > bans.latest):
-        return False
-    if path and path[-1] == target:
-        return False  # it arrived earlier
-    if any(banned >> target & 1 for banned in bans.since.values()):
-        return False
-    last = max([len(path), *bans.at, *bans.since]) + 1
-    for step in range(last):
-        move = path[step] if step < len(path) else target
-        banned = bans.at.get(step, 0)
-        for since, mask in bans.since.items():
-            banned |= mask if step >= since else 0
-        if banned >> move & 1:
-            return False
-    return True
-
-
 def _all_shortest(table: MoveTable, start: int, target: int, bans: Bans) -> list[Path]:
     for cost in range(HORIZON):
         found = [
             path
             for path in _walks(table, start, cost)
-            if (table.landing(path[-1]) if path else start) == target and _obeys(path, target, bans)
+            if (table.landing(path[-1]) if path else start) == target
+            and path[-1:] != (target,)  # otherwise it arrived earlier
+            and obeys(path, target, bans)
         ]
         if found:
             return found

@@ -1,6 +1,7 @@
 """Children of a node keep all solutions; disjoint children have each solution once."""
 
 import itertools
+import math
 from collections.abc import Iterator
 
 import pytest
@@ -21,6 +22,7 @@ from laneweave.coordinator.planning.problem import Bans, Diagram, Grid, MoveTabl
 from laneweave.coordinator.planning.shortest_paths import choose_path, shortest_paths
 from laneweave.protocol.lattice import Mode
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS
+from support.planning_oracles import move_at, obeys
 
 STEPS = 3
 Case = tuple[MoveTable, tuple[Diagram, Diagram], tuple[Path, Path]]
@@ -46,14 +48,10 @@ def pairs(draw: st.DrawFn) -> Case:
     return table, (first, second), (paths[0], paths[1])
 
 
-def _move(path: Path, target: int, step: int) -> int:
-    return path[step] if step < len(path) else target
-
-
 def _first_conflict(case: Case) -> Conflict | None:
     table, (a, b), (p, q) = case
     for step in range(max(len(p), len(q))):
-        moves = _move(p, a.target, step), _move(q, b.target, step)
+        moves = move_at(p, a.target, step), move_at(q, b.target, step)
         if table.conflicts[moves[0]] >> moves[1] & 1:
             return Conflict(step, not is_at_node(table, *moves), 0, 1)
     return None
@@ -78,94 +76,68 @@ def _solutions(case: Case) -> Iterator[tuple[Path, Path]]:
     for p, q in itertools.product(_arrivals(table, a), _arrivals(table, b)):
         steps = range(max(len(p), len(q)))
         if not any(
-            table.conflicts[_move(p, a.target, step)] >> _move(q, b.target, step) & 1
+            table.conflicts[move_at(p, a.target, step)] >> move_at(q, b.target, step) & 1
             for step in steps
         ):
             yield p, q
 
 
-def _obeys(path: Path, target: int, vehicle: int, constraints: tuple[Constraint, ...]) -> bool:
-    bans = bans_for(vehicle, constraints)
-    if len(path) < bans.earliest or (bans.latest is not None and len(path) > bans.latest):
-        return False
-    for step in range(max([len(path), *bans.at, *bans.since]) + 1):
-        banned = bans.at.get(step, 0)
-        for since, mask in bans.since.items():
-            banned |= mask if step >= since else 0
-        if banned >> _move(path, target, step) & 1:
-            return False
-    return True
-
-
-def _in_child(case: Case, solution: tuple[Path, Path], constraints: tuple[Constraint, ...]) -> bool:
+def _in_child(case: Case, solution: tuple[Path, Path], constraint: Constraint) -> bool:
     return all(
-        _obeys(path, diagram.target, vehicle, constraints)
+        obeys(path, diagram.target, bans_for(vehicle, (constraint,)))
         for vehicle, (path, diagram) in enumerate(zip(solution, case[1], strict=True))
     )
 
 
-@settings(max_examples=80, deadline=None)
-@given(pairs())
-def test_each_solution_is_in_exactly_one_disjoint_child_and_in_one_of_the_papers(
-    case: Case,
-) -> None:
-    table, diagrams, (p, q) = case
+@st.composite
+def conflicts(draw: st.DrawFn) -> tuple[Case, Conflict, tuple[int, int]]:
+    """Draw two vehicles whose paths conflict, their first conflict, and its two moves."""
+    case = draw(pairs())
     conflict = _first_conflict(case)
     assume(conflict is not None)
     assert conflict is not None
-    moves = _move(p, diagrams[0].target, conflict.step), _move(q, diagrams[1].target, conflict.step)
+    _, (a, b), (p, q) = case
+    moves = move_at(p, a.target, conflict.step), move_at(q, b.target, conflict.step)
+    return case, conflict, moves
+
+
+@settings(max_examples=80, deadline=None)
+@given(conflicts())
+def test_children_share_the_solutions_and_none_keeps_the_conflict(
+    drawn: tuple[Case, Conflict, tuple[int, int]],
+) -> None:
+    """Each solution is in exactly one disjoint child, and in at least one of the paper's."""
+    case, conflict, moves = drawn
+    table, diagrams, paths = case
     disjoint = disjoint_constraints(table, conflict, moves, diagrams)
     of_the_paper = constraints_of(table, conflict, moves)
     for solution in itertools.islice(_solutions(case), 200):
-        assert sorted(_in_child(case, solution, (c,)) for c in disjoint) == [False, True]
-        assert any(_in_child(case, solution, (c,)) for c in of_the_paper)
-
-
-@settings(max_examples=60, deadline=None)
-@given(pairs())
-def test_neither_child_keeps_the_conflicting_pair_of_moves(case: Case) -> None:
-    table, diagrams, paths = case
-    conflict = _first_conflict(case)
-    assume(conflict is not None)
-    assert conflict is not None
-    moves = (
-        _move(paths[0], diagrams[0].target, conflict.step),
-        _move(paths[1], diagrams[1].target, conflict.step),
-    )
-    for make in (
-        disjoint_constraints(table, conflict, moves, diagrams),
-        constraints_of(table, conflict, moves),
-    ):
-        for constraint in make:
-            assert not _in_child(case, paths, (constraint,))
+        assert sorted(_in_child(case, solution, c) for c in disjoint) == [False, True]
+        assert any(_in_child(case, solution, c) for c in of_the_paper)
+    assert not any(_in_child(case, paths, c) for c in (*disjoint, *of_the_paper))
 
 
 def _cost_of_child(
-    table: MoveTable, diagrams: tuple[Diagram, Diagram], constraints: tuple[Constraint, ...]
-) -> int | None:
+    table: MoveTable, diagrams: tuple[Diagram, Diagram], constraint: Constraint
+) -> float:
     total = 0
     for vehicle, diagram in enumerate(diagrams):
         (start,) = bits(table.starts(diagram.layer(0)))
-        bans = bans_for(vehicle, constraints)
+        bans = bans_for(vehicle, (constraint,))
         narrowed = shortest_paths(table, start, diagram.target, bans)
         if narrowed is None:
-            return None
+            return math.inf
         total += narrowed.cost
     return total
 
 
 @settings(max_examples=60, deadline=None)
-@given(pairs())
-def test_children_cost_more_as_predicted(case: Case) -> None:
-    table, diagrams, (p, q) = case
-    conflict = _first_conflict(case)
-    assume(conflict is not None)
-    assert conflict is not None
-    moves = _move(p, diagrams[0].target, conflict.step), _move(q, diagrams[1].target, conflict.step)
+@given(conflicts())
+def test_children_cost_more_as_predicted(drawn: tuple[Case, Conflict, tuple[int, int]]) -> None:
+    (table, diagrams, _), conflict, moves = drawn
     children = disjoint_constraints(table, conflict, moves, diagrams)
-    costs = [_cost_of_child(table, diagrams, (c,)) for c in children]
     before = diagrams[0].cost + diagrams[1].cost
-    rising = sum(cost is None or cost > before for cost in costs)
+    rising = sum(_cost_of_child(table, diagrams, c) > before for c in children)
     assert rising >= cardinality(table, conflict, moves, diagrams)
 
 

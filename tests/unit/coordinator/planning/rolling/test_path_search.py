@@ -206,21 +206,7 @@ def test_an_optimal_plan_is_kept_without_a_round() -> None:
 # ------------------------------------------------------------------------------ how good it is
 
 
-def test_two_vehicles_cost_the_minimum_nearly_always() -> None:
-    """The least cost: joint search over all cells of both."""
-    random = Random(7)
-    equal = 0
-    for seed in range(30):
-        vehicles = random.sample(dense(random, range(3), 1.0, SHORT), 2)
-        plan = StreamPlanner(SHORT, seed=seed).plan(0, vehicles)
-        cost = oracle.cost_of_plan(SHORT, plan, vehicles)
-        least = oracle.least_cost_of_two(SHORT, 0, vehicles[0], vehicles[1])
-        assert cost >= least - 1e-6
-        equal += cost <= least + 1e-6
-    assert equal >= 28
-
-
-@pytest.mark.parametrize("share", [0.5, 0.8, 1.0])
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.8, 1.0])
 def test_streams_cost_the_minimum_nearly_always(share: float) -> None:
     """The least cost: a mixed-integer programme."""
     random = Random(3)
