@@ -20,46 +20,6 @@ def components(joins: list[list[int]]) -> dict[int, Numbers]:
     return {number: tuple(sorted(group)) for group in groups for number in group}
 
 
-def test_alone_unless_joined() -> None:
-    assert Groups().of(7) == (7,)
-
-
-def test_all_members_know_their_group_in_ascending_order() -> None:
-    groups = Groups()
-    assert groups.join((4, 2))
-    assert [groups.of(number) for number in (2, 3, 4)] == [(2, 4), (3,), (2, 4)]
-
-
-def test_groups_that_share_a_member_become_one() -> None:
-    groups = Groups()
-    groups.join((0, 1))
-    groups.join((2, 3))
-    assert groups.join((3, 1))
-    assert {groups.of(number) for number in range(4)} == {(0, 1, 2, 3)}
-
-
-def test_join_returns_whether_it_was_new() -> None:
-    groups = Groups()
-    for numbers, new in (
-        ((), False),
-        ((5,), False),
-        ((5, 5), False),
-        ((1, 2), True),
-        ((2, 1), False),
-        ((2,), False),
-        ((0, 2), True),
-        ((0, 1), False),
-    ):
-        assert groups.join(numbers) is new
-
-
-def test_another_road_begins_without_groups() -> None:
-    groups = Groups()
-    groups.join((0, 1))
-    groups.forget()
-    assert groups.of(0) == (0,)
-
-
 @given(JOINS)
 def test_groups_are_connected_components(joins: list[list[int]]) -> None:
     groups = Groups()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-
 import pytest
 from attrs import evolve
 from hypothesis import given
@@ -58,14 +56,6 @@ def test_a_formation_closes_when_no_vehicle_can_enter_its_block() -> None:
     assert formation == Formation((0,), entries_of(a=(0, 0)), CLOSES_S)
 
 
-def test_what_the_census_does_not_know_as_closed_is_left_out() -> None:
-    """However late it is: it could lack a member."""
-    late = census(50.0, a=(0, 0), b=(-5, 1))
-    assert list(closed(late)) == [0, 1]
-    assert list(closed(evolve(late, closed_to=0))) == [0]
-    assert closed(evolve(late, closed_to=-1)) == {}
-
-
 def test_members_are_grouped_by_the_block_of_their_entry_and_sorted() -> None:
     found = closed(census(8.5, d=(-4, 0), b=(-3, 1), a=(-1, 1), c=(0, 2)))
     assert {number: (each.numbers, each.roster) for number, each in found.items()} == {
@@ -73,12 +63,6 @@ def test_members_are_grouped_by_the_block_of_their_entry_and_sorted() -> None:
         1: ((1,), ("d",)),
     }
     assert 1 not in closed(census(8.4, d=(-4, 0)))
-
-
-def test_a_vehicle_that_left_is_no_member_and_empty_formations_vanish() -> None:
-    assert closed(census(50.0, a=(0, 0), b=(-1, 1)))[0].roster == ("a", "b")
-    assert closed(census(60.0, b=(-1, 1)))[0].roster == ("b",)
-    assert closed(census(70.0)) == {}
 
 
 def test_joined_formations_are_one_under_the_least_number() -> None:
@@ -166,27 +150,6 @@ def test_no_vehicle_changes_lanes_before_the_rear_body_is_in_s3(
     assert abs(start_s / tick_s - round(start_s / tick_s)) < 1e-6
     # It is the earliest tick of that kind.
     assert start_s - tick_s < not_before_s or rear_bumper_m - 15.0 * tick_s < sorting_m + 1e-3
-
-
-def test_the_start_is_that_of_the_rearmost_cell() -> None:
-    rear, front = (-15, 0), (-8, 2)
-    assert start_time_s([front, rear], 0.0, SCENARIO) == start_time_s([rear], 0.0, SCENARIO)
-    assert start_time_s([front, rear], 0.0, SCENARIO) > start_time_s([front], 0.0, SCENARIO)
-
-
-def test_steps_left() -> None:
-    front_leaves_s, slot_s = SCENARIO.road.length_m / SCENARIO.formation.speed_mps, 4.0
-    block, behind = LATTICE.block_cells(0), LATTICE.block_cells(1)
-
-    def steps(cells: Collection[Cell], t_s: float) -> int:
-        return steps_left(cells, t_s, slot_s, SCENARIO)
-
-    assert steps(block, front_leaves_s) == 0
-    assert steps(block, front_leaves_s + 100.0) == 0
-    assert steps(block, front_leaves_s - 4.0) == 1
-    assert steps(block, front_leaves_s - 11.9) == 2
-    assert steps(behind, front_leaves_s) == 1  # the next block is a slot behind
-    assert steps(block | behind, front_leaves_s) == 0  # the foremost of several counts
 
 
 @given(slot_s=st.sampled_from(GROWING.slots_s), left_s=st.floats(-5.0, 100.0))

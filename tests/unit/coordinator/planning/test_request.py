@@ -57,22 +57,20 @@ def test_defaults() -> None:
     assert PlanRequest.from_dict({**short, "deadline_s": 2}).deadline_s == 2.0
 
 
-def _set(*path: str | int, to: object) -> Callable[[Document], None]:
+def _set(*path: str | int, to: object = None, drop: bool = False) -> Callable[[Document], None]:
     def change(target: Any) -> None:  # noqa: ANN401
         for key in path[:-1]:
             target = target[key]
-        target[path[-1]] = to
+        if drop:
+            del target[path[-1]]
+        else:
+            target[path[-1]] = to
 
     return change
 
 
 def _drop(*path: str | int) -> Callable[[Document], None]:
-    def change(target: Any) -> None:  # noqa: ANN401
-        for key in path[:-1]:
-            target = target[key]
-        del target[path[-1]]
-
-    return change
+    return _set(*path, drop=True)
 
 
 WRONG: list[tuple[Callable[[Document], None], str]] = [

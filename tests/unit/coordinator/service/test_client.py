@@ -149,17 +149,12 @@ def given_up_s(error: BaseException) -> float:
     return float(error.__notes__[0].removeprefix("at ")) - START_S
 
 
-def test_without_answers_for_long_there_is_no_service() -> None:
+@pytest.mark.parametrize("patience_s", [ABSENT_S, 20.0])
+def test_without_answers_for_long_there_is_no_service(patience_s: float) -> None:
+    asked = PendingRequest(REQUEST, 60.0, START_S, patience_s=patience_s)
     with pytest.raises(ServiceUnavailableError) as caught:
-        after_pauses(inquiry(60.0), [None])
-    assert ABSENT_S <= given_up_s(caught.value) <= ABSENT_S + LONGEST_PAUSE_S + 0.01
-
-
-def test_a_patient_client_waits_longer_for_a_service() -> None:
-    patient = PendingRequest(REQUEST, 60.0, START_S, patience_s=20.0)
-    with pytest.raises(ServiceUnavailableError) as caught:
-        after_pauses(patient, [None])
-    assert 20.0 <= given_up_s(caught.value) <= 20.0 + LONGEST_PAUSE_S + 0.02
+        after_pauses(asked, [None])
+    assert patience_s <= given_up_s(caught.value) <= patience_s + LONGEST_PAUSE_S + 0.02
 
 
 def test_an_answer_shows_that_there_is_a_service() -> None:
