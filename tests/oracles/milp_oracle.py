@@ -11,14 +11,14 @@ vehicles and move of the first.
 
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
 
 import numpy as np
-from scipy.optimize import Bounds, LinearConstraint, linear_sum_assignment, milp
-from scipy.sparse import coo_array
+from scipy.optimize import linear_sum_assignment
 
+from oracles.binary_programme import Row, cheapest_choice
 from oracles.path_rules import Cell, Move, Path, Problem
 
 PROGRAMME_LIMIT_S = 60.0
@@ -187,31 +187,6 @@ def _clique(
 # ------------------------------------------------------------------------------- the programme
 
 
-@dataclass
-class _Rows:
-    """A sparse matrix under construction, with the bounds of its rows."""
-
-    row: list[int] = field(default_factory=list)
-    column: list[int] = field(default_factory=list)
-    value: list[float] = field(default_factory=list)
-    lower: list[float] = field(default_factory=list)
-    upper: list[float] = field(default_factory=list)
-
-    def add(self, terms: list[tuple[int, float]], lower: float, upper: float) -> None:
-        index = len(self.lower)
-        for column, value in terms:
-            self.row.append(index)
-            self.column.append(column)
-            self.value.append(value)
-        self.lower.append(lower)
-        self.upper.append(upper)
-
-    def constraint(self, columns: int) -> LinearConstraint:
-        shape = (len(self.lower), columns)
-        matrix = coo_array((self.value, (self.row, self.column)), shape=shape)
-        return LinearConstraint(matrix.tocsr(), self.lower, self.upper)
-
-
 Team = tuple[frozenset[int], tuple[int, ...]]
 """Eligible targets, and the vehicles that have just these."""
 
@@ -231,7 +206,7 @@ class _Programme:
         self.steps = steps
         self.teams = _teams(problem)
         self.costs: list[float] = []
-        self.rows = _Rows()
+        self.rows: list[Row] = []
         # (team, step, move) of a vehicle that has not parked; (team, step, target): parks there
         # at that step; (team, step, target): is parked there during that step.
         self.move: dict[tuple[int, int, Move], int] = {}
@@ -288,11 +263,11 @@ class _Programme:
                 held = [(self.parked[k, t, j], 1.0), (self.park[k, t, j], -1.0)]
                 if (k, t - 1, j) in self.parked:
                     held.append((self.parked[k, t - 1, j], -1.0))
-                self.rows.add(held, 0.0, 0.0)
+                self.rows.append((held, 0.0, 0.0))
         starts = [problem.starts[i] for i in vehicles]
         for (t, cell), terms in balance.items():
             supply = -float(starts.count(cell)) if t == 0 else 0.0
-            self.rows.add(terms, supply, supply)
+            self.rows.append((terms, supply, supply))
 
     def _add_cliques(self, at: dict[tuple[int, int, Move], list[int]]) -> None:
         teams = range(len(self.teams))
@@ -300,7 +275,7 @@ class _Programme:
             for t in range(self.steps):
                 terms = [(x, 1.0) for k in teams for a in clique for x in at.get((k, t, a), ())]
                 if len(terms) > 1:
-                    self.rows.add(terms, -np.inf, 1.0)
+                    self.rows.append((terms, -np.inf, 1.0))
         # Vehicles that park at the very end meet in no later step.
         self._add_distinct_targets()
 
@@ -313,7 +288,7 @@ class _Programme:
         for j in range(len(self.problem.targets)):
             keys = [(k, self.steps, j) for k in range(len(self.teams))]
             terms = [(self.parked[key], 1.0) for key in keys if key in self.parked]
-            self.rows.add(terms, -np.inf, 1.0)
+            self.rows.append((terms, -np.inf, 1.0))
 
     def _add_pairs(self, at: dict[tuple[int, int, Move], list[int]]) -> None:
         problem = self.problem
@@ -325,27 +300,20 @@ class _Programme:
                     own = [(x, 1.0) for x in at.get((i, t, a), ())]
                     other = [(x, 1.0) for b in against[a] for x in at.get((j, t, b), ())]
                     if own and other:
-                        self.rows.add(own + other, -np.inf, 1.0)
+                        self.rows.append((own + other, -np.inf, 1.0))
         self._add_distinct_targets()
 
     def require_arrival_after(self, step: int) -> None:
         late = [(x, 1.0) for (_, t, _), x in self.park.items() if t > step]
-        self.rows.add(late, 1.0, np.inf)
+        self.rows.append((late, 1.0, np.inf))
 
     def require_cost_below(self, cost: int) -> None:
-        self.rows.add([(x, 1.0) for x in self.move.values()], -np.inf, cost - 1.0)
+        self.rows.append(([(x, 1.0) for x in self.move.values()], -np.inf, cost - 1.0))
 
     def solve(self) -> Solution | None:
-        count = len(self.costs)
-        if count == 0:
+        if not self.costs:
             return None
-        result = milp(
-            np.array(self.costs),
-            integrality=np.ones(count),
-            bounds=Bounds(0, 1),
-            constraints=self.rows.constraint(count),
-            options={"mip_rel_gap": 0.0, "time_limit": PROGRAMME_LIMIT_S},
-        )
+        result = cheapest_choice(self.costs, self.rows, PROGRAMME_LIMIT_S)
         if result.status == 2:
             return None
         if result.status != 0:

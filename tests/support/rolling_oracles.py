@@ -6,10 +6,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from itertools import pairwise, product
 
-import numpy as np
 from hypothesis import strategies as st
-from scipy.optimize import Bounds, LinearConstraint, milp
-from scipy.sparse import coo_array
 
 from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
@@ -22,6 +19,7 @@ from laneweave.coordinator.planning.rolling.problem import (
     StreamVehicle,
 )
 from laneweave.protocol.lattice import Cell
+from oracles.binary_programme import Row, cheapest_choice
 from oracles.path_rules import conflict_kinds
 
 ROAD = StreamRoad(3, 15.0, 60.0, (400.0, 1000.0), 1000.0, 5.0, max_paths=2000)
@@ -133,7 +131,7 @@ class Programme:
     def __init__(self, road: StreamRoad, slot: int, vehicles: Sequence[StreamVehicle]) -> None:
         """Lay down all moves."""
         self.cost: list[float] = []
-        self.rows: list[tuple[set[int], set[int], float, float]] = []
+        self.rows: list[Row] = []
         rivals: dict[tuple[int, str, Cell], set[int]] = defaultdict(set)
         for vehicle in vehicles:
             into: dict[Cell, set[int]] = {vehicle.cell: set()}
@@ -150,11 +148,13 @@ class Programme:
                             rivals[s, *key].add(x)
                         if place_m(road, s + 1, move[1]) <= road.length_m:
                             following[move[1]].add(x)
-                    self.rows.append((leaving, arriving, supply, supply))
+                    out = [(x, 1.0) for x in leaving]
+                    back = [(x, -1.0) for x in arriving]
+                    self.rows.append((out + back, supply, supply))
                     supply = 0.0
                 into = following
                 s += 1
-        self.rows += [(xs, set(), 0.0, 1.0) for xs in rivals.values() if len(xs) > 1]
+        self.rows += [([(x, 1.0) for x in xs], 0.0, 1.0) for xs in rivals.values() if len(xs) > 1]
 
     def _variable(
         self, road: StreamRoad, first: int, slot: int, vehicle: StreamVehicle, move: Move
@@ -166,23 +166,7 @@ class Programme:
         return len(self.cost) - 1
 
     def least_cost(self) -> float:
-        entries = [
-            (i, x, sign)
-            for i, (plus, minus, _, _) in enumerate(self.rows)
-            for xs, sign in ((plus, 1.0), (minus, -1.0))
-            for x in xs
-        ]
-        row, column, value = zip(*entries, strict=True)
-        shape = len(self.rows), len(self.cost)
-        matrix = coo_array((value, (row, column)), shape=shape).tocsr()
-        lower, upper = [row[2] for row in self.rows], [row[3] for row in self.rows]
-        result = milp(
-            np.array(self.cost),
-            integrality=np.ones(len(self.cost)),
-            bounds=Bounds(0, 1),
-            constraints=LinearConstraint(matrix, lower, upper),
-            options={"mip_rel_gap": 0.0},
-        )
+        result = cheapest_choice(self.cost, self.rows)
         assert result.status == 0, result.message
         return float(result.fun)
 

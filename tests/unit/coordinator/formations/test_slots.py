@@ -35,9 +35,11 @@ def left_s(plan: Plan) -> float:
     return time_left_s(plan.territory, plan.t0_s, SCENARIO)
 
 
-@pytest.mark.parametrize("steps", range(1, 12))
-def test_slots_are_the_longest_that_leave_a_reserve(steps: int) -> None:
+@pytest.mark.parametrize("late_s", [0.0, 7.0, 14.0, 16.1])
+@pytest.mark.parametrize("steps", range(12))
+def test_slots_are_the_longest_that_leave_a_reserve(steps: int, late_s: float) -> None:
     plan = climbing(steps)
+    plan = evolve(plan, t0_s=plan.t0_s + late_s)
     chosen = paced(plan)
     assert chosen == evolve(plan, slot_s=chosen.slot_s)
     leisurely, hasty = (
@@ -59,20 +61,6 @@ def test_more_steps_have_shorter_slots() -> None:
     assert set(slots) <= set(SCENARIO.slots_s)
 
 
-def test_a_late_plan_has_shorter_slots() -> None:
-    plan = climbing(4)
-    late = evolve(plan, t0_s=plan.t0_s + left_s(plan) - 4 * 6.0 - RESERVE_S)
-    assert paced(plan).slot_s == pytest.approx(7.0)
-    assert paced(late).slot_s == pytest.approx(6.0)
-    assert paced(evolve(late, t0_s=late.t0_s + 0.1)).slot_s == pytest.approx(5.8)
-
-
-def test_haste_takes_of_the_reserve() -> None:
-    plan = climbing(6)
-    late = evolve(plan, t0_s=plan.t0_s + left_s(plan) - 6 * 5.0 - MIN_RESERVE_S)
-    assert paced(late).slot_s == pytest.approx(5.0)
-
-
 def test_a_plan_begins_before_its_rear_is_in_s3_unless_a_lane_change_does() -> None:
     along: tuple[PlannedMove, ...] = ((0, (-3, 0), (-2, 0)), (1, (-2, 0), (-2, 1)))
     plan = evolve(
@@ -90,10 +78,6 @@ def test_a_plan_begins_before_its_rear_is_in_s3_unless_a_lane_change_does() -> N
     assert pacing.paced(plan, [], plan.t0_s - 1.0, end_s, SCENARIO).t0_s == pytest.approx(
         plan.t0_s - 1.0
     )
-
-
-def test_a_plan_without_moves_has_the_longest_slots() -> None:
-    assert paced(climbing(0)).slot_s == SCENARIO.slots_s[-1]
 
 
 def test_a_given_cycle_leaves_no_choice() -> None:

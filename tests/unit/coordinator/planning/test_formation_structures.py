@@ -164,17 +164,6 @@ def _assert_filled(
     assert len(targets) == len(preferred)
 
 
-def test_vehicles_with_a_lane_get_it_and_the_others_fill_the_rest() -> None:
-    vehicles = [dict(vehicle) for vehicle in LANE_DROP["vehicles"]]
-    for vehicle in vehicles[:4]:
-        vehicle["lane"] = 0
-    request = PlanRequest.from_dict(LANE_DROP | {"vehicles": vehicles})
-    response = plan(request)
-    lanes = [path[-1][1] for path in response.paths]
-    assert lanes[:4] == [0] * 4
-    assert lanes.count(1) == 2
-
-
 # --- requests ---------------------------------------------------------------------------------
 
 

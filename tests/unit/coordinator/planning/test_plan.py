@@ -13,7 +13,6 @@ from hypothesis import given, settings
 import laneweave.coordinator
 import laneweave.protocol
 from laneweave.coordinator.planning.paper.assignments import Weights
-from laneweave.coordinator.planning.path_map import final_arrival
 from laneweave.coordinator.planning.plan_validator import problems_of_response
 from laneweave.coordinator.planning.problem import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
@@ -21,7 +20,7 @@ from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import block_request, formation_request
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.lattice import Cell, Mode
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS
 from support.planning_oracles import cheapest_plan, requests
 
@@ -59,26 +58,6 @@ def test_cost_is_optimal_or_infeasibility_is_proven(request: PlanRequest) -> Non
     assert response.cost == expected
     assert response.lower_bound == expected
     assert problems_of_response(request, response) == []
-
-
-def test_waiting_and_returning_cost_steps() -> None:
-    """The second vehicle stands on its target but must leave it and come back."""
-    request = PlanRequest(
-        Grid(3, 2, [(0, 1), (2, 1)]),
-        1,
-        ("node", "edge", "special-1"),
-        (
-            VehicleRequest("passing", (0, 0), eligible=(0,)),
-            VehicleRequest("in the way", (1, 0), eligible=(1,)),
-        ),
-        ((2, 0), (1, 0)),
-        deadline_s=60.0,
-    )
-    response = plan(request)
-    assert response.status == "optimal"
-    # One step to make way, two to pass, one more until the cell is free, and back.
-    assert [final_arrival(path) for path in response.paths] == [3, 4]
-    assert response.cost == 7
 
 
 def test_a_vehicle_at_its_target_stays() -> None:
@@ -125,41 +104,6 @@ class TestInfeasible:
         response = plan(request)
         assert response.status == "infeasible"
         assert response.assignments_tried == 0
-
-    def test_one_infeasible_assignment_does_not_block_the_others(self) -> None:
-        """The cheapest assignment needs an impossible overtaking in a corridor."""
-        request = PlanRequest(
-            Grid(6, 1),
-            1,
-            ("node", "edge", "special-1"),
-            (
-                VehicleRequest("a", (0, 0), eligible=(1, 2)),
-                VehicleRequest("b", (1, 0), eligible=(0, 3)),
-            ),
-            ((0, 0), (2, 0), (4, 0), (5, 0)),
-            deadline_s=60.0,
-        )
-        response = plan(request)
-        assert response.status == "optimal"
-        assert response.assignment == (1, 3)
-        assert response.cost == cheapest_plan(request)
-
-
-@pytest.mark.parametrize("solver", ["tappa", "branching"])
-@pytest.mark.parametrize(
-    ("mode", "kinds"), [(1, ("node", "edge", "special-1")), (2, ("geometric",))]
-)
-def test_vehicles_that_would_close_up_move_one_after_the_other(
-    solver: str, mode: Mode, kinds: tuple[str, ...]
-) -> None:
-    vehicles = VehicleRequest("a", (0, 0), eligible=(0,)), VehicleRequest("b", (3, 0), lane=0)
-    targets = ((1, 0), (2, 0))
-    at_once = PlanRequest(Grid(4, 1), mode, kinds, vehicles, targets)
-    assert plan(at_once, solver=solver).cost == 2
-    in_turn = attrs.evolve(at_once, conflicts=(*kinds, "closing"))
-    response = plan(in_turn, solver=solver)
-    assert (response.status, response.cost) == ("optimal", 3)
-    assert problems_of_response(in_turn, response) == []
 
 
 class TestDeadline:

@@ -5,7 +5,6 @@ from typing import Any
 import attrs
 import pytest
 
-from laneweave.coordinator.planning import conflict_model as conflicts
 from laneweave.coordinator.planning.plan_validator import problems_of_paths, problems_of_response
 from laneweave.coordinator.planning.problem import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
@@ -80,21 +79,6 @@ def test_closing_moves_three_columns_apart_are_compared(mode: Mode, kinds: tuple
     assert found == ["closing conflict of a and b in step 0"]
     free = PlanRequest(Grid(4, 1), mode, kinds, vehicles, targets)
     assert problems_of_paths(free, (0, 1), paths) == []
-
-
-def test_pairs_are_compared_as_far_as_conflicts_reach(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A new conflict kind with a longer reach must not be skipped."""
-    monkeypatch.setitem(conflicts._COLUMNS_OF_KIND, "edge", 6)
-    monkeypatch.setitem(conflicts._PREDICATES, "edge", lambda a, b: b[0][0] - a[0][0] == 6)
-    request = PlanRequest(
-        Grid(8, 1),
-        1,
-        ("node", "edge"),
-        (VehicleRequest("a", (0, 0)), VehicleRequest("b", (6, 0))),
-        ((0, 0), (6, 0)),
-    )
-    paths = (((0, 0), (0, 0)), ((6, 0), (6, 0)))
-    assert problems_of_paths(request, (0, 1), paths) == ["edge conflict of a and b in step 0"]
 
 
 def test_oblique_moves_belong_to_mode_2() -> None:

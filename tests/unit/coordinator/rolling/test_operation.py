@@ -21,7 +21,6 @@ from laneweave.coordinator.rolling.operation import (
     MAX_DELAY_S,
     SNAPSHOT_S,
     RollingOperation,
-    _clusters,
 )
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.config.loading import parse_scenario
@@ -269,25 +268,16 @@ def test_the_planner_gets_all_vehicles_and_owned_cells() -> None:
     assert desk.calls[1].before == StreamPlan(SLOT + 1, {}, ())
 
 
-def test_it_plans_from_where_vehicles_will_hold() -> None:
-    desk = bench(A, B)
-    desk.hear(shown(A, OLD, moving=True, accepted=True, t_s=BEGUN_S + 0.4))
-    moved = shown(A, OLD, moving=True, accepted=True, t_s=BEGUN_S + SNAPSHOT_S)
-    desk.hear(evolve(moved, hold_cell=(1, 0)))
-    desk.think()
-    assert desk.calls[0].vehicles[A].cell == (1, 0)
-    assert not desk.calls[0].vehicles[A].held
-
-
 def test_later_states_do_not_count() -> None:
     """Whether it has arrived by then depends on how fast messages are."""
     desk = bench(A, B)
+    desk.control.on_census(census(A, B, C))
     desk.hear(evolve(shown(A, OLD), hold_cell=(1, 0), t_s=LOOK_S))
     desk.hear(evolve(shown(C), t_s=LOOK_S))
     desk.control.on_census(evolve(census(B, D), t_s=LOOK_S))
     call = desk.call()
     assert call.vehicles == {
-        name: StreamVehicle(name, HOMES[name], 1, held=False) for name in (A, B)
+        name: StreamVehicle(name, HOMES[name], 1, held=name is C) for name in (A, B, C)
     }
     desk.think(LOOK_S + SLOT_S)
     assert set(desk.calls[1].vehicles) == {B, D}
@@ -296,18 +286,12 @@ def test_later_states_do_not_count() -> None:
 def test_states_may_arrive_in_any_order() -> None:
     desk = bench(A)
     desk.hear(evolve(shown(A), hold_cell=(2, 0), t_s=LOOK_S))
-    desk.hear(evolve(shown(A), hold_cell=(1, 0), t_s=BEGUN_S + SNAPSHOT_S))
+    moving = shown(A, OLD, moving=True, accepted=True, t_s=BEGUN_S + SNAPSHOT_S)
+    desk.hear(evolve(moving, hold_cell=(1, 0)))
     desk.hear(evolve(shown(A), hold_cell=(0, 0), t_s=BEGUN_S + SNAPSHOT_S - 0.1))
     desk.hear(evolve(shown(A, OLD), hold_cell=(2, 0), t_s=LOOK_S))  # twice in a tick
     desk.think()
-    assert desk.calls[0].vehicles[A].cell == (1, 0)
-
-
-def test_a_vehicle_that_has_just_left_is_in_the_snapshot() -> None:
-    desk = bench(A, B)
-    desk.control.on_census(evolve(census(A), t_s=LOOK_S))
-    desk.think()
-    assert desk.calls[0].vehicles[B] == StreamVehicle(B, HOMES[B], 1, held=False)
+    assert desk.calls[0].vehicles == {A: StreamVehicle(A, (1, 0), 1, held=False)}
 
 
 def test_an_unheard_vehicle_does_not_keep_others_from_being_planned() -> None:
@@ -359,14 +343,6 @@ def test_the_result_of_the_next_planning_ends_older_ballots(result: str) -> None
     assert old.phase is BallotPhase.ABORTED
     if result == "in time":
         assert desk.transfer.ballot > old.ballot
-
-
-def test_a_vehicle_without_a_state_in_time_is_held() -> None:
-    desk = bench(A)
-    desk.control.on_census(census(A, C))
-    desk.hear(evolve(shown(C), t_s=LOOK_S))
-    desk.think()
-    assert [vehicle.held for vehicle in desk.calls[0].vehicles.values()] == [False, True]
 
 
 CLOSED = PendingTransfer(OLD, OWNED[A], (HOMES[A], (1, 0)), (A, B))
@@ -508,12 +484,6 @@ def test_vehicles_whose_promises_tell_ownership_are_in_the_roster() -> None:
     assert [transfer.roster for transfer in desk.control.transfers] == [(C,)]
 
 
-def test_groups_that_share_a_vehicle_are_one_cluster() -> None:
-    groups = [{A, B}, {C}, {D}, {B, C}]
-    assert sorted(map(sorted, _clusters(groups))) == [[A, B, C], [D]]
-    assert _clusters([]) == []
-
-
 def run_ballot(desk: Bench) -> Plan:
     """Let A and B promise what they are asked; return the plan that A is sent."""
     sent = dict(desk.control.outgoing(50.0))
@@ -562,15 +532,6 @@ def test_a_vehicle_that_leaves_is_forgotten_and_its_ballot_given_up() -> None:
     assert set(desk.control.observed.states) == {A, C}
     assert (first.phase, first.reason) == (BallotPhase.ABORTED, "B has left")
     assert second.phase is BallotPhase.PREPARING
-
-
-def test_a_plan_in_force_stays_so_when_a_vehicle_leaves() -> None:
-    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
-    desk.think()
-    transfer = desk.transfer
-    transfer.phase = BallotPhase.IN_FORCE
-    desk.control.on_census(census(A))
-    assert transfer.phase is BallotPhase.IN_FORCE
 
 
 def test_a_new_road_starts_without_memory() -> None:

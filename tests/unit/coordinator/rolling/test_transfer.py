@@ -191,6 +191,7 @@ def test_what_is_in_force_or_given_up_stays_so() -> None:
     transfer = issued()
     hear(transfer, state(A, MID, accepted=True), state(B, MID, accepted=True))
     hear(transfer, state(A, HIGH))
+    transfer.on_left(A)
     assert transfer.phase is BallotPhase.IN_FORCE
     transfer = make_transfer()
     transfer.abort("no reason")
