@@ -146,7 +146,7 @@ def test_coordinators_without_a_leader(listener: Listener) -> None:
         listener.coordinator(name)
     listener.heartbeat("c1", 3, 1.0, leading=True)  # too long ago
     listener.heartbeat("c2", 3, 1.9)
-    assert listener.status().problem == "there is no leader: 2 coordinators are there"
+    assert listener.status().problem == "there is no leader: 2 coordinators found"
 
 
 def test_two_claims_to_lead_are_shown(listener: Listener) -> None:
