@@ -1,1 +1,1 @@
-"""The command line, the local process supervisor, and reports."""
+"""Command line, runs, faults, observation, sweeps, reports and benchmarks."""

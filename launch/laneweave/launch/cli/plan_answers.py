@@ -104,7 +104,7 @@ def answer_request(
         try:
             draw(request, response)
         except OSError as error:
-            raise CommandFailedError(f"{out}: not drawn: {error}") from error
+            raise CommandFailedError(f"{out}: cannot be drawn: {error}") from error
 
 
 def explain_request(path: Path, deadline_s: float | None, drawing: Path | None = None) -> None:
@@ -129,7 +129,7 @@ def explain_request(path: Path, deadline_s: float | None, drawing: Path | None =
         try:
             draw_explanation(explanation, drawing)
         except OSError as error:
-            raise CommandFailedError(f"{drawing}: not drawn: {error}") from error
+            raise CommandFailedError(f"{drawing}: cannot be drawn: {error}") from error
 
 
 def _request(path: Path, deadline_s: float | None, solver: str | None = None) -> PlanRequest:

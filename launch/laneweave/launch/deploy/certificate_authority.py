@@ -116,7 +116,9 @@ def issue(
     name = identity.common_name
     path = certificate_path(folder, name)
     if path.exists() and not replace:
-        raise BadInputError("IDENTITY", name, f"one without a certificate in {folder}, or --force")
+        raise BadInputError(
+            "IDENTITY", name, f"an identity without certificate in {folder}, or --force"
+        )
     key = ec.generate_private_key(ec.SECP256R1())
     builder = _builder(_name(name), authority.certificate.subject, key.public_key(), days)
     # Only the router is a server.

@@ -80,7 +80,7 @@ def _check_network(scenario: Scenario, report: Report) -> None:
 
 
 def _check_moves(scenario: Scenario, report: Report) -> None:
-    """Make the checks of agents at their start, if the extra `agent` is installed."""
+    """Make the checks that agents make at their start, if the extra `agent` is installed."""
     try:
         from laneweave.agents.driving.trajectory import check_moves  # noqa: PLC0415 (an extra)
     except ModuleNotFoundError:

@@ -1,4 +1,4 @@
-"""The checker: safety properties that every run must satisfy, regardless of faults.
+"""The checker: properties that every run must satisfy, regardless of faults.
 
 The checker observes the bodies on the road and every sent message. It does not know the state
 machines of the processes, and shares no code with them.

@@ -50,7 +50,7 @@ NEW_PREFERENCES_S = (0.8, 3.0)
 PATIENCE_S = 90.0
 """Maximum time after the fault phase in which all vehicles must arrive."""
 MAX_FUTILE_PLANS = 5
-"""A vehicle that does not execute this number of plans that move it is stuck."""
+"""Number of plans without motion of a vehicle after which it counts as stuck."""
 HEALTHY_SLOTS = 8
 """Number of slots after the fault phase (rolling operation)."""
 CHECK_S = 0.5
@@ -58,7 +58,7 @@ CHECK_S = 0.5
 MAX_OLD_MESSAGES = 400
 """Number of old messages that are kept to be replayed or damaged."""
 KEEP_EVERY = 7
-"""Each message with a multiple of this number is kept."""
+"""One of this number of sent messages is kept."""
 _REPLAYABLE = (Prepare, Plan, VehicleState, Command, Sense)
 
 
@@ -137,7 +137,7 @@ class FaultRun:
         """Draw the setup and start all processes.
 
         Args:
-            seed: seed; determines all draws together with the name of the profile.
+            seed: determines all draws, together with the name of the profile.
             profile: profile from which the setup is drawn.
             vehicle_rules: rules of plan execution, which tests replace by faulty ones.
             leader_rules: rules of leaders, which tests replace by faulty ones.

@@ -201,7 +201,7 @@ class RandomFaults:
         return rng.choice(processes.coordinators)
 
     def _later(self, span_s: tuple[float, float], action: Callable[[], None], what: str) -> None:
-        """Schedule the end of a fault, unless all faults end before."""
+        """Schedule the end of a fault, which is skipped if all faults end before."""
         time_s = self._network.now_s + self._rng.uniform(*span_s)
         self._network.at(time_s, self._undo, action, what)
 

@@ -1,6 +1,6 @@
 """Setup of a run, drawn from its seed: road, vehicles, faults, and preferred lanes.
 
-In the rolling operation the road is short, because each slot plans up to its end. Some vehicles are
+In the rolling operation the road is short, because plans extend to its end. Some vehicles are
 in S3 at the start, the others enter behind them, and all leave at the end of the road.
 """
 
@@ -48,7 +48,7 @@ MOVE_SHARE = 0.8
 SLOTS_ON_ROAD = 45
 """Length of the road: slots in which a column passes it."""
 MAX_BEHIND = 3
-"""Number of empty columns that the last vehicle of a lane owns."""
+"""Number of empty cells behind the last vehicle of a lane that it owns."""
 STREAM_PLANNER = 0.05
 """Share of runs with the stream planner, which takes ten times as long as the rest of a run."""
 
@@ -271,10 +271,10 @@ def _visit(
 def _grants(
     scenario: Scenario, first: int, columns: int, visits: Sequence[Visit]
 ) -> Iterator[Grant]:
-    """Yield the owners of empty cells: the vehicle that last entered on their lane.
+    """Yield the assignments of empty cells to the vehicles that last entered on their lanes.
 
     A cell is granted when vehicles can no longer enter in it. Cells ahead of all vehicles belong to
-    the first one: the bridge would leave them without owners, but this stretch is short.
+    the first one; the bridge would leave them without owners, but this stretch is short.
     """
     lattice, spread_s = scenario.lattice, scenario.formation.entry_spread_s
     by_cell = {visit.cell: visit for visit in visits}

@@ -39,7 +39,7 @@ class Visit:
     """Cell in which the vehicle enters."""
     enters_s: float
     leaves_s: float | None
-    """None: the vehicle stays until the end."""
+    """Time of exit; None: the vehicle stays to the end of the road."""
     clock_offset_s: float = 0.0
     clock_drift: float = 0.0
     """Error of the clock rate: seconds gained per second."""

@@ -94,7 +94,7 @@ def _run(words: list[str]) -> str:
 
 @define
 class _Namespace:
-    """The launcher's side of a namespace and of the process that holds it."""
+    """A namespace and the process that holds it, controlled by the launcher."""
 
     process: ForkServerProcess
     connection: Connection
@@ -119,14 +119,14 @@ class _Namespace:
         try:
             self.connection.send([program, *words])
         except OSError as error:
-            raise NamespacesUnavailableError("a namespace is gone") from error
+            raise NamespacesUnavailableError("a namespace has ended") from error
         self.check_answer()
 
     def check_answer(self) -> None:
         try:
             answer = self.connection.recv() if self.connection.poll(ANSWER_S) else "no answer"
         except (EOFError, OSError) as error:
-            raise NamespacesUnavailableError("a namespace is gone") from error
+            raise NamespacesUnavailableError("a namespace has ended") from error
         if answer:
             raise NamespacesUnavailableError(answer)
 

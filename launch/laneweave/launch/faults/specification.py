@@ -59,7 +59,7 @@ class RoleFault:
     """
 
     verb: ClassVar[str]
-    """The effect on the target."""
+    """Effect on the target, as a past participle."""
 
     target: str = LEADER
     """`leader`, `router`, `coordinator` (any), `agent` (any on the road), or the name of a
@@ -80,11 +80,11 @@ class RoleFault:
         if self.at_s is None and self.between_s is None:
             raise BadInputError("at_s", "nothing", "a road time, or between_s instead")
         if self.at_s is not None and self.between_s is not None:
-            raise BadInputError("between_s", self.between_s, "nothing where at_s is given")
+            raise BadInputError("between_s", self.between_s, "nothing if at_s is given")
         if self.every_s is not None and self.at_s is None:
-            raise BadInputError("every_s", self.every_s, "nothing without at_s")
+            raise BadInputError("every_s", self.every_s, "only with at_s")
         if self.times is not None and self.at_s is not None and self.every_s is None:
-            raise BadInputError("times", self.times, "nothing without every_s or between_s")
+            raise BadInputError("times", self.times, "only with every_s or between_s")
         if self.count * (self.times or 1) > MAX_TIMES:
             raise BadInputError("times", self.times, f"count * times of at most {MAX_TIMES}")
         if self.count > 1 and self.target not in (AGENT, COORDINATOR):
@@ -103,7 +103,7 @@ class Kill(RoleFault):
     verb = "killed"
 
     restart_after_s: float | None = field(default=None, validator=optional(within(0.0, 600.0)))
-    """Wall-clock seconds; None: the role is not restarted."""
+    """Wall-clock seconds until the restart; None: no restart."""
     restart_share: float = field(default=1.0, validator=within(0.0, 1.0))
     """Share of killed roles that are restarted."""
 
@@ -136,14 +136,14 @@ class Partition:
     """Two groups, or a group and `others` (all processes outside the group)."""
     from_s: float = field(default=0.0, validator=within(0.0, MAX_S))
     until_s: float | None = field(default=None, validator=optional(within(0.0, MAX_S)))
-    """Road time; None: the end of the run."""
+    """Road time of the end; None: the end of the run."""
     method: str = field(default=AUTO, validator=one_of(AUTO, NAMESPACES, MESSAGES))
 
     def __attrs_post_init__(self) -> None:
         """Check that the fields do not contradict each other."""
         first, second = self.between
         if first == second or first not in GROUPS or second not in (*GROUPS, OTHERS):
-            allowed = f"two of {', '.join(GROUPS)}, or one of them and then {OTHERS}"
+            allowed = f"two of {', '.join(GROUPS)}, or one of them and {OTHERS}"
             raise BadInputError("between", list(self.between), allowed)
         if self.until_s is not None and self.until_s <= self.from_s:
             raise BadInputError("until_s", self.until_s, f"more than from_s, {self.from_s:g}")
@@ -232,7 +232,7 @@ def load_faults(
     Args:
         choice: path of a file, or the name of a preset if no such file exists; None: no faults.
         coordinators: names of the run's coordinators.
-        vehicles: names of the run's vehicles; None: accept every name of a vehicle.
+        vehicles: names of the run's vehicles; None: accept any vehicle name.
 
     Raises:
         BadInputError: the file or preset does not exist, or a value is not allowed.

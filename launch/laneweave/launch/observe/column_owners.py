@@ -102,7 +102,7 @@ def closed_formations(folder: Path, scenario: Scenario) -> Formations:
 
 
 def recorded_formations(folder: Path, lattice: Lattice) -> Formations:
-    """Return the formations with vehicles of a recorded run.
+    """Return the formations of a recorded run that contained vehicles.
 
     In recordings without `formation-closed` events and of the rolling operation, each block of the
     lattice counts as a formation.

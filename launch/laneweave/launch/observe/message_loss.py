@@ -15,7 +15,7 @@ from attrs import define, field
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name, RoadClock, VehicleState
 
 GRACE_TICKS = 5
-"""Ticks after its own within which a message must arrive, to not count as lost."""
+"""Number of ticks that a message may be late without counting as lost."""
 CONNECT_S = 1.0
 TOLERANCE_S = 1e-6
 
@@ -27,9 +27,9 @@ class LossMeter:
     window_ticks: int
     """Number of ticks over which loss is measured; 0: no measurement."""
     _received: dict[int, set[Name]] = field(factory=dict)
-    """Vehicles whose states were received, by tick that is not closed."""
+    """Vehicles whose states were received, by open tick."""
     _clocks: set[int] = field(factory=set)
-    """Ticks of received clock messages that are not closed."""
+    """Open ticks whose clock messages were received."""
     _first_tick: dict[Name, int] = field(factory=dict)
     """Tick of the first received state of each vehicle."""
     _censuses: deque[Census] = field(factory=lambda: deque(maxlen=4 * GRACE_TICKS))

@@ -35,7 +35,7 @@ class Plans:
     """The plans in force."""
 
     in_force: int
-    """Number that the leader publishes."""
+    """Number of plans in force, as published by the leader."""
     operation: str | None
     """`formations` or `rolling`, derived from vehicle states; None: unknown."""
     formations: int | None

@@ -35,7 +35,7 @@ class Run:
     """Value of `laneweave run --method`."""
     scenario: Scenario
     summary: RunSummary | None
-    """None: the run failed without a summary."""
+    """Summary; None: the run failed without one."""
     reason: str = ""
     """Reason of the failure; empty: success."""
     wall_s: float | None = None

@@ -81,12 +81,12 @@ def draw_report(folder: Path) -> None:
     """Write the pictures and the page of a finished run.
 
     Raises:
-        CommandFailedError: they cannot be written.
+        CommandFailedError: the files cannot be written.
     """
     try:
         report_run(single_run(folder))
     except OSError as error:
-        raise CommandFailedError(f"{folder}: pictures not drawn: {error}") from error
+        raise CommandFailedError(f"{folder}: the report cannot be written: {error}") from error
 
 
 def report_run(run: Run, *, formation: int | None = None, dpi: int = DPI) -> Path:

@@ -82,7 +82,7 @@ class LocalRun:
     show_progress: bool = True
     pace: float | None = None
     watch: Callable[[RoadView, Mapping[str, int]], None] | None = None
-    """Called ten times per second with the observed state and the process ids of the roles."""
+    """Callback, called ten times per second with observed state and process ids of the roles."""
     _processes: RoleProcesses = field(init=False)
     _options: dict[str, Any] = field(init=False)
     """Options of all roles."""

@@ -21,7 +21,7 @@ class Outcome:
 
     folder: Path
     summary: RunSummary | None
-    """None: the run ended before its summary was written."""
+    """Summary; None: the run ended before it was written."""
     problems: tuple[str, ...]
     """Reasons of a failure; empty: the run succeeded."""
 

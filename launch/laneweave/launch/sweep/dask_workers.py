@@ -46,7 +46,7 @@ def run_on_dask(
     try:
         asyncio.run(_check_connection(address))
     except (OSError, ValueError) as error:
-        raise BadInputError("--dask", address, "a Dask scheduler that answers") from error
+        raise BadInputError("--dask", address, "the address of a Dask scheduler") from error
     with Client(address, timeout=CONNECT_S, set_as_default=False, name=sweep) as client:
         stop = Event(sweep, client=client)
         try:

@@ -45,7 +45,7 @@ class PointResult:
 
 
 def kept_files(point: Point) -> tuple[str, ...]:
-    """Return the names of the files of a point to keep, apart from `LOG_FILE` after a failure."""
+    """Return the names of the files to keep; `LOG_FILE` is also kept after a failure."""
     kept = (SUMMARY_FILE, "trips.parquet", "events.jsonl")
     return (*kept, TRAJECTORIES) if point.keep_trajectories else kept
 
@@ -115,7 +115,7 @@ def run_locally(
 
 
 def wait_for_exit(process: subprocess.Popen[bytes], name: str, stopped: Callable[[], bool]) -> None:
-    """Wait for the end of a process, which is ended if an error is raised.
+    """Wait for the end of a process; if an error is raised, end the process.
 
     Args:
         process: the process.

@@ -1,8 +1,7 @@
 """Frames of a recorded run, made on request.
 
-The files of a run contain the current cell or move of each vehicle, but neither owned cells nor
-further plans nor lost messages; the frames lack these, too. The scene contains the message counts
-of the summary.
+The files of a run contain only the current cell or move of each vehicle; owned cells, further plans
+and lost messages are not recorded. The scene contains the message counts of the summary.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from laneweave.protocol.wire.events import ENTERED, FORMATIONS_JOINED, LEADER, L
 STEP_S = 0.2
 """Road time between two frames; the page interpolates."""
 STILL_M = 0.25
-"""Lateral distance from the centre of its cell above which a vehicle is moving."""
+"""Lateral distance from the centre of the cell above which a vehicle counts as moving."""
 
 
 @frozen
