@@ -124,7 +124,10 @@ def test_too_many_points() -> None:
         (["--jobs", "0"], "--jobs: got 0; allowed: [1, 256]"),
         (["--duration", "0"], "demand.duration_s: got 0.0"),
         (["--dask", "tcp://127.0.0.1:1", "--jobs", "2"], "--jobs: got 2; allowed: only without"),
-        (["--dask", "nonsense"], "--dask: got 'nonsense'; allowed: the address of a Dask scheduler"),
+        (
+            ["--dask", "nonsense"],
+            "--dask: got 'nonsense'; allowed: the address of a Dask scheduler",
+        ),
         (["--out", "/dev/null/out"], "--out: got '/dev/null/out'"),
         (["--keep-trajectories", "some"], "--keep-trajectories"),
         (["missing.toml"], "missing.toml"),
