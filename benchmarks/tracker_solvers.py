@@ -150,9 +150,9 @@ def record(scenario: Scenario, *, instances: int, seed: int) -> Recording:
     """
     scenario = always_solving(scenario)
     program = Tracker(scenario).program
-    parts = Parts.of(program.cost, program.rows)
+    parts = Parts.of(program.cost, program.constraints)
     exact = QuadraticProgram(
-        program.cost, program.rows, program.low.all, program.high.all, settings=_EXACT
+        program.cost, program.constraints, program.low.all, program.high.all, settings=_EXACT
     )
     recording = Recording(parts, [], [])
     for name in SITUATIONS:

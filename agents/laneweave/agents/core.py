@@ -1,19 +1,18 @@
-"""The vehicle agent's core: the claim on one vehicle, its plan execution and its driving.
+"""The vehicle agent's core: the claim on one vehicle, plan execution, and driving.
 
-At each tick it receives a SENSE with the measurements of the sensors and the state of the motion
-controller, checks that it is in charge of the vehicle, decides whether a move may begin
-(`execution`), and answers with a COMMAND that holds a trajectory (`driver`). Between ticks it
-answers PREPARE and PLAN and follows the states of other vehicles. When in doubt it holds its cell.
+At each tick the agent receives a SENSE with measurements and the state of the motion controller,
+checks that it is in charge of the vehicle, decides whether a move may begin (`plan_execution`), and
+answers with a COMMAND that contains a trajectory (`driver`). Between ticks it answers PREPARE and
+PLAN and handles the states of other vehicles.
 
-**The claim.** One process at a time acts for a vehicle; the vehicle's motion controller decides
-which. An agent claims the vehicle with its first COMMAND and sends nothing to other processes
-before a SENSE has shown that it is in charge. When another agent is in charge, it stays silent.
-When the caretaker is in charge (because this agent hung or its messages were lost), it takes a new
+**The claim.** One process at a time acts for a vehicle; the motion controller decides which. An
+agent claims the vehicle with its first COMMAND, and sends nothing to other processes before a SENSE
+reports that it is in charge. While another agent is in charge, it sends nothing at all. If the
+caretaker is in charge (because the agent hung or its messages were lost), it takes a new
 incarnation and claims the vehicle again.
 
-**The road.** A SENSE names its bridge. A newer bridge has another road and begins again at tick 0:
-the agent forgets the earlier road and takes a new incarnation. From then on it ignores the earlier
-bridge, whose messages may still be on their way.
+**The road.** A SENSE names its bridge. A newer bridge has another road and begins at tick 0: the
+agent discards its state, takes a new incarnation, and ignores late messages of the earlier bridge.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ from laneweave.protocol.wire.topics import (
 
 
 class AgentCore:
-    """State machine of one vehicle's agent; see `Core` for how it is driven."""
+    """State machine of one vehicle's agent; see `Core`."""
 
     def __init__(
         self,
@@ -76,12 +75,11 @@ class AgentCore:
         """Make an agent that has not received a SENSE yet (V1).
 
         Args:
-            vehicle: its name.
-            new_incarnation: returns a number that no process has used before, greater than all
-                earlier ones.
+            vehicle: name of the vehicle.
+            new_incarnation: returns a number greater than all incarnations before.
             scenario: lattice, limits, timing.
-            make_driver: makes the vehicle's driver; the fault simulation has a cheaper one.
-            rules: of plan execution; the fault simulation plants bugs here.
+            make_driver: returns the vehicle's driver; the fault search has a cheaper one.
+            rules: rules of plan execution; tests plant bugs here.
         """
         self.vehicle = vehicle
         self.ended = False
@@ -94,27 +92,27 @@ class AgentCore:
         self._rules = rules
         self._formation: int | None = None
         self.wanted_motions: tuple[int, ...] = ()
-        """Stretches of columns whose motions matter now; empty while it is not in charge."""
+        """Stretches of columns whose motions are needed now; empty while it is not in charge."""
         self.wanted_states: tuple[int, ...] = ()
-        """Formations whose states matter to this vehicle now."""
+        """Formations whose states are needed now."""
         self._move: PlannedMove | None = None
-        """The newest move that it has begun."""
+        """Newest move that has begun."""
         self._move_ticks = 0
         """Duration of that move."""
         self._sense: Sense | None = None
         self._command: Command | None = None
         self._own = {"vehicle": vehicle}
         self._state_parameters: dict[str, object] = {}
-        """Topic parameters of its STATE."""
+        """Topic parameters of STATE messages."""
 
     @property
     def wakeup_s(self) -> float | None:
-        """None: ticks drive the agent."""
+        """None: the agent acts on ticks and messages only."""
         return None
 
     @property
     def in_charge(self) -> bool:
-        """Whether the last SENSE showed that this process acts for the vehicle."""
+        """Whether the last SENSE reports that this process is in charge of the vehicle."""
         sense = self._sense
         return (
             sense is not None
@@ -125,11 +123,11 @@ class AgentCore:
 
     @property
     def solver_stats(self) -> SolverStats:
-        """Counters and durations of tracking so far."""
+        """Counters and durations of tracking."""
         return self._driver.solver_stats
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
-        """Take an event; see `Core`."""
+        """Handle an event; see `Core`."""
         del now_s
         if isinstance(event, Arrived):
             message = event.message
@@ -162,7 +160,7 @@ class AgentCore:
             self.wanted_states = execution.plan.formations
 
     def on_motion(self, motion: Motion) -> None:
-        """Take the motion of a vehicle in one of the wanted stretches."""
+        """Handle the motion of a vehicle in one of the wanted stretches."""
         self._driver.on_motion(motion)
 
     def _on_message(self, message: object) -> list[Effect]:
@@ -201,11 +199,11 @@ class AgentCore:
         if sense.attendant > self._incarnation:
             self._command, self.wanted_motions = None, ()
             if not sense.caretaker:
-                return []  # another agent is in charge: this one must not drive
+                return []  # another agent is in charge
             self._incarnation = above(self._new_incarnation(), sense.attendant)
         in_charge = self.in_charge
         if not (was_in_charge and in_charge):
-            # Also while a claim is pending: until it is granted another process may begin a move.
+            # Also while a claim is pending, since another process may begin a move until then.
             self._take_over(sense)
         return self._act(sense, in_charge=in_charge)
 
@@ -246,7 +244,7 @@ class AgentCore:
         return effects
 
     def _on_confirmation(self, sense: Sense) -> list[Effect]:
-        """Take a repeated SENSE: the controller may have noted something within the tick."""
+        """Handle a repeated SENSE: the controller may have stored something within the tick."""
         execution = self.execution
         if execution is None or not self.in_charge or sense.attendant != self._incarnation:
             return []
@@ -259,7 +257,7 @@ class AgentCore:
         return [self._state()] if any(changes) else []
 
     def _request_storage(self, execution: PlanExecution) -> list[Effect]:
-        """Ask the controller to note something now, before the next tick's COMMAND."""
+        """Request the controller to store something now, before the next tick's COMMAND."""
         command = self._command
         assert command is not None  # noqa: S101 (in charge: it has sent one)
         self._command = evolve(
@@ -272,13 +270,13 @@ class AgentCore:
         return [Send(COMMAND, self._command, self._own)] if self._command != command else []
 
     def _forget_road(self) -> None:
-        """Forget the vehicle of an earlier bridge, as a process that has just started (V1)."""
+        """Discard the state of an earlier bridge's vehicle, as after a restart (V1)."""
         self._incarnation = self._new_incarnation()
         self._sense = self._command = self._move = self.execution = None
         self.wanted_motions, self.wanted_states = (), ()
 
     def _take_over(self, sense: Sense) -> None:
-        """V1: take over what the motion controller is doing."""
+        """V1: continue the current motion of the motion controller."""
         self._formation, self._move = sense.formation, None
         self._state_parameters = {"formation": sense.formation, "vehicle": self.vehicle}
         self._driver.take_over(sense)
@@ -294,10 +292,10 @@ class AgentCore:
         )
 
     def _decide(self, sense: Sense, execution: PlanExecution) -> None:
-        """V5 to V7."""
+        """Apply V5 to V7: end motions, open the gate, begin moves."""
         if execution.moving and self._move is not None and sense.hold_cell != self._move[2]:
-            # The motion controller has not received the move, so the body is still at its origin:
-            # a trajectory that began earlier would be ahead of it. The plan may be gone by now.
+            # The COMMAND with the move was lost, so the body is still at its origin: a trajectory
+            # that began earlier would be ahead of it. The plan may have been dropped since.
             self._driver.begin(self._move, sense.tick, self._move_ticks)
         if execution.moving and self._driver.at_rest(sense):
             execution.end_motion()
@@ -317,7 +315,7 @@ class AgentCore:
         return Send(STATE, state, self._state_parameters)
 
     def leave(self) -> list[Effect]:
-        """End, because the vehicle has left the road."""
+        """End because the vehicle has left the road."""
         if self.ended:
             return []
         self.ended, self.wanted_motions, self.wanted_states = True, (), ()

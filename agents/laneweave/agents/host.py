@@ -1,4 +1,4 @@
-"""An agent process: hosts the agents of named vehicles, or of its shard of announced vehicles."""
+"""Core of an agent process: agents of named vehicles, or of a shard of the announced vehicles."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from laneweave.protocol.wire.topics import (
 )
 
 NO_BRIDGE_S = 60.0
-"""Agents of named vehicles end when there was no bridge for this long (node clock)."""
+"""Time without a bridge after which agents of named vehicles end (node clock)."""
 
 
 @frozen
@@ -44,14 +44,14 @@ class AgentMetrics:
 
     ABOUT: ClassVar[str] = "agent"
 
-    vehicles: int = metric("Vehicles that this process drives or waits for")
-    vehicles_in_charge: int = metric("Vehicles on the road of which this process is in charge")
-    solves_total: int = metric("Trajectories that were tracked, one for each tick")
-    unusable_total: int = metric("Solutions of the tracker that could not be used")
+    vehicles: int = metric("Vehicles that this process has agents for")
+    vehicles_in_charge: int = metric("Vehicles on the road that this process is in charge of")
+    solves_total: int = metric("Solutions of the tracker, one per tick and vehicle")
+    unusable_total: int = metric("Solutions of the tracker that were not usable")
 
 
 class AgentHost:
-    """The core of an agent process: dispatches events to the agents that they concern."""
+    """Core of an agent process: dispatches events to the agents that they concern."""
 
     def __init__(
         self,
@@ -59,22 +59,22 @@ class AgentHost:
         vehicles: Iterable[Name] = (),
         shard: Shard | None = None,
     ) -> None:
-        """Host named vehicles, or with a `shard` every announced vehicle that belongs to it."""
+        """Host the named vehicles, or all announced vehicles of a shard."""
         self._make_agent = make_agent
         self._shard = shard
         self._agents: dict[Name, AgentCore] = {name: make_agent(name) for name in vehicles}
         self._seen: set[Name] = set(self._agents)
         self._subscribed: dict[Topic, set[int]] = {MOTION: set(), STATE: set()}
-        """Stretches and blocks that it has subscribed to."""
+        """Stretches and blocks with a subscription."""
         self._motions: list[tuple[int, ...]] = []
-        """Stretches whose motions each vehicle wanted at the last update."""
+        """Stretches whose motions each vehicle needed at the last update."""
         self._states: list[tuple[int, ...]] = []
-        """Blocks whose states each vehicle wanted at the last update."""
+        """Blocks whose states each vehicle needed at the last update."""
         self._census_s = 0.0
         self._bridge = -1
         """Incarnation of the newest bridge."""
         self._no_bridge_since_s: float | None = 0.0
-        """When the bridge was lost; None: there is one."""
+        """Time at which the bridge was lost; None: there is a bridge."""
         self._solves = self._unusable = 0
         """Counters of agents that have ended."""
 
@@ -94,13 +94,13 @@ class AgentHost:
 
     @property
     def wakeup_s(self) -> float | None:
-        """When to stop waiting for a bridge; a shard never stops."""
+        """Time at which to stop waiting for a bridge; None for a shard, which never stops."""
         if self._shard is not None or self._no_bridge_since_s is None:
             return None
         return self._no_bridge_since_s + NO_BRIDGE_S
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
-        """Take an event; see `Core`."""
+        """Handle an event; see `Core`."""
         if isinstance(event, Arrived) and isinstance(event.message, Motion):
             motion = event.message  # changes no subscription
             for name, agent in self._agents.items():
@@ -114,7 +114,7 @@ class AgentHost:
             effects = self._on_event(event, now_s)
             self._update_subscriptions(effects)
         if hosted and not self._agents and self._shard is None:
-            effects.append(End())  # last: after it the node has left the network
+            effects.append(End())  # last, since the node then disconnects
         return effects
 
     def _on_event(self, event: Event, now_s: float) -> list[Effect]:
@@ -161,13 +161,13 @@ class AgentHost:
         return effects
 
     def _on_bridge(self, incarnation: int) -> list[Effect]:
-        """Take the token of a bridge: a new one has other vehicles, even if names are equal.
+        """Handle the token of a bridge; the vehicles of a new bridge are new despite equal names.
 
-        Agents of named vehicles find out by themselves, from the first SENSE of the new bridge.
+        Agents of named vehicles detect a new bridge by its first SENSE.
         """
         effects: list[Effect] = []
         if incarnation < max(self._bridge, 0):
-            return effects  # left over from an earlier run, or no bridge at all
+            return effects  # of an earlier run, or not a bridge
         self._no_bridge_since_s = None
         if self._shard is not None and self._bridge not in (-1, incarnation):
             for name in list(self._agents):
@@ -191,7 +191,7 @@ class AgentHost:
         effects = agent.handle(event, now_s)
         if agent.ended:
             self._remove(name)
-        # Not after every message: it looks at all agents of the host.
+        # Not after every message, since an update iterates over all agents.
         if agent.ended or wanted != (agent.wanted_motions, agent.wanted_states):
             self._update_subscriptions(effects)
         return effects
@@ -211,15 +211,15 @@ class AgentHost:
                 self._agents[name] = self._make_agent(name)
                 effects += self._agents[name].handle(Started(), now_s)
         for name in sorted(set(self._agents) - set(listed)):
-            # It has left, and the bridge's message about that was lost.
+            # The vehicle has left, and the SENSE that reports it was lost.
             effects += self._remove(name).leave()
         self._seen = set(listed)
         return effects
 
     def _update_subscriptions(self, effects: list[Effect]) -> None:
-        """Subscribe to the motions and states that matter now, and only to those.
+        """Subscribe only to the motions and states that are needed now.
 
-        States are most of the traffic, and most of the time no vehicle waits for another one.
+        States are most of the traffic, and vehicles rarely need those of others.
         """
         motions = [agent.wanted_motions for agent in self._agents.values()]
         states = [agent.wanted_states for agent in self._agents.values()]

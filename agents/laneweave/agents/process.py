@@ -1,4 +1,4 @@
-"""The agent process: one or several vehicles over Zenoh."""
+"""The agent process over Zenoh, for one or several vehicles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from laneweave.protocol.wire.messages import Name, Sense
 
 
 def warm_up(scenario: Scenario) -> None:
-    """Plan all moves and drive one tick, so that processes forked from this one need not."""
+    """Plan all moves and drive one tick in advance, for processes forked from this one."""
     driver = TrackingDriver(scenario)
     column, lane = cell = (0, 1)
     for (dx, dy), ticks in product(product((-1, 0, 1), repeat=2), scenario.move_durations):
@@ -51,10 +51,10 @@ def run_agents(
     """Run agents until their vehicles have left the road, or until SIGINT or SIGTERM.
 
     Args:
-        scenario: what all vehicles know.
+        scenario: settings that all vehicles share.
         access: endpoint, realm and identity of this process.
-        vehicles: names of its vehicles; empty: all of the shard, as they are announced.
-        shard: see `AgentHost`.
+        vehicles: names of the vehicles; empty with a shard.
+        shard: share of the announced vehicles; see `AgentHost`.
         wrap: wraps the core, to inject faults.
         observe: registers the metrics source.
 

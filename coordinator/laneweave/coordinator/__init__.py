@@ -1,1 +1,1 @@
-"""Election, formation building, planning, and the coordinator process."""
+"""The coordinator: election, ballots, both operations, planners and the planning service."""

@@ -1,4 +1,4 @@
-"""The coordinator's core: election, the planning service, and one operation that it leads."""
+"""The coordinator's core: election, planning service, and one operation."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ REPORT_S = 2.0
 
 
 class CoordinatorCore:
-    """State machine of a coordinator; see `Core` for how it is driven."""
+    """State machine of a coordinator; see `Core`."""
 
     def __init__(
         self,
@@ -81,12 +81,12 @@ class CoordinatorCore:
         """Make a candidate that has received nothing yet.
 
         Args:
-            name: by which candidates are ranked.
+            name: name of the candidate; candidates are ranked by name.
             incarnation: a number that no process of this name has used before.
             scenario: road, formations, timing.
-            rules: of a leader of formations; others than `LEADER_RULES` only in tests.
-            make_planner: makes the planner of the rolling operation.
-            workers: how many requests of clients are planned at a time.
+            rules: rules of leaders of formations; tests replace some.
+            make_planner: returns the planner of the rolling operation.
+            workers: number of client requests that are planned at a time.
         """
         self.name = name
         self.scenario = scenario
@@ -99,7 +99,7 @@ class CoordinatorCore:
         self._formation_of: dict[Name, int] = {}
         """Block in which each vehicle of the census entered."""
         self._handled_s = self._awake_since_s = 0.0
-        """When the last event was, and since when this leader has missed nothing (node clock)."""
+        """Time of the last event; start of the time without gaps between events (node clock)."""
         self._incarnation = incarnation
         self._seq = 0
         self._last_job = 0
@@ -125,7 +125,7 @@ class CoordinatorCore:
 
     @property
     def metrics(self) -> tuple[MetricsSnapshot, ...]:
-        """What this candidate has counted."""
+        """Counters of this candidate."""
         election = self.election
         return (
             CoordinatorMetrics(
@@ -141,19 +141,19 @@ class CoordinatorCore:
 
     @property
     def wakeup_s(self) -> float | None:
-        """Next heartbeat, election, or formation timer."""
+        """Time of the next heartbeat, election or timer of the operation."""
         return self._wakeup_s
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
-        """Take an event; see `Core`."""
+        """Handle an event; see `Core`."""
         if now_s > self._handled_s + self.election.election_s / 2:
-            # A leader that wakes up from a pause knows no more than one that has just been elected.
+            # After a pause a leader knows no more than one that has just been elected.
             self._awake_since_s = now_s
         self._handled_s = now_s
         if isinstance(event, Arrived) and isinstance(event.message, VehicleState):
             outcomes = self._on_state(event.message, now_s)
             if outcomes is None and self._wakeup_s is not None and now_s < self._wakeup_s:
-                return []  # as for most states: nothing waits for it, and nothing is due
+                return []  # most states: nothing depends on it, and nothing is due
             effects = list(self._effects(outcomes or ()))
         else:
             effects = list(self._on_event(event, now_s))
@@ -207,12 +207,12 @@ class CoordinatorCore:
 
     def _meet_candidate(self, name: str, incarnation: int, now_s: float) -> None:
         if name == self.name and incarnation != self._incarnation:
-            # Harmless for safety, but both would lead: neither outranks the other.
+            # Safe, but both would lead: neither outranks the other.
             log.warning("another coordinator has the same name", coordinator=name)
         self.election.on_token_up(name, incarnation, now_s)
 
     def _meet_bridge(self, incarnation: int) -> None:
-        """Forget the road of an earlier bridge; the clock of a new one starts at 0."""
+        """Discard the road of an earlier bridge; the clock of a new one starts at 0."""
         if incarnation > self._bridge:
             self._bridge = incarnation
             self.census = None
@@ -221,7 +221,7 @@ class CoordinatorCore:
             self.operation.forget()
 
     def _is_of_this_road(self, message: RoadClock | Census) -> bool:
-        """Return whether a message is of the newest bridge, which it may be the first to show."""
+        """Return whether a message comes from the newest bridge, which it may introduce."""
         if message.bridge:
             self._meet_bridge(message.bridge)
         return message.bridge in (0, self._bridge)
@@ -249,9 +249,9 @@ class CoordinatorCore:
                 pass
 
     def _on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
-        """Take the state of a vehicle; None: nothing waits for it.
+        """Handle the state of a vehicle; None: nothing depends on it.
 
-        A leader knows a vehicle by its census; one that has left counts no more.
+        A leader ignores vehicles that its census does not list, for example those that have left.
         """
         if self.election.leading and self._formation_of.get(state.vehicle) == state.formation:
             return self.operation.on_state(state, now_s)
@@ -303,20 +303,20 @@ class CoordinatorCore:
             )
 
     def _has_watched(self, now_s: float) -> bool:
-        """Return whether this leader has missed nothing for an election time."""
+        """Return whether this leader has handled events without gaps for an election timeout."""
         return now_s >= self._awake_since_s + self.election.election_s
 
     def _new_ballot(self, above: Ballot | None) -> Ballot:
         self._seq += 1
         ballot = Ballot(self.election.term, self.name, self._incarnation, self._seq)
         if above is not None and ballot < above:
-            # Equal terms happen, too: two candidates that did not hear each other take the same.
+            # Terms can be equal if two candidates did not receive each other's heartbeats.
             self.election.raise_term(above.term)
             ballot = ballot._replace(term=self.election.term)
         return ballot
 
     def _effects(self, outcomes: Iterable[Effect | LogEntry]) -> Iterator[Effect]:
-        """Publish log entries; pass effects on."""
+        """Return outcomes as effects; log entries become messages."""
         for outcome in outcomes:
             if isinstance(outcome, LogEntry):
                 yield self._log(outcome.kind, **outcome.data)
@@ -343,7 +343,7 @@ class CoordinatorCore:
             times.append(self.election.started_s + self.election.election_s)
         else:
             times += self.operation.wakeups
-        # Never ask for a moment that has passed: the same timer would fire for ever.
+        # A time in the past would make the same timer fire forever.
         self._wakeup_s = max(min(time for time in times if time > now_s), now_s + 1e-3)
 
 

@@ -1,8 +1,9 @@
 """Leader election among coordinator candidates (rule L1).
 
-A candidate leads when it has heard no better-ranked one for the election time and is itself at
-least that old. Candidates are ranked by name. Election gives progress, never safety: two leaders
-at once are harmless, because vehicles promise one ballot at a time.
+A candidate leads when it has run for an election timeout (`network.election_s`) and has received
+nothing from a higher-ranked candidate for that long. Candidates are ranked by name. The election
+serves progress, not safety: two leaders at once are harmless, because vehicles promise one ballot
+at a time.
 """
 
 from __future__ import annotations
@@ -15,41 +16,42 @@ from attrs import define, field
 from laneweave.protocol.wire.messages import Heartbeat, Name
 
 NEWCOMER_FACTOR = 1.5
-"""A leader waits this many election times for a better-ranked newcomer to lead."""
+"""A leader waits this many election timeouts for a higher-ranked new candidate to lead."""
 MAX_TERM = 2**62
-"""Higher terms are ignored: following one would leave no room to count on."""
+"""Higher terms are ignored: 64-bit integers would leave no room for further terms."""
 
 
 @define
 class _Peer:
     incarnation: int
     heard_s: float
+    """Time of the last message from this process."""
     since_s: float
-    """When this process was first heard."""
+    """Time of the first message from this process."""
     leading: bool = False
 
 
 @define
 class Election:
-    """What one candidate knows of the others."""
+    """One candidate's view of the others, and whether it leads."""
 
     name: Name
     incarnation: int
     election_s: float
     started_s: float
     term: int = 0
-    """Highest term seen; the own term while leading."""
+    """Highest term seen; the candidate's own term while it leads."""
     leading: bool = False
     link_up: bool = True
     won: int = 0
-    """How often it has begun to lead."""
+    """Number of times that this candidate has begun to lead."""
     _peers: dict[str, _Peer] = field(factory=dict)
     _dead: set[tuple[str, int]] = field(factory=set)
 
     def on_heartbeat(self, heartbeat: Heartbeat, now_s: float) -> None:
-        """Record that a candidate is alive, unless its process is known to be gone.
+        """Record that a candidate is alive, unless its process is known to have ended.
 
-        A heartbeat that was still in flight when its sender's connection closed must not revive it.
+        A heartbeat that was in flight when its sender's connection closed must not revive it.
         """
         if heartbeat.coordinator == self.name:
             return
@@ -62,7 +64,7 @@ class Election:
         self._hear(heartbeat.coordinator, heartbeat.incarnation, now_s).leading = heartbeat.leading
 
     def on_token_up(self, coordinator: str, incarnation: int, now_s: float) -> None:
-        """Record that a process has connected, or has woken up from a pause."""
+        """Record that a process has connected, or resumed after a pause."""
         if coordinator == self.name:
             return
         self._dead.discard((coordinator, incarnation))
@@ -82,11 +84,11 @@ class Election:
         return peer
 
     def on_token_down(self, coordinator: str, incarnation: int) -> None:
-        """Forget a process that is gone.
+        """Remove a process that has ended.
 
-        When this candidate loses its own connection, every token vanishes, before or after the
-        news of it. While it knows that it is disconnected it concludes nothing; in the moment
-        before, two leaders are harmless.
+        When this candidate loses its own connection, all tokens vanish, shortly before or after it
+        notices the loss. While it is disconnected, vanished tokens are ignored; before it notices,
+        two leaders are harmless.
         """
         if not self.link_up or coordinator == self.name:
             return
@@ -96,18 +98,18 @@ class Election:
             del self._peers[coordinator]
 
     def on_link(self, *, up: bool, now_s: float) -> None:
-        """Count the own age anew: the own connection was lost or has come back."""
+        """Restart this candidate's own age: its connection was lost or restored."""
         self.link_up = up
         self.started_s = now_s
 
     def see_term(self, term: int) -> None:
-        """Remember the highest term seen."""
+        """Adopt a higher term; a leader continues one term above it."""
         if self.term < term <= MAX_TERM:
-            # A leader that was paused while another one led must not go on below its term.
+            # A leader that was paused while another one led must not continue below its term.
             self.term = term + 1 if self.leading else term
 
     def update(self, now_s: float) -> bool:
-        """Decide whether to lead now; return whether this has changed."""
+        """Decide whether to lead; return whether this has changed."""
         rival = any(
             name < self.name
             and now_s < peer.heard_s + self.election_s
@@ -124,25 +126,24 @@ class Election:
         return True
 
     def raise_term(self, above: int) -> None:
-        """Take a term above one that was seen on a vehicle (L3)."""
+        """Raise the term above that of a ballot reported by a vehicle (L3)."""
         self.term = max(self.term, above + 1)
 
     def living(self, now_s: float) -> Iterator[str]:
-        """Yield the other candidates heard within the election time."""
+        """Yield the other candidates with a message within the election timeout."""
         for name, peer in self._peers.items():
             if now_s < peer.heard_s + self.election_s:
                 yield name
 
     def _patience_s(self, peer: _Peer) -> float:
-        """Return until when a leader waits for a better-ranked newcomer to lead.
+        """Return the time until which a leader waits for a higher-ranked new candidate to lead.
 
-        A newcomer may not lead before it is old enough; stepping down at once would leave no
-        leader.
+        A new candidate may not lead at once; stepping down earlier would leave no leader.
         """
         return peer.since_s + NEWCOMER_FACTOR * self.election_s
 
     def next_change_s(self, now_s: float) -> float:
-        """Return when the next decision after `now_s` may be due without any message."""
+        """Return when the decision may next change after `now_s` without any message."""
         times = [
             time_s
             for name, peer in self._peers.items()

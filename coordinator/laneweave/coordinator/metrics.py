@@ -11,13 +11,13 @@ from laneweave.protocol.runtime.metrics import metric
 
 @frozen
 class CoordinatorMetrics:
-    """The election and the plans as one candidate sees them."""
+    """Election and plans as seen by one candidate."""
 
     ABOUT: ClassVar[str] = "coordinator"
 
     leading: bool = metric("1 while this candidate leads, else 0")
-    term: int = metric("Highest term that it has seen; its own while it leads")
-    candidates: int = metric("Candidates that it hears, itself included")
-    elections_total: int = metric("Times that this process has begun to lead")
-    plans_in_force: int = metric("Plans in force, of formations or of this slot, while it leads")
-    road_seconds: float = metric("Newest road time that it has heard")
+    term: int = metric("Highest term that it has seen; its own term while it leads")
+    candidates: int = metric("Candidates with recent heartbeats, itself included")
+    elections_total: int = metric("Number of times that this process has begun to lead")
+    plans_in_force: int = metric("Plans in force while it leads, of formations or of this slot")
+    road_seconds: float = metric("Newest road time that it has received")

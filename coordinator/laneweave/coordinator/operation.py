@@ -14,49 +14,48 @@ from laneweave.protocol.wire.topics import PLAN, PREPARE
 
 @frozen
 class LogEntry:
-    """Something worth a line in `events.jsonl`."""
+    """Kind and data of a line in `events.jsonl`."""
 
     kind: str
     data: dict[str, Any] = field(factory=dict)
 
 
 class Operation(Protocol):
-    """What the coordinator that leads does for the vehicles on the road.
+    """Leader's work for the vehicles on the road.
 
-    Times are road time (`t_s`) and the node's clock (`now_s`). Methods that return effects may
-    return log entries, too.
+    Times are road time (`t_s`) and the node's clock (`now_s`).
     """
 
     def forget(self) -> None:
-        """Forget everything: there is another road."""
+        """Discard all state: there is another road."""
 
     def take_over(self) -> None:
-        """Begin anew: this coordinator has begun to lead, or has stopped."""
+        """Reset because this coordinator has begun or stopped leading."""
 
     def on_clock(self, t_s: float, now_s: float) -> None:
-        """Take a message of the road's clock, leading or not."""
+        """Handle a message of the road's clock, also while not leading."""
 
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
-        """Take the state of a vehicle on the road; None: nothing waits for it."""
+        """Handle the state of a vehicle on the road; None: nothing depends on it."""
 
     def lead(
         self, census: Census, t_s: float, now_s: float, *, changed: bool
     ) -> Iterable[Effect | LogEntry]:
-        """Do what is due: let timers run out, order plans, send messages (again).
+        """Handle expired timers, order plans, and send or repeat messages.
 
         Args:
-            census: the newest one.
+            census: the newest census.
             t_s: road time.
             now_s: node clock.
-            changed: the census, the road time or the leader has changed since the last call.
+            changed: whether census, road time or leader have changed since the last call.
         """
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterable[Compute | LogEntry]:
-        """Take the result of a computation; one that is not waited for any more is dropped."""
+        """Handle the result of a computation; ignore results that are no longer needed."""
 
     @property
     def wakeups(self) -> list[float]:
-        """Times at which `lead` has something to do (node clock)."""
+        """Times at which `lead` must be called (node clock)."""
 
     @property
     def in_force(self) -> int:

@@ -24,7 +24,7 @@ from laneweave.protocol.wire.messages import Name
 log = structlog.get_logger(__name__)
 
 WARN_AFTER_S = 8.0
-"""Loading takes a second or two, compiling most of a minute."""
+"""Loading the planner takes 1 to 2 s, compiling it most of a minute."""
 
 
 def run_coordinator(
@@ -40,12 +40,12 @@ def run_coordinator(
     The planner is loaded first, so that a leader can plan at once.
 
     Args:
-        scenario: the road, and the deployment.
-        name: by which candidates are ranked.
-        wrap: may put faults before the core.
-        observe: is told where its numbers come from.
-        workers_at_once: start the worker processes of the planning service now, not with its first
-            request.
+        scenario: road and deployment.
+        name: name of the candidate; candidates are ranked by name.
+        wrap: wraps the core, to inject faults.
+        observe: registers the metrics source.
+        workers_at_once: whether the worker processes of the planning service start now, not with
+            its first request.
 
     Raises:
         BadInputError: no router answers at the scenario's endpoint.
@@ -62,10 +62,10 @@ def run_coordinator(
 
 @contextlib.contextmanager
 def _exits_on_sigterm() -> Iterator[None]:
-    """Let SIGTERM end the process with status 0: it has nothing to complete yet.
+    """Exit with status 0 on SIGTERM: there is nothing to complete yet.
 
-    An exception that a handler raises inside a callback of the compiler would only be printed. So
-    a thread waits for the byte that Python writes when a signal arrives.
+    An exception raised by a signal handler inside a callback of the compiler would only be printed,
+    so a thread waits for the byte that Python writes when a signal arrives.
     """
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
@@ -83,14 +83,14 @@ def _exits_on_sigterm() -> Iterator[None]:
     finally:
         signal.set_wakeup_fd(descriptor)
         signal.signal(signal.SIGTERM, handler)
-        os.close(writer)  # the thread reads nothing, and ends
+        os.close(writer)  # ends the thread
 
 
 @contextlib.contextmanager
 def _warns_when_slow() -> Iterator[None]:
     """Warn if the planner has to be compiled, not only loaded."""
     timer = threading.Timer(
-        WARN_AFTER_S, log.warning, ("compiling the planner: once, for a minute",)
+        WARN_AFTER_S, log.warning, ("compiling the planner once; this takes about a minute",)
     )
     timer.daemon = True
     timer.start()

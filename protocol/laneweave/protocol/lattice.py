@@ -1,8 +1,8 @@
 """The lattice: the relative coordinate system (RCS) of the paper, Section 2.2.
 
 One endless lattice moves at the formation speed v_F along the road. A cell is (column, lane):
-columns grow forwards, lanes to the left, both from any integer. Its pitch is d_F along the road
-and the lane width across. Its position follows from the road clock:
+columns increase in the direction of travel, lanes to the left; both may be any integer. The pitch
+of cells is d_F along the road and the lane width across. Positions follow from the road clock:
 
     s(cell, t) = v_F t + column d_F         (front bumper, road start at s = 0)
     y(cell)    = (lane + 1/2) lane width    (body centre, right road edge at y = 0)
@@ -21,7 +21,7 @@ Cell = tuple[int, int]
 """(column, lane)."""
 
 Mode = Literal[1, 2]
-"""Relative motion mode: a vehicle moves to four neighbouring cells, or to eight."""
+"""Relative motion mode: 1 allows moves to four neighbouring cells, 2 to eight."""
 
 WAIT: Cell = (0, 0)
 STRAIGHT: tuple[Cell, ...] = ((1, 0), (-1, 0), (0, 1), (0, -1))
@@ -29,26 +29,25 @@ OBLIQUE: tuple[Cell, ...] = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
 def displacements(mode: Mode) -> tuple[Cell, ...]:
-    """Return what a vehicle may do in one step, in the order in which planners break ties.
+    """Return the displacements that a vehicle may make in one step, in tie-breaking order.
 
-    Waiting comes first, then straight moves, then oblique ones: among equally good paths the one
-    with the lowest index is also the simplest.
+    Waiting comes first, then straight moves, then oblique ones, so that planners prefer the
+    simplest of equally good paths.
     """
     return (WAIT, *STRAIGHT) if mode == 1 else (WAIT, *STRAIGHT, *OBLIQUE)
 
 
 STRETCH_COLUMNS = 4
-"""Columns of a stretch; a vehicle receives the motions of its own and both adjacent ones."""
+"""Columns of a stretch; a vehicle receives motions of its own and both adjacent stretches."""
 
 PlannedMove = tuple[int, Cell, Cell]
-"""(step, from, to): in this step of its plan the vehicle moves to a neighbouring cell."""
+"""(step, from, to): move to a neighbouring cell in a step of a plan."""
 
 
 def footprint(origin: Cell, target: Cell) -> frozenset[Cell]:
-    """Return the cells that a move occupies while it is under way.
+    """Return the cells that a move occupies: both ends, and the corners of an oblique move.
 
-    Both end cells and, for an oblique move, both corner cells. A hold (origin equal to target)
-    occupies its own cell.
+    A vehicle that holds (origin equal to target) occupies its cell.
     """
     (column, lane), (to_column, to_lane) = origin, target
     return frozenset({origin, target, (column, to_lane), (to_column, lane)})
@@ -63,10 +62,7 @@ def territory(start_cells: Iterable[Cell], moves: Iterable[PlannedMove]) -> froz
 
 
 def stretch_of(column: int) -> int:
-    """Return the number of the stretch of columns that contains a column.
-
-    Vehicles publish their motions per stretch, and receive those of three stretches.
-    """
+    """Return the number of the stretch that contains a column."""
     return -column // STRETCH_COLUMNS
 
 

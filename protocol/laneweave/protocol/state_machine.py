@@ -1,9 +1,9 @@
-"""State machines that run from a table of transitions.
+"""State machines defined by tables of transitions.
 
-A machine is an object with a `phase`; its `RuleBook` is the table of its transitions, which name
-guards and actions as functions of (machine, message). The first transition whose event, source
-phase and guards fit is taken. docs/PROTOCOL.md is generated from the tables: the first line of a
-function's docstring is its meaning there.
+A machine is an object with a `phase`; its `RuleBook` is the table of its transitions, whose guards
+and actions are functions of (machine, message). The first transition whose event, source phase and
+guards match is taken. The tables of docs/PROTOCOL.md are generated from the rule books: the first
+line of a function's docstring is its description there.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Function = Callable[..., Any]
 
 @frozen
 class Transition:
-    """One row: on this event, in these phases, if all guards hold, do the actions."""
+    """Row of the table: on `event` in one of `sources`, if all guards hold, call the actions."""
 
     rule: str
     """Name of the rule in docs/PROTOCOL.md; several transitions may belong to one rule."""
@@ -28,21 +28,21 @@ class Transition:
     sources: tuple[Enum, ...]
     """Phases in which it may be taken."""
     guards: tuple[Function, ...]
-    """Must all return true."""
+    """Conditions that must all hold."""
     actions: tuple[Function, ...]
     """Called in this order."""
     target: Enum | None = None
-    """Phase afterwards; None: the phase stays."""
+    """Phase after the actions; None: unchanged."""
 
 
 class RuleBook:
-    """The transitions of one kind of machine."""
+    """Transition table of one kind of machine."""
 
     def __init__(self, table: Iterable[Transition]) -> None:
         """Index the transitions by event."""
         self.table = tuple(table)
         self._rows: dict[str, list[Transition]] = {}
-        """Few enough for each event to be searched; phases are slow to hash."""
+        """Transitions by event. Phases are slow to hash, so `take` searches these short lists."""
         for row in self.table:
             self._rows.setdefault(row.event, []).append(row)
 
@@ -52,7 +52,7 @@ class RuleBook:
         return {function for row in self.table for function in (*row.guards, *row.actions)}
 
     def take(self, machine: Any, event: str, message: Any) -> Transition | None:  # noqa: ANN401
-        """Take the first transition that fits and return it; None: nothing changes."""
+        """Take the first transition that matches and return it; None: there is none."""
         phase = machine.phase
         for row in self._rows.get(event, ()):
             if phase not in row.sources:

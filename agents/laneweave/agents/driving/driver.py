@@ -1,9 +1,9 @@
 """The driver: computes jerks for the motion controller from the cell to hold or the move to make.
 
-It lays the reference through the lattice points (`reference`) and tracks it (`tracker`). When a
-solution is not usable it sends no jerks: the motion controller continues with the last usable
-trajectory and its own fallbacks (`sim_bridge.bodies.motion_controller`). It knows nothing of the
-protocol.
+It makes a reference through the lattice points (`reference`) and tracks it (`tracker`). If a
+solution is not usable, it returns no jerks, and the motion controller continues with the last
+usable trajectory and its fallbacks (`sim_bridge.bodies.motion_controller`). The driver is
+independent of the protocol.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ Course = tuple[Cell, Cell, int, int]
 
 @define  # made at each tick: frozen ones take three times as long
 class Drive:
-    """What the motion controller executes from this tick on."""
+    """Output of one tick for the motion controller."""
 
     motion_end_tick: int
-    """End of the motion under way; 0 when the vehicle holds."""
+    """End of the current motion; 0 if the vehicle holds."""
     motion_origin: Cell
     motion_ticks: int
     """Duration of the move; 0: the vehicle settles in its cell, or holds."""
     jerks: bytes
-    """Little-endian float32 pairs (along, across) in m/s3, one for each tick of the horizon; empty
-    when there is nothing better than what is being executed."""
+    """Little-endian float32 pairs (along, across) [m/s3], one per tick of the horizon; empty if no
+    solution is usable."""
 
 
 @frozen
 class SolverStats:
-    """Counters and durations of tracking so far."""
+    """Counters and durations of tracking."""
 
     solves: int = 0
     unusable: int = 0
@@ -55,43 +55,43 @@ class SolverStats:
 
 
 class Driver(Protocol):
-    """Drives one vehicle; `TrackingDriver` in every real agent."""
+    """Drives one vehicle; agents use `TrackingDriver`, the fault search a cheaper driver."""
 
     def take_over(self, sense: Sense) -> None:
-        """Continue the motion that the motion controller executes."""
+        """Continue the current motion of the motion controller."""
 
     def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
-        """Begin a move of `ticks` ticks at this tick."""
+        """Begin a move of `ticks` ticks at a tick."""
 
     def at_rest(self, sense: Sense) -> bool:
-        """Return whether the motion under way has ended."""
+        """Return whether the current motion has ended."""
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
-        """Return what the motion controller executes from this tick on."""
+        """Return the motion and the jerks from this tick on."""
 
     def motion(self, tick: int) -> Course | None:
-        """Return the motion to publish at this tick, if one is due."""
+        """Return the motion to publish at a tick; None: none is due."""
 
     def on_motion(self, motion: Motion) -> None:
-        """Take the announced motion of another vehicle."""
+        """Handle the announced motion of another vehicle."""
 
     @property
     def solver_stats(self) -> SolverStats:
-        """Counters and durations of tracking so far."""
+        """Counters and durations of tracking."""
 
 
 class TrackingDriver:
-    """Drives by tracking a reference at each tick."""
+    """Driver that tracks a reference at each tick."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Make a driver that has no vehicle yet; `take_over` gives it one."""
+        """Make a driver without a reference; `take_over` must be called first."""
         self._scenario = scenario
         self._tracker = Tracker(scenario)
         self._reference: Reference | None = None
         self._goal: Cell = (0, 0)
         self._durations = scenario.move_durations
         self._ticks = 0
-        """Duration of the newest move."""
+        """Duration of the newest move [ticks]."""
         self._lattice = scenario.lattice
         self._vehicle = scenario.vehicle
         self._speed_mps = scenario.lattice.speed_mps
@@ -101,12 +101,12 @@ class TrackingDriver:
 
     @property
     def solver_stats(self) -> SolverStats:
-        """Counters and durations of tracking so far."""
+        """Counters and durations of tracking."""
         solve_ms = np.array(self._solve_ms, dtype=_FLOAT32).tobytes()
         return SolverStats(len(self._solve_ms), self._unusable, self._osqp_solves, solve_ms)
 
     def take_over(self, sense: Sense) -> None:
-        """Continue the motion that the motion controller executes."""
+        """Continue the current motion of the motion controller."""
         scenario = self._scenario
         self._goal = sense.hold_cell
         if sense.motion_origin == sense.hold_cell and sense.motion_end_tick > sense.tick + 3:
@@ -121,21 +121,18 @@ class TrackingDriver:
             self._reference = Reference.hold(scenario, sense.hold_cell)
 
     def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
-        """Begin a move of `ticks` ticks at this tick."""
+        """Begin a move of `ticks` ticks at a tick."""
         self._goal, self._ticks = move[2], ticks
         self._reference = Reference.move(self._scenario, move[1], move[2], tick, ticks)
 
     def at_rest(self, sense: Sense) -> bool:
-        """Return whether the time of the motion is over and the body is at its target.
-
-        A late body is still moving although the time of its motion is over.
-        """
+        """Return whether the time of the motion is over and the body has arrived."""
         return sense.tick >= self._current.end_tick and at_rest_in_cell(
             sense.state, self._lattice, self._goal, sense.t_s
         )
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
-        """Track the reference."""
+        """Track the reference; return the motion and the jerks from this tick on."""
         reference, tick = self._current, sense.tick
         state = commanded_state(sense.state, sense.setpoint, self._vehicle, self._speed_mps)
         gaps = self._surroundings.gaps(sense, state, self._goal[1])
@@ -149,7 +146,7 @@ class TrackingDriver:
         self._unusable += not result.usable
         self._osqp_solves += result.iterations > 0
         return Drive(
-            # A late body is still moving: an agent that takes over must know.
+            # A late body is still moving; an agent that takes over must know this.
             motion_end_tick=max(reference.end_tick, tick + 1) if moving else 0,
             motion_origin=reference.origin,
             motion_ticks=self._ticks if reference.origin != self._goal else 0,
@@ -166,7 +163,7 @@ class TrackingDriver:
         return reference.origin, self._goal, reference.start_tick, self._ticks
 
     def on_motion(self, motion: Motion) -> None:
-        """Take the announced motion of another vehicle."""
+        """Handle the announced motion of another vehicle."""
         self._surroundings.on_motion(motion)
 
     @property

@@ -1,8 +1,8 @@
-"""Announced motions: the moves that other vehicles have published.
+"""Announced motions: moves that other vehicles have published.
 
-A MOTION message names a move's cells and its start; the trajectory follows from the scenario. An
-announced motion is matched with a sensed neighbour by place and speed: sensors do not know names,
-and an announcement may be forged or no longer driven.
+A MOTION message contains the cells and the start of a move; the trajectory follows from the
+scenario. Announced motions are matched with sensed neighbours by position and speed, because
+sensors do not report names and an announcement may be forged or outdated.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from laneweave.protocol.wire.messages import Motion, Name
 Array = NDArray[np.float64]
 
 REPEAT_TICKS = 10
-"""A motion is sent when it begins and repeated at this interval."""
+"""Interval at which a motion is repeated after its beginning."""
 FRESH_TICKS = 3 * REPEAT_TICKS
-"""A motion that has not been repeated for longer is dropped."""
+"""Time without repetition after which a motion is dropped."""
 NEAR_M = 1.0
-"""Largest distance along the road between a neighbour and the motion that it is matched with."""
+"""Maximum distance along the road between a neighbour and a motion that matches."""
 NEAR_MPS = 1.0
-"""Largest difference of their speeds."""
+"""Maximum difference of their speeds."""
 TURNED_M = 0.4
-"""Bodies lag behind their references and turn: they may touch a lane this much earlier, and leave
-it this much later."""
+"""Additional distance at which a body touches a lane, because it lags behind its reference and
+turns."""
 
 
 @frozen(eq=False)
 class _MoveTable:
-    """The trajectory of all moves by the same columns and lanes in the same time."""
+    """Trajectory of all moves with the same displacement and duration."""
 
     ticks: int
 
@@ -70,24 +70,25 @@ class _MoveTable:
 
 @define(eq=False)
 class _Known:
-    """The newest announced motion of one vehicle."""
+    """Newest announced motion of one vehicle."""
 
     motion: Motion
     table: _MoveTable
     tick: int
-    """When it was sent last."""
+    """Tick at which it was last sent."""
     start_m: float
-    """Where it began, relative to the lattice."""
+    """Position of its origin, relative to the lattice."""
     low_m: float
-    """Its vehicle is sensed between here and `high_m` while it lasts, relative to the lattice."""
+    """Lowest position at which its vehicle can be sensed, relative to the lattice."""
     high_m: float
+    """Highest such position."""
 
 
 class Motions:
-    """The announced motions that one vehicle knows."""
+    """Announced motions that one vehicle has received."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Begin without any."""
+        """Begin without motions."""
         formation = scenario.formation
         self._scenario = scenario
         self._pitch_m = formation.gap_m
@@ -96,15 +97,15 @@ class Motions:
         self._durations = scenario.move_durations
         self._tables: dict[tuple[int, int, int], _MoveTable] = {}
         self.known: dict[Name, _Known] = {}
-        """By vehicle; may contain outdated ones until `advance` drops them."""
+        """Motions by vehicle; may include outdated ones until `advance` drops them."""
         self._places: list[tuple[float, float, _Known]] | None = None
-        """(`low_m`, `high_m`, motion) of each; None when `known` has changed."""
+        """(`low_m`, `high_m`, motion) of each motion; None after a change of `known`."""
         self._tick = 0
         self._expiry_tick = 0
-        """Tick at which the next one is outdated."""
+        """Tick at which the next motion becomes outdated."""
 
     def add(self, motion: Motion) -> None:
-        """Add a motion, unless a newer one of its vehicle is known or it is no possible move."""
+        """Add a motion if it is a possible move and no newer one of its vehicle is known."""
         known = self.known.get(motion.vehicle)
         if known is not None:
             newest = known.motion
@@ -127,17 +128,14 @@ class Motions:
         low_m, high_m = min(start_m, end_m) - NEAR_M, max(start_m, end_m) + NEAR_M
         self.known[motion.vehicle] = _Known(motion, table, motion.tick, start_m, low_m, high_m)
         self._places = None
-        self._expiry_tick = -1  # it may have ended already
+        self._expiry_tick = -1  # the motion may have ended already
 
     def advance(self, tick: int) -> None:
-        """Set the current tick and drop outdated motions.
-
-        Those are motions that have ended, were not repeated, or begin too far in the future.
-        """
+        """Set the current tick; drop motions that have ended, expired, or begin far in the future."""
         if self._tick <= tick < self._expiry_tick:
             self._tick = tick
             return
-        self._tick = tick  # a lower one is of another road, on which all are outdated
+        self._tick = tick  # a lower tick is that of another road
         outdated = [
             name
             for name, known in self.known.items()
@@ -163,30 +161,30 @@ class Motions:
         lanes: tuple[int, int],
         free: float,
     ) -> Array | None:
-        """Return the future positions of a sensed neighbour whose motion is known.
+        """Return the predicted positions of a sensed neighbour with an announced motion.
 
         Args:
-            lane: lane in which it is sensed, a relevant one.
+            lane: lane in which the neighbour is sensed, a relevant one.
             s_m: commanded position of its front bumper.
             speed_mps: its commanded speed.
             lanes: the first and the last relevant lane.
-            free: value of the positions after it has left these lanes.
+            free: value for positions after the neighbour has left these lanes.
 
         Returns:
-            Commanded positions (N + 1,), beginning with `s_m`; None: no motion matches.
+            Commanded positions (N + 1,), starting with `s_m`; None: no motion matches.
         """
         tick = self._tick
         x_m = s_m - self._advance_m * tick
         places = self._places
         if places is None:
-            # Tuples, since nearly all are skipped.
+            # Tuples are fast to skip, and nearly all are skipped.
             places = [(known.low_m, known.high_m, known) for known in self.known.values()]
             self._places = places
         for low_m, high_m, known in places:
             if not low_m <= x_m <= high_m:
                 continue
             table = known.table
-            k = max(tick - known.motion.begin_tick, 0)  # others may be a tick ahead
+            k = max(tick - known.motion.begin_tick, 0)  # the sender may be a tick ahead
             if (
                 -NEAR_M <= known.start_m + table.along_m[k] - x_m <= NEAR_M
                 and -NEAR_MPS <= table.speeds_mps[k] - speed_mps <= NEAR_MPS
@@ -201,5 +199,5 @@ class Motions:
 
 
 def _content(motion: Motion) -> tuple[int, int, Cell, Cell]:
-    """Return what does not change when a motion is repeated; the newer of two is greater."""
+    """Return the fields that repetitions share; those of a newer motion are greater."""
     return motion.incarnation, motion.begin_tick, motion.origin, motion.target

@@ -1,12 +1,11 @@
-"""Quadratic programs: the only module that imports OSQP; it checks every answer.
+"""Quadratic programs, solved with OSQP; only this module imports it.
 
     minimise    1/2 x' P x
     subject to  lower <= A x <= upper
 
-P and A are set up once; the bounds change between solutions. This module makes up for checks that
-OSQP 1.1 leaves to its caller: it accepts vectors of the wrong length, prints a message and uses old
-data when lower > upper, keeps a NaN in its warm start, and returns a finite x for an infeasible
-problem.
+P and A are set up once; the bounds change between solves. The module checks every solution, and
+what OSQP 1.1 does not: OSQP accepts vectors of the wrong length, prints a message and uses old data
+if lower > upper, keeps a NaN in its warm start, and returns a finite x for an infeasible problem.
 """
 
 from __future__ import annotations
@@ -27,17 +26,17 @@ SOLVED = 1
 SOLVED_INACCURATE = 2
 MAX_ITERATIONS = 7
 INTERRUPTED = 10
-"""OSQP has caught a SIGINT."""
+"""Status after OSQP has caught a SIGINT."""
 
 _INFINITY = float(ext_builtin.OSQP_INFTY)
 
 
 @frozen
 class QPSettings:
-    """Settings of OSQP. There is no time limit: equal inputs must give equal results."""
+    """Settings of OSQP, without a time limit: equal inputs must give equal results."""
 
     eps_abs: float = 1e-3
-    """Largest residual, primal (in the rows' units) and dual, at which an iterate is accepted."""
+    """Maximum primal (in units of the constraints) and dual residual of an accepted iterate."""
     max_iter: int = 400
     check_termination: int = 5
     """Iterations between two termination tests."""
@@ -50,38 +49,38 @@ class QPSettings:
     eps_infeasible: float = 1e-4
     """Accuracy of the certificate of infeasibility."""
     polishing: bool = False
-    """Whether a solution is refined on its active rows, usually to machine accuracy."""
+    """Whether solutions are refined on their active constraints, usually to machine accuracy."""
     tolerance: float = 2e-3
-    """A result that violates a row by more is not usable, whatever OSQP's status."""
+    """Maximum violation of a constraint by a usable result, independent of OSQP's status."""
 
 
 @frozen(eq=False)
 class QPScale:
     """Units in which OSQP receives a program, in addition to its own scaling (Ruiz).
 
-    They determine its speed: a row with a large factor is enforced with a large step size, and both
-    weight the residuals in the termination test.
+    They determine its speed: a constraint with a large factor is enforced with a large step size,
+    and both kinds of units weight the residuals in the termination test.
     """
 
-    rows: Vector
-    """Positive factors (m,) of rows and their bounds."""
+    constraints: Vector
+    """Positive factors (m,) of the constraints and their bounds."""
     unknowns: Vector
-    """Positive units (n,) of x; the gradient counts in them."""
+    """Positive units (n,) of x, also used for the gradient."""
 
 
 @frozen
 class QPResult:
-    """Result of one solution."""
+    """Result of one solve."""
 
     x: Vector
-    """The solution, shape (n,); meaningless unless `usable`."""
+    """Solution (n,); meaningless unless `usable`."""
     usable: bool
-    """Whether OSQP terminated and x keeps all rows within the tolerance."""
+    """Whether OSQP terminated and x satisfies all constraints within the tolerance."""
     status: int
-    """OSQP's status: 1 solved, 2 inaccurate, 7 out of iterations, others: no solution."""
+    """Status of OSQP: 1 solved, 2 inaccurate, 7 out of iterations, others: no solution."""
     iterations: int
     violation: float
-    """Largest violation of a row by x, in the row's unit; infinite without a solution."""
+    """Maximum violation of a constraint by x; infinite without a solution."""
 
 
 class QuadraticProgram:
@@ -93,7 +92,7 @@ class QuadraticProgram:
     def __init__(
         self,
         cost: Any,  # noqa: ANN401 - scipy.sparse has no types
-        rows: Any,  # noqa: ANN401
+        constraints: Any,  # noqa: ANN401
         lower: Vector,
         upper: Vector,
         settings: QPSettings | None = None,
@@ -103,26 +102,27 @@ class QuadraticProgram:
 
         Args:
             cost: P, sparse (n, n), symmetric and positive semidefinite; both triangles.
-            rows: A, sparse (m, n).
+            constraints: A, sparse (m, n).
             lower: lower bounds (m,); -inf for none.
             upper: upper bounds (m,); +inf for none.
-            settings: None for the defaults.
+            settings: settings of OSQP; None: the defaults.
             scale: units in which OSQP receives the program; None: those of the caller.
 
         Raises:
             ValueError: the matrices or vectors do not fit, are not finite, lower > upper, or a
                 scale is not positive.
         """
-        m, n = rows.shape
+        m, n = constraints.shape
         if cost.shape != (n, n):
-            raise ValueError(f"cost has shape {cost.shape}, rows have {n} columns")
+            raise ValueError(f"cost has shape {cost.shape}, but there are {n} unknowns")
         self._settings = settings or QPSettings()
         self._scale = _checked_scale(scale or QPScale(np.ones(m), np.ones(n)), m, n)
-        by_rows, by_unknowns = (sparse.diags(by) for by in (self._scale.rows, self._scale.unknowns))
+        by_constraints = sparse.diags(self._scale.constraints)
+        by_unknowns = sparse.diags(self._scale.unknowns)
         cost_csc = (by_unknowns @ cost @ by_unknowns).tocsc()
-        rows_csc = (by_rows @ rows @ by_unknowns).tocsc()
-        self._rows = rows_csc.tocsr()
-        for name, matrix in (("cost", cost_csc), ("rows", rows_csc)):
+        constraints_csc = (by_constraints @ constraints @ by_unknowns).tocsc()
+        self._constraints = constraints_csc.tocsr()
+        for name, matrix in (("cost", cost_csc), ("constraints", constraints_csc)):
             if not np.isfinite(matrix.data).all():
                 raise ValueError(f"{name} has entries that are not finite")
         self._lower, self._upper = np.zeros(m), np.zeros(m)
@@ -136,11 +136,11 @@ class QuadraticProgram:
         triangle.data[triangle.indices > columns] = 0.0
         triangle.eliminate_zeros()
         triangle.sort_indices()
-        rows_csc.sort_indices()
+        constraints_csc.sort_indices()
         self._solver = ext_builtin.OSQPSolver(
             ext_builtin.CSC(triangle),
             self._zero_x,
-            ext_builtin.CSC(rows_csc),
+            ext_builtin.CSC(constraints_csc),
             self._lower,
             self._upper,
             m,
@@ -164,7 +164,7 @@ class QuadraticProgram:
         solver = self._solver
         solver.solve()
         if int(solver.info.status_val) == INTERRUPTED:
-            # The signal was meant for the process.
+            # The signal was sent to the process, not to OSQP.
             signal.raise_signal(signal.SIGINT)
             solver.solve()
         info = solver.info
@@ -181,17 +181,17 @@ class QuadraticProgram:
         return result
 
     def reset(self) -> None:
-        """Discard the previous solution: the next one starts from zero."""
+        """Discard the previous solution, so that the next solve starts from zero."""
         self._solver.warm_start(self._zero_x, self._zero_y)
         if self._settings.adaptive_rho_interval:
             self._solver.update_rho(self._settings.rho)
 
     def _row_violation(self, scaled: Vector) -> float:
-        values = self._rows @ scaled
+        values = self._constraints @ scaled
         np.subtract(values, self._upper, out=self._above)
         np.subtract(self._lower, values, out=self._below)
         np.maximum(self._above, self._below, out=self._above)
-        self._above /= self._scale.rows
+        self._above /= self._scale.constraints
         # A NaN anywhere propagates and fails every comparison.
         return max(float(self._above.max()), 0.0) if self._above.size else 0.0
 
@@ -200,19 +200,22 @@ class QuadraticProgram:
         shape = self._lower.shape
         if lower.shape != shape or upper.shape != shape:
             raise ValueError(f"bounds have shapes {lower.shape}, {upper.shape}, expected {shape}")
-        np.multiply(lower, self._scale.rows, out=self._new_lower)
-        np.multiply(upper, self._scale.rows, out=self._new_upper)
+        np.multiply(lower, self._scale.constraints, out=self._new_lower)
+        np.multiply(upper, self._scale.constraints, out=self._new_upper)
         np.maximum(self._new_lower, -_INFINITY, out=self._new_lower)
         np.minimum(self._new_upper, _INFINITY, out=self._new_upper)
         if not (self._new_lower <= self._new_upper).all():
             row = int(np.argmin(self._new_lower <= self._new_upper))
-            raise ValueError(f"row {row}: bounds [{lower[row]}, {upper[row]}] contain no value")
+            raise ValueError(f"constraint {row}: no value in [{lower[row]}, {upper[row]}]")
         self._lower, self._new_lower = self._new_lower, self._lower
         self._upper, self._new_upper = self._new_upper, self._upper
 
 
 def _checked_scale(scale: QPScale, m: int, n: int) -> QPScale:
-    for name, factors, size in (("row", scale.rows, m), ("unknown", scale.unknowns, n)):
+    for name, factors, size in (
+        ("constraint", scale.constraints, m),
+        ("unknown", scale.unknowns, n),
+    ):
         if factors.shape != (size,) or not (np.isfinite(factors) & (factors > 0.0)).all():
             raise ValueError(f"{name} scale is not {size} positive numbers")
     return scale

@@ -1,7 +1,7 @@
-"""References: the motion on the road clock that the tracker follows.
+"""References: motions on the road clock, which the tracker follows.
 
-A `Reference` holds a cell, or makes one move between two neighbouring cells, or settles in a cell.
-A reference that would run into the vehicle ahead is replaced by a yielding path (`yield_behind`).
+A `Reference` holds a cell, makes one move to a neighbouring cell, or settles in a cell. Where it
+would run into the vehicle ahead, it is replaced by a yielding path (`yield_behind`).
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from laneweave.protocol.vehicle.motion import State, cell_state, integrate, limi
 Array = NDArray[np.float64]
 
 _BUFFER_M = 0.5
-"""The yielding path stays this much further behind than it must, so that gap rows are inactive."""
+"""Extra distance of the yielding path, so that gap constraints stay inactive."""
 _REACT_S = 1.0
-"""A gap that is violated now must be open again after this time, not earlier."""
+"""Time after which a gap that is violated now must be restored."""
 _BRAKE_SHARE = 0.9
 _ACCEL_SHARE = 0.6
-"""Shares of the vehicle's limits that a yielding path may use."""
+"""Fractions of the vehicle's limits that a yielding path may use."""
 _LATERAL_GAINS = (1.3, 3.6, 3.0)
 """Jerk per error of (y, v_y, a_y) [1/s3, 1/s2, 1/s]: poles near -0.6 and -1.2 +- 0.8i 1/s."""
 
 
 @define(eq=False)
 class Window:
-    """A reference from some tick on, for N ticks."""
+    """Part of a reference: N ticks from some tick on."""
 
     states: Array
-    """(N + 1, 6): s, v, a, y, v_y, a_y on the road [m, s]."""
+    """States (N + 1, 6): s, v, a, y, v_y, a_y on the road [m, s]."""
     jerks: Array
-    """(N, 2): j_s, j_y [m/s3]."""
+    """Jerks (N, 2): j_s, j_y [m/s3]."""
     bounds: ErrorBounds | None = None
-    """Admissible errors beside it, from the next tick on; None: not computed."""
+    """Admissible errors from the next tick on; None: not computed."""
     defect: Array | None = None
-    """c (N, 3) by which it violates the dynamics along the road; None: it obeys them."""
+    """Violation c (N, 3) of the dynamics along the road; None: none."""
 
 
 class Reference:
-    """Hold a cell, then follow at most one trajectory, then hold the cell where it ends."""
+    """Reference that holds a cell, follows at most one trajectory, then holds its last cell."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class Reference:
 
         Args:
             scenario: lattice, tick and horizon.
-            origin: the cell held before; the trajectory is relative to it.
+            origin: cell that is held before; the trajectory is relative to it.
             trajectory: the motion; None: the cell is held.
             start_tick: tick at which the trajectory begins.
         """
@@ -84,7 +84,7 @@ class Reference:
         self._ramp = self._advance_m * np.arange(n + 1)
         self._limits = scenario.vehicle
         self._bounds: ErrorBounds | None = None
-        """Of the whole reference: they do not depend on the road clock."""
+        """Bounds of the whole reference; they do not depend on the road clock."""
 
     @classmethod
     def hold(cls, scenario: Scenario, cell: Cell) -> Reference:
@@ -122,7 +122,7 @@ class Reference:
         return cls(scenario, cell, trajectory, tick)
 
     def window(self, tick: int) -> Window:
-        """Return the reference from `tick` on: states (N + 1, 6), jerks (N, 2, read-only)."""
+        """Return the part of the reference from `tick` on; its jerks are read-only."""
         n = self._horizon
         first = tick - self.start_tick + n
         first = min(max(first, 0), len(self._jerks) - n)
@@ -142,23 +142,22 @@ def yield_behind(
 ) -> None:
     """Replace the part of a reference that is beyond the yielding path, in place.
 
-    The gap rows of the program would suffice, but a reference that runs through the vehicle ahead
-    pulls against them with a force that grows with the distance, and the program takes ten times as
-    long. The yielding path is the gentlest constant deceleration from the vehicle's own state that
-    stays behind:
+    The gap constraints alone would suffice, but against a reference far beyond them the program
+    takes ten times as long. The yielding path is the gentlest constant deceleration from the
+    vehicle's own state that stays behind:
 
         d = max over t of 2 (s + v t - latest(t)) / t^2
 
-    It reaches d with limited jerk, ends at standstill, never goes backwards, and is left as soon as
-    the reference is behind it. What the jerk limit costs, the next tick's d compensates. Across
-    the road the vehicle follows the reference as well as it can while it slows down, without
-    sliding sideways. Along the road the result need not obey the dynamics where the path begins or
+    It reaches d with limited jerk, ends at standstill, never goes backwards, and applies until the
+    reference is behind it. The distance lost by limited jerk is compensated by d of the next tick.
+    Across the road the vehicle follows the reference as well as possible at its speed, without
+    sliding sideways. Along the road the result may violate the dynamics where the path begins or
     ends.
 
     Args:
         state: (s, v, a, y, v_y, a_y) of the vehicle now.
-        states: the reference (N + 1, 6).
-        jerks: its jerks (N, 2).
+        states: states of the reference (N + 1, 6).
+        jerks: jerks of the reference (N, 2).
         latest_m: upper bounds (N + 1,) of the front bumper; +inf for none.
         tick_s: length of the tick [s].
         limits: the vehicle's limits.

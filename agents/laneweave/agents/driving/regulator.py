@@ -1,9 +1,9 @@
 """The linear-quadratic regulator: the tracking problem without inequality constraints.
 
-Each axis of a vehicle is a triple integrator (position, speed, acceleration) whose jerk is constant
+Each axis of a vehicle is a triple integrator (position, speed, acceleration) with constant jerk
 during a tick. With the weights below, the jerks that minimise the cost over an infinite horizon are
-w_k = -K e_k, where K follows from the fixed point of the Riccati recursion. `Regulator` holds this
-solution for a whole horizon as one matrix, together with the values of all constraint rows.
+w_k = -K e_k, where K follows from the fixed point of the Riccati recursion. `Regulator` contains
+this solution for a whole horizon as one matrix, with the values of all constraints.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from laneweave.protocol.scenario.fields import Vehicle
 Array = NDArray[np.float64]
 
 WEIGHTS = np.diag((1.0, 0.4, 0.1))
-"""Of errors along the road in (s, v, a) [1/m2, s2/m2, s4/m2]."""
+"""Weights of errors along the road in (s, v, a) [1/m2, s2/m2, s4/m2]."""
 LATERAL_WEIGHTS = np.diag((2.0, 0.8, 0.2))
-"""Of errors across the road in (y, v_y, a_y)."""
+"""Weights of errors across the road in (y, v_y, a_y)."""
 JERK_WEIGHT = 0.02
 
 _AT_REST = np.array((0.5, 0.5, 0.5, 0.3, 0.3, 0.5))
-"""Errors of a vehicle that holds its cell: several times those of its sensors."""
+"""Assumed errors of a vehicle that holds its cell: several times those of its sensors."""
 
 
 def axis_matrices(h: float) -> tuple[Array, Array]:
@@ -50,7 +50,7 @@ def cost_to_go(weights: Array, h: float) -> Array:
 
 
 def _gain(cost: Array, h: float) -> Array:
-    """Return K (1, 3) of the tick before a cost to go (3, 3)."""
+    """Return the gain K (1, 3) of the tick before a cost to go (3, 3)."""
     transition, effect = axis_matrices(h)
     gain: Array = effect.T @ cost @ transition / (JERK_WEIGHT + effect.T @ cost @ effect)
     return gain
@@ -77,7 +77,7 @@ class Regulator:
                 inputs[k, axis, block] = (-gain @ error)[0]
                 error = (transition - effect @ gain) @ error
                 errors[k, block, block] = error
-        self.rows: Array = np.concatenate(
+        self.constraints: Array = np.concatenate(
             [
                 errors[:, 1],
                 errors[:, 2],
@@ -88,14 +88,14 @@ class Regulator:
                 errors[:, 0],
             ]
         )
-        """Matrix (8 N, 6) that maps e_0 to the values of all constraint rows except the dynamics,
-        in the order of `program.ConstraintBounds`."""
-        self.inputs = np.ascontiguousarray(self.rows[5 * ticks : 7 * ticks])
-        """Matrix (2 N, 6) that maps e_0 to the jerks."""
+        """Matrix (8 N, 6) from e_0 to the values of all constraints except the dynamics, in the
+        order of `tracking_problem.ConstraintBounds`."""
+        self.inputs = np.ascontiguousarray(self.constraints[5 * ticks : 7 * ticks])
+        """Matrix (2 N, 6) from e_0 to the jerks."""
         self._ticks = ticks
 
     def unconstrained_errors(self, limits: Vehicle, speed_mps: float) -> tuple[float, ...]:
-        """Return the largest errors (6,) at which no limit binds while a cell is held.
+        """Return the errors (6,) up to which no limit binds while the vehicle holds a cell.
 
         Args:
             limits: the vehicle's limits.
@@ -111,12 +111,12 @@ class Regulator:
         )
         jerks = np.tile([limits.max_jerk_mps3, limits.max_lateral_jerk_mps3], n)
         margin = np.concatenate([np.repeat(margins, n), jerks])
-        used = np.abs(self.rows[: 7 * n]) @ _AT_REST
+        used = np.abs(self.constraints[: 7 * n]) @ _AT_REST
         share = min(float((margin / np.maximum(used, 1e-12)).min()), 1.0)
         return tuple(share * each for each in _AT_REST.tolist())
 
 
 @cache
 def shared_regulator(ticks: int, tick_s: float, slip: float) -> Regulator:
-    """Return the regulator that all vehicles of a process share."""
+    """Return the regulator, shared by all vehicles of a process."""
     return Regulator(ticks, tick_s, slip)

@@ -1,11 +1,10 @@
-"""Surroundings: the gaps that vehicles ahead and behind leave, as a vehicle's own sensors see them.
+"""Surroundings: free positions between the sensed vehicles ahead and behind.
 
-Neighbours count in the lanes that the body touches and in the lane that it enters. Each is
-predicted at constant speed for `SENSED_S`. A neighbour at the place of an announced motion
-(`motions`) is also predicted along that motion's trajectory, starting where it is sensed. At each
-tick the nearer prediction counts, so an announcement can only add to what is sensed. All positions
-are commanded ones (`protocol.vehicle.motion`): bodies of equal lag keep the distances that their
-commanded states keep.
+Relevant are neighbours in the lanes that the body touches and in the lane that it enters. They are
+predicted at constant speed for `SENSED_S`. A neighbour that matches an announced motion (`motions`)
+is also predicted along its trajectory, from the sensed position on. The nearer prediction of each
+tick counts, so an announcement cannot relax the limits from sensors. All positions are commanded
+ones (`protocol.vehicle.motion`): bodies of equal lag keep the distances of their commanded states.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from laneweave.protocol.wire.messages import Motion, Neighbour, Sense
 Array = NDArray[np.float64]
 
 SENSED_S = 1.0
-"""Time for which a sensed neighbour is predicted: speeds change."""
+"""Time for which a neighbour is predicted at its sensed speed."""
 
 
 _Sensed = tuple[int, float, float]
@@ -35,12 +34,12 @@ _Sensed = tuple[int, float, float]
 
 @frozen
 class _Side:
-    """Ahead or behind."""
+    """Direction of neighbours: ahead or behind."""
 
     sign: float
     nearest: Callable[[Any, Any], Any]
     free: float
-    """Limit where there is no neighbour."""
+    """Limit without a neighbour."""
 
 
 _AHEAD = _Side(1.0, np.minimum, np.inf)
@@ -60,23 +59,23 @@ class Surroundings:
         self._lag_s = limits.actuator_lag_s
         self._speed_mps = scenario.formation.speed_mps
         self._min_gap_m = scenario.tracking.min_gap_m
-        # How far acceleration or braking can take this vehicle during the prediction.
+        # Distances that this vehicle can gain or lose during the prediction.
         self._gain_m = limits.max_accel_mps2 * SENSED_S**2 / 2.0
         self._loss_m = -limits.min_accel_mps2 * SENSED_S**2 / 2.0
         self._times_s = np.arange(scenario.horizon_ticks + 1) * scenario.runtime.tick_s
         self._beyond = self._times_s > SENSED_S + 1e-9
 
     def on_motion(self, motion: Motion) -> None:
-        """Take the announced motion of another vehicle."""
+        """Handle the announced motion of another vehicle."""
         self._motions.add(motion)
 
     def gaps(self, sense: Sense, state: State, lane: int) -> Gaps:
-        """Return the gaps that neighbours leave, without neighbours too far away to matter.
+        """Return the gaps between neighbours, ignoring those out of reach.
 
         Args:
-            sense: measurements of the sensors.
+            sense: sensor measurements.
             state: commanded state of this vehicle.
-            lane: the lane that it is in or enters.
+            lane: lane that it is in or enters.
         """
         first, last = self._lattice.lanes_touched(sense.state[3], self._width_m)
         touched = first, last, lane
@@ -107,16 +106,16 @@ class Surroundings:
     ) -> tuple[list[_Sensed], list[_Sensed]]:
         """Return neighbours in relevant lanes (if motions are known), and those of them in reach.
 
-        It runs twice at each tick of each vehicle, and mostly no neighbour is in reach.
+        It is called twice per tick and vehicle; usually no neighbour is in reach.
 
         Args:
-            sense: measurements of the sensors.
+            sense: sensor measurements.
             state: commanded state of this vehicle.
-            others: the neighbours on one side.
+            others: the neighbours in one direction.
             touched: the first and the last lane that the body touches; the lane that it enters.
             sign: 1 ahead, -1 behind.
-            change_m: how far acceleration can take the vehicle towards them during the prediction;
-                negative behind.
+            change_m: distance by which acceleration can bring the vehicle closer to them during
+                the prediction; negative behind.
         """
         first, last, lane = touched
         motions_known, lag_s = self._motions.known, self._lag_s
@@ -124,13 +123,13 @@ class Surroundings:
         near: list[_Sensed] = []
         for other in others:
             if first <= other.lane <= last or other.lane == lane:
-                # From its position to its commanded position.
+                # Difference between position and commanded position.
                 lag_m = lag_s * (other.speed_mps - self._speed_mps)
                 front_m = sense.state[0] + sign * (other.gap_m - self._min_gap_m) + lag_m
                 other_mps = max(other.speed_mps + lag_s * other.accel_mps2, 0.0)
                 if motions_known:
                     relevant.append((other.lane, front_m, other_mps))
-                # Largest now or at the end of the prediction, since it is convex in time.
+                # The maximum is now or at the end of the prediction, by convexity in time.
                 closer_m = (state[1] - other_mps) * SENSED_S + change_m
                 if sign * closer_m < 0.0:
                     closer_m = 0.0
@@ -153,12 +152,12 @@ class Surroundings:
         side: _Side,
         lanes: tuple[int, int],
     ) -> Array | None:
-        """Return limits that also respect the announced motions of neighbours.
+        """Return limits that include the announced motions of neighbours.
 
         Args:
-            positions: limits of the prediction at constant speed; None: there are none.
+            positions: limits from the prediction at constant speed; None: there are none.
             others: sensed neighbours.
-            side: where they are.
+            side: direction of the neighbours.
             lanes: the first and the last relevant lane.
         """
         apart_m = side.sign * (self._length_m + self._min_gap_m)

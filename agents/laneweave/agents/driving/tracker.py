@@ -1,19 +1,19 @@
 """The tracker: jerks that keep the vehicle on its reference, by model predictive control.
 
-At each tick it solves the quadratic program of `program` for the commanded state
-(`protocol.vehicle.motion`), so the lag of the actuators is compensated.
+At each tick it solves the quadratic program of `tracking_problem` for the commanded state
+(`protocol.vehicle.motion`), which compensates the lag of the actuators.
 
-**The fast path.** Without active inequality rows the program's solution is that of the regulator,
-w_k = -K e_k: one precomputed matrix times e_0, and so are the values of all rows. Where this keeps
-every row it is the solution, and OSQP does not run, unless `tracking.always_solve` asks for it.
+**Fast path.** Without active inequality constraints, the solution is that of the regulator,
+w_k = -K e_k. Jerks and values of all constraints are one precomputed matrix times e_0. If they
+satisfy all constraints, OSQP does not run, unless `tracking.always_solve` is set.
 
-A reference that runs into the vehicle ahead yields (`reference.yield_behind`). Far from the
-reference (for example after an emergency brake), or when the program has no usable answer, the hold
-law's path back is the reference: zero is then a solution whatever the state, since bounds are
-widened to admit it. Both keep the errors small, and with them OSQP fast.
+**Other references.** A reference that runs into the vehicle ahead yields
+(`reference.yield_behind`). Far from the reference (for example after an emergency brake), or
+without a usable solution, the hold law's path to the reference replaces it, and the bounds are
+widened so that zero is a solution. Both keep errors small and OSQP fast.
 
-The solver's answer is checked: the jerks that are returned have been integrated exactly and held
-within the limits by `limited_jerk`, tick by tick where that is needed.
+Solutions are checked: the returned jerks have been integrated exactly, and limited by
+`limited_jerk` tick by tick where necessary.
 """
 
 from __future__ import annotations
@@ -34,34 +34,34 @@ from laneweave.protocol.vehicle.motion import State, hold_law, integrate, limite
 Array = NDArray[np.float64]
 
 _NEAR = (8.0, 4.0, 6.0, 3.0, 2.5, 6.0)
-"""Largest errors of (s, v, a, y, v_y, a_y) at which the reference is tracked as it is; none of them
-takes the vehicle as far as `program.FAR_M`."""
+"""Maximum errors of (s, v, a, y, v_y, a_y) at which the reference is tracked directly, small
+compared with `tracking_problem.FAR_M`."""
 _LIMIT_TOLERANCE = 1e-3
-"""Jerks whose states exceed a limit by more are limited tick by tick [m/s, m/s2]."""
+"""Maximum excess over a limit [m/s, m/s2]; beyond it, jerks are limited tick by tick."""
 
 
 @define(eq=False)  # made at each tick: frozen ones take three times as long
 class TrackResult:
-    """The answer of one tick."""
+    """Result of one tick."""
 
     jerk: Array
-    """Jerks (N, 2) from now on [m/s3], within the vehicle's limits as far as the state allows; zero
+    """Jerks (N, 2) from now on [m/s3], within the vehicle's limits if the state allows this; zero
     unless `usable`."""
     usable: bool
-    """Whether to drive by `jerk`; otherwise continue with the last usable answer."""
+    """Whether `jerk` may be executed; otherwise the last usable result continues."""
     iterations: int
-    """OSQP's; 0 on the fast path."""
+    """Iterations of OSQP; 0 on the fast path."""
     solve_ms: float
-    """CPU time of the calling thread [ms]; the first tick that needs OSQP sets it up."""
+    """CPU time of the calling thread [ms], including the set-up of OSQP at its first use."""
     violation: float
-    """Largest violation of a row by the solver's answer, before limits were applied."""
+    """Maximum violation of a constraint by the solver's solution, before `limited_jerk`."""
 
 
 class Tracker:
-    """Tracks references. One object per vehicle."""
+    """Tracks the references of one vehicle."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Prepare the program; `tracking.always_solve` turns the fast path off."""
+        """Prepare the program, and the fast path unless `tracking.always_solve` is set."""
         n = self._n = scenario.horizon_ticks
         self._tick_s = scenario.runtime.tick_s
         self._axis = axis_matrices(self._tick_s)
@@ -69,14 +69,14 @@ class Tracker:
         self._jerk_limits = np.array([limits.max_jerk_mps3, limits.max_lateral_jerk_mps3])
         self._shapes = (n + 1, 6), (n, 2)
         self._kept = np.empty(14 * n, dtype=np.bool_)
-        """Whether bounds are kept on the fast path, and the blocks, as views."""
+        """Buffer for comparisons with bounds on the fast path; its blocks follow as views."""
         kept = self._kept
         self._kept_low, self._kept_high = kept[: 10 * n].reshape(2, 5, n)
         self._kept_low_jerk, self._kept_high_jerk = kept[10 * n :].reshape(2, n, 2)
         self.program = TrackingProgram(scenario)
         self._regulator = None
         self.unconstrained_errors: tuple[float, ...] = ()
-        """Errors so small that no row binds while a cell is held."""
+        """Errors up to which no constraint binds while a cell is held."""
         if scenario.tracking.always_solve:
             self.program.set_up()
         else:
@@ -86,7 +86,7 @@ class Tracker:
             )
 
     def solve(self, state: State, window: Window, gaps: Gaps = NO_GAPS) -> TrackResult:
-        """Return the jerks that bring a vehicle from its commanded state to its reference.
+        """Return the jerks that take a vehicle from its commanded state to its reference.
 
         Raises:
             ValueError: a shape is wrong, a number is NaN or the state not finite.
@@ -129,15 +129,15 @@ class Tracker:
         return TrackResult(jerk, usable, iterations, elapsed_ms, result.violation)
 
     def rest(self, state: State, goal: State) -> TrackResult | None:
-        """Return the jerks that keep a vehicle in its cell when no other vehicle is near.
+        """Return the jerks that keep a vehicle in its cell while no other vehicle is near.
 
-        They equal those of `solve` and take a fraction of its time: this close to the cell no row
-        can bind. None: the commanded state is not this close to `goal`, rest in the cell.
+        They equal those of `solve`, but need less time: so close to the cell no constraint can
+        bind. None: the commanded state is not close enough to `goal`, rest in the cell.
         """
         if self._regulator is None:
             return None
         start = time.thread_time()
-        # Written out, since it runs at each tick of each vehicle.
+        # Unrolled, since it runs at each tick of each vehicle.
         max_s, max_v, max_a, max_y, max_vy, max_ay = self.unconstrained_errors
         s = state[0] - goal[0]
         if not -max_s <= s <= max_s:
@@ -162,12 +162,12 @@ class Tracker:
         return TrackResult(jerk, True, 0, (time.thread_time() - start) * 1e3, 0.0)
 
     def _regulated(self, error: State, target: Window, gaps: Gaps) -> Array | None:
-        """Return the jerks (N, 2) of the unconstrained solution if it keeps all rows."""
+        """Return the jerks (N, 2) of the unconstrained solution if all constraints hold."""
         if self._regulator is None or target.defect is not None:
             return None
         bounds = target.bounds or ErrorBounds.beside(target.states[1:], target.jerks, self._limits)
         n = self._n
-        values = self._regulator.rows.dot(error)
+        values = self._regulator.constraints.dot(error)
         free, free_jerk = values[: 5 * n].reshape(5, n), values[5 * n : 7 * n].reshape(n, 2)
         np.less_equal(bounds.low, free, self._kept_low)
         np.less_equal(free, bounds.high, self._kept_high)
@@ -185,7 +185,7 @@ class Tracker:
         return answer
 
     def _yielding(self, state: State, window: Window, latest: Array | None) -> Window:
-        """Return the reference as it is, or a yielding path if it violates a gap."""
+        """Return the reference, with a yielding path if it violates a gap."""
         if latest is None or not (window.states[:, 0] > latest).any():
             return window
         states, jerks = window.states.copy(), window.jerks.copy()
@@ -196,7 +196,7 @@ class Tracker:
         return Window(states, jerks, None, defect)
 
     def _path_back(self, state: State, states: Array) -> Window:
-        """Return the hold law's path from a state to the states of a reference."""
+        """Return the path of the hold law from a state to a reference."""
         path, inputs = [state], []
         for row in states[:-1].tolist():
             jerk = hold_law(path[-1], tuple(row), self._limits, self._tick_s)
@@ -205,7 +205,7 @@ class Tracker:
         return Window(np.array(path), np.array(inputs))
 
     def _limited(self, state: State, jerk: Array) -> Array:
-        """Return jerks (N, 2) that keep the limits exactly, as far as the state allows."""
+        """Return jerks (N, 2) that keep the limits exactly, if the state allows this."""
         clipped = np.clip(jerk, -self._jerk_limits, self._jerk_limits)
         if self._excess(state, clipped) <= _LIMIT_TOLERANCE:
             return clipped
@@ -217,7 +217,7 @@ class Tracker:
         return jerk
 
     def _excess(self, state: State, jerk: Array) -> float:
-        """Return the largest excess over a limit of the states that follow from jerks (N, 2)."""
+        """Return the maximum excess over a limit of the states that follow from jerks (N, 2)."""
         limits, h = self._limits, self._tick_s
         rate = np.cumsum(jerk, axis=0)
         rate *= h

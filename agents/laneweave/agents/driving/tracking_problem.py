@@ -1,4 +1,4 @@
-"""The tracker's quadratic program: costs, constraint rows and their bounds.
+"""The tracker's quadratic program: costs, constraints and their bounds.
 
 In error coordinates z = z_ref + e, u = u_ref + w, over N ticks of h seconds:
 
@@ -10,9 +10,9 @@ In error coordinates z = z_ref + e, u = u_ref + w, over N ticks of h seconds:
                 earliest_k <= s_k - g_k <= latest_k            vehicles behind and ahead (`Gaps`)
 
 c is zero for a reference that obeys the dynamics. S is the cost to go of the unconstrained problem.
-On the reference the solution is zero, which the solver's tolerance cannot spoil; in absolute
-coordinates the tolerance leaves 1.6 m/s3 of noise on the jerk. The slack g has a quadratic penalty:
-an exact (linear) one takes four times as long. All matrices are set up once; a tick changes bounds.
+On the reference the solution is exactly zero; in absolute coordinates, the solver's tolerance would
+leave noise of 1.6 m/s3 on the jerk. The slack g has a quadratic penalty: an exact (linear) one takes
+four times as long. All matrices are set up once; each tick changes only bounds.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from laneweave.protocol.vehicle.motion import State, integrate
 Array = NDArray[np.float64]
 
 _GAP_WEIGHT = 10.0
-# A fixed rho leaves nothing behind but the warm start, so a reset is complete.
+# With a fixed rho the warm start is the only state, so a reset is complete.
 SETTINGS = QPSettings(
     eps_abs=6e-3,
     max_iter=100,
@@ -50,23 +50,23 @@ SETTINGS = QPSettings(
     tolerance=2e-2,
 )
 _GAP_SCALE, _JERK_SCALE = 20.0, 0.4
-"""Row scales for OSQP; other rows have 1. With 1 for all, active gap rows take 300 iterations."""
+"""Scales of constraints for OSQP; all others have 1. With 1, active gaps take 300 iterations."""
 _STATE_SCALE = 0.3
-"""Scale of states and slacks for OSQP; jerks have 1, since their gradient must vanish."""
+"""Scale of states and slacks for OSQP; jerks have 1, because their gradient must vanish."""
 FAR_M = 1e4
-"""Bound of a gap row without a vehicle: finite, so that OSQP keeps the row's type and factors."""
+"""Bound of a gap without a vehicle: finite, so that OSQP keeps the constraint's type."""
 _MAX_PUSH_M = 1.0
-"""Vehicles behind push a vehicle at most this far ahead of its reference: they can brake, too."""
+"""Maximum distance ahead of its reference to which vehicles behind push a vehicle."""
 _SPEED_TOLERANCE_MPS = 0.3
 _SLIP_TOLERANCE_MPS = 0.1
-"""By how much OSQP's prediction may violate these limits near standstill."""
+"""Maximum violation of these limits by OSQP's prediction near standstill."""
 
 
 @frozen(eq=False)
 class Gaps:
-    """Positions that other vehicles leave free for the front bumper, now and at N ticks [m].
+    """Bounds on the front bumper set by other vehicles, now and at N ticks [m].
 
-    Commanded positions, each (N + 1,); infinite where there is no vehicle.
+    Commanded positions (N + 1,), infinite at ticks without a bound.
     """
 
     earliest: Array | None = None
@@ -78,7 +78,7 @@ class Gaps:
         """Check the shapes for a horizon of N ticks.
 
         Raises:
-            ValueError: one is not (N + 1,).
+            ValueError: a shape is not (N + 1,).
         """
         shape = (ticks + 1,)
         for name, positions in (("earliest", self.earliest), ("latest", self.latest)):
@@ -91,25 +91,25 @@ NO_GAPS = Gaps()
 
 @define(eq=False)
 class ErrorBounds:
-    """Smallest and largest errors beside a reference at which no limit is exceeded, for n ticks.
+    """Bounds on the errors relative to a reference within which no limit is exceeded, for n ticks.
 
-    Unlike the program's bounds they have no tolerance near standstill: the fast path of the
-    tracker is exact.
+    Unlike the program's bounds they have no tolerance near standstill, so that the fast path of
+    the tracker is exact.
     """
 
     low: Array
-    """(5, n): of v, a, a_y, v_y - slip v and v_y + slip v; -inf for none."""
+    """Lower bounds (5, n) of v, a, a_y, v_y - slip v and v_y + slip v; -inf for none."""
     high: Array
-    """Likewise; +inf for none."""
+    """Upper bounds (5, n); +inf for none."""
     low_jerk: Array
-    """(n, 2)."""
+    """Lower bounds (n, 2) of the jerks."""
     high_jerk: Array
 
     @classmethod
     def beside(cls, states: Array, jerks: Array, limits: Vehicle) -> ErrorBounds:
-        """Return the bounds beside states (n, 6) and jerks (n, 2).
+        """Return the bounds for a reference with states (n, 6) and jerks (n, 2).
 
-        The tolerance is added and subtracted again, so that both kinds of bounds round alike.
+        Adding and subtracting the tolerance makes the rounding that of the program's bounds.
         """
         _, speed, accel, _, slip, lateral_accel = states.T
         low, high = np.full((5, len(states)), -np.inf), np.full((5, len(states)), np.inf)
@@ -136,10 +136,10 @@ class ErrorBounds:
 
 
 class ConstraintBounds:
-    """One bound vector (14 N,) and views of its blocks."""
+    """Bounds (14 N,) of all constraints on one side, with views of its blocks."""
 
     def __init__(self, n: int) -> None:
-        """Begin with zeros for N ticks."""
+        """Initialise with zeros for N ticks."""
         self.all = np.zeros(14 * n)
         self.dynamics = self.all[: 6 * n].reshape(n, 6)
         self.speed = self.all[6 * n : 7 * n]
@@ -153,10 +153,10 @@ class ConstraintBounds:
 
 
 class TrackingProgram:
-    """The program of one vehicle: bounds that change at each tick, and OSQP to solve it."""
+    """The quadratic program of one vehicle; its bounds change at each tick."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Prepare the bounds; OSQP is set up when it is needed first.
+        """Prepare the bounds; OSQP is set up at its first use.
 
         Most vehicles never need OSQP, and its set-up takes as long as hundreds of ticks.
         """
@@ -168,19 +168,19 @@ class TrackingProgram:
         )
         self.cost = _cost(n, self._tick_s)
         """P, sparse, over x = (e_1 .. e_N, w_0 .. w_N-1, g_1 .. g_N)."""
-        self.rows = _rows(n, self._tick_s, self._limits.max_slip_ratio)
-        """A, sparse; the first 6 N rows are the dynamics."""
+        self.constraints = _constraints(n, self._tick_s, self._limits.max_slip_ratio)
+        """A, sparse; the first 6 N constraints are the dynamics."""
         self.low, self.high = _initial_bounds(n)
         self._gaps = NO_GAPS
         self._qp: QuadraticProgram | None = None
         self._stale = False
 
     def discard_solution(self) -> None:
-        """Do not start the next solution from the previous one: the situation has changed."""
+        """Do not start the next solve from the previous solution, since the situation has changed."""
         self._stale = True
 
     def solve(self) -> QPResult:
-        """Solve with the bounds that were written last."""
+        """Solve with the bounds written last."""
         qp = self._qp
         if qp is None:
             qp = self.set_up()
@@ -191,11 +191,11 @@ class TrackingProgram:
         return qp.solve()
 
     def set_up(self) -> QuadraticProgram:
-        """Set OSQP up with initial bounds, so that the result does not depend on the moment."""
+        """Set OSQP up with initial bounds, so that results do not depend on the time of the set-up."""
         low, high = _initial_bounds(self._n)
         self._qp = QuadraticProgram(
             self.cost,
-            self.rows,
+            self.constraints,
             low.all,
             high.all,
             settings=SETTINGS,
@@ -214,10 +214,10 @@ class TrackingProgram:
 
         Args:
             error: e_0.
-            states: the reference (N + 1, 6).
-            jerks: its jerks (N, 2).
-            defect: c (N, 3) of the axis along the road; None for zero.
-            gaps: positions that other vehicles leave free.
+            states: states of the reference (N + 1, 6).
+            jerks: jerks of the reference (N, 2).
+            defect: c (N, 3) of the axis along the road; None: zero.
+            gaps: bounds set by other vehicles.
         """
         low, high, limits = self.low, self.high, self._limits
         low.dynamics[:] = 0.0
@@ -244,11 +244,11 @@ class TrackingProgram:
         np.negative(low.jerk, out=low.jerk)
 
     def write_gaps(self, states: Array, gaps: Gaps) -> None:
-        """Write the bounds of the gap rows for a reference (N + 1, 6)."""
+        """Write the bounds of the gap constraints for a reference (N + 1, 6)."""
         low, high = self.low.gap, self.high.gap
         if gaps.latest is not None:
             np.subtract(gaps.latest[1:], states[1:, 0], out=high)
-            # Where even the yielding path violates a gap, the row asks for the path only.
+            # Where even the yielding path violates a gap, the bound is that path.
             high.clip(0.0, FAR_M, out=high)
         elif self._gaps.latest is not None:
             high[:] = FAR_M
@@ -261,24 +261,24 @@ class TrackingProgram:
         self._gaps = gaps
 
     def admit_zero(self) -> None:
-        """Widen the limits' bounds so that zero, the reference itself, is a solution."""
+        """Widen the bounds of the limits so that zero, the reference itself, is a solution."""
         np.minimum(self.low.limits, 0.0, out=self.low.limits)
         np.maximum(self.high.limits, 0.0, out=self.high.limits)
 
 
 def program_scale(n: int) -> QPScale:
-    """Return the units in which OSQP solves the program over n ticks fast."""
-    rows = ConstraintBounds(n)
-    rows.all[:] = 1.0
-    rows.jerk[:] = _JERK_SCALE
-    rows.gap[:] = _GAP_SCALE
+    """Return the units in which OSQP quickly solves the program over n ticks."""
+    factors = ConstraintBounds(n)
+    factors.all[:] = 1.0
+    factors.jerk[:] = _JERK_SCALE
+    factors.gap[:] = _GAP_SCALE
     unknowns = np.full(9 * n, _STATE_SCALE)
     unknowns[6 * n : 8 * n] = 1.0
-    return QPScale(rows.all, unknowns)
+    return QPScale(factors.all, unknowns)
 
 
 def _initial_bounds(n: int) -> tuple[ConstraintBounds, ConstraintBounds]:
-    """Return lower and upper bounds in which those that never change are set."""
+    """Return lower and upper bounds with those that never change."""
     low, high = ConstraintBounds(n), ConstraintBounds(n)
     low.slip_left[:] = -np.inf
     high.slip_right[:] = np.inf
@@ -287,8 +287,8 @@ def _initial_bounds(n: int) -> tuple[ConstraintBounds, ConstraintBounds]:
 
 
 @cache
-def _rows(n: int, h: float, slip: float) -> Any:  # noqa: ANN401 - scipy.sparse has no types
-    """Return A, rows in the order of `ConstraintBounds`."""
+def _constraints(n: int, h: float, slip: float) -> Any:  # noqa: ANN401 - scipy.sparse has no types
+    """Return A, with constraints in the order of `ConstraintBounds`."""
     transition, effect = axis_matrices(h)
     eye = sparse.eye(n)
     shift = sparse.diags([np.ones(n - 1)], [-1], shape=(n, n))

@@ -1,21 +1,21 @@
 """Trajectories between cells: minimum-jerk motions that keep every limit of the vehicle.
 
-In the moving frame a vehicle goes from rest to rest. A minimum-jerk quintic over one cell needs
-6 m/s2 in 3.8 s, more than the vehicle can do. A move is therefore the solution of the quadratic
-program over n ticks of h seconds
+In the moving frame a vehicle goes from rest to rest. A minimum-jerk quintic over one cell in 3.8 s
+needs 6 m/s2, more than the vehicle's limit. A move is therefore the solution of a quadratic program
+over n ticks of h seconds,
 
     minimise    sum_k j_s,k^2 + j_y,k^2
     subject to  z_{k+1} = A z_k + B u_k,  z_0 = 0,  z_n = (ds, 0, 0, dy, 0, 0)
-                speed, acceleration, jerk and slip within a share of the vehicle's limits
+                speed, acceleration, jerk and slip within a fraction of the vehicle's limits
 
-which is solved once per kind of move and process. Its jerks are integrated again, exactly, and the
-result is checked against all limits, whatever the solver reported.
+which is solved once per kind of move and process. The jerks are then integrated exactly and the
+result is checked against all limits, independent of the solver's status.
 
-States are commanded states (`protocol.vehicle.motion`): the body follows them with its actuators'
-lag and is 0.1 m short of its cell when the time of the move is over, 0.04 m at the end of the slot
-(default lags). A move forwards approaches the vehicle that holds in the cell beyond its target. It
-stays so far behind that the emergency brake (`protocol.vehicle.braking`) need not act, with a
-margin for errors:
+States are commanded states (`protocol.vehicle.motion`): the body follows them with the lag of its
+actuators, and is 0.1 m short of its cell at the end of the move, 0.04 m at the end of the slot
+(default lags). A move forwards approaches a vehicle that holds in the cell beyond the target. It
+stays far enough behind that the emergency brake (`protocol.vehicle.emergency_brake`) does not act,
+with a margin for errors:
 
     s_k+r + (lag + r h) v_F + (v_F + v_k+r)^2 / (2 b)
         <=  2 d_F - L + braking distance of the vehicle ahead - margin - errors
@@ -49,15 +49,15 @@ from laneweave.protocol.vehicle.emergency_brake import (
 Array = NDArray[np.float64]
 
 LIMIT_SHARE = 0.96
-"""Share of each limit that a trajectory uses; the rest is left to the tracker."""
+"""Fraction of each limit that a trajectory uses; the tracker needs the rest."""
 _END_TOLERANCE = 1e-3
-"""Accepted error at the end of a trajectory [m, m/s, m/s2]."""
+"""Maximum error at the end of a trajectory [m, m/s, m/s2]."""
 _LIMIT_TOLERANCE = 1e-4
-"""Accepted excess over a limit's share [m/s, m/s2, m/s3]."""
+"""Maximum excess over a fraction of a limit [m/s, m/s2, m/s3]."""
 _TRACKING_ERROR_M = 0.25
-"""Margin for tracking errors behind a vehicle ahead."""
+"""Margin for tracking errors behind the vehicle ahead."""
 _CLOSING_SPEEDUP = 0.5
-"""Largest closing speed that the tangents cover, as a share of v_F."""
+"""Maximum closing speed that the tangents cover, as a fraction of v_F."""
 _TANGENTS = 5
 _SETTINGS = QPSettings(
     eps_abs=1e-6,
@@ -72,12 +72,12 @@ _SETTINGS = QPSettings(
 
 
 class InfeasibleTrajectoryError(ValueError):
-    """No trajectory keeps all limits in the time given."""
+    """No trajectory of the given duration keeps all limits."""
 
 
 @frozen(eq=False)
 class Trajectory:
-    """Samples of a motion in the moving frame; obeys the discrete dynamics exactly."""
+    """Samples of a motion in the moving frame, which obey the discrete dynamics exactly."""
 
     states: Array
     """(n + 1, 6): s [m], v [m/s] and a [m/s2] along the road, s and v relative to the lattice;
@@ -93,17 +93,17 @@ class Trajectory:
 
 @frozen
 class Envelope:
-    """Bound on position and speed behind a vehicle that holds, so that braking is in time."""
+    """Bound on position and speed behind a vehicle that holds, which leaves room to brake."""
 
     ticks: int
-    """Ticks of reaction."""
+    """Reaction time [ticks]."""
     brake_mps2: float
     max_m: float
     """Upper bound of s + (v_F + v)^2 / (2 brake), with s and v relative to the lattice."""
 
     @classmethod
     def behind(cls, scenario: Scenario, gap_m: float) -> Envelope:
-        """Return the envelope of a move that starts with a net gap of `gap_m` to a vehicle."""
+        """Return the envelope of a move that starts with a net gap of `gap_m` to the vehicle."""
         speed_mps, braking = scenario.formation.speed_mps, scenario.braking
         ticks = max(round(braking.reaction_s / scenario.runtime.tick_s), 1)
         lost_s = scenario.vehicle.actuator_lag_s + ticks * scenario.runtime.tick_s
@@ -123,7 +123,7 @@ def move_profile(scenario: Scenario, dx: int, dy: int, ticks: int | None = None)
         scenario: limits, tick, lattice.
         dx: columns, -1 to 1.
         dy: lanes, -1 to 1.
-        ticks: duration; None: that of the scenario's shortest T_F.
+        ticks: duration; None: that of a move in the scenario's shortest T_F.
 
     Raises:
         InfeasibleTrajectoryError: the move cannot be driven within the limits.
@@ -146,12 +146,10 @@ def move_profile(scenario: Scenario, dx: int, dy: int, ticks: int | None = None)
 
 
 def check_moves(scenario: Scenario) -> None:
-    """Check that every move of the scenario can be driven within the vehicle's limits.
-
-    All of them are planned, for every T_F that a plan may have, and stay in the cache.
+    """Check that all moves of a scenario, for all T_F, can be driven within the vehicle's limits.
 
     Raises:
-        BadInputError: one cannot.
+        BadInputError: a move cannot.
     """
     for slot_s in scenario.slots_s:
         for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)):
@@ -187,22 +185,22 @@ def plan_trajectory(
         ticks: duration.
         ds_m: distance along the road, relative to the lattice.
         dy_m: distance across the road.
-        envelope: bound behind a vehicle that holds ahead; None: there is none.
+        envelope: bound behind a vehicle that holds ahead; None: none.
 
     Raises:
-        InfeasibleTrajectoryError: it cannot be driven within the limits.
+        InfeasibleTrajectoryError: there is no trajectory within the limits.
         ValueError: a number is not finite.
     """
     if ds_m == 0.0 and dy_m == 0.0:
         return _integrated(np.zeros((ticks, 2)), tick_s)
-    # With a unit of time near an eighth of the duration, all states are of similar size.
+    # A unit of time near an eighth of the duration makes all states of similar magnitude.
     unit_s = ticks * tick_s / 8.0
     program = _trajectory_program(
         limits, speed_mps, tick_s / unit_s, unit_s, ticks, (ds_m, dy_m), envelope
     )
     what = f"{ds_m:g} m along and {dy_m:g} m across in {ticks * tick_s:g} s"
     if envelope is not None:
-        what += ", with room to brake behind a vehicle that holds beyond"
+        what += ", with room to brake behind a vehicle that holds beyond the target"
     solution = program.solve()
     if not solution.usable:
         out = solution.status == MAX_ITERATIONS
@@ -294,12 +292,12 @@ def _both(limit: float) -> tuple[float, float]:
 def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Trajectory:
     """Return the trajectory of minimum squared jerk from a state to rest at the origin.
 
-    Limits are ignored: a vehicle that enters has so long for one and a half columns that it never
-    comes near them.
+    Limits are not checked: a vehicle that enters has enough time for 1.5 columns to stay far from
+    them.
 
     Args:
         scenario: tick.
-        start: state (6,) relative to the lattice point where it ends.
+        start: state (6,) relative to the lattice point at the end.
         ticks: duration, at least three.
     """
     tick_s = scenario.runtime.tick_s
@@ -311,7 +309,7 @@ def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Traject
 
 @lru_cache(maxsize=256)
 def _reach(tick_s: float, ticks: int) -> tuple[Array, Array]:
-    """Return how each tick's jerk (3, ticks) and the initial state (3, 3) change the last state."""
+    """Return the matrices from jerks (3, ticks) and initial state (3, 3) to the last state."""
     transition, effect = axis_matrices(tick_s)
     power: Array = np.eye(3)
     effects = []
@@ -322,7 +320,7 @@ def _reach(tick_s: float, ticks: int) -> tuple[Array, Array]:
 
 
 def _integrated(jerks: Array, tick_s: float, start: Array | None = None) -> Trajectory:
-    """Return the read-only trajectory of jerks (n, 2) from a state, or from rest at the origin."""
+    """Return the trajectory of jerks (n, 2) from a state, by default rest at the origin."""
     transition, effect = axis_matrices(tick_s)
     states = np.zeros((len(jerks) + 1, 6))
     if start is not None:
@@ -338,7 +336,7 @@ def _integrated(jerks: Array, tick_s: float, start: Array | None = None) -> Traj
 
 
 def _excess(trajectory: Trajectory, limits: Vehicle, speed_mps: float) -> float:
-    """Return the largest excess over a limit's share [m/s, m/s2, m/s3]; NaN if a sample is."""
+    """Return the maximum excess over a fraction of a limit [m/s, m/s2, m/s3]; NaN propagates."""
     _, v, a, _, v_y, a_y = trajectory.states.T
     jerk = np.abs(trajectory.jerks).max(axis=0)
     share = LIMIT_SHARE

@@ -1,6 +1,6 @@
-"""One ballot of a leader, as both operations use it: prepare, promise, plan, accept.
+"""Ballots of a leader, shared by both operations: prepare, promise, plan, accept.
 
-Entry point: `ballot_round.BallotRound` (state and messages) with `ballot_rules`, the rows of the
-transition table that both operations share. `formations.leader` and `rolling.transfer` add what an
-operation does where a ballot cannot go on. Imported by `formations` and `rolling` only.
+Entry point: `ballot_round.BallotRound` with `PLAN_RULES`, the transitions that both operations
+share. `formations.leader` and `rolling.transfer` add the transitions for ballots that fail.
+Imported by `formations` and `rolling` only.
 """

@@ -1,14 +1,14 @@
 """One ballot of a leader: prepare, promise, plan, accept (rules L4 to L8).
 
-The leader asks every vehicle of the roster for a promise, has a plan made from the cells in which
-they will hold, and issues that one plan under the ballot. Nothing here is needed for safety, except
-that a ballot is never used twice and that a plan is made only from the promises of the *whole*
-roster; vehicles check the rest.
+The leader requests a promise from every vehicle of the roster, has a plan made from the hold cells
+in the promises, and issues that plan under the ballot. Safety needs only two properties of this: a
+ballot is never used twice, and a plan is made only from promises of the *whole* roster. Vehicles
+check everything else.
 
-Each operation has a table of its own, with the rows of `PLAN_RULES` in both. They differ where a
-ballot is outbid, a vehicle has restarted, or planning has failed: formations try again, the rolling
-operation gives up until the next slot. Between the events `PROMISED` and `PLANNED` the plan is
-made: by the planner, beside the core (formations), or at once from the promises (rolling).
+Each operation has its own table, which contains `PLAN_RULES`. The tables differ in the handling of
+ballots that are outbid, of restarted vehicles and of failed planning: formations try again, the
+rolling operation aborts the ballot. Between the events `PROMISED` and `PLANNED` the plan is made,
+by a computation outside the core (formations) or at once from the promises (rolling).
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from laneweave.protocol.state_machine import RuleBook, Transition
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, VehicleState
 
 ISSUE_S = 30.0
-"""A plan that is not accepted by all in this time is given up: a vehicle refuses it (L8)."""
+"""A plan that not all vehicles have accepted in this time is abandoned (L8)."""
 
 
 class BallotPhase(Enum):
-    """Where a leader stands with its newest ballot."""
+    """Progress of a leader with its newest ballot."""
 
     OBSERVING = "observing"
-    """L2: is a plan in force that can be adopted?"""
+    """L2: determining whether a plan in force can be adopted."""
     PREPARING = "preparing"
     """L3, L4: collecting promises."""
     PLANNING = "planning"
-    """L5: the whole roster has promised."""
+    """L5: the whole roster has promised; the plan is being made."""
     ISSUING = "issuing"
     """L6: the plan is being sent until all have accepted."""
     IN_FORCE = "in force"
     """All have accepted the plan."""
     BACKING_OFF = "backing off"
-    """L7: a vehicle promised a higher ballot."""
+    """L7: pausing because a vehicle has promised a higher ballot."""
     ABORTED = "aborted"
-    """Nothing more is sent; the vehicles hold, or follow the plan that is in force."""
+    """Nothing more is sent; vehicles hold or execute an earlier plan that is in force."""
 
 
 UNFINISHED = (BallotPhase.PREPARING, BallotPhase.PLANNING, BallotPhase.ISSUING)
@@ -53,45 +53,45 @@ PROMISED, PLANNED, FAILED, TOO_LATE = "promised", "planned", "planning failed", 
 
 @define(kw_only=True)
 class BallotRound:
-    """A leader's state of one ballot at a time; subclasses say for whom, and feed it events."""
+    """A leader's state of one ballot at a time; subclasses define the roster and pass events."""
 
     rules: RuleBook
     resend_s: float
-    """Period of sending PREPARE and PLAN again."""
+    """Period after which PREPARE and PLAN are repeated."""
     phase: BallotPhase = BallotPhase.PREPARING
     ballot: Ballot | None = None
     plan: Plan | None = None
     promises: dict[Name, VehicleState] = field(factory=dict)
     accepted: set[Name] = field(factory=set)
     failures: int = 0
-    """Plannings that failed under this ballot."""
+    """Number of failed planning attempts under this ballot."""
     back_offs: int = 0
-    """Pauses in a row without an acceptance between them."""
+    """Number of consecutive pauses without an acceptance between them."""
     now_s: float = 0.0
     """Time of the current event (node clock)."""
     due_s: float = 0.0
-    """When the phase's timer fires, or something is to be sent again (node clock)."""
+    """Time of the next timer or repeated message (node clock)."""
     until_s: float = 0.0
-    """When the phase has lasted for long enough (node clock)."""
+    """End of the phase's time limit (node clock)."""
 
     @property
     def roster(self) -> tuple[Name, ...]:
-        """All vehicles whose promises and acceptances the ballot needs."""
+        """Vehicles whose promises and acceptances the ballot needs."""
         raise NotImplementedError
 
     @property
     def blocks(self) -> tuple[int, ...]:
-        """Blocks of columns that the plan may use; empty where vehicles own cells."""
+        """Blocks of columns that the plan may use; empty in the rolling operation."""
         return ()
 
     @property
     def hold_cells(self) -> dict[Name, Cell]:
-        """Where each vehicle will hold, from its promise."""
+        """Hold cell of each vehicle, from its promise."""
         return {name: self.promises[name].hold_cell for name in self.roster}
 
     @property
     def incarnations(self) -> dict[Name, int]:
-        """Incarnation of the process of each vehicle that promised."""
+        """Incarnation of the process that promised for each vehicle."""
         return {name: self.promises[name].incarnation for name in self.roster}
 
     def make_plan(
@@ -101,7 +101,7 @@ class BallotRound:
         t0_s: float,
         slot_s: float,
     ) -> Plan:
-        """Return the plan of these moves from the cells that were promised."""
+        """Return the plan with these moves from the promised hold cells."""
         assert self.ballot is not None  # noqa: S101 (set before planning begins)
         cells, every_move = self.hold_cells, [move for each in moves.values() for move in each]
         return Plan(
@@ -117,12 +117,12 @@ class BallotRound:
         )
 
     def take(self, event: str, now_s: float, message: object = None) -> bool:
-        """Take an event of the rule table; return whether a row of it fits."""
+        """Handle an event of the rule table; return whether a transition was taken."""
         self.now_s = now_s
         return self.rules.take(self, event, message) is not None
 
     def outgoing(self, now_s: float) -> Iterable[tuple[Name, Prepare | Plan]]:
-        """Return what has to be sent (again) now, and to which vehicle."""
+        """Return the messages to send or repeat now, each with its receiver."""
         if now_s < self.due_s or self.ballot is None:
             return []
         if self.phase is BallotPhase.PREPARING:
@@ -139,7 +139,7 @@ class BallotRound:
 
     @property
     def wakeup_s(self) -> float | None:
-        """When a timer fires, or `outgoing` has something to send; None: never."""
+        """Time of the next timer or repeated message; None: there is none."""
         if self.phase in _WITHOUT_TIMER:
             return None
         return self.due_s
@@ -152,7 +152,7 @@ _WITHOUT_TIMER = (BallotPhase.PLANNING, BallotPhase.IN_FORCE, BallotPhase.ABORTE
 
 
 def has_higher_promise(ballot_round: BallotRound, state: VehicleState) -> bool:
-    """It promised more than b."""
+    """The vehicle has promised a ballot above b."""
     return (
         ballot_round.ballot is not None
         and state.promised is not None
@@ -161,23 +161,23 @@ def has_higher_promise(ballot_round: BallotRound, state: VehicleState) -> bool:
 
 
 def had_promised(ballot_round: BallotRound, state: VehicleState) -> bool:
-    """Its promise was counted."""
+    """A promise of the vehicle is counted."""
     return state.vehicle in ballot_round.promises
 
 
 def restarted(ballot_round: BallotRound, state: VehicleState) -> bool:
-    """Its incarnation is not the one that promised."""
+    """Another incarnation than the reported one has promised."""
     promise = ballot_round.promises.get(state.vehicle)
     return promise is None or promise.incarnation != state.incarnation
 
 
 def is_promise(ballot_round: BallotRound, state: VehicleState) -> bool:
-    """It promised b and has not accepted."""
+    """The vehicle has promised b and not accepted."""
     return state.promised == ballot_round.ballot and not state.accepted
 
 
 def count_promise(ballot_round: BallotRound, state: VehicleState) -> None:
-    """Count the promise, with hold cell and incarnation."""
+    """Record the promise, with hold cell and incarnation."""
     ballot_round.promises[state.vehicle] = state
     if len(ballot_round.promises) == len(ballot_round.roster) and not ballot_round.failures:
         ballot_round.due_s = ballot_round.now_s
@@ -189,16 +189,16 @@ def all_have_promised(ballot_round: BallotRound, _: object) -> bool:
 
 
 def may_plan(ballot_round: BallotRound, _: object) -> bool:
-    """The pause after failed planning is over."""
+    """The pause after a failed attempt is over."""
     return not ballot_round.failures or ballot_round.now_s >= ballot_round.due_s
 
 
 def order_plan(ballot_round: BallotRound, _: object) -> None:
-    """Plan from the hold cells."""
+    """Plan from the promised hold cells."""
 
 
 def issue(ballot_round: BallotRound, plan: Plan) -> None:
-    """PLAN, the one and only of b."""
+    """Send PLAN, once per ballot."""
     ballot_round.plan = plan
     ballot_round.failures = 0
     ballot_round.accepted = set()
@@ -207,22 +207,22 @@ def issue(ballot_round: BallotRound, plan: Plan) -> None:
 
 
 def is_acceptance(ballot_round: BallotRound, state: VehicleState) -> bool:
-    """It accepted b."""
+    """The vehicle has accepted b."""
     return state.promised == ballot_round.ballot and state.accepted
 
 
 def is_last_acceptance(ballot_round: BallotRound, state: VehicleState) -> bool:
-    """All others have accepted."""
+    """All other vehicles have accepted b."""
     return ballot_round.accepted | {state.vehicle} >= set(ballot_round.roster)
 
 
 def count_acceptance(ballot_round: BallotRound, state: VehicleState) -> None:
-    """Count the acceptance."""
+    """Record the acceptance."""
     ballot_round.accepted.add(state.vehicle)
     ballot_round.back_offs = 0
 
 
-# --- the rows that both operations share ------------------------------------------------------
+# --- transitions that both operations share ---------------------------------------------------
 
 _PREPARING, _PLANNING, _ISSUING = UNFINISHED
 _IN_FORCE = BallotPhase.IN_FORCE
@@ -242,14 +242,14 @@ PLAN_RULES = (
     ),
     Transition("L6", STATE, (_ISSUING,), (is_acceptance,), (count_acceptance,)),
 )
-"""From the promises of all to a plan in force (L5, L6)."""
+"""Transitions from the last promise to a plan in force (L5, L6)."""
 
 
 def is_older(state: VehicleState, other: VehicleState) -> bool:
-    """Return whether a state of a vehicle was sent before another one of it.
+    """Return whether a state was sent before another state of the same vehicle.
 
-    Between two ticks it shows states with equal times; it never promises less or takes back an
-    acceptance, so a late state cannot pass for a newer one.
+    States sent between two ticks have equal times. Their order follows from the promise and the
+    acceptance, which never go back.
     """
     if state.incarnation == other.incarnation and state.t_s != other.t_s:
         return state.t_s < other.t_s

@@ -1,8 +1,8 @@
 """One formation under a leader: its ballots, one after the other (rules L2 to L8).
 
-A leader observes the formation first and adopts the plan that is in force (L2). Otherwise, and
-whenever that plan stalls or no longer fits, it prepares a new ballot. `LEADER_RULES` is the table;
-docs/PROTOCOL.md shows it. L1 is `election.Election`.
+A leader first observes the formation and adopts a plan that is in force (L2). If there is none, or
+if it stalls or no longer fits, the leader prepares a new ballot. `LEADER_RULES` is the table, shown
+in docs/PROTOCOL.md. L1 is `election.Election`.
 """
 
 from __future__ import annotations
@@ -35,33 +35,33 @@ from laneweave.protocol.state_machine import RuleBook, Transition
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, VehicleState
 
 OBSERVE_S = 1.0
-"""How long a new leader waits for the states of a roster before it prepares (L2)."""
+"""Longest time for which a new leader waits for the states of a roster (L2)."""
 BACK_OFF_S = (0.05, 0.3)
-"""Random pause before a leader outbids another one (L7); twice as long each time in a row, so that
-one of two leaders gets the time to plan."""
+"""Range of the random pause before a leader outbids another one (L7). It doubles with each
+consecutive pause, so that one of two leaders has time to plan."""
 MAX_BACK_OFFS = 6
-"""The pause grows this often at most."""
+"""Maximum number of doublings of the pause."""
 RETRY_S = 1.0
-"""First pause after failed planning; doubles with each failure (L5)."""
+"""First pause after failed planning; it doubles with each failure (L5)."""
 LONGEST_RETRY_S = 8.0
 
 
 @define
 class FormationLeader(BallotRound):
-    """The leader's state for one formation, or for several that are joined."""
+    """A leader's state for one formation, or for joined formations."""
 
     formation: Formation
     new_ballot: Callable[[Ballot | None], Ballot]
-    """Returns a ballot never used before and above the given one, if one is given."""
+    """Returns a new ballot, above the given one if there is one."""
     rng: random.Random
     rules: RuleBook = field(factory=lambda: LEADER_RULES, kw_only=True)
     phase: BallotPhase = field(default=BallotPhase.OBSERVING, kw_only=True)
     out_of_reach: frozenset[Name] = frozenset()
-    """Members that the plan in force does not bring to their lanes, because it cannot."""
+    """Members that cannot reach their lanes with the plan in force."""
     states: dict[Name, VehicleState] = field(factory=dict)
-    """The newest state of each member."""
+    """Newest state of each member."""
     highest: Ballot | None = None
-    """Highest ballot that a member has shown; a new one must be above it to be promised."""
+    """Highest ballot that a member has reported; members promise only higher ones."""
 
     @property
     def roster(self) -> tuple[Name, ...]:
@@ -75,11 +75,11 @@ class FormationLeader(BallotRound):
 
     @property
     def unattended(self) -> frozenset[Name]:
-        """Members that no agent drives: they promised to hold."""
+        """Members without an agent, according to their promises; they only hold."""
         return frozenset(name for name in self.roster if not self.promises[name].attended)
 
     def begin(self, now_s: float, *, observe: bool = True) -> None:
-        """Take the formation over (L2), or prepare at once where there can be no plan yet (L3)."""
+        """Observe the formation (L2), or prepare at once if there can be no plan yet (L3)."""
         self.now_s = now_s
         observe_members(self, None)
         self.phase = BallotPhase.OBSERVING
@@ -88,10 +88,7 @@ class FormationLeader(BallotRound):
             self.take(TIME, now_s)
 
     def on_members(self, formation: Formation, now_s: float) -> None:
-        """Take the formation as a newer census shows it (L8).
-
-        Vehicles that have left can neither promise nor accept; targets may be new.
-        """
+        """Update the formation from a newer census (L8)."""
         if formation == self.formation:
             return
         for vehicle in set(self.formation.roster) - set(formation.roster):
@@ -100,7 +97,7 @@ class FormationLeader(BallotRound):
         self.formation = formation
 
     def on_state(self, state: VehicleState, now_s: float) -> None:
-        """Take the state of a member (L2, L4, L6, L7, L8)."""
+        """Handle the state of a member (L2, L4, L6, L7, L8)."""
         if self._is_news(state):
             self.states[state.vehicle] = state
             if state.promised is not None:
@@ -108,12 +105,12 @@ class FormationLeader(BallotRound):
             self.take(STATE, now_s, state)
 
     def on_plan(self, plan: Plan, now_s: float, out_of_reach: Iterable[Name] = ()) -> None:
-        """Issue the plan under the ballot that was promised (L5)."""
+        """Issue the plan under the promised ballot (L5)."""
         self.out_of_reach = frozenset(out_of_reach)
         self.take(PLANNED, now_s, plan)
 
     def _is_news(self, state: VehicleState) -> bool:
-        """Return whether a state is from a member and not older than its newest one."""
+        """Return whether a state is from a member and not older than its newest state."""
         known = self.states.get(state.vehicle)
         return state.vehicle in self.formation.roster and (
             known is None or not is_older(state, known)
@@ -124,19 +121,19 @@ class FormationLeader(BallotRound):
 
 
 def observe_members(leader: FormationLeader, _: object) -> None:
-    """Listen to all members."""
+    """Observe all members."""
     leader.states.clear()
     leader.promises = {}
     leader.until_s = leader.due_s = leader.now_s + OBSERVE_S
 
 
 def all_have_reported(leader: FormationLeader, _: object) -> bool:
-    """All members have shown their states."""
+    """All members have reported their states."""
     return all(name in leader.states for name in leader.roster)
 
 
 def one_plan_is_in_force(leader: FormationLeader, _: object) -> bool:
-    """All show the same ballot as accepted, no member is overdue."""
+    """All members have accepted the same ballot, and none is overdue."""
     states = [leader.states[name] for name in leader.roster]
     return len({state.promised for state in states}) == 1 and all(
         state.accepted and not state.overdue for state in states
@@ -144,22 +141,22 @@ def one_plan_is_in_force(leader: FormationLeader, _: object) -> bool:
 
 
 def adopt(leader: FormationLeader, _: object) -> None:
-    """Adopt: send nothing, watch."""
+    """Adopt the plan: send nothing, monitor states."""
     leader.ballot = next(iter(leader.states.values())).promised
-    # The promises were given to another leader; a vehicle that has accepted has promised.
+    # The promises were given to another leader; acceptance implies a promise.
     leader.promises = dict(leader.states)
     leader.back_offs = 0
-    # This plan may bring members to their lanes that an earlier one could not.
+    # The adopted plan may reach lanes that an earlier plan could not.
     leader.out_of_reach = frozenset()
 
 
 def time_is_up(leader: FormationLeader, _: object) -> bool:
-    """The phase has lasted for long enough."""
+    """The time limit of the phase has passed."""
     return leader.now_s >= leader.until_s
 
 
 def prepare(leader: FormationLeader, _: object) -> None:
-    """PREPARE a new ballot, above all that members have shown."""
+    """Send PREPARE for a new ballot, above all that members have reported."""
     leader.ballot = leader.new_ballot(leader.highest)
     leader.plan = None
     leader.promises = {}
@@ -169,37 +166,37 @@ def prepare(leader: FormationLeader, _: object) -> None:
 
 
 def back_off(leader: FormationLeader, _: object) -> None:
-    """Pause for 0.05 to 0.3 s, twice as long each time in a row."""
+    """Pause for 0.05 to 0.3 s, doubled with each consecutive pause."""
     pause_s = leader.rng.uniform(*BACK_OFF_S) * 2.0 ** min(leader.back_offs, MAX_BACK_OFFS)
     leader.back_offs += 1
     leader.until_s = leader.due_s = leader.now_s + pause_s
 
 
 def has_joined(leader: FormationLeader, state: VehicleState) -> bool:
-    """It has joined the formations of b and no others."""
+    """The vehicle has joined exactly the blocks of b."""
     return state.joined == leader.formation.numbers
 
 
 def void_promise(leader: FormationLeader, state: VehicleState) -> None:
-    """Void the promise: it has lost its memory since."""
+    """Discard the promise: the process that made it has been replaced."""
     del leader.promises[state.vehicle]
 
 
 def keep_ballot(leader: FormationLeader, _: object) -> None:
-    """Keep the ballot, try again after 1, 2, 4, 8, 8, ... s."""
+    """Keep the ballot; plan again after 1, 2, 4, 8, 8, ... s."""
     leader.due_s = leader.now_s + min(RETRY_S * 2.0**leader.failures, LONGEST_RETRY_S)
     leader.failures += 1
 
 
 def stalls(_: FormationLeader, state: VehicleState) -> bool:
-    """Its next move is overdue."""
+    """The vehicle's next move is overdue."""
     return state.overdue
 
 
 def is_off_lane(leader: FormationLeader, state: VehicleState) -> bool:
-    """It is done on a lane that it does not prefer, though it could reach its own.
+    """The vehicle has completed the plan off its preferred lane, although it is within reach.
 
-    An adopted plan may have been made for targets that this leader never saw.
+    An adopted plan may have been made for other targets.
     """
     return (
         leader.formation.sorts
@@ -214,7 +211,7 @@ def is_off_lane(leader: FormationLeader, state: VehicleState) -> bool:
 
 
 def has_new_targets(leader: FormationLeader, formation: Formation) -> bool:
-    """There are new targets, new members, or another structure to take on."""
+    """Targets, members or the structure to form are new."""
     return formation.stage != leader.formation.stage or not (
         set(formation.members) <= set(leader.formation.members)
     )

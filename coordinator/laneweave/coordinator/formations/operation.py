@@ -1,4 +1,4 @@
-"""The paper's operation: every formation on the road is led by ballots of its own."""
+"""The paper's operation: formations on the road, each led by its own ballots."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from laneweave.protocol.wire.events import FORMATIONS_JOINED, PLAN_IN_FORCE
 from laneweave.protocol.wire.messages import Ballot, Census, VehicleState
 
 JUST_CLOSED_S = 1.0
-"""For this much road time after it has closed, no leader can have made a plan for a formation."""
+"""Road time after a formation closes within which no leader can have planned for it."""
 
 
 class FormationsOperation:
@@ -43,16 +43,16 @@ class FormationsOperation:
 
         Args:
             scenario: road, formations, timing.
-            new_ballot: returns a ballot never used before and above the given one, if one is given.
+            new_ballot: returns a new ballot, above the given one if there is one.
             new_job: returns the number of a new computation.
-            has_watched: returns whether this leader has missed nothing for an election time, at a
-                time of the node's clock.
-            rng: for pauses.
+            has_watched: returns whether, at a time of the node's clock, this leader has handled
+                events without gaps for an election timeout.
+            rng: source of random pauses.
             plan: plans one request.
-            rules: of a leader; others than `LEADER_RULES` only in tests.
+            rules: rules of a leader; tests replace some.
         """
         self.leaders: dict[int, FormationLeader] = {}
-        """Each under the lowest number of its blocks."""
+        """Leaders by the lowest block number of their formation."""
         self._scenario = scenario
         self._new_ballot = new_ballot
         self._has_watched = has_watched
@@ -62,22 +62,22 @@ class FormationsOperation:
         self._planner = FormationPlanner(scenario, self._groups, self.leaders, new_job, plan)
 
     def forget(self) -> None:
-        """Forget all formations, and which of them are joined."""
+        """Discard all formations, and which of them are joined."""
         self._groups.forget()
         self.take_over()
 
     def take_over(self) -> None:
-        """Forget all formations; what vehicles have joined stays joined."""
+        """Discard all formations; joined formations stay joined."""
         self.leaders.clear()
         self._planner.forget()
 
     def on_clock(self, t_s: float, now_s: float) -> None:
-        """Measure the pace of the road."""
+        """Measure the ratio of road time to the node's clock."""
         self._planner.pace.on_clock(t_s, now_s)
 
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry]:
-        """Pass the state on to the leader of its formation."""
-        # Formations that a vehicle has joined stay joined, under any leader.
+        """Pass the state to the leader of its formation."""
+        # Formations stay joined under any leader.
         self._groups.join((state.formation, *state.joined))
         group = self._groups.of(state.formation)
         leader = self.leaders.get(group[0])
@@ -93,7 +93,7 @@ class FormationsOperation:
     def lead(
         self, census: Census, t_s: float, now_s: float, *, changed: bool
     ) -> Iterator[Effect | LogEntry]:
-        """Update members, let timers run out, order plans, send messages."""
+        """Update members, handle expired timers, order plans, send messages."""
         if changed or self._groups.changed:
             yield from self._update_members(census, t_s, now_s)
             self._groups.changed = False
@@ -129,18 +129,18 @@ class FormationsOperation:
             resend_s=self._scenario.network.resend_s,
             rules=self._rules,
         )
-        # There is no plan to adopt for a formation that this leader has seen close a moment ago.
+        # There is no plan to adopt for a formation that has just closed while this leader watched.
         just_closed = t_s - formation.closed_s <= JUST_CLOSED_S
         leader.begin(now_s, observe=not (just_closed and self._has_watched(now_s)))
         return leader
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[Compute | LogEntry]:
-        """Issue a plan that was made, or try again later."""
+        """Issue the resulting plan, or try again later."""
         return self._planner.finish(computed, t_s, now_s)
 
     @property
     def wakeups(self) -> list[float]:
-        """Times of the leaders' timers."""
+        """Times of the next timer of each leader."""
         times = (leader.wakeup_s for leader in self.leaders.values())
         return [time for time in times if time is not None]
 

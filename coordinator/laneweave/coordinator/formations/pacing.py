@@ -1,14 +1,14 @@
-"""When the steps of a plan are driven: start, length of all slots, pauses for neighbours.
+"""Timing of a plan: start, length of the slots, pauses for neighbouring formations.
 
-Lanes are changed in S3 only (paper, Section 5.2.1). Where the scenario leaves T_F open, the slots
-of a plan are as long as its road allows, and a plan begins as soon as none of its lane changes
-comes before S3. Moves along the road may come earlier, and so may lane changes of vehicles that
-are in S3 while the rear of the formation is not.
+Lanes are changed in S3 only (paper, Section 5.2.1). If the scenario does not fix T_F, the slots of
+a plan are as long as the road allows, and the plan begins as soon as no lane change takes place
+before S3. Moves along the road may begin earlier, as may lane changes of vehicles that are already
+in S3 while the rear of the formation is not.
 
-Plans stay in the blocks of their formations, so their footprints never meet. But a move may close
-up head-on with one of a neighbouring formation across the border of their blocks (conflict kind
-`closing`), and then the emergency brake acts. Formations are planned one after the other: the later
-plan pauses for a slot where it would close up.
+Plans stay in the blocks of their formations, so their footprints never intersect. But two moves
+towards each other across the border of two formations (conflict kind `closing`) would trigger the
+emergency brake. Formations are planned one after the other, and the later plan pauses for a slot to
+avoid such moves.
 """
 
 from __future__ import annotations
@@ -24,23 +24,20 @@ from laneweave.protocol.vehicle.plan_execution import TIME_TOLERANCE_S
 from laneweave.protocol.wire.messages import Plan
 
 RESERVE_S = 3.0
-"""Road time after the last slot that is left for lost messages."""
+"""Reserve of road time after the last slot, for lost messages."""
 MIN_RESERVE_S = 1.0
-"""The same where moves would not be comfortable otherwise."""
+"""Reserve if `RESERVE_S` would leave too little time for comfortable moves."""
 
 _MODEL = ConflictModel(("closing",))
 
 
 def steps_of(plan: Plan) -> int:
-    """Return how many slots a plan takes."""
+    """Return the number of slots of a plan."""
     return max((1 + step for moves in plan.moves.values() for step, _, _ in moves), default=0)
 
 
 def comfortable_steps(start_s: float, end_s: float, scenario: Scenario) -> int:
-    """Return how many comfortable steps fit in between two road times.
-
-    Where T_F is given, as many as fit in.
-    """
+    """Return the number of steps of comfortable length, or of the given T_F, between two times."""
     shortest_s, longest_s = scenario.cycles_s
     if shortest_s == longest_s:
         return int((end_s - start_s) / longest_s)
@@ -50,15 +47,15 @@ def comfortable_steps(start_s: float, end_s: float, scenario: Scenario) -> int:
 def paced(
     plan: Plan, others: Sequence[Plan], not_before_s: float, end_s: float, scenario: Scenario
 ) -> Plan:
-    """Return a plan in the longest slots in which it ends in time; if none are, in the shortest.
+    """Return a plan with the longest slots with which it ends in time, or with the shortest.
 
-    It pauses for slots in which it would come too close to plans of its neighbours.
+    The plan pauses where its moves would close up with moves of its neighbours.
 
     Args:
-        plan: as it was planned; it begins when all of its vehicles are where they may change lanes.
-        others: plans of neighbouring formations; they stay as they are.
-        not_before_s: road time before which it cannot begin.
-        end_s: road time by which it should have ended.
+        plan: plan with the latest start: when all of its vehicles are in S3.
+        others: plans of neighbouring formations, which are not changed.
+        not_before_s: earliest start (road time).
+        end_s: road time by which the plan should have ended.
         scenario: road, lattice, T_F.
     """
     slots_s, slack_s = scenario.slots_s[::-1], scenario.formation.slack_s
@@ -80,7 +77,7 @@ def paced(
 
 
 def _start_s(plan: Plan, slot_s: float, not_before_s: float, scenario: Scenario) -> float:
-    """Return the first road time at which no lane change comes before S3."""
+    """Return the earliest start of a plan with which no lane change takes place before S3."""
     in_time = [
         start_time_s([origin], 0.0, scenario) - step * slot_s
         for moves in plan.moves.values()
@@ -91,16 +88,16 @@ def _start_s(plan: Plan, slot_s: float, not_before_s: float, scenario: Scenario)
 
 
 def with_pauses(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: int) -> Plan:
-    """Return a plan with pauses, so that none of its moves closes up with one of other plans.
+    """Return a plan with pauses, so that no move closes up with a move of another plan.
 
-    All vehicles pause together, so the order of moves stays as it was planned.
+    All vehicles pause together, so the order of moves does not change.
 
     Args:
-        plan: the new one.
-        others: of neighbouring formations; they stay as they are.
-        slack_s: how much shorter a move is than the slot of its plan [s].
-        max_steps: how many slots there are. What still closes up when they are used up is left to
-            the brake: better late than on a wrong lane.
+        plan: the new plan.
+        others: plans of neighbouring formations, which are not changed.
+        slack_s: difference between the length of a slot and the duration of a move [s].
+        max_steps: maximum number of slots. Moves that still close up then rely on the emergency
+            brake, because a delay is better than a wrong lane.
     """
     theirs = [
         (other.t0_s + step * other.slot_s, other.slot_s - slack_s, (origin, target))
@@ -132,7 +129,7 @@ def with_pauses(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: i
 
 
 def _paused(plan: Plan, pause: int) -> Plan:
-    """Return a plan whose moves of a step, and all after them, begin a slot later."""
+    """Return a plan whose moves from a step on begin one slot later."""
     return evolve(
         plan,
         moves={

@@ -1,8 +1,7 @@
-"""Planning of formations: orders, and what becomes of the results (rule L5).
+"""Planning orders of formations, and their results (rule L5).
 
-The planning itself runs beside the core (`Compute`), one formation at a time; here its orders are
-written and its results turned into plans, into failures, or into formations that are joined because
-one alone lacks room.
+The planner runs outside the core (`Compute`), for one formation at a time. This module writes the
+orders. It turns the results into plans or failures, or joins formations if one alone lacks room.
 """
 
 from __future__ import annotations
@@ -49,40 +48,40 @@ from laneweave.protocol.wire.events import (
 from laneweave.protocol.wire.messages import Ballot, Plan
 
 START_MARGIN_S = 0.5
-"""A plan that is made late starts this much road time after it is ready."""
+"""Minimum road time between the completion of a plan and its start."""
 ROOM_S = 2.5
-"""Longest wait of a formation that lacks room for the next one to close (road time)."""
+"""Maximum time for which a formation that lacks room waits for the next to close (road time)."""
 SHORTEST_DEADLINE_S = 1.0
-"""Deadline of planning where the first move could begin at once."""
+"""Deadline of planning if the first move could begin at once."""
 LONGEST_DEADLINE_S = 15.0
-"""Deadline of planning where the first move is far off: the other formations wait meanwhile."""
+"""Deadline of planning if the first move is far off; other formations wait meanwhile."""
 MAX_DOUBLINGS = 4
-"""The bound on search nodes doubles with each failed planning, this often."""
+"""The node limit doubles with each failed attempt, up to this number of times."""
 PACE_WINDOW_S = 2.0
 """Measurement window of the road's pace (node clock)."""
 LOGGED = (
     *("status", "cost", "lower_bound", "steps", "solve_ms"),
     *("assignments_tried", "nodes_expanded", "solver", "fallback"),
 )
-"""Fields of a response that are logged with its plan."""
+"""Fields of a response that are logged with the plan."""
 MIN_PACE = 0.1
-"""Lowest pace, so that deadlines stay finite while the road stands still."""
+"""Minimum pace; it keeps deadlines finite while the road stands still."""
 
 
 @define
 class RoadPace:
-    """Ratio of road time to the node's clock, measured from the messages of the road's clock."""
+    """Ratio of road time to the node's clock, measured from clock messages."""
 
     pace: float = field(default=1.0, init=False)
-    """Road seconds per second of the node's clock, as measured last."""
+    """Road seconds per second of the node's clock, as last measured."""
     _since: tuple[float, float] | None = field(default=None, init=False)
-    """Road time and node clock when the measurement under way began."""
+    """Road time and node clock at the beginning of the current measurement."""
 
     def on_clock(self, t_s: float, now_s: float) -> None:
         """Process a clock message.
 
         Args:
-            t_s: road time; a smaller one than before restarts the measurement.
+            t_s: road time; a decrease restarts the measurement.
             now_s: node clock.
         """
         if self._since is None or t_s < self._since[0]:
@@ -95,7 +94,7 @@ class RoadPace:
 
 
 class FormationPlanner:
-    """Orders and results of planning."""
+    """Orders plans for formations and handles the results."""
 
     def __init__(
         self,
@@ -105,12 +104,12 @@ class FormationPlanner:
         new_job: Callable[[], int],
         plan: PlanFunction,
     ) -> None:
-        """Begin with nothing ordered.
+        """Begin without orders.
 
         Args:
             scenario: road, lattice, settings of planning.
-            groups: which formations are joined; it grows here.
-            leaders: of all formations, each under its lowest block.
+            groups: joined blocks; joins of formations are added.
+            leaders: leaders of all formations by lowest block number.
             new_job: returns the number of a new computation.
             plan: plans one request.
         """
@@ -119,11 +118,11 @@ class FormationPlanner:
         self._leaders = leaders
         self._new_job = new_job
         self._waiting: dict[int, tuple[Ballot, Callable[[], Sorting]]] = {}
-        """Orders that have not begun, oldest first: for each formation its ballot and the work."""
+        """Orders that have not begun, oldest first: ballot and computation of each formation."""
         self._under_way: tuple[int, int, Ballot] | None = None
-        """Number, formation and ballot of the computation under way."""
+        """Number, formation and ballot of the current computation."""
         self.pace = RoadPace()
-        """From which deadlines follow."""
+        """Pace of the road, for deadlines."""
         formation = scenario.formation
         oblique = formation.weight_oblique
         weights = Weights(
@@ -132,11 +131,11 @@ class FormationPlanner:
         self._make_plan = partial(plan, weights=weights)
 
     def forget(self) -> None:
-        """Drop all orders that have not begun."""
+        """Discard all orders that have not begun."""
         self._waiting.clear()
 
     def _deadline_s(self, start_s: float, t_s: float) -> float:
-        """Return the deadline: that of the scenario, or the time until the first move."""
+        """Return the deadline of the scenario, or the time until the first move."""
         given_s = self._scenario.formation.planning_deadline_s
         if given_s is not None:
             return given_s
@@ -146,10 +145,10 @@ class FormationPlanner:
     def order(
         self, leader: FormationLeader, t_s: float, now_s: float
     ) -> Iterator[Compute | LogEntry]:
-        """Order a plan from the promises of a formation; give up if no step fits in.
+        """Order a plan from the promises of a formation; abort if no step can be completed.
 
         Args:
-            leader: in phase `PLANNING`.
+            leader: leader in phase `PLANNING`.
             t_s: road time.
             now_s: node clock.
         """
@@ -157,7 +156,7 @@ class FormationPlanner:
         assert ballot is not None  # noqa: S101 (set before planning begins)
         formation, scenario = leader.formation, self._scenario
         block_of = scenario.lattice.block_of
-        # A promise of a cell elsewhere makes planning fail; it says nothing of the time left.
+        # Hold cells outside the blocks make planning fail later; they do not affect the time left.
         cells = [cell for cell in leader.hold_cells.values() if block_of(cell[0]) in numbers]
         cells = cells or self._block_cells(numbers)
         start_s, end_s = self._start_s(formation, cells, t_s), self._end_s(formation)
@@ -181,9 +180,9 @@ class FormationPlanner:
             None if formation.sorts else scenario.formation.structures[formation.stage],
         )
         nodes = scenario.formation.max_nodes * 2 ** min(leader.failures, MAX_DOUBLINGS)
-        # An order under an earlier ballot is replaced, and waits for its turn anew.
+        # Replaces an order under an earlier ballot, at the end of the queue.
         self._waiting.pop(numbers[0], None)
-        # In the job: promises that cannot be planned from fail there, as any failed planning does.
+        # Invalid promises fail inside the job, like any other failed planning.
         self._waiting[numbers[0]] = (
             ballot,
             partial(sort_lanes, task, nodes, self._make_plan),
@@ -191,7 +190,7 @@ class FormationPlanner:
         yield from self._begin()
 
     def _begin(self) -> Iterator[Compute]:
-        """Begin with the oldest order that is still wanted, unless a computation is under way."""
+        """Start the oldest order that is still needed, unless a computation is running."""
         while self._waiting and self._under_way is None:
             number = next(iter(self._waiting))
             ballot, work = self._waiting.pop(number)
@@ -200,7 +199,7 @@ class FormationPlanner:
                 yield Compute(self._under_way[0], work)
 
     def _wanted(self, number: int, ballot: Ballot) -> bool:
-        """Return whether the leader of a formation still waits for a plan under a ballot."""
+        """Return whether the leader of a formation still needs a plan under a ballot."""
         leader = self._leaders.get(number)
         return (
             leader is not None
@@ -211,7 +210,7 @@ class FormationPlanner:
     def _end_s(self, formation: Formation) -> float:
         """Return the road time by which the plan of a formation should have ended.
 
-        That is when its next plan is to be made, or when its foremost column leaves the road.
+        That is the time of its next planning, or the time at which its front leaves the road.
         """
         if not formation.sorts:
             next_s = stage_begin_s(formation.numbers, formation.stage + 1, self._scenario)
@@ -220,10 +219,10 @@ class FormationPlanner:
         return time_left_s([(front, 0)], 0.0, self._scenario)
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[Compute | LogEntry]:
-        """Take a result, drop it if it is not wanted any more, and begin with the next order.
+        """Handle a result, unless it is no longer needed, and start the next order.
 
         Args:
-            computed: the result of a job, a `Sorting`, or an error.
+            computed: result of a job: a `Sorting`, or an error.
             t_s: road time.
             now_s: node clock.
         """
@@ -264,7 +263,7 @@ class FormationPlanner:
         yield LogEntry(PLANNING_FAILED, data)
 
     def _join_neighbour(self, leader: FormationLeader, t_s: float) -> bool:
-        """Join a formation that lacks room with a neighbour; false when none can help.
+        """Join a formation that lacks room with a neighbour, if possible; return whether it did.
 
         Both plan under one ballot from now on.
         """
@@ -280,7 +279,7 @@ class FormationPlanner:
         return False
 
     def _steps_left_in(self, numbers: Numbers, t_s: float) -> int:
-        """Return how many steps fit in for all cells of some blocks."""
+        """Return the number of steps that remain for all cells of some blocks."""
         cells, scenario = self._block_cells(numbers), self._scenario
         start_s = start_time_s(cells, t_s + START_MARGIN_S, scenario)
         return steps_left(cells, start_s, scenario.cycles_s[0], scenario)
@@ -290,7 +289,7 @@ class FormationPlanner:
         return [cell for number in numbers for cell in lattice.block_cells(number)]
 
     def _neighbours(self, numbers: Numbers) -> Iterator[FormationLeader]:
-        """Yield the formation behind and the one ahead, as far as there are any."""
+        """Yield the formation behind and the formation ahead, if they exist."""
         for number in (numbers[-1] + 1, numbers[0] - 1):
             neighbour = self._leaders.get(self._groups.of(number)[0])
             if neighbour is not None:
@@ -311,7 +310,7 @@ class FormationPlanner:
         return leader.make_plan(leader.formation.numbers, sorting.moves, t0_s, slot_s)
 
     def _paced(self, plan: Plan, leader: FormationLeader, t_s: float) -> Plan:
-        """Choose the slots of a plan; it begins when its vehicles have settled in their cells."""
+        """Choose start and slots of a plan, so that its vehicles have settled before it begins."""
         formation, cells = leader.formation, plan.start_cells.values()
         others = self._neighbouring_plans(plan)
         if not formation.sorts:
@@ -321,27 +320,27 @@ class FormationPlanner:
         return paced(plan, others, not_before_s, end_s, self._scenario)
 
     def _neighbouring_plans(self, plan: Plan) -> list[Plan]:
-        """Return the plans of the neighbours that this leader has made and that are driven."""
+        """Return the plans of neighbours that this leader has made and that may be executed."""
         if "closing" not in self._scenario.formation.conflict_kinds:
             return []
         return [
             neighbour.plan
             for neighbour in self._neighbours(plan.formations)
-            # In other phases it has been outbid, or given up, and is not what is driven.
+            # In other phases the plan has been outbid or aborted and is not executed.
             if neighbour.plan is not None
             and neighbour.plan.ballot == neighbour.ballot
             and neighbour.phase in (BallotPhase.ISSUING, BallotPhase.IN_FORCE)
         ]
 
     def _start_s(self, formation: Formation, cells: Collection[Cell], t_s: float) -> float:
-        """Return the road time at which a formation may begin to move."""
+        """Return the earliest road time at which a formation may begin to move."""
         if formation.sorts:
             return start_time_s(cells, t_s + START_MARGIN_S, self._scenario)
         begin_s = stage_begin_s(formation.numbers, formation.stage, self._scenario)
         return on_tick(max(begin_s, self._settled_s(cells), t_s + START_MARGIN_S), self._scenario)
 
     def _settled_s(self, cells: Collection[Cell]) -> float:
-        """Return the road time at which vehicles that entered in some cells rest in them."""
+        """Return the road time at which vehicles that entered in some cells have settled."""
         formation, lattice = self._scenario.formation, self._scenario.lattice
         rear = min(column for column, _ in cells)
         return lattice.passing_time_s(rear) + formation.entry_spread_s + formation.settle_s

@@ -1,15 +1,14 @@
-"""Formations as the census describes them, and the time that they have on the road.
+"""Formations derived from the census, and their time on the road.
 
-The roadside builds formations out of the stream of arrivals and says which blocks of columns belong
-to which formation. A formation is *closed* when no vehicle can enter its blocks any more: its
-roster is known for certain from that census on.
+The roadside builds formations from the stream of arrivals and assigns blocks of columns to them. A
+formation is *closed* when no more vehicles can enter its blocks; from that census on, its roster is
+complete.
 
 **Joined formations** plan under one ballot. Such a plan may use the blocks of all of them, and its
-roster is all vehicles that entered there. Once a plan has used two blocks, a vehicle of either may
-be in the other one, so no later plan may use one of them without the vehicles of both: joined
-formations stay joined until their vehicles have left. Every vehicle remembers with which blocks its
-formation is joined (`VehicleState.joined`), so any leader learns it from the promises that it needs
-anyway.
+roster is all vehicles that entered there. After a plan has used two blocks, a vehicle of either may
+be in the other, so no later plan may use one of them without the vehicles of both: formations stay
+joined until their vehicles have left. Every vehicle stores the joined blocks
+(`VehicleState.joined`), so every leader learns them from the promises.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name
 
 STAGE_LEAD_S = 5.0
-"""How long before a change of structure its plan is made: longer than planning takes. The previous
-plan has ended by then."""
+"""Time before a change of structure at which it is planned: longer than planning takes. By then the
+previous plan has ended."""
 
 Numbers = tuple[int, ...]
 """Numbers of blocks, ascending."""
@@ -34,22 +33,23 @@ Numbers = tuple[int, ...]
 
 @frozen
 class Formation:
-    """A closed formation, or joined ones, and the members on the road, in order of their names."""
+    """A closed formation, or joined ones, with the members that are on the road."""
 
     numbers: Numbers
-    """Of their blocks, ascending."""
+    """Block numbers, ascending."""
     members: tuple[CensusEntry, ...]
+    """Members in the order of their names."""
     closed_s: float = 0.0
-    """Road time at which the last of them was closed."""
+    """Road time at which the last of the formations was closed."""
     joined: int = 1
-    """How many formations these are."""
+    """Number of formations."""
     deserted: Numbers = ()
-    """Blocks of joined formations whose vehicles have all left the road. Plans avoid them: they may
-    hold vehicles of formations that were joined under another leader."""
+    """Blocks of joined formations whose vehicles have all left the road. Plans avoid them, since
+    vehicles of formations joined under another leader may be there."""
     stage: int = 0
-    """Which of the scenario's structures it is to take on now."""
+    """Index of the scenario's structure to form next."""
     sorts: bool = True
-    """It has taken on all of them, and sorts its lanes."""
+    """Whether all structures are done and the formation sorts its lanes."""
 
     @property
     def roster(self) -> tuple[Name, ...]:
@@ -59,18 +59,18 @@ class Formation:
 
 @define
 class Groups:
-    """Which blocks plan together, as far as one leader knows; groups only grow."""
+    """Groups of blocks that plan together, as known to one leader; groups only grow."""
 
     changed: bool = False
     """Set when blocks are joined; the reader resets it."""
     _group: dict[int, Numbers] = field(factory=dict)
 
     def of(self, number: int) -> Numbers:
-        """Return all blocks that plan together with one, itself included."""
+        """Return the group of a block, itself included."""
         return self._group.get(number, (number,))
 
     def join(self, numbers: Iterable[int]) -> bool:
-        """Join blocks and all that they are joined with; return whether that is new."""
+        """Merge the groups of some blocks; return whether this changes anything."""
         union = tuple(sorted({other for number in numbers for other in self.of(number)}))
         if not union or self.of(union[0]) == union:
             return False
@@ -79,26 +79,23 @@ class Groups:
         return True
 
     def forget(self) -> None:
-        """Forget all groups: another road has other formations."""
+        """Discard all groups: another road has other formations."""
         self._group.clear()
 
 
 def closed_formations(
     census: Census, t_s: float, scenario: Scenario, groups: Groups
 ) -> dict[int, Formation]:
-    """Return the formations that are complete and on the road.
+    """Return the complete formations on the road by their lowest block number.
 
-    Formations with a block that the census does not know as closed are left out: it could lack a
-    member of theirs.
+    Formations with a block that is not closed in the census are left out, since a member could be
+    missing.
 
     Args:
-        census: the vehicles on the road, and the blocks of each formation.
+        census: vehicles on the road, and the blocks of each formation.
         t_s: road time.
-        scenario: the lattice.
-        groups: which blocks plan together; the blocks of each closed formation are added.
-
-    Returns:
-        Each formation under the lowest number of its blocks.
+        scenario: lattice, structures.
+        groups: blocks that plan together; the blocks of each closed formation are merged in it.
     """
     lattice = scenario.lattice
     closed_s: dict[int, list[float]] = {}
@@ -127,10 +124,10 @@ def closed_formations(
 
 
 def stage_at(numbers: Numbers, t_s: float, scenario: Scenario) -> int:
-    """Return which structure the formation in some blocks should plan for at a road time.
+    """Return the index of the structure that a formation should plan at a road time.
 
-    The first one at once; each later one, and the sorting behind the last one, `STAGE_LEAD_S`
-    before the rear gets there.
+    The first structure is planned at once. Each later structure, and the sorting after the last
+    one, is planned `STAGE_LEAD_S` before the rear of the formation reaches its position.
     """
     structures = scenario.formation.structures
     later = range(1, len(structures) + 1)
@@ -138,7 +135,7 @@ def stage_at(numbers: Numbers, t_s: float, scenario: Scenario) -> int:
 
 
 def stage_begin_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
-    """Return the road time at which all bodies in some blocks are where a stage begins."""
+    """Return the road time at which all bodies in some blocks are beyond the start of a stage."""
     structures, lattice = scenario.formation.structures, scenario.lattice
     sorts = stage == len(structures)
     from_m = scenario.road.sorting_start_m if sorts else structures[stage].from_m
@@ -149,31 +146,31 @@ def stage_begin_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
 def pairs_to_join(
     formations: Mapping[int, Formation], t_s: float, scenario: Scenario
 ) -> Iterator[Numbers]:
-    """Yield the blocks of neighbouring formations whose vehicles fit into one (paper, Fig. 2b).
+    """Yield the blocks of neighbours whose vehicles fit into one formation (paper, Fig. 2b).
 
-    Where the scenario lets them join for that; not when the one ahead may sort already.
+    Pairs join only if `formation.join` is "room" and the formation ahead has not begun to sort.
     """
     formation = scenario.formation
     if formation.join != "room":
         return
-    taken: set[int] = set()
+    paired: set[int] = set()
     for ahead, behind in pairwise(sorted(formations)):
         front, rear = formations[ahead], formations[behind]
         if (
-            ahead not in taken
+            ahead not in paired
             and front.numbers[-1] + 1 == rear.numbers[0]
             and front.joined + rear.joined <= formation.max_joined
             and len(front.members) + len(rear.members) <= formation.max_vehicles
             and t_s < stage_begin_s(front.numbers, len(formation.structures), scenario)
         ):
-            taken |= {ahead, behind}
+            paired |= {ahead, behind}
             yield (*front.numbers, *rear.numbers)
 
 
 def start_time_s(cells: Collection[Cell], not_before_s: float, scenario: Scenario) -> float:
-    """Return the road time at which vehicles in these cells may begin to change lanes, on a tick.
+    """Return the tick [s] from which vehicles in these cells may change lanes.
 
-    That is when the rearmost body is in S3, and never before `not_before_s`.
+    The rearmost body is in S3 then, and it is not before `not_before_s`.
     """
     lattice, road = scenario.lattice, scenario.road
     in_sorting_s = lattice.passing_time_s(
@@ -183,17 +180,17 @@ def start_time_s(cells: Collection[Cell], not_before_s: float, scenario: Scenari
 
 
 def on_tick(t_s: float, scenario: Scenario) -> float:
-    """Return the first tick at or after a road time."""
+    """Return the first tick [s] at or after a road time."""
     tick_s = scenario.runtime.tick_s
     return math.ceil(t_s / tick_s - 1e-6) * tick_s
 
 
 def time_left_s(cells: Collection[Cell], t_s: float, scenario: Scenario) -> float:
-    """Return how long it takes from `t_s` until the foremost cell reaches the end of the road."""
+    """Return the time from `t_s` until the foremost cell reaches the end of the road."""
     front = max(column for column, _ in cells)
     return scenario.lattice.passing_time_s(front, scenario.road.length_m) - t_s
 
 
 def steps_left(cells: Collection[Cell], t_s: float, slot_s: float, scenario: Scenario) -> int:
-    """Return how many whole steps fit in before the foremost cell reaches the end of the road."""
+    """Return the number of whole steps until the foremost cell reaches the end of the road."""
     return max(0, math.floor(time_left_s(cells, t_s, scenario) / slot_s + 1e-6))

@@ -1,10 +1,9 @@
 """Lane sorting of one formation, or of joined ones: from promises to moves.
 
-Before it sorts, a formation may take on other structures, in which any vehicle may have any place.
-
-The grid is the blocks of the formations. Vehicles without an agent block their cells. When the
-whole sorting is impossible, one vehicle at a time is excused from reaching its lane, so that one
-vehicle in a corner does not keep all others from theirs.
+The grid consists of the blocks of the formations. Vehicles without an agent block their cells. If
+complete sorting is impossible, one vehicle after the other is exempted from reaching its lane, so
+that a single blocked vehicle does not prevent all others from sorting. Before it sorts, a formation
+may form other structures, in which every vehicle may take any place.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ from laneweave.protocol.scenario.fields import DrivingStructure, Scenario
 from laneweave.protocol.wire.messages import Name
 
 MAX_PLACEMENTS = 6
-"""Placements of the targets that are tried where the first one takes too many steps."""
+"""Maximum number of target placements that are tried if the first one takes too many steps."""
 MIN_DEADLINE_S = 0.05
-"""Shortest deadline of one attempt."""
+"""Minimum deadline of one attempt."""
 
 
 @frozen
@@ -39,23 +38,22 @@ class SortingTask:
     """Input of a sorting."""
 
     numbers: Numbers
-    """The formations whose blocks may be used."""
+    """Blocks that may be used, ascending."""
     hold_cells: Mapping[Name, Cell]
-    """Lattice cell of each member, in the order of the answer."""
+    """Lattice cell of each member, in the order of the result."""
     preferred_lanes: Mapping[Name, int]
-    """Lane that each member needs."""
     unattended: Collection[Name]
-    """Members that hold whatever is planned."""
+    """Members without an agent, which only hold."""
     scenario: Scenario
     """Mode, conflict kinds, lattice."""
     deadline_s: float
-    """For all attempts together [s]."""
+    """Deadline of all attempts together [s]."""
     steps: int = 1_000_000
-    """Steps that fit on the road; if a plan has more, other targets are tried."""
+    """Number of steps that fit on the road; if a plan has more, other targets are tried."""
     deserted: Numbers = ()
-    """Blocks of `numbers` in which only the cells that members hold may be used."""
+    """Blocks of `numbers` in which only hold cells of members may be used."""
     structure: DrivingStructure | None = None
-    """Structure that the vehicles should form, each in any place of it; None: they sort."""
+    """Structure to form, with any vehicle in any place; None: sort by lanes."""
 
     @property
     def columns(self) -> range:
@@ -67,7 +65,7 @@ class SortingTask:
 
     @property
     def movers(self) -> dict[Name, Cell]:
-        """Grid cell of each member that can be moved."""
+        """Grid cell of each member that can move."""
         first = self.columns.start
         return {
             name: (column - first, lane)
@@ -79,8 +77,8 @@ class SortingTask:
     def blocked(self) -> tuple[Cell, ...]:
         """Grid cells that paths must avoid.
 
-        These are the cells of members without an agent, those between the blocks, and those of
-        deserted blocks.
+        These are the cells of members without an agent, the cells between the blocks, and the cells
+        of deserted blocks.
         """
         first, lattice = self.columns.start, self.scenario.lattice
         usable = {*self.numbers} - {*self.deserted}
@@ -99,15 +97,15 @@ class Sorting:
     """The result of a sorting."""
 
     response: PlanResponse | None
-    """Of the planner; None: no vehicle can be moved."""
+    """Response of the planner; None: no vehicle can move."""
     moves: dict[Name, tuple[PlannedMove, ...]]
-    """Moves of every member, on the lattice."""
+    """Moves of each member on the lattice."""
     out_of_reach: tuple[Name, ...]
     """Members that do not reach their lanes."""
     short_of_room: bool
-    """A member that could be moved does not reach its lane: more blocks could help."""
+    """Whether a member that can move does not reach its lane, so more blocks could help."""
     impossible: str = ""
-    """Why the structure has too few cells; then no member moves. Empty: it has enough."""
+    """Reason why the structure has too few cells, so that no member moves; empty: it has enough."""
 
     @property
     def solved(self) -> bool:
@@ -115,16 +113,16 @@ class Sorting:
         return self.response is None or bool(self.response.paths)
 
 
-def plan_requests(task: SortingTask, excused: Name | None = None) -> Iterator[PlanRequest]:
-    """Yield the requests for a sorting, one for each placement of the targets, the best first.
+def plan_requests(task: SortingTask, exempt: Name | None = None) -> Iterator[PlanRequest]:
+    """Yield one plan request for each placement of the targets, best placement first.
 
     Args:
-        task: with at least one vehicle that can be moved.
-        excused: a vehicle that need not reach its lane.
+        task: a task with at least one vehicle that can move.
+        exempt: a vehicle that need not reach its lane.
     """
     scenario = task.scenario
     wanted = {
-        name: cell[1] if name == excused else task.preferred_lanes[name]
+        name: cell[1] if name == exempt else task.preferred_lanes[name]
         for name, cell in task.movers.items()
     }
     for targets in placements(
@@ -176,13 +174,13 @@ def sort_lanes(
     plan: PlanFunction,
     clock: Clock = time.monotonic,
 ) -> Sorting:
-    """Plan a sorting; if that is impossible, excuse one member from reaching its lane.
+    """Plan a sorting; if it is impossible, exempt one member from reaching its lane.
 
     Args:
-        task: what is to be sorted.
-        max_nodes: bound on search nodes of each attempt.
-        plan: plans each attempt.
-        clock: returns the time, in seconds, for the deadline.
+        task: input of the sorting.
+        max_nodes: maximum number of search nodes of each attempt.
+        plan: plans one request.
+        clock: returns the time for the deadline [s].
     """
     if not task.movers:
         return _sorting(task, None)
@@ -191,9 +189,9 @@ def sort_lanes(
     if task.structure is not None:
         return _form(task, task.structure, make_plan)
     ends_s = clock() + task.deadline_s
-    for excused in (None, *task.movers):
+    for exempt in (None, *task.movers):
         best: PlanResponse | None = None
-        for request in islice(plan_requests(task, excused), MAX_PLACEMENTS):
+        for request in islice(plan_requests(task, exempt), MAX_PLACEMENTS):
             left_s = ends_s - clock()
             if best is not None and left_s <= MIN_DEADLINE_S:
                 break
@@ -208,14 +206,14 @@ def sort_lanes(
 
 
 def _steps(response: PlanResponse) -> float:
-    """Return how many steps a plan takes; infinite: there is none."""
+    """Return the number of steps of a plan; infinite: there is no plan."""
     return math.inf if response.steps is None else response.steps
 
 
 def _form(
     task: SortingTask, structure: DrivingStructure, make_plan: Callable[[PlanRequest], PlanResponse]
 ) -> Sorting:
-    """Plan the paths into a structure; all members stay where they are if it has too few cells."""
+    """Plan the paths into a structure; if it has too few cells, all members hold."""
     members = [{"id": name, "cell": list(cell)} for name, cell in task.movers.items()]
     lanes = {"lanes": list(structure.lanes)} if structure.lanes else {}
     try:
@@ -243,7 +241,7 @@ def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:
     missed: tuple[Name, ...] = ()
     if task.structure is None:
         missed = tuple(name for name, cell in ends.items() if cell[1] != task.preferred_lanes[name])
-    # After a timeout nothing is known of the room, and planning more blocks would take longer.
+    # After a timeout it is unknown whether there is room, and planning more blocks takes longer.
     known = response is not None and response.status != "timeout"
     short_of_room = known and any(name not in task.unattended for name in missed)
     return Sorting(response, moves, missed, short_of_room)

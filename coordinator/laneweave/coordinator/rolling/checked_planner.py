@@ -1,4 +1,4 @@
-"""The rolling planner of a scenario's road, and the check that every plan has to pass."""
+"""The rolling planner for a scenario's road, with a check of every plan."""
 
 from __future__ import annotations
 
@@ -17,19 +17,16 @@ from laneweave.protocol.lattice import Cell, Mode
 from laneweave.protocol.scenario.fields import Scenario
 
 REWARD = -0.5
-"""Cost of a column gained if drift is rewarded; a move costs 0.3."""
+"""Cost of a column gained forwards if drift is rewarded; a move costs 0.3."""
 
 
 Planner = Callable[[int, Sequence[StreamVehicle], StreamPlan | None, Collection[Cell]], StreamPlan]
-"""Returns paths for all vehicles from the beginning of a slot on, given the slot, the vehicles, the
-plan before, and blocked cells; `StreamPlanner.plan` except in fault searches and tests."""
+"""Function of slot, vehicles, previous plan and blocked cells that returns paths for all vehicles
+from that slot on; `StreamPlanner.plan` except in fault searches and tests."""
 
 
 def checked(road: StreamRoad, planner: Planner) -> Planner:
-    """Return a planner that raises `ValueError` for plans that break a rule.
-
-    A check takes half a millisecond.
-    """
+    """Return a planner that raises `ValueError` for invalid plans; a check takes 0.5 ms."""
 
     def plan(
         slot: int,
@@ -40,21 +37,21 @@ def checked(road: StreamRoad, planner: Planner) -> Planner:
         table = planner(slot, vehicles, before, blocked)
         problems = problems_of_plan(road, table, vehicles, blocked)
         if problems:
-            raise ValueError(f"the plan of slot {slot} is wrong: {'; '.join(problems)}")
+            raise ValueError(f"the plan of slot {slot} is invalid: {'; '.join(problems)}")
         return table
 
     return plan
 
 
 def stream_planner(scenario: Scenario) -> Planner:
-    """Return the planner of a scenario's road."""
+    """Return the checked planner for a scenario's road."""
     road = stream_road(scenario)
     costs = StreamCosts(forward=REWARD if scenario.formation.reward_drift else 0.0)
     return checked(road, StreamPlanner(road, costs, scenario.seed).plan)
 
 
 def stream_road(scenario: Scenario) -> StreamRoad:
-    """Return the road of a scenario as the rolling planner needs it."""
+    """Return a scenario's road as input of the rolling planner."""
     formation, road = scenario.formation, scenario.road
     mode: Mode = 1 if formation.mode == 1 else 2
     return StreamRoad(

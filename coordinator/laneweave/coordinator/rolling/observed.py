@@ -1,8 +1,7 @@
-"""The states and the census that a leader has received, as of now and of a moment ago.
+"""States and census that a leader has received, as of now and of the previous tick.
 
-Plans are made from what was the case at one road time, so they do not depend on how fast messages
-are. That time is at most one tick ago, so the newest state of each vehicle and the newest one with
-an earlier time suffice.
+Plans are made from the states at one road time, so they do not depend on message delays. That time
+is at most one tick ago, so the two newest states of each vehicle suffice.
 """
 
 from __future__ import annotations
@@ -15,48 +14,48 @@ from attrs import frozen
 from laneweave.coordinator.ballots.ballot_round import is_older
 from laneweave.protocol.wire.messages import Census, Name, VehicleState
 
-_News = TypeVar("_News", Census, VehicleState)
+_Message = TypeVar("_Message", Census, VehicleState)
 
 
 @frozen
 class Snapshot:
-    """What was known at one road time."""
+    """Census and states at one road time."""
 
     census: Census
     states: Mapping[Name, VehicleState]
-    """Of the vehicles on the road that had been heard."""
+    """States of the vehicles on the road; vehicles without a state are missing."""
     gone: frozenset[Name]
-    """Vehicles in the roster of a pending transfer that had left the road."""
+    """Vehicles in the rosters of pending transfers that had left the road."""
 
 
 class ObservedRoad:
-    """The newest states and the newest census, and those before them."""
+    """The newest and the previous states and census."""
 
     def __init__(self) -> None:
-        """Begin with nothing known."""
+        """Begin without states and census."""
         self.states: dict[Name, VehicleState] = {}
         """The newest state of each vehicle on the road."""
         self.census: Census | None = None
-        """The newest one."""
+        """The newest census."""
         self._before: dict[Name, VehicleState] = {}
-        """The newest state with an earlier time."""
+        """Newest state of each vehicle with an earlier time."""
         self._left: dict[Name, VehicleState] = {}
-        """The newest state of each vehicle that has left since the last snapshot."""
+        """Newest state of each vehicle that has left since the last snapshot."""
         self._census_before: Census | None = None
 
     def forget(self) -> None:
-        """Forget everything: there is another road."""
+        """Discard everything: there is another road."""
         self.states.clear()
         self.take_over()
 
     def take_over(self) -> None:
-        """Forget where vehicles are; what they have shown of what they own stays true."""
+        """Discard positions; what states report of transfers stays true."""
         self._before.clear()
         self._left.clear()
         self.census = self._census_before = None
 
     def on_census(self, census: Census) -> list[Name]:
-        """Take a newer census; return the vehicles that have left the road."""
+        """Handle a newer census; return the vehicles that have left the road."""
         if self.census is not None and census.t_s > self.census.t_s:
             self._census_before = self.census
         self.census = census
@@ -67,7 +66,7 @@ class ObservedRoad:
         return gone
 
     def on_state(self, state: VehicleState) -> bool:
-        """Take the state of a vehicle; return whether it is its newest one."""
+        """Handle the state of a vehicle; return whether it is the newest."""
         known = self.states.get(state.vehicle)
         if known is not None and is_older(state, known):
             if state.t_s < known.t_s:
@@ -80,11 +79,11 @@ class ObservedRoad:
 
     @property
     def gone(self) -> frozenset[Name]:
-        """Vehicles in the roster of a pending transfer that have left the road."""
+        """Vehicles in the rosters of pending transfers that have left the road."""
         return _gone(self.states.values(), self.census)
 
     def at(self, t_s: float) -> Snapshot:
-        """Return what was known at a road time [s], and forget the vehicles that have left.
+        """Return the snapshot at a road time [s], and discard vehicles that have left.
 
         Raises:
             ValueError: no census has been received.
@@ -112,8 +111,8 @@ class ObservedRoad:
             self._before[state.vehicle] = state
 
 
-def _at(t_s: float, newest: _News | None, before: _News | None) -> _News | None:
-    """Return what was known at a road time; None: nothing yet."""
+def _at(t_s: float, newest: _Message | None, before: _Message | None) -> _Message | None:
+    """Return the message that was the newest at a road time; None: there was none."""
     return newest if newest is not None and newest.t_s <= t_s else before
 
 

@@ -1,10 +1,10 @@
 """The rolling operation under a leader: all vehicles on the road are planned anew in each slot.
 
-Shortly after a slot has begun, the hold cell of every vehicle at its end is known. From there the
-rolling planner makes complete paths for all vehicles; their moves in the next slot are put into
-force by ballots over exactly the vehicles that are concerned (`transfer`), while the moves of this
-slot are under way. No vehicle stops for a new plan: one that is not reached holds, and is planned
-from there.
+Shortly after a slot has begun, the hold cell of every vehicle at its end is known. From these cells
+the rolling planner plans complete paths for all vehicles. While the moves of this slot are in
+progress, their moves in the next slot are put into force by ballots over only the vehicles
+concerned (`transfer`). No vehicle stops for a new plan: a vehicle that misses one holds, and the
+next plan starts from its cell.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from laneweave.protocol.wire.events import (
 from laneweave.protocol.wire.messages import Ballot, Census, Name, Plan, Prepare, VehicleState
 
 SNAPSHOT_S = 0.5
-"""Vehicles that move in a slot have begun, and shown it, this long after the slot has begun.
+"""Time after the beginning of a slot at which all its moves have begun and been reported.
 
-Plans are made from the states up to then, one tick later, when all of them have arrived: so plans
-do not depend on how fast messages are."""
+Plans are made from the states up to this time, one tick later, when all of them have arrived. So
+plans do not depend on message delays."""
 LISTEN_S = 0.5
-"""How long a new leader listens before it plans (node clock). One that leads only for a moment,
-because it has not heard another leader, must not outbid the ballots of that one."""
+"""Time for which a new leader only listens (node clock). A leader that has just not received the
+heartbeats of another one must not outbid its ballots."""
 MAX_DELAY_S = 1.0
-"""A plan that is ready later than this after its slot has begun is dropped."""
+"""A plan that is ready later than this after the beginning of its slot is dropped."""
 LOOKAHEAD_M = 600.0
-"""How far before the place where moves begin vehicles are planned for: the length of S3, so that
-all vehicles that can come near each other there are known in time."""
+"""Distance before the first moves from which on vehicles are planned for: the length of S3, so that
+all vehicles that can interact there are included in time."""
 MARGIN_COLUMNS = 10
-"""Columns ahead of the foremost vehicle and behind the rearmost one that may be planned with."""
+"""Columns ahead of the foremost and behind the rearmost vehicle that plans may use."""
 
 
 class RollingOperation:
@@ -60,11 +60,11 @@ class RollingOperation:
         new_job: Callable[[], int],
         planner: Planner,
     ) -> None:
-        """Begin with nothing known.
+        """Begin without vehicles.
 
         Args:
             scenario: road, lattice, timing.
-            new_ballot: returns a ballot never used before and above the given one, if one is given.
+            new_ballot: returns a new ballot, above the given one if there is one.
             new_job: returns the number of a new computation.
             planner: plans all vehicles.
         """
@@ -78,23 +78,22 @@ class RollingOperation:
         self._transfer_of: dict[Name, CellTransfer] = {}
         self._highest: Ballot | None = None
         self._since: tuple[float, float] | None = None
-        """When this leader began to receive states: road time, node clock."""
+        """Road time and node clock at which this leader began to receive states."""
         self._ordered: tuple[int, int] | None = None
-        """Numbers of the computation under way and of the slot that it plans."""
+        """Numbers of the computation in progress and of the slot that it plans."""
         self._newest_slot = -1
         self._last_plan: StreamPlan | None = None
 
     def forget(self) -> None:
-        """Forget everything: there is another road."""
+        """Discard everything: there is another road."""
         self.take_over()
         self.observed.forget()
         self._last_plan, self._newest_slot = None, -1
 
     def take_over(self) -> None:
-        """Begin anew: listen for a while before anything is planned.
+        """Reset: listen for `LISTEN_S` before planning, and drop the ballots of the earlier term.
 
-        What vehicles have shown of what they own stays true, but not where they are. Ballots of an
-        earlier term are not pursued.
+        What vehicles have reported of transfers stays true, but not their positions.
         """
         self.transfers.clear()
         self._transfer_of.clear()
@@ -102,13 +101,13 @@ class RollingOperation:
         self._ordered = self._since = None
 
     def on_clock(self, t_s: float, now_s: float) -> None:
-        """Ignore it: a plan is due in each slot, whatever the pace of the road."""
+        """Ignore the clock message: plans are due by road time alone."""
 
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
-        """Take the state of a vehicle, unless a newer one is known.
+        """Handle the state of a vehicle, unless a newer one is known.
 
         Returns:
-            None: no ballot under way waits for it, as for most states.
+            None: no unfinished ballot depends on it, as for most states.
         """
         if not self.observed.on_state(state):
             return None
@@ -130,7 +129,7 @@ class RollingOperation:
     def lead(
         self, census: Census, t_s: float, now_s: float, *, changed: bool
     ) -> Iterator[Effect | LogEntry]:
-        """Order the plan of the next slot when it is time for it; send messages."""
+        """Order the plan of the next slot when it is due; send messages."""
         if changed:
             self.on_census(census)
             yield from self.order(t_s, now_s)
@@ -138,19 +137,19 @@ class RollingOperation:
             yield to_vehicle(vehicle, message)
 
     def on_census(self, census: Census) -> None:
-        """Take which vehicles are on the road."""
+        """Update the vehicles on the road."""
         for name in self.observed.on_census(census):
             transfer = self._transfer_of.pop(name, None)
             if transfer is not None:
                 transfer.on_left(name)
 
     def outgoing(self, now_s: float) -> Iterator[tuple[Name, Prepare | Plan]]:
-        """Yield what has to be sent (again) now, and to which vehicle."""
+        """Yield the messages to send or repeat now, each with its receiver."""
         for transfer in self.transfers:
             yield from transfer.outgoing(now_s)
 
     def order(self, t_s: float, now_s: float) -> Iterator[Compute]:
-        """Order the plan of the next slot when it is time for it."""
+        """Order the plan of the next slot when it is due."""
         census = self.observed.census
         if census is None:
             return
@@ -166,7 +165,7 @@ class RollingOperation:
         if slot < self._newest_slot or t_s <= snapshot_s or now_s < self._since[1] + LISTEN_S:
             return
         if max(self._since[0], t_s - 1.5 * self._scenario.runtime.tick_s) > snapshot_s:
-            snapshot_s = t_s  # too late for that time: take the newest states
+            snapshot_s = t_s  # too late for that snapshot: use the newest states
         vehicles, blocked = self._observed_at(snapshot_s, slot + 1)
         self._newest_slot = slot + 1
         job = self._new_job()
@@ -176,48 +175,48 @@ class RollingOperation:
     def _observed_at(
         self, snapshot_s: float, slot: int
     ) -> tuple[tuple[StreamVehicle, ...], frozenset[Cell]]:
-        """Return the vehicles to plan for from a slot on, and the cells that they cannot use."""
+        """Return the vehicles to plan for from a slot on, and the blocked cells."""
         vehicles: dict[Cell, StreamVehicle] = {}
-        owned, taken = set[Cell](), set[Cell]()
-        # States received while this coordinator led before do not tell where vehicles are now.
+        owned, reserved = set[Cell](), set[Cell]()
+        # States from an earlier term of this leader do not report current positions.
         since_s = self._since[0] - 1e-6 if self._since is not None else 0.0
         far_m = self._scenario.moves_from_m - LOOKAHEAD_M
-        then = self.observed.at(snapshot_s)
-        # A vehicle that was not heard may be elsewhere by now, and another one in its cell.
+        snapshot = self.observed.at(snapshot_s)
+        # Last: vehicles without a state may have moved, and others may hold in their cells.
         for entry in sorted(
-            then.census.on_road, key=lambda entry: entry.vehicle not in then.states
+            snapshot.census.on_road, key=lambda entry: entry.vehicle not in snapshot.states
         ):
-            state = then.states.get(entry.vehicle)
+            state = snapshot.states.get(entry.vehicle)
             column = entry.cell[0] if state is None else state.hold_cell[0]
             if self._scenario.lattice.cell_s_m(column, (slot - 1) * self._slot_s) < far_m:
                 continue
             if state is None:
-                unheard = StreamVehicle(entry.vehicle, entry.cell, entry.preferred_lane, held=True)
-                vehicles.setdefault(entry.cell, unheard)
+                unknown = StreamVehicle(entry.vehicle, entry.cell, entry.preferred_lane, held=True)
+                vehicles.setdefault(entry.cell, unknown)
                 continue
-            # With an open gate its move may begin at any moment. With a closed one it never will
-            # if the vehicle promises a newer ballot, which it is asked for.
+            # With an open gate the move may begin at any time. With a closed gate it never begins
+            # once the vehicle promises the newer ballot.
             late = state.go and not state.done and not state.moving
-            owned |= certain_cells(state, then.states, then.gone)
+            owned |= certain_cells(state, snapshot.states, snapshot.gone)
             if late:
-                taken |= {*state.owned} - {state.hold_cell}
+                reserved |= {*state.owned} - {state.hold_cell}
             held = late or not state.attended or state.t_s < since_s
-            heard = StreamVehicle(entry.vehicle, state.hold_cell, entry.preferred_lane, held)
-            vehicles.setdefault(state.hold_cell, heard)
+            known = StreamVehicle(entry.vehicle, state.hold_cell, entry.preferred_lane, held)
+            vehicles.setdefault(state.hold_cell, known)
         columns = [column for column, _ in vehicles] or [0]
         blocked = frozenset(
             (column, lane)
             for column in range(min(columns) - MARGIN_COLUMNS, max(columns) + MARGIN_COLUMNS + 1)
             for lane in range(self._scenario.road.lanes)
-            if (column, lane) not in owned or (column, lane) in taken
+            if (column, lane) not in owned or (column, lane) in reserved
         )
         return tuple(vehicles.values()), blocked
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[LogEntry]:
-        """Take a plan, and begin ballots for its first moves.
+        """Handle a plan: begin ballots for its first moves.
 
         Args:
-            computed: the result of the newest computation, or of another one, which is ignored.
+            computed: result of a computation; ignored unless it is the newest.
             t_s: road time.
             now_s: node clock.
         """
@@ -270,7 +269,7 @@ class RollingOperation:
             name = Name(vehicle)
             state = states.get(name)
             if state is None or state.hold_cell != path[0]:
-                continue  # it has moved meanwhile
+                continue  # it has moved since
             cells = footprint(path[0], path[1])
             if all(cell in owner for cell in cells):
                 moves[name] = (path[0], path[1])
@@ -288,7 +287,7 @@ class RollingOperation:
             )
 
     def _with_partners(self, names: set[Name]) -> set[Name]:
-        """Add the vehicles whose promises are needed to tell what the others own."""
+        """Add the vehicles whose promises determine what the others own."""
         roster, waiting, states = set(names), sorted(names), self.observed.states
         while waiting:
             new = partners(states[waiting.pop()], states) - roster
@@ -298,7 +297,7 @@ class RollingOperation:
 
     @property
     def wakeups(self) -> list[float]:
-        """Times at which messages are to be sent again."""
+        """Times at which messages are repeated."""
         return [each.wakeup_s for each in self.transfers if each.wakeup_s is not None]
 
     @property
@@ -308,7 +307,7 @@ class RollingOperation:
 
 
 def _clusters(groups: Iterable[set[Name]]) -> list[set[Name]]:
-    """Join groups that share a vehicle."""
+    """Merge groups that share a vehicle."""
     clusters: list[set[Name]] = []
     for group in groups:
         joined = set(group)

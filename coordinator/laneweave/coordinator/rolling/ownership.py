@@ -1,8 +1,8 @@
-"""What each vehicle owns in the rolling operation, as far as a leader can tell from states.
+"""Cells that vehicles own in the rolling operation, derived from their states.
 
-A plan gives every vehicle of its roster a *pending transfer*: it owns the cells `before` until it
-knows that the start gate is open, then `after`. A vehicle whose own gate is closed does not know
-which of the two holds, since others of the roster may have opened theirs.
+A plan gives every vehicle of its roster a *pending transfer*: the vehicle owns the cells `before`
+until it knows that the start gate is open, and the cells `after` from then on. A vehicle with a
+closed gate alone cannot determine which of the two holds, since others may have opened theirs.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ States = Mapping[Name, VehicleState]
 def owned_cells(
     state: VehicleState, states: States, gone: Collection[Name] = ()
 ) -> frozenset[Cell] | None:
-    """Return the cells that a vehicle owns, from its state and from those of others.
+    """Return the cells that a vehicle owns, from its state and the states of others.
 
-    The gate of its pending transfer is open if a vehicle of the roster shows it. It never opens if
-    one has promised more without ever having had the transfer, or if all have promised more with
-    closed gates. Where a vehicle will never tell, since it has a newer transfer or has left the
-    road, only those cells are certain that the vehicle owns either way. While it moves it may still
-    be in one of the others.
+    The gate of its pending transfer is open if a vehicle of the roster reports it open. It never
+    opens if one of them has promised a higher ballot without storing the transfer, or if all have
+    promised higher ballots with closed gates. If a vehicle can no longer report the gate, because
+    it has a newer transfer or has left the road, only cells in both `before` and `after` are
+    certain; while the vehicle moves, nothing is, since it may still be in another cell.
 
     Args:
-        state: of the vehicle; it shows cells that it owns.
-        states: the newest ones of others; what they show stays true.
+        state: state of the vehicle, with owned cells.
+        states: newest states of all vehicles; what they report of transfers stays true.
         gone: vehicles that have left the road.
 
     Returns:
-        None: it cannot be told yet.
+        None: not known yet.
     """
     transfer = state.transfer
     if transfer is None or transfer.open:
@@ -52,7 +52,7 @@ def owned_cells(
 def certain_cells(
     state: VehicleState, states: States, gone: Collection[Name] = ()
 ) -> frozenset[Cell]:
-    """Return the cells that a vehicle owns whichever way its pending transfer resolves."""
+    """Return the cells that a vehicle owns whether or not its pending transfer opens."""
     owned, transfer = owned_cells(state, states, gone), state.transfer
     if owned is not None or transfer is None:
         return owned or frozenset()
@@ -60,7 +60,7 @@ def certain_cells(
 
 
 def partners(state: VehicleState, states: States) -> frozenset[Name]:
-    """Return the vehicles whose promises would tell what a vehicle owns; none if that is known."""
+    """Return the vehicles whose promises determine what a vehicle owns; none if it is known."""
     transfer = state.transfer
     if transfer is None or transfer.open:
         return frozenset()
@@ -71,14 +71,14 @@ def partners(state: VehicleState, states: States) -> frozenset[Name]:
 
 
 class _Sign(Enum):
-    """What a vehicle shows of the start gate of a transfer's plan; all but `NONE` stay true."""
+    """Evidence from one vehicle on the start gate of a transfer; all but `NONE` stays true."""
 
-    OPEN = "it is open"
-    CLOSED = "it has promised more with a closed gate"
-    WITHOUT = "it has promised more, and has never had the transfer"
-    NEWER = "it has a newer transfer"
-    GONE = "it has left the road"
-    NONE = "nothing"
+    OPEN = "the gate is open"
+    CLOSED = "the vehicle has promised a higher ballot with a closed gate"
+    WITHOUT = "the vehicle has promised a higher ballot without storing the transfer"
+    NEWER = "the vehicle has a newer transfer"
+    GONE = "the vehicle has left the road"
+    NONE = "no evidence"
 
 
 def _signs(

@@ -1,9 +1,9 @@
-"""One ballot of the rolling operation: some vehicles move, and cells are transferred for it.
+"""One ballot of the rolling operation: vehicles move, and the cells for it change owners.
 
-The roster is the vehicles that move and those that own a cell that is moved through. The plan is
-short: at most one move of each vehicle, in one slot. A ballot that is outbid, whose vehicles
-restart, or that is not in force in time is given up: its vehicles hold, and the next slot is
-planned from there. `TRANSFER_RULES` is the table; docs/PROTOCOL.md shows it.
+The roster is the vehicles that move and the owners of the cells of their footprints. Each vehicle
+makes at most one move, all in one slot. A ballot is aborted if it is outbid, a vehicle restarts, or
+it is not in force in time; its vehicles then hold, and the next slot is planned from there.
+`TRANSFER_RULES` is the table, shown in docs/PROTOCOL.md.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Steps = Mapping[Name, tuple[Cell, Cell]]
 
 @define(kw_only=True)
 class CellTransfer(BallotRound):
-    """A leader's state of one ballot, and of no other after it."""
+    """A leader's state of a single ballot."""
 
     rules: RuleBook = field(factory=lambda: TRANSFER_RULES)
     ballot: Ballot
@@ -51,42 +51,42 @@ class CellTransfer(BallotRound):
     """Road time at which the moves begin."""
     slot_s: float
     gone: frozenset[Name] = frozenset()
-    """Vehicles that have left the road, of those in pending transfers of members."""
+    """Vehicles in the rosters of pending transfers that have left the road."""
     reason: str = ""
-    """Why it was given up."""
+    """Why the ballot was aborted."""
 
     @property
     def unfinished(self) -> bool:
-        """Whether it may still come into force."""
+        """Whether the ballot may still come into force."""
         return self.phase in UNFINISHED
 
     def on_state(self, state: VehicleState, states: States, now_s: float) -> None:
-        """Take a newer state of a member; `states` has the newest one of every vehicle."""
+        """Handle a newer state of a member; `states` are the newest states of all vehicles."""
         self.take(STATE, now_s, state)
         if self.take(PROMISED, now_s):
             plan = self._make_plan(states)
             self.take(PLANNED if isinstance(plan, Plan) else FAILED, now_s, plan)
 
     def on_left(self, vehicle: Name) -> None:
-        """Give up: a member has left the road."""
+        """Abort because a member has left the road."""
         self.rules.take(self, MEMBERS, f"{vehicle} has left")
 
     def abort(self, reason: str) -> None:
-        """Give up, unless it is in force or given up already: no time is left."""
+        """Abort because no time is left, unless the ballot is in force."""
         self.rules.take(self, TOO_LATE, reason)
 
     def _make_plan(self, states: States) -> Plan | str:
-        """Return the plan from the promises, or why it cannot be made any more."""
+        """Return the plan from the promises, or why it cannot be made."""
         before: dict[Name, frozenset[Cell]] = {}
         for name, promise in self.promises.items():
             owned = owned_cells(promise, dict(states) | self.promises, self.gone)
             if owned is None:
-                return f"it cannot be told what {name} owns"
+                return f"the cells of {name} are not known"
             before[name] = owned
         for name, (origin, _) in self.moves.items():
             promise = self.promises[name]
             if promise.hold_cell != origin or not promise.attended:
-                return f"{name} is not where it was planned from"
+                return f"{name} is not in the cell that was planned from"
         plan = self._plan(before)
         return "; ".join([*plan_problems(plan), *ownership_problems(plan)]) or plan
 
@@ -108,22 +108,22 @@ class CellTransfer(BallotRound):
 
 
 def reports_owned_cells(_: CellTransfer, state: VehicleState) -> bool:
-    """It shows the cells that it owns: its controller has noted the promise."""
+    """The state reports owned cells: the controller has stored the promise."""
     return bool(state.owned)
 
 
 def record_outbid(transfer: CellTransfer, _: object) -> None:
-    """Give up until the next slot."""
+    """Abort until the next slot."""
     transfer.reason = "outbid"
 
 
 def record_restart(transfer: CellTransfer, state: VehicleState) -> None:
-    """Give up until the next slot."""
+    """Abort until the next slot."""
     transfer.reason = f"{state.vehicle} has restarted"
 
 
 def record_reason(transfer: CellTransfer, reason: str) -> None:
-    """Give up until the next slot."""
+    """Abort until the next slot."""
     transfer.reason = reason
 
 

@@ -1,4 +1,4 @@
-"""Clients of the planning service of a network's coordinators.
+"""Clients of the planning service.
 
     with PlanClient("tcp/127.0.0.1:7447") as client:
         response = client.plan(request, timeout_s=10.0)
@@ -6,12 +6,12 @@
     async with AsyncPlanClient("tcp/127.0.0.1:7447") as client:
         response = await client.plan(request, timeout_s=10.0)
 
-On a network that is described by a file, secured or not, a client is named:
+A client of a deployment, secured or not, reads its configuration file and has a name:
 
     PlanClient(client_access(Path("deployment.toml"), "dispatch"))
 
-A client may be used by many threads, or tasks, at a time. A request is sent again, under its id,
-when the coordinator that had it dies.
+Several threads, or tasks, may share a client. If a coordinator ends before it has answered, the
+client sends the request again under the same id.
 """
 
 from __future__ import annotations
@@ -49,31 +49,32 @@ from laneweave.protocol.wire.topics import SERVICE, Keys, Party
 
 DEFAULT_TIMEOUT_S = 10.0
 LONGEST_ATTEMPT_S = 86_400.0
-"""Zenoh does not accept arbitrarily long timeouts."""
+"""Longest timeout of a query, since Zenoh does not accept arbitrarily long ones."""
 
 
 FIRST_PAUSE_S = 0.02
 LONGEST_PAUSE_S = 0.5
 ABSENT_S = 3.0
-"""A coordinator that is killed is given up at once, one that hangs after `network.lease_s`, and a
-new router is found in less than a second."""
+"""Time without any answer after which the service counts as absent. The failure of a killed
+coordinator is detected at once, that of a hanging one after `network.lease_s`; a restarted router
+is found in less than a second."""
 
 
 class PlanError(Exception):
-    """A request was not planned; the message says why, in one line."""
+    """A request was not planned; the message gives the reason in one line."""
 
 
 class RequestRefusedError(PlanError):
     """The request is not valid."""
 
     def __init__(self, message: str, field_name: str) -> None:
-        """Store the line and the field that it is about."""
+        """Store the message and the name of the invalid field."""
         super().__init__(message)
         self.field = field_name
 
 
 class ServiceUnavailableError(PlanError):
-    """No answer: no coordinator can be reached on this network."""
+    """There is no answer because no coordinator can be reached on this network."""
 
 
 class ServiceOverloadedError(PlanError):
@@ -85,16 +86,16 @@ class DeadlinePassedError(PlanError):
 
 
 class PlanningFailedError(PlanError):
-    """The service made an error."""
+    """An error occurred in the service."""
 
 
 @define
 class PendingRequest:
-    """One plan request over all attempts: what to do after each one; pure, without a clock.
+    """One plan request over all attempts: decides what to do after each; pure, without a clock.
 
-    A request may be sent repeatedly: coordinators recognise it by its id, and planning it twice
-    does no harm. It is sent again if there is no answer (its coordinator was killed or is cut off,
-    and the others do not know yet), or if its coordinator is overloaded.
+    A request may be sent repeatedly: coordinators recognise it by its id, and planning it twice is
+    harmless. It is sent again if there is no answer (its coordinator has ended or is disconnected,
+    and the others have not noticed yet), or if its coordinator is overloaded.
     """
 
     request: PlanRequest
@@ -102,25 +103,25 @@ class PendingRequest:
     begun_s: float
     form: Format = JSON
     patience_s: float = ABSENT_S
-    """Without any answer for so long there is no service [s]."""
+    """Time without any answer after which the service counts as absent [s]."""
     _pause_s: float = FIRST_PAUSE_S
     _absent_since_s: float | None = field(default=None)
 
     @property
     def payload(self) -> bytes:
-        """Bytes of the request; the same each time, so the same coordinator is assigned to it."""
+        """Encoded request; equal bytes are assigned to the same coordinator."""
         return self.form.write(self.request.to_dict())
 
     def left_s(self, now_s: float) -> float:
-        """Return the time left [s]."""
+        """Return the remaining time [s]."""
         return self.begun_s + self.timeout_s - now_s
 
     def after(self, answer: Answer | None, now_s: float) -> PlanResponse | float:
         """Return the plan, or the pause [s] after which the request should be sent again.
 
         Args:
-            answer: to the newest attempt; None: there was none.
-            now_s: on the clock of `begun_s`.
+            answer: answer to the newest attempt; None: there was none.
+            now_s: time on the clock of `begun_s`.
 
         Raises:
             PlanError: there will be no plan.
@@ -148,7 +149,7 @@ class PendingRequest:
         return self._pause(now_s, absent)
 
     def _pause(self, now_s: float, otherwise: PlanError) -> float:
-        """Try again after a growing pause, unless no time is left for it."""
+        """Return the next, longer pause; raise `otherwise` if no time is left for it."""
         pause_s, self._pause_s = self._pause_s, min(2 * self._pause_s, LONGEST_PAUSE_S)
         if self.left_s(now_s) <= pause_s:
             raise otherwise
@@ -159,14 +160,14 @@ class PendingRequest:
         try:
             return PlanResponse.from_dict(_parse(answer))
         except BadInputError as error:
-            raise PlanningFailedError(f"the answer is no plan: {error}") from error
+            raise PlanningFailedError(f"the answer is not a plan: {error}") from error
 
     @staticmethod
     def _refusal(answer: Answer) -> Refusal:
         try:
             return Refusal.from_dict(_parse(answer))
         except BadInputError as error:
-            raise PlanningFailedError(f"the answer is no error reply: {error}") from error
+            raise PlanningFailedError(f"the answer is not an error reply: {error}") from error
 
 
 def _parse(answer: Answer) -> dict[str, object]:
@@ -178,8 +179,8 @@ def client_access(config: Path, name: str = "plan", endpoint: str | None = None)
 
     Args:
         config: the DEPLOYMENT.toml.
-        name: of the client, whose certificate is `client.NAME` where the deployment is secured.
-        endpoint: of the router; overrides that of the file.
+        name: name of the client; in a secured deployment its certificate is `client.NAME`.
+        endpoint: endpoint of the router; overrides that of the file.
 
     Raises:
         BadInputError: the file is not valid, or there is no endpoint.
@@ -197,8 +198,8 @@ class _Connection:
         """Connect.
 
         Args:
-            access: to the network, or only the endpoint of its router.
-            patience_s: without any answer for so long, there is no service.
+            access: access to the network, or only the endpoint of its router.
+            patience_s: time without any answer after which the service counts as absent.
 
         Raises:
             BadInputError: no router answers there.
@@ -227,21 +228,21 @@ class _Connection:
 
 
 class PlanClient(_Connection):
-    """Blocking client."""
+    """Blocking client of the planning service."""
 
     def plan(self, request: PlanRequest, timeout_s: float = DEFAULT_TIMEOUT_S) -> PlanResponse:
         """Send a request and return the plan.
 
         Args:
-            request: what to plan; one without an id gets one.
-            timeout_s: how long to wait, all attempts together.
+            request: the request; if it has no id, it gets one.
+            timeout_s: timeout of all attempts together.
 
         Raises:
             RequestRefusedError: the request is not valid.
             ServiceUnavailableError: there is no coordinator, or this client is closed.
             ServiceOverloadedError: the coordinators were overloaded at every attempt.
             DeadlinePassedError: no worker was free before its deadline.
-            PlanningFailedError: the service made an error.
+            PlanningFailedError: an error occurred in the service.
             TimeoutError: no answer within `timeout_s`.
         """
         pending = self._begin(request, timeout_s)
@@ -253,7 +254,7 @@ class PlanClient(_Connection):
             time.sleep(outcome)
 
     def close(self) -> None:
-        """Leave the network; calls that wait for a plan raise `ServiceUnavailableError`."""
+        """Disconnect; waiting calls raise `ServiceUnavailableError`."""
         self._close()
 
     def __enter__(self) -> Self:
@@ -266,17 +267,17 @@ class PlanClient(_Connection):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Leave the network."""
+        """Disconnect."""
         self.close()
 
 
 class AsyncPlanClient(_Connection):
-    """Client for asyncio."""
+    """Client of the planning service for asyncio."""
 
     async def plan(
         self, request: PlanRequest, timeout_s: float = DEFAULT_TIMEOUT_S
     ) -> PlanResponse:
-        """Send a request and return the plan; as `PlanClient.plan`."""
+        """Send a request and return the plan; see `PlanClient.plan`."""
         pending = self._begin(request, timeout_s)
         while True:
             answer = await asyncio.wrap_future(self._ask(pending))
@@ -286,7 +287,7 @@ class AsyncPlanClient(_Connection):
             await asyncio.sleep(outcome)
 
     async def close(self) -> None:
-        """Leave the network; calls that wait for a plan raise `ServiceUnavailableError`."""
+        """Disconnect; waiting calls raise `ServiceUnavailableError`."""
         await asyncio.to_thread(self._close)
 
     async def __aenter__(self) -> Self:
@@ -299,5 +300,5 @@ class AsyncPlanClient(_Connection):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Leave the network."""
+        """Disconnect."""
         await self.close()

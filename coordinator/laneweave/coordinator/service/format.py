@@ -1,4 +1,4 @@
-"""Encoding of requests and answers: JSON or MessagePack, the answer like its request."""
+"""Encoding of requests and answers as JSON or MessagePack; answers use that of their request."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from laneweave.protocol.errors import BadInputError, one_line
 from laneweave.protocol.runtime.node import Reply
 
 INVALID: Final = "invalid"
-"""The request is not acceptable; sending it again will not help."""
+"""The request is not valid; sending it again does not help."""
 OVERLOADED: Final = "overloaded"
-"""The coordinator is overloaded; sent again later, the request may be planned."""
+"""The coordinator is overloaded; sending the request again later may help."""
 LATE: Final = "late"
 """The deadline passed before a worker was free."""
 FAILED: Final = "failed"
-"""Planning failed: an error in the service."""
+"""Planning failed because of an error in the service."""
 CODES: Final = (INVALID, OVERLOADED, LATE, FAILED)
 
 
 @frozen
 class Refusal:
-    """Why there is no plan."""
+    """Error reply: the reason why there is no plan."""
 
     code: str
     """One of `CODES`."""
     message: str
-    """One line for a person."""
+    """One readable line."""
     field: str
-    """The field of the request that is not acceptable; empty: none in particular."""
+    """The invalid field of the request; empty: none in particular."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the error reply as a map."""
@@ -42,7 +42,7 @@ class Refusal:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Refusal:
-        """Read an error reply; without a code: `INVALID` if it names a field, else `FAILED`."""
+        """Read an error reply; a missing code is `INVALID` if a field is named, else `FAILED`."""
         field = one_line(str(data.get("field", "")))
         message = one_line(str(data.get("message", "")))
         return cls(str(data.get("code", INVALID if field else FAILED)), message, field)
@@ -66,14 +66,14 @@ class Format:
         try:
             data = self.parse(payload)
         except Exception as error:
-            # Parsers raise many kinds: not text, too deep, too many digits, truncated.
+            # Parsers raise many kinds of errors: not text, too deep, too many digits, truncated.
             raise BadInputError("request", payload[:16], f"a map in {self.encoding}") from error
         if not isinstance(data, dict):
             raise BadInputError("request", type(data).__name__, f"a map in {self.encoding}")
         return data
 
     def reply(self, token: int, answer: PlanResponse | Refusal) -> Reply:
-        """Return the effect that answers a question."""
+        """Return the effect that answers a query."""
         ok = isinstance(answer, PlanResponse)
         return Reply(token, self.write(answer.to_dict()), ok=ok, encoding=self.encoding)
 
@@ -83,14 +83,11 @@ MSGPACK: Final = Format("application/msgpack", msgpack.packb, msgpack.unpackb)
 
 
 def format_of(payload: bytes, encoding: str) -> Format:
-    """Return the format of a payload, from its encoding or from its first byte.
-
-    Zenoh's default encoding says nothing about maps.
-    """
+    """Return the format of a payload, from its encoding if known, else from its first byte."""
     kind = encoding.partition(";")[0]
     for form in (JSON, MSGPACK):
         if kind == form.encoding:
             return form
-    # No JSON text begins with a byte of a MessagePack map, unless with a byte-order mark.
+    # Only a byte-order mark makes a JSON text begin with a byte that begins a MessagePack map.
     looks_packed = payload[:1] >= b"\x80" and not payload.startswith(codecs.BOM_UTF8)
     return MSGPACK if looks_packed else JSON

@@ -1,9 +1,9 @@
-"""Rendezvous hashing: which of several coordinators a request is assigned to.
+"""Rendezvous hashing: assigns each request to one of several coordinators.
 
 Each coordinator hashes every name with the request; the highest hash wins. Coordinators that know
-the same names agree. When one dies, only its requests are assigned anew. While the known names
-differ, a request may be taken by two coordinators, which make the same plan, or by none, and is
-sent again.
+the same names agree. When one ends, only its requests are assigned anew. While the known names
+differ, a request may be assigned to two coordinators, which make the same plan, or to none; the
+client then sends it again.
 
 Thaler and Ravishankar, "Using name-based mappings to increase hit rates", IEEE/ACM Transactions on
 Networking 6(1), 1998.

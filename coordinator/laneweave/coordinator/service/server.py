@@ -1,9 +1,9 @@
-"""The planning service: answers plan requests of anyone on the network.
+"""The planning service: answers plan requests from clients on the network.
 
-Every coordinator of a network receives every request and takes those that are assigned to it
-(`rendezvous`): so any number of them share the load without messages between them. A request waits
-until a worker is free, at most until its deadline, and is planned in the time that is left then. A
-repeated request, with the same id, gets the same answer, or that of the planning under way.
+Every coordinator receives every request and accepts those that are assigned to it (`rendezvous`),
+so any number of coordinators share the load without messages between them. A request waits until a
+worker is free, at most until its deadline, and is planned in the remaining time. A repeated request
+with the same id gets the same answer.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from laneweave.protocol.scenario.deployment_fields import Service
 from laneweave.protocol.scenario.fields import DEFAULT_SOLVER
 
 HANDED_OUT_AHEAD = 1
-"""Jobs queued for each worker beside its current one, so that it never waits for the next."""
+"""Jobs queued for each worker in addition to its current one, so that it is never idle."""
 CACHE_BYTES = 1 << 26
 """Upper bound on the total size of cached answers."""
 
@@ -50,37 +50,37 @@ class ServiceMetrics:
 
     ABOUT: ClassVar[str] = "service"
 
-    taken_total: int = metric("Requests that fell to this coordinator", default=0)
-    left_total: int = metric("Requests that were left to other coordinators", default=0)
-    answered_total: int = metric("Requests that were planned and answered", default=0)
+    taken_total: int = metric("Requests assigned to this coordinator", default=0)
+    left_total: int = metric("Requests assigned to other coordinators", default=0)
+    answered_total: int = metric("Requests planned and answered", default=0)
     repeated_total: int = metric(
-        "Requests that were answered with another one's answer, by their id", default=0
+        "Repeated requests, by id, that got the answer of an earlier one", default=0
     )
-    invalid_total: int = metric("Requests refused: not valid", default=0)
-    overloaded_total: int = metric("Requests refused: too many in hand", default=0)
+    invalid_total: int = metric("Requests refused because they are not valid", default=0)
+    overloaded_total: int = metric("Requests refused because of overload", default=0)
     late_total: int = metric(
-        "Requests dropped: the deadline passed before a worker was free", default=0
+        "Requests dropped because no worker was free before the deadline", default=0
     )
     failed_total: int = metric("Requests whose planning failed", default=0)
-    planning_seconds_total: float = metric("Solvers' time", default=0.0)
+    planning_seconds_total: float = metric("Time spent in solvers", default=0.0)
     service_seconds_total: float = metric(
-        "Time from requests' arrivals to their answers, without the solvers' time", default=0.0
+        "Time from the arrival of requests to their answers, without solvers", default=0.0
     )
-    waiting: int = metric("Requests that wait for a worker", default=0)
-    planning: int = metric("Requests that workers have", default=0)
+    waiting: int = metric("Requests waiting for a worker", default=0)
+    planning: int = metric("Requests handed to workers", default=0)
 
 
 @define(eq=False)
 class _Entry:
-    """A request that waits or is being planned."""
+    """A request that is waiting or being planned."""
 
     request: PlanRequest
     arrived_s: float
     job: int
     clients: list[tuple[int, Format]] = field(factory=list)
-    """Tokens of the questions that wait for the answer, and their formats."""
+    """Token and format of each query that waits for the answer."""
     dropped: bool = False
-    """It was answered before its computation ended."""
+    """Whether the request was answered before its computation ended."""
 
     @property
     def deadline_s(self) -> float:
@@ -89,16 +89,16 @@ class _Entry:
 
 @frozen
 class _CachedAnswer:
-    """A cached answer, packed: in Python it would take twenty times as much memory."""
+    """A cached answer, packed: as Python objects it would take 20 times as much memory."""
 
     request: bytes
-    """Digest."""
+    """Digest of the request."""
     answer: bytes
     answered_s: float
 
 
 class PlanningService:
-    """Pure core of the service; its coordinator passes it questions, results and the time."""
+    """Pure core of the service; its coordinator passes in queries, results and the time."""
 
     def __init__(
         self,
@@ -111,11 +111,11 @@ class PlanningService:
         """Make a service without requests.
 
         Args:
-            name: of the coordinator, among those that share the load.
+            name: name of the coordinator.
             settings: limits.
-            workers: how many requests are planned at a time.
+            workers: number of requests that are planned at a time.
             plan: plans one request, in a worker process.
-            solver: for requests that name none.
+            solver: solver for requests that name none.
         """
         self._name = name
         self._solver = solver
@@ -125,29 +125,29 @@ class PlanningService:
         self._waiting: deque[_Entry] = deque()
         self._planning: dict[int, _Entry] = {}
         self._pending: dict[str, _Entry] = {}
-        """Requests that wait or are planned, by id; those without one are not here."""
+        """Waiting and running requests by id; requests without an id are not included."""
         self._answers: dict[str, _CachedAnswer] = {}
-        """Answers by the request's id, in order of their time."""
+        """Cached answers by request id, oldest first."""
         self._cached_bytes = 0
         self._metrics = ServiceMetrics()
 
     @property
     def metrics(self) -> ServiceMetrics:
-        """What has been done so far."""
+        """Counters and current load."""
         return attrs.evolve(self._metrics, waiting=len(self._waiting), planning=len(self._planning))
 
     @property
     def wakeup_s(self) -> float | None:
-        """Earliest deadline of a request that waits."""
+        """Earliest deadline of a waiting request."""
         return min((entry.deadline_s for entry in self._not_begun()), default=None)
 
     def _not_begun(self) -> Iterator[_Entry]:
-        """Yield the requests that no worker has begun; workers take jobs in order."""
+        """Yield the requests that no worker has started; workers take jobs in order."""
         ahead = islice(self._planning.values(), self._workers, None)
         yield from (entry for entry in ahead if not entry.dropped)
         yield from self._waiting
 
-    # --- questions ----------------------------------------------------------------------------
+    # --- queries ------------------------------------------------------------------------------
 
     def take(
         self,
@@ -158,13 +158,13 @@ class PlanningService:
         others: Iterable[str],
         now_s: float,
     ) -> Iterator[Effect]:
-        """Take a request, leave it to another coordinator, or refuse it.
+        """Accept a request, decline it for another coordinator, or refuse it.
 
         Args:
-            token: of the question.
-            payload: the encoded request.
-            encoding: MIME type that the client gave, if any.
-            job: number of the computation that this may become.
+            token: token of the query.
+            payload: encoded request.
+            encoding: MIME type given by the client, if any.
+            job: number for the computation of the request.
             others: names of the other live coordinators.
             now_s: node clock.
         """
@@ -219,13 +219,13 @@ class PlanningService:
             cached is not None and cached.request != _digest(request)
         )
         if another:
-            raise BadInputError("id", request.id, "an id that no other request has had of late")
+            raise BadInputError("id", request.id, "an id that no other recent request has")
         return entry, cached
 
     def _overloaded(self) -> Refusal:
         limit = self._settings.queue_limit
         text = (
-            f"service.queue_limit: got {limit} requests in hand; allowed: {limit}; ask again later"
+            f"service.queue_limit: got {limit} pending requests; allowed: {limit}; try again later"
         )
         return Refusal(OVERLOADED, text, "")
 
@@ -236,7 +236,7 @@ class PlanningService:
         return job in self._planning
 
     def _hand_out(self, now_s: float) -> Iterator[Effect]:
-        """Give workers what waits, in the order of its coming."""
+        """Hand waiting requests to workers, in order of arrival."""
         max_planning = self._workers * (1 + HANDED_OUT_AHEAD)
         while self._waiting and len(self._planning) < max_planning:
             entry = self._waiting.popleft()
@@ -268,7 +268,7 @@ class PlanningService:
         return Refusal(FAILED, f"planning failed: {error}", "")
 
     def drop_late(self, now_s: float) -> Iterator[Effect]:
-        """Drop what has waited until its deadline."""
+        """Drop requests that have waited until their deadlines."""
         late = [entry for entry in self._not_begun() if entry.deadline_s <= now_s]
         for entry in late:
             if entry.job in self._planning:
@@ -281,13 +281,13 @@ class PlanningService:
         self._count("late_total")
         waited_s, deadline_s = now_s - entry.arrived_s, entry.request.deadline_s
         text = (
-            f"deadline_s: got {deadline_s:g}; allowed: longer than the {waited_s:.3f} s that "
-            "requests wait for a worker at present"
+            f"deadline_s: got {deadline_s:g}; allowed: longer than the {waited_s:.3f} s for which "
+            "requests currently wait for a worker"
         )
         return Refusal(LATE, text, "deadline_s")
 
     def _end(self, entry: _Entry, answer: PlanResponse | Refusal, now_s: float) -> Iterator[Effect]:
-        """Answer all who have asked for it, and keep what is worth keeping."""
+        """Answer all queries for a request, and cache a plan."""
         if isinstance(answer, PlanResponse):
             self._count("answered_total")
             planned_s = answer.solve_ms / 1e3
@@ -302,7 +302,7 @@ class PlanningService:
             self._expire_answers(now_s)
 
     def _expire_answers(self, now_s: float) -> None:
-        """Let answers go that are too many, too long together, or too old."""
+        """Remove the oldest answers while they are too many, too large or too old."""
         answers, settings = self._answers, self._settings
         while answers:
             oldest = next(iter(answers))
@@ -318,12 +318,12 @@ class PlanningService:
 
 
 def _digest(request: PlanRequest) -> bytes:
-    # MessagePack does not write every text that JSON reads.
+    # MessagePack cannot encode every text that JSON can represent.
     return blake2b(JSON.write(request.to_dict()), digest_size=16).digest()
 
 
 def plan_in_time(plan: PlanFunction, request: PlanRequest, left_s: float) -> PlanResponse:
-    """Plan a request in the time that is left of its deadline."""
+    """Plan a request in the time that remains until its deadline."""
     left_s = min(left_s, request.deadline_s)
     response = plan(attrs.evolve(request, deadline_s=left_s))
     waited_ms = round(1e3 * (request.deadline_s - left_s), 3)

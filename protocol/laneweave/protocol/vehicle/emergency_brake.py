@@ -1,18 +1,18 @@
-"""The emergency brake: whether a vehicle must brake now, according to its own sensors.
+"""The emergency brake: decides from a vehicle's own sensors whether it must brake now.
 
-A vehicle decides at each tick. It continues for one more tick if it would still come to rest behind
-the vehicle ahead, should that one brake as hard as it can from now on and this one from the next
-tick on. Otherwise it brakes now, beyond its jerk limit: jerk-limited braking comes too late. By
-induction there is no impact: at every tick, braking from now on was enough one tick earlier
-(docs/SAFETY.md derives it, with the measurement errors).
+At each tick, the vehicle compares two stopping points: that of the vehicle ahead if it brakes as
+hard as it can from now on, and its own if it brakes from the next tick on. If the second is behind
+the first, it continues for one tick. Otherwise it brakes now, without jerk limit, because
+jerk-limited braking would be too late. By induction there is no impact (docs/SAFETY.md has the
+derivation, with measurement errors).
 
 A body that moves at v with acceleration a and brakes with b through a first-order lag L travels
 
     (v + L (a + b))^2 / (2 b)  -  L^2 (a + b)
 
-until it stands still. Lag costs a speed of L (a + b), which limits the reaction time: cells of
-length d_F and moves that take T_F leave little room (`config.checks`, and `check_moves` of the
-agents).
+until it stands still. The lag acts like an additional speed of L (a + b). This bounds the reaction
+time for which cells of length d_F and moves of duration T_F are possible (`config.cross_checks`,
+and `check_moves` of the agents).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from laneweave.protocol.vehicle.motion import Jerk, State
 from laneweave.protocol.wire.messages import Neighbour
 
 ERROR_SIGMAS = 4.5
-"""Measurement errors for which plans leave room, in standard deviations."""
+"""Measurement error that plans allow for, in standard deviations."""
 
 
 def stopping_distance_m(
@@ -34,10 +34,10 @@ def stopping_distance_m(
     """Return the distance that a body travels until it stands still, if it brakes from now on.
 
     Args:
-        speed_mps: its speed, >= 0.
-        accel_mps2: its acceleration.
-        brake_mps2: its braking, > 0, which its acceleration approaches.
-        lag_s: time constant of that approach.
+        speed_mps: initial speed, >= 0.
+        accel_mps2: initial acceleration.
+        brake_mps2: commanded deceleration, > 0.
+        lag_s: time constant with which the acceleration approaches it.
     """
     change = accel_mps2 + brake_mps2
     gained = speed_mps + lag_s * change
@@ -47,21 +47,21 @@ def stopping_distance_m(
 
 
 def own_braking_mps2(scenario: Scenario) -> float:
-    """Return the braking that a vehicle assumes of itself: its own, but at most the one ahead's.
+    """Return the deceleration that a vehicle assumes for itself: not above that of the one ahead.
 
-    A vehicle that brakes harder than the one ahead may be closest to it before both stand still.
+    If it braked harder, the gap could be smallest before both stand still.
     """
     return min(-scenario.vehicle.min_accel_mps2, scenario.braking.lead_brake_mps2)
 
 
 def lead_lag_s(scenario: Scenario) -> float:
-    """Return the lag that is assumed of the brakes ahead: not longer than the vehicle's own."""
+    """Return the brake lag assumed for the vehicle ahead: at most the vehicle's own."""
     return min(scenario.braking.lead_lag_s, scenario.vehicle.actuator_lag_s)
 
 
 def lead_path_m(speed_mps: float, accel_mps2: float, brake_mps2: float, lag_s: float) -> float:
-    """Return the minimum distance that a vehicle ahead travels, if it brakes from now on."""
-    # It may stop accelerating at once; if it brakes harder than assumed, it continues to do so.
+    """Return the minimum distance that a vehicle ahead travels if it brakes from now on."""
+    # It may stop accelerating at once. Braking harder than assumed is taken to continue.
     accel = min(max(accel_mps2, -brake_mps2), 0.0)
     return stopping_distance_m(max(speed_mps, 0.0), accel, brake_mps2, lag_s)
 
@@ -71,7 +71,7 @@ def spare_error_m(scenario: Scenario, speed_mps: float) -> float:
 
     Args:
         scenario: tables `sensing`, `braking` and `vehicle`.
-        speed_mps: speed of the vehicle itself; the one ahead drives at v_F.
+        speed_mps: speed of the vehicle; the one ahead drives at v_F.
     """
     noise, assumed, limits = scenario.sensing, scenario.braking, scenario.vehicle
     own_s = limits.actuator_lag_s + assumed.reaction_s + speed_mps / own_braking_mps2(scenario)
@@ -86,15 +86,15 @@ def spare_error_m(scenario: Scenario, speed_mps: float) -> float:
 
 
 def last_tick_m(brake_mps2: float, tick_s: float) -> float:
-    """Return the maximum extra distance because braking ends with a whole tick.
+    """Return the maximum extra distance of braking that ends with a whole tick.
 
-    In its last tick a body brakes just hard enough to stand still at the end of it.
+    In its last tick a body brakes just hard enough to stand still at the end of the tick.
     """
     return brake_mps2 * tick_s * tick_s / 8.0
 
 
 class EmergencyBrake:
-    """Decides when a vehicle must brake, whatever its commands are."""
+    """Decides when a vehicle must brake, independent of its commands."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Take the assumptions from the tables `braking` and `vehicle`, and the tick."""
@@ -110,16 +110,16 @@ class EmergencyBrake:
     def spare_m(
         self, state: State, setpoint_mps2: float, jerk: Jerk, others: Iterable[Neighbour]
     ) -> float:
-        """Return the net gap beyond the margin that is left if all vehicles brake in time.
+        """Return the net gap that remains beyond the margin if all vehicles brake.
 
         Args:
             state: measured state of the body.
             setpoint_mps2: set-point of its acceleration along the road.
-            jerk: its jerk until the next tick, within its limits; only that along the road counts.
+            jerk: jerk until the next tick, within the limits; only the part along the road matters.
             others: vehicles ahead that it must not hit.
 
         Returns:
-            Negative: it must brake now. Infinite: there is no vehicle ahead.
+            Negative: the vehicle must brake now. Infinite: there is no vehicle ahead.
         """
         spare_m = float("inf")
         own_m: float | None = None
@@ -133,11 +133,11 @@ class EmergencyBrake:
         return spare_m - self._margin_m
 
     def _own_path_m(self, state: State, setpoint_mps2: float, jerk_mps3: float) -> float:
-        """Return the distance that it travels if it brakes after its reaction time."""
+        """Return the distance that the vehicle travels if it brakes after its reaction time."""
         _, v, a, _, _, _ = state
         lag_s, tick_s, later_s = self._lag_s, self._tick_s, self._later_s
-        # The commanded state has no lag, and the body comes to rest where it does. It is integrated
-        # as in `integrate`, for a tick and for the rest of the reaction time.
+        # The commanded state has no lag and the same stopping point. It is integrated as in
+        # `integrate`, for a tick and for the rest of the reaction time.
         speed, half = v + lag_s * a, tick_s * tick_s / 2.0
         ahead_m = (
             lag_s * v + speed * tick_s + setpoint_mps2 * half + jerk_mps3 * (half * tick_s / 3.0)
@@ -150,9 +150,9 @@ class EmergencyBrake:
 
 
 def min_pitch_m(scenario: Scenario) -> float:
-    """Return the minimum column pitch at which vehicles that hold one cell apart do not brake.
+    """Return the minimum column pitch at which vehicles that hold in adjacent cells do not brake.
 
-    It leaves room for measurement errors up to `ERROR_SIGMAS`.
+    It includes measurement errors up to `ERROR_SIGMAS`.
     """
     speed_mps, pitch_m = scenario.formation.speed_mps, scenario.formation.gap_m
     ahead = Neighbour(0, pitch_m - scenario.vehicle.length_m, speed_mps)

@@ -1,22 +1,21 @@
 """Motion of one vehicle: exact integration, limits, and the control law that holds a cell.
 
-State and input of the road model, both axes triple integrators (front bumper s along the road,
-body centre y across it):
+Both axes are triple integrators (front bumper s along the road, body centre y across it):
 
     state z = (s, v, a, y, v_y, a_y)        input u = (j_s, j_y), constant during a tick
 
 **The commanded state.** The acceleration of a body follows its set-point u with a first-order lag:
 lag da/dt = u - a. Let c = s + lag v. Then dc/dt = v + lag a and d2c/dt2 = u: the point c moves
-without lag, and the body follows it like a low-pass filter, lag ds/dt = c - s. Controlling the
-*commanded state* (c, dc/dt, u) therefore compensates the lag exactly. Since a low-pass filter
-averages, the body keeps every limit on speed, acceleration and jerk that the commanded state keeps,
-and two bodies of equal lag keep the distances of their commanded states. All control laws here, the
+without lag, and the body follows it through a low-pass filter, lag ds/dt = c - s. Controlling the
+*commanded state* (c, dc/dt, u) therefore compensates the lag exactly. A low-pass filter averages,
+so the body keeps every limit on speed, acceleration and jerk that the commanded state keeps, and
+two bodies of equal lag keep the distances of their commanded states. All control laws here, the
 tracker and the references use commanded states. The constant lag v_F is left out of c, so a vehicle
 that holds has equal true and commanded states.
 
-Everything here is a pure function of floats. The agent plans with it, the motion controller drives
-with it when the agent's commands end, and the plant integrates with it, so the three agree to the
-last bit.
+All functions are pure functions of floats. The agent plans with them, the motion controller drives
+with them when the agent's commands end, and the plant integrates with them, so the results of all
+three are bit-identical.
 """
 
 from __future__ import annotations
@@ -35,34 +34,34 @@ Jerk = tuple[float, float]
 
 ARRIVED_ALONG_M = 0.5
 ARRIVED_ACROSS_M = 0.3
-"""A motion has ended when its time is over and the body is this close to the target point."""
+"""Distance from the target point at which a body has arrived, after the time of the motion."""
 
-# Poles of the hold law near -0.6 and -1.2 +- 0.8i 1/s: no overshoot worth mentioning, and slow
-# enough for ticks of 0.1 s.
+# Poles of the hold law near -0.6 and -1.2 +- 0.8i 1/s: hardly any overshoot, and slow enough for
+# ticks of 0.1 s.
 _POSITION_GAIN = 0.35
-"""Wanted speed per position error [1/s]."""
+"""Requested speed per position error [1/s]."""
 _SPEED_GAIN = 1.2
-"""Wanted acceleration per speed error [1/s]."""
+"""Requested acceleration per speed error [1/s]."""
 _ACCEL_GAIN = 3.0
 """Jerk per acceleration error [1/s]."""
 _BRAKE_SHARE = 0.6
-"""Share of the braking limit that the hold law asks for."""
+"""Fraction of the braking limit that the hold law uses."""
 _ACCEL_SHARE = 0.8
-"""Share of the other limits that the hold law asks for."""
+"""Fraction of the other limits that the hold law uses."""
 _CATCH_UP_SHARE = 0.25
-"""Largest speed towards the cell along the road, as a share of the cell's speed."""
+"""Maximum speed towards the cell along the road, as a fraction of the cell's speed."""
 
 _PLENTY = 0.3
-"""Exceeds the 1/4 of `_min_accel` by far more than rounding errors."""
+"""More than the 1/4 of `_min_accel`, with ample room for rounding errors."""
 
 _OPEN_GAIN = 0.6
-"""Speed at which a gap that is too small is opened, per missing metre [1/s]."""
+"""Speed at which a gap that is too small is widened, per missing metre [1/s]."""
 _SETTLE_TICKS = 2.0
-"""Ticks within which the safe speed is reached."""
+"""Number of ticks within which the safe speed is reached."""
 
 
 def integrate(state: State, jerk: Jerk, tick_s: float) -> State:
-    """Return the state after one tick of constant jerk: the exact solution."""
+    """Return the exact state after one tick of constant jerk."""
     s, v, a, y, v_y, a_y = state
     j_s, j_y = jerk
     half = tick_s * tick_s / 2.0
@@ -80,7 +79,7 @@ def integrate(state: State, jerk: Jerk, tick_s: float) -> State:
 def commanded_state(
     state: State, setpoint: tuple[float, float], limits: Vehicle, speed_mps: float
 ) -> State:
-    """Return the commanded state of a body; see the module.
+    """Return the commanded state of a body; see the module docstring.
 
     Args:
         state: state of the body.
@@ -107,7 +106,7 @@ def cell_state(lattice: Lattice, cell: Cell, t_s: float) -> State:
 
 
 def at_rest_in_cell(state: State, lattice: Lattice, cell: Cell, t_s: float) -> bool:
-    """Return whether a motion to `cell` has ended: the body is close to the target at `t_s`."""
+    """Return whether a body has arrived in `cell` at road time `t_s` [s]."""
     goal = cell_state(lattice, cell, t_s)
     return (
         abs(state[0] - goal[0]) <= ARRIVED_ALONG_M and abs(state[3] - goal[3]) <= ARRIVED_ACROSS_M
@@ -117,12 +116,12 @@ def at_rest_in_cell(state: State, lattice: Lattice, cell: Cell, t_s: float) -> b
 def limited_jerk(state: State, jerk: Jerk, limits: Vehicle, tick_s: float) -> Jerk:
     """Return the jerk nearest to `jerk` that keeps the vehicle within its limits.
 
-    After the tick the accelerations are within their limits, the speed within [0, max_speed_mps]
-    and |v_y| <= max_slip_ratio v, and later ticks can keep all of these: braking ends early enough
+    After the tick the accelerations are within their limits, the speed is within [0, max_speed_mps]
+    and |v_y| <= max_slip_ratio v, and later ticks can keep these limits: braking ends early enough
     for the acceleration to return to zero before the vehicle would roll backwards. From a state
-    that was reached within the limits the jerk limits suffice. From any other (after an emergency
-    brake) the speed limits take precedence over the jerk limits, and the acceleration limits over
-    the speed limits. The state must be finite; a jerk that is NaN counts as zero.
+    that was reached within the limits, the jerk limits suffice. From other states (after an
+    emergency brake) the speed limits take precedence over the jerk limits, and the acceleration
+    limits over the speed limits. The state must be finite; a jerk that is NaN counts as zero.
     """
     _, v, a, _, v_y, a_y = state
     a_next = limited_accel(v, a, jerk[0], limits, tick_s)
@@ -138,7 +137,7 @@ def limited_accel(v: float, a: float, jerk: float, limits: Vehicle, tick_s: floa
     j_max = limits.max_jerk_mps3
     step = j_max * tick_s
     a_next = a + tick_s * (jerk if -j_max <= jerk <= j_max else _clamp(jerk, -j_max, j_max))
-    # Usually the room is ample, which is a cheaper test than the bound itself: see `_min_accel`.
+    # Usually the limit is far away; this test is cheaper than the bound itself (`_min_accel`).
     share, x = (2.0 * v / tick_s + a) / step, -a_next / step
     if share < (x + 1.0) * x + _PLENTY:
         a_next = max(a_next, _min_accel(share, step))
@@ -170,7 +169,7 @@ def _limited_lateral_accel(
     a_max = limits.max_lateral_accel_mps2
     step = j_max * tick_s
     ay_next = a_y + tick_s * (jerk if -j_max <= jerk <= j_max else _clamp(jerk, -j_max, j_max))
-    # The distance to either side of the slip limit is a speed, too: ratio v -+ v_y >= 0.
+    # The margins to the slip limit on both sides are treated like speeds: ratio v -+ v_y >= 0.
     speed, rate, rate_next = ratio * v, ratio * a, ratio * a_next
     share, x = (2.0 * (speed + v_y) / tick_s + (rate + a_y)) / step, -(rate_next + ay_next) / step
     if share < (x + 1.0) * x + _PLENTY:
@@ -184,9 +183,9 @@ def _limited_lateral_accel(
 def hold_law(state: State, reference: State, limits: Vehicle, tick_s: float) -> Jerk:
     """Return the jerk that brings the vehicle to rest in a cell: a saturated linear feedback.
 
-    The position error determines a speed, the speed error an acceleration, the acceleration error
-    a jerk; each is saturated before it is used. Other vehicles are ignored: see `keep_gap`. The
-    result keeps the limits as `limited_jerk` does.
+    The position error determines a speed, the speed error an acceleration, and the acceleration
+    error a jerk; each is saturated. Other vehicles are ignored: see `keep_gap`. The result keeps
+    the limits as in `limited_jerk`.
 
     Args:
         state: finite state.
@@ -220,7 +219,7 @@ def keep_gap(
     min_gap_m: float,
     tick_s: float,
 ) -> Jerk:
-    """Return `jerk`, or one that brakes harder where that is needed to stay behind a vehicle.
+    """Return `jerk`, or one that brakes harder if this is needed to stay behind other vehicles.
 
     The safe speed after Gipps ("A behavioural car-following model for computer simulation",
     Transportation Research B 15, 1981): if the vehicle ahead brakes with b to standstill, this one,
@@ -228,15 +227,15 @@ def keep_gap(
 
         v T + v^2 / (2 b)  <=  gap - min_gap + v_other^2 / (2 b).
 
-    b is also the maximum braking of the hold law, so a row of vehicles that all drive by these laws
-    is safe as a whole. T is the time in which limited jerk builds b up; the time until the vehicle
-    stops accelerating, and the speed that it gains until then, are added.
+    b is also the maximum braking of the hold law, so a queue of vehicles that all use these laws is
+    safe. T is the time in which limited jerk reaches b, plus the time until the vehicle stops
+    accelerating; the speed that it gains until then is added, too.
 
-    Two exceptions. A vehicle at least `min_gap_m` behind may always be as fast as the one ahead: a
-    row at equal speed stays as it is, however tight, but below v T it relies on `min_gap_m` when
-    the first one brakes. And a vehicle closer than `min_gap_m` falls back. Time is discrete: with
-    ticks of 0.1 s up to 0.1 m of the gap may be missing, with ticks of 0.4 s up to 2 m (measured).
-    The result keeps the limits as `limited_jerk` does.
+    There are two exceptions. A vehicle at least `min_gap_m` behind may always be as fast as the one
+    ahead, so a queue at equal speed keeps its gaps; if they are below v T, it relies on `min_gap_m`
+    when the first vehicle brakes. A vehicle closer than `min_gap_m` falls back. Since time is
+    discrete, up to 0.1 m of the gap may be missing with ticks of 0.1 s, and up to 2 m with ticks of
+    0.4 s (measured). The result keeps the limits as in `limited_jerk`.
 
     Args:
         state: finite state.
@@ -248,7 +247,7 @@ def keep_gap(
     """
     _, v, a, _, _, _ = state
     brake = -_BRAKE_SHARE * limits.min_accel_mps2
-    # A vehicle that accelerates continues to do so until limited jerk has ended it.
+    # Limited jerk ends an acceleration only after some time.
     fade_s = max(a, 0.0) / limits.max_jerk_mps3
     gained_v = max(a, 0.0) * (0.5 * fade_s + tick_s)
     delay_s = brake / (2.0 * limits.max_jerk_mps3) + 2.0 * tick_s + fade_s
@@ -273,15 +272,15 @@ def _clamp(value: float, low: float, high: float) -> float:
 def _min_accel(share: float, step: float) -> float:
     """Return the minimum rate after this tick with which a speed can stay above its lower bound.
 
-    The room is the speed above that bound [m/s] and the rate its derivative [m/s2]. Raising the
-    rate to zero from -x jerk tick_s, by whole ticks at full jerk and a partial one, uses
-    jerk tick_s^2 / 2 times the linear interpolation of m^2 at x, and this tick uses the mean of
-    both rates. At the bound both together use all of the room:
+    The margin is the speed above that bound [m/s] and the rate its derivative [m/s2]. Raising the
+    rate from -x jerk tick_s to zero, by whole ticks at full jerk and a partial one, uses
+    jerk tick_s^2 / 2 times the linear interpolation of m^2 at x of the margin, and this tick uses
+    the mean of both rates. The minimum rate uses all of the margin:
 
-        x + interp(m^2)(x) = 2 (room + rate tick_s / 2) / (jerk tick_s^2)
+        x + interp(m^2)(x) = 2 (margin + rate tick_s / 2) / (jerk tick_s^2)
 
-    The interpolation exceeds x^2 by at most 1/4: where the right side is above x + x^2 + 1/4, a
-    rate of -x jerk tick_s is above the bound.
+    The interpolation exceeds x^2 by at most 1/4: if the right side is above x + x^2 + 1/4, a rate
+    of -x jerk tick_s is above the minimum.
 
     Args:
         share: the right side.

@@ -1,13 +1,14 @@
-"""Plan execution: the vehicle's side of the execution protocol, rules V1 to V7.
+"""Plan execution: the vehicle's side of the protocol, rules V1 to V7.
 
-The vehicle holds its cell unless everything that its next move needs is *known*: it has promised
-and accepted a plan, every member of the roster has shown that it accepted the same plan (start
-gate), and every vehicle whose earlier move interferes has shown that it completed it. Time only
-paces; silence always means hold. `VEHICLE_RULES` is the table; the first line of each guard and
-action is its meaning in docs/PROTOCOL.md, and docs/SAFETY.md has the argument.
+A vehicle holds its cell until all conditions of its next move are *known* to be true: it has
+accepted a plan, every member of the roster has reported that it accepted the same plan (start
+gate), and every vehicle with an earlier interfering move has reported its completion. The clock can
+delay moves, but never release one; without messages vehicles hold. `VEHICLE_RULES` is the table;
+the first lines of its guards and actions are shown in docs/PROTOCOL.md. docs/SAFETY.md has the
+proof.
 
-The process in charge of a vehicle runs this machine: its agent, or its caretaker, which never
-moves it.
+The process in charge of a vehicle runs this machine: its agent, or its caretaker, which never moves
+the vehicle.
 """
 
 from __future__ import annotations
@@ -30,23 +31,23 @@ from laneweave.protocol.wire.messages import (
 )
 
 LISTEN_S = 1.0
-"""A vehicle receives the states of its predecessors from this time before a move is due."""
+"""Time before a move is due at which the vehicle subscribes to the states of the others."""
 OVERDUE_SLOTS = 1.5
 OVERDUE_S = 2.0
-"""A move is overdue when it has been due for 1.5 slots, or for a slot and 2 s if that is less."""
+"""A move that has been due for 1.5 slots, or a slot and 2 s if that is less, is overdue."""
 TIME_TOLERANCE_S = 1e-6
 
 
 class ExecutionPhase(Enum):
-    """What a vehicle has of the newest ballot."""
+    """Progress of a vehicle with the newest ballot."""
 
     FREE = "free"
-    """Nothing promised, no plan."""
+    """No ballot is promised."""
     PROMISED = "promised"
     TAKEN = "taken"
-    """It has the plan, and waits for its motion controller to note that."""
+    """The vehicle has the plan; its motion controller has not stored the acceptance yet."""
     GATED = "gated"
-    """It has accepted the plan and waits at the start gate."""
+    """The plan is accepted; the start gate is closed."""
     GOING = "going"
     """The start gate is open."""
 
@@ -60,12 +61,10 @@ GATE, TICK, REST = "tick (gate)", "tick (move)", "motion ends"
 
 @define
 class PlanExecution:
-    """The machine of one vehicle: takes messages and ticks, returns what to do and to publish.
+    """State machine of one vehicle: handles messages and ticks, and decides when moves begin.
 
-    Constructing it is V1: nothing promised, no plan.
-
-    `hold_cell`, `moving`, `joined`, `owned` and `stored_transfer` mirror the motion controller,
-    which outlives this object.
+    It begins without promise and plan (V1). `hold_cell`, `moving`, `joined`, `owned` and
+    `stored_transfer` mirror the motion controller, which outlives this object.
     """
 
     vehicle: Name
@@ -73,34 +72,34 @@ class PlanExecution:
     hold_cell: Cell
     lattice: Lattice
     joined: tuple[int, ...]
-    """Blocks that plans may use, as the motion controller has confirmed; ascending."""
+    """Blocks that plans must have, ascending, as the motion controller has stored them."""
     moving: bool = False
     phase: ExecutionPhase = ExecutionPhase.FREE
     promised: Ballot | None = None
     plan: Plan | None = None
     completed: int = 0
     progress: dict[Name, int] = field(factory=dict)
-    """Completed moves of my plan that each other member has shown; -1: not ready yet."""
+    """Completed moves of the same plan that each other member has reported; -1: not ready yet."""
     wanted_joined: tuple[int, ...] = field(init=False)
-    """Blocks that the motion controller should note."""
+    """Blocks that the motion controller should store."""
     moving_in_plan: bool = False
-    """The motion under way is a move of the accepted plan."""
+    """Whether the current motion is a move of the accepted plan."""
     needs: tuple[Needs, ...] = ()
-    """For each of my moves what it needs of the others."""
+    """Dependencies of each move of this vehicle."""
     t_s: float = 0.0
     """Road time of the tick."""
     promise_stored: bool = False
-    """The motion controller has noted the promise, so it counts."""
+    """Whether the motion controller has stored the promise; only then it counts."""
     owned: frozenset[Cell] | None = None
-    """Cells that the vehicle owns, from its controller; None: formations own blocks."""
+    """Cells that the vehicle owns, as stored by the controller; None: formations own blocks."""
     transfer: PendingTransfer | None = None
-    """Pending transfer of the newest plan that was taken."""
+    """Transfer of the newest plan that was taken."""
     stored_transfer: PendingTransfer | None = None
-    """The newest pending transfer that the controller has noted."""
+    """Newest transfer that the controller has stored."""
     rules: RuleBook = field(factory=lambda: VEHICLE_RULES)
 
     def __attrs_post_init__(self) -> None:
-        """Ask for no more blocks than the controller has."""
+        """Request no additional blocks."""
         self.wanted_joined = self.joined
 
     def on_prepare(self, prepare: Prepare) -> bool:
@@ -108,21 +107,21 @@ class PlanExecution:
         return self.rules.take(self, PREPARE, prepare) is not None
 
     def on_plan(self, plan: Plan) -> bool:
-        """V3: take the plan of the promised ballot, once; return whether it was taken now.
+        """V3: take the plan of the promised ballot, once; return whether it is taken now.
 
-        A plan that cannot be executed safely is never taken. A taken plan is accepted, and shown
-        as accepted, when the motion controller has noted it for this process (`on_stored`).
+        A plan that cannot be executed safely is never taken. A taken plan is accepted when the
+        motion controller has stored it for this process (`on_stored`).
         """
         return self.rules.take(self, PLAN, plan) is not None
 
     def on_stored(self, ballot: Ballot | None) -> bool:
-        """V3: the controller has noted a plan; return whether it is newly accepted now."""
+        """V3: handle the accepted plan that the controller reports; return whether that is new."""
         return self.rules.take(self, STORED, ballot) is not None
 
     def on_joined(self, formations: tuple[int, ...]) -> bool:
-        """Add the blocks that the controller has noted as joined; return whether any is new.
+        """Add the blocks that the controller reports as joined; return whether any is new.
 
-        The report may be older than what is known already: joined blocks never part.
+        Joined blocks are never removed, so an old report has no effect.
         """
         if formations == self.joined or set(formations) <= set(self.joined):
             return False
@@ -131,10 +130,10 @@ class PlanExecution:
         return True
 
     def on_owned(self, sense: Sense) -> bool:
-        """Take what the controller notes as owned; return whether it newly notes a promise.
+        """Copy what the controller stores; return whether the promise is newly stored.
 
-        A promise of an earlier process binds this one: it is treated like a PREPARE. Without effect
-        where formations own blocks.
+        A promise of an earlier process binds this one and is treated like a PREPARE. No effect if
+        formations own blocks.
         """
         if self.owned is None:
             return False
@@ -146,11 +145,11 @@ class PlanExecution:
         return self.promise_stored and not before
 
     def on_state(self, state: VehicleState) -> None:
-        """V4: remember what another member of the same plan has shown."""
+        """V4: record the progress of another member of the same plan."""
         self.rules.take(self, STATE, state)
 
     def tick(self, t_s: float) -> PlannedMove | None:
-        """V5 and V6: open the gate when it may, and return the move that starts now, if any."""
+        """V5 and V6: open the gate if possible, and return the move that starts now, if any."""
         self.t_s = t_s
         self.rules.take(self, GATE, None)
         if self.rules.take(self, TICK, None) is None:
@@ -158,32 +157,32 @@ class PlanExecution:
         return self.next_move
 
     def end_motion(self) -> None:
-        """V7: the motion has ended; the controller holds again."""
+        """V7: handle the end of the current motion."""
         self.rules.take(self, REST, None)
 
     @property
     def wanted_accepted(self) -> Ballot | None:
-        """The plan that the motion controller should note as accepted."""
+        """Ballot of the plan that the motion controller should store as accepted."""
         return self.plan.ballot if self.plan is not None else None
 
     @property
     def wanted_promised(self) -> Ballot | None:
-        """The promise that the motion controller should note, where it must."""
+        """Promise that the motion controller should store; None if formations own blocks."""
         return self.promised if self.owned is not None else None
 
     @property
     def go(self) -> bool:
-        """The start gate is open."""
+        """Whether the start gate is open."""
         return self.phase is ExecutionPhase.GOING
 
     @property
     def done(self) -> bool:
-        """All moves of the accepted plan are completed."""
+        """Whether all moves of the accepted plan are completed."""
         return self.accepted and self.next_move is None
 
     @property
     def ready(self) -> bool:
-        """Accepted, and not moving or moving in a move of this plan."""
+        """Whether the plan is accepted and the vehicle holds or makes a move of this plan."""
         return self.accepted and (not self.moving or self.moving_in_plan)
 
     def overdue(self, t_s: float) -> bool:
@@ -197,8 +196,8 @@ class PlanExecution:
         """Return the state to publish.
 
         Args:
-            sense: what the vehicle sensed last.
-            formation: block in which it entered.
+            sense: the newest measurements.
+            formation: block in which the vehicle entered.
             attended: whether an agent drives it.
         """
         return VehicleState(
@@ -225,10 +224,10 @@ class PlanExecution:
         )
 
     def needs_states(self, t_s: float) -> bool:
-        """Return whether the states of other vehicles matter now.
+        """Return whether the states of other vehicles are needed now.
 
-        They do until the gate is open, and from `LISTEN_S` before the next move is due until that
-        is released. States missed in between do no harm: they are published again.
+        They are needed until the gate is open, and from `LISTEN_S` before the next move is due
+        until it is released. States are repeated, so missing some in between is harmless.
         """
         plan = self.plan
         if plan is None:
@@ -242,18 +241,18 @@ class PlanExecution:
 
     @property
     def next_move(self) -> PlannedMove | None:
-        """The first move of the plan that is not completed."""
+        """First move of the plan that is not completed; None: there is none."""
         if self.plan is None or self.completed >= len(self.plan.moves[self.vehicle]):
             return None
         return self.plan.moves[self.vehicle][self.completed]
 
     @property
     def accepted(self) -> bool:
-        """It has a plan, and its motion controller has noted that."""
+        """Whether a plan is accepted: the motion controller has stored it."""
         return self.phase in ACCEPTED
 
     def is_due(self, t_s: float) -> bool:
-        """Return whether the time of the next move has come."""
+        """Return whether the next move is due at a road time."""
         plan = self.plan
         if plan is None:
             return False
@@ -267,24 +266,24 @@ class PlanExecution:
 
 
 def is_in_roster(execution: PlanExecution, prepare: Prepare) -> bool:
-    """I am in the roster."""
+    """The vehicle is in the roster."""
     return execution.vehicle in prepare.roster
 
 
 def is_above_promise(execution: PlanExecution, prepare: Prepare) -> bool:
-    """The ballot is above the one that I promised, if any."""
+    """The ballot is above the promised one, if any."""
     return execution.promised is None or prepare.ballot > execution.promised
 
 
 def promise(execution: PlanExecution, prepare: Prepare) -> None:
-    """Promise the ballot, ask the controller to note its blocks as joined."""
+    """Promise the ballot; request the controller to store its blocks as joined."""
     execution.promised, execution.promise_stored = prepare.ballot, False
     if execution.owned is None:
         execution.wanted_joined = tuple(sorted({*execution.wanted_joined, *prepare.formations}))
 
 
 def drop_plan(execution: PlanExecution, _: object) -> None:
-    """Drop the plan: k = 0, nothing heard; the motion under way ends and belongs to no plan."""
+    """Drop the plan: k = 0; a motion in progress continues, but belongs to no plan."""
     execution.plan = None
     execution.completed = 0
     execution.needs = ()
@@ -292,36 +291,36 @@ def drop_plan(execution: PlanExecution, _: object) -> None:
 
 
 def forget_progress(execution: PlanExecution, _: object) -> None:
-    """Forget what others have shown."""
+    """Clear progress."""
     execution.progress = {}
 
 
 def publish_state(execution: PlanExecution, _: object) -> None:
-    """Show my state."""
+    """Publish the state."""
 
 
 def is_promised_ballot(execution: PlanExecution, plan: Plan) -> bool:
-    """Its ballot is the one that I promised."""
+    """The ballot of the plan is the promised one."""
     return plan.ballot == execution.promised
 
 
 def names_own_incarnation(execution: PlanExecution, plan: Plan) -> bool:
-    """It names my incarnation."""
+    """The plan names the incarnation of this process."""
     return plan.incarnations.get(execution.vehicle) == execution.incarnation
 
 
 def starts_in_hold_cell(execution: PlanExecution, plan: Plan) -> bool:
-    """I start in my hold cell."""
+    """The start cell is the hold cell."""
     return plan.start_cells.get(execution.vehicle) == execution.hold_cell
 
 
 def is_executable(_: PlanExecution, plan: Plan) -> bool:
-    """It can be executed safely (`plan_problems`)."""
+    """The plan can be executed safely (`plan_problems`)."""
     return not plan_problems(plan)
 
 
 def stays_in_its_blocks(execution: PlanExecution, plan: Plan) -> bool:
-    """Its territory lies in the blocks of its formations."""
+    """The territory lies in the blocks of the plan."""
     if execution.owned is not None:
         return True
     blocks = set(plan.formations)
@@ -332,22 +331,22 @@ def stays_in_its_blocks(execution: PlanExecution, plan: Plan) -> bool:
 
 
 def has_joined(execution: PlanExecution, plan: Plan) -> bool:
-    """Its blocks are exactly those that my controller has noted as joined."""
+    """The blocks of the plan are exactly those that the controller has stored as joined."""
     return execution.owned is not None or set(plan.formations) == set(execution.joined)
 
 
 def transfers_only_owned_cells(execution: PlanExecution, plan: Plan) -> bool:
-    """It transfers cells among their owners only, and counts no cell as mine that I do not own."""
+    """The cell transfers are valid, and the vehicle owns the cells attributed to it."""
     if execution.owned is None:
         return True
-    mine = execution.owned | set(
+    owned = execution.owned | set(
         execution.stored_transfer.after if execution.stored_transfer is not None else ()
     )
-    return not ownership_problems(plan) and set(plan.before[execution.vehicle]) <= mine
+    return not ownership_problems(plan) and set(plan.before[execution.vehicle]) <= owned
 
 
 def take_plan(execution: PlanExecution, plan: Plan) -> None:
-    """Take the plan, derive what its moves need, ask the controller to note it."""
+    """Take the plan, derive its dependencies; request the controller to store the acceptance."""
     execution.plan = plan
     execution.needs = dependencies(plan, execution.vehicle)
     if execution.owned is not None:
@@ -358,12 +357,12 @@ def take_plan(execution: PlanExecution, plan: Plan) -> None:
 
 
 def is_stored(execution: PlanExecution, ballot: Ballot | None) -> bool:
-    """My controller has noted for me that I accept it."""
+    """The controller has stored the acceptance for this process."""
     return execution.plan is not None and ballot == execution.plan.ballot
 
 
 def is_of_same_plan(execution: PlanExecution, state: VehicleState) -> bool:
-    """A is another member and shows my plan's ballot as accepted."""
+    """A is another member and reports that it has accepted the same plan."""
     plan = execution.plan
     return (
         plan is not None
@@ -375,18 +374,18 @@ def is_of_same_plan(execution: PlanExecution, state: VehicleState) -> bool:
 
 
 def reports_open_gate(_: PlanExecution, state: VehicleState) -> bool:
-    """A has go."""
+    """A reports an open gate."""
     return state.go
 
 
 def record_progress(execution: PlanExecution, state: VehicleState) -> None:
     """progress[A] = max(progress[A], k if A is ready, else -1)."""
-    shown = state.completed if state.ready else -1
-    execution.progress[state.vehicle] = max(execution.progress.get(state.vehicle, -1), shown)
+    reported = state.completed if state.ready else -1
+    execution.progress[state.vehicle] = max(execution.progress.get(state.vehicle, -1), reported)
 
 
 def is_holding(execution: PlanExecution, _: object) -> bool:
-    """I hold my cell."""
+    """The vehicle holds its cell."""
     return not execution.moving
 
 
@@ -400,7 +399,7 @@ def all_are_ready(execution: PlanExecution, _: object) -> bool:
 
 
 def open_transfer(execution: PlanExecution, _: object) -> None:
-    """Own the cells of `after`: the transfer is open."""
+    """Open the transfer: the vehicle owns the cells `after`."""
     if execution.transfer is not None:
         execution.transfer = PendingTransfer(execution.transfer.ballot, open=True)
 
@@ -411,12 +410,12 @@ def has_next_move(execution: PlanExecution, _: object) -> bool:
 
 
 def move_is_due(execution: PlanExecution, _: object) -> bool:
-    """My clock >= t0 + step * slot."""
+    """Road time >= t0 + step * slot."""
     return execution.is_due(execution.t_s)
 
 
 def is_released(execution: PlanExecution, _: object) -> bool:
-    """progress[A] >= need(A) for all dependencies of the move."""
+    """progress[A] >= needs[A] for all dependencies of the move."""
     progress = execution.progress
     for other, count in execution.needs[execution.completed].items():
         if progress.get(other, -1) < count:
@@ -425,7 +424,7 @@ def is_released(execution: PlanExecution, _: object) -> bool:
 
 
 def start_move(execution: PlanExecution, _: object) -> None:
-    """Move: from now on I count as being at the target."""
+    """Begin the move: the target becomes the hold cell."""
     move = execution.next_move
     if move is not None:
         execution.hold_cell = move[2]
@@ -433,17 +432,17 @@ def start_move(execution: PlanExecution, _: object) -> None:
 
 
 def is_moving(execution: PlanExecution, _: object) -> bool:
-    """I was moving."""
+    """The vehicle was moving."""
     return execution.moving
 
 
 def moved_in_plan(execution: PlanExecution, _: object) -> bool:
-    """The motion was a move of my plan."""
+    """The motion was a move of the plan."""
     return execution.moving_in_plan
 
 
 def count_move(execution: PlanExecution, _: object) -> None:
-    """Count it: k += 1."""
+    """Count the move: k += 1."""
     execution.completed += 1
 
 

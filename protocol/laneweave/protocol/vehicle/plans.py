@@ -1,8 +1,7 @@
-"""Plans as partial orders: what a move waits for, and what makes a plan executable.
+"""Plans as partial orders of moves: dependencies between moves, and validity of plans.
 
-A plan is not a timetable. Its moves are ordered by *dependencies*, which every vehicle derives from
-the same PLAN message, and each dependency is released by a fact that stays true: "A has
-completed k moves of this ballot".
+Moves are ordered by *dependencies*, which every vehicle derives from the same PLAN message. Each
+dependency is released by a fact that stays true: "A has completed k moves of this ballot".
 """
 
 from __future__ import annotations
@@ -14,14 +13,14 @@ from laneweave.protocol.lattice import Cell, footprint, territory
 from laneweave.protocol.wire.messages import Name, Plan
 
 Needs = dict[Name, int]
-"""Completed moves that others must have shown before a move may start."""
+"""Number of moves that each other vehicle must have completed before a move may start."""
 
 
 def dependencies(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
-    """Return for each move of a vehicle how many completed moves it needs of the others.
+    """Return for each move of a vehicle how many moves others must have completed before.
 
-    A move in step s needs of vehicle A: 1 + the index of A's last move in a step before s whose
-    footprint meets the move's; vehicles with no such move are left out.
+    For a move in step s and another vehicle A, this is 1 + the index of A's last move before step s
+    whose footprint intersects that of the move. Vehicles without such a move are left out.
     """
 
     def needs(step: int, cells: frozenset[Cell]) -> Needs:
@@ -38,11 +37,12 @@ def dependencies(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
 
 
 def plan_problems(plan: Plan) -> list[str]:
-    """Return what is wrong with a plan; empty when it can be executed safely.
+    """Return the reasons why a plan cannot be executed safely; empty: it can.
 
-    Checked: the maps cover the roster; slots last; moves are chains of neighbouring cells from the
-    start cell with ascending steps; what vehicles occupy during a step (footprint of a move, or the
-    cell of a hold) is disjoint; the territory covers everything.
+    The maps must cover the roster, and slots have a positive length. The moves of each vehicle must
+    form a chain of neighbouring cells from its start cell, with ascending steps. The cells that
+    vehicles occupy during a step (footprint of a move, or hold cell) must be disjoint. The
+    territory must contain all occupied cells.
     """
     problems = list(_roster_problems(plan))
     if plan.slot_s <= 0:
@@ -62,10 +62,11 @@ def plan_problems(plan: Plan) -> list[str]:
 
 
 def ownership_problems(plan: Plan) -> list[str]:
-    """Return what is wrong with the cell transfers of a plan; empty when nothing is.
+    """Return the reasons why the cell transfers of a plan are invalid; empty: they are valid.
 
-    Checked: the maps cover the roster; no cell has two owners, before or after; no vehicle gets a
-    cell that no member owned; every vehicle owns afterwards the cells that it occupies.
+    The maps must cover the roster. No cell may have two owners, before or after the plan. No
+    vehicle may receive a cell that no member owned. Afterwards every vehicle must own the cells
+    that it occupies.
     """
     problems = [
         f"{name} does not cover the roster"

@@ -1,9 +1,9 @@
-"""All messages, with units, sender, rate, and what the receiver does when one is not as expected.
+"""All messages: sender, receivers, rate, units, and how receivers handle unexpected ones.
 
-All are frozen attrs classes; `codec` turns them into MessagePack and back and checks field types,
-so a core never sees a malformed message. `t_s` is road time [s], the clock that moves the lattice;
-it advances in ticks. A cell is (column, lane) in the lattice frame. docs/PROTOCOL.md has a section
-for each class, generated from the docstrings of this module.
+Messages are frozen attrs classes; `codec` encodes them as MessagePack and checks field types when
+decoding, so a core never receives a malformed message. `t_s` is road time [s], the clock that moves
+the lattice; it advances in ticks. A cell is (column, lane) in the lattice frame. The sections of
+docs/PROTOCOL.md on messages are generated from the docstrings of this module.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ Name = NewType("Name", str)
 
 
 class Ballot(NamedTuple):
-    """Identifier of one attempt of one leader process to execute one plan.
+    """Identifier of one attempt of one leader process to have one plan executed.
 
-    Part of several messages; compared field by field, in this order. Never used for two plans: a
-    coordinator that restarts has another incarnation.
+    Part of several messages. Ballots are compared field by field, in this order. No two plans share
+    a ballot: a coordinator that restarts has another incarnation.
     """
 
     term: int
-    """Term of the leader, raised at each election and above every term that it sees."""
+    """Term of the leader; each election raises it above every term that the leader has seen."""
     coordinator: Name
     incarnation: int
     """Start time of the coordinator process [ns]."""
     seq: int
-    """Number of the ballot in this process."""
+    """Sequence number of the ballot in its process."""
 
 
 @frozen
@@ -40,9 +40,10 @@ class Heartbeat:
     """Coordinator to coordinators, bridge and observers, every `network.heartbeat_s` (wall clock).
 
     Also sent at once when a coordinator begins or stops leading. Missing for `network.election_s`:
-    the sender is no longer a candidate. Late or duplicated: harmless. From a process whose token is
-    gone, or older than one heard since: only its term is noted. A term above its own: a candidate
-    notes it, a leader continues one term above it. Under the receiver's own name: ignored.
+    the sender no longer counts as a candidate. Late or duplicated: harmless. From a process whose
+    token has vanished, or that a newer process of the same name has replaced: only the term is
+    used. A higher term than the receiver's: a candidate adopts it, a leader continues one term
+    above it. With the receiver's own name: ignored.
     """
 
     coordinator: Name
@@ -50,18 +51,19 @@ class Heartbeat:
     incarnation: int
     """Incarnation of the sender [ns]."""
     term: int
-    """Highest term that it has seen; its own while it leads."""
+    """Highest term that the sender has seen; its own term while it leads."""
     leading: bool
+    """Whether the sender leads."""
     formations: int
     """Number of plans in force, for observers."""
 
 
 @frozen
 class PendingTransfer:
-    """Pending transfer of cells with one plan of the rolling operation, as one vehicle stores it.
+    """Transfer of cells by one plan of the rolling operation, as one vehicle stores it.
 
-    Part of other messages. The vehicle owns `before` until it knows that the start gate is open,
-    then `after`.
+    Part of other messages. The vehicle owns the cells `before` until it knows that the start gate
+    is open, and the cells `after` from then on.
     """
 
     ballot: Ballot
@@ -71,52 +73,55 @@ class PendingTransfer:
     after: tuple[Cell, ...] = ()
     """Cells that the vehicle owns once the gate is open."""
     roster: tuple[Name, ...] = ()
-    """Vehicles with a pending transfer of this ballot."""
+    """All vehicles that store a transfer of this ballot."""
     open: bool = False
-    """The start gate is open; the other fields are empty then."""
+    """Whether the start gate is open; the cells and the roster are then empty."""
 
 
 @frozen
 class Prepare:
     """Leader to each vehicle of the roster that has not promised, every `network.resend_s`.
 
-    Missing: sent again. Duplicated, late, or of an older ballot than the promised one: changes
-    nothing; the vehicle answers with its state, which shows the promised ballot.
+    Missing: sent again. Duplicated, late, or of a lower ballot than the promised one: no effect,
+    but the vehicle answers with its state, which contains the promised ballot.
     """
 
     ballot: Ballot
     formations: tuple[int, ...]
-    """Blocks that the plan may use, ascending; of one formation or of joined ones."""
+    """Blocks that the plan may use, ascending: those of one formation or of joined formations."""
     roster: tuple[Name, ...]
-    """All vehicles on the road that entered in these blocks."""
+    """All vehicles on the road that entered in these blocks; in the rolling operation, the vehicles
+    that move and the owners of the cells that they need."""
 
 
 @frozen
 class Plan:
     """Leader to each vehicle of the roster that has not accepted, every `network.resend_s`.
 
-    One per ballot. Missing: sent again; no vehicle moves before all have accepted (start gate).
-    Duplicated, late, of any ballot but the promised one, not executable, for other blocks than the
-    vehicle has joined, leaving these blocks, or with unsound transfers of cells: ignored (V3).
-    Dependencies between moves are not sent; they are a pure function of this message.
+    There is one per ballot. Missing: sent again; no vehicle moves before all have accepted (start
+    gate). Ignored (V3) if it is a duplicate, its ballot is not the promised one, it cannot be
+    executed safely, its blocks are not exactly the joined ones, its territory leaves them, or its
+    cell transfers are invalid. Each vehicle derives the dependencies between moves from this
+    message.
     """
 
     ballot: Ballot
     formations: tuple[int, ...]
     """Blocks of the ballot, which contain the territory."""
     roster: tuple[Name, ...]
+    """Vehicles of the ballot."""
     incarnations: dict[Name, int]
     """Incarnation of the process in charge of each vehicle when it promised [ns]."""
     start_cells: dict[Name, Cell]
-    """Hold cell in each vehicle's promise."""
+    """Hold cell of each vehicle, from its promise."""
     moves: dict[Name, tuple[PlannedMove, ...]]
-    """(step, from, to) of each vehicle, steps ascending; steps without a move are not listed."""
+    """Moves (step, from, to) of each vehicle, in ascending order of steps."""
     t0_s: float
     """Road time at which step 0 may begin [s]."""
     slot_s: float
-    """T_F: step n may begin at t0 + n slot [s]. A move takes 0.2 s less, or `formation.move_s`."""
+    """T_F [s]: step n may begin at t0 + n T_F. A move takes 0.2 s less, or `formation.move_s`."""
     territory: tuple[Cell, ...]
-    """Start cells and footprints of all moves."""
+    """All start cells and the footprints of all moves."""
     before: dict[Name, tuple[Cell, ...]] = field(factory=dict)
     """Rolling operation: cells that each vehicle owns when the plan is made."""
     after: dict[Name, tuple[Cell, ...]] = field(factory=dict)
@@ -127,38 +132,40 @@ class Plan:
 class VehicleState:
     """Vehicle to its formation and the coordinators, every tick and at once on every change.
 
-    It is promise, acknowledgement and progress report in one. Missing: vehicles that wait for it
-    hold. Late or duplicated: harmless to vehicles, since "completed k moves of ballot b" stays
-    true; the leader drops states older than its newest. Of another ballot than the receiver's plan:
-    says nothing about this plan.
+    It serves as promise, acceptance and progress report. Missing: vehicles that wait for it hold.
+    Late or duplicated: harmless to vehicles, since "completed k moves of ballot b" stays true;
+    leaders drop states older than the newest of that vehicle. With another ballot than that of the
+    receiver's plan: not used for this plan.
     """
 
     vehicle: Name
-    """Sender; the caretaker sends for a vehicle without an agent."""
+    """Vehicle that the state describes; its caretaker sends the state while it has no agent."""
     incarnation: int
     """Incarnation of the process in charge of the vehicle [ns]."""
     formation: int
     """Number of the block in which the vehicle entered."""
     joined: tuple[int, ...]
-    """Blocks that its plans must have, ascending, as its motion controller has stored them."""
+    """Blocks that its plans must have, ascending, as stored by its motion controller."""
     promised: Ballot | None
+    """Highest ballot that the process in charge has promised."""
     accepted: bool
-    """It has the plan of the promised ballot, and its motion controller has stored that."""
+    """Whether the plan of that ballot is accepted, and the motion controller has stored this."""
     ready: bool
-    """Accepted, and not moving, or moving in a move of this plan."""
+    """Whether the plan is accepted and the vehicle holds or makes a move of this plan."""
     completed: int
-    """k: completed moves of the accepted plan."""
+    """k: number of completed moves of the accepted plan."""
     hold_cell: Cell
-    """Cell in which it holds: its own, or the target while it moves."""
+    """Cell in which the vehicle holds, or the target of its motion."""
     moving: bool
+    """Whether a motion is in progress."""
     go: bool
-    """Its start gate is open."""
+    """Whether the start gate of the accepted plan is open."""
     done: bool
-    """It has completed all moves of the accepted plan."""
+    """Whether all moves of the accepted plan are completed."""
     overdue: bool
-    """Its next move has been due for more than 1.5 slots, or a slot and 2 s if that is less."""
+    """Whether the next move has been due for 1.5 slots, or for a slot and 2 s if that is less."""
     attended: bool
-    """An agent drives it; without one its caretaker sends this state, and it only holds."""
+    """Whether an agent drives the vehicle; otherwise its caretaker is in charge, and it holds."""
     s_m: float
     """Position of the front bumper along the road [m], from the start of the road."""
     y_m: float
@@ -168,22 +175,22 @@ class VehicleState:
     t_s: float
     """Road time of the tick [s]."""
     owned: Annotated[tuple[Cell, ...], override(rename="estate")] = ()
-    """Rolling operation: cells that it owns; empty until its motion controller has stored the
-    promise."""
+    """Rolling operation: cells that the vehicle owns; empty until its motion controller has stored
+    the promise. Key on the wire: `estate`."""
     transfer: Annotated[PendingTransfer | None, override(rename="deed")] = None
-    """Rolling operation: its newest pending transfer of cells."""
+    """Rolling operation: newest transfer of its cells. Key on the wire: `deed`."""
 
 
 @frozen
 class Motion:
-    """Vehicle to those in its own and both adjacent stretches of columns: its motion under way.
+    """Vehicle to others in its own and both adjacent stretches of columns: its current motion.
 
     Sent when the motion begins and every 10 ticks while it lasts; a vehicle that holds sends
-    nothing. The trajectory is not sent: it follows from the scenario, which all vehicles share.
-    Only the trackers of others use it, and only if they sense a vehicle where the motion says.
-    Missing, late, or not repeated for 30 ticks: others use their sensors alone. Duplicated: no
-    effect. Older than the vehicle's newest motion, by incarnation and then `begin_tick`, or not a
-    move of the scenario: ignored.
+    nothing. The trajectory follows from the scenario, which all vehicles share. Only the trackers
+    of other vehicles use the message, and only if they sense a vehicle at the position that follows
+    from it. Missing, late, or not repeated for 30 ticks: they rely on their sensors alone.
+    Duplicated: no effect. Older than the newest motion of that vehicle (by incarnation, then by
+    `begin_tick`), or not a move of the scenario: ignored.
     """
 
     vehicle: Name
@@ -199,12 +206,12 @@ class Motion:
     ticks: int
     """Duration [ticks]."""
     tick: int
-    """Tick at which this was sent."""
+    """Tick at which the message was sent."""
 
 
 @frozen
 class Neighbour:
-    """Nearest vehicle ahead or behind in a lane, as local sensing sees it; part of `Sense`."""
+    """Nearest vehicle ahead or behind in a lane, as measured by sensors; part of `Sense`."""
 
     lane: int
     gap_m: float
@@ -217,14 +224,14 @@ class Neighbour:
 
 @frozen
 class Sense:
-    """Bridge to one vehicle at each tick: the state of its sensors and its motion controller.
+    """Bridge to one vehicle at each tick: measurements and the state of its motion controller.
 
     Missing: sent again every `runtime.tick_resend_s` until `runtime.tick_deadline_s`; then the
-    vehicle continues its last trajectory. Duplicated: the agent gives the same answer again. Older
-    than the newest tick of the same bridge, or from an older bridge than the newest: ignored. From
-    a newer bridge: the agent forgets the earlier road and takes a new incarnation. `left` is
-    repeated for 20 ticks or until the agent's token is gone; at the end of a run it goes once to
-    every vehicle on the road.
+    vehicle continues its last trajectory. Duplicated: the agent repeats its answer. Older than the
+    newest tick of the same bridge, or from an earlier bridge: ignored. From a newer bridge: the
+    agent discards its state of the earlier road and takes a new incarnation. A message with `left`
+    is repeated for 20 ticks or until the agent's token vanishes; at the end of a run each vehicle
+    on the road receives one.
     """
 
     vehicle: Name
@@ -238,16 +245,16 @@ class Sense:
     hold_cell: Cell
     """Cell in which the motion controller will hold without a new command."""
     motion_end_tick: int
-    """Tick at which the motion under way ends; not after `tick`: the vehicle holds."""
+    """Tick at which the current motion ends; not after `tick` if the vehicle holds."""
     motion_origin: Cell
-    """Cell in which the motion under way began; `hold_cell` when it holds."""
+    """Cell in which the current motion began; `hold_cell` if the vehicle holds."""
     preferred_lane: int
     ahead: tuple[Neighbour, ...]
     """Neighbours ahead: at most one per lane that the body touches or is next to."""
     behind: tuple[Neighbour, ...] = ()
-    """Neighbours behind, likewise."""
+    """Neighbours behind, selected in the same way."""
     setpoint: tuple[float, float] = (0.0, 0.0)
-    """Newest accelerations commanded to the actuators, along and across [m/s2]."""
+    """Accelerations last commanded to the actuators, along and across the road [m/s2]."""
     formation: int = 0
     """Number of the block in which the vehicle entered."""
     attendant: int = 0
@@ -255,20 +262,19 @@ class Sense:
     motion_ticks: int = 0
     """Duration of the move under way [ticks]; 0: the vehicle settles in its cell, or holds."""
     caretaker: bool = False
-    """The caretaker is in charge, because the agent died or fell silent."""
+    """Whether the caretaker is in charge, because the agent ended or stopped answering."""
     joined: tuple[int, ...] = ()
     """Blocks that the controller has stored as joined."""
     accepted: Ballot | None = None
-    """Newest plan accepted by the process in charge, as the controller has stored it."""
+    """Ballot of the newest plan that the process in charge has accepted, as stored."""
     left: bool = False
-    """The vehicle has left the road: its agent reports and ends."""
+    """Whether the vehicle has left the road; its agent then sends its report and ends."""
     owned: Annotated[tuple[Cell, ...], override(rename="estate")] = ()
-    """Rolling operation: cells that the vehicle owns."""
+    """Rolling operation: cells that the vehicle owns. Key on the wire: `estate`."""
     promised: Ballot | None = None
-    """Rolling operation: highest ballot promised by any process in charge, as the controller has
-    stored it."""
+    """Rolling operation: highest ballot that any process in charge has promised, as stored."""
     transfer: Annotated[PendingTransfer | None, override(rename="deed")] = None
-    """Rolling operation: the newest pending transfer of cells."""
+    """Rolling operation: newest transfer of cells. Key on the wire: `deed`."""
     bridge: int = 0
     """Incarnation of the bridge [ns]: another one means another road; 0: not given."""
 
@@ -277,12 +283,12 @@ class Sense:
 class Command:
     """Agent to the motion controller of its vehicle (in the bridge), the answer to each `Sense`.
 
-    It contains the whole remaining trajectory. Missing: the controller plays the trajectory that it
-    has, then holds. Duplicated: no effect. Only the answer to the current tick is played, while the
-    bridge waits for answers; a late one only ends `silent`. From an older incarnation than the one
-    in charge: refused; from a newer one: that process takes charge. `joined`, `accepted`,
-    `promised` and `deed` are stored whatever the tick, and confirmed in the next SENSE. Jerks that
-    are not finite pairs, or cells off the road's lanes: refused and logged.
+    It contains the complete remaining trajectory. Missing: the controller executes the trajectory
+    that it has, then holds. Duplicated: no effect. Only an answer to the current tick that arrives
+    in time is executed; a late answer only ends the agent's silence. From an older incarnation than
+    the one in charge: refused. From a newer one: that process takes charge. `joined`, `accepted`,
+    `promised` and `transfer` are stored for any tick, and confirmed in the next SENSE. With jerks
+    that are not finite pairs, or cells outside the lanes of the road: refused and logged.
     """
 
     vehicle: Name
@@ -290,31 +296,31 @@ class Command:
     incarnation: int
     """Incarnation of the sending process [ns]."""
     tick: int
-    """Tick that it answers."""
+    """Tick of the SENSE that it answers."""
     hold_cell: Cell
     """Cell in which the controller holds after the last jerk."""
     motion_end_tick: int
-    """Tick at which the motion under way ends; 0 when the vehicle holds."""
+    """Tick at which the current motion ends; 0 if the vehicle holds."""
     motion_origin: Cell
     """Cell in which the motion began."""
     jerks: bytes
-    """Little-endian float32 pairs (along, across) [m/s3], one per tick of the horizon, from `tick`
-    on."""
+    """Little-endian float32 pairs (along, across) [m/s3], one per tick, from `tick` on."""
     motion_ticks: int = 0
     """Duration of the move under way [ticks]; 0: the vehicle settles in its cell, or holds."""
     joined: tuple[int, ...] = ()
-    """Blocks that the controller shall store as joined, in addition to those that it has."""
+    """Blocks that the controller adds to the joined ones."""
     accepted: Ballot | None = None
-    """Accepted plan, which the controller shall store."""
+    """Ballot of the accepted plan, to be stored."""
     promised: Ballot | None = None
-    """Rolling operation: promised ballot, which the controller shall store."""
+    """Rolling operation: promised ballot, to be stored."""
     transfer: Annotated[PendingTransfer | None, override(rename="deed")] = None
-    """Rolling operation: transfer of the newest plan, which the controller shall store or open."""
+    """Rolling operation: transfer of the newest plan, to be stored or opened. Key on the wire:
+    `deed`."""
 
 
 @frozen
 class CensusEntry:
-    """Vehicle on the road, as counted at its entry; part of `Census`."""
+    """Vehicle on the road, as recorded at its entry; part of `Census`."""
 
     vehicle: Name
     cell: Cell
@@ -326,7 +332,7 @@ class CensusEntry:
 
 @frozen
 class ClosedFormation:
-    """Blocks of a formation that no vehicle enters any more; part of `Census`."""
+    """Formation that accepts no more vehicles, and its blocks; part of `Census`."""
 
     first_block: int
     """Number of its foremost block, which is also the number of the formation."""
@@ -337,11 +343,11 @@ class ClosedFormation:
 
     @property
     def blocks(self) -> tuple[int, ...]:
-        """Numbers of its blocks, ascending."""
+        """Block numbers, ascending."""
         return tuple(range(self.first_block, self.last_block + 1))
 
     def columns(self, lattice: Lattice) -> range:
-        """Return its columns in ascending order."""
+        """Return the columns of the formation in ascending order."""
         return range(
             lattice.block_range(self.last_block).start, lattice.block_range(self.first_block).stop
         )
@@ -356,22 +362,23 @@ class Announcement:
     """Lane on which it arrives."""
     preferred_lane: int
     arrival_s: float
-    """Road time at which it would pass s = 0 on a free road [s]."""
+    """Road time at which it would pass s = 0 without other vehicles [s]."""
 
 
 @frozen
 class Census:
     """Bridge to coordinators, fleets and observers, on every change and every 10 ticks.
 
-    A change: a vehicle has entered, left, or is announced or no longer announced, or a formation is
-    closed. The census is complete: a vehicle is on the road at `t_s` if and only if it is listed.
-    On each lane, only as many vehicles are announced as free cells pass in `runtime.announce_s`,
-    and one more, so that agents start only for vehicles that can enter soon. An agent process with
-    a shard starts an agent for each listed vehicle of its shard, and ends those no longer listed.
+    A change is an entry, a departure, the closing of a formation, or an announcement made or
+    withdrawn. The census is complete: a vehicle is on the road at `t_s` if and only if it is
+    listed. Each lane announces at most one vehicle more than free cells pass within
+    `runtime.announce_s`, so that agents start only for vehicles that can enter soon. An agent
+    process with a shard starts an agent for each listed vehicle of its shard, and ends the agents
+    of vehicles that are no longer listed.
 
-    Missing: the receiver works with the older census, and plans nothing for formations closed
-    since. Duplicated: no effect. Late, that is older than the newest: ignored. A coordinator's road
-    time is the newest `t_s` of census and clock.
+    Missing: the receiver uses the older census, and plans nothing for formations closed since then.
+    Duplicated or older than the newest: ignored. A coordinator's road time is the newest `t_s` of
+    census and clock.
     """
 
     t_s: float
@@ -381,10 +388,10 @@ class Census:
     announced: tuple[Announcement, ...]
     """Vehicles that wait at the entrance or arrive within `runtime.announce_s`."""
     formations: tuple[ClosedFormation, ...] = ()
-    """Closed formations with a vehicle on the road, foremost first; an entry never changes, and no
-    block is in two. Empty in the rolling operation."""
+    """Closed formations with a vehicle on the road, foremost first. An entry never changes, and no
+    block belongs to two formations. Empty in the rolling operation."""
     closed_to: int = -1
-    """All blocks up to this number are closed; their vehicles are listed, or have left."""
+    """All blocks up to this number are closed: their vehicles are listed or have left."""
     bridge: int = 0
     """Incarnation of the bridge [ns]: another one means another road; 0: not given."""
 
@@ -393,8 +400,8 @@ class Census:
 class RoadClock:
     """Bridge to coordinators and observers, each tick: road time and progress.
 
-    Missing: the coordinator's clock stands still until the next clock or census, so that nothing
-    new begins. Late or duplicated: ignored. Agents take road time from `Sense`.
+    Missing: the coordinator's road time stands still until the next clock or census, so it begins
+    nothing new. Late or duplicated: ignored. Agents take road time from `Sense`.
     """
 
     tick: int
@@ -409,7 +416,7 @@ class RoadClock:
     left: int
     """Vehicles that have left so far."""
     ended: bool
-    """The run is over."""
+    """Whether the run is over."""
     bridge: int = 0
     """Incarnation of the bridge [ns]: another one means another road; 0: not given."""
 
@@ -418,37 +425,37 @@ class RoadClock:
 class Report:
     """Any role to the recorder: its counters.
 
-    Sent by agents when their vehicle has left or they are asked to end, by the bridge at the end of
-    its run, and by coordinators every 2 s and when they are asked to end. Missing: the summary
-    counts less; at the end of a run the bridge waits up to 2 s for the reports of all its agents.
-    Late: not recorded. Duplicated: the newest of a sender counts. Counters of a process are the
-    maximum over its senders, all others are summed.
+    Sent by agents when their vehicle has left or they are stopped, by the bridge at the end of its
+    run, and by coordinators every 2 s and when they are stopped. Missing: not included in the
+    summary; at the end of a run the bridge waits up to 2 s for the reports of all its agents. Late:
+    not recorded. Duplicated: the newest report of a sender counts. The summary takes the maximum of
+    a process's counters over its senders, and the sum of all others.
     """
 
     role: Name
     name: Name
     process: Name = Name("unknown")
-    """Process that counts, set by the node; several vehicles may share one."""
+    """Process of the sender, set by the node; several vehicles may share one."""
     published: int = 0
     """Messages published by the process since its start, including this one; set by the node."""
     rejected: int = 0
     """Malformed messages received by the process since its start; set by the node."""
     solves: int = 0
-    """Ticks that were tracked."""
+    """Number of ticks at which a reference was tracked."""
     unusable: int = 0
     """Solves without a usable solution."""
     osqp_solves: int = 0
-    """Solves with OSQP; in the others the unconstrained optimum satisfies all constraints."""
+    """Solves with OSQP; in all others the unconstrained optimum satisfied all constraints."""
     solve_ms: bytes = b""
     """CPU time of each solve [ms], little-endian float32."""
 
 
 @frozen
 class LogEvent:
-    """Any role to the recorder, when something happens: a line in `events.jsonl`.
+    """Any role to the recorder, for each event: a line in `events.jsonl`.
 
-    So far only coordinators send events; the bridge writes its own directly. Missing, or late,
-    after the end of the run: not recorded. Duplicated: recorded twice.
+    Currently only coordinators send events; the bridge writes its own directly. Missing, or after
+    the end of the run: not recorded. Duplicated: recorded twice.
     """
 
     role: Name

@@ -86,7 +86,7 @@ def test_scales_that_are_not_positive_raise(bad: float) -> None:
     for scale in (QPScale(np.array([1.0, bad]), ones), QPScale(ones, np.array([bad, 1.0]))):
         with pytest.raises(ValueError, match="positive"):
             QuadraticProgram(eye, eye, -ones, ones, scale=scale)
-    with pytest.raises(ValueError, match="row scale"):
+    with pytest.raises(ValueError, match="constraint scale"):
         QuadraticProgram(eye, eye, -ones, ones, scale=QPScale(np.ones(3), ones))
 
 
@@ -136,9 +136,9 @@ def test_refuses_bad_matrices() -> None:
     zero = np.zeros(2)
     with pytest.raises(ValueError, match="cost"):
         QuadraticProgram(sparse.eye(3, format="csc"), eye, zero, zero)
-    with pytest.raises(ValueError, match="rows has entries"):
+    with pytest.raises(ValueError, match="constraints has entries"):
         QuadraticProgram(eye, eye * np.inf, zero, zero)
-    with pytest.raises(ValueError, match="row 0"):
+    with pytest.raises(ValueError, match="constraint 0"):
         QuadraticProgram(eye, eye, zero + 1.0, zero)
 
 

@@ -364,7 +364,7 @@ CLOSED = PendingTransfer(OLD, OWNED[A], (HOMES[A], (1, 0)), (A, B))
             {HOMES[A], (1, 0)},
         ),
         (shown(A, attended=False), True, set(), {*OWNED[A]}),
-        (  # what it owns cannot be told
+        (  # its cells are not known
             shown(A, OLD, PendingTransfer(OLD, OWNED[A], (HOMES[A],), (A, B)), accepted=True),
             False,
             {*OWNED[A]} - {HOMES[A]},
@@ -597,7 +597,7 @@ def test_a_wrong_plan_is_not_issued() -> None:
     assert bench.order(BEGUN_S - 2.0) is None
     compute = bench.order()
     assert compute is not None
-    with pytest.raises(ValueError, match=f"the plan of slot {SLOT + 1} is wrong: .* on the road"):
+    with pytest.raises(ValueError, match=f"the plan of slot {SLOT + 1} is invalid: .* on the road"):
         compute.work()
     (note,) = bench.control.finish(Computed(compute.job, None, "wrong"), LOOK_S, 0.0)
     assert note == LogEntry("planning-failed", {"slot": SLOT + 1, "error": "wrong"})

@@ -141,11 +141,14 @@ def test_a_closed_transfer_of_an_older_plan_is_resolved_by_the_others() -> None:
 # --- giving up --------------------------------------------------------------------------------
 
 WRONG = {
-    "A is not where it was planned from": [evolve(state(A, MID), hold_cell=(1, 0)), state(B, MID)],
+    "A is not in the cell that was planned from": [
+        evolve(state(A, MID), hold_cell=(1, 0)),
+        state(B, MID),
+    ],
     "B does not own": [state(A, MID), evolve(state(B, MID), hold_cell=TARGET)],
     "no member owned": [state(A, MID), state(B, MID, owned=((2, 1),))],
     "a cell has two owners": [state(A, MID, owned=(*BEFORE[A], (2, 1))), state(B, MID)],
-    "it cannot be told what B owns": [
+    "the cells of B are not known": [
         state(C, LOW, PendingTransfer(LOW, (), (), (A, B, C))),  # it may open its gate yet
         state(A, MID, PendingTransfer(LOW, BEFORE[A], BEFORE[A], (A,))),
         state(B, MID, PendingTransfer(LOW, BEFORE[B], (), (A, B, C))),
@@ -169,7 +172,7 @@ def test_is_given_up_when_it_cannot_succeed(why: str) -> None:
 def test_a_vehicle_without_agent_is_not_moved() -> None:
     transfer = make_transfer()
     hear(transfer, evolve(state(A, MID), attended=False), state(B, MID))
-    assert transfer.reason == "A is not where it was planned from"
+    assert transfer.reason == "A is not in the cell that was planned from"
     transfer = make_transfer()
     hear(transfer, state(A, MID), evolve(state(B, MID), attended=False))
     assert (
