@@ -131,7 +131,7 @@ class Motions:
         self._expiry_tick = -1  # the motion may have ended already
 
     def advance(self, tick: int) -> None:
-        """Set the current tick; drop motions that have ended, expired, or begin far in the future."""
+        """Set the current tick; drop motions that have ended, expired or begin much later."""
         if self._tick <= tick < self._expiry_tick:
             self._tick = tick
             return

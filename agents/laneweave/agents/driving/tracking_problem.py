@@ -11,8 +11,8 @@ In error coordinates z = z_ref + e, u = u_ref + w, over N ticks of h seconds:
 
 c is zero for a reference that obeys the dynamics. S is the cost to go of the unconstrained problem.
 On the reference the solution is exactly zero; in absolute coordinates, the solver's tolerance would
-leave noise of 1.6 m/s3 on the jerk. The slack g has a quadratic penalty: an exact (linear) one takes
-four times as long. All matrices are set up once; each tick changes only bounds.
+leave noise of 1.6 m/s3 on the jerk. The slack g has a quadratic penalty, because an exact (linear)
+one takes four times as long. All matrices are set up once; each tick changes only bounds.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ class TrackingProgram:
         self._stale = False
 
     def discard_solution(self) -> None:
-        """Do not start the next solve from the previous solution, since the situation has changed."""
+        """Do not start the next solve from the previous solution."""
         self._stale = True
 
     def solve(self) -> QPResult:
@@ -191,7 +191,7 @@ class TrackingProgram:
         return qp.solve()
 
     def set_up(self) -> QuadraticProgram:
-        """Set OSQP up with initial bounds, so that results do not depend on the time of the set-up."""
+        """Set OSQP up with initial bounds, so that results are independent of its time."""
         low, high = _initial_bounds(self._n)
         self._qp = QuadraticProgram(
             self.cost,
