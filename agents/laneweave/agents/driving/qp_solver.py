@@ -206,7 +206,7 @@ class QuadraticProgram:
         np.minimum(self._new_upper, _INFINITY, out=self._new_upper)
         if not (self._new_lower <= self._new_upper).all():
             row = int(np.argmin(self._new_lower <= self._new_upper))
-            raise ValueError(f"constraint {row}: no value in [{lower[row]}, {upper[row]}]")
+            raise ValueError(f"constraint {row}: bounds [{lower[row]}, {upper[row]}] are empty")
         self._lower, self._new_lower = self._new_lower, self._lower
         self._upper, self._new_upper = self._new_upper, self._upper
 

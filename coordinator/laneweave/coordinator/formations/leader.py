@@ -178,7 +178,7 @@ def has_joined(leader: FormationLeader, state: VehicleState) -> bool:
 
 
 def void_promise(leader: FormationLeader, state: VehicleState) -> None:
-    """Discard the promise: the process that made it has been replaced."""
+    """Discard the promise: the newest state no longer confirms it."""
     del leader.promises[state.vehicle]
 
 
