@@ -224,7 +224,7 @@ def test_a_failed_drawing_is_reported(
     monkeypatch.setattr(plan_drawing, "draw_plan", full)
     status, out, (line,) = laneweave("plan", CASE_STUDY, "--draw", tmp_path / "plan.png")
     assert (status, json.loads(out)["cost"]) == (1, 7)
-    assert "not drawn" in line
+    assert "cannot be drawn" in line
 
 
 def test_without_draw_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
