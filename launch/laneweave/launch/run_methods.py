@@ -107,12 +107,7 @@ _WITHOUT_EFFECT = ("security", "service", "observation")
 
 
 def affects(field_name: str, method: str) -> bool:
-    """Return whether a field of a scenario can change the results of a method.
-
-    Args:
-        field_name: `table.field`, or the name of a field outside tables.
-        method: value of `laneweave run --method`.
-    """
+    """Return whether a field (`table.field`) of a scenario can change the results of a method."""
     table = field_name.partition(".")[0]
     if table in _WITHOUT_EFFECT:
         return False

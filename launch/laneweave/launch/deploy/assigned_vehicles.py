@@ -29,13 +29,7 @@ class AssignedVehicles:
 def assigned_vehicles(
     security: Security, vehicles: Sequence[str], shard: str | None, fleet: str | None
 ) -> AssignedVehicles:
-    """Return vehicles and identity of an agent process.
-
-    Args:
-        security: table of the configuration that contains the fleets.
-        vehicles: names on the command line.
-        shard: value of `--shard`.
-        fleet: value of `--fleet`.
+    """Return vehicles and identity of an agent process from its command-line arguments.
 
     Raises:
         BadInputError: arguments contradict each other, or a secured deployment has no such fleet.

@@ -37,13 +37,7 @@ class Report:
 def check_deployment(
     scenario: Scenario, identity: Identity | None, environment: Mapping[str, str] = os.environ
 ) -> Report:
-    """Check properties of a configuration that loading does not check.
-
-    Args:
-        scenario: configuration of the deployment.
-        identity: identity whose certificate files are checked; None: no files.
-        environment: environment variables, which may contain secrets.
-    """
+    """Check what loading a configuration does not check; with `identity` also certificate files."""
     report = Report()
     _check_network(scenario, report)
     _check_moves(scenario, report)

@@ -57,15 +57,7 @@ class CellOwnership:
         transfer: PendingTransfer | None,
         body: Cells | None = None,
     ) -> None:
-        """Update owned cells and newest transfer of a vehicle.
-
-        Args:
-            t_s: virtual time.
-            vehicle: name of the vehicle.
-            cells: owned cells.
-            transfer: newest transfer.
-            body: cells that the body occupies from now on; None: unchanged.
-        """
+        """Update owned cells, newest transfer and, if not None, body cells of a vehicle."""
         holding = Holding(frozenset(cells), transfer)
         if body is not None:
             self._bodies[vehicle] = body

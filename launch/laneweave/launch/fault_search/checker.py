@@ -131,15 +131,7 @@ class Checker:
     def begin(
         self, t_s: float, vehicle: str, incarnation: int, move: tuple[Cell, Cell], lasts_s: float
     ) -> None:
-        """Record the start of a motion.
-
-        Args:
-            t_s: virtual time.
-            vehicle: name of the vehicle.
-            incarnation: incarnation of the process that commands the motion.
-            move: previous and next hold cell.
-            lasts_s: duration of the motion.
-        """
+        """Record that process `incarnation` begins a motion from `move[0]` to `move[1]`."""
         self._log(t_s, f"{vehicle} moves from {move[0]} to {move[1]} in {lasts_s:.2f} s")
         self.advance(t_s)
         self.motions += 1

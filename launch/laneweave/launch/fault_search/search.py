@@ -70,15 +70,7 @@ def _run_seed(seed: int, profile: Profile, *, digest: bool) -> SeedResult:
 def search(
     seeds: range, profile: Profile, jobs: int, *, digest: bool = False, show: bool = False
 ) -> SearchResult:
-    """Run all seeds.
-
-    Args:
-        seeds: seeds to run.
-        profile: profile from which the seeds draw.
-        jobs: number of processes.
-        digest: whether to compute a digest of the delivered messages of each seed.
-        show: whether to show a progress bar.
-    """
+    """Run all seeds in `jobs` processes, optionally with message digests and a progress bar."""
     result = SearchResult()
     bar = Progress(
         TextColumn("{task.description}"),

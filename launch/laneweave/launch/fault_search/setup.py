@@ -54,13 +54,7 @@ STREAM_PLANNER = 0.05
 
 
 def make_scenario(lanes: int, max_joined: int, *, growing: bool = False) -> Scenario:
-    """Return a scenario with formations: a long road, and short times for cheap runs.
-
-    Args:
-        lanes: number of lanes.
-        max_joined: maximum number of formations that plan together.
-        growing: whether formations have different lengths.
-    """
+    """Return a scenario with formations (of different lengths if `growing`) on a long road."""
     formation = FormationSettings(
         operation="formations",
         close="vehicles" if growing else "columns",

@@ -29,13 +29,7 @@ MAX_SAMPLES: Final = 600_000
 
 
 def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
-    """Return the data of the player as a JSON object.
-
-    Args:
-        run: the run.
-        tracks: trajectories of the run.
-        title: title of the run on the page.
-    """
+    """Return the data of the player as a JSON object."""
     scenario, road = run.scenario, run.scenario.road
     formations = closed_formations(run.folder, scenario)
     samples = _sample(run, tracks, formations)

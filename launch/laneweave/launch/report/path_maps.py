@@ -66,12 +66,7 @@ class DrivenMap:
 
 
 def driven_map(run: Run, tracks: Tracks, formation: int | None) -> DrivenMap | None:
-    """Return the driven path map of a formation; None: the run has no formations.
-
-    Args:
-        run: the run.
-        tracks: trajectories of the run.
-        formation: number of the formation; None: the one with the most moves.
+    """Return the path map of a formation, by default of that with most moves; None: no formations.
 
     Raises:
         BadInputError: the run has no such formation.
@@ -141,12 +136,6 @@ def _driven_slots(
     """Return road time of the first slot of a formation, and length of the slots.
 
     They are those of the last plan under which the formation moved, if any.
-
-    Args:
-        run: the run.
-        formation: number of the formation.
-        entered_s: entry time of its last vehicle.
-        changes_s: times at which its vehicles started to move to other cells.
     """
     tick_s, slot_s = run.scenario.runtime.tick_s, run.scenario.cycles_s[0]
     last_s = max(changes_s, default=math.inf) + 0.5 * tick_s

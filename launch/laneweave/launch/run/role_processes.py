@@ -56,12 +56,7 @@ class RoleProcesses:
     _paused: set[str] = field(factory=set)
 
     def start(self, role: str, name: str, **options: object) -> None:
-        """Start a role.
-
-        Args:
-            role: `router`, `coordinator`, `bridge` or `agent`.
-            name: name of the process, unique among running processes.
-            **options: options of the role, such as the `vehicles` of an agent.
+        """Start a role in the process `name`; `options` are specific to the role.
 
         Raises:
             CommandFailedError: the process cannot be created.

@@ -55,12 +55,7 @@ class StoppedError(Exception):
 
 
 def run_in_process(point: Point, folder: Path, stopped: Callable[[], bool]) -> PointResult:
-    """Run a point in a new process and return its result.
-
-    Args:
-        point: the point.
-        folder: folder of the files, which is created.
-        stopped: returns whether the sweep has been stopped.
+    """Run a point in a process that writes to a new `folder`; end it if `stopped` returns True.
 
     Raises:
         StoppedError: the sweep has been stopped, and the process has ended.
@@ -115,12 +110,7 @@ def run_locally(
 
 
 def wait_for_exit(process: subprocess.Popen[bytes], name: str, stopped: Callable[[], bool]) -> None:
-    """Wait for the end of a process; if an error is raised, end the process.
-
-    Args:
-        process: the process.
-        name: name of its run.
-        stopped: returns whether to stop the process.
+    """Wait for a process of the run `name`; end it if `stopped` returns True or an error is raised.
 
     Raises:
         StoppedError: the process has been stopped.

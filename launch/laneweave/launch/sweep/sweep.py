@@ -26,12 +26,6 @@ Runner = Callable[[Sequence[Point], Path], Generator[PointResult, None, None]]
 def run_sweep(points: Sequence[Point], folder: SweepFolder, run: Runner, *, show: bool) -> int:
     """Run the points that are not finished, and return the number of failed points.
 
-    Args:
-        points: all points of the sweep.
-        folder: folder of the sweep.
-        run: function that runs points.
-        show: whether to show progress on stderr.
-
     Raises:
         CommandFailedError: files or processes cannot be created.
     """

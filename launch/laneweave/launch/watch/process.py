@@ -53,12 +53,7 @@ LISTEN_RULE: Final = "HOST:PORT, an address of this machine; port 0: any free po
 
 
 def watch_live(scenario: Scenario, listen: str, ready: Callable[[str], None]) -> None:
-    """Serve the page of a deployment until SIGINT or SIGTERM.
-
-    Args:
-        scenario: configuration of the deployment.
-        listen: HOST:PORT.
-        ready: called with the URL when the page is served.
+    """Serve the page of a deployment until SIGINT or SIGTERM; call `ready` with its URL.
 
     Raises:
         BadInputError: there is no router at the endpoint, or the address cannot be used.

@@ -99,13 +99,7 @@ Health = Callable[[], tuple[bool, dict[str, Any]]]
 
 
 def make_app(source: FrameSource, browsers: Browsers, health: Health) -> Starlette:
-    """Return the application.
-
-    Args:
-        source: frames that browsers can request.
-        browsers: set of browsers that receive live frames.
-        health: callback for health checks.
-    """
+    """Return the application; `browsers` will contain the connected browsers."""
     scene = partial(opening, source, uuid4().hex)
 
     async def healthz(_request: Request) -> Response:
