@@ -25,11 +25,19 @@ from laneweave.agents.driving.trajectory import move_profile
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.launch.cli.main import command_line
 from laneweave.launch.cli.plan_answers import answer_request
-from laneweave.launch.faults.specification import load_faults
+from laneweave.launch.faults.specification import (
+    GROUPS,
+    Kill,
+    Partition,
+    Pause,
+    load_faults,
+    preset_names,
+)
 from laneweave.launch.observe.status import SCHEMA, Status
 from laneweave.protocol.config.loading import load_scenario, parse_scenario
 from laneweave.protocol.field_validators import HOST_PORT_RULE, NAME_RULE
 from laneweave.protocol.lattice import Cell, footprint
+from laneweave.protocol.runtime.message_faults import MessageRule
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS, Scenario
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.codec import KINDS
@@ -131,6 +139,8 @@ def _scenario_fields() -> Iterator[tuple[str, attrs.Attribute[Any]]]:
 
 def _default(attribute: attrs.Attribute[Any]) -> str:
     value = attribute.default
+    if value is attrs.NOTHING:
+        return "required"
     if value is None:
         return "not set"
     if isinstance(value, tuple):
@@ -156,14 +166,11 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
             "tuple[DrivingStructure, ...]": "list of tables",
         }
         return kinds[re.sub(r"[a-z]+\.", "", kind)]
-    # For an optional field: the rule for its values.
-    rule = getattr(attribute.validator, "validator", attribute.validator)
-    found = inspect.getclosurevars(rule).nonlocals
+    found = _limits(attribute)
     if "choices" in found:
         return ", ".join(f"`{json.dumps(one)}`" for one in found["choices"] if one is not None)
     if "low" in found:
-        bracket = "(" if found["open_low"] else "["
-        return f"{bracket}{_number(found['low'])}, {_number(found['high'])}]"
+        return _range(found)
     rules = {
         "key_part": NAME_RULE,
         "host_port": HOST_PORT_RULE,
@@ -172,6 +179,17 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
         "_conflict_kinds": "any of " + ", ".join(f"`{kind}`" for kind in CONFLICT_KINDS),
     }
     return rules[getattr(attribute.validator, "__name__", "")]
+
+
+def _limits(attribute: attrs.Attribute[Any]) -> Mapping[str, Any]:
+    # For an optional field: the rule for its values.
+    rule = getattr(attribute.validator, "validator", attribute.validator)
+    return {} if rule is None else inspect.getclosurevars(rule).nonlocals
+
+
+def _range(limits: Mapping[str, Any]) -> str:
+    bracket = "(" if limits["open_low"] else "["
+    return f"{bracket}{_number(limits['low'])}, {_number(limits['high'])}]"
 
 
 def _number(value: float) -> str:
@@ -197,6 +215,36 @@ def test_rules_between_fields_name_existing_fields() -> None:
     named = set(re.findall(r"`([a-z]+\.[a-z_0-9]+)`", part))
     assert named
     assert named <= known
+
+
+# --- docs/FAULTS.md and docs/RUNS.md -------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("heading", "kind"),
+    [
+        ("## Messages: `[[messages]]`", MessageRule),
+        ("## Kills: `[[kill]]`", Kill),
+        ("## Pauses: `[[pause]]`", Pause),
+        ("## Partitions: `[[partition]]`", Partition),
+    ],
+)
+def test_tables_of_faults(heading: str, kind: type) -> None:
+    shown = {code(cells[0]): cells[1:] for cells in rows(section(read("FAULTS.md"), heading))}
+    fields = attrs.fields_dict(kind)
+    assert shown.keys() == fields.keys()
+    for name, (default, allowed, meaning) in shown.items():
+        limits = _limits(fields[name])
+        assert default == _default(fields[name]), name
+        assert "low" not in limits or allowed == _range(limits), name
+        assert meaning, name
+
+
+def test_presets_and_groups_of_faults() -> None:
+    presets = rows(section(read("FAULTS.md"), "## Presets"))
+    assert tuple(sorted(code(cells[0]) for cells in presets)) == preset_names()
+    part = section(read("FAULTS.md"), "## Partitions: `[[partition]]`")
+    assert all(f"`{group}`" in part for group in GROUPS)
 
 
 def test_endings_of_runs() -> None:

@@ -10,7 +10,7 @@ from evaluation.lattice_points import TOLERANCE_M, lattice_spacing
 from evaluation.points import slow_stretch, within_limits
 from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks
 from laneweave.protocol.config.loading import load_scenario
-from laneweave.protocol.scenario.fields import Scenario
+from support.tracks import make_tracks
 
 SCENARIO = load_scenario(None)
 LATTICE = SCENARIO.lattice
@@ -20,23 +20,17 @@ Vehicle = tuple[int, int, float]
 """(column, lane, metres ahead of its cell)."""
 
 
-def parked(*vehicles: Vehicle, scenario: Scenario = SCENARIO) -> Tracks:
+def parked(*vehicles: Vehicle) -> Tracks:
     """Return vehicles that hold their cells for 40 s."""
-    t_s = np.tile(TICKS * scenario.runtime.tick_s, len(vehicles))
-    column, lane, ahead_m = (
-        np.repeat(values, len(TICKS)) for values in zip(*vehicles, strict=True)
-    )
-    rows = len(t_s)
-    return Tracks(
-        names=tuple(f"v{number}" for number in range(len(vehicles))),
-        starts=len(TICKS) * np.arange(len(vehicles) + 1),
-        t_s=t_s,
-        s_m=LATTICE.speed_mps * t_s + LATTICE.pitch_m * column + ahead_m,
-        y_m=(lane + 0.5) * LATTICE.lane_width_m,
-        speed_mps=np.full(rows, LATTICE.speed_mps),
-        accel_mps2=np.zeros(rows),
-        column=column.astype(np.int64),
-        lane=lane.astype(np.int64),
+    t_s = TICKS * SCENARIO.runtime.tick_s
+    return make_tracks(
+        t_s,
+        len(vehicles),
+        s_m=[LATTICE.speed_mps * t_s + LATTICE.pitch_m * c + ahead_m for c, _, ahead_m in vehicles],
+        y_m=[LATTICE.cell_y_m(lane) for _, lane, _ in vehicles],
+        speed_mps=[LATTICE.speed_mps] * len(vehicles),
+        column=[column for column, _, _ in vehicles],
+        lane=[lane for _, lane, _ in vehicles],
     )
 
 
@@ -108,11 +102,7 @@ def test_without_a_lattice_there_is_nothing_to_look_at() -> None:
         evolve(tracks, column=np.full_like(tracks.column, OFF_LATTICE)), SCENARIO
     )
     assert (found.least_m, found.pairs, found.worst_off_m) == (None, 0, None)
-    floats, ints = np.empty(0), np.empty(0, np.int64)
-    nobody = Tracks(
-        (), np.zeros(1, np.int64), floats, floats, floats, floats, floats, ints, ints
-    )  # fmt: skip
-    assert lattice_spacing(nobody, SCENARIO).pairs == 0
+    assert lattice_spacing(make_tracks(np.empty(0), 0), SCENARIO).pairs == 0
 
 
 def test_limits() -> None:

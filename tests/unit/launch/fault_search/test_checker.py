@@ -76,87 +76,39 @@ SHARED: tuple[Paths, Paths] = (
     {B: ((4, 1), (4, 0)), C: ((8, 0), (8, 1))},
 )
 """A and B share the first plan, B and C the second one."""
+APART: tuple[Paths, Paths] = ({A: SHARED[0][A]}, {B: SHARED[0][B]})
+SHORT: Paths = {A: ((0, 0), (1, 0))}
+LONG: Paths = {A: ((0, 0), (1, 0), (1, 1))}
+A_GOES: Motion = (1.0, A, 1, (0, 1))
 
 
 @pytest.mark.parametrize(
-    ("plans", "motions", "kinds"),
+    ("kind", "plans", "motions"),
     [
-        pytest.param([FOLLOWING], [(1.0, B, 1, (1, 1)), (1.9, A, 1, (1, 0))], [], id="in order"),
-        pytest.param(
-            [FOLLOWING],
-            [(1.0, B, 1, (1, 1)), (1.5, A, 1, (1, 0))],
-            ["cell"],
-            id="a cell that is still occupied",
-        ),
-        pytest.param(
-            [{A: ((0, 0), (1, 0)), B: ((1, 0),)}],
-            [(1.0, A, 1, (1, 0))],
-            ["cell"],
-            id="a cell in which a vehicle holds",
-        ),
-        pytest.param(
-            [{A: ((0, 0), (1, 1)), B: ((1, 0),)}],
-            [(1.0, A, 1, (1, 1))],
-            ["cell"],
-            id="the corner of an oblique motion",
-        ),
-        pytest.param(
-            [THERE_AND_BACK], [(1.0, A, 1, (0, 1))], ["motion"], id="another lane than planned"
-        ),
-        pytest.param(
-            [THERE_AND_BACK], [(1.0, A, 1, (-1, 0))], ["motion"], id="another column than planned"
-        ),
-        pytest.param(
-            [THERE_AND_BACK],
-            [(1.0, A, 1, (1, 0)), (2.0, A, 1, (0, 0)), (3.0, A, 1, (1, 0))],
-            ["motion"],
-            id="a motion out of order",
-        ),
-        pytest.param(
-            [{A: ((0, 0), (1, 0))}],
-            [(1.0, A, 1, (1, 0)), (2.0, A, 1, (1, 1))],
-            ["motion"],
-            id="a motion after the end of the plan",
-        ),
-        pytest.param(
-            [{A: ((0, 0), (1, 0), (1, 1))}],
-            [(1.0, A, 1, (1, 0)), (1.4, A, 1, (1, 1))],
-            ["motion"],
-            id="a motion before the last one has ended",
-        ),
-        pytest.param(
-            SHARED,
-            [(1.0, A, 1, (0, 1)), (1.0, B, 1, (4, 1)), (1.9, C, 2, (8, 1)), (3.0, B, 2, (4, 0))],
-            [],
-            id="plans one after the other",
-        ),
-        pytest.param(
-            SHARED,
-            [(1.0, A, 1, (0, 1)), (1.5, C, 2, (8, 1))],
-            ["interleaved"],
-            id="a plan that begins during a motion of another one",
-        ),
-        pytest.param(
-            SHARED,
-            [(1.0, A, 1, (0, 1)), (2.0, C, 2, (8, 1)), (3.0, A, 1, (0, 0))],
-            ["interleaved"],
-            id="a plan that continues after another one has begun",
-        ),
-        pytest.param(
-            [{A: ((0, 0), (0, 1), (0, 0))}, {B: ((4, 0), (4, 1))}],
-            [(1.0, A, 1, (0, 1)), (1.5, B, 2, (4, 1)), (2.0, A, 1, (0, 0))],
-            [],
-            id="plans without a common vehicle at the same time",
-        ),
+        (None, [FOLLOWING], [(1.0, B, 1, (1, 1)), (1.9, A, 1, (1, 0))]),  # in order
+        ("cell", [FOLLOWING], [(1.0, B, 1, (1, 1)), (1.5, A, 1, (1, 0))]),  # still occupied
+        ("cell", [{A: ((0, 0), (1, 0)), B: ((1, 0),)}], [(1.0, A, 1, (1, 0))]),  # held
+        ("cell", [{A: ((0, 0), (1, 1)), B: ((1, 0),)}], [(1.0, A, 1, (1, 1))]),  # a corner
+        ("motion", [THERE_AND_BACK], [(1.0, A, 1, (0, 1))]),  # another lane than planned
+        ("motion", [THERE_AND_BACK], [(1.0, A, 1, (-1, 0))]),  # another column
+        ("motion", [THERE_AND_BACK], [(at_s, A, 1, (at_s % 2, 0)) for at_s in (1, 2, 3)]),  # order
+        ("motion", [SHORT], [(1.0, A, 1, (1, 0)), (2.0, A, 1, (1, 1))]),  # after the plan's end
+        ("motion", [LONG], [(1.0, A, 1, (1, 0)), (1.4, A, 1, (1, 1))]),  # before the last has ended
+        # Plans one after the other; one that begins during a motion of another; one that goes on
+        # after another has begun; and plans without a common vehicle at the same time.
+        (None, SHARED, [A_GOES, (1.0, B, 1, (4, 1)), (1.9, C, 2, (8, 1)), (3.0, B, 2, (4, 0))]),
+        ("interleaved", SHARED, [A_GOES, (1.5, C, 2, (8, 1))]),
+        ("interleaved", SHARED, [A_GOES, (2.0, C, 2, (8, 1)), (3.0, A, 1, (0, 0))]),
+        (None, APART, [A_GOES, (1.5, B, 2, (4, 1)), (2.0, A, 1, (0, 0))]),
     ],
 )
-def test_motions(plans: list[Paths], motions: list[Motion], kinds: list[str]) -> None:
+def test_motions(kind: str | None, plans: list[Paths], motions: list[Motion]) -> None:
     scene = Scene(*plans)
     for motion in motions:
         scene.move(*motion)
     scene.checker.advance(5.0)
-    assert [kind for kind in scene.kinds if kind != "overlap"] == kinds
-    assert kinds or "overlap" not in scene.kinds
+    assert [each for each in scene.kinds if each != "overlap"] == ([] if kind is None else [kind])
+    assert kind or "overlap" not in scene.kinds
     assert scene.checker.motions == len(motions)
 
 

@@ -66,37 +66,6 @@ def test_a_body_at_rest_is_done() -> None:
     assert body((3, 3)).done_s == 0.0
 
 
-HEAD_ON = body((0, 0), (1, 0)), body((2, 0), (1, 0))
-
-
-@pytest.mark.parametrize(
-    ("pair", "from_s", "to_s", "at_s"),
-    [
-        # 30 m apart at a closing speed of 30 m/s: 25 m remain between the bumpers.
-        pytest.param(HEAD_ON, 0.0, 1.0, 25.0 / 30.0, id="head-on"),
-        pytest.param(HEAD_ON, 0.0, 0.8, None, id="after the interval"),
-        pytest.param(HEAD_ON, 0.9, 1.0, 0.9, id="before the interval"),
-        pytest.param(
-            (body((0, 0), (1, 0)), body((1, 1), (0, 1))), 0.0, 1.0, None, id="on different lanes"
-        ),
-        pytest.param(
-            (body((0, 0), (0, 1)), body((0, 1), (0, 0))),
-            *(0.0, 1.0, (3.5 - 1.8) / 7.0),
-            id="exchange of cells",
-        ),
-        # One rests at the end of its motion from 1 s on; the other arrives there later.
-        pytest.param(
-            (body((0, 0), (1, 0)), body((3, 0), (1, 0), lasts_s=3.0)), 0.0, 3.0, 2.5, id="at rest"
-        ),
-    ],
-)
-def test_first_time_of_an_overlap(
-    pair: tuple[Body, Body], from_s: float, to_s: float, at_s: float | None
-) -> None:
-    expected = None if at_s is None else pytest.approx(at_s)
-    assert overlap_between(*pair, from_s, to_s) == expected
-
-
 def test_exact_against_small_steps() -> None:
     rng = random.Random(1)
     found = 0

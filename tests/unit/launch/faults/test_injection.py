@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from attrs import define, field
 
 from laneweave.launch.faults.injection import FaultInjection
@@ -152,57 +153,28 @@ def test_a_pause_ends_after_wall_clock_time_and_a_paused_role_is_no_target() -> 
 # --- recovery -------------------------------------------------------------------------------------
 
 
-def test_recovery_is_measured_until_another_process_leads() -> None:
+@pytest.mark.parametrize(
+    ("fault", "heartbeats", "recovery_s"),
+    [
+        # What is in flight of the killed leader does not count, and nothing counts twice.
+        (Kill(at_s=5.0), [(100.1, "c1", 1), (100.3, "c2", 1), (101.0, "c3", 1)], [0.3]),
+        # A leader that was started again is another one.
+        (Kill(at_s=5.0, restart_after_s=0.5), [(100.6, "c1", 1), (101.5, "c1", 2)], [1.5]),
+        (Pause(at_s=5.0, for_s=4.0), [(101.2, "c2", 1)], [1.2]),
+        # Within the lease, or when it resumes before another one leads, it stays the leader.
+        (Pause(at_s=5.0, for_s=LEASE_S), [(101.2, "c2", 1)], []),
+        (Pause(at_s=5.0, for_s=1.5), [(101.6, "c1", 1), (109.0, "c2", 1)], []),
+    ],
+)
+def test_recovery_is_measured_until_another_process_leads(
+    fault: Kill | Pause, heartbeats: list[tuple[float, str, int]], recovery_s: list[float]
+) -> None:
     roles, view = FakeRoles(), on_road(leader="c1")
-    faults = injection(roles, kill=(Kill(at_s=5.0),))
+    faults = injection(roles, **{"kill" if isinstance(fault, Kill) else "pause": (fault,)})
     faults.step(5.0, 100.0, view)
-    leads(view, "c1")  # in flight
-    faults.step(5.1, 100.1, view)
-    assert view.leader is None
-    assert faults.failover.recovery_s == []
-    leads(view, "c2")
-    faults.step(5.3, 100.3, view)
-    assert faults.failover.recovery_s == [0.3]
-    faults.step(6.0, 101.0, view)
-    assert faults.failover.recovery_s == [0.3]
-
-
-def test_a_restarted_leader_counts_as_another_one() -> None:
-    roles, view = FakeRoles(coordinators=("c1",)), on_road(leader="c1", incarnation=1)
-    faults = injection(roles, kill=(Kill(at_s=5.0, restart_after_s=0.5),))
-    faults.step(5.0, 100.0, view)
-    faults.step(5.5, 100.5, view)
-    leads(view, "c1", incarnation=2)
-    faults.step(6.5, 101.5, view)
-    assert faults.failover.recovery_s == [1.5]
-
-
-def test_a_pause_longer_than_the_lease_is_a_failover() -> None:
-    roles, view = FakeRoles(), on_road(leader="c1")
-    faults = injection(roles, pause=(Pause(at_s=5.0, for_s=4.0),))
-    faults.step(5.0, 100.0, view)
-    leads(view, "c2")
-    faults.step(6.2, 101.2, view)
-    assert faults.failover.recovery_s == [1.2]
-
-
-def test_a_pause_within_the_lease_is_no_failover() -> None:
-    roles, view = FakeRoles(), on_road(leader="c1")
-    faults = injection(roles, pause=(Pause(at_s=5.0, for_s=LEASE_S),))
-    faults.step(5.0, 100.0, view)
-    assert view.leader == "c1"
-    leads(view, "c2")
-    faults.step(6.2, 101.2, view)
-    assert faults.failover.recovery_s == []
-
-
-def test_a_leader_that_resumes_before_another_one_leads_is_no_failover() -> None:
-    roles, view = FakeRoles(), on_road(leader="c1")
-    faults = injection(roles, pause=(Pause(at_s=5.0, for_s=1.5),))
-    faults.step(5.0, 100.0, view)
-    faults.step(6.5, 101.5, view)
-    leads(view, "c1")
-    faults.step(6.6, 101.6, view)
-    leads(view, "c2")
-    faults.step(9.0, 109.0, view)
-    assert faults.failover.recovery_s == []
+    assert (view.leader == "c1") is (isinstance(fault, Pause) and fault.for_s == LEASE_S)
+    for now_s, leader, incarnation in heartbeats:
+        faults.step(now_s - 95.0, now_s - 0.05, view)
+        leads(view, leader, incarnation)
+        faults.step(now_s - 95.0, now_s, view)
+    assert faults.failover.recovery_s == recovery_s

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
-import json
-import re
 from pathlib import Path
-from typing import Any
 
-import attrs
 import pytest
 
 from laneweave.launch.faults.specification import (
-    GROUPS,
     FaultSpec,
     Kill,
     Partition,
@@ -23,7 +17,6 @@ from laneweave.launch.faults.specification import (
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.message_faults import MessageRule
 
-ROOT = Path(__file__).resolve().parents[4]
 COORDINATORS = ("c1", "c2")
 VEHICLES = ("v0001", "v0002")
 PRESETS = ("blackout", "everything", "leader-chaos", "lossy10", "lossy50", "router-restart")
@@ -190,7 +183,7 @@ def test_a_partition_has_a_window() -> None:
 # --- presets --------------------------------------------------------------------------------------
 
 
-def test_the_presets_are_those_of_the_reference() -> None:
+def test_the_presets() -> None:
     assert preset_names() == PRESETS
 
 
@@ -226,65 +219,3 @@ def test_a_file_takes_precedence_over_a_preset(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lossy10").write_text("seed = 3\n", encoding="utf-8")
     assert load_faults("lossy10", COORDINATORS) == FaultSpec(seed=3)
-
-
-# --- docs/FAULTS.md -------------------------------------------------------------------------------
-
-REFERENCE = (ROOT / "docs" / "FAULTS.md").read_text(encoding="utf-8")
-
-
-def reference_rows(heading: str) -> list[list[str]]:
-    """Return the cells of the first table below a heading, without its head."""
-    part = REFERENCE.partition(f"\n{heading}\n")[2]
-    table = re.search(r"^\|.*?\n\n", part, re.MULTILINE | re.DOTALL)
-    assert table is not None, heading
-    lines = table[0].strip().splitlines()[2:]
-    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
-
-
-def allowed_range(attribute: attrs.Attribute[Any]) -> str | None:
-    validator = getattr(attribute.validator, "validator", attribute.validator)
-    if validator is None:
-        return None
-    found = inspect.getclosurevars(validator).nonlocals
-    if "low" not in found:
-        return None
-    bracket = "(" if found["open_low"] else "["
-    low, high = (
-        "2^63 - 1" if value > 2**53 else f"{value:.10g}" for value in (found["low"], found["high"])
-    )
-    return f"{bracket}{low}, {high}]"
-
-
-@pytest.mark.parametrize(
-    ("heading", "kind"),
-    [
-        ("## Messages: `[[messages]]`", MessageRule),
-        ("## Kills: `[[kill]]`", Kill),
-        ("## Pauses: `[[pause]]`", Pause),
-        ("## Partitions: `[[partition]]`", Partition),
-    ],
-)
-def test_the_reference_has_every_field_with_default_and_range(heading: str, kind: type) -> None:
-    rows = {cells[0].strip("`"): cells[1:] for cells in reference_rows(heading)}
-    fields = {attribute.name: attribute for attribute in attrs.fields(kind)}
-    assert rows.keys() == fields.keys()
-    for name, attribute in fields.items():
-        default, allowed, meaning = rows[name]
-        if attribute.default is attrs.NOTHING:
-            assert default == "required", name
-        elif attribute.default is None:
-            assert default == "not set", name
-        else:
-            value = attribute.default
-            shown = json.dumps(list(value) if isinstance(value, tuple) else value)
-            assert default == f"`{shown}`", name
-        expected = allowed_range(attribute)
-        assert expected is None or allowed == expected, name
-        assert meaning, name
-
-
-def test_the_reference_lists_presets_and_groups() -> None:
-    assert tuple(sorted(cells[0].strip("`") for cells in reference_rows("## Presets"))) == PRESETS
-    part = REFERENCE.partition("## Partitions: `[[partition]]`")[2]
-    assert all(f"`{group}`" in part for group in GROUPS)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from attrs import evolve
 from numpy.typing import NDArray
 
 from laneweave.launch.recordings.runs import Run, single_run
@@ -20,6 +19,7 @@ from laneweave.launch.report.animation import KINDS, animation_data
 from laneweave.launch.report.snapshots import _shade
 from laneweave.launch.web import road_script
 from support.javascript import needs_node, printed_json
+from support.tracks import make_tracks
 
 
 @pytest.fixture(scope="module")
@@ -71,19 +71,8 @@ def test_long_runs_are_sampled_more_coarsely_and_then_cut(
     assert len(data["vehicles"]) < len(tracks.names)
 
 
-def test_a_run_without_vehicles(run: Run, tracks: Tracks) -> None:
-    nothing = np.empty(0)
-    none = evolve(
-        tracks,
-        names=(),
-        starts=np.zeros(1, np.int64),
-        t_s=nothing,
-        s_m=nothing,
-        y_m=nothing,
-        speed_mps=nothing,
-        accel_mps2=nothing,
-    )
-    data = animation_data(run, none, "")
+def test_a_run_without_vehicles(run: Run) -> None:
+    data = animation_data(run, make_tracks(np.empty(0), 0), "")
     assert (data["vehicles"], data["columns"]["s_m"], data["end_s"]) == ([], "", 0.0)
 
 

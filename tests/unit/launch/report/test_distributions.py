@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from attrs import evolve
 from numpy.typing import ArrayLike
 
 from laneweave.launch.observe.column_owners import read_events
@@ -32,6 +33,7 @@ from laneweave.launch.report.style import label_colours, spread_evenly
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError
 from support.older_recordings import older_recording
+from support.tracks import make_tracks
 
 T_S = 0.1 * np.arange(101)
 SHORT = load_scenario(None, demand__duration_s=10.0)
@@ -39,22 +41,9 @@ SHORT = load_scenario(None, demand__duration_s=10.0)
 
 def tracks(*vehicles: Sequence[ArrayLike]) -> Tracks:
     """Return tracks of 10 s from (s m, y m, speed m/s, acceleration m/s2) of each vehicle."""
-    rows = len(T_S)
-    s_m, y_m, speed_mps, accel_mps2 = (
-        np.concatenate([np.broadcast_to(vehicle[number], rows) for vehicle in vehicles])
-        for number in range(4)
-    )
-    return Tracks(
-        names=tuple(f"v{number}" for number in range(len(vehicles))),
-        starts=rows * np.arange(len(vehicles) + 1),
-        t_s=np.tile(T_S, len(vehicles)),
-        s_m=s_m,
-        y_m=y_m,
-        speed_mps=speed_mps,
-        accel_mps2=accel_mps2,
-        column=np.zeros(rows * len(vehicles), np.int64),
-        lane=np.zeros(rows * len(vehicles), np.int64),
-    )
+    names = ("s_m", "y_m", "speed_mps", "accel_mps2")
+    columns = dict(zip(names, zip(*vehicles, strict=True), strict=True))
+    return make_tracks(T_S, len(vehicles), **columns)
 
 
 def centres(counts: Counts, quantity: Quantity) -> list[float]:
@@ -160,18 +149,7 @@ def formations_of_two_lengths(folder: Path) -> tuple[Run, Tracks]:
         slot = np.clip(np.floor((t_s - start_s) / slot_s + 1e-6) + 1, 0, 2).astype(int)
         columns.append(np.array([column for column, _ in path])[slot])
         lanes.append(np.array([lane for _, lane in path])[slot])
-    rows = len(t_s) * len(cells)
-    driven = Tracks(
-        names=tuple(cells),
-        starts=len(t_s) * np.arange(len(cells) + 1),
-        t_s=np.tile(t_s, len(cells)),
-        s_m=np.zeros(rows),
-        y_m=np.zeros(rows),
-        speed_mps=np.zeros(rows),
-        accel_mps2=np.zeros(rows),
-        column=np.concatenate(columns),
-        lane=np.concatenate(lanes),
-    )
+    driven = evolve(make_tracks(t_s, 4, column=columns, lane=lanes), names=tuple(cells))
     trips = {
         "vehicle": list(cells),
         "preferred_lane": [path[-1][1] for _, path, _, _ in cells.values()],

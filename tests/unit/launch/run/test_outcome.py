@@ -16,6 +16,8 @@ from support.summaries import make_summary
 
 MEASURED = ("min_gap_m", "min_headway_s", "max_accel_mps2", "min_accel_mps2", "max_jerk_mps3")
 
+MANY_RECOVERIES = Failover(1.0, [0.1, 0.2, 0.3, 0.4, 0.5, 0.9], [])
+
 
 def summary(
     *, overlaps: int = 0, left: int = 5, measured: float | None = 1.5, ending: str = "complete"
@@ -35,38 +37,16 @@ def judge(folder: Path, found: RunSummary, **more: Any) -> Outcome:  # noqa: ANN
 
 
 def test_a_run_without_problems(tmp_path: Path) -> None:
-    outcome = judge(tmp_path, summary(), dropped=3)
+    outcome = judge(tmp_path, summary(), dropped=3, failover=Failover(1.0, [0.25], [0.5]))
 
     assert outcome.exit_status == 0
     written = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert outcome.summary == RunSummary.from_json(written)
     assert written["runtime"]["processes"] == 9
     assert written["messages"] == {"published": 7, "dropped_by_faults": 3}
-
-
-def test_an_unknown_number_of_processes(tmp_path: Path) -> None:
-    outcome = judge(tmp_path, summary(), processes=None)
-    assert outcome.summary is not None
-    assert outcome.summary.runtime.processes is None
-    assert "(? processes)" in printed(outcome)
-
-
-def test_ticks_solved_by_osqp_are_counted_apart(tmp_path: Path) -> None:
-    assert "17 / 50,383 ticks" in printed(judge(tmp_path, summary()))
-
-
-def test_recoveries_measured_by_the_launcher_replace_those_of_the_bridge(tmp_path: Path) -> None:
-    outcome = judge(tmp_path, summary(), failover=Failover(1.0, [0.25], [0.5]))
-    assert outcome.summary is not None
-    assert outcome.summary.failover.recovery_s == [0.25]
-    assert outcome.summary.failover.plan_recovery_s == [0.5]
-    assert "(0.250 s)" in printed(outcome)
-
-
-def test_many_recoveries_are_summarised(tmp_path: Path) -> None:
-    times_s = [0.1, 0.2, 0.3, 0.4, 0.5, 0.9]
-    outcome = judge(tmp_path, summary(), failover=Failover(1.0, times_s, []))
-    assert "(p50 0.350, max 0.900 s without)" in printed(outcome)
+    # Recoveries measured here replace those of the bridge.
+    failover = written["failover"]
+    assert (failover["recovery_s"], failover["plan_recovery_s"]) == ([0.25], [0.5])
 
 
 @pytest.mark.parametrize(
@@ -102,10 +82,21 @@ def printed(outcome: Outcome) -> str:
     return stream.getvalue()
 
 
-def test_what_was_not_measured_is_a_dash(tmp_path: Path) -> None:
-    text = printed(judge(tmp_path, summary(left=0, measured=None)))
-    assert "- / - / - s" in text
-    assert "0 (0.00%)" in text
+@pytest.mark.parametrize(
+    ("found", "more", "shown"),
+    [
+        (summary(), {"processes": None}, "(? processes)"),
+        (summary(), {}, "17 / 50,383 ticks"),
+        (summary(), {"failover": Failover(1.0, [0.25], [0.5])}, "(0.250 s)"),
+        (summary(), {"failover": MANY_RECOVERIES}, "(p50 0.350, max 0.900 s without)"),
+        (summary(left=0, measured=None), {}, "- / - / - s"),
+        (summary(left=0, measured=None), {}, "0 (0.00%)"),
+    ],
+)
+def test_the_table_at_the_end(
+    tmp_path: Path, found: RunSummary, more: dict[str, Any], shown: str
+) -> None:
+    assert shown in printed(judge(tmp_path, found, **more))
 
 
 def test_all_reasons_are_printed(tmp_path: Path) -> None:

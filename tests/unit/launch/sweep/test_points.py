@@ -39,8 +39,16 @@ def test_points_are_named_by_label_volume_and_seed() -> None:
 @pytest.mark.parametrize(
     ("label", "columns", "vehicles"), [("paper-6", 4, 6), ("paper-12", 8, 12), ("paper-18", 12, 18)]
 )
-def test_labels_bring_their_settings(label: str, columns: int, vehicles: int) -> None:
-    base = load_scenario(None, formation__block_columns=6, formation__max_vehicles=4)
+@pytest.mark.parametrize(
+    "base",
+    [
+        load_scenario(None, formation__block_columns=6, formation__max_vehicles=4),
+        load_scenario(None, formation__operation="rolling"),
+    ],
+)
+def test_labels_bring_their_settings(
+    base: Scenario, label: str, columns: int, vehicles: int
+) -> None:
     formation = METHODS[label].settings(base).formation
     assert (formation.block_columns, formation.max_vehicles) == (columns, vehicles)
     assert (formation.operation, formation.entry, formation.close) == (
@@ -98,16 +106,6 @@ def test_volumes_and_labels_that_do_not_fit_the_scenario() -> None:
     base = load_scenario(None, road__s3_m=160.0)
     with pytest.raises(BadInputError, match=r"road.s3_m \(paper-12\): got 160.0"):
         plan_points(base, ["paper-12"], [1000.0], range(1), KeepTrajectories.none)
-
-
-@pytest.mark.parametrize("base", [Scenario(), load_scenario(None, formation__operation="rolling")])
-def test_the_labels_of_the_paper_have_its_settings_in_any_scenario(base: Scenario) -> None:
-    (point,) = plan_points(base, ["paper-6"], [1000.0], range(1), KeepTrajectories.none)
-    formation = point.scenario.formation
-    assert (formation.operation, formation.cycle_s) == ("formations", 4.0)
-    assert formation.interlaced
-    assert not formation.closes_by_vehicles
-    assert (formation.block_columns, formation.max_vehicles) == (4, 6)
 
 
 def test_too_many_points() -> None:

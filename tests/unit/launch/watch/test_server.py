@@ -260,17 +260,12 @@ def test_nothing_queues_for_a_browser() -> None:
     assert (browser.frame, browser.request, browser.skipped) == ("999", (999, 999), 999)
 
 
-@pytest.mark.parametrize(
-    "listen", ["", "8080", "localhost", ":8080", "127.0.0.1:", "127.0.0.1:x", "127.0.0.1:65536"]
-)
-def test_malformed_addresses_are_refused(listen: str) -> None:
-    with pytest.raises(BadInputError, match="--listen"):
-        open_socket(listen)
-
-
 def test_unusable_addresses_are_refused() -> None:
     with contextlib.closing(open_socket("127.0.0.1:0")) as taken:
         port = taken.getsockname()[1]
-        for listen in (f"127.0.0.1:{port}", "192.0.2.1:8080", "no.such.host.invalid:80"):
+        for listen in (
+            *("", "8080", "localhost", ":8080", "127.0.0.1:", "127.0.0.1:x", "127.0.0.1:65536"),
+            *(f"127.0.0.1:{port}", "192.0.2.1:8080", "no.such.host.invalid:80"),
+        ):
             with pytest.raises(BadInputError, match="--listen"):
                 open_socket(listen)
