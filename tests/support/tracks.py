@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from laneweave.launch.recordings.trajectories import Tracks
 
 
-def make_tracks(t_s: NDArray[np.float64], count: int, **values: Sequence[ArrayLike]) -> Tracks:
+def make_tracks(t_s: ArrayLike, count: int, **values: Sequence[ArrayLike]) -> Tracks:
     """Return tracks of vehicles v0, v1, ... that are on the road at the same times.
 
     Args:
@@ -19,16 +19,17 @@ def make_tracks(t_s: NDArray[np.float64], count: int, **values: Sequence[ArrayLi
         **values: for a field of the tracks, numbers or arrays over time, one per vehicle; a field
             that is not given is 0.
     """
+    times_s = np.asarray(t_s)
 
     def column(name: str, kind: type) -> NDArray[np.float64]:
-        rows = [np.broadcast_to(value, len(t_s)) for value in values.get(name, (0,) * count)]
+        rows = [np.broadcast_to(value, len(times_s)) for value in values.get(name, (0,) * count)]
         return np.concatenate([np.empty(0), *rows]).astype(kind)
 
     floats = {name: column(name, float) for name in ("s_m", "y_m", "speed_mps", "accel_mps2")}
     return Tracks(
         names=tuple(f"v{number}" for number in range(count)),
-        starts=len(t_s) * np.arange(count + 1),
-        t_s=np.tile(t_s, count),
+        starts=len(times_s) * np.arange(count + 1),
+        t_s=np.tile(times_s, count),
         **floats,
         column=column("column", np.int64),  # type: ignore[arg-type]
         lane=column("lane", np.int64),  # type: ignore[arg-type]

@@ -87,10 +87,12 @@ def test_exact_against_small_steps() -> None:
         else:
             found += 1
             assert at_s <= stepped_s
+            assert _overlap(pair[0], pair[1], at_s, margin_m=1e-6)
             assert stepped_s - at_s < 0.0011 or stepped_s == math.inf
     assert found > 50
 
 
-def _overlap(one: Body, other: Body, t_s: float) -> bool:
+def _overlap(one: Body, other: Body, t_s: float, margin_m: float = 0.0) -> bool:
     (x_m, y_m), (u_m, w_m) = one.at(t_s), other.at(t_s)
-    return abs(x_m - u_m) < GEOMETRY.length_m and abs(y_m - w_m) < GEOMETRY.width_m
+    along_m, across_m = abs(x_m - u_m) - margin_m, abs(y_m - w_m) - margin_m
+    return along_m < GEOMETRY.length_m and across_m < GEOMETRY.width_m

@@ -77,6 +77,9 @@ def test_the_current_leader_is_killed() -> None:
     assert roles.done == [("kill", "c2")]
     assert view.leader is None
     assert faults.injected == [{"t_s": 5.0, "fault": "kill[0]", "killed": "c2"}]
+    leads(view, "c2")  # in flight
+    faults.step(5.1, 0.2, view)
+    assert view.leader is None
 
 
 def test_a_fault_without_a_target_waits_for_one() -> None:
@@ -170,7 +173,8 @@ def test_recovery_is_measured_until_another_process_leads(
     fault: Kill | Pause, heartbeats: list[tuple[float, str, int]], recovery_s: list[float]
 ) -> None:
     roles, view = FakeRoles(), on_road(leader="c1")
-    faults = injection(roles, **{"kill" if isinstance(fault, Kill) else "pause": (fault,)})
+    is_kill = isinstance(fault, Kill)
+    faults = injection(roles, kill=(fault,)) if is_kill else injection(roles, pause=(fault,))
     faults.step(5.0, 100.0, view)
     assert (view.leader == "c1") is (isinstance(fault, Pause) and fault.for_s == LEASE_S)
     for now_s, leader, incarnation in heartbeats:
