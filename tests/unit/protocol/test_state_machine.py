@@ -89,14 +89,6 @@ def test_the_first_row_whose_source_and_guards_fit_is_taken_and_no_other(
     assert (machine.done, machine.phase) == (done, then)
 
 
-def test_the_order_of_the_table_decides() -> None:
-    backwards = RuleBook(TABLE[::-1])
-    machine = Machine()
-    taken = backwards.take(machine, "switch", "softly")
-    assert taken is TABLE[3]
-    assert machine.phase is Lamp.OFF
-
-
 @pytest.mark.parametrize(
     ("event", "phase"), [("replace", Lamp.ON), ("repaint", Lamp.OFF), ("", Lamp.BROKEN)]
 )
@@ -135,11 +127,6 @@ def test_a_function_is_replaced_in_a_copy_only() -> None:
     assert BOOK.table == TABLE
     machine = Machine(powered=False)
     assert BOOK.take(machine, "switch", "softly") is TABLE[3]
-
-
-def test_a_function_is_replaced_in_all_of_its_rows() -> None:
-    book = replacing(BOOK, {click: unused})
-    assert book.functions == {is_powered, is_rough, glow, unused}
 
 
 def test_a_function_that_no_rule_uses_cannot_be_replaced() -> None:
