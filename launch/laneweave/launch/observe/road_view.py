@@ -91,10 +91,10 @@ class RoadView:
     """Incarnation of the newest bridge."""
     roads: int = 0
     """Number of roads observed so far."""
-    clock_heard_s: float = 0.0
+    clock_received_s: float = 0.0
     first_clock: RoadClock | None = None
     """Clock with the lowest tick."""
-    first_clock_heard_s: float = 0.0
+    first_clock_received_s: float = 0.0
     heartbeats: dict[Process, tuple[Heartbeat, float]] = field(factory=dict)
     """Newest heartbeat of each process, and its time of arrival."""
     linked: bool = True
@@ -206,9 +206,9 @@ class RoadView:
                 if abs(state.t_s - clock.t_s) <= FORGET_S
             }
         if self.first_clock is None or clock.tick < self.first_clock.tick:
-            self.first_clock, self.first_clock_heard_s = clock, now_s
+            self.first_clock, self.first_clock_received_s = clock, now_s
         if self.clock is None or clock.tick >= self.clock.tick:
-            self.clock, self.clock_heard_s = clock, now_s
+            self.clock, self.clock_received_s = clock, now_s
         self.loss.on_clock(clock)
 
     def _on_state(self, state: VehicleState) -> None:

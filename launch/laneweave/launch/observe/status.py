@@ -236,12 +236,12 @@ def _problem(
         found = "one coordinator" if count == 1 else f"{count or 'no'} coordinators"
         return f"there is no leader: {found} found"
     # The token of a killed process may persist, so only processes with heartbeats count.
-    heard = Counter(
+    active = Counter(
         one.coordinator
         for one in candidates
         if one.heard_s_ago is not None and one.heard_s_ago < election_s
     )
-    for name, processes in heard.items():
+    for name, processes in active.items():
         if processes > 1:
             return f"{processes} coordinators have the name {name}, which must be unique"
     return _road_problem(view, listened_s)
@@ -286,7 +286,7 @@ def _road(view: RoadView) -> Road | None:
     if first is None or clock is None:
         return None
     advanced_s = clock.t_s - first.t_s
-    lasted_s = view.clock_heard_s - view.first_clock_heard_s
+    lasted_s = view.clock_received_s - view.first_clock_received_s
     return Road(
         t_s=round(clock.t_s, 3),
         advanced_s=round(advanced_s, 3),

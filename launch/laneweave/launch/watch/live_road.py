@@ -140,13 +140,13 @@ class LiveRoad:
             return "waiting"
         if view.clock.ended:
             return "ended"
-        return "still" if wall_s - view.clock_heard_s > STILL_S else "live"
+        return "still" if wall_s - view.clock_received_s > STILL_S else "live"
 
     def _update_status(self, wall_s: float) -> None:
         status = self._status_at(wall_s)
         if status != self._status:
             self._status = status
-            self._since_s = self.view.clock_heard_s if status == "still" else wall_s
+            self._since_s = self.view.clock_received_s if status == "still" else wall_s
 
     def _forget_departed(self) -> None:
         view = self.view

@@ -129,9 +129,9 @@ const laneweaveFrames = (() => {
     const width = scene.road.lane_width_m;
     const known = bodies.filter((one) => one.lane >= 0);
     const there = known.filter((one) => Math.floor(one.y / width) === one.lane);
-    const heard = bodies.filter((one) => !one.faint);
-    const speed = heard.reduce((sum, one) => sum + one.v, 0) / (heard.length || 1);
-    return { onLane: there.length, knownLane: known.length, speed: heard.length ? speed : null };
+    const seen = bodies.filter((one) => !one.faint);
+    const speed = seen.reduce((sum, one) => sum + one.v, 0) / (seen.length || 1);
+    return { onLane: there.length, knownLane: known.length, speed: seen.length ? speed : null };
   }
 
   return { FrameStore, between, facts, MOVING, UNATTENDED, UNHEARD, OVERDUE };

@@ -286,27 +286,27 @@ class Watch {
     const { store } = this;
     const { scene } = store;
     const { onLane, knownLane, speed } = laneweaveFrames.facts(scene, this.picture.bodies);
-    const say = (id, text) => {
+    const setText = (id, text) => {
       const element = part(id);
       if (element.textContent !== text) element.textContent = text;
     };
-    say("time", frame.t === null ? "–" : `${frame.t.toFixed(1)} s`);
-    say("run", frame.run > 1 ? `run ${frame.run} since the server started` : "");
+    setText("time", frame.t === null ? "–" : `${frame.t.toFixed(1)} s`);
+    setText("run", frame.run > 1 ? `run ${frame.run} since the server started` : "");
     const [demanded, entered, , left] = frame.counts ?? [0, 0, 0, 0];
-    say("count", frame.counts ? `${this.picture.bodies.length}` : "–");
-    say("counts", frame.counts ? `${entered} of ${demanded} entered, ${left} left` : "");
-    say("sorted", knownLane ? `${Math.round((100 * onLane) / knownLane)} %` : "–");
-    say("speed", speed === null ? "" : `${onLane} of ${knownLane}; mean ${speed.toFixed(1)} m/s`);
-    say("leader", frame.leader ? `${frame.leader[0]}, term ${frame.leader[1]}` : "none");
+    setText("count", frame.counts ? `${this.picture.bodies.length}` : "–");
+    setText("counts", frame.counts ? `${entered} of ${demanded} entered, ${left} left` : "");
+    setText("sorted", knownLane ? `${Math.round((100 * onLane) / knownLane)} %` : "–");
+    setText("speed", speed === null ? "" : `${onLane} of ${knownLane}; mean ${speed.toFixed(1)} m/s`);
+    setText("leader", frame.leader ? `${frame.leader[0]}, term ${frame.leader[1]}` : "none");
     part("leader").classList.toggle("bad", !frame.leader);
     this.showCandidates(frame.candidates);
-    this.showLoss(frame.loss, scene.losses, say);
+    this.showLoss(frame.loss, scene.losses, setText);
     const [plannedAt, planned, took, solver, fallback] = frame.plan ?? [];
     const by = solver ? ` by ${solver}${fallback ? " (fallback)" : ""}` : "";
-    say("plan", frame.plan ? `${took.toFixed(1)} ms` : "–");
-    say("planned", frame.plan ? `${planned} vehicles${by}, at ${plannedAt.toFixed(1)} s` : "");
+    setText("plan", frame.plan ? `${took.toFixed(1)} ms` : "–");
+    setText("planned", frame.plan ? `${planned} vehicles${by}, at ${plannedAt.toFixed(1)} s` : "");
     this.showNews(frame.news);
-    this.showTime(frame, say);
+    this.showTime(frame, setText);
     this.showStatus();
   }
 
@@ -324,15 +324,15 @@ class Watch {
     part("candidates").replaceChildren(...chips);
   }
 
-  showLoss(loss, losses, say) {
+  showLoss(loss, losses, setText) {
     if (losses) {
       const { published, dropped_by_faults: dropped } = losses;
-      say("loss", published ? `${((100 * dropped) / published).toFixed(2)} %` : "–");
-      say("losses", published ? `${dropped} dropped by faults, ${published} published` : "");
+      setText("loss", published ? `${((100 * dropped) / published).toFixed(2)} %` : "–");
+      setText("losses", published ? `${dropped} dropped by faults, ${published} published` : "");
       return;
     }
-    say("loss", loss ? `${((100 * loss[1]) / loss[0]).toFixed(2)} %` : "–");
-    say("losses", loss ? `${loss[1]} of ${loss[0]} states` : "no states expected yet");
+    setText("loss", loss ? `${((100 * loss[1]) / loss[0]).toFixed(2)} %` : "–");
+    setText("losses", loss ? `${loss[1]} of ${loss[0]} states` : "no states expected yet");
     part("loss").classList.toggle("bad", loss !== null && loss[1] > 0.05 * loss[0]);
   }
 
@@ -350,7 +350,7 @@ class Watch {
     part("news").replaceChildren(...items);
   }
 
-  showTime(frame, say) {
+  showTime(frame, setText) {
     const { store } = this;
     const slider = part("slider");
     slider.min = store.first;
@@ -363,7 +363,7 @@ class Watch {
     } else if (!this.live) {
       text = `${road} of ${(store.last * store.scene.step_s).toFixed(1)} s`;
     }
-    say("now", text);
+    setText("now", text);
     slider.setAttribute("aria-valuetext", text);
   }
 
