@@ -99,10 +99,10 @@ class Plan:
     """Leader to each vehicle of the roster that has not accepted, every `network.resend_s`.
 
     There is one per ballot. Missing: sent again; no vehicle moves before all have accepted (start
-    gate). Ignored (V3) if it is a duplicate, its ballot is not the promised one, it cannot be
-    executed safely, its blocks are not exactly the joined ones, its territory leaves them, or its
-    cell transfers are invalid. Each vehicle derives the dependencies between moves from this
-    message.
+    gate). Duplicated or late: ignored. A plan is also ignored (V3) if its ballot is not the
+    promised one, it cannot be executed safely, its blocks are not exactly the joined ones, its
+    territory leaves them, or its cell transfers are invalid. Vehicles derive the dependencies
+    between moves from this message.
     """
 
     ballot: Ballot
