@@ -64,7 +64,7 @@ def drive(tracker: Tracker, scenario: Scenario, name: str, seed: str) -> Iterato
     """Simulate an episode of a situation in closed loop with an exact plant.
 
     Args:
-        tracker: a new one.
+        tracker: a new tracker.
         scenario: limits, tick and horizon.
         name: of the situation, see `SITUATIONS`.
         seed: of the episode.

@@ -7,7 +7,7 @@ from typing import Any
 from laneweave.protocol.scenario.fields import Scenario
 
 _THREE_LANES = ("#2f6fc4", "#3f9b4f", "#cf3f3a")
-"""Right to left: blue, green, red, the paper's colours."""
+"""The paper's colours from right to left: blue, green, red."""
 _MORE_LANES = (
     "#2f6fc4",
     "#e08b27",

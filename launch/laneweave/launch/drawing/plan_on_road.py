@@ -104,7 +104,7 @@ def drive_plan(scenario: Scenario, names: Sequence[str], paths: Sequence[Sequenc
 
     Args:
         scenario: v_F, d_F, T_F, lane width, vehicles and tracking; see `scenario_in_mode`.
-        names: of the vehicles.
+        names: names of the vehicles.
         paths: cells of each vehicle at all time points; one time point: all hold.
     """
     slot_ticks = round(scenario.cycles_s[0] / scenario.runtime.tick_s)

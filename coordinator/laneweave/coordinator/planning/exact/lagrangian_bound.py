@@ -53,25 +53,25 @@ class Scratch(NamedTuple):
     move_from: Ints
     """(T, K + 1) where the moves of a step and team begin."""
     move_cost: Floats
-    """(moves,)"""
+    """(moves,) cost of each move in `move`."""
     present: Floats
     """(T, R) multipliers of the current iteration."""
     direction: Floats
-    """(T, R)"""
+    """(T, R) subgradient with momentum."""
     use: Floats
     """(T, R) number of vehicles in each clique on their cheapest paths; then the subgradient."""
     mass: Floats
     """(K, T, D, X) weights of the relaxed solutions that contain a move."""
     mass_of_team: Floats
-    """(T, R, K)"""
+    """(T, R, K) mass of the moves of a team in a clique."""
     mass_of_cell: Floats
-    """(T, R, numbers of from-cells in a clique)"""
+    """(T, R, `residue_count`) mass of the moves from a cell in a clique."""
     reach: Floats
     """(K, T + 1, X) minimum reduced cost at which a team reaches a cell before a step."""
     min_cost: Floats
     """(K, T + 1, X) minimum of `cost_to_go` minus the dual value of the target."""
     cost: Floats
-    """(N, J)"""
+    """(N, J) minimum cost of each vehicle and target."""
     holder: Ints
     """(J,) the vehicle that has a target; -1: none."""
     dual: Floats
@@ -90,7 +90,7 @@ class Stack(NamedTuple):
     earliest: Ints
     """(S, P) earliest step before which a vehicle may have finally arrived."""
     multipliers: Floats
-    """(S, T, R)"""
+    """(S, T, R) Lagrange multipliers."""
     step_size: Floats
     """(S,) factor of the step size."""
 

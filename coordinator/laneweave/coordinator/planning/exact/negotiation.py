@@ -29,7 +29,7 @@ _SPARE_STEPS = 4
 _ATTEMPTS = 4
 """Attempts to improve the path set in one pass."""
 _MAX_REMOVED = (6, 12)
-"""Maximum number of vehicles that are removed together, in alternation."""
+"""Maximum numbers of vehicles that are removed together; they alternate."""
 _IDLE_ATTEMPTS = 800
 """Attempts without an improvement after which negotiation restarts."""
 
@@ -40,7 +40,7 @@ class CandidatePaths(NamedTuple):
     path: Ints
     """(N, T) displacements; `PARKED`: arrived."""
     cost: Ints
-    """(N,)"""
+    """(N,) cost of each path."""
     target: Ints
     """(N,) number of the target of each vehicle."""
     use: Floats
@@ -52,7 +52,7 @@ class CandidatePaths(NamedTuple):
     weight: Floats
     """(T, R) current cost of each clique."""
     cost_to_go: Floats
-    """(T + 1, X)"""
+    """(T + 1, X) minimum cost from a cell before a step to the target of one vehicle."""
     parked: Floats
     """(T + 1,) cost of staying at the target from a step on."""
     random: NDArray[np.uint64]

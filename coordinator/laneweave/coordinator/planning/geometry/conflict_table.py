@@ -2,7 +2,7 @@
 
 Two vehicles make one move each in the same step, from cells that lie an offset apart. Their
 clearance is the smallest gap between bumpers over all moments at which the bodies are less than
-`clearance_across_m` shift sideways:
+`clearance_across_m` apart sideways:
 
 - all pairs of moments of both moves, beginning and end included, if each may be late by any amount
   (`BodyGeometry.lateness_s` is None): one may not have started, or may have arrived long ago;

@@ -93,9 +93,9 @@ def _velocity(path: Floats, sample_s: float) -> Floats:
 class BodyGeometry:
     """Sizes, times and clearances that decide whether two moves bring two bodies too close.
 
-    Two bodies are *too close* when at some moment less than `clearance_across_m` is between them
-    sideways and, at the same moment, less than `clearance_along_m` between their bumpers. The
-    defaults are the paper's sizes and times.
+    Two bodies are *too close* if at some moment they are less than `clearance_across_m` apart
+    sideways and their bumpers less than `clearance_along_m`. The defaults are the paper's sizes and
+    times.
 
     The minimum gap for which a vehicle's tracker follows its plan is 3 m (`tracking.min_gap_m`);
     the default clearance of 5 m leaves 2 m for errors and for braking. Two vehicles that follow
@@ -122,7 +122,7 @@ class BodyGeometry:
     profile. The default covers minimum-jerk trajectories within the default limits of acceleration
     (0.55 m)."""
     profile_error_across_m: float = field(default=0.1, validator=within(0, 10))
-    """The same sideways (0.05 m)."""
+    """The same across the road (0.05 m)."""
     lateness_s: float | None = field(
         default=None, validator=attrs.validators.optional(within(0, 60))
     )

@@ -197,7 +197,7 @@ def disjoint_constraints(
 def _side_to_branch_on(sets: tuple[int, int], layers: tuple[int, int]) -> int:
     """Return the vehicle (0 or 1) whose set covers the larger share of its shortest paths.
 
-    A share of 1 means that its cost cardinality.
+    A share of 1 means that its cost rises.
     """
     first, second = (
         (chosen & layer).bit_count() / layer.bit_count()

@@ -86,7 +86,7 @@ class Costs(NamedTuple):
     """`StreamCosts` for the compiled code."""
 
     of_move: Singles
-    """Of each displacement."""
+    """Cost of each displacement."""
     off_lane: np.float32
 
 
@@ -123,7 +123,7 @@ class Scratch(NamedTuple):
 
 
 class Window(NamedTuple):
-    """All arrays of one planning."""
+    """All arrays for planning one slot."""
 
     low: int
     """Column of the lattice that is the window's lowest."""

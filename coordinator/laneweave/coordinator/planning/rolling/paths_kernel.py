@@ -20,8 +20,8 @@ vehicle waits, so that taking its place is not penalized again in each slot."""
 MAX_EJECTED = 100
 """Maximum number of vehicles hit by one ejection chain."""
 _IMPASSABLE = 5e3
-"""Higher than the cost of any path; lower than a conflict with a `FIXED` vehicle in the chain of a
-vehicle that misses its lane. The paths of other vehicles cost at most a hundredth of it."""
+"""Cost from which paths are rejected, and factor of forbidden conflicts. Paths without conflicts
+cost at most a hundredth of it; a conflict with a `FIXED` vehicle costs more."""
 _UNREACHED = 1e9
 NO_PATH = 1e9
 """Cost of a vehicle without a path."""

@@ -96,7 +96,7 @@ def _eject(table, paths, costs, start, softness, slack, rng, scratch):
 
     Vehicles that are hit are rerouted in turn, and may hit others (ejection chains: Glover 1996).
     Each hit raises the penalty of the vehicle. The chain is undone, and the decrease is 0, if it
-    hits costly_count than `MAX_EJECTED` or the sum of costs grows by `slack` or costly_count.
+    hits more than `MAX_EJECTED` or the sum of costs grows by `slack` or more.
     """
     saved, queue, hit, marked = scratch.saved, scratch.queue, scratch.hit, scratch.marked
     was_placed = paths.placed[start]
@@ -245,7 +245,7 @@ def improve(table, paths, costs, rounds, max_paths, rng, scratch):
     """Improve all paths for some rounds; return the number of rounds.
 
     While vehicles miss their lanes, ejection chains and reorderings alternate; the slack decreases
-    from several moves to none. Afterwards a few costly_count rounds look for cheaper paths.
+    from several moves to none. Afterwards a few more rounds look for cheaper paths.
     """
     off_lane, costly = scratch.off_lane, scratch.costly
     turn = idle = 0
