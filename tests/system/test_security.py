@@ -58,7 +58,7 @@ from support.secured import (
 )
 
 A, B = "v0001", "v0002"
-FLEETS = {vehicle: f"fleet.agents-{1 if Shard(0, 2).takes(vehicle) else 2}" for vehicle in (A, B)}
+FLEETS = {one: f"fleet.agents-{1 if Shard(0, 2).contains(one) else 2}" for one in (A, B)}
 STRANGERS = ("client.stranger", "vehicle.stranger")
 """They have certificates of the right authority, but the deployment does not know them."""
 MEMBERS = ("bridge", "coordinator.c1", "coordinator.c3", f"vehicle.{A}", f"vehicle.{B}",

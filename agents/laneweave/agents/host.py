@@ -207,7 +207,7 @@ class AgentHost:
         listed = dict.fromkeys(entry.vehicle for entry in census.announced)
         listed |= dict.fromkeys(entry.vehicle for entry in census.on_road)
         for name in listed:
-            if name not in self._seen and shard.takes(name):
+            if name not in self._seen and shard.contains(name):
                 self._agents[name] = self._make_agent(name)
                 effects += self._agents[name].handle(Started(), now_s)
         for name in sorted(set(self._agents) - set(listed)):

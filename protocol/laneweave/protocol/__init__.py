@@ -1,4 +1,4 @@
-"""What all processes share; imports no other package of laneweave.
+"""Code that all processes share; imports no other package of laneweave.
 
-Start with `wire.messages` (what is sent) and `runtime.node` (how a core is driven).
+Start with `wire.messages` (the messages) and `runtime.node` (how a core is driven).
 """

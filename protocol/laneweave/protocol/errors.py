@@ -1,4 +1,4 @@
-"""Errors that are shown to the user."""
+"""Errors that are reported to the user."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 80
 
 
 class BadInputError(ValueError):
-    """A value supplied by a user or a peer is not acceptable.
+    """A value from a user or a peer is invalid.
 
-    The message is one line that names the field, the value and what is allowed. The command line
-    prints it and exits with status 2; a running process counts it and continues.
+    The one-line message names the field, the value and the allowed values. The command line prints
+    it and exits with status 2; a running process counts it and continues.
     """
 
     def __init__(self, field: str, value: object, allowed: str) -> None:
@@ -25,7 +25,7 @@ class BadInputError(ValueError):
         super().__init__(field, value, allowed)
 
     def __str__(self) -> str:
-        """Return the message as one line, for any value and name."""
+        """Return the message as one line."""
         try:
             shown = _SHORT.repr(self.value)
         except ValueError:  # an integer of thousands of digits
@@ -40,15 +40,15 @@ class BadInputError(ValueError):
 
 
 def one_line(text: str, length: int = 500) -> str:
-    """Return text as one printable line of limited length."""
+    """Return a text as one printable line of at most `length` characters."""
     words = "".join(char if char.isprintable() else " " for char in text).split()
     line = " ".join(words)
     return line if len(line) <= length else line[: length - 3] + "..."
 
 
 class RefusedError(Exception):
-    """Another process refused the input; the message is its line. Exit status 2."""
+    """Another process rejected the input with this message. Exit status 2."""
 
 
 class CommandFailedError(RuntimeError):
-    """The command failed although its input is valid; the message says why. Exit status 1."""
+    """A command failed although its input is valid; the message is the reason. Exit status 1."""

@@ -1,6 +1,6 @@
-"""Validators of configured values (names, numbers, endpoints), for attrs fields and elsewhere.
+"""Validators of configuration values: names, numbers, endpoints.
 
-Every check raises `BadInputError` with the field, the value and the allowed range.
+All of them raise `BadInputError` with the field, the value and the allowed values.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ def one_of(*choices: object) -> Validator:
 
 
 def key_part(_: object, attribute: attrs.Attribute[Any], value: str) -> None:
-    """Check that a value can be one part of a key."""
+    """Check that a value is valid as one part of a key."""
     if not NAME_PATTERN.fullmatch(value):
         raise BadInputError(attribute.name, value, NAME_RULE)
 
 
 def key_parts(_: object, attribute: attrs.Attribute[Any], value: Sequence[str]) -> None:
-    """Check that values can be parts of keys and that none is repeated."""
+    """Check that all values are valid as parts of keys, and unique."""
     for one in value:
         key_part(None, attribute, one)
         if value.count(one) > 1:
@@ -60,16 +60,16 @@ def key_parts(_: object, attribute: attrs.Attribute[Any], value: Sequence[str]) 
 
 
 def host_port(_: object, attribute: attrs.Attribute[Any], value: str) -> None:
-    """Check that a value is HOST:PORT, or empty."""
+    """Check that a value is HOST:PORT or empty."""
     if value:
         host_and_port(attribute.name, value)
 
 
 def host_and_port(name: str, text: str) -> tuple[str, int]:
-    """Return the parts of HOST:PORT; an IPv6 address is in brackets.
+    """Return host and port of HOST:PORT, where an IPv6 address is in brackets.
 
     Raises:
-        BadInputError: the text has another form.
+        BadInputError: the text does not have this form.
     """
     host, _, port = text.rpartition(":")
     bare = host[1:-1] if host[:1] == "[" and host[-1:] == "]" else host
@@ -80,14 +80,10 @@ def host_and_port(name: str, text: str) -> tuple[str, int]:
 
 
 def check_endpoint(endpoint: str, name: str = "network.endpoint") -> str:
-    """Return a Zenoh endpoint.
-
-    Args:
-        endpoint: text to check.
-        name: field name for the error.
+    """Return a Zenoh endpoint unchanged if it is valid; `name` is the field for the error.
 
     Raises:
-        BadInputError: the endpoint is malformed, or of a kind that the Zenoh wheel lacks.
+        BadInputError: the endpoint is malformed, or the Zenoh wheel lacks its protocol.
     """
     found = _NETWORK.fullmatch(endpoint)
     if not _SOCKET.fullmatch(endpoint) and (found is None or int(found["port"]) > 65535):
@@ -101,6 +97,6 @@ def is_tls(endpoint: str) -> bool:
 
 
 def host_of(endpoint: str) -> str:
-    """Return the host of a well-formed endpoint without brackets; empty for socket files."""
+    """Return the host of a valid endpoint without brackets; empty for socket files."""
     found = _NETWORK.fullmatch(endpoint)
     return found["host"].strip("[]") if found else ""

@@ -1,4 +1,4 @@
-"""Writing of files."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from pathlib import Path
 
 
 def write_atomically(path: Path, write: str | Callable[[Path], object]) -> None:
-    """Write a file completely or not at all: readers never see a part of it.
+    """Write or replace a file atomically: readers never see a partial file.
 
     Args:
-        path: the file, which is replaced if it exists.
-        write: its text, or a function that writes the content to the path that it is given.
+        path: the file.
+        write: its text, or a function that writes its content to a given path.
     """
-    unfinished = path.with_suffix(".part")
+    part = path.with_suffix(".part")
     if isinstance(write, str):
-        unfinished.write_text(write, encoding="utf-8")
+        part.write_text(write, encoding="utf-8")
     else:
-        write(unfinished)
-    unfinished.replace(path)
+        write(part)
+    part.replace(path)

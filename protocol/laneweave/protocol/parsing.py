@@ -1,8 +1,8 @@
 """Strict conversion of untyped maps (TOML, MessagePack, JSON) into attrs classes, with cattrs.
 
-Nothing is coerced: a string is not a number, a bool is not an int, text is not a list; an int is
-accepted where a float is meant. Unknown keys are errors. Every failure becomes one `BadInputError`
-that names the field by its path.
+Values are not coerced: a string is not a number, a bool is not an int, text is not a list. The only
+exception is an int for a float. Unknown keys are errors. Every failure raises one `BadInputError`
+that names the path of the field.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from laneweave.protocol.errors import BadInputError
 T = TypeVar("T")
 Hook = Callable[[Any, Any], Any]
 NumberOrRange = float | tuple[float, float]
-"""A number, or the range from which one is drawn."""
+"""A number, or the range from which it is drawn."""
 TextOrTexts = str | tuple[str, ...]
-"""A text, or a list of them."""
+"""A text or several."""
 
 
 def _exactly(kind: type, name: str) -> Hook:
@@ -68,7 +68,7 @@ def _text_or_texts(value: object, _: type) -> TextOrTexts:
 
 
 def strict_converter(*, detailed: bool) -> Converter:
-    """Return a converter that coerces nothing; `detailed` collects paths for error messages."""
+    """Return a converter without coercion; `detailed`: errors name the path of the field."""
     converter = Converter(forbid_extra_keys=True, detailed_validation=detailed)
     converter.register_structure_hook(int, _exactly(int, "an integer"))
     converter.register_structure_hook(str, _exactly(str, "a string"))
@@ -106,7 +106,7 @@ def _tuple_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a gen
             raise BadInputError("", value, f"a list of {count}")
         return value
 
-    def fast_alike(value: object, _: type) -> tuple[Any, ...]:
+    def fast_uniform(value: object, _: type) -> tuple[Any, ...]:
         return tuple([first_hook(item, first_part) for item in parts(value)])
 
     def fast_mixed(value: object, _: type) -> tuple[Any, ...]:
@@ -125,8 +125,8 @@ def _tuple_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a gen
 
     if converter.detailed_validation:
         return detailed
-    # Lists of one kind (states, cells) are most of what a vehicle receives.
-    return fast_alike if all(part is first_part for _, part in hooks) else fast_mixed
+    # Vehicles mostly receive lists of one kind (states, cells).
+    return fast_uniform if all(part is first_part for _, part in hooks) else fast_mixed
 
 
 def _dict_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a generic alias)
@@ -161,10 +161,10 @@ def _class_hook(kind: type, converter: Converter) -> Hook:
             raise BadInputError("", value, "a table")
         for key in value:
             if type(key) is not str:
-                raise BadInputError("", key, "text as the key of each field")
+                raise BadInputError("", key, "a text as the key of each field")
         return fields_hook(value, kind)
 
-    # The fast hook rejects the same values, but its errors name no field.
+    # The fast hook rejects the same values, but its errors do not name the field.
     return detailed if converter.detailed_validation else fields_hook
 
 
@@ -175,11 +175,11 @@ def structure(data: Mapping[str, Any], kind: type[T]) -> T:
     """Build an instance of the attrs class `kind` from nested maps.
 
     Raises:
-        BadInputError: the first thing that is wrong, named by its path.
+        BadInputError: the first invalid value, with its path.
     """
     try:
         return _CONVERTER.structure(data, kind)
-    except Exception as error:  # noqa: BLE001 (cattrs raises what the hooks and validators raise)
+    except Exception as error:  # noqa: BLE001 (hooks and validators may raise anything)
         raise first_problem(error) from None
 
 
@@ -191,7 +191,7 @@ def as_lists(_: object, __: object, value: object) -> object:
 
 
 def first_problem(error: Exception, path: str = "") -> BadInputError:
-    """Return the first leaf of a cattrs error group as one line with its path."""
+    """Return the first leaf of a cattrs error group as an error with its path."""
     if isinstance(error, BaseValidationError):
         for inner in error.exceptions:
             return first_problem(inner, path + _step(inner, bool(path)))

@@ -1,7 +1,7 @@
-"""`summary.json`: the figures of one run.
+"""`summary.json`: the results of one run.
 
-The bridge writes it at the end of a run; the launcher adds what only it knows. Fields with a
-default are missing from summaries of earlier versions, or of runs without such figures.
+The bridge writes the file at the end of a run; the launcher adds the fields that only it knows.
+Fields with a default are absent in summaries of earlier versions and of runs without these results.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ class VehicleCounts:
     entered: int
     left: int
     on_preferred_lane: int
-    """Left the road on the lane that they prefer."""
+    """Vehicles that left the road on their preferred lane."""
     peak: int
-    """Highest number on the road at one time."""
+    """Maximum number on the road at the same time."""
     left_off_lane: int | None = None
     left_unattended: int | None = None
 
 
 @frozen(kw_only=True)
 class TravelTime:
-    """Travel times of the counted vehicles in s; None: no vehicle was counted."""
+    """Travel times of the counted vehicles [s]; None: no vehicle was counted."""
 
     mean: float | None
     p50: float | None
@@ -51,7 +51,7 @@ class Safety:
     """Counts and extremes over all vehicles and ticks; None: nothing was measured."""
 
     overlaps: int
-    """Pairs of bodies that ever intersected."""
+    """Pairs of bodies that intersected at any tick."""
     sumo_collisions: int
     min_gap_m: float | None
     min_headway_s: float | None
@@ -63,7 +63,7 @@ class Safety:
 
 @frozen(kw_only=True)
 class PlanningMs:
-    """Planning times in ms."""
+    """Planning times [ms]."""
 
     p50: float | None
     p95: float | None
@@ -72,7 +72,7 @@ class PlanningMs:
 
 @frozen(kw_only=True)
 class DurationMs:
-    """Durations in ms."""
+    """Durations [ms]."""
 
     p50: float | None
     p99: float | None
@@ -80,7 +80,7 @@ class DurationMs:
 
 @frozen(kw_only=True)
 class Planning:
-    """Plans of all coordinators."""
+    """Counts of plans, over all coordinators."""
 
     plans: int
     optimal: int
@@ -92,7 +92,7 @@ class Planning:
 
 @frozen(kw_only=True)
 class Tracking:
-    """Tracking by agents, and what caretakers did instead."""
+    """Counts of tracking by agents, and of fallbacks."""
 
     solves: int
     osqp_solves: int | None = None
@@ -108,12 +108,12 @@ class Tracking:
 
 @frozen(kw_only=True)
 class RuntimeFigures:
-    """Processes and their speed."""
+    """Processes, and the speed of the run."""
 
     real_time_factor: float
     wall_s: float
     processes: int | None
-    """Highest number at one time; None: not known."""
+    """Maximum number at the same time; None: unknown."""
     vehicles_per_process: int
     tick_ms: DurationMs
 
@@ -133,14 +133,15 @@ class LeaderChanges:
 
     leader_changes: int
     recovery_s: list[float]
-    """Times without a leader; with faults: from each fault of a leader until another one led."""
+    """Times without a leader [s]; with injected faults: from each fault of a leader until another
+    one led."""
     plan_recovery_s: list[float] | None = None
-    """From each fault of a leader until the next plan was in force."""
+    """Times from each fault of a leader until the next plan was in force [s]."""
 
 
 @frozen(kw_only=True)
 class RunSummary:
-    """The figures of one run, as in `summary.json`."""
+    """The content of `summary.json`."""
 
     schema: str
     method: str
@@ -161,14 +162,14 @@ class RunSummary:
     messages: Messages
     failover: LeaderChanges
     faults: dict[str, Any] | None = None
-    """Injected faults; None: none were asked for."""
+    """Injected faults; None: the run has no fault file."""
 
     @classmethod
     def from_json(cls, data: object) -> RunSummary:
-        """Return the summary of a JSON object.
+        """Return the summary in a JSON object.
 
         Raises:
-            BadInputError: it is not a summary.
+            BadInputError: the object is not a summary.
         """
         try:
             return _CONVERTER.structure(data, cls)
@@ -181,13 +182,13 @@ class RunSummary:
 
     @property
     def preferred_percent(self) -> float | None:
-        """Share of the vehicles that left which did so on the lane that they prefer, in %."""
+        """Percentage of the departed vehicles that left on their preferred lane."""
         left = self.vehicles.left
         return 100.0 * self.vehicles.on_preferred_lane / left if left else None
 
 
 def read_summary(folder: Path) -> RunSummary | None:
-    """Return a run's summary; None: there is none, or it is incomplete."""
+    """Return the summary in a run's folder; None if it is missing or incomplete."""
     try:
         return RunSummary.from_json(json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8")))
     except (OSError, ValueError):
@@ -195,7 +196,7 @@ def read_summary(folder: Path) -> RunSummary | None:
 
 
 def write_summary(folder: Path, summary: RunSummary) -> None:
-    """Write `summary.json`, atomically, also if this process is killed."""
+    """Write `summary.json` atomically."""
     text = json.dumps(summary.to_json(), indent=2, allow_nan=False) + "\n"
     write_atomically(folder / SUMMARY_FILE, text)
 

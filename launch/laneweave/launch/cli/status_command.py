@@ -81,7 +81,7 @@ def _role_health(role: Role | None, name: str | None, shard: str | None) -> Role
     if shard is not None:
         if role is not Role.agent or name is not None:
             raise BadInputError("--shard", shard, "only with --role agent and without --name")
-        return RoleHealth(AGENT, shard, parse_shard(shard, "--shard").takes, is_shard=True)
+        return RoleHealth(AGENT, shard, parse_shard(shard, "--shard").contains, is_shard=True)
     if name is not None and (role in (None, Role.bridge) or not NAME_PATTERN.fullmatch(name)):
         raise BadInputError("--name", name, f"only with --role coordinator or agent: {NAME_RULE}")
     if name is None and role in (Role.coordinator, Role.agent):

@@ -62,7 +62,7 @@ def _of_fleet(
         raise BadInputError("--fleet", fleet, f"one of security.fleets: {known}")
     taken = _shard(members)
     for vehicle in vehicles:
-        if not (taken.takes(vehicle) if taken is not None else vehicle in members):
+        if not (taken.contains(vehicle) if taken is not None else vehicle in members):
             raise BadInputError("VEHICLE", vehicle, f"a vehicle of the fleet {fleet}")
     if vehicles:
         return AssignedVehicles(_fleet(fleet), tuple(vehicles), None)

@@ -1,5 +1,5 @@
-"""Reading a scenario file and checking its tables against each other.
+"""Loading of scenario files, and rules between their fields.
 
-Entry point: `loading.load_scenario`. `checks` has the rules between fields, `identities` the names
-of all processes of a deployment. Imported by `security`, `transports` and the other packages.
+Entry point: `loading.load_scenario`. `cross_checks` has the rules between fields, `participants`
+the names of all processes. Imported by `security`, `transports` and the other packages.
 """

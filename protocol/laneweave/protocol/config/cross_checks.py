@@ -15,17 +15,17 @@ from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
 from laneweave.protocol.wire.identities import MAX_COMMON_NAME
 
 MIN_GAP_M = 1.0
-"""Minimum gap between bumpers of neighbouring cells: bodies turn, and track with some error."""
+"""Minimum gap between bumpers of neighbouring cells, for rotated bodies and tracking errors."""
 MIN_SIDE_GAP_M = 0.5
-"""Minimum gap between bodies side by side, for the same reasons."""
+"""The same between bodies side by side."""
 MAX_TICKS = 200
-"""Maximum horizon of the tracker."""
+"""Maximum horizon of the tracker [ticks]."""
 MAX_SECURED_VEHICLES = 5000
-"""Maximum number of vehicles for which a router has rules."""
+"""Maximum number of vehicles for which a router holds access rules."""
 
 _RELATIONS = {"at least": ge, "at most": le, "more than": gt, "less than": lt}
 _Comparison = tuple[str, str, float, str]
-"""(field, relation, limit, what the limit is)."""
+"""(field, relation, limit, description of the limit)."""
 
 ROLLING_ONLY = ("sort_in_s2", "reward_drift")
 """Fields of `formation` that only the rolling operation reads."""
@@ -65,7 +65,7 @@ def check_scenario(scenario: Scenario) -> None:
 
 
 def check_effects(data: Mapping[str, Any], scenario: Scenario) -> None:
-    """Check that each value of a file's tables has an effect in the scenario that they define.
+    """Check that each value in a file has an effect in the resulting scenario.
 
     Raises:
         BadInputError: the first field without an effect.
@@ -89,7 +89,7 @@ def _require(ok: bool, name: str, value: object, allowed: str) -> None:
 
 
 def _compare(scenario: Scenario, comparisons: Iterable[_Comparison]) -> None:
-    """Check that fields have the stated relations to their limits."""
+    """Check each field against its limit."""
     for name, relation, limit, meaning in comparisons:
         value = attrgetter(name)(scenario)
         _require(
@@ -154,7 +154,7 @@ def _check_motion(scenario: Scenario) -> None:
 
 
 def _check_structures(scenario: Scenario) -> None:
-    """Check that structures are in order along the road, before S3, and on existing lanes."""
+    """Check that structures ascend along the road, end before S3 and use existing lanes."""
     road, before_m = scenario.road, -1.0
     for number, structure in enumerate(scenario.formation.structures):
         name = f"formation.structures[{number}]"
@@ -201,7 +201,7 @@ def _check_timing(scenario: Scenario) -> None:
     )
     _require(
         scenario.horizon_ticks <= MAX_TICKS,
-        "runtime.tick_s",  # a horizon that is given has its own bound
+        "runtime.tick_s",  # an explicit horizon has its own bound
         runtime.tick_s,
         f"long enough for the longest T_F, {longest_s:g} s, to have at most {MAX_TICKS} ticks",
     )
@@ -218,7 +218,7 @@ def _check_timing(scenario: Scenario) -> None:
 
 
 def _in_ticks(scenario: Scenario, time_s: float, min_ticks: int) -> bool:
-    """Return whether a time is a whole number of ticks, and not too few."""
+    """Return whether a time is a whole number of at least `min_ticks` ticks."""
     ticks = time_s / scenario.runtime.tick_s
     return ticks >= min_ticks - 1e-6 and abs(ticks - round(ticks)) < 1e-6
 
@@ -243,8 +243,8 @@ def _check_braking(scenario: Scenario) -> None:
 def _check_settling(scenario: Scenario) -> None:
     """Check that a vehicle can settle in its cell within its limits.
 
-    The minimum-jerk motion from rest to rest over d in T takes a speed of 15/8 d/T, an acceleration
-    of 10/sqrt(3) d/T2 and a jerk of 60 d/T3.
+    The minimum-jerk motion from rest to rest over d in T has a peak speed of 15/8 d/T, a peak
+    acceleration of 10/sqrt(3) d/T^2 and a peak jerk of 60 d/T^3.
     """
     formation, vehicle = scenario.formation, scenario.vehicle
     offset_m = formation.entry_spread_s * formation.speed_mps

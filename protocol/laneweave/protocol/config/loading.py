@@ -1,4 +1,4 @@
-"""Reading a scenario: a TOML file, or tables, to a checked `Scenario`."""
+"""Conversion of a TOML file or of nested tables into a checked `Scenario`."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def load_scenario(path: Path | None, **overrides: object) -> Scenario:
     """Read a scenario and apply overrides such as `seed=3` or `demand__volume_veh_per_lane_h=1600`.
 
     Args:
-        path: a TOML file; None takes the defaults: the paper's road, and formations of six.
-        **overrides: values that replace those of the file; `None` leaves the file's value.
+        path: a TOML file; None: the defaults (the paper's road, formations of six).
+        **overrides: values that replace those of the file; `None` keeps the file's value.
             `table__field` names a field of a table.
 
     Raises:
-        BadInputError: the file cannot be read, is not TOML, a value is not acceptable, or has no
-            effect beside the file's other values.
+        BadInputError: the file cannot be read or is not TOML; a value is invalid, or has no effect
+            in combination with the other values of the file.
     """
     data: dict[str, Any] = {}
     if path is not None:
@@ -47,7 +47,7 @@ def load_scenario(path: Path | None, **overrides: object) -> Scenario:
 
 
 def _resolve_folder(data: dict[str, Any], path: Path) -> None:
-    """Make the folder of certificates independent of the working directory."""
+    """Make the folder of certificates relative to the file."""
     security = data.get("security")
     if isinstance(security, dict):
         folder = security.get("folder", Security().folder)
@@ -66,15 +66,15 @@ def read_toml(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise BadInputError("file", str(path), f"a readable file ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
-        # Not UTF-8, not TOML, a NUL in the path, too many digits, too deep.
+        # Not UTF-8, not TOML, a NUL in the path, too many digits, nested too deep.
         raise BadInputError("file", str(path), f"valid TOML ({error})") from error
 
 
 def parse_scenario(data: Mapping[str, Any]) -> Scenario:
-    """Build a scenario from nested tables and cross-check it.
+    """Build a scenario from nested tables and check it.
 
     Raises:
-        BadInputError: a field is unknown, of the wrong type or range, or contradicts others.
+        BadInputError: a field is unknown, has a wrong type or value, or contradicts others.
     """
     scenario = structure(_with_current_names(data), Scenario)
     check_scenario(scenario)
@@ -82,7 +82,7 @@ def parse_scenario(data: Mapping[str, Any]) -> Scenario:
 
 
 def _with_current_names(data: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the tables with the earlier value `operation = "paper"` replaced by its meaning."""
+    """Return the tables with the former value `operation = "paper"` replaced by its meaning."""
     formation = data.get("formation") if isinstance(data, Mapping) else None
     if not isinstance(formation, Mapping) or formation.get("operation") != "paper":
         return data
@@ -90,5 +90,5 @@ def _with_current_names(data: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def to_tables(scenario: Scenario) -> dict[str, Any]:
-    """Return nested tables from which `parse_scenario` builds the same scenario."""
+    """Return the nested tables from which `parse_scenario` builds this scenario."""
     return attrs.asdict(scenario)

@@ -1,7 +1,7 @@
 """Names of all processes and vehicles of a deployment, derived from its scenario.
 
-The bridge numbers vehicles in order of arrival. The launcher starts agents, and the router grants
-rights, before any vehicle arrives, so both need the names in advance.
+The bridge numbers vehicles in order of arrival. Launcher and router need their names in advance, to
+start agents and to grant rights.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from laneweave.protocol.wire.topics import Party
 
 
 def vehicle_name(number: int) -> str:
-    """Return the name of a vehicle by its number in order of arrival, from 1."""
+    """Return the name of a vehicle, given its number in order of arrival, from 1."""
     return f"v{number:04d}"
 
 
 def max_vehicles(demand: Demand, lanes: int) -> int:
-    """Return an upper bound on the number of vehicles that arrive in a demand.
+    """Return an upper bound on the number of arriving vehicles.
 
-    Arrivals are random. The count of a lane varies less than a Poisson variable of the same mean,
-    so six standard deviations are exceeded in fewer than one of 10^8 demands; and each lane has at
+    The number of arrivals on a lane varies less than a Poisson variable of equal mean, so it
+    exceeds six standard deviations in fewer than one of 10^8 cases. In addition, each lane has at
     most one arrival per `demand.min_headway_s`.
     """
     mean = lanes * demand.volume_veh_per_lane_h * demand.duration_s / 3600.0
@@ -41,10 +41,10 @@ def demanded_vehicles(scenario: Scenario) -> tuple[str, ...]:
 
 
 def members_of(members: FleetMembers, vehicles: Iterable[str]) -> tuple[str, ...]:
-    """Return the vehicles of a fleet; `vehicles` are all that a shard selects from."""
+    """Return the vehicles of a fleet; `vehicles`: those from which a shard selects."""
     if isinstance(members, str):
         shard = parse_shard(members, "security.fleets")
-        return tuple(vehicle for vehicle in vehicles if shard.takes(vehicle))
+        return tuple(vehicle for vehicle in vehicles if shard.contains(vehicle))
     return members
 
 
@@ -54,7 +54,7 @@ def coordinator_names(scenario: Scenario) -> tuple[str, ...]:
 
 
 def single_vehicles(scenario: Scenario) -> tuple[str, ...]:
-    """Return the vehicles that may have a process of their own."""
+    """Return the vehicles that may have their own process."""
     return scenario.security.vehicles or demanded_vehicles(scenario)
 
 

@@ -1,5 +1,5 @@
 """The tables of a scenario file as frozen attrs classes, with the range of each field.
 
-Entry point: `tables.Scenario`. Nothing here reads a file or compares tables with each other; that
-is `protocol.config`. Any package may import it.
+Entry point: `fields.Scenario`. `protocol.config` reads files and checks fields against each other.
+Any package may import it.
 """

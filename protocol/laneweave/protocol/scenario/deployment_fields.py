@@ -1,7 +1,6 @@
-"""Configuration tables about the deployment of roles: network, security, service.
+"""Tables of a scenario file about the deployment of roles: network, security, service, observation.
 
-They are part of the one TOML file that every role reads (`tables.py`); a file that holds only
-these is what docs/DEPLOYMENT.md calls a DEPLOYMENT.toml.
+Every role reads the same file (see `fields.py`).
 """
 
 from __future__ import annotations
@@ -17,24 +16,24 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import host_port, key_part, key_parts, one_of, within
 
 FleetMembers = str | tuple[str, ...]
-"""A shard `I/N` of the vehicles that are announced, or vehicles by name."""
+"""A shard `I/N` of the announced vehicles, or vehicles by name."""
 MAX_SHARDS = 10_000
 
 
 @frozen
 class Shard:
-    """Share of the announced vehicles that a process takes, by a hash of their names."""
+    """Part `index` of `count` of the announced vehicles, by a hash of their names."""
 
     index: int
     count: int
 
-    def takes(self, vehicle: str) -> bool:
-        """Return whether a vehicle belongs to this shard; equal in all processes."""
+    def contains(self, vehicle: str) -> bool:
+        """Return whether a vehicle belongs to this shard; the same in all processes."""
         return zlib.crc32(vehicle.encode()) % self.count == self.index
 
 
 def parse_shard(text: str, name: str) -> Shard:
-    """Return the shard `I/N`; `name` is the field or option, for the error.
+    """Return the shard `I/N`; `name` is the field or option for the error.
 
     Raises:
         BadInputError: the text is not a shard.
@@ -48,24 +47,24 @@ def parse_shard(text: str, name: str) -> Shard:
 
 @frozen
 class Network:
-    """How roles connect, and when they consider each other lost; wall-clock seconds."""
+    """Connections between roles; durations are wall-clock time."""
 
     realm: str = field(default="default", validator=key_part)
-    """First part of every key: deployments with different realms do not see each other."""
+    """First variable part of every key; realms do not receive each other's messages."""
     endpoint: str = ""
     """Zenoh endpoint of the router; empty: a socket in a temporary folder (`laneweave run`)."""
     listen: tuple[str, ...] = ()
-    """Where the router listens; empty: at `endpoint`."""
+    """Endpoints at which the router listens; empty: `endpoint`."""
     lease_s: float = field(default=1.0, validator=within(0.1, 60.0))
-    """A silent session is closed after this time (Zenoh's transport lease)."""
+    """Time after which a silent session is closed (Zenoh's transport lease)."""
     connect_timeout_s: float = field(default=0.0, validator=within(0.0, 86_400.0))
-    """How long a role tries to connect, so that the router may start later; 0: one attempt."""
+    """Time for which a role tries to connect, if the router starts later; 0: one attempt."""
     heartbeat_s: float = field(default=0.1, validator=within(0.01, 10.0))
     election_s: float = field(default=0.7, validator=within(0.05, 60.0))
-    """A candidate leads when it has been the best-ranked one for this long. A process that dies is
-    noticed at once by its liveliness token; this is for one that hangs."""
+    """Election timeout: a candidate leads after it has been the best-ranked one for this time. It
+    detects processes that hang; a liveliness token reports a dead one at once."""
     resend_s: float = field(default=0.2, validator=within(0.01, 10.0))
-    """PREPARE and PLAN are sent again after this time without an answer."""
+    """Time without an answer after which PREPARE and PLAN are sent again."""
 
     @property
     def listens_at(self) -> tuple[str, ...]:
@@ -85,20 +84,20 @@ def _fleets(_: object, attribute: attrs.Attribute[Any], value: Mapping[str, Flee
 
 @frozen
 class Security:
-    """Access control of the network; off by default, for runs on one host."""
+    """Access control of the network; off by default."""
 
     mode: str = field(default="off", validator=one_of("off", "mtls"))
-    """`mtls`: every process has a certificate, and the router grants rights by its name."""
+    """`mtls`: every process has a certificate, whose name determines its rights."""
     folder: str = "certs"
-    """Folder of the certificates that `laneweave certs init` makes; relative to the file."""
+    """Folder of the certificates, relative to the file."""
     fleets: Mapping[str, FleetMembers] = field(factory=dict, validator=_fleets, hash=False)
-    """Agent processes that drive several vehicles: a shard `I/N`, or the vehicles' names."""
+    """Agent processes that drive several vehicles, by name: a shard `I/N`, or names of vehicles."""
     vehicles: tuple[str, ...] = field(default=(), validator=key_parts)
-    """Vehicles that may have a process of their own; empty: all that may arrive in the demand."""
+    """Vehicles that may have their own process; empty: all that may arrive."""
     clients: tuple[str, ...] = field(default=("plan",), validator=key_parts)
     """Processes that may query the planning service."""
     observers: tuple[str, ...] = field(default=("ping", "status", "watch"), validator=key_parts)
-    """Processes that may only read."""
+    """Processes that may only subscribe."""
 
 
 @frozen
@@ -106,20 +105,20 @@ class Service:
     """The planning service of every coordinator."""
 
     workers: int = field(default=0, validator=within(0, 256))
-    """Processes that plan; 0: one less than there are cores, at least one."""
+    """Number of worker processes; 0: one less than the number of cores, at least one."""
     worker_memory_mb: float = field(default=1500.0, validator=within(50.0, 1_000_000.0))
-    """Limit on the arrays of branch and bound in each of them. A plan that reaches it is completed
-    by the other solver; without a proof its status is `feasible`."""
+    """Limit on the arrays of branch and bound in each worker; the other solver completes a plan
+    that reaches it, which without a proof has the status `feasible`."""
     queue_limit: int = field(default=256, validator=within(1, 100_000))
-    """Maximum number of requests that wait or are being planned; more are refused."""
+    """Maximum number of waiting and running requests; further ones are rejected."""
     max_request_bytes: int = field(default=262_144, validator=within(1024, 1 << 20))
-    """A longer request is refused."""
+    """Maximum size of a request; longer ones are rejected."""
     max_deadline_s: float = field(default=600.0, validator=within(0.001, 3600.0))
-    """A request with a longer deadline is refused."""
+    """Maximum deadline of a request; longer ones are rejected."""
     cache_entries: int = field(default=1024, validator=within(0, 1_000_000))
-    """Number of answers kept for requests that are repeated with the same id."""
+    """Number of cached answers to requests with an id."""
     cache_s: float = field(default=60.0, validator=within(0.0, 86_400.0))
-    """Time for which answers are kept."""
+    """Time for which answers are cached."""
 
 
 @frozen
@@ -127,4 +126,4 @@ class Observation:
     """Observation of a deployment."""
 
     metrics: str = field(default="", validator=host_port)
-    """HOST:PORT at which a role serves its metrics in the Prometheus text format; empty: none."""
+    """HOST:PORT where a role serves its metrics in the Prometheus text format; empty: nowhere."""

@@ -1,8 +1,8 @@
 """The scenario: one TOML file for world and deployment, read by every role.
 
-Every field has a unit in its name, a default (the paper's value, Table "Simulation parameters",
-where the paper gives one) and a checked range. `config.loading` reads the file and checks the
-fields against each other.
+Every field has its unit in its name, a checked range, and a default: the paper's value (Table
+"Simulation parameters") if there is one. `config` reads the file and checks the rules between
+fields.
 """
 
 from __future__ import annotations
@@ -26,30 +26,29 @@ SCHEMA = "laneweave.scenario/1"
 
 BASE_CONFLICTS = ("node", "edge", "special-1")
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
-"""Range of T_F where `formation.cycle_s` leaves it open: from the paper's value on."""
+"""Range of T_F if `formation.cycle_s` is not set; the lower end is the paper's value."""
 COMFORT_MPS2 = 3.0
-"""Accelerations up to this are comfortable, along and across."""
+"""Maximum comfortable acceleration, along and across the road."""
 ROLLING_CYCLE_S = 6.0
 COMFORTABLE_VOLUME_VEH_PER_LANE_H = 2000.0
-"""Up to this volume T_F of the rolling operation is `ROLLING_CYCLE_S`, which is comfortable. Denser
-traffic needs more steps on the same road: at 2400 one vehicle in a hundred misses its lane with
-6 s, none in a thousand with 4 s (`benchmarks/stream.py`)."""
+"""Maximum volume at which T_F of the rolling operation is the comfortable `ROLLING_CYCLE_S`. Denser
+traffic needs more steps on the same road: at 2400, 1 % of the vehicles miss their lanes with 6 s,
+but less than 0.1 % with 4 s (`benchmarks/stream.py`)."""
 CYCLE_STEP_S = 0.2
-"""Step between values of T_F: few values mean few trajectories to plan."""
+"""Step between values of T_F; few values keep the number of planned trajectories low."""
 SLACK_S = 0.2
-"""Part of T_F in which nothing moves, unless `formation.move_s` says otherwise."""
+"""Part of T_F without motion if `formation.move_s` is not set."""
 
 PAPERS_FORMATIONS: Mapping[str, object] = MappingProxyType(
     {"entry": "interlaced", "close": "columns", "cycle_s": 4.0}
 )
-"""Values of the table `formation` that `operation = "paper"` stands for in files, recordings and
-options."""
+"""Values of the table `formation` for which `operation = "paper"` stands."""
 
 SOLVERS: Final = ("tappa", "branching")
 """`tappa`: the paper's algorithm. `branching`: branch and bound, for large formations."""
 DEFAULT_SOLVER: Final = "tappa"
 ROLLING_SOLVER: Final = "rolling"
-"""Planner of the rolling operation, where plans are counted by solver."""
+"""Name of the rolling operation's planner in counts of plans by solver."""
 CONFLICT_KINDS = (
     "node",
     "edge",
@@ -63,7 +62,7 @@ CONFLICT_KINDS = (
 
 
 def solver_of_event(kind: str, data: Mapping[str, Any]) -> str | None:
-    """Return the solver that an event reports; None if it reports none."""
+    """Return the solver that an event reports, if any."""
     if kind == STREAM_PLANNED:
         return ROLLING_SOLVER
     solver = data.get("solver")
@@ -88,18 +87,18 @@ class Road:
 
     @property
     def length_m(self) -> float:
-        """Whole length of the road."""
+        """Total length of the road."""
         return self.s1_m + self.s2_m + self.s3_m
 
     @property
     def sorting_start_m(self) -> float:
-        """Where S3 begins: no lane change before it."""
+        """Position at which S3 and lane changes begin."""
         return self.s1_m + self.s2_m
 
 
 @frozen
 class Demand:
-    """Random arrivals: per lane, headway = minimum + exponential, mean 3600 / volume."""
+    """Random arrivals on each lane: minimum plus exponential headways of mean 3600 / volume."""
 
     volume_veh_per_lane_h: float = field(default=1000.0, validator=within(0, 3600, open_low=True))
     duration_s: float = field(default=300.0, validator=within(0, 86_400, open_low=True))
@@ -113,7 +112,7 @@ class DrivingStructure:
     """A geometric structure in which formations drive before they sort (paper, Section 2.2)."""
 
     from_m: float = field(validator=within(0.0, 60_000.0))
-    """Formations change to it when their rear has passed this position."""
+    """Formations change to it after their rear has passed this position."""
     structure: str = field(validator=one_of("parallel", "interlaced"))
     lanes: tuple[int, ...] = ()
     """Lanes that it uses; empty: all lanes."""
@@ -121,83 +120,82 @@ class DrivingStructure:
 
 @frozen
 class FormationSettings:
-    """Formation control parameters d_F, T_F, v_F and settings of the planner."""
+    """Formation control parameters d_F, T_F and v_F, and settings of the planner."""
 
     operation: str = field(default="formations", validator=one_of("formations", "rolling"))
-    """`formations`: closed formations, each sorted by one plan (the paper's operation).
-    `rolling`: no formations; the whole stream is replanned in each slot."""
+    """`formations`: closed formations, each sorted by one plan, as in the paper. `rolling`: no
+    formations; the whole stream is replanned in each slot."""
     entry: str = field(default="free", validator=one_of("free", "interlaced"))
-    """Formations: the cells that vehicles may enter, all or those of the interlaced structure."""
+    """Formations: cells that vehicles may enter, all or those of the interlaced structure."""
     close: str = field(default="vehicles", validator=one_of("vehicles", "columns"))
     """Formations: `vehicles`: a formation ends at `max_vehicles` vehicles or `max_columns` columns;
     `columns`: each formation has `block_columns` columns, as in the paper."""
     gap_m: float = field(default=15.0, validator=within(1.0, 200.0))
     """d_F, the column pitch."""
     cycle_s: float | None = field(default=None, validator=optional(within(0.5, 60.0)))
-    """T_F, the time slot of a step. None: formations take 4 to 7 s, as long as their road allows;
-    the rolling operation chooses by volume (`Scenario.cycles_s`)."""
+    """T_F, the time slot of a step. None: 4 to 7 s in formations, as long as the road allows, and
+    by volume in the rolling operation (`Scenario.cycles_s`)."""
     move_s: float | None = field(default=None, validator=optional(within(0.5, 60.0)))
-    """Time that a move takes within its slot; the rest is slack for lost messages. None: 0.2 s
-    less than T_F."""
+    """Duration of a move within its slot; the rest is slack for lost messages. None: 0.2 s less
+    than T_F."""
     speed_mps: float = field(default=15.0, validator=within(1.0, 60.0))
     """v_F, the speed of the lattice."""
     settle_s: float = field(default=10.0, validator=within(1.0, 60.0))
-    """Time from the entry until a vehicle is in its cell."""
+    """Time from the entry until a vehicle has settled in its cell."""
     sort_in_s2: bool = False
-    """Rolling operation: lanes are changed in S2, too, as soon as vehicles have settled."""
+    """Rolling operation: settled vehicles also change lanes in S2."""
     reward_drift: bool = False
-    """Rolling operation: moving ahead of v_F counts as a gain where it costs no other vehicle."""
+    """Rolling operation: reward moves ahead of v_F that cost no other vehicle anything."""
     block_columns: int = field(default=4, validator=within(1, 24))
-    """Columns of a formation where `close` is `columns`; the interlaced structure uses half of
-    its cells."""
+    """Columns of a formation if `close` is `columns`."""
     max_columns: int = field(default=7, validator=within(1, 24))
-    """Maximum length of a formation where `close` is `vehicles`."""
+    """Maximum length of a formation if `close` is `vehicles`."""
     max_vehicles: int = field(default=6, validator=within(1, 36))
     """Maximum size of a formation (paper: six)."""
     max_joined: int = field(default=1, validator=within(1, 4))
-    """Maximum number of neighbouring formations that one ballot may join."""
+    """Maximum number of neighbouring formations in one ballot."""
     join: str = field(default="needed", validator=one_of("needed", "room"))
-    """When neighbouring formations join: `needed`: when one alone lacks room for sorting; `room`:
-    also when the vehicles of both fit into one formation, `max_vehicles`."""
+    """Condition for joining neighbouring formations. `needed`: one alone lacks room for sorting.
+    `room`: also if the vehicles of both fit into one formation."""
     structures: tuple[DrivingStructure, ...] = ()
-    """Structures that formations take on one after the other before they sort in S3; empty: they
+    """Structures that formations take on, one after the other, before they sort in S3; empty: they
     stay in the cells in which they entered."""
     mode: int = field(default=1, validator=one_of(1, 2))
     """Relative motion mode."""
     conflicts: tuple[str, ...] = field(default=(), validator=_conflict_kinds)
-    """Conflict kinds the planner avoids; empty: those of the mode, and closing."""
+    """Conflict kinds that the planner avoids; empty: those of the mode, and `closing`."""
     weight_straight: int = field(default=1, validator=one_of(0, 1))
     """l_s of the formation relative distance."""
     weight_oblique: int | None = field(default=None, validator=one_of(None, 0, 1, 2))
-    """l_o of the formation relative distance; none: the number of steps of an oblique edge."""
+    """l_o of the formation relative distance; None: the number of steps of an oblique edge."""
     solver: str = field(default=DEFAULT_SOLVER, validator=one_of(*SOLVERS))
-    """Solver of formations, and of requests to the planning service that name none."""
+    """Solver of formations, and of service requests that do not name one."""
     planning_deadline_s: float | None = field(
         default=None, validator=optional(within(0.01, 3600.0))
     )
-    """Upper bound on planning time; none: the time until the first move could begin, 1 to 15 s. On
-    most machines `max_nodes` is reached first."""
+    """Maximum planning time; None: the time until the first move could begin, 1 to 15 s. On most
+    machines `max_nodes` is reached first."""
     max_nodes: int = field(default=20_000, validator=within(1, 100_000_000))
-    """Maximum number of search nodes per plan: results do not depend on the machine's speed."""
+    """Maximum number of search nodes per plan, independent of the machine's speed."""
 
     @property
     def rolling(self) -> bool:
-        """Whether the operation is the rolling one."""
+        """Whether the rolling operation is selected."""
         return self.operation == "rolling"
 
     @property
     def interlaced(self) -> bool:
-        """Whether only the cells of the interlaced structure may be entered."""
+        """Whether vehicles may enter only the cells of the interlaced structure."""
         return not self.rolling and self.entry == "interlaced"
 
     @property
     def closes_by_vehicles(self) -> bool:
-        """Whether the lengths of formations follow the traffic."""
+        """Whether the length of formations follows the traffic."""
         return not self.rolling and self.close == "vehicles"
 
     @property
     def block_width(self) -> int:
-        """Columns of a block, the unit of which formations own one or several."""
+        """Columns of a block; a formation owns one or several blocks."""
         return 1 if self.closes_by_vehicles else self.block_columns
 
     @property
@@ -207,22 +205,22 @@ class FormationSettings:
 
     @property
     def slack_s(self) -> float:
-        """Part of T_F in which nothing moves."""
+        """Part of T_F without motion."""
         if self.cycle_s is None or self.move_s is None:
             return SLACK_S
         return self.cycle_s - self.move_s
 
     @property
     def entry_spacing_s(self) -> float:
-        """Time between two cells of a lane that may be entered."""
+        """Time between two successive cells of a lane that may be entered."""
         return (2.0 if self.interlaced else 1.0) * self.gap_m / self.speed_mps
 
     @property
     def bound_veh_per_lane_h(self) -> float:
-        """Maximum number of vehicles per lane and hour: one for each cell that may be entered.
+        """Maximum flow [vehicles/(lane h)]: one vehicle for each cell that may be entered.
 
-        V_u = 3600 v_F / (2 d_F) with interlaced entry (paper, Section 5.2.3), twice as many
-        where every cell may be entered.
+        V_u = 3600 v_F / (2 d_F) with interlaced entry (paper, Section 5.2.3), twice that with free
+        entry.
         """
         return 3600.0 / self.entry_spacing_s
 
@@ -230,27 +228,27 @@ class FormationSettings:
     def entry_spread_s(self) -> float:
         """Maximum time between a vehicle and its cell as they pass the start of the road.
 
-        Half of the time between two cells, so that a vehicle waits only if it is too close behind
-        another one. In formations half as much again: vehicles catch up with cells that stayed
-        empty, and queues end sooner.
+        With half of the time between two cells, a vehicle waits only if it is too close behind
+        another one. Formations use three quarters: vehicles catch up with cells that stayed empty,
+        and queues dissolve sooner.
         """
         return (0.5 if self.rolling else 0.75) * self.entry_spacing_s
 
     @property
     def oblique_steps(self) -> int:
-        """Steps that an oblique edge takes: the largest l_o that still is a lower bound."""
+        """Number of steps of an oblique edge: the largest l_o that is still a lower bound."""
         return 2 if self.mode == 1 else 1
 
     @property
     def conflict_kinds(self) -> tuple[str, ...]:
-        """The conflict kinds in force."""
+        """Conflict kinds that the planner avoids, defaults included."""
         if self.conflicts:
             return self.conflicts
         return (*(BASE_CONFLICTS if self.mode == 1 else ("geometric",)), "closing")
 
     @property
     def executable(self) -> bool:
-        """Whether moves of one step have disjoint footprints, as plans without timetable need."""
+        """Whether moves of one step have disjoint footprints, so that no timetable is needed."""
         kinds = set(self.conflict_kinds)
         return "geometric" in kinds or (self.mode == 1 and set(BASE_CONFLICTS) <= kinds)
 
@@ -268,7 +266,7 @@ class Vehicle:
     max_lateral_accel_mps2: float = field(default=3.0, validator=within(0.1, 20.0))
     max_lateral_jerk_mps3: float = field(default=8.0, validator=within(0.1, 100.0))
     max_slip_ratio: float = field(default=0.25, validator=within(0.01, 1.0))
-    """Lateral speed is at most this share of the forward speed: no sliding sideways."""
+    """Maximum ratio of lateral to forward speed."""
     actuator_lag_s: float = field(default=0.2, validator=within(0.0, 2.0))
     """The body's acceleration follows its set-point as a first-order lag of this time constant."""
     lateral_actuator_lag_s: float = field(default=0.1, validator=within(0.0, 2.0))
@@ -276,36 +274,36 @@ class Vehicle:
 
 @frozen
 class Sensing:
-    """Standard deviations of measurement errors, which are drawn anew at each tick."""
+    """Standard deviations of the measurement errors, which are drawn at each tick."""
 
     position_noise_m: float = field(default=0.05, validator=within(0.0, 5.0))
     lateral_noise_m: float = field(default=0.02, validator=within(0.0, 1.0))
     speed_noise_mps: float = field(default=0.02, validator=within(0.0, 2.0))
-    """Of its own speed, along and across."""
+    """Own speed, along and across the road."""
     accel_noise_mps2: float = field(default=0.05, validator=within(0.0, 2.0))
-    """Of its own acceleration, along and across."""
+    """Own acceleration, along and across the road."""
     gap_noise_m: float = field(default=0.05, validator=within(0.0, 2.0))
-    """Of the gap to another vehicle."""
+    """Gap to another vehicle."""
     other_speed_noise_mps: float = field(default=0.03, validator=within(0.0, 2.0))
     other_accel_noise_mps2: float = field(default=0.2, validator=within(0.0, 5.0))
 
 
 @frozen
 class Braking:
-    """Assumptions of the emergency brake about the vehicle ahead and its own vehicle.
+    """Assumptions of the emergency brake.
 
-    Its own braking is `vehicle.min_accel_mps2`, through `vehicle.actuator_lag_s`.
+    Its own vehicle brakes with `vehicle.min_accel_mps2`, with the lag `vehicle.actuator_lag_s`.
     """
 
     lead_brake_mps2: float = field(default=10.0, validator=within(0.1, 30.0))
     """Hardest braking of the vehicle ahead."""
     lead_lag_s: float = field(default=0.2, validator=within(0.0, 2.0))
-    """Minimum time constant of the first-order lag of its brakes."""
+    """Minimum time constant of the first-order lag of the brakes of the vehicle ahead."""
     reaction_s: float = field(default=0.1, validator=within(0.01, 5.0))
-    """Time from a measurement to the set-point that follows from the next one: one tick, and whole
-    ticks for delays of sensors and brakes (none in this plant)."""
+    """Time from a measurement to the set-point of the brakes: one tick, plus delays of sensors and
+    brakes in whole ticks (none in this plant)."""
     margin_m: float = field(default=0.3, validator=within(0.0, 10.0))
-    """Net gap left when both stand still; measurement errors reduce it."""
+    """Net gap at standstill; measurement errors reduce it."""
 
 
 @frozen
@@ -313,74 +311,74 @@ class Tracking:
     """The tracking controller of the lower level."""
 
     horizon_ticks: int | None = field(default=None, validator=optional(within(10, 200)))
-    """Ticks that the tracker looks ahead; None: the longest T_F."""
+    """Horizon of the tracker; None: the longest T_F."""
     min_gap_m: float = field(default=3.0, validator=within(0.0, 100.0))
-    """The tracker leaves its reference to keep this net gap to the vehicle ahead."""
+    """Net gap to the vehicle ahead, for which the tracker leaves its reference."""
     always_solve: bool = False
-    """Solve the quadratic program with OSQP in every tick, also where its solution without the
-    inequalities is known to satisfy them all."""
+    """Solve the quadratic program with OSQP in every tick, even if its unconstrained solution
+    satisfies all constraints."""
 
 
 @frozen
 class RuleSettings:
-    """The rule-based reference method (paper, Section 5.2.2), as decision 20 reads it."""
+    """The rule-based reference method (paper, Section 5.2.2; interpreted in decision 20)."""
 
     standstill_gap_m: float = field(default=5.0, validator=within(0.0, 100.0))
-    """d_0 of the gap d_R = d_0 + v tau; the paper's table calls it d_R."""
+    """d_0 of the gap d_R = d_0 + v tau (d_R in the paper's table)."""
     headway_s: float = field(default=0.66, validator=within(0.0, 10.0))
-    """tau of the same."""
+    """tau of the gap d_R."""
     stop_distance_m: float = field(default=150.0, validator=within(1.0, 20_000.0))
-    """d_stop: a vehicle that yields this near to the end stops; d_end in the paper's table."""
+    """d_stop: a vehicle that yields closer to the end stops (d_end in the paper's table)."""
     gap: str = field(default="front-to-front", validator=one_of("front-to-front", "net"))
-    """What d_R is measured between: front bumpers, or bumper to bumper."""
+    """Definition of d_R: between front bumpers, or bumper to bumper."""
     yielding: str = field(default="unsorted", validator=one_of("unsorted", "all"))
-    """Vehicles that slow down for one of higher priority."""
+    """Vehicles that slow down for vehicles of higher priority: those off their lane, or all."""
     slow_down_mps2: float = field(default=3.0, validator=within(0.1, 20.0))
-    """Braking of a vehicle that yields; behind another vehicle it brakes as hard as needed."""
+    """Braking of a vehicle that yields; car following brakes as hard as necessary."""
     lane_change_s: float = field(default=0.0, validator=within(0.0, 20.0))
     """Time that a lane change takes; 0: none."""
     min_gap_m: float = field(default=1.0, validator=within(0.1, 50.0))
-    """Minimum net gap: d_R alone, front to front, would let bumpers touch."""
+    """Minimum net gap; d_R between front bumpers alone would let vehicles touch."""
 
 
 @frozen
 class Lc2013Settings:
-    """The reference method that is SUMO's own: lane changing LC2013, car following of Krauss."""
+    """The reference method `lc2013`: SUMO's LC2013 lane changing and Krauss car following."""
 
     headway_s: float = field(default=0.66, validator=within(0.0, 10.0, open_low=True))
-    """tau of the car following, from bumper to bumper."""
+    """tau of the car following, bumper to bumper."""
     min_gap_m: float = field(default=0.0, validator=within(0.0, 50.0))
     """Net gap at standstill."""
     lane_change_s: float = field(default=0.0, validator=within(0.0, 20.0))
     """Time that a lane change takes; 0: none."""
     lane_changes: str = field(default="sorting", validator=one_of("sorting", "everywhere"))
-    """Where lanes are changed: in S3 only, or on the whole road."""
+    """Part of the road with lane changes: S3, or the whole road."""
 
 
 @frozen
 class Runtime:
-    """How a run is executed."""
+    """Execution of a run."""
 
     tick_s: float = field(default=0.1, validator=within(0.01, 1.0))
     tick_resend_s: float = field(default=0.05, validator=within(0.005, 10.0))
-    """Interval at which a tick is resent to agents that have not answered (wall-clock seconds)."""
+    """Interval for resending SENSE to agents that have not answered (wall-clock seconds)."""
     tick_deadline_s: float = field(default=0.3, validator=within(0.02, 60.0))
-    """A tick proceeds after this time; vehicles without an answer continue their trajectories
+    """Time after which a tick ends; vehicles without an answer continue their trajectories
     (wall-clock seconds)."""
     agent_silent_s: float = field(default=3.0, validator=within(0.1, 600.0))
-    """After this time without an answer ticks no longer wait for an agent, and its vehicle's
+    """Time without an answer after which ticks no longer wait for an agent, and its vehicle's
     caretaker takes charge (wall-clock seconds)."""
     agent_start_s: float = field(default=15.0, validator=within(0.1, 120.0))
     """Maximum wait at the entrance for a vehicle's agent (wall-clock seconds)."""
     announce_s: float = field(default=6.0, validator=within(0.0, 600.0))
-    """Arrivals are announced this long ahead, so that their agents are up in time (road s)."""
+    """Time by which arrivals are announced ahead, for the start of their agents (road seconds)."""
     max_pace: float = field(default=10.0, validator=within(0.01, 1000.0))
-    """Maximum road seconds per second: the wall-clock time of network and planning must stay short
-    compared with the time between a plan and its start."""
+    """Maximum road seconds per second; network and planning take wall-clock time, which must be
+    short compared with the time between a plan and its start."""
     coordinators: int = field(default=3, validator=within(1, 9))
     vehicles_per_process: int = field(default=1, validator=within(1, 1000))
     max_road_s: float = field(default=100_000.0, validator=within(1.0, 1e6))
-    """A run that exceeds this road time is ended and counts as failed."""
+    """Road time after which an incomplete run is ended and counts as failed."""
 
 
 @frozen
@@ -406,7 +404,7 @@ class Scenario:
 
     @property
     def lattice(self) -> Lattice:
-        """The moving lattice of this scenario."""
+        """The lattice of this scenario."""
         return Lattice(
             pitch_m=self.formation.gap_m,
             speed_mps=self.formation.speed_mps,
@@ -417,7 +415,7 @@ class Scenario:
 
     @property
     def cycles_s(self) -> tuple[float, float]:
-        """Shortest and longest T_F [s]; the same in the rolling operation, which has one slot."""
+        """Shortest and longest T_F [s]; equal in the rolling operation."""
         cycle_s = self.formation.cycle_s
         if cycle_s is not None:
             return cycle_s, cycle_s
@@ -429,17 +427,16 @@ class Scenario:
 
     @property
     def slots_s(self) -> tuple[float, ...]:
-        """T_F that plans may have [s], ascending: every `CYCLE_STEP_S` from shortest to longest."""
+        """Possible values of T_F [s], ascending in steps of `CYCLE_STEP_S`."""
         shortest_s, longest_s = self.cycles_s
         count = round((longest_s - shortest_s) / CYCLE_STEP_S)
         return tuple(shortest_s + CYCLE_STEP_S * number for number in range(count + 1))
 
     @property
     def comfortable_cycle_s(self) -> float:
-        """Shortest T_F that plans may have in which no move needs more than `COMFORT_MPS2` [s].
+        """Shortest T_F in which no move exceeds `COMFORT_MPS2`, otherwise the longest [s].
 
-        A minimum-jerk move by d in T needs an acceleration of 10 / sqrt(3) d / T^2. If there is
-        none, the longest.
+        A minimum-jerk move by d in T has a peak acceleration of 10 / sqrt(3) d / T^2.
         """
         formation = self.formation
         min_s = math.sqrt(10.0 / math.sqrt(3.0) * formation.gap_m / COMFORT_MPS2)
@@ -448,27 +445,27 @@ class Scenario:
 
     @property
     def horizon_ticks(self) -> int:
-        """Ticks that the tracker looks ahead."""
+        """Horizon of the tracker in ticks."""
         ticks = self.tracking.horizon_ticks
         return round(self.cycles_s[1] / self.runtime.tick_s) if ticks is None else ticks
 
     @property
     def move_s(self) -> float:
-        """Time that a move takes in the shortest T_F [s]."""
+        """Duration of a move in the shortest T_F [s]."""
         return self.cycles_s[0] - self.formation.slack_s
 
     def move_ticks(self, slot_s: float) -> int:
-        """Return how many ticks a move takes in slots of this length."""
+        """Return the duration of a move in ticks, in slots of this length."""
         return round((slot_s - self.formation.slack_s) / self.runtime.tick_s)
 
     @property
     def move_durations(self) -> frozenset[int]:
-        """Ticks that a move may take: in each T_F that plans may have."""
+        """Possible durations of a move in ticks."""
         return frozenset(map(self.move_ticks, self.slots_s))
 
     @property
     def moves_from_m(self) -> float:
-        """Position from which bodies may move from cell to cell: S3, or S2 if that is used."""
+        """Position from which vehicles may move from cell to cell: in S3, or also in S2 [m]."""
         start_m, formation = self.road.sorting_start_m, self.formation
         if not (formation.rolling and formation.sort_in_s2):
             return start_m
@@ -476,7 +473,7 @@ class Scenario:
 
     @property
     def lane_shares(self) -> tuple[float, ...]:
-        """Share of vehicles that prefer each lane, one number per lane, summing to one."""
+        """Share of vehicles that prefer each lane; the sum is one."""
         shares = self.demand.lane_shares or (1.0,) * self.road.lanes
         total = sum(shares)
         return tuple(share / total for share in shares)

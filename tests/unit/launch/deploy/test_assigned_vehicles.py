@@ -62,7 +62,7 @@ def test_contradictions_are_refused(
 
 def test_a_vehicle_of_another_shard_is_refused() -> None:
     vehicles = [f"v{number}" for number in range(20)]
-    even = [vehicle for vehicle in vehicles if Shard(0, 2).takes(vehicle)]
+    even = [vehicle for vehicle in vehicles if Shard(0, 2).contains(vehicle)]
     assert assigned_vehicles(SECURED, even, None, "even").vehicles == tuple(even)
     with pytest.raises(BadInputError, match="a vehicle of the fleet even"):
         assigned_vehicles(SECURED, vehicles, None, "even")

@@ -49,5 +49,5 @@ def test_shards_share_all_vehicles() -> None:
     vehicles = [f"v{number:04d}" for number in range(1, 200)]
     parts = [members_of(f"{index}/3", vehicles) for index in range(3)]
     assert sorted(name for part in parts for name in part) == vehicles
-    assert parts[1] == tuple(name for name in vehicles if Shard(1, 3).takes(name))
+    assert parts[1] == tuple(name for name in vehicles if Shard(1, 3).contains(name))
     assert members_of(("x", "y"), vehicles) == ("x", "y")
