@@ -92,8 +92,8 @@ SNAPSHOTS: dict[type[MetricsSnapshot], str] = {
 
 _VERBS = {
     Exchange.MESSAGES: ("sends", "reads"),
-    Exchange.TOKENS: ("shows", "watches"),
-    Exchange.QUERIES: ("asks", "serves"),
+    Exchange.TOKENS: ("declares", "watches"),
+    Exchange.QUERIES: ("queries", "serves"),
 }
 _PARTIES = (
     Party.BRIDGE,
@@ -117,7 +117,7 @@ def rights_table() -> str:
 
 def _rights_of(identity: Identity) -> Iterator[str]:
     if identity.party is Party.FLEET:
-        yield "all that a vehicle may, for each of its vehicles"
+        yield "all rights of each of its vehicles"
     for exchange, verbs in _VERBS.items():
         topics = [topic for topic in TOPICS if topic.exchange is exchange]
         for verb, rights in zip(verbs, (SENDING[exchange], READING[exchange]), strict=True):

@@ -1,6 +1,6 @@
-"""How a pure core is driven: events in, effects out, over any transport.
+"""The runtime of pure cores: events in, effects out, over any transport.
 
-Entry points: `node.Core` (what a role implements), `node.Node` (joins one core to one transport),
-`transport.Transport` (the interface to the network). Imports `wire` only; both transports and all
-roles import it.
+Entry points: `node.Core` (implemented by each role), `node.Node` (connects a core to a transport),
+`transport.Transport` (interface to the network). Imports only `wire`; both transports and all roles
+import it.
 """

@@ -1,4 +1,4 @@
-"""Queue of a node's inputs, with fair scheduling of queries."""
+"""Input queue of a node, with fair scheduling of queries."""
 
 from __future__ import annotations
 
@@ -15,18 +15,17 @@ from laneweave.protocol.runtime.transport import Delivery, Query
 MAX_QUERY_WAIT_S = 0.02
 """Longest time a query waits while other work is queued, unless that exceeds `QUERY_SHARE`."""
 QUERY_SHARE = 0.1
-"""Maximum share of the time for queries while other work is queued."""
+"""Maximum fraction of time for queries while other work is queued."""
 
 Item = Delivery | Computed | SnapshotRequest | Stopping
-"""Input of a process."""
+"""Input of a node."""
 
 
 class Inbox:
-    """Queue of a node's inputs.
+    """Input queue of a node.
 
-    Queries wait until no other work is queued, or for `MAX_QUERY_WAIT_S`: a flood of them must
-    not stop a leader. `put` may be called from callbacks and signal handlers, because
-    `SimpleQueue.put` is reentrant.
+    Queries wait for other work, at most `MAX_QUERY_WAIT_S`: a flood of queries must not block a
+    leader.
     """
 
     def __init__(self) -> None:
@@ -34,18 +33,18 @@ class Inbox:
         self._items: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self._queries: deque[Query] = deque()
         self._next_query_s = 0.0
-        """Time at which the next query is taken even if other work is queued."""
+        """Time from which a query is taken even if other work is queued."""
 
     def put(self, item: Item) -> None:
-        """Add an input; may be called from any thread, callback or signal handler."""
+        """Add an input; safe in any thread, callback and signal handler (`put` is reentrant)."""
         if isinstance(item, Query):
             self._queries.append(item)
-            self._items.put(None)  # wakes `take`
+            self._items.put(None)  # wake up `take`
         else:
             self._items.put(item)
 
     def take(self, timeout_s: float) -> Iterator[Item]:
-        """Yield the next inputs within this time: at most one item and one query."""
+        """Yield the inputs that arrive within a timeout: at most one query and one other input."""
         with contextlib.suppress(queue.Empty):
             item = self._items.get(timeout=0.0 if self._queries else timeout_s)
             if item is not None:

@@ -1,10 +1,10 @@
-"""Message faults above the transport: a core wrapper that loses, duplicates and delays messages.
+"""Message faults above the transport: a core wrapper that drops, duplicates and delays messages.
 
-`FaultyCore` sits between a node and its core, so each receiver loses or delays messages on its own,
+`FaultyCore` is between a node and its core, so faults are independent for each receiver and work
 with any transport. Liveliness tokens, link events and queries are not affected.
 
-Each topic has a random generator, seeded by the run's seed and the process's label: equal seeds and
-equal arrivals give equal faults.
+Each topic has its own random generator, seeded with the run's seed and the process's label: equal
+seeds and equal arrivals give equal faults.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from laneweave.protocol.wire.messages import RoadClock
 from laneweave.protocol.wire.topics import TOPICS
 
 SENDER_OF_ROLE = {"agent": "vehicle", "coordinator": "coordinator", "bridge": "bridge"}
-"""Sender that a process of each role counts as, in rules."""
+"""Kind of sender in rules, by role."""
 SENDERS = tuple(SENDER_OF_ROLE.values())
 MESSAGE_TOPICS = tuple(topic.name for topic in TOPICS if topic.kind is not None)
 CoreWrapper = Callable[[Core], Core]
-"""Function that wraps a core, or returns it unchanged."""
+"""Wraps a core, or returns it unchanged."""
 MAX_HELD = 10_000
-"""Maximum number of delayed messages; more are lost."""
+"""Maximum number of delayed messages; further ones are dropped."""
 
 
 def _message_topics(_: object, attribute: attrs.Attribute[Any], value: tuple[str, ...]) -> None:
@@ -51,28 +51,28 @@ def _message_topics(_: object, attribute: attrs.Attribute[Any], value: tuple[str
 
 @frozen(kw_only=True)
 class MessageRule:
-    """Fault of some messages for some time; several rules are applied in turn.
+    """Message fault with a topic, a time range and parties; rules are applied one after the other.
 
     Raises:
-        BadInputError: a value is not acceptable.
+        BadInputError: a value is invalid.
     """
 
     topics: tuple[str, ...] = field(default=(), validator=_message_topics)
-    """Topic names; empty: all that carry messages."""
+    """Names of topics; empty: all that carry messages."""
     loss: float = field(default=0.0, validator=within(0.0, 1.0))
-    """Probability that a receiver does not get a message."""
+    """Probability that a receiver loses a message."""
     duplication: float = field(default=0.0, validator=within(0.0, 1.0))
-    """Probability that a receiver gets a message twice."""
+    """Probability that a receiver receives a message twice."""
     delay_s: float = field(default=0.0, validator=within(0.0, 60.0))
-    """Delay of each copy, in wall-clock seconds."""
+    """Delay of each copy (wall-clock time)."""
     jitter_s: float = field(default=0.0, validator=within(0.0, 60.0))
-    """Maximum of a uniform extra delay per copy; above the messages' spacing it reorders them."""
+    """Maximum of an additional uniform delay of each copy; reorders messages that follow closer."""
     from_s: float = field(default=0.0, validator=within(0.0, 1e6))
     """Road time at which the rule starts; 0: also before the road's clock starts."""
     until_s: float | None = field(
         default=None, validator=attrs.validators.optional(within(0.0, 1e6))
     )
-    """Road time at which it ends; None: at the end of the run."""
+    """Road time at which the rule ends; None: at the end of the run."""
     sender: str | None = field(default=None, validator=attrs.validators.optional(one_of(*SENDERS)))
     """Kind of sender; None: any."""
     receiver: str | None = field(
@@ -85,22 +85,22 @@ class MessageRule:
         if self.until_s is not None and self.until_s <= self.from_s:
             raise BadInputError("until_s", self.until_s, f"more than from_s, {self.from_s:g}")
 
-    def holds(self, road_s: float) -> bool:
-        """Return whether the rule is in force at a road time."""
+    def is_active(self, road_s: float) -> bool:
+        """Return whether the rule applies at a road time."""
         return self.from_s <= road_s and (self.until_s is None or road_s < self.until_s)
 
 
 class FaultBoard(Protocol):
-    """State that the processes of a run share without messages."""
+    """State that the processes of a run share outside of messages."""
 
     road_s: float
-    """Road time; written by the bridge's `FaultyCore`, read by all others."""
+    """Road time, written by the bridge's `FaultyCore` and read by all others."""
     dropped: int
-    """Number of lost messages; each `FaultyCore` adds its own."""
+    """Number of dropped messages; each `FaultyCore` adds its own."""
 
 
 class FaultyCore:
-    """A core with message faults at its input; a `Core` itself."""
+    """A `Core` that injects message faults into the input of another one."""
 
     def __init__(
         self,
@@ -114,11 +114,11 @@ class FaultyCore:
         """Wrap a core.
 
         Args:
-            core: receives the messages that are not lost.
-            rules: rules of the whole run; those for other receivers are ignored.
+            core: receives the remaining messages.
+            rules: all rules of the run; those for other receivers are ignored.
             board: shared road time and counter.
             receiver: kind of receiver, one of `SENDERS`.
-            seed: seed of all draws, different in each process of the run.
+            seed: seed of all draws, unique to the process.
         """
         self.core = core
         self._board = board
@@ -136,14 +136,14 @@ class FaultyCore:
 
     @property
     def wakeup_s(self) -> float | None:
-        """Time of the next delayed message or of the core's wakeup."""
+        """Time of the next delayed message or of the core's wakeup, whichever is earlier."""
         wakeup_s = self.core.wakeup_s
         if not self._held:
             return wakeup_s
         return self._held[0][0] if wakeup_s is None else min(wakeup_s, self._held[0][0])
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
-        """Handle an event; see `Core`."""
+        """Handle an event, see `Core`."""
         match event:
             case Arrived():
                 effects: Iterable[Effect] = self._on_arrived(event, now_s)
@@ -157,7 +157,7 @@ class FaultyCore:
             yield effect
 
     def _on_arrived(self, arrived: Arrived, now_s: float) -> Iterator[Effect]:
-        delays_s = self._fate(arrived)
+        delays_s = self._copy_delays_s(arrived)
         if not delays_s:
             self._board.dropped += 1
         for delay_s in delays_s:
@@ -175,8 +175,8 @@ class FaultyCore:
         if wakeup_s is not None and wakeup_s <= now_s:
             yield from self.core.handle(wakeup, now_s)
 
-    def _fate(self, arrived: Arrived) -> list[float]:
-        """Return the delay of each copy of a message [s]; an empty list if it is lost."""
+    def _copy_delays_s(self, arrived: Arrived) -> list[float]:
+        """Return the delay of each copy of a message [s]; empty if the message is dropped."""
         delays_s = [0.0]
         name = arrived.topic.name
         rules = self._rules_for.get(name)
@@ -189,9 +189,9 @@ class FaultyCore:
         road_s, sender = self._board.road_s, _sender(arrived)
         draw = self._generator(name).random
         for rule in rules:
-            if not rule.holds(road_s) or rule.sender not in (None, sender):
+            if not rule.is_active(road_s) or rule.sender not in (None, sender):
                 continue
-            # Draw both in any case, so that duplicates do not depend on loss.
+            # Always draw both, so that duplicates do not depend on loss.
             lost, doubled = draw() < rule.loss, draw() < rule.duplication
             if lost:
                 return []
@@ -204,7 +204,7 @@ class FaultyCore:
     def _generator(self, topic: str) -> random.Random:
         generator = self._generators.get(topic)
         if generator is None:
-            # Text seeds are hashed with SHA-512, equally in all processes.
+            # Text seeds are hashed with SHA-512, identically in all processes.
             generator = random.Random(f"{self._seed}/{topic}")  # noqa: S311 (no secrets)
             self._generators[topic] = generator
         return generator

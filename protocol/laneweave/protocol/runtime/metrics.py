@@ -1,10 +1,10 @@
-"""Metrics of a process: what it counts, described once, readable from other threads.
+"""Metrics of a process, described once and readable from other threads.
 
 A *snapshot* is a frozen attrs class with a class variable `ABOUT` and one field per metric: an int,
-a float, a bool, or a mapping of text to number, described by `metric`. Field names end with the
-unit, in base units, and with `_total` if the value only ever grows.
+a float, a bool, or a mapping from text to numbers, described by `metric`. Field names end with a
+base unit, and with `_total` if the value never decreases.
 
-A reader never touches the counters of another thread: it puts a `SnapshotRequest` among the events
+A reader does not access the counters of another thread: it queues a `SnapshotRequest` as an input
 of the process, and the thread that counts answers it (`snapshot_source`).
 """
 
@@ -19,25 +19,25 @@ from attrs import frozen
 
 PREFIX = "laneweave"
 SNAPSHOT_TIMEOUT_S = 2.0
-"""A process that does not answer a request in this time counts as hanging."""
+"""Time without an answer after which a process counts as hanging."""
 
 
 class MetricsSnapshot(attrs.AttrsInstance, Protocol):
     """Metrics of one subject at one moment."""
 
     ABOUT: ClassVar[str]
-    """Subject: the first word of the metrics' names."""
+    """First part of the metrics' names."""
 
 
 Source = Callable[[], Iterable[MetricsSnapshot]]
-"""Returns the current metrics of a process; callable from any thread but its own. Raises
-`TimeoutError` if the process hangs."""
+"""Returns the current metrics of a process, called from another thread. Raises `TimeoutError` if
+the process hangs."""
 Observe = Callable[[Source], None]
-"""Callback that registers the metrics source of a process, once it is ready."""
+"""Callback that registers the metrics source of a process when it is ready."""
 
 
 def unobserved(_: Source) -> None:
-    """Ignore the source: the `Observe` of a process without a metrics server."""
+    """Ignore the metrics source; the `Observe` of a process without a metrics server."""
 
 
 @frozen
@@ -47,14 +47,14 @@ class SnapshotRequest:
     _answers: queue.SimpleQueue[Iterable[MetricsSnapshot]] = attrs.field(factory=queue.SimpleQueue)
 
     def answer(self, snapshots: Iterable[MetricsSnapshot]) -> None:
-        """Answer; called by the thread that counts."""
+        """Set the answer; called by the thread that counts."""
         self._answers.put(snapshots)
 
     def wait(self) -> Iterable[MetricsSnapshot]:
-        """Return the answer.
+        """Wait for the answer and return it.
 
         Raises:
-            TimeoutError: there was none in time.
+            TimeoutError: no answer within `SNAPSHOT_TIMEOUT_S`.
         """
         try:
             return self._answers.get(timeout=SNAPSHOT_TIMEOUT_S)
@@ -63,7 +63,7 @@ class SnapshotRequest:
 
 
 def snapshot_source(request: Callable[[SnapshotRequest], None]) -> Source:
-    """Return a source that passes requests to `request` and waits for their answers."""
+    """Return a source that passes a request to `request` and waits for the answer."""
 
     def snapshots() -> Iterable[MetricsSnapshot]:
         one = SnapshotRequest()
@@ -81,17 +81,18 @@ class Metric:
     """Full name, such as `laneweave_node_published_total`."""
     meaning: str
     label: str
-    """Name of the label that distinguishes its parts; empty: it has none."""
+    """Name of the label that distinguishes the samples; empty: there is one sample without
+    label."""
     field: str
-    """Field of the snapshot."""
+    """Name of the snapshot's field."""
 
     @property
     def counts(self) -> bool:
-        """Whether it only ever grows."""
+        """Whether the metric is a counter, which never decreases."""
         return self.name.endswith("_total")
 
     def samples(self, snapshot: MetricsSnapshot) -> Iterator[tuple[tuple[str, ...], float]]:
-        """Yield (label values, number) for each part."""
+        """Yield (label values, number) of each sample."""
         value = getattr(snapshot, self.field)
         if self.label:
             for part, number in value.items():
@@ -104,15 +105,15 @@ def metric(meaning: str, *, label: str = "", default: object = attrs.NOTHING) ->
     """Return the attrs field of a metric.
 
     Args:
-        meaning: what the number is, in one sentence without the full stop.
-        label: of a mapping: what its keys are.
-        default: of the field; without one it is mandatory.
+        meaning: description of the number, without a final full stop.
+        label: meaning of the keys of a mapping.
+        default: default of the field; mandatory without it.
     """
     return attrs.field(default=default, metadata={"meaning": meaning, "label": label})
 
 
 def metrics_of(kind: type[MetricsSnapshot]) -> tuple[Metric, ...]:
-    """Return the descriptions of a snapshot's metrics."""
+    """Return the descriptions of the metrics in a snapshot class."""
     return tuple(
         Metric(
             name=f"{PREFIX}_{kind.ABOUT}_{attribute.name}",
@@ -130,15 +131,11 @@ class NodeMetrics:
 
     ABOUT: ClassVar[str] = "node"
 
-    published_total: int = metric("Messages that this process has published")
-    received_total: Mapping[str, int] = metric(
-        "Well-formed messages that have arrived", label="topic"
-    )
-    rejected_total: int = metric("Messages that have arrived and were not well formed")
-    events_total: int = metric(
-        "Events that the core has handled: messages, tokens, timers, results"
-    )
-    handling_seconds_total: float = metric("Time that this process has spent on handling events")
+    published_total: int = metric("Messages published by this process")
+    received_total: Mapping[str, int] = metric("Valid messages received", label="topic")
+    rejected_total: int = metric("Invalid messages received")
+    events_total: int = metric("Events handled by the core: messages, tokens, timers, results")
+    handling_seconds_total: float = metric("Time spent on handling events")
 
 
 @frozen
@@ -147,4 +144,4 @@ class RouterMetrics:
 
     ABOUT: ClassVar[str] = "router"
 
-    sessions: int = metric("Processes that are connected")
+    sessions: int = metric("Connected processes")

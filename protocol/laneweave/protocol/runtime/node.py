@@ -1,9 +1,9 @@
 """Events, effects, and the node that drives a pure core over a transport.
 
-A *core* is a state machine without I/O, clock, thread or randomness of its own: `handle` takes an
-event and the time and returns effects; `wakeup_s` is the time of its next wakeup. A `Node` decodes
-payloads into typed events and carries out effects with the transport. It counts and drops
-malformed input, so a core never sees it.
+A *core* is a state machine without I/O, clock, threads and unseeded randomness: `handle` takes an
+event and the time and returns effects; `wakeup_s` is the time of the next wakeup. A `Node` decodes
+payloads into typed events and executes effects through the transport. It counts and drops malformed
+input, so a core never receives it.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from laneweave.protocol.wire.topics import Keys, Topic
 
 log = structlog.get_logger(__name__)
 
-TOO_LATE = "the deadline passed before it began"
-"""Error of a delegated computation that was not started."""
+TOO_LATE = "the deadline passed before the computation began"
+"""Error of a delegated computation whose deadline passed before it started."""
 
 
 @frozen
 class Started:
-    """The node has started: the first event of every core."""
+    """First event of every core."""
 
 
 @frozen
 class Arrived:
-    """A well-formed message."""
+    """A valid message arrived."""
 
     topic: Topic
     parameters: Mapping[str, str]
@@ -54,7 +54,7 @@ class Arrived:
 
 @frozen
 class _OnTopic:
-    """A topic, and parameters of its keys; those that are not given match anything."""
+    """A topic and parameters of its keys; missing parameters match all values."""
 
     topic: Topic
     parameters: Mapping[str, Any] = field(factory=dict)
@@ -72,12 +72,12 @@ class PeerDown(_OnTopic):
 
 @frozen
 class Wakeup:
-    """The time `wakeup_s` of the core has come."""
+    """The core's `wakeup_s` has been reached."""
 
 
 @frozen
 class Computed:
-    """A computation of the core has ended; `error` is set if it raised."""
+    """A computation of the core has ended; `error` is not empty if it failed."""
 
     job: int
     result: Any
@@ -86,7 +86,7 @@ class Computed:
 
 @frozen
 class QueryArrived:
-    """A question to this node's service; answer with `Reply` or `Decline`."""
+    """A query to this node's service; answered with `Reply` or `Decline`."""
 
     token: int
     payload: bytes
@@ -96,7 +96,7 @@ class QueryArrived:
 
 @frozen
 class Stopping:
-    """The process is to end: the last event of a core."""
+    """Last event of a core: the process is about to end."""
 
 
 Event = (
@@ -129,12 +129,12 @@ class Listen(_OnTopic):
 
 @frozen
 class Unlisten(_OnTopic):
-    """Undo `Listen`."""
+    """Cancel a subscription."""
 
 
 @frozen
 class Announce(_OnTopic):
-    """Show a liveliness token."""
+    """Declare a liveliness token."""
 
 
 @frozen
@@ -149,14 +149,14 @@ class Watch(_OnTopic):
 
 @frozen
 class Serve:
-    """Answer questions on a topic."""
+    """Receive queries on a topic."""
 
     topic: Topic
 
 
 @frozen
 class Reply:
-    """Answer a question; `ok` false marks an error reply."""
+    """Answer a query; `ok` is false for an error reply."""
 
     token: int
     payload: bytes
@@ -166,14 +166,14 @@ class Reply:
 
 @frozen
 class Decline:
-    """Leave a question to the other servers of the topic."""
+    """Leave a query to the other servers of the topic."""
 
     token: int
 
 
 @frozen
 class Compute:
-    """Run `work` on another thread, after earlier jobs; `Computed` brings its result."""
+    """Run `work` in another thread, after earlier jobs; `Computed` has its result."""
 
     job: int
     work: Callable[[], Any]
@@ -181,22 +181,21 @@ class Compute:
 
 @frozen
 class Delegate:
-    """Run `work` in a worker process; `Computed` brings its result.
+    """Run `work` in a worker process; `Computed` has its result.
 
-    `work` must be picklable. It is called with the seconds left until `deadline_s`; if none are
-    left it is not called and counts as failed. A worker is killed when it exceeds the deadline by
-    far.
+    `work` must be picklable. It is called with the time left until `deadline_s` [s]; without time
+    left the job fails. A worker that exceeds the deadline by `worker_pool.OVERDUE_S` is killed.
     """
 
     job: int
     work: Callable[[float], Any]
     deadline_s: float
-    """On the clock of `now_s`."""
+    """Time on the clock of `now_s`."""
 
 
 @frozen
 class End:
-    """Leave the network: the core has nothing more to do."""
+    """Leave the network; the core has finished."""
 
 
 Effect = (
@@ -221,22 +220,22 @@ class Core(Protocol):
     def handle(self, event: Event, now_s: float) -> Iterable[Effect]:
         """Handle one event and return the effects.
 
-        The content of an event may be shared with other cores and must not be modified.
+        Other cores may share the content of an event, so it must not be modified.
         """
 
     @property
     def wakeup_s(self) -> float | None:
-        """Time of the next `Wakeup`, on the clock of `now_s`; None: none is needed."""
+        """Time of the next `Wakeup`, on the clock of `now_s`; None: no wakeup."""
 
 
 def core_metrics(core: Core) -> Iterable[MetricsSnapshot]:
-    """Return the metrics of a core: its property `metrics`, or nothing if it has none."""
+    """Return the metrics of a core: its property `metrics`, if it has one."""
     metrics: Iterable[MetricsSnapshot] = getattr(core, "metrics", ())
     return metrics
 
 
 class Node:
-    """Drives one core over one transport."""
+    """Driver of one core over one transport."""
 
     def __init__(
         self,
@@ -248,15 +247,15 @@ class Node:
         read: Callable[[str, bytes], Arrived] | None = None,
         write: Callable[[object], bytes] = encode,
     ) -> None:
-        """Join a core to its transport; nothing is sent before the first `dispatch`.
+        """Connect a core to a transport; nothing is sent before the first `dispatch`.
 
         Args:
             core: receives the events.
-            transport: carries out the effects.
+            transport: executes the effects.
             keys: key grammar of the realm.
-            submit: runs computations elsewhere, and calls `dispatch(Computed(...))` at the end.
-            label: distinguishes this process from all others in reports.
-            read: decodes a message, as `read_message` does, which is the default; may cache.
+            submit: runs a computation elsewhere, then calls `dispatch(Computed(...))`.
+            label: unique name of this process in reports.
+            read: decodes a message, by default `read_message`; may cache.
             write: encodes a message for `read`.
         """
         self._label = label
@@ -265,21 +264,21 @@ class Node:
         self.published = 0
         self.rejected = 0
         self.received: dict[str, int] = {}
-        """Well-formed messages by topic name."""
+        """Number of valid messages by topic name."""
         self.handled = 0
-        """Events that the core has handled."""
+        """Number of events that the core has handled."""
         self.handling_s = 0.0
-        """Total handling time, added up by the runner."""
+        """Total handling time [s], accumulated by the runner."""
         self._transport = transport
         self._keys = keys
         self._submit = submit
         self._read = read or partial(read_message, keys)
         self._write = write
         self._encoded: tuple[object, bytes] = (None, b"")
-        """Newest message and its bytes: a plan is sent to one vehicle after the other."""
+        """Newest message and its bytes, since a plan is sent to several vehicles."""
 
     def deliver(self, delivery: Delivery, now_s: float) -> None:
-        """Translate a delivery into an event and let the core handle it."""
+        """Convert a delivery into an event and dispatch it."""
         event: Event
         try:
             if isinstance(delivery, Received):
@@ -287,14 +286,14 @@ class Node:
                 name = event.topic.name
                 self.received[name] = self.received.get(name, 0) + 1
             else:
-                event = self._news(delivery)
+                event = self._other_event(delivery)
         except BadInputError as error:
             self._reject(delivery, str(error))
             return
         self.dispatch(event, now_s)
 
     def dispatch(self, event: Event, now_s: float) -> None:
-        """Let the core handle an event and carry out the effects."""
+        """Pass an event to the core and execute the effects."""
         if self.ended:
             return
         self.handled += 1
@@ -302,7 +301,7 @@ class Node:
             if isinstance(effect, Send):
                 self._send(effect)
             else:
-                self._carry_out(effect)
+                self._execute(effect)
 
     def metrics(self) -> list[MetricsSnapshot]:
         """Return the metrics of this node and its core."""
@@ -311,7 +310,7 @@ class Node:
         )
         return [own, *core_metrics(self.core)]
 
-    def _news(self, delivery: LinkUp | LinkDown | Query | TokenUp | TokenDown) -> Event:
+    def _other_event(self, delivery: LinkUp | LinkDown | Query | TokenUp | TokenDown) -> Event:
         if isinstance(delivery, (LinkUp, LinkDown)):
             return delivery
         if isinstance(delivery, Query):
@@ -321,7 +320,7 @@ class Node:
 
     def _reject(self, delivery: Delivery, reason: str) -> None:
         self.rejected += 1
-        # Log the 1st, 10th, 100th, ... only: a flood must not fill the log.
+        # Log only the 1st, 10th, 100th, ...: a flood must not fill the log.
         if self.rejected == 10 ** (len(str(self.rejected)) - 1):
             key = getattr(delivery, "key", "")
             log.warning("message ignored", key=key, reason=reason, ignored=self.rejected)
@@ -341,7 +340,7 @@ class Node:
         key = self._keys.key(topic, **effect.parameters)
         self._transport.publish(key, self._encoded[1], topic.quality)
 
-    def _carry_out(self, effect: Effect) -> None:
+    def _execute(self, effect: Effect) -> None:
         transport = self._transport
         match effect:
             case Compute() | Delegate():
@@ -373,10 +372,10 @@ def read_message(
     payload: bytes,
     decode: Callable[[bytes, type], object] = decode,
 ) -> Arrived:
-    """Return the message that arrived on a key; a pure function.
+    """Return the message in a payload that arrived on a key.
 
     Raises:
-        BadInputError: the key is not one of `keys`, or the payload is not a message of its topic.
+        BadInputError: the key is not in `keys`, or the payload is not a message of its topic.
     """
     topic, parameters = known_key(keys, key)
     if topic.kind is None:
@@ -388,7 +387,7 @@ def known_key(keys: Keys, key: str) -> tuple[Topic, Mapping[str, str]]:
     """Return a key's topic and parameters.
 
     Raises:
-        BadInputError: the key is not one of `keys`.
+        BadInputError: the key is not in `keys`.
     """
     known = keys.read(key)
     if known is None:
@@ -406,7 +405,7 @@ def run_job(job: Compute) -> Computed:
 
 
 def run_delegated(job: Delegate, now_s: Callable[[], float]) -> Computed:
-    """Run a delegated computation in this process, on the clock `now_s`, if time is left."""
+    """Run a delegated computation in this process unless its deadline on `now_s` has passed."""
     left_s = job.deadline_s - now_s()
     if left_s <= 0:
         return Computed(job.job, None, TOO_LATE)
@@ -414,5 +413,5 @@ def run_delegated(job: Delegate, now_s: Callable[[], float]) -> Computed:
 
 
 def error_text(error: Exception) -> str:
-    """Return an exception as the `error` of a `Computed`."""
+    """Return the `error` of a `Computed` for an exception."""
     return f"{type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""Signals: die with the parent, stop on SIGINT and SIGTERM."""
+"""Process signals: termination with the parent process, SIGINT and SIGTERM."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def die_with_parent() -> None:
-    """Make the kernel send SIGTERM to this process when its parent dies."""
+    """Request SIGTERM from the kernel when the parent of this process dies."""
     parent = os.getppid()
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if os.getppid() != parent:
@@ -22,9 +22,11 @@ def die_with_parent() -> None:
 
 @contextlib.contextmanager
 def stop_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Call `stop` on SIGINT and SIGTERM until the block ends; it must not take a lock."""
+    """Call `stop` on SIGINT and SIGTERM until the block ends.
 
-    # A handler may interrupt code that holds a lock, so `stop` takes none and does not log.
+    `stop` must neither take a lock nor log: it may interrupt code that holds the lock.
+    """
+
     def on_signal(_number: int, _frame: object) -> None:
         stop()
 

@@ -1,8 +1,8 @@
 """The interface to the network.
 
 `transports.zenoh` implements it over Zenoh, `transports.simulated` in virtual time. Both pass
-`Delivery` values to one callable, may lose, duplicate and reorder messages (the simulated one does
-so on purpose), and pass the same contract tests.
+`Delivery` values to one callable, may lose, duplicate and reorder messages, and pass the same
+contract tests.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from laneweave.protocol.wire.topics import Quality
 
 @frozen
 class Received:
-    """A payload published on a key."""
+    """A payload arrived on a key."""
 
     key: str
     payload: bytes
@@ -32,9 +32,9 @@ class TokenUp:
 
 @frozen
 class TokenDown:
-    """A liveliness token vanished: its process ended, fell silent, or this node lost the network.
+    """A liveliness token vanished: its process ended or hangs, or this node lost its connection.
 
-    In the last case a `LinkDown` comes at the same time, before or after it.
+    In the last case `LinkDown` is delivered at the same time, before or after this event.
     """
 
     key: str
@@ -42,17 +42,17 @@ class TokenDown:
 
 @frozen
 class LinkUp:
-    """The connection to the network came up."""
+    """The connection to the network is established."""
 
 
 @frozen
 class LinkDown:
-    """The connection to the network is lost; messages published now are lost."""
+    """The connection to the network is lost, and so are messages published meanwhile."""
 
 
 @frozen
 class Query:
-    """A query on a key that this node serves; the answer must carry its `token`."""
+    """A query on a key that this node serves; `token` identifies it in the answer."""
 
     key: str
     payload: bytes
@@ -63,21 +63,21 @@ class Query:
 
 @frozen
 class Answer:
-    """Answer to a question."""
+    """Answer to a query."""
 
     payload: bytes
     ok: bool
-    """False: an error reply."""
+    """False for an error reply."""
     encoding: str = ""
 
 
-def update_tokens(seen: dict[str, None], news: TokenUp | TokenDown) -> bool:
-    """Update the visible tokens; return False if the event repeats what is known."""
-    known = news.key in seen
-    if isinstance(news, TokenUp):
-        seen[news.key] = None
+def update_tokens(tokens: dict[str, None], event: TokenUp | TokenDown) -> bool:
+    """Apply a token event to the visible tokens; return whether it changed them."""
+    known = event.key in tokens
+    if isinstance(event, TokenUp):
+        tokens[event.key] = None
         return not known
-    seen.pop(news.key, None)
+    tokens.pop(event.key, None)
     return known
 
 
@@ -86,40 +86,40 @@ Deliver = Callable[[Delivery], None]
 
 
 class Transport(Protocol):
-    """Network operations of a node. No call blocks for long; none raises on a lost link."""
+    """Network operations of a node, which neither block for long nor raise if the link is lost."""
 
     def publish(self, key: str, payload: bytes, quality: Quality) -> None:
-        """Send a payload to all subscribers of the key, this node included."""
+        """Send a payload to all subscribers of a key, including this node."""
 
     def subscribe(self, key_expression: str) -> None:
-        """Deliver messages on matching keys from now on (`*` is one part, `**` any number)."""
+        """Deliver messages on matching keys (`*`: one part; `**`: any number of parts)."""
 
     def unsubscribe(self, key_expression: str) -> None:
-        """Undo `subscribe`; unknown expressions are ignored."""
+        """Cancel a subscription; unknown expressions are ignored."""
 
     def announce(self, key: str) -> None:
-        """Show a liveliness token on this key while this node is alive and connected."""
+        """Declare a liveliness token, visible while this node is alive and connected."""
 
     def withdraw(self, key: str) -> None:
-        """Withdraw a liveliness token; unknown ones are ignored."""
+        """Withdraw a liveliness token; unknown keys are ignored."""
 
     def watch(self, key_expression: str) -> None:
-        """Deliver tokens that appear or vanish, beginning with those that are there.
+        """Deliver appearing and vanishing tokens, beginning with the existing ones.
 
-        This node's own tokens are included. For each key, appearances and disappearances alternate,
-        beginning with an appearance; repeated reports are not delivered. A token of its own that it
-        shows only briefly may appear and vanish twice, because the network reports it, too, later.
-        Several nodes may show a token on one key: it vanishes when the last of them withdraws it.
+        The node's own tokens are included. For each key, `TokenUp` and `TokenDown` alternate,
+        beginning with `TokenUp`. A short-lived token of this node may appear and vanish twice,
+        because the network reports it as well. If several nodes declare a token on one key, it
+        vanishes when the last of them withdraws it.
         """
 
     def serve(self, key: str) -> None:
-        """Deliver questions that are asked on this key."""
+        """Deliver queries on a key."""
 
     def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
-        """Answer a question once; unknown tokens are ignored."""
+        """Answer a query once; unknown tokens are ignored."""
 
     def decline(self, token: int) -> None:
-        """Leave a question to the other servers of its key; unknown tokens are ignored."""
+        """Leave a query to the other servers of its key; unknown tokens are ignored."""
 
     def close(self) -> None:
-        """Leave the network. Idempotent; all later calls do nothing."""
+        """Leave the network. Idempotent; later calls of all methods have no effect."""

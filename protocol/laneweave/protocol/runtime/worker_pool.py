@@ -1,8 +1,8 @@
 """Worker processes that run the `Delegate` effects of a core.
 
-One thread per worker passes the next job to its process and waits for the result, for the death of
-the process, or until the job is long overdue. In the last two cases the process is replaced, and
-only that job fails. (The pools of the standard library and of pebble break down as a whole when an
+One thread per worker sends the next job to its process and waits for the result, for the death of
+the process, or until `OVERDUE_S` after the deadline. In the last two cases the process is replaced,
+and only that job fails. (The pools of the standard library and of pebble fail completely when an
 idle worker is killed.)
 """
 
@@ -27,80 +27,80 @@ from laneweave.protocol.runtime.processes import die_with_parent
 log = structlog.get_logger(__name__)
 
 OVERDUE_S = 5.0
-"""A worker that exceeds its job's deadline by this time is killed."""
+"""Time by which a worker may exceed the deadline of its job before it is killed."""
 END_S = 2.0
-"""Longest wait for the end of a killed process."""
+"""Maximum wait for the end of a killed process."""
 CHECK_S = 1.0
 """Interval at which an idle thread checks that its process is alive."""
 PAUSE_S = 0.5
-"""Delay before the replacement of a process that died this soon after its start, so that one that
-cannot start does not keep the machine busy."""
+"""Delay before the replacement of a process that died within this time after its start, so that
+failing starts do not load the machine."""
 
-# A fork would take over threads and sockets of the network.
+# A fork would inherit the sockets and locked state of Zenoh.
 _CONTEXT = multiprocessing.get_context("spawn")
-_Order = tuple[Delegate, Callable[[Computed], None]]
+_Job = tuple[Delegate, Callable[[Computed], None]]
 
 
 class WorkerPool:
-    """Workers of a process; they die with it."""
+    """Pool of worker processes, which die with their parent."""
 
     def __init__(self, workers: int, warm_up: Callable[[], None] | None = None) -> None:
-        """Prepare; processes start with the first job, or with `start`.
+        """Create the pool; processes start with the first job, or with `start`.
 
         Args:
-            workers: number of jobs that run at a time.
-            warm_up: picklable function that each worker calls at its start.
+            workers: maximum number of concurrent jobs.
+            warm_up: picklable function that each worker calls when it starts.
         """
-        self._orders: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
-        self._workers = [_Worker(self._orders, warm_up) for _ in range(workers)]
+        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        self._workers = [_Worker(self._jobs, warm_up) for _ in range(workers)]
         self._started = False
 
     @property
     def process_ids(self) -> list[int]:
-        """Ids of the running processes."""
+        """Process ids of the running workers."""
         return [worker.process_id for worker in self._workers if worker.process_id]
 
     def start(self) -> None:
-        """Start the workers now; return at once."""
+        """Start the workers without waiting for them."""
         if not self._started:
             self._started = True
             for worker in self._workers:
                 worker.thread.start()
 
     def submit(self, job: Delegate, done: Callable[[Computed], None]) -> None:
-        """Queue a job; `done` is called from a thread."""
+        """Queue a job; `done` is called from a worker's thread."""
         self.start()
-        self._orders.put((job, done))
+        self._jobs.put((job, done))
 
     def close(self) -> None:
-        """End the workers at once; results of their jobs are discarded."""
+        """Kill the workers and discard the results of their jobs."""
         for worker in self._workers:
             worker.end()
         for _ in self._workers:
-            self._orders.put(None)
+            self._jobs.put(None)
         if self._started:
             for worker in self._workers:
                 worker.thread.join(END_S)
 
 
 class _Worker:
-    """One process at a time, and the thread that manages it."""
+    """A thread that manages one process at a time."""
 
     def __init__(
-        self, orders: queue.SimpleQueue[_Order | None], warm_up: Callable[[], None] | None
+        self, jobs: queue.SimpleQueue[_Job | None], warm_up: Callable[[], None] | None
     ) -> None:
-        self._orders = orders
+        self._jobs = jobs
         self._warm_up = warm_up
         self._lock = threading.Lock()
         self._ending = threading.Event()
         self._process: SpawnProcess | None = None
         self._connection: Connection | None = None
-        self._begun_s = -math.inf
-        self.thread = threading.Thread(target=self._look_after, name="worker", daemon=True)
+        self._started_s = -math.inf
+        self.thread = threading.Thread(target=self._run_jobs, name="worker", daemon=True)
 
     @property
     def process_id(self) -> int:
-        """Id of the process; 0 if there is none."""
+        """Process id; 0 without a process."""
         process = self._process
         return 0 if process is None or process.pid is None else process.pid
 
@@ -108,56 +108,56 @@ class _Worker:
         """Kill the process and end the thread."""
         with self._lock:
             self._ending.set()
-            process = self._process  # the thread may let go of it meanwhile
+            process = self._process  # the thread may reset it concurrently
             if process is not None:
                 process.kill()
 
-    def _look_after(self) -> None:
-        self._begin()
+    def _run_jobs(self) -> None:
+        self._start_process()
         while not self._ending.is_set():
             try:
-                order = self._orders.get(timeout=CHECK_S)
+                order = self._jobs.get(timeout=CHECK_S)
             except queue.Empty:
                 if self._process is None or not self._process.is_alive():
-                    self._begin()
+                    self._start_process()
                 continue
             if order is None:
                 break
             job, done = order
             try:
-                result = self._do(job)
+                result = self._run(job)
             except Exception as error:
-                # The thread must go on, or a share of the requests would wait forever.
+                # If the thread ended, its share of the requests would wait forever.
                 log.exception("a worker is replaced after an error", job=job.job)
-                self._forget()
+                self._discard_process()
                 result = Computed(job.job, None, error_text(error))
             if not self._ending.is_set():
                 done(result)
                 if self._connection is None:
-                    self._begin()
-        self._forget()
+                    self._start_process()
+        self._discard_process()
 
-    def _begin(self) -> Connection | None:
+    def _start_process(self) -> Connection | None:
         """Start a process, replacing the previous one.
 
         Returns:
             The connection to it; None if the pool is ending or the process cannot be started.
         """
-        self._forget()
-        if time.monotonic() < self._begun_s + PAUSE_S:
+        self._discard_process()
+        if time.monotonic() < self._started_s + PAUSE_S:
             self._ending.wait(PAUSE_S)
         with self._lock:
             if self._ending.is_set():
                 return None
-            self._begun_s = time.monotonic()
+            self._started_s = time.monotonic()
             try:
                 self._process, self._connection = _start(self._warm_up)
             except OSError as error:
                 log.warning("a worker cannot be started", reason=str(error))
             return self._connection
 
-    def _forget(self) -> None:
-        """Kill the process, if any, and close its connection."""
+    def _discard_process(self) -> None:
+        """Kill the process if there is one, and close its connection."""
         if self._connection is not None:
             self._connection.close()
             self._connection = None
@@ -166,36 +166,36 @@ class _Worker:
             self._process.join(END_S)
             self._process = None
 
-    def _do(self, job: Delegate) -> Computed:
+    def _run(self, job: Delegate) -> Computed:
         """Run a job; retry once in a new process if the worker dies."""
         for _ in range(2):
-            connection = self._connection or self._begin()
-            done = None if connection is None else self._try(connection, job)
+            connection = self._connection or self._start_process()
+            done = None if connection is None else self._try_once(connection, job)
             if done is not None:
                 return done
-            self._forget()
+            self._discard_process()
             if not self._ending.is_set():
                 log.warning("a worker died", job=job.job)
         return Computed(job.job, None, "the worker died")
 
-    def _try(self, connection: Connection, job: Delegate) -> Computed | None:
+    def _try_once(self, connection: Connection, job: Delegate) -> Computed | None:
         """Return the result of a job; None if the process died."""
         left_s = max(0.0, job.deadline_s - time.monotonic())
         try:
             connection.send(job)
-            # A new process warms up first; its pipe has room for a job.
+            # A new process warms up first; the pipe can hold a job.
             if connection.poll(left_s + OVERDUE_S):
                 result, error = connection.recv()
                 return Computed(job.job, result, error)
         except (EOFError, OSError):
             return None
         except Exception as error:
-            # It cannot be pickled. The pipe carries whole messages, so nothing of it is left there.
-            log.exception("a job or its result cannot be handed over", job=job.job)
+            # Pickling failed. The pipe transfers complete messages, so it is still usable.
+            log.exception("a job or its result cannot be transferred", job=job.job)
             return Computed(job.job, None, error_text(error))
-        self._forget()
-        log.warning("a worker was stopped: it went on too long", job=job.job)
-        return Computed(job.job, None, "the worker was stopped: it went on too long")
+        self._discard_process()
+        log.warning("a worker was killed: it exceeded its deadline", job=job.job)
+        return Computed(job.job, None, "the worker was killed: it exceeded its deadline")
 
 
 def _start(warm_up: Callable[[], None] | None) -> tuple[SpawnProcess, Connection]:
@@ -211,30 +211,30 @@ def _start(warm_up: Callable[[], None] | None) -> tuple[SpawnProcess, Connection
 
 
 def _work(connection: Connection, warm_up: Callable[[], None] | None) -> None:
-    """Run jobs until the other end is closed: the main function of a worker process."""
+    """Run jobs until the other end is closed; main function of a worker process."""
     die_with_parent()
-    # Ctrl-C reaches the whole process group; the owner of the pool ends its workers.
+    # Ctrl-C reaches the whole process group, but the parent ends its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if warm_up is not None:
         warm_up()
     with contextlib.suppress(EOFError, OSError):
         while True:
-            _do_next(connection)
+            _run_next(connection)
 
 
-def _do_next(connection: Connection) -> None:
+def _run_next(connection: Connection) -> None:
     """Run one job.
 
     Raises:
         EOFError, OSError: the other end is closed.
     """
     try:
-        # All processes of a machine share the clock of `time.monotonic`.
+        # `time.monotonic` is the same in all processes of a machine.
         computed = run_delegated(connection.recv(), time.monotonic)
         connection.send((computed.result, computed.error))
     except (EOFError, OSError):
         raise
-    except Exception as error:  # it cannot be pickled
-        log.exception("a job or its result cannot be handed over")
+    except Exception as error:  # pickling failed
+        log.exception("a job or its result cannot be transferred")
         connection.send((None, error_text(error)))

@@ -1,8 +1,8 @@
 """Rights of each process on a secured network, derived from the table of topics.
 
-Each right follows from a row of `topics.TOPICS`: senders may send on the keys that name them,
-readers read all keys of the topic, the addressee those that name it. A router checks what comes in
-from a process and what goes out to it, so each right has a flow, seen from the router. Pure.
+Each right follows from a row of `topics.TOPICS`: senders may send on keys that contain their name,
+readers may read all keys of the topic, the addressee only keys that contain its name. A router
+checks both directions, so each right has a flow as seen from the router. Without I/O.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ CA_FILE = "LANEWEAVE_CA_FILE"
 CERTIFICATE_FILE = "LANEWEAVE_CERTIFICATE_FILE"
 PRIVATE_KEY_FILE = "LANEWEAVE_PRIVATE_KEY_FILE"
 PRIVATE_KEY = "LANEWEAVE_PRIVATE_KEY"
-"""Environment variables that take precedence over the files in `security.folder`."""
-# Zenoh accepts unknown identities but silently drops their traffic, so they are rejected here.
+"""Environment variables that override the files in `security.folder`."""
+# Zenoh accepts unknown identities but silently drops their traffic, so reject them here.
 KNOWN_RULE = (
     "an identity of this configuration: runtime.coordinators, security.fleets, "
     "security.vehicles, security.clients, security.observers"
 )
 REQUEST_MARGIN = 2
-"""The router lets in requests up to this factor above the limit, so that the service itself can
-refuse them with a reason."""
-EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 (compared with, not listened at)
-"""Hosts that mean all interfaces: a router listens there, but clients cannot connect to them."""
+"""Factor by which the router's size limit exceeds the service's, so that the service can reject a
+request with a reason."""
+EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 (not an address to listen at)
+"""Hosts that mean all interfaces; clients cannot connect to them."""
 
 
 class Flow(StrEnum):
-    """Direction, seen from the router."""
+    """Direction as seen from the router."""
 
     IN = "ingress"
     OUT = "egress"
@@ -58,10 +58,10 @@ class Flow(StrEnum):
 SENDING: dict[Exchange, tuple[tuple[Flow, str], ...]] = {
     Exchange.MESSAGES: ((Flow.IN, "put"),),
     Exchange.TOKENS: ((Flow.IN, "liveliness_token"),),
-    # A querier learns that a server exists before it queries.
+    # A client learns that a server exists before it queries.
     Exchange.QUERIES: ((Flow.IN, "query"), (Flow.OUT, "reply"), (Flow.OUT, "declare_queryable")),
 }
-"""Rights of a topic's sender: flow, and kind of Zenoh message."""
+"""Rights of a topic's sender: flow and kind of Zenoh message."""
 READING: dict[Exchange, tuple[tuple[Flow, str], ...]] = {
     Exchange.MESSAGES: ((Flow.IN, "declare_subscriber"), (Flow.OUT, "put")),
     Exchange.TOKENS: (
@@ -71,9 +71,9 @@ READING: dict[Exchange, tuple[tuple[Flow, str], ...]] = {
     ),
     Exchange.QUERIES: ((Flow.IN, "declare_queryable"), (Flow.IN, "reply"), (Flow.OUT, "query")),
 }
-"""Rights of its readers."""
+"""Rights of a topic's readers."""
 _REPORTING = {Party.VEHICLE: "agent", Party.COORDINATOR: "coordinator", Party.BRIDGE: "bridge"}
-"""Role in the keys of topics that any of these may send."""
+"""Role in the keys of topics with `ANY_SENDER`."""
 
 
 @frozen
@@ -98,7 +98,7 @@ def rules_of(identity: Identity, scenario: Scenario) -> tuple[Rule, ...]:
 
 
 def _represented(identity: Identity, scenario: Scenario) -> Iterator[tuple[Party, str]]:
-    """Yield the parties and names that an identity acts for: a fleet also for its vehicles."""
+    """Yield the party and name of an identity, and for a fleet those of its vehicles."""
     yield identity.party, identity.name
     if identity.party is Party.FLEET:
         members = scenario.security.fleets.get(identity.name, ())
@@ -109,7 +109,7 @@ def _represented(identity: Identity, scenario: Scenario) -> Iterator[tuple[Party
 def rights_on(
     topic: Topic, party: Party, name: str
 ) -> Iterator[tuple[tuple[Flow, str], dict[str, str]]]:
-    """Yield the rights that a topic grants, each with the parameters that its keys must have."""
+    """Yield the rights that a topic grants, with the parameters of the keys."""
     own = _own(topic, party, name)
     sending, reading = SENDING[topic.exchange], READING[topic.exchange]
     if party == topic.sender or (topic.sender == ANY_SENDER and party in _REPORTING):
@@ -123,25 +123,25 @@ def rights_on(
 
 
 def _own(topic: Topic, party: Party, name: str) -> dict[str, str]:
-    """Return the parameters of the keys that name this process."""
+    """Return the parameters of keys that contain the name of this process."""
     own = {str(party): name}
     if party in _REPORTING:
         own |= {"role": _REPORTING[party], "name": name or str(party)}
     return {key: value for key, value in own.items() if key in topic.parameters}
 
 
-# --- what processes and the router are given ------------------------------------------------------
+# --- settings of processes and of the router ------------------------------------------------------
 
 
 def access_of(
     scenario: Scenario, identity: str, environment: Mapping[str, str] = os.environ
 ) -> Access:
-    """Return how a process joins the network of a deployment.
+    """Return the connection settings of a process.
 
     Args:
         scenario: the deployment.
         identity: common name of the process's certificate, such as `coordinator.c1`.
-        environment: may hold paths of credentials, or the private key.
+        environment: may contain paths of credentials, or the private key.
 
     Raises:
         BadInputError: the identity is unknown, or the environment contradicts itself.
@@ -184,7 +184,7 @@ def credentials_of(
 
 
 def guard_of(scenario: Scenario, environment: Mapping[str, str] = os.environ) -> RouterGuard | None:
-    """Return what a deployment's router enforces; None if the network is not secured.
+    """Return the restrictions that a router enforces; None if the network is not secured.
 
     Raises:
         BadInputError: the environment contradicts itself.
@@ -202,7 +202,7 @@ def guard_of(scenario: Scenario, environment: Mapping[str, str] = os.environ) ->
 
 
 def access_control(scenario: Scenario) -> dict[str, Any]:
-    """Return the rights of all identities as Zenoh's `access_control`; all else is denied."""
+    """Return the rights of all identities as Zenoh's `access_control`, which denies all others."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []

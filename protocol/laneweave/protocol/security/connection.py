@@ -1,6 +1,6 @@
-"""What a process needs to join the network: plain values, without knowledge of scenarios.
+"""Connection settings of a process, independent of scenarios.
 
-`rights` derives them from a scenario; `transports.zenoh` uses them.
+`access_control` derives them from a scenario; `transports.zenoh` uses them.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from attrs import field, frozen
 
 @frozen
 class Credentials:
-    """Certificate and private key of a process, and the authority that it trusts: X.509 in PEM.
+    """Certificate, private key and trusted authority of a process: X.509 in PEM.
 
-    Each is the path of a file, except `private_key_pem`, which is the text of the key.
+    All fields are paths, except `private_key_pem`, which is the key itself.
     """
 
     ca: str
@@ -27,36 +27,36 @@ class Credentials:
 
 @frozen
 class Access:
-    """How a client joins the network."""
+    """Connection settings of a client."""
 
     endpoint: str
     """Zenoh endpoint of the router."""
     realm: str = "default"
     lease_s: float = 1.0
-    """The others give this process up after this time of silence."""
+    """Time of silence after which other processes consider this one lost."""
     credentials: Credentials | None = None
     """None: the network is not secured."""
     identity: str = ""
     """Common name of the process's certificate."""
     connect_timeout_s: float = 0.0
-    """How long to try to connect; 0: once."""
+    """Time for which to retry; 0: one attempt."""
 
 
 @frozen
 class RouterGuard:
-    """What a router enforces on a secured network."""
+    """Restrictions that a router enforces on a secured network."""
 
     credentials: Credentials
     host: str
-    """Host at which clients reach the router; empty if the configuration does not say."""
+    """Host at which clients reach the router; empty if unknown."""
     access_control: dict[str, Any]
-    """Zenoh's setting of this name."""
+    """Zenoh's `access_control`."""
     size_limits: list[dict[str, Any]]
     """Zenoh's `low_pass_filter`."""
 
 
 def ca_path(folder: Path) -> Path:
-    """Return the path of the authority's certificate in a folder of certificates."""
+    """Return the path of the authority's certificate."""
     return folder / "ca.pem"
 
 

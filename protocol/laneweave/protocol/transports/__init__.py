@@ -1,4 +1,4 @@
 """The two implementations of `runtime.transport.Transport`: Zenoh, and a simulated network.
 
-Both pass the same contract tests. Roles never import them; process modules and launch do.
+Both pass the same contract tests. Cores do not import them; process modules and launch do.
 """

@@ -1,6 +1,6 @@
-"""What crosses the network: messages, their keys and their encoding.
+"""Messages, keys and encoding: the content of the network.
 
-Entry points: `messages` (every message with units and the meaning of its loss), `topics` (the key
-grammar), `codec` (MessagePack). Knows nothing of transports, nodes and configuration.
-Any package may import it.
+Entry points: `messages` (every message with units and the effect of its loss), `topics` (key
+grammar), `codec` (MessagePack). Independent of transports, nodes and configuration. Any package may
+import it.
 """

@@ -1,7 +1,7 @@
 """MessagePack codec of the messages: [version, kind, fields].
 
-Decoding checks size, version, kind, field names, types, finiteness and ranges. Arbitrary bytes
-raise `BadInputError` and nothing else.
+Decoding checks size, version, kind, field names, types, finiteness and ranges. For invalid bytes it
+raises `BadInputError` only.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ KINDS: dict[str, type] = {
 }
 _MIN_INT, _MAX_INT = -(2**63), 2**63 - 1
 _MIN_FLOAT, _MAX_FLOAT = -1e12, 1e12
-"""Beyond every position, speed and time, and small enough for calculations."""
+"""Range of floats: larger than every position, speed and time, and safe in calculations."""
 _MAX_DEPTH = 8
 
 
@@ -63,7 +63,7 @@ def _ballot(value: object, _: type) -> Ballot:
 
 def _plain_data(value: object, _: type) -> dict[str, Any]:
     if not isinstance(value, dict) or not _is_plain(value, _MAX_DEPTH):
-        allowed = "a map with text keys of what JSON knows: finite, 64-bit, not deep"
+        allowed = "a map of JSON values: text keys, finite 64-bit numbers, not too deep"
         raise BadInputError("", value, allowed)
     return value
 
@@ -119,15 +119,15 @@ def decode(payload: bytes, expected: type | None = None) -> object:
 
     Args:
         payload: arbitrary bytes.
-        expected: message class of the key; None: any.
+        expected: required message class; None: any.
 
     Raises:
-        BadInputError: the bytes are not one well-formed message of the expected kind.
+        BadInputError: the payload is not one valid message of the expected class.
     """
     kind, body = _open_envelope(payload, expected)
     try:
         return _FAST.structure(body, kind)
-    except Exception:  # noqa: BLE001 (the slow converter names the field)
+    except Exception:  # noqa: BLE001 (the slow converter reports the field)
         return _explain(body, kind)
 
 

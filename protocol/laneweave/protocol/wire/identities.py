@@ -2,10 +2,10 @@
 
     router  bridge  coordinator.NAME  vehicle.NAME  fleet.NAME  client.NAME  observer.NAME
 
-The *identity* is the common name of a process's certificate; the router grants rights by it
-(`security.rights`). The *incarnation* tells one start of a process from all others: a time in ns
-whose low bits are the process id, so numbers grow with time and two live processes of one machine
-never share one, even after `above` has raised a number past the clock.
+The *identity* is the common name of a process's certificate and determines its rights
+(`security.access_control`). The *incarnation* identifies one start of a process: a time in ns whose
+low bits are the process id. Incarnations ascend, and two live processes of a machine never have the
+same one, even after `above` has raised a number beyond the clock.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from laneweave.protocol.field_validators import NAME_PATTERN
 from laneweave.protocol.wire.topics import Party
 
 MAX_COMMON_NAME = 64
-"""Maximum length in characters, by X.520."""
+"""Maximum number of characters according to X.520."""
 IDENTITY_RULE = (
     "router, bridge, or coordinator, vehicle, fleet, client or observer with a dot and a name, "
     f"at most {MAX_COMMON_NAME} characters"
 )
 _PROCESS_BITS = 22
-"""Size of a Linux process id; one step of the remaining bits is 4 ms."""
+"""Number of bits of a Linux process id; the remaining bits have a step of 4 ms."""
 _STEP = 1 << _PROCESS_BITS
 
 
@@ -40,7 +40,7 @@ class Identity:
 
     @property
     def common_name(self) -> str:
-        """Its form in a certificate."""
+        """Common name in the certificate."""
         return f"{self.party}.{self.name}" if self.name else str(self.party)
 
 
@@ -67,7 +67,7 @@ class Incarnations:
         self._last = 0
 
     def __call__(self) -> int:
-        """Return an incarnation that no process has used before."""
+        """Return an unused incarnation."""
         number = time.time_ns() // _STEP * _STEP + os.getpid() % _STEP
         self._last = number = above(number, self._last)
         return number

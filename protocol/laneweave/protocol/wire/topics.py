@@ -1,9 +1,9 @@
-"""Key grammar: each topic's keys, message class, sender, readers and quality of service.
+"""Key grammar: keys, message class, sender, readers and quality of service of each topic.
 
     laneweave/{realm}/{topic}/...
 
-Everything else follows from the table `TOPICS`: keys and their parsing, the message classes that
-the codec knows, the rights of processes (`security.rights`), and a table of docs/PROTOCOL.md.
+The table `TOPICS` determines keys and their parsing, the message classes of the codec, the rights
+of processes (`security.access_control`), and a table of docs/PROTOCOL.md.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class Quality(Enum):
     """Quality of service of a topic; `transports.zenoh` maps it to Zenoh's settings."""
 
     LATEST = "latest"
-    """Periodic messages; dropped when the network is congested."""
+    """Periodic messages, which congestion drops."""
     ASSURED = "assured"
-    """Blocks when the network is congested; acknowledged and resent by the protocol."""
+    """Messages that congestion blocks; the protocol acknowledges and resends them."""
     LOCKSTEP = "lockstep"
-    """As ASSURED, with the highest priority: ticks and their answers."""
+    """Ticks and their answers: as ASSURED, with the highest priority."""
 
 
 class Exchange(Enum):
@@ -40,13 +40,13 @@ class Exchange(Enum):
     MESSAGES = "messages"
     """The sender publishes; readers subscribe."""
     TOKENS = "tokens"
-    """The sender shows a liveliness token; readers watch it."""
+    """The sender declares a liveliness token; readers watch it."""
     QUERIES = "queries"
     """The sender queries; readers serve and answer."""
 
 
 class Party(StrEnum):
-    """Kinds of processes, by the rights that they have."""
+    """Kinds of processes with different rights."""
 
     ROUTER = "router"
     """Forwards all messages."""
@@ -57,41 +57,42 @@ class Party(StrEnum):
     VEHICLE = "vehicle"
     """Agent process of one vehicle."""
     FLEET = "fleet"
-    """Agent process of several vehicles, which it may take from the census."""
+    """Agent process of several vehicles, possibly a shard of the census."""
     CLIENT = "client"
-    """Asks the planning service."""
+    """Queries the planning service."""
     OBSERVER = "observer"
-    """Only reads."""
+    """Only subscribes."""
 
 
 ANY_SENDER = "any"
-"""Vehicles, coordinators and the bridge, each under its own {role} and {name}."""
+"""Sender of a topic of vehicles, coordinators and the bridge, with their {role} and {name} as
+keys."""
 
 
 @frozen
 class Topic:
-    """One kind of key: what travels on it, and which processes send and read it.
+    """A kind of keys, with their messages, senders and readers.
 
-    The rights that a router grants (`security.rights`) follow from these fields alone.
+    The rights that a router grants (`security.access_control`) follow from these fields.
     """
 
     name: str
     pattern: str
-    """Key below the realm, with {parameters}."""
+    """Key without prefix and realm, with {parameters}."""
     kind: type | None
     """Message class; None for tokens and the planning service."""
     sender: str
-    """A `Party`, or `ANY_SENDER`. A process that the key names sends under its own name only."""
+    """A `Party`, or `ANY_SENDER`. Keys with the name of a process are reserved for this process."""
     quality: Quality
     readers: tuple[Party, ...] = ()
     """Parties that read all keys of the topic."""
     addressee: Party | None = None
-    """Party that reads only the keys that name it."""
+    """Party that reads only keys that contain its name."""
     deputy: Party | None = None
     """Party that may send in place of any sender."""
     exchange: Exchange = Exchange.MESSAGES
     remark: str = ""
-    """For the table of docs/PROTOCOL.md."""
+    """Remark for the table of docs/PROTOCOL.md."""
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -116,8 +117,8 @@ COMMAND = Topic(
     "command", "command/{vehicle}", messages.Command, Party.VEHICLE, Quality.LOCKSTEP,
     readers=(Party.BRIDGE,),
 )  # fmt: skip
-# Vehicles read each other's states: one that waits must see that another has left its cell. The
-# caretaker of a vehicle without an agent, a part of the bridge, sends in the agent's place.
+# Vehicles read the states of those that must leave their cells first. For a vehicle without an
+# agent, its caretaker in the bridge sends.
 STATE = Topic(
     "state", "state/{formation}/{vehicle}", messages.VehicleState, Party.VEHICLE, Quality.LATEST,
     readers=(Party.COORDINATOR, Party.VEHICLE, Party.OBSERVER), deputy=Party.BRIDGE,
@@ -175,7 +176,7 @@ TOPICS = tuple(each for each in tuple(globals().values()) if isinstance(each, To
 
 @frozen
 class Keys:
-    """Builds and reads the keys of one realm."""
+    """Builder and parser of the keys of one realm."""
 
     realm: str
 
@@ -183,38 +184,38 @@ class Keys:
         """Check the realm.
 
         Raises:
-            BadInputError: the realm cannot be one part of a key.
+            BadInputError: the realm is not valid as one part of a key.
         """
         if not NAME_PATTERN.fullmatch(self.realm):
             raise BadInputError("network.realm", self.realm, NAME_RULE)
 
     def key(self, topic: Topic, **parameters: object) -> str:
-        """Return a concrete key, or a key expression when a parameter is `*`.
+        """Return a key, or a key expression if a parameter is `*`.
 
         Raises:
-            BadInputError: a parameter cannot be one part of a key.
+            BadInputError: a parameter is not valid as one part of a key.
         """
         return _key(self.realm, topic.pattern, **parameters)
 
     def all_of(self, topic: Topic, **given: object) -> str:
-        """Return the key expression that matches all keys of a topic with the given parameters."""
+        """Return the expression for all keys of a topic with the given parameters."""
         return self.key(topic, **(dict.fromkeys(topic.parameters, "*") | given))
 
     def read(self, key: str) -> tuple[Topic, Mapping[str, str]] | None:
-        """Return a key's topic and parameters; None for a foreign key."""
+        """Return a key's topic and parameters; None for an unknown key."""
         return _read(self.realm, key) if len(key) <= _MAX_KEY else None
 
 
 _MEMO = 1024
-"""Size of the caches of keys; a process uses few keys, many times a second."""
+"""Size of the caches of keys."""
 _MAX_KEY = max(
     len(re.sub(r"{\w+}", "x" * 64, f"{PREFIX}/{{realm}}/{topic.pattern}")) for topic in TOPICS
 )
-"""Maximum length of a key in characters; longer texts are neither parsed nor cached."""
+"""Maximum number of characters of a key; longer texts are neither parsed nor cached."""
 _PATTERNS = tuple((topic, tuple(topic.pattern.split("/"))) for topic in TOPICS)
 
 
-# `typed`: 1, 1.0 and True are equal, but their texts differ.
+# `typed`, because 1, 1.0 and True are equal but have different texts.
 @lru_cache(maxsize=_MEMO, typed=True)
 def _key(realm: str, pattern: str, /, **parameters: object) -> str:
     texts = {name: str(value) for name, value in parameters.items()}
@@ -234,7 +235,7 @@ def _read(realm: str, key: str) -> tuple[Topic, Mapping[str, str]] | None:
         if len(pattern) == len(parts):
             found = _match(pattern, parts)
             if found is not None:
-                # The cached result is shared by all callers.
+                # All callers share the cached result.
                 return topic, MappingProxyType(found)
     return None
 
@@ -258,7 +259,7 @@ def incarnation_of(parameters: Mapping[str, str]) -> int:
 
 
 def matches(expression: str, key: str) -> bool:
-    """Return whether an expression matches a key: `*` is one part, `**` any number of parts."""
+    """Return whether an expression matches a key (`*`: one part; `**`: any number of parts)."""
     if "*" not in expression:
         return expression == key
     return _compiled(expression).fullmatch("/" + key) is not None
@@ -266,7 +267,7 @@ def matches(expression: str, key: str) -> bool:
 
 @lru_cache(maxsize=_MEMO)
 def _compiled(expression: str) -> re.Pattern[str]:
-    """Return a pattern for the matching keys, each part preceded by a slash."""
+    """Return a pattern for matching keys with a leading slash."""
     wild = {"*": "/[^/]*", "**": "(?:/[^/]*)*"}
     return re.compile(
         "".join(wild.get(part) or "/" + re.escape(part) for part in expression.split("/"))
@@ -274,5 +275,5 @@ def _compiled(expression: str) -> re.Pattern[str]:
 
 
 def matches_any(expressions: Iterable[str], key: str) -> bool:
-    """Return whether one of several key expressions matches a key."""
+    """Return whether any of the expressions matches a key."""
     return any(matches(expression, key) for expression in expressions)

@@ -308,7 +308,7 @@ def test_what_is_being_planned_is_not_dropped_at_its_deadline(desk: Desk) -> Non
     assert desk.answer(token)["status"] == "optimal"
 
 
-@pytest.mark.parametrize("error", ["the worker was stopped: it went on too long", "it died"])
+@pytest.mark.parametrize("error", ["the worker was killed: it exceeded its deadline", "it died"])
 def test_a_failed_computation_is_an_error_reply_and_is_not_called_late(
     desk: Desk, error: str
 ) -> None:

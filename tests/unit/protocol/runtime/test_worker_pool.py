@@ -115,7 +115,10 @@ def test_a_job_whose_deadline_has_passed_is_not_begun(
     one: Bench, tmp_path: Path, within_s: float
 ) -> None:
     computed = one.do(partial(jobs.note, tmp_path / "begun"), within_s)
-    assert (computed.result, computed.error) == (None, "the deadline passed before it began")
+    assert (computed.result, computed.error) == (
+        None,
+        "the deadline passed before the computation began",
+    )
     assert not jobs.noted(tmp_path / "begun")
 
 
@@ -125,7 +128,7 @@ def test_a_deadline_that_passes_while_the_job_waits_counts(one: Bench, tmp_path:
     second = one.order(partial(jobs.note, tmp_path / "begun"), within_s=0.1)
     assert one.done.get(timeout=WAIT_S) == Computed(first, 0.2)
     assert one.done.get(timeout=WAIT_S) == Computed(
-        second, None, "the deadline passed before it began"
+        second, None, "the deadline passed before the computation began"
     )
     assert not jobs.noted(tmp_path / "begun")
 
@@ -194,7 +197,7 @@ def test_a_worker_that_goes_on_too_long_is_killed(
     monkeypatch.setattr(worker_pool, "OVERDUE_S", 0.1)
     one.order(partial(jobs.sleep, 1000.0), within_s=0.1)
     os.kill(before, number)
-    assert one.done.get(timeout=WAIT_S).error == "the worker was stopped: it went on too long"
+    assert one.done.get(timeout=WAIT_S).error == "the worker was killed: it exceeded its deadline"
     wait_until(lambda: is_gone(before))
     monkeypatch.undo()
     assert one.process_id() != before

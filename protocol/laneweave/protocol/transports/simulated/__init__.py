@@ -1,4 +1,4 @@
-"""A network inside one process, in virtual time, with seeded faults; harsher than Zenoh.
+"""A network inside one process, in virtual time, with seeded faults.
 
 Entry point: `network.SimulatedNetwork`. Used by tests, by the fault search and by
 `laneweave run --transport simulated`.

@@ -1,4 +1,4 @@
-"""A member of the simulated network (a node on its machine) and the liveliness tokens it sees."""
+"""Members of the simulated network (nodes with their machines), and liveliness tokens."""
 
 from __future__ import annotations
 
@@ -30,70 +30,68 @@ from laneweave.protocol.transports.simulated.virtual_time import Clock, Item, Si
 from laneweave.protocol.wire.topics import matches_any
 
 WAKE_AGAIN_S = 0.001
-"""Delay of a wakeup that a core requests for a past time, so that virtual time goes on."""
+"""Delay of a wakeup that a core requests for a past time, so that virtual time advances."""
 INJECTED_FAILURE = "injected failure"
 """Error of a computation that fails because of `Conditions.compute_failure`."""
-
-
 _DELIVERIES = (Received, TokenUp, TokenDown, LinkUp, LinkDown, Query)
 
 
 class Member:
-    """One node with its clock, alarm, computations and connection."""
+    """A node with its clock, alarm, computations and connection."""
 
     node: Node
     transport: Transport
 
     def __init__(self, simulation: Simulation, name: str, number: int) -> None:
-        """Start connected and running, with an exact clock; the network sets node and transport."""
+        """Start connected and running; the network sets `node` and `transport`."""
         self.name = name
         self.number = number
-        """Ascending in the order in which members join."""
+        """Number in the order in which members join."""
         self.subscriptions: dict[str, None] = {}
         self.watched: dict[str, None] = {}
         self.tokens: dict[str, None] = {}
         self.served: set[str] = set()
         self.closed = False
         self.clock: Clock | None = None
-        """None: it shows virtual time."""
+        """None: virtual time."""
         self.connected = True
         self.unplugged = False
-        """Disconnected on its own: a router that comes back does not change that."""
+        """Disconnected individually: a returning router does not reconnect it."""
         self.connection = 0
-        """Number of the connection: messages of an earlier one do not arrive."""
+        """Number of the current connection; messages of earlier connections are dropped."""
         self.paused = False
         self.pauses = 0
         self.lapsed = False
-        """Paused for longer than its lease."""
+        """Paused for longer than the lease."""
         self.last_token_s = 0.0
-        """Arrival time of the newest token event: these do not overtake each other."""
+        """Arrival time of the newest token event, since token events stay in order."""
         self.seen: dict[str, None] = {}
-        """Tokens that its node knows to be there."""
+        """Tokens that the node has been notified of."""
         self._simulation = simulation
         self._backlog: list[Item] = []
         self._alarm = 0
-        """Number of the newest alarm; older ones are void."""
+        """Number of the newest alarm; older alarms are ignored."""
         self._alarm_s = math.inf
-        """Virtual time of the newest alarm; infinite: there is none."""
+        """Virtual time of the newest alarm; infinite: none."""
         self._computed_s = {Compute: 0.0, Delegate: 0.0}
-        """End of the newest computation of each kind."""
+        """End of the newest computation of each kind, in virtual time."""
 
     @property
     def visible(self) -> bool:
-        """Whether others see its tokens."""
+        """Whether its tokens are visible to others."""
         return self.connected and not self.lapsed
 
     # --- input ------------------------------------------------------------------------------
 
     def receive(self, connection: int, delivery: Delivery) -> None:
-        """Deliver what was sent during this connection."""
+        """Handle a delivery that was sent during the given connection."""
         if not self.connected or self.connection != connection:
             return
         if not isinstance(delivery, (TokenUp, TokenDown)) or update_tokens(self.seen, delivery):
             self.handle(delivery)
 
     def handle(self, item: Item) -> None:
-        """Let the node handle an input, now or when it is resumed."""
+        """Pass an input to the node, or queue it while the node is paused."""
         if self.closed:
             return
         if self.paused:
@@ -119,12 +117,12 @@ class Member:
     # --- time -------------------------------------------------------------------------------
 
     def _local_s(self) -> float:
-        """Return the time on its own clock."""
+        """Return the time on this member's clock."""
         now_s = self._simulation.now_s
         return now_s if self.clock is None else self.clock.local_s(now_s)
 
     def resume(self) -> None:
-        """End a pause: handle all queued inputs in order."""
+        """End a pause and handle all queued inputs in order."""
         self.paused = False
         backlog, self._backlog = self._backlog, []
         for item in backlog:
@@ -132,7 +130,7 @@ class Member:
         self._reset_alarm()
 
     def set_clock(self, clock: Clock) -> None:
-        """Replace its clock."""
+        """Replace the clock."""
         self.clock = clock
         self._reset_alarm()
 
@@ -140,11 +138,10 @@ class Member:
         self._alarm_s = math.inf
         self._set_alarm()
 
-    def _set_alarm(self, soonest_s: float = 0.0) -> None:
-        """Set an alarm for the core's wakeup unless an earlier one is set.
+    def _set_alarm(self, min_s: float = 0.0) -> None:
+        """Set an alarm for the core's wakeup unless an earlier alarm is set.
 
-        An alarm that proves too early sets the next one. That is much rarer than a core postponing
-        its wakeup.
+        An alarm that is too early sets the next one. This is rarer than postponed wakeups.
         """
         if self.closed or self.paused:
             return
@@ -155,7 +152,7 @@ class Member:
         if due_s < self._alarm_s:
             self._alarm_s = due_s
             self._alarm += 1
-            at_s = due_s if due_s > self._simulation.now_s else soonest_s
+            at_s = due_s if due_s > self._simulation.now_s else min_s
             self._simulation.at(at_s, self._ring, self._alarm)
 
     def _ring(self, alarm: int) -> None:
@@ -184,21 +181,21 @@ class Member:
             computed = (
                 run_job(job) if isinstance(job, Compute) else run_delegated(job, self._local_s)
             )
-        # As on one thread and one worker: jobs of a kind end in the order of their requests.
+        # As with one thread and one worker, jobs of a kind end in the order of their requests.
         end_s = max(self._computed_s[type(job)], simulation.now_s + duration_s)
         self._computed_s[type(job)] = end_s
         simulation.at(end_s, self.handle, computed)
 
 
 class Tokens:
-    """Liveliness: reports tokens that appear and vanish to the members that watch them.
+    """Liveliness tokens: notifies members of appearing and vanishing tokens that they watch.
 
-    Several nodes may show a token on one key: it appears with the first and vanishes with the last.
-    Reports are never lost and stay in order, as Zenoh's declarations do.
+    If several nodes declare a token on one key, it appears with the first and vanishes with the
+    last. Notifications are never lost and stay in order, as on Zenoh.
     """
 
     def __init__(self, simulation: Simulation, members: Mapping[str, Member]) -> None:
-        """Serve all that are in `members` at the time of each call."""
+        """Notify the entries that `members` has at each call."""
         self._simulation = simulation
         self._members = members
 
@@ -207,21 +204,21 @@ class Tokens:
         kind: type[TokenUp | TokenDown],
         owner: Member,
         keys: Iterable[str],
-        but: Member | None = None,
+        exclude: Member | None = None,
     ) -> None:
-        """Report tokens that a visible member has just shown or withdrawn, to all but one."""
+        """Report tokens that a visible member has just declared or withdrawn."""
         if not owner.visible:
             return
         for key in keys:
-            if not self._shown(key, owner):
-                news = kind(key)
+            if not self._declared_elsewhere(key, owner):
+                event = kind(key)
                 for member in self._members.values():
-                    watches = member is not but and member.connected
+                    watches = member is not exclude and member.connected
                     if watches and matches_any(member.watched, key):
-                        self._send(member, news)
+                        self._send(member, event)
 
     def report_existing(self, watcher: Member, expressions: Iterable[str]) -> None:
-        """Report the tokens that are there to one watcher."""
+        """Report the existing tokens to one watcher."""
         keys = (
             key
             for member in self._members.values()
@@ -232,14 +229,14 @@ class Tokens:
         for key in dict.fromkeys(keys):
             self._send(watcher, TokenUp(key))
 
-    def _shown(self, key: str, owner: Member) -> bool:
-        """Return whether another member shows a token on this key."""
+    def _declared_elsewhere(self, key: str, owner: Member) -> bool:
+        """Return whether another visible member has a token on this key."""
         return any(
             member is not owner and member.visible and key in member.tokens
             for member in self._members.values()
         )
 
-    def _send(self, watcher: Member, news: TokenUp | TokenDown) -> None:
+    def _send(self, watcher: Member, event: TokenUp | TokenDown) -> None:
         simulation = self._simulation
         watcher.last_token_s = max(watcher.last_token_s, simulation.now_s + simulation.delay_s())
-        simulation.at(watcher.last_token_s, watcher.receive, watcher.connection, news)
+        simulation.at(watcher.last_token_s, watcher.receive, watcher.connection, event)

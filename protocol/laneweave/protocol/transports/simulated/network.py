@@ -1,15 +1,14 @@
-"""The transport in virtual time: a network inside one process that is harsher than Zenoh.
+"""The transport in virtual time: a network inside one process.
 
-Nodes, messages and computations share one event queue; time jumps from event to event. Each
-message may be lost, duplicated, delayed and reordered for each receiver, drawn from one seeded
-generator: equal seeds give equal runs. Nodes can be killed, paused, resumed and disconnected, the
-router can be lost and clocks can be wrong. Liveliness behaves as measured on Zenoh: a killed
-process is noticed at once, a silent one after its lease, and a node that loses the network sees all
-others vanish.
+Nodes, messages and computations share one event queue; time jumps from event to event. Loss,
+duplication, delay and reordering are drawn for each message and receiver from one seeded generator:
+equal seeds give equal runs. Nodes can be killed, paused, resumed and disconnected, the router can
+be lost, and clocks can be wrong. Liveliness behaves as measured on Zenoh: a killed process is
+detected at once, a silent one after its lease, and for a node without connection all tokens vanish.
 
-Messages travel as bytes and are checked on receipt, as on Zenoh. All receivers of the same bytes
-share one decoded message, so no core may modify it. With `skip_codec`, messages travel as objects,
-without codec and checks, for speed.
+Messages are sent as bytes and checked on receipt, as on Zenoh. All receivers of the same bytes
+share one decoded message, so cores must not modify it. With `skip_codec`, messages are sent as
+objects, without codec and checks, for speed.
 """
 
 from __future__ import annotations
@@ -48,15 +47,15 @@ from laneweave.protocol.wire.messages import Name
 from laneweave.protocol.wire.topics import Keys, Quality, Topic, matches, matches_any
 
 KILL_SEEN_S = 0.005
-"""Time until others notice a killed process (measured on Zenoh: 2 to 9 ms)."""
+"""Time until others detect a killed process (measured on Zenoh: 2 to 9 ms)."""
 REJOIN_S = (0.2, 0.9)
-"""Range of the time until a node reconnects to a router that is back (measured on Zenoh)."""
+"""Range of the time in which nodes reconnect to a restored router (measured on Zenoh)."""
 _CACHE_SIZE = 4096
-"""Size of the caches of decoded messages, which all receivers share."""
+"""Size of the shared caches of decoded messages."""
 
 
 class Parcel(bytes):
-    """A message that travels as an object, in place of its bytes."""
+    """A message object that is sent in place of its bytes."""
 
     message: object
 
@@ -68,12 +67,12 @@ class Parcel(bytes):
 
 
 class _Reader:
-    """Decodes the messages of a realm, whether they travel as bytes or as objects."""
+    """Decoder of a realm's messages, which are bytes or objects."""
 
     def __init__(self, keys: Keys, read_payload: Callable[[bytes, type], object]) -> None:
         self._keys = keys
         self._known: dict[str, tuple[Topic, Mapping[str, str]]] = {}
-        # A plan has many receivers, each with a key of its own: it is still decoded only once.
+        # A plan has several receivers with different keys, but is decoded only once.
         read = partial(read_message, keys, decode=read_payload)
         self._read = lru_cache(maxsize=_CACHE_SIZE)(read)
 
@@ -88,16 +87,16 @@ class _Reader:
 
 @frozen
 class _OpenQuery:
-    """A question at one of the servers that may answer it."""
+    """A query at one of the servers that may answer it."""
 
     server: Member
     answer: Callable[[Answer | None], None]
     tokens: set[int]
-    """Tokens of all servers that may still answer; shared among them."""
+    """Tokens of all servers that may still answer; shared by their entries."""
 
 
 class _Transport:
-    """One node's view of the simulated network: the peer of `ZenohTransport`; see `Transport`."""
+    """`Transport` of one node over the simulated network."""
 
     def __init__(self, network: SimulatedNetwork, member: Member) -> None:
         self._network = network
@@ -148,12 +147,12 @@ class _Transport:
 
 
 class SimulatedNetwork(Simulation):
-    """The network and its nodes, in virtual time."""
+    """The network with its nodes, in virtual time."""
 
     def __init__(
         self, seed: int, conditions: Conditions | None = None, *, skip_codec: bool = False
     ) -> None:
-        """Create an empty network at time 0; `skip_codec`: messages bypass codec and checks."""
+        """Create an empty network at time 0; `skip_codec`: send messages as objects."""
         super().__init__(seed, conditions)
         self._skip_codec = skip_codec
         self._members: dict[str, Member] = {}
@@ -162,12 +161,12 @@ class SimulatedNetwork(Simulation):
         self._routes: dict[str, tuple[Member, ...]] = {}
         """Receivers of each key, in order of their start."""
         self._keys_by_prefix: dict[str, list[str]] = {}
-        """Keys of the routes, by all but their last part."""
+        """Keys with routes, by key without its last part."""
         self._cut: Callable[[str, str], bool] | None = None
         self._router_up = True
         self._outages = 0
         self._queries: dict[int, _OpenQuery] = {}
-        """Open questions, by the token under which each server knows them."""
+        """Open queries by token; each server of a query has its own token."""
         self._token_count = count(1)
         self._label_count = count(1)
         self._member_count = count()
@@ -177,10 +176,10 @@ class SimulatedNetwork(Simulation):
     # --- nodes ------------------------------------------------------------------------------
 
     def add(self, name: str, core: Core, realm: str) -> Node:
-        """Start a node now; while the router is lost it starts without a connection.
+        """Start a node; while the router is lost, it starts without a connection.
 
         Raises:
-            ValueError: a node of this name is there already.
+            ValueError: a node of this name exists.
         """
         if name in self._members:
             raise ValueError(f"node {name} is already in the network")
@@ -219,11 +218,11 @@ class SimulatedNetwork(Simulation):
     # --- faults of nodes --------------------------------------------------------------------
 
     def kill(self, name: str) -> None:
-        """Kill a node: its tokens vanish at once, and it sends nothing more."""
+        """Kill a node; its tokens vanish at once."""
         self._vanish(name, KILL_SEEN_S)
 
     def stop(self, name: str) -> None:
-        """Ask a node to end, as SIGTERM does; a paused one ends when it is resumed."""
+        """Request the end of a node, as SIGTERM does; a paused node ends when it is resumed."""
         member = self._members.get(name)
         if member is not None:
             member.handle(Stopping())
@@ -238,7 +237,7 @@ class SimulatedNetwork(Simulation):
         self.at(self.now_s + self.conditions.lease_s, self._lapse, member, member.pauses)
 
     def resume(self, name: str) -> None:
-        """Resume a paused node: it handles all inputs that have queued up."""
+        """Resume a paused node, which then handles its queued inputs."""
         member = self._members[name]
         if not member.paused:
             return
@@ -249,13 +248,13 @@ class SimulatedNetwork(Simulation):
         self._rejoin_later(member)
 
     def set_clock(self, name: str, offset_s: float = 0.0, rate: float = 1.0) -> None:
-        """Set a node's clock to show `offset + rate * t` at virtual time t; default: exact.
+        """Set a node's clock to `offset_s + rate * t` at virtual time t.
 
-        The clock belongs to the machine: a node that starts later under this name has it, too. For
-        a running node time jumps.
+        The clock belongs to the machine: later nodes of this name have the same clock. For a
+        running node time jumps.
 
         Raises:
-            ValueError: an argument is not finite, or the clock does not go forwards.
+            ValueError: an argument is not finite, or the rate is not positive.
         """
         clock = self._clocks[name] = Clock(offset_s, rate)
         if name in self._members:
@@ -264,45 +263,45 @@ class SimulatedNetwork(Simulation):
     # --- faults of the network --------------------------------------------------------------
 
     def cut(self, blocked: Callable[[str, str], bool] | None) -> None:
-        """Partition: messages from a to b are lost if `blocked(a, b)`; None ends it."""
+        """Drop messages from a to b if `blocked(a, b)`; None ends the partition."""
         self._cut = blocked
 
     def disconnect(self, name: str) -> None:
-        """Disconnect a node: it and the others see each other's tokens vanish at once.
+        """Disconnect a node; its tokens vanish for all others at once.
 
-        The node sees its own vanish, too, and `LinkDown` at a random place among these.
+        For the node itself all tokens vanish, with `LinkDown` at a random place among these events.
         """
         member = self._members[name]
         member.unplugged = True
         self._break_links([member])
 
     def reconnect(self, name: str) -> None:
-        """Reconnect a node: at once, or when the router is back."""
+        """Reconnect a node at once, or when the router is restored."""
         member = self._members[name]
         member.unplugged = False
         if self._router_up:
             self._join(member)
 
     def lose_router(self) -> None:
-        """Disconnect all nodes: each sees all others vanish at once."""
+        """Disconnect all nodes; for each of them all tokens vanish at once."""
         if self._router_up:
             self._router_up = False
             self._outages += 1
             self._break_links(list(self._members.values()))
 
     def restore_router(self) -> None:
-        """Bring the router back; each node reconnects after a time drawn from `REJOIN_S`."""
+        """Restore the router; each node reconnects after a random time in `REJOIN_S`."""
         if not self._router_up:
             self._router_up = True
             for member in self._members.values():
                 self._rejoin_later(member)
 
     def inject(self, key: str, payload: bytes) -> None:
-        """Deliver arbitrary bytes on a key, as an intruder could."""
+        """Deliver arbitrary bytes on a key."""
         for receiver in self._route(key):
             self._send(receiver, Received(key, payload))
 
-    # --- what transports call ---------------------------------------------------------------
+    # --- called by transports ---------------------------------------------------------------
 
     def transmit(self, sender: str, key: str, payload: bytes) -> None:
         """Send a payload to every subscriber of its key."""
@@ -322,7 +321,7 @@ class SimulatedNetwork(Simulation):
             ):
                 self.dropped += 1
                 continue
-            # `_send`, inlined: most events of a simulation originate here.
+            # `_send` inlined, because most events of a simulation originate here.
             arrival_s = self.now_s + conditions.delay_s + conditions.jitter_s * draw()
             arguments = (receiver.connection, message)
             heapq.heappush(self.queue, (arrival_s, next(self.order), receiver.receive, arguments))
@@ -330,9 +329,9 @@ class SimulatedNetwork(Simulation):
                 self._send(receiver, message)
 
     def query(self, key: str, payload: bytes, answer: Callable[[Answer | None], None]) -> None:
-        """Ask all servers of the key and take the first answer.
+        """Query all servers of a key and pass the first answer to `answer`.
 
-        The answer is None if there is no server, or if each has declined, died or been cut off.
+        The answer is None if there is no server, or if all have declined, ended or disconnected.
         """
         servers = [
             member for member in self._members.values() if member.connected and key in member.served
@@ -346,28 +345,28 @@ class SimulatedNetwork(Simulation):
             self.at(self.now_s + self.delay_s(), answer, None)
 
     def accept_answer(self, server: Member, token: int, given: Answer | None) -> None:
-        """Take the answer of a server; None: it declines."""
+        """Process the answer of a server; None: it declines."""
         if token in self._queries and server.connected and not server.closed:
             self._settle(token, given)
 
     def _settle(self, token: int, given: Answer | None) -> None:
-        """Pass the first answer on; None when no server is left that may answer."""
-        question = self._queries.get(token)
-        if question is None:
+        """Pass on the first answer, or None if no other server can answer."""
+        query = self._queries.get(token)
+        if query is None:
             return
-        for other in tuple(question.tokens) if given is not None else (token,):
+        for other in tuple(query.tokens) if given is not None else (token,):
             del self._queries[other]
-            question.tokens.discard(other)
-        if not question.tokens:
-            self.at(self.now_s + self.delay_s(), question.answer, given)
+            query.tokens.discard(other)
+        if not query.tokens:
+            self.at(self.now_s + self.delay_s(), query.answer, given)
 
     def _abandon_queries(self, server: Member) -> None:
-        """Settle the questions that a server can no longer answer."""
+        """Remove a server that can no longer answer from all open queries."""
         for token in [token for token, one in self._queries.items() if one.server is server]:
             self._settle(token, None)
 
     def update_routes(self, member: Member, expression: str) -> None:
-        """Update the routes of all matching keys after a subscription has changed."""
+        """Update the routes of all keys that a changed subscription matches."""
         for key in self._known_keys(expression):
             receivers = [other for other in self._routes[key] if other is not member]
             if not member.closed and matches_any(member.subscriptions, key):
@@ -375,7 +374,7 @@ class SimulatedNetwork(Simulation):
             self._routes[key] = tuple(receivers)
 
     def _known_keys(self, expression: str) -> list[str]:
-        """Return the matching keys that have routes."""
+        """Return the keys with routes that an expression matches."""
         fixed, star, rest = expression.partition("*")
         if not star:
             return [expression] if expression in self._routes else []
@@ -384,10 +383,10 @@ class SimulatedNetwork(Simulation):
         return [key for key in self._routes if matches(expression, key)]
 
     def remove(self, name: str) -> None:
-        """Remove a node that has left by itself."""
+        """Remove a node that has left the network itself."""
         self._vanish(name, self.conditions.delay_s)
 
-    # --- inside -----------------------------------------------------------------------------
+    # --- internals --------------------------------------------------------------------------
 
     def _reader(self, realm: str) -> _Reader:
         """Return the reader that all nodes of a realm share."""
@@ -407,8 +406,8 @@ class SimulatedNetwork(Simulation):
         self.at(self.now_s + seen_after_s, self._abandon_queries, member)
 
     def _hide(self, member: Member) -> None:
-        """Report to all others that the tokens of a member are gone."""
-        self.tokens.report(TokenDown, member, member.tokens, but=member)
+        """Report to all other members that the tokens of a member have vanished."""
+        self.tokens.report(TokenDown, member, member.tokens, exclude=member)
 
     def _lapse(self, member: Member, pause: int) -> None:
         if member.paused and member.pauses == pause and not member.closed:
@@ -424,17 +423,17 @@ class SimulatedNetwork(Simulation):
             member.connection += 1
             self._abandon_queries(member)
         for member in broken:
-            news: list[Delivery] = [TokenDown(key) for key in member.seen]
+            events: list[Delivery] = [TokenDown(key) for key in member.seen]
             member.seen.clear()
-            news.insert(self.random.randint(0, len(news)), LinkDown())
-            for item in news:
+            events.insert(self.random.randint(0, len(events)), LinkDown())
+            for item in events:
                 member.handle(item)
 
     def _join(self, member: Member) -> None:
         if member.connected:
             return
         member.connected = True
-        self.tokens.report(TokenUp, member, member.tokens, but=member)
+        self.tokens.report(TokenUp, member, member.tokens, exclude=member)
         self.tokens.report_existing(member, member.watched)
         member.handle(LinkUp())
 
@@ -445,7 +444,7 @@ class SimulatedNetwork(Simulation):
 
     def _rejoin(self, member: Member, outage: int) -> None:
         lost_again = self._outages != outage
-        # A paused node reconnects when it is resumed.
+        # A paused node reconnects after it has been resumed.
         if not (lost_again or member.paused or member.unplugged or member.closed):
             self._join(member)
 

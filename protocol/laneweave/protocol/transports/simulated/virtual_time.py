@@ -1,4 +1,4 @@
-"""Virtual time: an event queue, the conditions and clocks of a simulation, and its trace digest."""
+"""Virtual time: event queue, conditions and clocks of a simulation, and trace digests."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from laneweave.protocol.runtime.transport import (
 Item = Delivery | Computed | Started | Stopping | Wakeup
 """Input of a node."""
 Trace = Callable[[float, str, Item], None]
-"""Called with the virtual time, a node's name and its input, in order."""
+"""Called with virtual time, node name and input, in order."""
 Action = Callable[..., None]
 
 _SHARE = and_(ge(0.0), le(1.0))
@@ -34,40 +34,40 @@ _TIME = and_(ge(0.0), lt(math.inf))
 
 @frozen
 class Conditions:
-    """How the network treats messages, and how long computations take."""
+    """Message faults, and durations of computations."""
 
     delay_s: float = field(default=0.002, validator=_TIME)
     jitter_s: float = field(default=0.003, validator=_TIME)
-    """Delay is uniform in [delay, delay + jitter], so messages overtake each other."""
+    """The delay is uniform in [delay, delay + jitter], so messages overtake each other."""
     loss: float = field(default=0.0, validator=_SHARE)
-    """Probability that a receiver does not get a message."""
+    """Probability that a receiver loses a message."""
     duplication: float = field(default=0.0, validator=_SHARE)
-    """Probability that a receiver gets a message twice."""
+    """Probability that a receiver receives a message twice."""
     lease_s: float = field(default=0.5, validator=_TIME)
-    """The tokens of a paused node vanish after this time."""
+    """Time after which the tokens of a paused node vanish."""
     compute_s: float = field(default=0.05, validator=_TIME)
-    """Minimum virtual time of a computation."""
+    """Minimum virtual duration of a computation."""
     compute_jitter_s: float = field(default=0.0, validator=_TIME)
-    """Computation time is uniform in [compute, compute + jitter]."""
+    """The duration is uniform in [compute, compute + jitter]."""
     compute_failure: float = field(default=0.0, validator=_SHARE)
     """Probability that a computation fails."""
 
 
 @frozen
 class Clock:
-    """A machine's clock, which shows `offset + rate * t` at virtual time t."""
+    """A machine's clock, which reads `offset_s + rate * t` at virtual time t."""
 
     offset_s: float = field(default=0.0, validator=and_(gt(-math.inf), lt(math.inf)))
     rate: float = field(default=1.0, validator=and_(gt(0.0), lt(math.inf)))
 
     def local_s(self, virtual_s: float) -> float:
-        """Return the time that the clock shows at a virtual time."""
+        """Return the reading of the clock at a virtual time."""
         return self.offset_s + self.rate * virtual_s
 
     def virtual_s(self, local_s: float) -> float:
-        """Return the first virtual time, up to rounding, at which the clock shows `local_s`."""
+        """Return the first virtual time, up to rounding, at which the clock reads `local_s`."""
         virtual_s = (local_s - self.offset_s) / self.rate
-        # Round up: a node that is woken must not find that its time has not come yet.
+        # Round up: a wakeup must not be early on the node's clock.
         step_s = math.ulp(virtual_s)
         while self.local_s(virtual_s) < local_s:
             virtual_s += step_s
@@ -76,31 +76,31 @@ class Clock:
 
 
 class Simulation:
-    """Virtual clock, queue of future events, and the one random generator."""
+    """Virtual clock, queue of future events, and random generator."""
 
     def __init__(self, seed: int, conditions: Conditions | None = None) -> None:
         """Start at time 0 with an empty queue."""
         self.now_s = 0.0
         self.conditions = conditions or Conditions()
-        """May be replaced at any time; messages in transit are not affected."""
+        """May be replaced at any time, without effect on messages in transit."""
         self.trace: Trace | None = None
-        """Called with every input of every node, if set."""
+        """Called with every input of every node; None: no trace."""
         self.dropped = 0
-        """Messages that did not reach a receiver, counted per receiver."""
+        """Lost messages, counted per receiver."""
         self.delivered = 0
-        """Deliveries to nodes."""
+        """Number of deliveries to nodes."""
         self.random = random.Random(seed)  # noqa: S311 (simulation, not secrets)
         self.queue: list[tuple[float, int, Action, tuple[Any, ...]]] = []
-        """(time, order among equal times, action, arguments)."""
+        """(time, order among equal times, action, arguments) of each future event."""
         self.order = count()
 
     def at(self, time_s: float, action: Action, *arguments: object) -> None:
-        """Schedule an action at a virtual time; a time in the past means now."""
+        """Schedule an action at a virtual time, or now if the time has passed."""
         at_s = max(time_s, self.now_s)
         heapq.heappush(self.queue, (at_s, next(self.order), action, arguments))
 
     def step(self) -> bool:
-        """Process the next event; return False if there is none."""
+        """Process the next event; return whether there was one."""
         if not self.queue:
             return False
         self.now_s, _, action, arguments = heapq.heappop(self.queue)
@@ -124,10 +124,9 @@ class Simulation:
 
 
 class TraceDigest:
-    """A trace that keeps a running hash of all inputs of all nodes: are two runs the same?
+    """A trace that computes a hash of all inputs of all nodes, to compare two runs.
 
-    Results of computations are left out, since they may be any object; their effect shows in the
-    messages that follow.
+    It omits the results of computations, which may be any object but affect later messages.
     """
 
     def __init__(self) -> None:

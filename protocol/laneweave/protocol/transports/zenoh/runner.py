@@ -1,4 +1,4 @@
-"""Runner that drives a core over Zenoh in real time: the shell of every role."""
+"""Runner of a core over Zenoh in real time, for all roles."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def run_core(
     pool: WorkerPool | None = None,
     observe: Observe = unobserved,
 ) -> None:
-    """Drive a core over Zenoh until it ends or the process gets SIGINT or SIGTERM.
+    """Run a core over Zenoh until it ends or the process receives SIGINT or SIGTERM.
 
-    Call it from the main thread. `Compute` jobs run in a thread, `Delegate` jobs in `pool`, which
-    only a core that delegates needs. `observe` registers the metrics source of node and core.
+    Must be called in the main thread. `Compute` jobs run in a thread, `Delegate` jobs in `pool`,
+    which only a core that delegates needs. `observe` registers the metrics of node and core.
 
     Raises:
-        BadInputError: the realm is malformed, or no router has answered at the endpoint within
+        BadInputError: the realm is malformed, or no router answers at the endpoint within
             `connect_timeout_s`.
     """
     keys = Keys(access.realm)
@@ -64,7 +64,7 @@ def run_core(
             inbox.put(Computed(job.job, None, "this process has no workers"))
 
     with stop_signals(lambda: inbox.put(Stopping())):
-        # Before the connection, the inbox can contain nothing but `Stopping`.
+        # Before the connection, the inbox can contain only `Stopping`.
         transport = connect(access, inbox.put, lambda wait_s: any(inbox.take(wait_s)))
         if transport is None:
             return
@@ -106,13 +106,10 @@ def _handle(node: Node, item: Item) -> None:
 
 
 class _Worker:
-    """Thread that computes.
-
-    Started when first needed, and a daemon, so that the process can end without waiting for it.
-    """
+    """Daemon thread for computations, started with the first one."""
 
     def __init__(self, done: Callable[[Computed], None]) -> None:
-        """Prepare; `done` is called from the thread."""
+        """Create the worker; `done` is called from its thread."""
         self._done = done
         self._jobs: queue.SimpleQueue[Compute] | None = None
 

@@ -1,4 +1,4 @@
-"""Settings of Zenoh sessions, as (path in its configuration, value). Pure.
+"""Settings of Zenoh sessions, as (path in Zenoh's configuration, value).
 
 docs/PROTOCOL.md gives the reasons.
 """
@@ -13,8 +13,8 @@ from laneweave.protocol.security.connection import Access, Credentials, RouterGu
 
 DROP_AFTER_US = 50
 OPEN_MS = 2000
-"""Timeout of one attempt to connect. While a link is cut, packets are lost, and a longer attempt
-would still be waiting when the link is back."""
+"""Timeout of one attempt to connect. An attempt on a cut link waits until its timeout, even if the
+link is restored before."""
 Setting = tuple[str, Any]
 
 
@@ -22,7 +22,7 @@ def client_settings(access: Access) -> Iterator[Setting]:
     """Yield the settings of a client."""
     yield from _common_settings("client", access.lease_s)
     yield "connect/endpoints", [access.endpoint]
-    # As one value: its parts cannot be set individually.
+    # Zenoh does not accept the parts individually.
     yield (
         "connect/retry",
         {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5},
@@ -34,7 +34,7 @@ def client_settings(access: Access) -> Iterator[Setting]:
 def router_settings(
     endpoints: Sequence[str], lease_s: float, guard: RouterGuard | None
 ) -> Iterator[Setting]:
-    """Yield the settings of a router; without a guard all clients may do everything."""
+    """Yield the settings of a router; without a guard all clients have all rights."""
     yield from _common_settings("router", lease_s)
     yield "listen/endpoints", list(endpoints)
     if guard is not None:
@@ -51,8 +51,8 @@ def _common_settings(mode: str, lease_s: float) -> Iterator[Setting]:
     yield "transport/link/tx/lease", int(lease_s * 1000)
     yield "transport/unicast/open_timeout", OPEN_MS
     yield "transport/shared_memory/enabled", False
-    # A client that hangs fills its buffers. Senders that block must wait for less than a lease, or
-    # all sessions would expire; senders that may drop do so at once.
+    # The buffers of a hanging client fill up. Blocking senders must wait for less than a lease, or
+    # all sessions would expire; other senders drop messages at once.
     yield f"{congestion}/block/wait_before_close", int(lease_s * 1e6 / 3)
     yield f"{congestion}/drop/wait_before_drop", DROP_AFTER_US
 
@@ -67,9 +67,9 @@ def _tls_settings(credentials: Credentials, side: str) -> Iterator[Setting]:
         yield f"{tls}/{side}_private_key_base64", encoded
     else:
         yield f"{tls}/{side}_private_key", credentials.private_key
-    # Both sides show certificates, and close the link when one expires.
+    # Both sides present certificates, and close the link when one expires.
     yield f"{tls}/enable_mtls", True
     yield f"{tls}/verify_name_on_connect", True
     yield f"{tls}/close_link_on_expiration", True
-    # TLS only, whatever an endpoint says.
+    # Only TLS, for any endpoint.
     yield "transport/link/protocols", ["tls"]

@@ -1,8 +1,8 @@
-"""The transport over Zenoh: the only module that imports zenoh.
+"""The transport over Zenoh; the only module that imports zenoh.
 
-Shape: every process is a client of one router, which is a Python process itself. Scouting and
-gossip are off; nothing listens but the router. Callbacks only enqueue. See docs/PROTOCOL.md for
-the settings of each topic and why they are so.
+Every process is a client of one router, which is also a Python process. Scouting and gossip are
+off; only the router listens. Callbacks only enqueue. docs/PROTOCOL.md explains the settings of each
+topic.
 """
 
 from __future__ import annotations
@@ -43,8 +43,7 @@ from laneweave.protocol.wire.topics import Party, Quality
 
 log = structlog.get_logger(__name__)
 
-# Express would send each sample in a packet of its own; with DROP it loses most of a synchronised
-# burst, so it is off everywhere.
+# With `express` each sample has its own packet, and DROP loses most of a synchronised burst.
 _QUALITY: dict[Quality, dict[str, Any]] = {
     quality: {"congestion_control": congestion, "priority": priority, "express": False}
     for quality, congestion, priority in (
@@ -55,20 +54,20 @@ _QUALITY: dict[Quality, dict[str, Any]] = {
 }
 
 MAX_OPEN_QUERIES = 4096
-"""Maximum number of open questions; more are declined."""
+"""Maximum number of open queries; further ones are declined."""
 TOO_LONG = bytes(MAX_BYTES + 1)
-"""Payload that replaces one that is too long, which is not read."""
+"""Replacement of a payload that is too long to be read."""
 ROUTER_RUNTIME = "(rx: (worker_threads: 64))"
-"""Zenoh's default are two threads that receive. Each connection that has run into its lease holds
-one of them while it is closed, for up to 10 s (the linger of its socket): with two of them gone,
-no messages are forwarded. As many processes may vanish with a host at once."""
+"""Zenoh's default is two receiving threads. Closing an expired connection blocks one of them for up
+to 10 s (the linger of its socket), and without a free thread no messages are forwarded. When a host
+fails, many connections expire at once."""
 _RUNTIME_VARIABLE = "ZENOH_RUNTIME"
 CLIENT_RUNTIME = (
     "(app: (worker_threads: 1), acc: (handover: app), tx: (handover: app), rx: (handover: app), "
     "net: (handover: app))"
 )
-"""A single thread for all of Zenoh's task pools in a client. With one process per vehicle, passing
-each message between threads costs about a tenth of the time of two cores."""
+"""A single thread for all of Zenoh's task pools in a client: with one process per vehicle, passing
+messages between threads costs about a tenth of the time of two cores."""
 CONNECT_AGAIN_S = 0.5
 """Interval between attempts to connect."""
 
@@ -77,12 +76,12 @@ def _open(settings: Iterable[Setting], runtime: str) -> zenoh.Session:
     """Open a session.
 
     Args:
-        settings: of the session.
-        runtime: value of `ZENOH_RUNTIME`, unless the environment sets it. Zenoh reads it at the
-            first session of a process only.
+        settings: settings of the session.
+        runtime: value of `ZENOH_RUNTIME` if the environment does not set it. Zenoh reads it only
+            for the first session of a process.
 
     Raises:
-        zenoh.ZError: no router answers, or it cannot listen.
+        zenoh.ZError: no router answers, or the router cannot listen.
     """
     config = zenoh.Config()
     for path, value in settings:
@@ -93,12 +92,12 @@ def _open(settings: Iterable[Setting], runtime: str) -> zenoh.Session:
     try:
         return zenoh.open(config)
     finally:
-        # Child processes may have another role, and inherit the environment.
+        # Child processes inherit the environment and may have another role.
         os.environ.pop(_RUNTIME_VARIABLE, None)
 
 
 class ZenohTransport:
-    """One client session."""
+    """A client session; a `Transport`."""
 
     def __init__(self, access: Access, deliver: Deliver) -> None:
         """Connect to a router.
@@ -127,7 +126,7 @@ class ZenohTransport:
         self._tokens: dict[str, Any] = {}
         self._watched: dict[str, Any] = {}
         self._seen: dict[str, None] = {}
-        """Keys of the tokens that the node knows to be there."""
+        """Keys of the tokens that the node has been notified of."""
         self._seen_lock = threading.Lock()
         self._served: dict[str, Any] = {}
         self._queries: dict[int, zenoh.Query] = {}
@@ -139,25 +138,25 @@ class ZenohTransport:
         )
 
     def publish(self, key: str, payload: bytes, quality: Quality) -> None:
-        """Send; silently lost while there is no connection."""
+        """Send a payload, which is silently lost without a connection."""
         with contextlib.suppress(zenoh.ZError):
             self._session.put(key, payload, **_QUALITY[quality])
 
     def subscribe(self, key_expression: str) -> None:
-        """Subscribe once; a second call for the same expression does nothing."""
+        """Subscribe to matching keys; repeated calls have no effect."""
         if key_expression not in self._subscriptions and not self._closed:
             self._subscriptions[key_expression] = self._session.declare_subscriber(
                 key_expression, self._on_sample
             )
 
     def unsubscribe(self, key_expression: str) -> None:
-        """Undo `subscribe`."""
+        """Cancel a subscription."""
         subscription = self._subscriptions.pop(key_expression, None)
         if subscription is not None:
             subscription.undeclare()
 
     def announce(self, key: str) -> None:
-        """Show a liveliness token."""
+        """Declare a liveliness token."""
         if key not in self._tokens and not self._closed:
             self._tokens[key] = self._session.liveliness().declare_token(key)
 
@@ -168,7 +167,7 @@ class ZenohTransport:
             token.undeclare()
 
     def watch(self, key_expression: str) -> None:
-        """Watch liveliness tokens once; a second call for the same expression does nothing."""
+        """Watch matching liveliness tokens; repeated calls have no effect."""
         if key_expression not in self._watched and not self._closed:
             self._watched[key_expression] = self._session.liveliness().declare_subscriber(
                 key_expression, self._on_token, history=True
@@ -204,14 +203,11 @@ class ZenohTransport:
     def query(
         self, key: str, payload: bytes, timeout_s: float, encoding: str = ""
     ) -> Future[Answer | None]:
-        """Ask the servers of a key.
+        """Query the servers of a key.
 
         Returns:
-            The first answer. None: the key has no server, or each has declined, died or been cut
-            off.
-
-        Raises:
-            TimeoutError: as the future's result, if no server has answered in time.
+            A future of the first answer. None: the key has no server, or all have declined, ended
+            or disconnected. The future raises `TimeoutError` if no server answers in time.
         """
         first: Future[Answer | None] = Future()
         first.set_running_or_notify_cancel()
@@ -219,8 +215,7 @@ class ZenohTransport:
         def take(reply: zenoh.Reply) -> None:
             _settle(first, _answer_of(reply))
 
-        # Without consolidation each reply is delivered as it comes: a server that hangs must not
-        # delay the answers of the others.
+        # With consolidation, a hanging server would delay the answers of the others.
         try:
             self._session.get(
                 key,
@@ -235,10 +230,10 @@ class ZenohTransport:
         return first
 
     def close(self) -> None:
-        """Close the session; without it a callback subscriber hangs the interpreter at exit."""
+        """Close the session; otherwise its subscribers would block the exit of the interpreter."""
         if not self._closed:
             self._closed = True
-            # Closing undeclares everything; later calls must not touch the closed session.
+            # Closing undeclares everything; later calls must not access the closed session.
             self._subscriptions.clear()
             self._tokens.clear()
             self._session.close()  # type: ignore[no-untyped-call]
@@ -247,12 +242,12 @@ class ZenohTransport:
         self._deliver(Received(str(sample.key_expr), sample.payload.to_bytes()))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
-        # A session's own token comes from itself and, at times, again from the router.
+        # The session reports its own tokens, and sometimes the router reports them again.
         kind = TokenUp if sample.kind == zenoh.SampleKind.PUT else TokenDown
-        news = kind(str(sample.key_expr))
+        event = kind(str(sample.key_expr))
         with self._seen_lock:
-            if update_tokens(self._seen, news):
-                self._deliver(news)
+            if update_tokens(self._seen, event):
+                self._deliver(event)
 
     def _on_link(self, event: zenoh.TransportEvent) -> None:
         self._deliver(LinkUp() if event.kind == zenoh.SampleKind.PUT else LinkDown())
@@ -280,22 +275,22 @@ def connect(
     Args:
         access: see `ZenohTransport`.
         deliver: see `ZenohTransport`.
-        stopped: waits for some seconds and returns whether the process was asked to end.
+        stopped: waits for some seconds and returns whether the process is to end.
 
     Returns:
-        The session; None: the process was asked to end meanwhile.
+        The session; None if the process is to end.
 
     Raises:
-        BadInputError: the endpoint is malformed, or no router has answered there in time.
+        BadInputError: the endpoint is malformed, or no router answers there in time.
     """
     check_endpoint(access.endpoint)
-    give_up_s = time.monotonic() + access.connect_timeout_s
+    deadline_s = time.monotonic() + access.connect_timeout_s
     waiting = False
     while True:
         try:
             return ZenohTransport(access, deliver)
         except BadInputError as error:
-            if error.field != "network.endpoint" or time.monotonic() >= give_up_s:
+            if error.field != "network.endpoint" or time.monotonic() >= deadline_s:
                 raise
         if not waiting:
             waiting = True
@@ -305,10 +300,10 @@ def connect(
 
 
 def connect_blocking(access: Access, deliver: Deliver) -> ZenohTransport:
-    """Connect as `connect` does, without a way to stop.
+    """Connect as `connect` does, in a process that is not stopped by a callback.
 
     Raises:
-        BadInputError: as `connect`.
+        BadInputError: see `connect`.
     """
     transport = connect(access, deliver, time.sleep)
     assert transport is not None  # noqa: S101 (`sleep` returns None)
@@ -326,15 +321,15 @@ def run_router(
     """Run a Zenoh router until SIGINT or SIGTERM.
 
     Args:
-        listen: endpoints where it listens. A socket file that a killed router left is replaced.
-        lease_s: clients consider the router lost after this time of silence.
-        ready: called when it listens.
-        field: name of the field with the endpoints, for errors.
-        guard: rights and credentials; None: all clients may do everything.
-        observe: registers the metrics source, once it listens.
+        listen: endpoints at which it listens; a socket file left by a killed router is replaced.
+        lease_s: time of silence after which clients consider the router lost.
+        ready: called when the router listens.
+        field: field of the endpoints, for errors.
+        guard: rights and credentials; None: all clients have all rights.
+        observe: registers the metrics source when the router listens.
 
     Raises:
-        BadInputError: it cannot listen at an endpoint, or its credentials are not valid.
+        BadInputError: the router cannot listen at an endpoint, or its credentials are invalid.
     """
     endpoints = [check_endpoint(endpoint, field) for endpoint in listen]
     if guard is not None:
@@ -345,7 +340,7 @@ def run_router(
             session = _open(router_settings(endpoints, lease_s, guard), ROUTER_RUNTIME)
         except zenoh.ZError as error:
             raise BadInputError(
-                field, ", ".join(endpoints), "endpoints that are free to listen at"
+                field, ", ".join(endpoints), "endpoints that are not in use"
             ) from error
         try:
             observe(lambda: [RouterMetrics(len(session.info.transports()))])
@@ -372,7 +367,7 @@ def _answer_of(reply: zenoh.Reply) -> Answer | Exception:
 
 
 def _settle(first: Future[Answer | None], answer: Answer | Exception | None) -> None:
-    """Complete a future unless it is complete."""
+    """Complete a future unless it is already complete."""
     if first.done():
         return
     with contextlib.suppress(InvalidStateError):
