@@ -1,4 +1,4 @@
-"""The simulated world: demand, vehicles' bodies and motion controllers, SUMO, measurement.
+"""The simulated world: demand, bodies and motion controllers of vehicles, SUMO, recording.
 
 Entry points: `core.BridgeCore` (lockstep ticks with agents), `process.run_bridge` (over Zenoh),
 `baselines.reference_road` (methods without agents). Imported by launch only.

@@ -1,10 +1,10 @@
 """The bridge's core: lockstep ticks between the simulated world and the vehicles' agents.
 
-In a tick the roadside admits vehicles, every vehicle on the road receives a SENSE, its agent
-answers with a trajectory, all bodies move by one tick, the world shows them, and gaps and overlaps
-are measured. SENSE is repeated to agents that have not answered (`answers`); after the deadline
-their motion controllers continue with the trajectory that they have. A vehicle whose agent is
-absent or silent gets a caretaker (`attendance`).
+In each tick the roadside admits vehicles, every vehicle on the road receives a SENSE, its agent
+answers with a trajectory, all bodies move by one tick, the world displays them, and gaps and
+overlaps are measured. SENSE is repeated to agents that have not answered (`tick_answers`); after
+the deadline their motion controllers continue their trajectories. A vehicle whose agent is absent
+or silent gets a caretaker (`attendance`).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ log = structlog.get_logger(__name__)
 
 BRIDGE = Name("bridge")
 SHUT_DOWN_S = 2.0
-"""How long the bridge waits for final reports at the end of a run."""
+"""Maximum wait for final reports at the end of a run."""
 
 
 @frozen
@@ -73,32 +73,32 @@ class BridgeMetrics:
     ABOUT: ClassVar[str] = "bridge"
 
     road_seconds: float = metric("Road time")
-    ticks_total: int = metric("Ticks of the road that are over")
+    ticks_total: int = metric("Completed ticks of the road")
     missed_answers_total: int = metric(
-        "Answers of agents that had not come when their tick's deadline passed"
+        "Answers of agents that were missing at their tick's deadline"
     )
-    vehicles_demanded_total: int = metric("Vehicles that have arrived at the road")
+    vehicles_demanded_total: int = metric("Vehicles that have arrived at the entrance")
     vehicles_entered_total: int = metric("Vehicles that have entered the road")
     vehicles_left_total: int = metric("Vehicles that have left the road at its end")
     vehicles_on_road: int = metric("Vehicles on the road")
-    vehicles_unattended: int = metric("Vehicles on the road of which a caretaker is in charge")
+    vehicles_unattended: int = metric("Vehicles on the road with a caretaker in charge")
 
 
 class TickPhase(Enum):
-    """State of the current tick: what the bridge waits for."""
+    """State of the current tick: what the bridge is waiting for."""
 
     STARTING = "starting"
     AGENTS = "agents"
-    """The agents of vehicles at the entrance."""
+    """Agents of vehicles at the entrance."""
     ANSWERS = "answers"
     PACE = "pace"
-    """The time of the next tick."""
+    """Start time of the next tick."""
     SHUTTING_DOWN = "wind-up"
     ENDED = "ended"
 
 
 class BridgeCore:
-    """State machine of the bridge; see `Core` for how it is driven."""
+    """State machine of the bridge; a `Core`."""
 
     def __init__(
         self,
@@ -111,16 +111,16 @@ class BridgeCore:
         incarnation: int = 0,
         stopwatch: Callable[[], float] = time.perf_counter,
     ) -> None:
-        """Set the world up before the first tick.
+        """Create the bridge before the first tick.
 
         Args:
             scenario: road, demand, vehicles.
             world: an empty world.
             record: receives the measurements.
-            new_incarnation: returns a number that no process has used before, for caretakers.
+            new_incarnation: returns an unused incarnation, for caretakers.
             pace: maximum road seconds per second of the node's clock; None: the scenario's.
-            incarnation: distinguishes this road from earlier ones of the same deployment.
-            stopwatch: measures the duration of ticks [s]; has no other effect.
+            incarnation: distinguishes this road from earlier roads of the same deployment.
+            stopwatch: clock [s] for measuring the duration of ticks.
         """
         self.scenario = scenario
         self.tick = 0
@@ -129,7 +129,7 @@ class BridgeCore:
         self._world = world
         self._record = record
         self._roadside = Roadside(scenario, incarnation)
-        self._tick_lasts_s = scenario.runtime.tick_s / (pace or scenario.runtime.max_pace)
+        self._tick_duration_s = scenario.runtime.tick_s / (pace or scenario.runtime.max_pace)
         self._incarnation = incarnation
         self._stopwatch = stopwatch
         self._attendance = Attendance(scenario, new_incarnation)
@@ -138,14 +138,14 @@ class BridgeCore:
         self._unreported: set[str] = {BRIDGE}
         """Processes whose final report is awaited."""
         self._agent_wait_s = scenario.runtime.agent_start_s
-        """How long to wait for the next agent that is not up yet."""
+        """Maximum wait for agents at the entrance."""
         self._ending = Ending.COMPLETE
         self._tick_began = 0.0
         self._opened_s = 0.0
         self._until_s = 0.0
-        """Deadline of every phase but ANSWERS, which has its own."""
+        """Deadline of all phases except ANSWERS."""
 
-    # --- as a core ----------------------------------------------------------------------------
+    # --- core interface -----------------------------------------------------------------------
 
     @property
     def metrics(self) -> tuple[MetricsSnapshot, ...]:
@@ -171,7 +171,7 @@ class BridgeCore:
 
     @property
     def wakeup_s(self) -> float | None:
-        """Next resend, deadline, or tick."""
+        """Time of the next resend, deadline or tick."""
         match self.phase:
             case TickPhase.ANSWERS:
                 return min(self._answers.resend_s, self._answers.deadline_s)
@@ -181,9 +181,9 @@ class BridgeCore:
                 return None
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
-        """Take an event; see `Core`."""
+        """Handle an event, see `Core`."""
         if isinstance(event, Arrived) and isinstance(event.message, Command):
-            effects = self._on_command(event.message)  # nearly every event is one
+            effects = self._on_command(event.message)  # most events
         else:
             effects = list(self._on_event(event, now_s))
         if self.phase is not TickPhase.ANSWERS or self._answers.complete(now_s):
@@ -209,7 +209,7 @@ class BridgeCore:
                 for name in self._answers.due_resends(now_s):
                     yield self._sense_of(self.vehicles[name])
             case Stopping():
-                # Stopped while it waits for final reports: the run itself has ended.
+                # While the bridge waits for final reports, the run itself has ended.
                 shutting_down = self.phase is TickPhase.SHUTTING_DOWN
                 self._finish(self._ending if shutting_down else Ending.INTERRUPTED)
             case _:
@@ -242,7 +242,7 @@ class BridgeCore:
         if self._attendance.register_command(vehicle, command):
             effects.append(self._sense_of(vehicle))
         if command.tick != self.tick or self.phase is not TickPhase.ANSWERS:
-            # A late answer was computed for a past state: executed now, it would end elsewhere.
+            # A late answer was computed for a past state and would lead to a wrong position.
             if command.tick < self.tick and command.incarnation == attendant:
                 self._answers.late(name)
             return effects
@@ -251,7 +251,7 @@ class BridgeCore:
         except BadInputError as error:
             log.warning("command ignored", vehicle=name, reason=str(error))
             return effects
-        # Only an accepted command changes the process in charge.
+        # Only an accepted command can change the process in charge.
         if attendant not in (0, vehicle.controller.attendant):
             previous = "caretaker" if had_caretaker else "agent"
             self._record.on_agent_took_over(self.t_s, name, previous)
@@ -260,14 +260,14 @@ class BridgeCore:
     def _on_report(self, report: Report) -> None:
         if report.role in ("agent", "bridge"):
             if report.name not in self._unreported:
-                return  # about a vehicle of an earlier run, or a duplicate
+                return  # a vehicle of an earlier run, or a duplicate
             self._unreported.discard(report.name)
         self._record.on_report(report)
 
     # --- the tick -----------------------------------------------------------------------------
 
     def _proceed(self, now_s: float) -> Iterator[Effect]:
-        """Proceed through the phases until one has to wait, for one tick at most."""
+        """Advance through the phases, by at most one tick, until one has to wait."""
         if self.phase is TickPhase.PACE and now_s >= self._until_s:
             self._open_tick(now_s)
         if self.phase is TickPhase.AGENTS:
@@ -283,7 +283,7 @@ class BridgeCore:
             yield End()
 
     def _open_tick(self, now_s: float) -> None:
-        """Admit vehicles at the entrance; wait for their agents."""
+        """Admit vehicles at the entrance and start to wait for their agents."""
         self._opened_s = now_s
         self._tick_began = self._stopwatch()
         for arrival in self._roadside.newly_demanded(self.t_s):
@@ -317,7 +317,7 @@ class BridgeCore:
                 self._unreported.add(vehicle.name)
             else:
                 self._record.event(self.t_s, AGENT_MISSING, vehicle=vehicle.name)
-                # After a missing agent, do not wait long for the next ones until one appears.
+                # After a missing agent, wait only briefly for others until one appears.
                 self._agent_wait_s = self.scenario.network.resend_s
         self._at_entrance.clear()
 
@@ -355,11 +355,11 @@ class BridgeCore:
         if self._is_over():
             yield from self._shut_down(now_s)
             return
-        lasts_s = self._tick_lasts_s
+        min_s = self._tick_duration_s
         if self._answers.all_silent or not self._attendance.link_up:
-            # No agent can answer: do not run ahead of the vehicles during a network failure.
-            lasts_s = max(lasts_s, self.scenario.runtime.tick_s)
-        self._until_s = max(now_s, self._opened_s + lasts_s)
+            # No agent can answer: run at most in real time during a network failure.
+            min_s = max(min_s, self.scenario.runtime.tick_s)
+        self._until_s = max(now_s, self._opened_s + min_s)
         self.phase = TickPhase.PACE
 
     def _remove_departed(self) -> Iterator[Effect]:
@@ -388,8 +388,7 @@ class BridgeCore:
         yield from self._attendance.notify_departed(self.tick)
         for vehicle in self.vehicles.values():
             yield notify_left(vehicle, self.tick)
-        # Last, so that it counts everything, and through the network like the others: the node adds
-        # its own counters.
+        # Sent last, through the network like the other reports: the node adds its counters.
         yield Send(REPORT, Report(role=BRIDGE, name=BRIDGE), {"role": BRIDGE, "name": BRIDGE})
         self.phase = TickPhase.SHUTTING_DOWN
         self._until_s = now_s + SHUT_DOWN_S

@@ -1,4 +1,4 @@
-"""The bridge process: SUMO on one side, Zenoh on the other."""
+"""The bridge process, which connects SUMO to Zenoh."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def run_bridge(
     Args:
         scenario: complete configuration.
         folder: the run's folder.
-        method: name of the control method, for the summary.
+        method: name of the control method in the summary.
         pace: maximum road seconds per second; None: the scenario's.
         wrap: wraps the core, to inject faults.
         observe: registers the metrics source.
@@ -56,5 +56,5 @@ def run_bridge(
         try:
             run_core(wrap(core), access_of(scenario, "bridge"), observe=observe)
         finally:
-            # Also after an error, to keep what was recorded.
+            # Also after an error, to save the recorded data.
             record.close(core.t_s, Ending.INTERRUPTED)

@@ -1,4 +1,4 @@
-"""The world in which bodies are shown, measured and sensed."""
+"""Interface of the world that displays and measures bodies."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 
 class World(Protocol):
-    """Shows bodies; `SumoWorld` outside tests."""
+    """Display of bodies; tests replace `SumoWorld`."""
 
     def add(self, vehicle: str, state: State) -> None:
-        """Put a vehicle on the road."""
+        """Add a vehicle to the road."""
 
     def place(self, vehicle: str, state: State) -> None:
         """Set the state of a vehicle at the end of the next step."""
@@ -32,7 +32,7 @@ class World(Protocol):
         """Return the pairs that the world itself reports as colliding."""
 
     def remove(self, vehicle: str) -> None:
-        """Take a vehicle off the road."""
+        """Remove a vehicle from the road."""
 
 
 def show_bodies(
@@ -42,9 +42,9 @@ def show_bodies(
     record: RunRecord,
     t_s: float,
 ) -> None:
-    """Show all bodies after a tick, record their poses, and update every vehicle's sensors.
+    """Display all bodies after a tick, record their poses and update all sensors.
 
-    The vehicles have already moved by one tick; `t_s` is the road time after it.
+    `t_s` is the road time after the tick.
     """
     states = {name: vehicle.state for name, vehicle in vehicles.items()}
     for name, state in states.items():

@@ -1,8 +1,8 @@
-"""SUMO's own lane changing and car following: LC2013 and Krauss, as automated vehicles.
+"""SUMO's own lane changing (LC2013) and car following (Krauss), for automated vehicles.
 
 Headway and desired speed are those of the other methods; all vehicles are equal and drive without
-imperfection. The route to its exit makes SUMO choose each vehicle's preferred lane; in S1 and S2
-lane changes are switched off unless the scenario allows them everywhere.
+imperfection. A vehicle's route leads to the exit of its preferred lane. In S1 and S2 lane changes
+are disabled unless the scenario allows them everywhere.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from laneweave.sim_bridge.sumo.traffic import SumoTraffic
 
 
 class Lc2013Traffic:
-    """The vehicles on the road, driven by SUMO; see `Traffic`."""
+    """The vehicles on the road, driven by SUMO; a `Traffic`."""
 
     def __init__(self, scenario: Scenario, sumo: SumoTraffic) -> None:
         """Begin with an empty road."""
         self._sumo = sumo
         self._vehicles: dict[str, ReferenceVehicle] = {}
         self._offered: dict[str, int] = {}
-        """Lane of each vehicle that waits in SUMO for room, at most one per lane."""
+        """Lane of each vehicle that waits in SUMO for insertion, at most one per lane."""
         self._kept_on_lane: set[ReferenceVehicle] = set()
         """Vehicles that may not change lanes yet."""
         self._poses: dict[str, Pose] = {}
@@ -39,7 +39,7 @@ class Lc2013Traffic:
         return self._vehicles.values()
 
     def step(self, t_s: float, entrance: Entrance) -> list[ReferenceVehicle]:
-        """Let SUMO move all vehicles on to `t_s` and insert those for which there is room."""
+        """Let SUMO advance to `t_s`; return the vehicles that it has inserted."""
         self._offer(t_s, entrance)
         entered = self._sumo.advance()
         self._poses = self._sumo.positions()
@@ -61,13 +61,13 @@ class Lc2013Traffic:
         return self._sumo.collisions()
 
     def remove(self, vehicle: ReferenceVehicle) -> None:
-        """Take a vehicle off the road."""
+        """Remove a vehicle from the road."""
         del self._vehicles[vehicle.name]
         self._kept_on_lane.discard(vehicle)
         self._sumo.remove(vehicle.name)
 
     def _offer(self, t_s: float, entrance: Entrance) -> None:
-        """Offer SUMO the next vehicle of each lane once; SUMO inserts it when there is room."""
+        """Queue the next vehicle of each lane in SUMO, which inserts it when there is room."""
         for lane in range(self._road.lanes):
             arrival = entrance.next_on(lane)
             if arrival is not None and arrival.vehicle not in self._offered:
@@ -105,12 +105,12 @@ def check_lc2013(scenario: Scenario) -> None:
     """Check that SUMO can drive the vehicles.
 
     Raises:
-        BadInputError: names the field that does not fit.
+        BadInputError: a field is unsuitable.
     """
     headway_s, tick_s = scenario.lc2013.headway_s, scenario.runtime.tick_s
     if headway_s < tick_s:
         raise BadInputError(
             "lc2013.headway_s",
             headway_s,
-            f"at least runtime.tick_s = {tick_s:g}: a vehicle looks once in a tick",
+            f"at least runtime.tick_s = {tick_s:g}: a vehicle reacts once per tick",
         )

@@ -1,4 +1,4 @@
-"""The road of a reference method, tick by tick: demand, entrance, traffic, measurement, record."""
+"""The road of a reference method: demand, entrance, traffic, measurement and recording."""
 
 from __future__ import annotations
 
@@ -21,60 +21,60 @@ from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S
 
 @define(eq=False)
 class ReferenceVehicle:
-    """A vehicle on the road: position and lane, without formation and motion controller."""
+    """A vehicle on the road, without formation and motion controller."""
 
     arrival: Arrival
     entered_s: float
     """Road time at which its front passed s = 0."""
     s_m: float
-    """Position of the front bumper."""
+    """Position of the front bumper along the road."""
     speed_mps: float
     y_m: float
-    """Position of the body's centre."""
+    """Position of the body's centre across the road."""
     lane: int
-    """Its lane; during a lane change the new one."""
+    """Current lane; during a lane change the new lane."""
     accel_mps2: float = 0.0
     lateral_speed_mps: float = 0.0
     previous_lane: int | None = None
-    """During a lane change the old lane."""
+    """Old lane during a lane change."""
     formation: None = None
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Name of the vehicle."""
         return self.arrival.vehicle
 
     @property
     def preferred_lane(self) -> int:
-        """Lane on which it wants to leave the road."""
+        """Lane on which the vehicle wants to leave the road."""
         return self.arrival.preferred_lane
 
     @property
     def finished(self) -> bool:
-        """Whether all its lane changes are finished."""
+        """Whether all lane changes are finished."""
         return self.lane == self.preferred_lane and self.previous_lane is None
 
     @property
     def state(self) -> State:
-        """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2)."""
+        """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""
         return self.s_m, self.speed_mps, self.accel_mps2, self.y_m, self.lateral_speed_mps, 0.0
 
     @property
     def cell(self) -> tuple[None, int]:
-        """(None, lane): it is in no column."""
+        """(None, lane), since there are no columns."""
         return None, self.lane
 
     @property
     def rung_ticks(self) -> Mapping[Rung, int]:
-        """Empty: it has no motion controller."""
+        """Empty, since there is no motion controller."""
         return {}
 
 
 class Entrance:
-    """Queues of vehicles that wait to enter, by lane, in order of arrival."""
+    """Queues of waiting vehicles on each lane, in order of arrival."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Begin with empty queues."""
+        """Create empty queues."""
         self._queues: list[deque[Arrival]] = [deque() for _ in range(scenario.road.lanes)]
         self._speed_mps = scenario.formation.speed_mps
         self._tick_s = scenario.runtime.tick_s
@@ -88,30 +88,30 @@ class Entrance:
         self._queues[arrival.lane].append(arrival)
 
     def next_on(self, lane: int) -> Arrival | None:
-        """Return the next vehicle of a lane."""
+        """Return the next vehicle on a lane, if any."""
         return self._queues[lane][0] if self._queues[lane] else None
 
     def max_entry_m(self, arrival: Arrival, t_s: float) -> float:
-        """Return how far beyond s = 0 a vehicle can be at the tick at which it enters.
+        """Return the maximum position at which a vehicle can enter in this tick.
 
-        Vehicles arrive between ticks: one that does not wait has driven at v_F since its arrival.
+        A vehicle that arrived between two ticks and did not wait has driven at v_F since then.
         """
         return self._speed_mps * min(max(t_s - arrival.t_s, 0.0), self._tick_s)
 
     def take(self, lane: int) -> Arrival:
-        """Remove and return the next vehicle of a lane."""
+        """Remove and return the next vehicle on a lane."""
         return self._queues[lane].popleft()
 
 
 class Traffic(Protocol):
-    """The vehicles on the road, and the method that moves them."""
+    """The vehicles on the road, moved by a reference method."""
 
     @property
     def vehicles(self) -> Collection[ReferenceVehicle]:
         """All vehicles on the road."""
 
     def step(self, t_s: float, entrance: Entrance) -> list[ReferenceVehicle]:
-        """Move all vehicles on to `t_s`; return those that entered from the entrance."""
+        """Move all vehicles to their positions at `t_s`; return the vehicles that entered."""
 
     def poses(self) -> dict[str, Pose]:
         """Return the pose of each vehicle."""
@@ -120,11 +120,11 @@ class Traffic(Protocol):
         """Return the pairs that SUMO reports as colliding."""
 
     def remove(self, vehicle: ReferenceVehicle) -> None:
-        """Take a vehicle off the road."""
+        """Remove a vehicle from the road."""
 
 
 class ReferenceRoad:
-    """The road of a reference method; `advance` it until it has ended."""
+    """The road of a reference method; call `advance` until `ending` is set."""
 
     def __init__(
         self,
@@ -133,10 +133,7 @@ class ReferenceRoad:
         record: RunRecord,
         stopwatch: Callable[[], float] = time.perf_counter,
     ) -> None:
-        """Set the road up before the first tick.
-
-        `stopwatch` measures the duration of ticks [s]; it has no other effect.
-        """
+        """Create the road before the first tick; `stopwatch` measures the duration of ticks [s]."""
         self.tick = 0
         self._scenario = scenario
         self._traffic = traffic
@@ -154,7 +151,7 @@ class ReferenceRoad:
 
     @property
     def ending(self) -> Ending | None:
-        """Why the run has ended; None: it has not."""
+        """Reason for the end of the run; None while it continues."""
         if self._left == len(self._arrivals):
             return Ending.COMPLETE
         if self.t_s >= self._scenario.runtime.max_road_s:
@@ -163,7 +160,7 @@ class ReferenceRoad:
 
     @property
     def clock(self) -> RoadClock:
-        """Counts and road time, for the progress bar."""
+        """Road time and counts for the progress bar."""
         on_road = len(self._traffic.vehicles)
         return RoadClock(
             tick=self.tick,
@@ -177,14 +174,14 @@ class ReferenceRoad:
 
     def advance(self) -> None:
         """Advance by one tick."""
-        began = self._stopwatch()
+        start_s = self._stopwatch()
         self.tick += 1
         self._queue_arrivals()
         for vehicle in self._traffic.step(self.t_s, self._entrance):
             self._record.on_entered(vehicle)
         self._measure()
         self._remove_departed()
-        self._record.on_tick(self.t_s, len(self._traffic.vehicles), self._stopwatch() - began)
+        self._record.on_tick(self.t_s, len(self._traffic.vehicles), self._stopwatch() - start_s)
 
     def _queue_arrivals(self) -> None:
         """Queue the vehicles that arrived since the last tick."""

@@ -1,7 +1,7 @@
-"""The rule-based method: vehicles move by `rules`, SUMO shows them.
+"""The rule-based method: `rules` move the vehicles, SUMO displays them.
 
-Along the road accelerations are constant during a tick and within the vehicle's limits. Across it a
-lane change has constant speed within the slip limit, or takes no time at all.
+Longitudinal acceleration is constant during a tick and within the vehicle's limits. A lane change
+has constant lateral speed within the slip limit, or is instantaneous.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ _ROUNDING_M = 1e-9
 
 
 class RuleTraffic:
-    """The vehicles on the road, moved by the rules; see `Traffic`."""
+    """The vehicles on the road, moved by the rules; a `Traffic`."""
 
     def __init__(self, scenario: Scenario, world: World) -> None:
-        """Begin with an empty road, shown in an empty world."""
+        """Begin with an empty road in an empty world."""
         self._world = world
         self._rules = Rules(scenario)
         self._lanes = Lanes(scenario.road.lanes)
@@ -40,7 +40,7 @@ class RuleTraffic:
         return self._vehicles.values()
 
     def step(self, t_s: float, entrance: Entrance) -> list[ReferenceVehicle]:
-        """Move all vehicles on to `t_s`, then admit those for which there is room."""
+        """Move all vehicles to their positions at `t_s`; admit and return new ones."""
         slowing = self._rules.sort(self._lanes)
         leaders = self._lanes.leaders()
         for vehicle in sorted(self._vehicles.values(), key=priority):
@@ -61,7 +61,7 @@ class RuleTraffic:
         return self._world.collisions()
 
     def remove(self, vehicle: ReferenceVehicle) -> None:
-        """Take a vehicle off the road."""
+        """Remove a vehicle from the road."""
         del self._vehicles[vehicle.name]
         self._lanes.leave(vehicle)
         self._world.remove(vehicle.name)
@@ -69,7 +69,7 @@ class RuleTraffic:
     def _move_along(
         self, vehicle: ReferenceVehicle, leaders: Iterable[ReferenceVehicle], *, slows_down: bool
     ) -> None:
-        """Move a vehicle along the road by one tick, after the vehicles ahead of it."""
+        """Move a vehicle along the road by one tick, after all vehicles ahead of it."""
         s_m, before_mps, tick_s = vehicle.s_m, vehicle.speed_mps, self._tick_s
         wanted_mps = min(
             self._rules.approach_speed_mps(vehicle),
@@ -129,7 +129,7 @@ class RuleTraffic:
         return entered
 
     def _room_m(self, lane: int, max_entry_m: float) -> float | None:
-        """Return where on a lane a vehicle can enter at v_F, None if there is no room."""
+        """Return the position at which a vehicle can enter a lane at v_F; None without room."""
         if not self._lanes[lane]:
             return max_entry_m
         ahead, speed_mps = self._lanes[lane][-1], self._speed_mps
@@ -144,13 +144,13 @@ class RuleTraffic:
 
 
 def check_rule(scenario: Scenario) -> None:
-    """Check that the rules can be followed in a scenario.
+    """Check that vehicles can follow the rules in a scenario.
 
     Raises:
-        BadInputError: names the field that does not fit.
+        BadInputError: a field is unsuitable.
     """
     rule, road, speed_mps = scenario.rule, scenario.road, scenario.formation.speed_mps
-    # The speed falls in proportion to the remaining distance, updated once per tick.
+    # Speed decreases in proportion to the remaining distance, once per tick.
     braking_m = speed_mps**2 / -scenario.vehicle.min_accel_mps2
     min_m = braking_m + 3.0 * speed_mps * scenario.runtime.tick_s
     if not min_m <= rule.stop_distance_m < road.s3_m:

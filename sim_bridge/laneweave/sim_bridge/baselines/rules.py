@@ -1,13 +1,12 @@
-"""The rules of the rule-based method (paper, Section 5.2.2; decision 20 says how they are read).
+"""The rules of the rule-based method (paper, Section 5.2.2; interpreted in decision 20).
 
-Rule 1. Vehicles drive at v_F on the lane on which they are in S1 and S2, and in S3 once they are
-        on their preferred lane.
+Rule 1. Vehicles drive at v_F on their current lane in S1 and S2, and in S3 on their preferred lane.
 Rule 2. A vehicle changes to the next lane towards the preferred one when the gaps there, to the
         vehicle ahead and to the vehicle behind, satisfy the constant time headway policy.
-Rule 3. When a gap is too small, the vehicle with lower priority slows down: the nearer to the end,
-        the slower.
+Rule 3. If a gap is too small, the vehicle with lower priority slows down, the more the closer it is
+        to the end.
 
-Everything here is pure: positions go in, lane changes and speeds come out.
+Lane changes and speeds are pure functions of the positions.
 """
 
 from __future__ import annotations
@@ -24,7 +23,8 @@ from laneweave.sim_bridge.baselines.reference_road import ReferenceVehicle
 def priority(vehicle: ReferenceVehicle) -> tuple[float, str]:
     """Return the sort key: vehicles closer to the end come first.
 
-    The name breaks ties. Without it three vehicles side by side would wait for each other forever.
+    Ties are broken by name; otherwise three vehicles side by side would wait for each other
+    forever.
     """
     return -vehicle.s_m, vehicle.name
 
@@ -32,9 +32,9 @@ def priority(vehicle: ReferenceVehicle) -> tuple[float, str]:
 class Following:
     """Car following: gaps and speeds behind a vehicle ahead.
 
-    Positions are those of front bumpers. A follower knows where the vehicle ahead will be at the
-    end of the tick, since speeds are chosen from the front to the back. Both move at constant
-    acceleration during a tick.
+    Positions are those of front bumpers. Speeds are chosen from front to rear, so a follower knows
+    the position of the vehicle ahead at the end of the tick. Both have constant acceleration during
+    a tick.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -55,9 +55,9 @@ class Following:
     def is_safe(
         self, s_m: float, speed_mps: float, ahead_s_m: float, ahead_speed_mps: float
     ) -> bool:
-        """Return whether a vehicle may begin to follow: the gap is d_R, with room to brake.
+        """Return whether a vehicle may start to follow: the gap is at least d_R, with room to brake.
 
-        d_R alone is not enough behind a much slower vehicle.
+        Behind a much slower vehicle d_R alone is not sufficient.
         """
         distance_m = ahead_s_m - s_m
         if distance_m < self.gap_m(speed_mps):
@@ -72,14 +72,14 @@ class Following:
 
         It is the lower of two speeds v', reached over the distance (v + v') / 2 dt:
 
-        - the speed at which the gap is d_R at the end of the tick. Where all vehicles keep d_R,
-          speeds follow the speed ahead as a first-order lag of tau does, without harder braking;
+        - the speed at which the gap is d_R at the end of the tick. If all vehicles keep d_R, speeds
+          follow the speed ahead with a first-order lag of time constant tau;
         - the speed from which the follower can still stop behind the vehicle ahead if both brake
-          as hard as they can from then on. This is Krauss' condition for a follower that reacts
-          within the tick.
+          with maximum deceleration. This is Krauss' condition for a follower that reacts within the
+          tick.
 
-        Position and speed of the follower are those at the beginning of the tick, those of the
-        vehicle ahead those at its end.
+        Position and speed of the follower are given for the beginning of the tick, those of the
+        vehicle ahead for its end.
         """
         half_s, braking = 0.5 * self._tick_s, self._braking_mps2
         room_m = ahead_s_m - s_m - speed_mps * half_s
@@ -92,24 +92,24 @@ class Following:
 
 
 class Lanes:
-    """The vehicles on each lane, by priority; a vehicle that changes lanes is on two."""
+    """The vehicles on each lane by priority; during a lane change a vehicle is on two lanes."""
 
     def __init__(self, lanes: int) -> None:
         """Begin with an empty road."""
         self._lanes: list[list[ReferenceVehicle]] = [[] for _ in range(lanes)]
 
     def __getitem__(self, lane: int) -> Sequence[ReferenceVehicle]:
-        """Return the vehicles on a lane, from front to back."""
+        """Return the vehicles on a lane, from front to rear."""
         return self._lanes[lane]
 
     def __iter__(self) -> Iterator[Sequence[ReferenceVehicle]]:
-        """Yield lane by lane."""
+        """Yield the vehicles of each lane."""
         return iter(self._lanes)
 
-    def around(
+    def neighbours(
         self, vehicle: ReferenceVehicle, lane: int
     ) -> tuple[ReferenceVehicle | None, ReferenceVehicle | None]:
-        """Return the next vehicles ahead and behind on a lane on which a vehicle is not."""
+        """Return the next vehicles ahead and behind on another lane."""
         there = self._lanes[lane]
         place = bisect_left(there, priority(vehicle), key=priority)
         return (
@@ -123,25 +123,25 @@ class Lanes:
         there.insert(bisect_left(there, priority(vehicle), key=priority), vehicle)
 
     def leave(self, vehicle: ReferenceVehicle) -> None:
-        """Take a vehicle off the road."""
+        """Remove a vehicle from the road."""
         self.end_change(vehicle)
         self._lanes[vehicle.lane].remove(vehicle)
 
     def begin_change(self, vehicle: ReferenceVehicle, lane: int) -> None:
-        """Begin a lane change; the vehicle is on both lanes until it ends."""
+        """Begin a lane change; until its end the vehicle is on both lanes."""
         self.enter(vehicle, lane)
         vehicle.previous_lane, vehicle.lane = vehicle.lane, lane
 
     def end_change(self, vehicle: ReferenceVehicle) -> None:
-        """Take a vehicle off its previous lane, if it is still there."""
+        """Remove a vehicle from its previous lane, if it is still there."""
         if vehicle.previous_lane is not None:
             self._lanes[vehicle.previous_lane].remove(vehicle)
             vehicle.previous_lane = None
 
     def leaders(self) -> dict[ReferenceVehicle, list[ReferenceVehicle]]:
-        """Return the next vehicles ahead of each vehicle, on each lane on which it is.
+        """Return the next vehicles ahead of each vehicle, one per lane that it occupies.
 
-        A vehicle that changes lanes follows two: the nearer one need not be the slower one.
+        During a lane change a vehicle follows both: the nearer one need not be the slower one.
         """
         found: dict[ReferenceVehicle, list[ReferenceVehicle]] = {}
         for lane in self._lanes:
@@ -166,12 +166,12 @@ class Rules:
         self._change_m = self._speed_mps * rule.lane_change_s
 
     def sort(self, lanes: Lanes) -> set[ReferenceVehicle]:
-        """Apply rules 2 and 3 to every vehicle that is not on its preferred lane, by priority.
+        """Apply rules 2 and 3 to all vehicles off their preferred lane, by priority.
 
-        A vehicle that begins a lane change is on the new lane at once, so no other takes its gap.
+        A lane change occupies the gap on the new lane at once.
 
         Returns:
-            The vehicles that slow down, for another vehicle or to find a gap behind it.
+            The vehicles that slow down, for another vehicle or to reach a gap behind it.
         """
         unsorted = sorted(
             {
@@ -187,7 +187,7 @@ class Rules:
         slowing: set[ReferenceVehicle] = set()
         for vehicle in unsorted:
             lane = self.next_lane(vehicle)
-            slowed = list(self._slowed(vehicle, *lanes.around(vehicle, lane)))
+            slowed = list(self._slowed(vehicle, *lanes.neighbours(vehicle, lane)))
             if not slowed:
                 lanes.begin_change(vehicle, lane)
                 if self._change_m == 0.0:
@@ -205,7 +205,7 @@ class Rules:
         ahead: ReferenceVehicle | None,
         behind: ReferenceVehicle | None,
     ) -> Iterator[ReferenceVehicle]:
-        """Yield the vehicles that must slow down before a vehicle can change lanes."""
+        """Yield the vehicles that must slow down for a lane change."""
         is_safe = self.following.is_safe
         if ahead is not None and not is_safe(
             vehicle.s_m, vehicle.speed_mps, ahead.s_m, ahead.speed_mps
@@ -214,8 +214,8 @@ class Rules:
         if behind is not None and not is_safe(
             behind.s_m, behind.speed_mps, vehicle.s_m, vehicle.speed_mps
         ):
-            # By rule 1 a vehicle that has finished continues at v_F: then the other one waits. One
-            # that is still changing has not: it may be blocked on its old lane by the other one.
+            # By rule 1 a vehicle that has finished continues at v_F, and the other one waits. A
+            # vehicle that is still changing may be blocked by the other one on its old lane.
             yields = self._all_yield or not behind.finished
             yield behind if yields else vehicle
 
@@ -228,12 +228,12 @@ class Rules:
     def approach_speed_mps(self, vehicle: ReferenceVehicle) -> float:
         """Return the maximum speed near the end of the road: v_F on the preferred lane.
 
-        On another lane a vehicle leaves room for its remaining lane changes and slows down in
-        proportion over the distance d_stop before that point. So it is slow when it is near, a
-        vehicle beside it that yields stops farther behind, and the gap opens.
+        On other lanes, the distance of the remaining lane changes is reserved before the end, and
+        speed decreases linearly over the distance d_stop before that point. A vehicle beside it
+        that yields stops farther behind, so that a gap opens.
         """
-        to_come = abs(vehicle.preferred_lane - vehicle.lane)
-        if to_come == 0:
+        remaining = abs(vehicle.preferred_lane - vehicle.lane)
+        if remaining == 0:
             return self._speed_mps
-        left_m = self._end_m - vehicle.s_m - to_come * self._change_m
+        left_m = self._end_m - vehicle.s_m - remaining * self._change_m
         return self._speed_mps * min(max(left_m / self._stop_m, 0.0), 1.0)
