@@ -53,9 +53,9 @@ def show_bodies(
     road, size = scenario.road, scenario.vehicle
     bodies = Bodies(world.positions(), size.length_m, size.width_m)
     accels_mps2: dict[str, float] = {name: state[2] for name, state in states.items()}
-    around = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels_mps2)
+    neighbours = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels_mps2)
     for name, vehicle in vehicles.items():
-        vehicle.perceive(around[name])
+        vehicle.perceive(neighbours[name])
     record.on_positions(
         t_s,
         vehicles.values(),

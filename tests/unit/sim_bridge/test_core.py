@@ -145,8 +145,8 @@ def test_measurement_errors_are_the_same_in_repeated_senses(tmp_path: Path) -> N
         assert sense.state != true
         assert sense.state == pytest.approx(true, abs=0.4)
         controller = desk.core.vehicles[name].controller
-        assert (sense.state, sense.ahead) == (controller.measured, controller.around.ahead)
-        assert sense.behind == controller.around.behind
+        assert (sense.state, sense.ahead) == (controller.measured, controller.neighbours.ahead)
+        assert sense.behind == controller.neighbours.behind
     assert senses[A].ahead == senses[B].behind == ()
     for (other,) in (senses[B].ahead, senses[A].behind):
         assert other.gap_m != 25.0

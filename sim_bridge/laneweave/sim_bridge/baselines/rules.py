@@ -55,7 +55,7 @@ class Following:
     def is_safe(
         self, s_m: float, speed_mps: float, ahead_s_m: float, ahead_speed_mps: float
     ) -> bool:
-        """Return whether a vehicle may start to follow: the gap is at least d_R, with room to brake.
+        """Return whether a vehicle may start to follow: at least d_R away, with room to brake.
 
         Behind a much slower vehicle d_R alone is not sufficient.
         """

@@ -1,20 +1,19 @@
 """A vehicle's motion controller, which outlives the vehicle's agent process.
 
-It drives on one of the rungs of a fallback ladder, `Rung`, and on its own only moves down:
+It drives on one of the rungs of a fallback ladder (`Rung`):
 
-    play        executes the trajectory of the newest command until it ends
-    hold        comes to rest in the cell that the last command named, and stays there at v_F
-    give way    does the same, with comfortable braking behind a vehicle ahead
-    emergency   brakes as hard as the vehicle can, as long as `EmergencyBrake` requires
+    execute     executes the trajectory of the newest command until its end
+    hold        steers into the cell of the newest command, and stays in it at v_F
+    give way    the same, with comfortable braking behind a vehicle ahead
+    emergency   brakes as hard as possible while `EmergencyBrake` requires it
 
-A vehicle whose agent has just died, or whose commands have just been lost, still plays. A
-trajectory that has ended or that an emergency interrupted is not resumed: only a new command leads
-back up. The emergency brake acts on every rung and uses local sensing only.
+Without an agent, or without new commands, it executes the trajectory to its end. A trajectory that
+has ended or was interrupted by an emergency is not resumed: only a new command leads back to
+`execute`. The emergency brake acts on every rung and uses only local sensing.
 
-The controller also stores what must survive the agent, and what a replaced agent must not change:
-the process in charge of the vehicle, the formations that it has joined, the plan that the process
-in charge has accepted, and in the rolling operation the highest promise and the cells that the
-vehicle owns. Only the process in charge changes where the vehicle holds or what it plays.
+The controller also stores the data that must survive the agent: the process in charge, the joined
+formations, the newest accepted plan, and in the rolling operation the highest promise and the owned
+cells. Only the process in charge can change the hold cell and the trajectory.
 """
 
 from __future__ import annotations
@@ -46,15 +45,14 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, Neighbo
 from laneweave.sim_bridge.bodies.plant import Plant
 
 MAX_COLUMN = 2**31 - 1
-"""Columns are recorded with 32 bits; no vehicle gets this far. Formation numbers are smaller."""
+"""Maximum column, which is recorded with 32 bits. Formation numbers are smaller."""
 RELEASE_M = 1.0
-"""An emergency ends when the spare distance exceeds that of one tick, which every tick of braking
-gains, by this margin. Without a margin each favourable measurement error would release the brake,
-and these errors would add up."""
+"""Margin beyond the distance of one tick at which an emergency ends. Without it, favourable
+measurement errors would release the brake again and again, and accumulate."""
 
 
 class Rung(IntEnum):
-    """What a vehicle executes; see the module."""
+    """Rung of the fallback ladder; see the module."""
 
     EXECUTE = 0
     HOLD = 1
@@ -70,35 +68,34 @@ class MotionController:
     _scenario: Scenario
     hold_cell: Cell
     attendant: int = 0
-    """Incarnation of the process in charge; 0: none yet."""
+    """Incarnation of the process in charge; 0: none."""
     joined: tuple[int, ...] = field(init=False)
-    """Formations whose blocks the vehicle's plans may use, ascending; it only ever grows."""
+    """Formations whose blocks the vehicle's plans may use, ascending; never shrinks."""
     accepted: Ballot | None = None
     """Newest plan that the process in charge has accepted."""
     promised: Ballot | None = None
-    """Highest ballot that any process in charge has promised (rolling operation): a promise also
-    binds later processes."""
+    """Highest promised ballot, which also binds later processes in charge (rolling operation)."""
     owned: tuple[Cell, ...] = ()
     """Cells that the vehicle owns, ascending (rolling operation)."""
     transfer: PendingTransfer | None = None
-    """Newest transfer of cells, pending or completed."""
+    """Newest cell transfer, pending or completed."""
     _granted: frozenset[Cell] = frozenset()
-    """Cells from the roadside that no plan contains yet."""
+    """Cells assigned by the roadside that are not part of any plan yet."""
     motion_origin: Cell = field(init=False)
     motion_end_tick: int = 0
     motion_ticks: int = 0
-    """Planned duration of the current move; 0: it settles, or holds."""
+    """Planned duration of the current move; 0 while settling or holding."""
     command_tick: int = -1
-    """Tick of the newest command; -1: none yet."""
+    """Tick of the newest command; -1: none."""
     rung: Rung = Rung.HOLD
     """Rung of the last tick."""
     rung_ticks: dict[Rung, int] = field(init=False)
-    """Ticks on each rung."""
-    around: Neighbours = NO_NEIGHBOURS
-    """Its measured neighbours."""
+    """Number of ticks on each rung."""
+    neighbours: Neighbours = NO_NEIGHBOURS
+    """Measured neighbours."""
     _measured: State | None = None
     _jerks: array[float] = field(init=False)
-    """Pairs (along, across), one for each tick."""
+    """Pairs (along, across) for successive ticks [m/s3]."""
     _jerks_tick: int = 0
     """Tick of the first pair."""
     lattice: Lattice = field(init=False)
@@ -109,7 +106,7 @@ class MotionController:
         """Begin without a trajectory, in the formation of the cell."""
         self.lattice = self._scenario.lattice
         self.tick_s = self._scenario.runtime.tick_s
-        # The other blocks of its formation are known when that is closed.
+        # The other blocks of the formation are known when it is closed.
         self.joined = (self.lattice.block_of(self.hold_cell[0]),)
         self.motion_origin = self.hold_cell
         self.rung_ticks = dict.fromkeys(Rung, 0)
@@ -118,35 +115,34 @@ class MotionController:
 
     @property
     def rolling(self) -> bool:
-        """Whether vehicles own cells, not formations blocks."""
+        """Whether vehicles own cells (rolling operation)."""
         return self._scenario.formation.rolling
 
     @property
     def measured(self) -> State:
-        """Measured state of the body; the exact one before the first measurement."""
+        """Measured state of the body; exact before the first measurement."""
         return self.plant.state if self._measured is None else self._measured
 
-    def perceive(self, measured: State, around: Neighbours) -> None:
+    def perceive(self, measured: State, neighbours: Neighbours) -> None:
         """Set the measurements of this tick."""
-        self._measured, self.around = measured, around
+        self._measured, self.neighbours = measured, neighbours
 
     def accept_command(self, command: Command) -> bool:
-        """Take a command of the process in charge, or of one that takes charge with it.
+        """Accept a command of the process in charge, or of a process that takes charge with it.
 
-        A command is refused when its incarnation is lower than that of the process in charge, when
-        one of this tick or a later one has been taken, or when it names a cell that the vehicle
-        does not own (where vehicles own cells). A higher incarnation takes charge. It must name the
-        cell in which the vehicle already holds: before, it could not act for the vehicle, so no
-        plan can allow it to move. A refused process may try again at the next tick.
+        Rejected are commands of an older incarnation than the process in charge, commands that are
+        not newer than the newest one, and commands with a hold cell that the vehicle does not own
+        (rolling operation). A newer incarnation takes charge. Its first command must keep the hold
+        cell: no plan can allow it to move before it was in charge. A rejected process may try again
+        at the next tick.
 
-        A command without jerks that names the cell in which the vehicle holds does not change the
-        current motion.
+        A command without jerks and with the current hold cell does not change the motion.
 
         Returns:
-            Whether it was taken.
+            Whether the command was accepted.
 
         Raises:
-            BadInputError: the jerks are not pairs of finite numbers, a cell is on no lane, or a
+            BadInputError: the jerks are not pairs of finite numbers, a cell is not on a lane, or a
                 number is out of range.
         """
         if command.incarnation < self.attendant or command.tick <= self.command_tick:
@@ -181,15 +177,15 @@ class MotionController:
         self.accepted = None
 
     def store_requests(self, command: Command) -> bool:
-        """Note what the process in charge requests, whatever the tick of its command.
+        """Store formations, promise, transfer and acceptance from a command of any tick.
 
-        Returns:
-            Whether anything has changed.
+        Commands of other processes than the one in charge are ignored. Returns whether anything has
+        changed.
         """
         if command.incarnation != self.attendant:
             return False
-        asked = command.joined, command.accepted, command.promised, command.transfer
-        if asked == (self.joined, self.accepted, self.promised, self.transfer):
+        requested = command.joined, command.accepted, command.promised, command.transfer
+        if requested == (self.joined, self.accepted, self.promised, self.transfer):
             return False  # the usual case
         if not _in_range(command.joined):
             return False
@@ -206,22 +202,22 @@ class MotionController:
         return (self.joined, self.accepted, self.promised, self.transfer) != before
 
     def store_acceptance(self, ballot: Ballot) -> None:
-        """Note a plan that the process in charge has accepted, unless it is older.
+        """Store an acceptance of the process in charge unless a newer one is stored.
 
-        Where vehicles own cells, its transfer must be pending.
+        In the rolling operation the transfer of this ballot must be pending.
         """
         if self.rolling and (self.transfer is None or self.transfer.ballot != ballot):
             return
         self.accepted = ballot if self.accepted is None else max(self.accepted, ballot)
 
     def store_promise(self, ballot: Ballot) -> None:
-        """Note a promise, unless it is older."""
+        """Store a promise unless a newer one is stored."""
         self.promised = ballot if self.promised is None else max(self.promised, ballot)
 
     def begin_transfer(self, transfer: PendingTransfer) -> None:
-        """Note the pending transfer of an accepted plan, unless a higher ballot is promised.
+        """Store the pending transfer of an accepted plan unless a higher ballot is promised.
 
-        Cells that the roadside has assigned since the plan was made stay with the vehicle.
+        The vehicle keeps cells that the roadside has assigned since the plan was made.
         """
         newer = self.transfer is None or transfer.ballot > self.transfer.ballot
         if newer and self.promised is not None and transfer.ballot >= self.promised:
@@ -230,7 +226,7 @@ class MotionController:
             self.owned = self.transfer.before
 
     def complete_transfer(self, ballot: Ballot) -> None:
-        """Complete the pending transfer: the start gate of its plan is open."""
+        """Complete the pending transfer of a plan whose start gate is open."""
         if self.transfer is not None and self.transfer.ballot == ballot and not self.transfer.open:
             self.owned, self.transfer = self.transfer.after, PendingTransfer(ballot, open=True)
 
@@ -242,13 +238,13 @@ class MotionController:
             self.transfer = _with_cells(self.transfer, {cell})
 
     def join(self, formations: Iterable[int]) -> None:
-        """Note formations as joined."""
+        """Add joined formations."""
         self.joined = tuple(sorted({*self.joined, *formations}))
 
     def moving(self, tick: int) -> bool:
         """Return whether the current motion has not ended at `tick`.
 
-        A late body is still moving although the time of its motion is over.
+        A late body continues to move after the planned end of its motion.
         """
         return tick < self.motion_end_tick or not at_rest_in_cell(
             self.measured, self.lattice, self.hold_cell, tick * self.tick_s
@@ -257,7 +253,7 @@ class MotionController:
     def step(self, tick: int) -> None:
         """Drive from `tick` to the next one."""
         measured, plant = self.measured, self.plant
-        near: Sequence[Neighbour] = self.around.ahead
+        near: Sequence[Neighbour] = self.neighbours.ahead
         if near:
             near = self._relevant(near, measured[3])
         rung, jerk = self._next(tick, near)
@@ -289,7 +285,7 @@ class MotionController:
         return jerks
 
     def _next(self, tick: int, near: Iterable[Neighbour]) -> tuple[Rung, Jerk]:
-        """Return rung and jerk of a tick without an emergency."""
+        """Return rung and jerk of a tick if there is no emergency."""
         index = 2 * (tick - self._jerks_tick)
         if 0 <= index < len(self._jerks):
             return Rung.EXECUTE, (self._jerks[index], self._jerks[index + 1])
@@ -314,7 +310,7 @@ class MotionController:
         """Return whether an emergency begins or continues."""
         limits, tick_s = self._scenario.vehicle, self.tick_s
         accel = self.plant.setpoint[0]
-        # The jerk that the body will execute: a command cannot brake harder than its limits.
+        # The jerk that the body will execute within its limits.
         speed = measured[1] + limits.actuator_lag_s * measured[2]
         allowed = (limited_accel(speed, accel, jerk[0], limits, tick_s) - accel) / tick_s
         spare_m = self._brake.spare_m(measured, accel, (allowed, 0.0), near)
@@ -323,14 +319,14 @@ class MotionController:
         return spare_m < 0.0
 
     def _relevant(self, others: Iterable[Neighbour], y_m: float) -> list[Neighbour]:
-        """Return the neighbours on lanes that the body touches or moves to."""
+        """Return the neighbours on lanes that the body touches or enters."""
         first, last = self.lattice.lanes_touched(y_m, self._scenario.vehicle.width_m)
         goal = self.hold_cell[1]
         return [other for other in others if first <= other.lane <= last or other.lane == goal]
 
 
 def _with_cells(transfer: PendingTransfer, cells: Iterable[Cell]) -> PendingTransfer:
-    """Return a transfer with additional cells that stay with the vehicle."""
+    """Return a transfer with additional cells that the vehicle keeps."""
     return evolve(
         transfer,
         before=tuple(sorted({*transfer.before, *cells})),

@@ -1,4 +1,4 @@
-"""Overlaps of bodies, the gaps between them, and the neighbours that exact sensors would see.
+"""Overlaps of bodies, gaps between them, and exact neighbours of each vehicle.
 
 A vehicle's body is a rectangle of length L and width W. Its pose consists of
 
@@ -6,11 +6,9 @@ A vehicle's body is a rectangle of length L and width W. Its pose consists of
     y        position of its centre across the road,
     heading  angle of its body, atan2(v_y, v): a body points in its direction of motion.
 
-So the body's centre is (s - L/2 cos heading, y). The overlap test is exact for these rectangles. It
-decides about a run's safety; SUMO's collision list misses pairs that overlap between two lanes and
-is recorded beside it.
-
-`Bodies` sorts the vehicles along the road once, for all queries, and compares near ones only.
+The body's centre is (s - L/2 cos heading, y). The overlap test is exact for these rectangles and
+determines the safety of a run. SUMO's collision list, which misses overlaps between two lanes, is
+recorded in addition.
 """
 
 from __future__ import annotations
@@ -22,25 +20,25 @@ from typing import NamedTuple
 from laneweave.protocol.wire.messages import Neighbour
 
 Pose = tuple[float, float, float, float]
-"""(s m, y m, heading rad, speed m/s)."""
+"""(s [m], y [m], heading [rad], speed [m/s])."""
 
 _Point = tuple[float, float]
 
 _TOUCH_M = 1e-9
-"""Bodies that touch do not overlap, and a body that touches a lane border does not cross it."""
+"""Tolerance: touching bodies do not overlap, and a body that touches a lane border is inside."""
 
 
 class MinGaps(NamedTuple):
-    """Smallest gap and headway of two vehicles in line; infinite if there are none."""
+    """Minimum gap and headway of vehicles in line; infinite without such vehicles."""
 
     gap_m: float
-    """Bumper to bumper, along the road."""
+    """Bumper-to-bumper distance along the road."""
     headway_s: float
-    """Distance front to front divided by the speed of the follower."""
+    """Front-to-front distance divided by the speed of the follower."""
 
 
 class Neighbours(NamedTuple):
-    """The neighbours of a vehicle, by lane."""
+    """Measured neighbours of a vehicle, by lane."""
 
     ahead: tuple[Neighbour, ...]
     behind: tuple[Neighbour, ...]
@@ -49,10 +47,10 @@ class Neighbours(NamedTuple):
 NO_NEIGHBOURS = Neighbours((), ())
 
 ExactNeighbour = tuple[int, float, float, float]
-"""(lane, gap m, speed m/s, acceleration m/s2): a `Neighbour` without measurement errors."""
+"""(lane, gap [m], speed [m/s], acceleration [m/s2]): a `Neighbour` without measurement errors."""
 
 ExactNeighbours = tuple[Sequence[ExactNeighbour], Sequence[ExactNeighbour]]
-"""(ahead, behind), by lane: an `Around` without measurement errors."""
+"""(ahead, behind): `Neighbours` without measurement errors."""
 
 
 def pose_of(state: Sequence[float]) -> Pose:
@@ -62,9 +60,9 @@ def pose_of(state: Sequence[float]) -> Pose:
 
 
 def corners(pose: Pose, length_m: float, width_m: float) -> tuple[_Point, _Point, _Point, _Point]:
-    """Return a body's corners (x, y): front right, front left, rear left, rear right.
+    """Return a body's corners (x, y) [m]: front right, front left, rear left, rear right.
 
-    In metres; x along the road from its start, y across it from the right edge.
+    x is measured along the road from its start, y across it from the right edge.
     """
     s_m, y_m, heading, _ = pose
     cosine, sine = math.cos(heading), math.sin(heading)
@@ -80,10 +78,10 @@ def corners(pose: Pose, length_m: float, width_m: float) -> tuple[_Point, _Point
 
 
 class Bodies:
-    """All bodies on the road at one time, of equal size."""
+    """All bodies on the road at one time, of equal size; sorted once for all queries."""
 
     def __init__(self, poses: Mapping[str, Pose], length_m: float, width_m: float) -> None:
-        """Sort them along the road.
+        """Sort the bodies along the road.
 
         Args:
             poses: pose of each vehicle.
@@ -97,9 +95,9 @@ class Bodies:
         self._extents = [_extent(pose, length_m, width_m) for pose in self._poses]
 
     def overlapping_pairs(self) -> list[tuple[str, str]]:
-        """Return all pairs of vehicles whose bodies overlap.
+        """Return all pairs of vehicles whose bodies overlap, as sorted pairs of names.
 
-        Sorted pairs of names, each in alphabetical order. Bodies that only touch are not included.
+        Bodies that only touch are not included.
         """
         names, poses, extents = self._names, self._poses, self._extents
         length_m, width_m = self._length_m, self._width_m
@@ -114,29 +112,29 @@ class Bodies:
                     break
                 _, _, other_low, other_high = extents[ahead]
                 if other_low >= high or other_high <= low:
-                    continue  # side by side: nearly all near pairs
+                    continue  # side by side, like most near pairs
                 if _intersect(one, other, length_m, width_m):
                     name, other_name = names[index], names[ahead]
                     pairs.append((min(name, other_name), max(name, other_name)))
         return sorted(pairs)
 
     def min_gaps(self) -> MinGaps:
-        """Return the smallest gap and time headway between vehicles in line.
+        """Return the minimum gap and time headway of vehicles in line.
 
-        Two vehicles are in line if their bodies overlap laterally. The gap is the distance along
-        the road by which the follower would have to move to touch the other: exact for rotated
-        bodies, negative if and only if the bodies overlap. The follower is the one whose front is
-        behind.
+        Two vehicles are in line if their bodies overlap laterally; the follower is the vehicle
+        whose front is behind. The gap is the distance along the road by which the follower can move
+        until it touches the other vehicle: exact for rotated bodies, negative for overlapping
+        bodies.
         """
         length_m, width_m = self._length_m, self._width_m
-        # With equal fronts, names do not decide which one is behind.
+        # For equal fronts the order does not depend on names.
         bodies = sorted(zip(self._poses, self._extents, strict=True))
-        # Of two leaders in line the farther one can only have the smaller gap if their fronts are
-        # closer than rotation can extend a body.
+        # A vehicle farther ahead can have the smaller gap only if its front is closer than rotation
+        # can extend a body.
         slack_m = length_m + width_m
         count = len(bodies)
         rotated = []
-        """(Lower bound of the gap, indices) of pairs with a rotated body."""
+        """(lower bound of the gap [m], indices) of pairs with a rotated body."""
         min_gap = min_headway = math.inf
         for index, ((s_m, _, heading, speed_mps), (rear, front, low, high)) in enumerate(bodies):
             low, high = low + _TOUCH_M, high - _TOUCH_M  # noqa: PLW2901
@@ -167,24 +165,21 @@ class Bodies:
     def exact_neighbours(
         self, lanes: int, lane_width_m: float, accels_mps2: Mapping[str, float]
     ) -> dict[str, ExactNeighbours]:
-        """Return the neighbours that each vehicle's sensors would see if they were exact.
+        """Return the neighbours of each vehicle without measurement errors.
 
-        In each lane that its body touches or that is adjacent to such a lane, a vehicle sees the
-        nearest vehicle ahead that touches the lane, and the nearest one behind. A vehicle that
-        straddles two lanes is seen in both. The gap is bumper to bumper, with bodies taken as
-        unrotated; it is negative for vehicles side by side, of which the one with the front ahead
-        is ahead (at equal positions: the one with the later name).
+        They are the nearest vehicle ahead and behind in each lane that the vehicle's body touches
+        and in the adjacent lanes. A vehicle that straddles two lanes is in both. The
+        bumper-to-bumper gap ignores rotation and is negative for vehicles side by side. The vehicle
+        whose front is farther ahead counts as ahead; at equal positions, the vehicle with the later
+        name.
 
         Args:
             lanes: number of lanes.
             lane_width_m: width of a lane.
-            accels_mps2: acceleration of each vehicle; zero where none is given.
-
-        Returns:
-            For each vehicle at most one ahead in each lane and one behind, by lane.
+            accels_mps2: acceleration of each vehicle; default: zero.
         """
         touched = []
-        """The first and the last lane that each body touches."""
+        """First and last lane that each body touches."""
         for _, _, low, high in self._extents:
             first = min(max(int((low + _TOUCH_M) // lane_width_m), 0), lanes - 1)
             last = min(max(int((high - _TOUCH_M) // lane_width_m), first), lanes - 1)
@@ -193,7 +188,7 @@ class Bodies:
         accels = [accels_mps2.get(name, 0.0) for name in names]
 
         def nearest(order: Iterable[int], sign: float) -> list[list[ExactNeighbour]]:
-            """Return the neighbours of each vehicle among those before it in an order."""
+            """Return the neighbours of each vehicle among its predecessors in an order."""
             last_seen = [-1] * lanes
             seen: list[list[ExactNeighbour]] = [[]] * len(names)
             for index in order:
@@ -252,9 +247,8 @@ def _intersect(one: Pose, other: Pose, length_m: float, width_m: float) -> bool:
 def _gap_m(behind: Pose, ahead: Pose, length_m: float, width_m: float) -> float:
     """Return the distance along the road between two bodies that overlap laterally.
 
-    Over the y that both bodies cover, the rear boundary of a body is convex and the front boundary
-    is concave, both with kinks at corners: their smallest difference is at a corner or at an end of
-    the common range.
+    As functions of y, rear boundaries are convex and front boundaries are concave, with kinks at
+    corners, so their minimum difference is at a corner or at an end of the common range of y.
     """
     if behind[2] == 0.0 and ahead[2] == 0.0:
         return ahead[0] - length_m - behind[0]
@@ -265,18 +259,18 @@ def _gap_m(behind: Pose, ahead: Pose, length_m: float, width_m: float) -> float:
     crossings = [(_crossings(one, y), _crossings(other, y)) for y in levels]
     return max(
         min(min(rear) - max(front) for front, rear in crossings),
-        # Of two rotated bodies in line the one whose front is ahead can be behind.
+        # A rotated body with the front ahead can be behind the other body.
         min(min(rear) - max(front) for rear, front in crossings),
     )
 
 
 def _crossings(shape: Sequence[_Point], level_y: float) -> list[float]:
-    """Return the x at which a polygon's sides cross a level y that the polygon covers."""
+    """Return the x coordinates at which the sides of a polygon cross a level y."""
     found = []
     for index, (x, y) in enumerate(shape):
         other_x, other_y = shape[index - 1]
         if min(y, other_y) <= level_y <= max(y, other_y):
             share = (level_y - y) / (other_y - y) if other_y != y else 0.0
             found += [x + share * (other_x - x)] if other_y != y else [x, other_x]
-    # Rounding can put the end of the common range just outside the polygon.
+    # Due to rounding, the level may be just outside the polygon.
     return found or [min(shape, key=lambda point: abs(point[1] - level_y))[0]]

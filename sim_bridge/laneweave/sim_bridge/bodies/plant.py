@@ -1,9 +1,9 @@
-"""The plant: how a vehicle's body moves.
+"""The plant: motion of a vehicle's body.
 
-Along and across the road the set-point of acceleration changes by a jerk that is constant during a
-tick, and the body's acceleration follows it with a first-order lag (`protocol.vehicle.motion`: the
-body follows a commanded state). The plant keeps the commanded state within the vehicle's limits and
-integrates both exactly.
+Along and across the road, the acceleration set-point changes with a jerk that is constant during a
+tick, and the body's acceleration follows it with a first-order lag: the body follows a commanded
+state (`protocol.vehicle.motion`). The plant keeps the commanded state within the vehicle's limits
+and integrates both exactly.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ Axis = tuple[float, float, float]
 
 
 class Plant:
-    """One vehicle's body: its state, and the set-points of its actuators."""
+    """State and actuator set-points of one vehicle's body."""
 
     def __init__(self, state: State, limits: Vehicle, tick_s: float) -> None:
-        """Start at a state, with set-points that equal its accelerations."""
+        """Start at a state, with its accelerations as set-points."""
         self._state = state
         self._setpoint = (state[2], state[5])
         self._limits = limits
-        # Read in each tick.
+        # Used in each tick.
         self._lag_s, self._lag_y_s = limits.actuator_lag_s, limits.lateral_actuator_lag_s
         self._slip_ratio = limits.max_slip_ratio
         self._tick_s = tick_s
@@ -34,27 +34,27 @@ class Plant:
 
     @property
     def state(self) -> State:
-        """(s, v, a, y, v_y, a_y) in m and s."""
+        """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""
         return self._state
 
     @property
     def setpoint(self) -> tuple[float, float]:
-        """Commanded accelerations of its actuators, along and across [m/s2]."""
+        """Acceleration set-points, along and across [m/s2]."""
         return self._setpoint
 
     def step(self, jerk_s: float, jerk_y: float) -> State:
-        """Move by one tick with jerks that `limited_jerk` limits; return the new state."""
+        """Move by one tick with limited jerks [m/s3]; return the new state."""
         commanded = commanded_state(self._state, self._setpoint, self._limits, 0.0)
         self._move(commanded, limited_jerk(commanded, (jerk_s, jerk_y), self._limits, self._tick_s))
         return self._state
 
     def brake(self, jerk_y: float) -> State:
-        """Brake as hard as the vehicle can for one tick, beyond the limit on longitudinal jerk.
+        """Brake with maximum deceleration for one tick, beyond the limit on longitudinal jerk.
 
-        The requested lateral jerk is limited by `limited_jerk`. Returns the new state.
+        The lateral jerk [m/s3] is limited. Returns the new state.
         """
         s, v, _, y, v_y, a_y = commanded_state(self._state, self._setpoint, self._limits, 0.0)
-        # The commanded state stops first, and the body comes to rest behind it.
+        # The commanded state stops before the body does.
         accel = max(self._limits.min_accel_mps2, -v / self._tick_s)
         now = (s, v, accel, y, v_y, a_y)
         _, allowed_y = limited_jerk(now, (0.0, jerk_y), self._limits, self._tick_s)
@@ -64,7 +64,7 @@ class Plant:
         return self._state
 
     def _move(self, commanded: State, jerk: Jerk) -> None:
-        """Move on from a commanded state whose frame stands on the road."""
+        """Move by one tick from a commanded state in road coordinates."""
         from_s, from_v, from_a, from_y, from_vy, from_ay = commanded
         to_s, to_v, to_a, to_y, to_vy, to_ay = integrate(commanded, jerk, self._tick_s)
         s, v, a, y, v_y, a_y = self._state
@@ -73,13 +73,12 @@ class Plant:
         lag_s, lag_y_s = self._lag_s, self._lag_y_s
         next_s, next_v, a = _follow((s, v, a), along, to_along, jerk[0], lag_s, self._decay)
         y, v_y, a_y = _follow((y, v_y, a_y), across, to_across, jerk[1], lag_y_s, self._decay_y)
-        # Brakes do not push a body backwards: not when released just before standstill, nor by
-        # rounding.
+        # Neither braking nor rounding moves a body backwards.
         next_s, next_v = max(next_s, s), max(next_v, 0.0)
         slip = self._slip_ratio * next_v
         if abs(v_y) > slip:
-            # Bodies do not slide sideways although their axes lag differently; this overrides the
-            # limit on lateral jerk.
+            # Different lags must not make a body slide sideways; this overrides the limit on
+            # lateral jerk.
             v_y, a_y, to_ay = math.copysign(slip, v_y), 0.0, 0.0
         self._state = (next_s, next_v, a, y, v_y, a_y)
         self._setpoint = (to_a, to_ay)
@@ -88,14 +87,14 @@ class Plant:
 def _follow(
     body: Axis, commanded: Axis, then: Axis, jerk: float, lag_s: float, decay: float
 ) -> Axis:
-    """Return a body's axis after a tick in which its commanded axis goes on with constant jerk.
+    """Return one axis of a body after a tick with constant jerk of the commanded state.
 
-    The commanded position is a cubic in time. The body follows another cubic; its initial deviation
-    from that cubic decays by the factor `decay`.
+    The commanded position is a cubic in time. The body converges to another cubic; its deviation
+    from that decays by the factor `decay`.
     """
     if lag_s <= 0.0:
         return then
-    # Both ends of that cubic, which lags in position, speed and acceleration.
+    # Both ends of the cubic to which the body converges.
     s, v, a = commanded
     begin_a = a - lag_s * jerk
     begin_v = v - lag_s * begin_a
@@ -112,5 +111,5 @@ def _follow(
 
 
 def _decay(tick_s: float, lag_s: float) -> float:
-    """Return the share of a deviation that remains after a tick."""
+    """Return the factor by which a deviation decays in a tick."""
     return math.exp(-tick_s / lag_s) if lag_s > 0.0 else 0.0

@@ -1,7 +1,7 @@
-"""A vehicle's sensors: every measurement has an independent error.
+"""A vehicle's sensors, with independent normally distributed measurement errors.
 
-Errors are normally distributed (table `sensing` of the scenario) and drawn from the scenario's seed
-and the vehicle's name, so equal seeds give equal runs.
+The errors (table `sensing` of the scenario) are seeded with the scenario's seed and the vehicle's
+name, so equal seeds give equal runs.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from laneweave.protocol.wire.messages import Name, Neighbour
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import ExactNeighbours, Neighbours
 
 _DRAWN = 1024
-"""Random numbers drawn at once."""
+"""Number of random numbers drawn at once."""
 
 
 class Sensors:
     """The sensors of one vehicle."""
 
     def __init__(self, scenario: Scenario, vehicle: Name) -> None:
-        """Seed the errors of a vehicle."""
+        """Create the sensors with the seed of the vehicle."""
         noise = scenario.sensing
         self._random = np.random.default_rng([scenario.seed, zlib.crc32(vehicle.encode())])
         self._normal: list[float] = []
-        """Drawn in advance: drawing one number at a time is slow."""
+        """Samples drawn in advance, because drawing single numbers is slow."""
         self._used = 0
         self._state_noise = (
             noise.position_noise_m,
@@ -44,7 +44,7 @@ class Sensors:
         )
 
     def measure(self, state: State) -> State:
-        """Return the measured state (s, v, a, y, v_y, a_y) in m and s."""
+        """Return the measurement of a state (s, v, a, y, v_y, a_y)."""
         s, v, a, y, v_y, a_y = state
         s_m, v_mps, a_mps2, y_m, vy_mps, ay_mps2 = self._state_noise
         e_s, e_v, e_a, e_y, e_vy, e_ay = self._draw(6)
@@ -57,11 +57,10 @@ class Sensors:
             a_y + e_ay * ay_mps2,
         )
 
-    def measure_neighbours(self, around: ExactNeighbours) -> Neighbours:
-        """Return the measured neighbours."""
-        ahead, behind = around
+    def measure_neighbours(self, neighbours: ExactNeighbours) -> Neighbours:
+        """Return the measurement of all neighbours."""
+        ahead, behind = neighbours
         sigma_m, sigma_mps, sigma_mps2 = self._other_noise
-        # Drawn for all at once, in their order.
         errors = self._draw(3 * (len(ahead) + len(behind)))
         seen = []
         index = 0

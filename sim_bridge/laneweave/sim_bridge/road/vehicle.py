@@ -92,16 +92,16 @@ class RoadVehicle:
         """Ticks on each rung of the fallback ladder."""
         return self.controller.rung_ticks
 
-    def perceive(self, around: ExactNeighbours) -> None:
+    def perceive(self, neighbours: ExactNeighbours) -> None:
         """Measure its own state and its neighbours, given as exact sensors would see them."""
         if self.sensors is not None:
             measured = self.sensors.measure(self.state)
-            self.controller.perceive(measured, self.sensors.measure_neighbours(around))
+            self.controller.perceive(measured, self.sensors.measure_neighbours(neighbours))
 
     def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
         """Return its SENSE at the tick that begins: measurements and state of its controller."""
         controller = self.controller
-        around = controller.around
+        neighbours = controller.neighbours
         return Sense(
             vehicle=self.name,
             tick=tick,
@@ -112,8 +112,8 @@ class RoadVehicle:
             motion_origin=controller.motion_origin,
             motion_ticks=controller.motion_ticks,
             preferred_lane=self.admission.arrival.preferred_lane,
-            ahead=around.ahead,
-            behind=around.behind,
+            ahead=neighbours.ahead,
+            behind=neighbours.behind,
             setpoint=controller.plant.setpoint,
             formation=self.block,
             attendant=controller.attendant,
