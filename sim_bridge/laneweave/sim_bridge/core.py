@@ -331,7 +331,7 @@ class BridgeCore:
 
     def _start_caretakers(self, now_s: float) -> Iterator[Effect]:
         """Put caretakers in charge of vehicles whose agents are absent, silent or too late."""
-        for name in self._answers.finish_tick(now_s):
+        for name in self._answers.update_durations(now_s):
             self._record.event(self.t_s, AGENT_SILENT, vehicle=name)
         for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
             self._record.on_caretaker_took_over(self.t_s, vehicle.name, absence)

@@ -300,7 +300,7 @@ def test_a_bad_network_slows_a_run_down_and_nothing_else(tmp_path: Path) -> None
 
 def test_the_clock_does_not_race_while_the_bridge_is_off_the_network(tmp_path: Path) -> None:
     street = Street(SHORT_ROAD, tmp_path, MANY)
-    street.bridge._tick_lasts_s = 1e-3  # as fast as agents answer
+    street.bridge._tick_duration_s = 1e-3  # as fast as agents answer
     street.start_shard()
     street.run_to(60)
     street.network.disconnect("bridge")

@@ -223,7 +223,7 @@ class LightRoad:
 
     def _attend(self, now_s: float) -> Iterator[Effect]:
         """Let caretakers take charge of vehicles with absent or silent agents."""
-        self._attendance.answers.finish_tick(now_s)
+        self._attendance.answers.update_durations(now_s)
         for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
             if absence is Absence.ABSENT and now_s < vehicle.admission.t_s + AGENT_START_S:
                 continue

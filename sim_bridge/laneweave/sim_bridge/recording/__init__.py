@@ -1,5 +1,4 @@
 """The files of a run: trajectories, trips, events, ticks and the summary.
 
-Entry point: `run_record.RunRecord`. Imported by `sim_bridge.core`, `baselines`
-and launch.
+Entry point: `run_record.RunRecord`. Imported by `sim_bridge.core`, `baselines` and launch.
 """

@@ -1,12 +1,12 @@
-"""The record of a run: its files, and the figures of all roles in `summary.json`.
+"""The record of a run: its files, and the results of all roles in `summary.json`.
 
-    trajectories.parquet   one row per vehicle and tick, written in row groups as the run goes on
+    trajectories.parquet   one row per vehicle and tick, written in row groups during the run
     trips.parquet          one row per demanded vehicle, written at the end
     ticks.parquet          one row per tick, written at the end
     events.jsonl           one JSON object per line, flushed line by line
 
-The first two contain the scenario as JSON in their metadata (key `SCENARIO_KEY`), so that figures
-can be drawn from them alone.
+The metadata of the first two contain the scenario as JSON (key `SCENARIO_KEY`), so that figures can
+be drawn from them alone.
 """
 
 from __future__ import annotations
@@ -72,11 +72,11 @@ class RecordedVehicle(Protocol):
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Name of the vehicle."""
 
     @property
     def arrival(self) -> Arrival:
-        """Its demand."""
+        """Arrival at the entrance."""
 
     @property
     def entered_s(self) -> float:
@@ -84,24 +84,24 @@ class RecordedVehicle(Protocol):
 
     @property
     def formation(self) -> int | None:
-        """Number of its formation, None if the method has none."""
+        """Number of the formation, if any."""
 
     @property
     def state(self) -> State:
-        """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2)."""
+        """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""
 
     @property
     def cell(self) -> tuple[int | None, int]:
-        """Column and lane that it holds or moves to; column None off the lattice."""
+        """(column, lane) that the vehicle holds or moves to; column None off the lattice."""
 
     @property
     def rung_ticks(self) -> Mapping[Rung, int]:
-        """Ticks on each rung of the ladder; empty without a motion controller."""
+        """Ticks on each rung of the fallback ladder; empty without a motion controller."""
 
 
 @define
 class _Leadership:
-    """The leader, as seen in heartbeats."""
+    """The leader and its changes, according to heartbeats."""
 
     leader: tuple[Name, int] | None = None
     last_heartbeat_s: float = 0.0
@@ -110,23 +110,23 @@ class _Leadership:
 
 
 class Ending(Enum):
-    """Why a run ended."""
+    """Reason for the end of a run."""
 
     COMPLETE = "complete"
     """All demanded vehicles have left."""
     INTERRUPTED = "interrupted"
-    """It was stopped, or something failed."""
+    """The run was stopped, or something failed."""
     LIMIT = "limit"
-    """The road time limit was reached."""
+    """`max_road_s` was reached."""
 
 
 class RunRecord:
-    """Collects a run's measurements and writes its folder."""
+    """Collector of a run's measurements, and writer of its folder."""
 
     def __init__(
         self, folder: Path, scenario: Scenario, method: str, stopwatch: Callable[[], float]
     ) -> None:
-        """Open the files of a run in its folder, which is created if it is missing."""
+        """Open the files of a run in its folder, which is created if necessary."""
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._scenario = scenario
@@ -144,14 +144,14 @@ class RunRecord:
         self._plans: list[dict[str, Any]] = []
         self._plans_by_solver = Counter(dict.fromkeys(SOLVERS, 0))
         self._ticks: list[tuple[float, int, float]] = []
-        """(road time, vehicles on the road, duration in ms) of each tick."""
+        """(road time [s], vehicles on the road, duration [ms]) of each tick."""
         self._rung_ticks: Counter[Rung] = Counter()
         self._caretaker_takeovers = 0
         self._agent_takeovers = 0
         self._left_unattended = 0
         self._closed = False
         self.missed_ticks = 0
-        """Answers that had not arrived by their tick's deadline."""
+        """Number of answers that were missing at their tick's deadline."""
 
     # --- the road -----------------------------------------------------------------
 
@@ -160,7 +160,7 @@ class RunRecord:
         self._write_event(t_s, kind, {"role": "bridge"} | data)
 
     def on_demanded(self, arrival: Arrival) -> None:
-        """Record a vehicle that wants to enter."""
+        """Record the arrival of a vehicle."""
         self._trips[Name(arrival.vehicle)] = Trip(arrival)
 
     def on_entered(self, vehicle: RecordedVehicle) -> None:
@@ -192,7 +192,7 @@ class RunRecord:
     def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
         """Record a vehicle that has passed the end of the road since the last tick.
 
-        `attended`: its agent was in charge, not its caretaker.
+        `attended`: its agent was in charge, not a caretaker.
         """
         s_m, v_mps, _, y_m, _, _ = vehicle.state
         beyond_m = s_m - self._scenario.road.length_m
@@ -211,15 +211,15 @@ class RunRecord:
             self.event(left_s, LEFT_OFF_LANE, **lanes, attended=attended)
 
     def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
-        """Record a vehicle that is on the road at the end of the run."""
+        """Record a vehicle that remains on the road at the end of the run."""
         self._rung_ticks.update(vehicle.rung_ticks)
 
     def on_missed(self, agents: int) -> None:
-        """Record the number of agents that have not answered a tick by its deadline."""
+        """Record the number of answers that were missing at a tick's deadline."""
         self.missed_ticks += agents
 
     def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
-        """Record that a caretaker has taken charge, and why: see `Absence`."""
+        """Record that a caretaker has taken charge; `reason` is an `Absence`."""
         self._caretaker_takeovers += 1
         self.event(t_s, CARETAKER_TOOK_OVER, vehicle=vehicle, reason=reason)
 
@@ -237,7 +237,7 @@ class RunRecord:
         collisions: Iterable[tuple[str, str]],
         gaps: MinGaps,
     ) -> None:
-        """Record positions, overlaps, collisions and gaps at a tick."""
+        """Record positions, overlaps, collisions and gaps of a tick."""
         overlaps = list(overlaps)
         for pair in overlaps:
             self.event(t_s, OVERLAP, vehicles=pair)
@@ -262,14 +262,11 @@ class RunRecord:
                 self._plans_by_solver[solver] += 1
 
     def on_report(self, report: Report) -> None:
-        """Record the counters of a role; the newest report of a sender counts."""
+        """Record the counters of a role, which replace its earlier ones."""
         self._reports[report.role, report.name] = report
 
     def on_heartbeat(self, heartbeat: Heartbeat, t_s: float, now_s: float) -> None:
-        """Record changes of the leader and the times without one.
-
-        `now_s` is the node's clock.
-        """
+        """Record changes of the leader and times without one; `now_s` is the node's clock."""
         leadership = self._leadership
         sender = (heartbeat.coordinator, heartbeat.incarnation)
         if not heartbeat.leading:
@@ -285,7 +282,7 @@ class RunRecord:
     # --- the end ------------------------------------------------------------------------------
 
     def close(self, t_s: float, ending: Ending) -> None:
-        """Write all files. Idempotent: the first ending counts."""
+        """Write all files; only the first call has an effect."""
         if self._closed:
             return
         self.event(t_s, RUN_ENDED, ending=ending.value)
@@ -300,16 +297,17 @@ class RunRecord:
         write_summary(self._folder, self._summary(trips, t_s, ending))
 
     def _write_event(self, t_s: float, kind: str, data: Mapping[str, object]) -> None:
-        """Write a line to `events.jsonl` immediately, unless the record is closed.
+        """Write a line to `events.jsonl` immediately unless the record is closed.
 
-        Values unknown to JSON are written as text; keys `t_s` and `kind` in the data are ignored.
+        Values that JSON does not support are written as text; keys `t_s` and `kind` in the data are
+        ignored.
         """
         if not self._closed:
             own: dict[str, object] = {"t_s": t_s, "kind": kind}
             self._events.write(json.dumps({**own, **data, **own}, default=str) + "\n")
 
     def _write_ticks(self) -> None:
-        """Write ticks.parquet: how long each tick took, with how many vehicles on the road."""
+        """Write `ticks.parquet`: duration of each tick and number of vehicles on the road."""
         types = {"t_s": pa.float64(), "on_road": pa.int32(), "tick_ms": pa.float32()}
         columns = zip(*self._ticks, strict=True) if self._ticks else ((), (), ())
         table = pa.table(
@@ -407,7 +405,7 @@ def _sample(vehicle: RecordedVehicle) -> Sample:
 
 
 def _per_process(reports: Iterable[Report], counter: str) -> int:
-    """Return the sum over processes of a counter that each may report for several vehicles."""
+    """Return the sum of a counter over processes, which may report it for several vehicles."""
     newest: dict[Name, int] = {}
     for report in reports:
         newest[report.process] = max(newest.get(report.process, 0), getattr(report, counter))
@@ -419,7 +417,7 @@ def _number(value: object) -> float:
 
 
 def _milliseconds(packed: Iterable[bytes]) -> NDArray[np.float64]:
-    """Return the valid durations: reports come from other processes."""
+    """Return the valid durations in reports of other processes."""
     whole = b"".join(each for each in packed if len(each) % 4 == 0)
     values = np.frombuffer(whole, dtype="<f4").astype(np.float64)
     return values[np.isfinite(values) & (values >= 0.0)]

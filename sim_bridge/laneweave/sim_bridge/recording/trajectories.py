@@ -1,4 +1,4 @@
-"""Trajectories: a row for each vehicle and tick in `trajectories.parquet`, and their extremes."""
+"""Trajectories: one row per vehicle and tick in `trajectories.parquet`, and extreme values."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.trips import Metadata, finite
 
 ROWS_PER_GROUP = 100_000
-"""Rows that are buffered before they are written."""
+"""Number of rows that are written together."""
 EMERGENCY_SHARE = 0.9
-"""Braking harder than this share of the limit counts as an emergency brake."""
+"""Fraction of the braking limit beyond which braking counts as an emergency brake."""
 
 _COLUMNS: list[pa.Field[Any]] = [
     pa.field("t_s", pa.float64(), nullable=False),
@@ -31,19 +31,19 @@ _COLUMNS: list[pa.Field[Any]] = [
 ]
 
 Sample = tuple[str, float, float, float, float, int | None, int]
-"""(vehicle, s m, y m, speed m/s, acceleration m/s2, column or None off the lattice, lane).
+"""(vehicle, s [m], y [m], speed [m/s], acceleration [m/s2], column or None off the lattice, lane).
 
-s is the front bumper, y the body's centre from the right road edge; column and lane are the cell.
+s: front bumper; y: centre of the body from the right road edge; column and lane: cell.
 """
 
 
 class Trajectories:
-    """Writes the rows in groups as the run goes on, and measures the extremes over them."""
+    """Writer of trajectories, which also computes their extreme values."""
 
     def __init__(self, path: Path, metadata: Metadata, min_accel_mps2: float) -> None:
-        """Open the file; `min_accel_mps2` is the limit of braking."""
+        """Open the file; `min_accel_mps2` is the braking limit."""
         self.peak = 0
-        """Highest number of vehicles in a tick."""
+        """Maximum number of vehicles in a tick."""
         self._schema = pa.schema(_COLUMNS, metadata)
         self._writer = pq.ParquetWriter(
             path,
@@ -54,10 +54,10 @@ class Trajectories:
         )
         self._times: list[float] = []
         self._rows: list[Sample] = []
-        """Buffered rows; `_times` has the time of each."""
+        """Buffered rows; `_times` contains their times."""
         self._brake_mps2 = EMERGENCY_SHARE * min_accel_mps2
         self._last_s, self._last_accels = -math.inf, dict[str, float]()
-        """Time of the last tick, and the acceleration of each vehicle in it."""
+        """Time of the last tick, and accelerations of all vehicles in it."""
         self._overlaps: set[tuple[str, str]] = set()
         self._collisions: set[tuple[str, str]] = set()
         self._min_gap_m = self._min_headway_s = math.inf
@@ -66,7 +66,7 @@ class Trajectories:
         self._max_jerk_mps3 = -math.inf
 
     def tick(self, t_s: float, rows: list[Sample]) -> None:
-        """Record all vehicles on the road at a road time, once per tick."""
+        """Record all vehicles on the road; called once per tick."""
         brake_mps2, last_accels, dt_s = self._brake_mps2, self._last_accels, t_s - self._last_s
         accels = {row[0]: row[4] for row in rows}
         for vehicle, accel in accels.items():
@@ -90,20 +90,14 @@ class Trajectories:
         collisions: Iterable[tuple[str, str]],
         gaps: MinGaps,
     ) -> None:
-        """Record how close the vehicles are in one tick.
-
-        Args:
-            overlaps: pairs of `Bodies.overlapping_pairs`.
-            collisions: pairs that SUMO reports.
-            gaps: result of `Bodies.min_gaps`.
-        """
+        """Record overlaps, collisions reported by SUMO, and minimum gaps of one tick."""
         self._overlaps.update(overlaps)
         self._collisions.update(collisions)
         self._min_gap_m = min(self._min_gap_m, gaps.gap_m)
         self._min_headway_s = min(self._min_headway_s, gaps.headway_s)
 
     def safety(self) -> Safety:
-        """Return the counts and extremes so far."""
+        """Return the counts and extreme values so far."""
         return Safety(
             overlaps=len(self._overlaps),
             sumo_collisions=len(self._collisions),

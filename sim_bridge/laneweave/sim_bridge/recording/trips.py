@@ -1,4 +1,4 @@
-"""Trips: a row for each demanded vehicle in `trips.parquet`, and the figures over all of them."""
+"""Trips: one row per demanded vehicle in `trips.parquet`, and statistics of trips."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Metadata = dict[bytes | str, bytes | str]
 SCENARIO_KEY = b"laneweave.scenario"
 """Key of the scenario in the metadata of a run's Parquet files."""
 WARM_UP_S = 60.0
-"""Vehicles that enter before this road time are not counted: the road is emptier for them."""
+"""Road time before which entering vehicles are not counted, since the road is still empty."""
 
 _COLUMNS: list[pa.Field[Any]] = [
     pa.field("vehicle", pa.string(), nullable=False),
@@ -51,7 +51,7 @@ class Trip:
     final_lane: int | None = None
 
     def row(self, last_arrival_s: float) -> dict[str, Any]:
-        """Return its row; its travel time includes the time for which it waited to enter."""
+        """Return the row of the trip; travel time includes waiting at the entrance."""
         demanded_s, entered_s, left_s = self.arrival.t_s, self.entered_s, self.left_s
         entered_in_time = entered_s is not None and WARM_UP_S <= entered_s <= last_arrival_s
         left = self.final_lane is not None
@@ -85,16 +85,16 @@ def trips_table(trips: Iterable[Trip], metadata: Metadata) -> pa.Table:
 
 
 def travel_time(trips: pa.Table) -> TravelTime:
-    """Return the figures of the counted vehicles' travel times."""
+    """Return statistics of the counted vehicles' travel times."""
     times_s = trips.filter(pc.field("counted"))["travel_time_s"].to_numpy()
     mean_s = finite(float(np.mean(times_s))) if len(times_s) else None
     return TravelTime(mean=mean_s, **percentiles_of(times_s, 50, 95, largest=True))
 
 
 def throughput(trips: pa.Table, lanes: int) -> float | None:
-    """Return the vehicles per lane and hour that pass the end of the road; None if undefined.
+    """Return the flow at the end of the road [vehicles/(lane h)]; None if undefined.
 
-    It is the rate between the first and the last counted vehicle that leave.
+    It is measured between the first and the last counted vehicle that leave.
     """
     counted_s = trips.filter(pc.field("counted"))["left_s"].to_numpy()
     if not len(counted_s) or counted_s.max() <= counted_s.min():
@@ -105,14 +105,14 @@ def throughput(trips: pa.Table, lanes: int) -> float | None:
 
 
 def finite(value: float) -> float | None:
-    """Return a number for JSON, rounded to a thousandth; None for infinities and NaN."""
+    """Return a number for JSON, rounded to three decimals; None for infinities and NaN."""
     return round(value, 3) if math.isfinite(value) else None
 
 
 def percentiles_of(
     values: NDArray[Any], *percentiles: int, largest: bool = False
 ) -> dict[str, float | None]:
-    """Return percentiles by name, `max` too if it is wanted; None where there are no values."""
+    """Return percentiles by name, with `largest` also `max`; None without values."""
     ranks = {f"p{percentile}": percentile for percentile in percentiles}
     if largest:
         ranks["max"] = 100

@@ -1,8 +1,7 @@
-"""Attendance: which process acts for each vehicle, its agent or a caretaker in place of it.
+"""Attendance: the process in charge of each vehicle, its agent or a caretaker.
 
-These rules hold on every road, whether its bodies are SUMO's or those of the fault simulation: when
-an agent counts as present or silent, when a caretaker takes charge and when it ends, and how agents
-learn that their vehicles have left.
+Rules for agents that are present or silent, for the beginning and end of caretakers, and for
+notifying agents that their vehicles have left. The bridge and the fault search share them.
 """
 
 from __future__ import annotations
@@ -22,34 +21,33 @@ from laneweave.sim_bridge.road.tick_answers import Answers
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 LEFT_REPEATS = 20
-"""Ticks for which the agent of a vehicle that left is notified."""
+"""Number of ticks in which the agent of a departed vehicle is notified."""
 
 
 class Absence(StrEnum):
-    """Why a vehicle needs a caretaker."""
+    """Reason for a caretaker."""
 
     ABSENT = "absent"
-    """Its agent has no token."""
+    """The agent has no token."""
     SILENT = "silent"
-    """Its agent has a token but sends nothing."""
+    """The agent has a token but sends no messages."""
     LATE = "late"
-    """Its agent always answers too late."""
+    """The agent always answers too late."""
 
 
 class Caretaker:
-    """Acts for one vehicle whose agent died, fell silent, or never came.
+    """Representative of a vehicle whose agent is dead, silent or missing.
 
-    It runs the same plan execution as an agent and publishes the same states, with two differences:
-    it never starts a move, and it accepts only plans in which its own vehicle has none. So the
-    coordinator that plans for the vehicle's formation does not have to wait for the agent or guess:
-    the vehicle promises where it stays, and the others are planned around it.
+    It runs the same plan execution as an agent and publishes the same states, but it never starts a
+    move, and accepts only plans in which its vehicle does not move. The vehicle promises to stay in
+    its cell, and the leader plans around it.
 
-    It does not drive: the motion controller finishes the trajectory that it has and holds. The
-    caretaker ends when an agent claims the vehicle with a COMMAND.
+    The motion controller finishes its trajectory and holds. The caretaker ends when an agent claims
+    the vehicle with a COMMAND.
     """
 
     def __init__(self, vehicle: RoadVehicle, incarnation: int, tick: int) -> None:
-        """Take charge of a vehicle at the tick that begins, whatever its motion.
+        """Take charge of a vehicle at the beginning of a tick.
 
         Raises:
             ValueError: the incarnation is not greater than that of the process in charge.
@@ -69,10 +67,10 @@ class Caretaker:
         self._execution.on_owned(vehicle.sense(tick, caretaker=True))
 
     def on_message(self, message: Prepare | Plan, tick: int) -> VehicleState | None:
-        """V2 and V3: promise, or accept a plan in which this vehicle only holds.
+        """Promise a ballot (V2), or accept a plan without moves of this vehicle (V3).
 
         Returns:
-            The state to publish at once; None: the message changes nothing.
+            The state to publish at once; None if the message has no effect.
         """
         execution, controller = self._execution, self._vehicle.controller
         if isinstance(message, Prepare):
@@ -92,7 +90,7 @@ class Caretaker:
         return self.state(tick) if accepted else None
 
     def state(self, tick: int) -> VehicleState:
-        """Return the state to publish at a tick; V7 when the controller's motion has ended."""
+        """Return the state to publish in a tick; end the motion if the controller has (V7)."""
         vehicle, execution = self._vehicle, self._execution
         if execution.moving and not vehicle.controller.moving(tick):
             execution.end_motion()
@@ -101,13 +99,13 @@ class Caretaker:
 
 
 class Attendance:
-    """Agents and caretakers of a road, and the messages of the caretakers.
+    """Agents and caretakers of a road.
 
-    PREPARE and PLAN of a vehicle are subscribed to only while its caretaker is in charge.
+    The bridge subscribes to PREPARE and PLAN of a vehicle only while its caretaker is in charge.
     """
 
     def __init__(self, scenario: Scenario, new_incarnation: Callable[[], int]) -> None:
-        """Begin without agents and caretakers; the callable returns unused incarnations."""
+        """Begin without agents; `new_incarnation` returns unused incarnations."""
         self.answers = Answers(scenario.runtime)
         self.link_up = True
         """Whether the bridge is connected to the network."""
@@ -115,23 +113,23 @@ class Attendance:
         self._new_incarnation = new_incarnation
         self._caretakers: dict[Name, Caretaker] = {}
         self.departed: dict[Name, tuple[RoadVehicle, int]] = {}
-        """Vehicles that have left the road, and how often their agents are still notified."""
+        """Vehicles that have left the road, with the number of remaining notifications."""
         self._absence_counts_s = -math.inf
-        """From this time on a missing token means that the agent is absent."""
+        """Time from which an agent without a token counts as absent."""
 
     def __contains__(self, vehicle: Name) -> bool:
-        """Return whether a vehicle's caretaker is in charge."""
+        """Return whether a caretaker is in charge of a vehicle."""
         return vehicle in self._caretakers
 
     @property
     def caretaker_count(self) -> int:
-        """Number of vehicles whose caretaker is in charge."""
+        """Number of vehicles with a caretaker in charge."""
         return len(self._caretakers)
 
     # --- agents -------------------------------------------------------------------------------
 
     def on_network(self, event: Event, now_s: float) -> None:
-        """Process agents' tokens and the bridge's own connection; ignore other events."""
+        """Handle agents' tokens and the state of the bridge's connection; ignore other events."""
         match event:
             case PeerUp(topic, parameters) if topic is VEHICLE_ALIVE:
                 self.answers.agent_up(Name(parameters["vehicle"]))
@@ -151,17 +149,17 @@ class Attendance:
                 pass
 
     def start_tick(self, vehicles: Mapping[Name, RoadVehicle], now_s: float) -> None:
-        """Begin a tick that is sent to all vehicles on the road."""
+        """Start a tick for all vehicles on the road."""
         self.answers.start_tick(vehicles, now_s, link_up=self.link_up)
 
     def register_command(self, vehicle: RoadVehicle, command: Command) -> bool:
-        """Register a COMMAND as a sign of life, and note what its agent has joined and accepted.
+        """Register a COMMAND as a sign of life, and store its requests in the controller.
 
         Returns:
-            Whether the vehicle has noted something that its agent waits for.
+            Whether the controller has stored a change, which the agent waits for.
         """
-        # An agent that answers late is present: the next tick waits for it, and it catches up. An
-        # agent that is no longer in charge is no evidence for the one that is.
+        # Late answers also show that an agent is present, but a replaced agent says nothing about
+        # its successor.
         if command.incarnation >= vehicle.controller.attendant or vehicle.name in self:
             self.answers.on_message(vehicle.name)
         return vehicle.controller.store_requests(command)
@@ -169,10 +167,10 @@ class Attendance:
     def accept_command(
         self, vehicle: RoadVehicle, command: Command
     ) -> Generator[Effect, None, bool]:
-        """Hand a COMMAND to the vehicle's motion controller; a claim ends its caretaker.
+        """Pass a COMMAND to the vehicle's motion controller; a claim ends the caretaker.
 
         Returns:
-            Whether the controller obeys it.
+            Whether the controller accepts it.
 
         Raises:
             BadInputError: the command is invalid.
@@ -183,19 +181,19 @@ class Attendance:
             return False
         self.answers.in_time(vehicle.name)
         if controller.attendant != attendant:
-            # An agent that claims a vehicle is present even if its token has not been seen.
+            # An agent that claims a vehicle is present, even before its token appears.
             self.answers.agent_up(vehicle.name)
             yield from self._end_caretaker(vehicle.name)
         return True
 
     def leave(self, vehicle: RoadVehicle) -> Iterator[Effect]:
-        """Take a vehicle off the road, and notify its agent from now on."""
+        """Remove a vehicle from the road, and notify its agent from now on."""
         self.answers.remove(vehicle.name)
         self.departed[vehicle.name] = (vehicle, LEFT_REPEATS)
         yield from self._end_caretaker(vehicle.name)
 
     def notify_departed(self, tick: int) -> Iterator[Effect]:
-        """Notify the agents of departed vehicles that are up once more."""
+        """Notify the present agents of departed vehicles again."""
         for name, (vehicle, repeats) in list(self.departed.items()):
             if name not in self.answers.up or repeats == 0:
                 del self.departed[name]
@@ -208,9 +206,9 @@ class Attendance:
     def unattended(
         self, vehicles: Mapping[Name, RoadVehicle], now_s: float
     ) -> Iterator[tuple[RoadVehicle, Absence]]:
-        """Yield the vehicles without a process in charge, and why."""
+        """Yield the vehicles that need a caretaker, with the reason."""
         if not self.link_up:
-            return  # without a connection, silence is no evidence
+            return  # without a connection, no message can arrive
         absence_counts = now_s >= self._absence_counts_s
         answers, caretakers = self.answers, self._caretakers
         for name, vehicle in vehicles.items():
@@ -231,7 +229,7 @@ class Attendance:
         yield Listen(PLAN, {"vehicle": vehicle.name})
 
     def on_message(self, vehicle: Name, message: Prepare | Plan, tick: int) -> Iterator[Effect]:
-        """Dispatch a message to the caretaker that it concerns, and send its answer."""
+        """Pass a message to the vehicle's caretaker, and publish its answer."""
         caretaker = self._caretakers.get(vehicle)
         state = None if caretaker is None else caretaker.on_message(message, tick)
         if state is not None:
@@ -243,7 +241,7 @@ class Attendance:
             yield _state_effect(caretaker.state(tick))
 
     def _end_caretaker(self, vehicle: Name) -> Iterator[Effect]:
-        """End a vehicle's caretaker, if it has one: an agent is in charge, or the vehicle left."""
+        """End a vehicle's caretaker, if it has one."""
         if self._caretakers.pop(vehicle, None) is not None:
             yield Unlisten(PREPARE, {"vehicle": vehicle})
             yield Unlisten(PLAN, {"vehicle": vehicle})
@@ -254,6 +252,6 @@ def _state_effect(state: VehicleState) -> Effect:
 
 
 def notify_left(vehicle: RoadVehicle, tick: int) -> Effect:
-    """Return the message upon which an agent reports and ends."""
+    """Return the SENSE that makes the agent of a departed vehicle report and end."""
     sense = vehicle.sense(tick, caretaker=False, left=True)
     return Send(SENSE, sense, {"vehicle": vehicle.name})

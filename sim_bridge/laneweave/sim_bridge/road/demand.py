@@ -4,10 +4,10 @@ On each lane the headway between two arrivals is
 
     min_headway + Exp(3600 / volume - min_headway)      (mean 3600 / volume seconds),
 
-and each vehicle draws its preferred lane from the scenario's lane shares. Every lane has its own
-random generator for headways and another for preferences, all derived from the scenario's seed.
-So equal seeds give equal arrivals, a lane's arrivals do not depend on the number of other lanes,
-and the stream of a longer duration begins with that of a shorter one, names included.
+and the preferred lane of each vehicle is drawn from the scenario's lane shares. Every lane has one
+random generator for headways and one for preferences, seeded with the scenario's seed. Equal seeds
+give equal arrivals, the arrivals on a lane do not depend on other lanes, and arrivals of a longer
+duration begin with those of a shorter one, including names.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ _HEADWAYS, _PREFERENCES = 0, 1
 
 @frozen
 class Arrival:
-    """A vehicle that wants to enter the road."""
+    """Arrival of a vehicle at the entrance."""
 
     vehicle: str
-    """Its name: `v` and its number in order of arrival over all lanes, from 1."""
+    """Name: `v` and the number in order of arrival on all lanes, from 1."""
     lane: int
-    """Lane on which it arrives; 0 is the rightmost."""
+    """Lane of the arrival; 0 is the rightmost."""
     preferred_lane: int
-    """Lane on which it wants to leave the road."""
+    """Lane on which the vehicle wants to leave the road."""
     t_s: float
-    """Road time at which it would pass the start of an empty road."""
+    """Road time at which the vehicle would pass the start of an empty road."""
 
 
 def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
-    """Draw all arrivals in [0, demand.duration_s] from a scenario's seed, by time, then lane."""
+    """Return the seeded arrivals in [0, demand.duration_s], sorted by time, then lane."""
     drawn = sorted(
         (t_s, lane, preferred)
         for lane in range(scenario.road.lanes)
@@ -52,14 +52,14 @@ def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
 
 
 def _arrivals_on(lane: int, scenario: Scenario) -> list[tuple[float, int]]:
-    """Return (time in s, preferred lane) of each arrival on one lane."""
+    """Return (time [s], preferred lane) of each arrival on one lane."""
     demand = scenario.demand
     mean_excess_s = max(0.0, 3600.0 / demand.volume_veh_per_lane_h - demand.min_headway_s)
     headways, preferences = (
         default_rng(SeedSequence(scenario.seed, spawn_key=(purpose, lane)))
         for purpose in (_HEADWAYS, _PREFERENCES)
     )
-    # The last bound is exactly one despite rounding: every draw in [0, 1) finds a lane.
+    # Without the last bound, rounding cannot exclude a draw in [0, 1).
     bounds = np.array([*accumulate(scenario.lane_shares)][:-1])
     result: list[tuple[float, int]] = []
     t_s = 0.0

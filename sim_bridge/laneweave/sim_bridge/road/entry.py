@@ -1,15 +1,14 @@
 """Entry metering at the start of the road.
 
-A vehicle enters at s = 0 with the lattice speed v_F. It gets the first free cell on its lane,
-behind its predecessor, that passes s = 0 at most `spread_s` before or after the vehicle, and
-settles in that cell on the first stretch of road. With interlaced entry only every other
-cell may be entered ("checkerboard", the paper's structure for driving). Vehicles of a lane enter in
-order of arrival, at least a column's time apart.
+A vehicle enters at s = 0 with the lattice speed v_F. It gets the first free cell of its lane behind
+its predecessor that passes s = 0 at most `spread_s` before or after the vehicle, and settles in
+this cell. With interlaced entry only every other cell may be entered, as in the paper's driving
+structure. Vehicles of a lane enter in order of arrival, at least the time of one column apart.
 
-In the operations with formations, `formation_building` decides whether a formation takes a vehicle.
+With formations, `formation_building` decides whether a formation admits a vehicle.
 
-Decisions are causal: they are made in order of time, and at equal times from the right lane to the
-left, so nothing depends on later arrivals.
+Decisions do not depend on later arrivals: they are made in order of time, and at equal times from
+the right lane to the left.
 """
 
 from __future__ import annotations
@@ -24,23 +23,23 @@ from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.formation_building import FormationBuilder
 
 TIME_TOLERANCE_S = 1e-9
-"""Ticks and passing times are equal instants computed in two ways."""
+"""Tolerance for comparing ticks with passing times, due to rounding."""
 
 
 @frozen
 class Admission:
-    """A vehicle enters the road at s = 0 with speed v_F."""
+    """Entry of a vehicle at s = 0 with speed v_F."""
 
     arrival: Arrival
     cell: Cell
     t_s: float
-    """Road time at which it passes s = 0."""
+    """Road time at which the vehicle passes s = 0."""
     offset_m: float = 0.0
-    """Distance by which it is ahead of its cell."""
+    """Distance by which the vehicle is ahead of its cell."""
 
 
 class EntryMeter:
-    """Assigns lattice cells to arriving vehicles; pure and incremental."""
+    """Incremental assignment of lattice cells to arriving vehicles."""
 
     def __init__(
         self,
@@ -55,8 +54,8 @@ class EntryMeter:
         Args:
             lattice: the lattice whose cells are assigned.
             spread_s: maximum time between a vehicle and its cell at s = 0.
-            builder: builds formations of the vehicles that enter; None: there are none.
-            interlaced: whether only every other cell may be entered.
+            builder: assigns entering vehicles to formations; None: no formations.
+            interlaced: only every other cell may be entered.
         """
         self._lattice = lattice
         self._builder = builder
@@ -65,27 +64,24 @@ class EntryMeter:
         self._queues: list[list[Arrival]] = [[] for _ in range(lattice.lanes)]
         self._names: set[str] = set()
         self._columns = [0] * lattice.lanes
-        """The next column of each lane that can be entered."""
+        """Next column of each lane that can be entered."""
         self._free_s = [-math.inf] * lattice.lanes
         """Earliest time at which the next vehicle of each lane may enter."""
 
     @property
     def waiting(self) -> tuple[Arrival, ...]:
-        """Vehicles that were demanded and not yet admitted, by lane."""
+        """Queued vehicles, by lane."""
         return tuple(arrival for queue in self._queues for arrival in queue)
 
     def closed_column(self, lane: int) -> int:
-        """Return the last column of a lane that no vehicle can enter any more."""
+        """Return the last column of a lane that can no longer be entered."""
         return self._columns[lane] + 1
 
     def demand(self, arrival: Arrival) -> None:
-        """Queue a vehicle on its lane, in order of arrival time.
-
-        It may be queued before its arrival time. Queued after it, the vehicle takes the first
-        possible cell from then on.
+        """Queue a vehicle on its lane in order of arrival, before or after its arrival time.
 
         Raises:
-            ValueError: the lattice lacks its lane or its preferred lane, or it already waits.
+            ValueError: a lane does not exist, or the vehicle is already queued.
         """
         lanes = range(self._lattice.lanes)
         if arrival.lane not in lanes or arrival.preferred_lane not in lanes:
@@ -98,7 +94,7 @@ class EntryMeter:
     def admit(self, until_s: float) -> list[Admission]:
         """Return the vehicles that have entered since the last call, by time, then lane.
 
-        `until_s` is usually the current road time; a vehicle demanded later enters later.
+        `until_s` is usually the current road time.
         """
         admissions = []
         while True:
@@ -113,13 +109,13 @@ class EntryMeter:
                 admissions.append(Admission(arrival, cell, t_s, offset_m))
                 self._free_s[lane] = t_s + self._lattice.pitch_m / self._lattice.speed_mps
             self._columns[lane] -= 1
-        # A column that has passed is not available to later demand.
+        # Columns that have passed are not available to later arrivals.
         for lane in range(self._lattice.lanes):
             self._skip(lane, until_s - TIME_TOLERANCE_S)
         return admissions
 
     def _entry_s(self, lane: int) -> float:
-        """Return when the first vehicle of a queue enters if its next cell is free."""
+        """Return when the first vehicle of a queue can enter the next column [s]."""
         queue = self._queues[lane]
         if not queue:
             return math.inf
@@ -128,7 +124,7 @@ class EntryMeter:
         return max(ready_s, self._lattice.passing_time_s(self._columns[lane]) - self._spread_s)
 
     def _skip(self, lane: int, t_s: float) -> None:
-        """Advance to the first column of a lane that can still be entered at a time."""
+        """Advance to the first column of a lane that can be entered at a time."""
         lattice, column = self._lattice, self._columns[lane]
         if self._builder is not None:
             column = int(min(column, self._builder.first_open_column))
@@ -139,7 +135,7 @@ class EntryMeter:
         self._columns[lane] = column
 
     def _dequeue(self, cell: Cell, t_s: float) -> Arrival | None:
-        """Remove and return the first of the queue, unless no formation takes it."""
+        """Remove and return the first vehicle of a queue, unless no formation admits it."""
         builder, queue = self._builder, self._queues[cell[1]]
         if builder is not None and not builder.try_add(cell, queue[0].preferred_lane, t_s):
             return None

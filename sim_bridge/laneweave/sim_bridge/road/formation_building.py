@@ -1,19 +1,18 @@
-"""Formation building at the entrance: which columns become one formation, and when it is closed.
+"""Formation building at the entrance: columns, members and closing of formations.
 
 A formation is *closed* when no vehicle can enter its columns any more, so its members are final.
-The roadside assigns each column to at most one closed formation, once: plans of different
-formations rely on this.
+Each column belongs to at most one closed formation, permanently: plans of different formations rely
+on this.
 
 - `ColumnBlocks`, as in the paper: all formations have the same number of columns.
 - `GrowingFormations`, the default: the length follows the traffic. A formation begins with the
-  column of its first vehicle. It ends when it has its maximum number of vehicles, when another
-  vehicle would need more places on a lane than the shortest formation has, or at its maximum
-  length, so that few vehicles do not wait for each other. Behind its last vehicle it gets the
-  columns that sorting needs: one free column's worth of cells, and as many columns as vehicles
-  prefer the same lane.
+  column of its first vehicle. It ends at its maximum number of vehicles, at its maximum length, or
+  before a vehicle that would need more places on a lane than the shortest formation has. Behind the
+  last vehicle it gets the columns that sorting needs: at least as many free cells as lanes, and as
+  many columns as vehicles prefer the same lane.
 
-Both close a formation before it needs more places on a lane than it has. **This refines the
-paper's operation**, which groups vehicles regardless of their preferences.
+Both close a formation before it needs more places on a lane than it has, unlike the paper, which
+groups vehicles regardless of their preferences.
 """
 
 from __future__ import annotations
@@ -37,15 +36,15 @@ class ColumnBlocks:
     spread_s: float
     """Maximum time between a vehicle and its cell at the start of the road."""
     first_open_column: float = math.inf
-    """The foremost column that can still be entered; infinite: any."""
+    """Foremost column that can still be entered; infinite: any."""
     _taken: Counter[int] = field(factory=Counter)
     _preferring: Counter[tuple[int, int]] = field(factory=Counter)
-    """Vehicles by (block, preferred lane)."""
+    """Number of vehicles by (block, preferred lane)."""
     _next: int = 0
-    """The next block to be closed."""
+    """Next block to be closed."""
 
     def try_add(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
-        """Take a vehicle that would enter in a cell; False: it needs a cell further back."""
+        """Add a vehicle that would enter in a cell; return False if it needs a later cell."""
         del t_s
         block = self.lattice.block_of(cell[0])
         if (
@@ -58,7 +57,7 @@ class ColumnBlocks:
         return True
 
     def closed(self, t_s: float) -> list[ClosedFormation]:
-        """Return the formations closed since the last call: their last column has passed."""
+        """Return the formations closed since the last call, whose last columns have passed."""
         closed = []
         while (closed_s := self._closing_s(self._next)) <= t_s:
             if self._taken[self._next]:
@@ -68,7 +67,7 @@ class ColumnBlocks:
 
     @property
     def closed_to(self) -> int:
-        """All blocks up to this number are closed; -1: none."""
+        """Number up to which all blocks are closed; -1: none."""
         return self._next - 1
 
     def _closing_s(self, block: int) -> float:
@@ -86,23 +85,23 @@ class GrowingFormations:
     spread_s: float
     """Maximum time between a vehicle and its cell at the start of the road."""
     first_open_column: float = 0
-    """The foremost column that can still be entered."""
+    """Foremost column that can still be entered."""
     _front: int | None = None
-    """Foremost column of the open formation; None: there is none."""
+    """Foremost column of the open formation, if any."""
     _rear: int = 0
-    """Column of its last vehicle."""
+    """Column of the last vehicle in the open formation."""
     _taken: int = 0
     _preferring: Counter[int] = field(factory=Counter)
-    """Vehicles of the open formation by preferred lane."""
+    """Number of vehicles in the open formation by preferred lane."""
     _closed: list[ClosedFormation] = field(factory=list)
 
     @property
     def shortest_length(self) -> int:
-        """Columns of a full formation with no more cells than it needs."""
+        """Columns of a full formation without additional cells."""
         return self._length_for(self.max_vehicles)
 
     def try_add(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
-        """Take a vehicle that would enter in a cell; False: it needs a cell further back."""
+        """Add a vehicle that would enter in a cell; return False if it needs a later cell."""
         column = cell[0]
         if self._front is not None and column <= self._front - self.max_columns:
             self._close(self._front - self.max_columns + 1, t_s)
@@ -111,7 +110,7 @@ class GrowingFormations:
         if column > self.first_open_column:
             return False
         if self._front is None:
-            # Columns ahead of the one just entered can still be entered, this many:
+            # Vehicles can still enter this many columns ahead of the current one.
             spread_m = self.spread_s * self.lattice.speed_mps
             ahead = math.floor(2.0 * spread_m / self.lattice.pitch_m + 1e-6)
             self._front = int(min(self.first_open_column, column + ahead))
@@ -125,7 +124,7 @@ class GrowingFormations:
 
     @property
     def closed_to(self) -> int:
-        """All blocks up to this number are closed; -1: none."""
+        """Number up to which all blocks are closed; -1: none."""
         return self.lattice.block_of(int(self.first_open_column)) - 1
 
     def closed(self, t_s: float) -> list[ClosedFormation]:
@@ -139,7 +138,7 @@ class GrowingFormations:
         return closed
 
     def _close(self, last_column: int, t_s: float) -> None:
-        """Close the open formation at a column, or behind it if it needs more cells."""
+        """Close the open formation at a column, or farther back if it needs more cells."""
         if self._front is None:
             return
         length = max(
@@ -155,17 +154,17 @@ class GrowingFormations:
         self._preferring.clear()
 
     def _length_for(self, vehicles: int) -> int:
-        """Return the columns that hold some vehicles and one free column's worth of cells."""
+        """Return the number of columns for some vehicles and as many free cells as lanes."""
         lanes = self.lattice.lanes
         return math.ceil((vehicles + lanes) / lanes) if lanes > 1 else vehicles
 
 
 FormationBuilder = ColumnBlocks | GrowingFormations
-"""Assigns entering vehicles to formations, in order of time."""
+"""Assigns entering vehicles to formations, in order of entry."""
 
 
 def formation_builder(scenario: Scenario) -> FormationBuilder | None:
-    """Return the builder of a scenario's formations; None: there are none."""
+    """Return the builder of a scenario's formations, if it has formations."""
     formation, lattice = scenario.formation, scenario.lattice
     spread_s = formation.entry_spread_s
     if formation.rolling:

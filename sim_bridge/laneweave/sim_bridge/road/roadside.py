@@ -1,6 +1,6 @@
 """The roadside at the entrance: admits vehicles, counts them, and publishes clock and census.
 
-The census is complete, so coordinators know every roster exactly.
+The census is complete, so coordinators know all rosters.
 """
 
 from __future__ import annotations
@@ -28,20 +28,19 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 CENSUS_EVERY_TICKS = 10
 MAX_EMPTY = 12
-"""Maximum number of empty cells that a vehicle gets behind it; fewer where moves begin soon, since
-it must own all of them before a plan can transfer any."""
+"""Maximum distance in columns between a vehicle and empty cells assigned to it. It is smaller if
+moves begin soon: all cells must be assigned before a plan can transfer them."""
 
 
 class Roadside:
     """Demand, entry metering and census."""
 
     def __init__(self, scenario: Scenario, bridge: int = 0) -> None:
-        """Draw the demand of a scenario; `bridge` is the incarnation of the bridge."""
+        """Draw the arrivals of a scenario; `bridge` is the incarnation of the bridge."""
         self._bridge = bridge
         self._announce_s = scenario.runtime.announce_s
         self._tick_s = scenario.runtime.tick_s
         self._lanes = scenario.road.lanes
-        # One more, so that no vehicle enters without an announcement.
         lattice, formation = scenario.lattice, scenario.formation
         ahead_s = self._announce_s + self._tick_s
         self._announced_per_lane = math.ceil(ahead_s / formation.entry_spacing_s) + 1
@@ -54,16 +53,16 @@ class Roadside:
             interlaced=formation.interlaced,
         )
         self._closed: list[ClosedFormation] = []
-        """Closed formations with a vehicle on the road."""
+        """Closed formations with vehicles on the road."""
         self._closed_to = -1
         self._recent: list[tuple[int, int, Name]] = []
-        """Column, lane and name of recently entered vehicles."""
+        """(column, lane, name) of recently entered vehicles."""
         self._next: list[list[tuple[int, Name]]] = [[] for _ in range(self._lanes)]
-        """By lane: vehicles that have entered since cells were assigned, foremost first."""
+        """Vehicles by lane that have entered since cells were last assigned, foremost first."""
         self._unassigned: list[Cell] = []
-        """Empty cells that no vehicle owns yet."""
+        """Empty cells without an owner."""
         self._assigned_to = [1 + MAX_EMPTY] * self._lanes
-        """By lane: the last column whose cells were assigned."""
+        """Last processed column of each lane."""
         columns = int(scenario.moves_from_m / lattice.pitch_m)
         self._max_empty = max(0, min(MAX_EMPTY, columns - 2))
         self._arrivals = arrivals(scenario)
@@ -74,10 +73,10 @@ class Roadside:
         self._announced: tuple[Announcement, ...] = ()
         self._census_sent_tick = -CENSUS_EVERY_TICKS
         self._census_changed = True
-        """A vehicle entered or left since the last census, or a block has closed."""
+        """Whether a vehicle has entered or left, or a block has closed, since the last census."""
 
     def newly_demanded(self, t_s: float) -> tuple[Arrival, ...]:
-        """Return the vehicles that arrived since the last call."""
+        """Return the arrivals since the last call."""
         first = self._demanded
         while (
             self._demanded < len(self._arrivals)
@@ -87,8 +86,8 @@ class Roadside:
         return self._arrivals[first : self._demanded]
 
     def admit(self, t_s: float) -> list[Admission]:
-        """Return the vehicles whose cells pass the start of the road up to now."""
-        # Queue arrivals up to the next tick: their cell may pass between two ticks.
+        """Return the vehicles that have entered since the last call."""
+        # Also queue arrivals before the next tick, since cells pass between ticks.
         while (
             self._queued < len(self._arrivals)
             and self._arrivals[self._queued].t_s <= t_s + self._tick_s
@@ -104,9 +103,9 @@ class Roadside:
         return admissions
 
     def close_formations(self, t_s: float) -> list[ClosedFormation]:
-        """Return the formations that have been closed since the last call.
+        """Return the formations closed since the last call.
 
-        Call it after `admit`, which decides on their members.
+        Must be called after `admit`, which determines their members.
         """
         if self._builder is None:
             return []
@@ -120,8 +119,8 @@ class Roadside:
     def assign_empty_cells(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
         """Assign empty cells at the entrance to vehicles near them (rolling operation).
 
-        A cell is assigned when no vehicle can enter in it any more. Cells without a near vehicle
-        wait for the next vehicles; those too far ahead of these stay without an owner.
+        A cell is assigned when no vehicle can enter in it any more. Cells without a vehicle nearby
+        wait for the next vehicles; cells too far ahead of these stay without an owner.
         """
         if not self._rolling:
             return
@@ -129,7 +128,7 @@ class Roadside:
             closed = self._meter.closed_column(lane)
             for column in range(self._assigned_to[lane] - 1, closed - 1, -1):
                 if self._next[lane] and self._next[lane][0][0] == column:
-                    self._remember(column, lane, self._next[lane].pop(0)[1])
+                    self._store_recent(column, lane, self._next[lane].pop(0)[1])
                 else:
                     self._assign((column, lane), vehicles)
             self._assigned_to[lane] = closed
@@ -139,7 +138,7 @@ class Roadside:
                 self._assign(cell, vehicles)
 
     def _assign(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
-        """Assign an empty cell to a near vehicle, preferably ahead of it on the same lane."""
+        """Assign an empty cell to a nearby vehicle, preferably one ahead on the same lane."""
         column, lane = cell
         first, last = column - self._max_empty, column + self._max_empty
         near = [
@@ -152,24 +151,21 @@ class Roadside:
         else:
             self._unassigned.append(cell)
 
-    def _remember(self, column: int, lane: int, name: Name) -> None:
-        """Remember an entered vehicle, and forget those far ahead of it."""
+    def _store_recent(self, column: int, lane: int, name: Name) -> None:
+        """Store an entered vehicle, and remove vehicles far ahead of it."""
         far = column + 2 * self._max_empty
         self._recent = [one for one in self._recent if one[0] <= far]
         self._recent.append((column, lane, name))
 
     def count_left(self) -> None:
-        """Count a vehicle that passed the end of the road."""
+        """Count a vehicle that has passed the end of the road."""
         self._left += 1
         self._census_changed = True
 
     def publish(
         self, tick: int, t_s: float, on_road: Collection[RoadVehicle], *, ended: bool = False
     ) -> Iterator[Effect]:
-        """Publish the clock, and the census on every change, every 10 ticks, and at the end.
-
-        The closing of a formation is a change, too: its roster is final then.
-        """
+        """Publish the clock, and the census on every change, every 10 ticks, and at the end."""
         yield Send(CLOCK, self.clock(tick, t_s, len(on_road), ended=ended))
         due = ended or tick >= self._census_sent_tick + CENSUS_EVERY_TICKS
         announced = self.update_announcements(t_s)
@@ -179,7 +175,7 @@ class Roadside:
             yield Send(CENSUS, self.census(t_s, on_road))
 
     def clock(self, tick: int, t_s: float, on_road: int, *, ended: bool = False) -> RoadClock:
-        """Return the clock of a tick, with the numbers of vehicles."""
+        """Return the clock message of a tick, with counts of vehicles."""
         return RoadClock(
             tick=tick,
             t_s=t_s,
@@ -192,7 +188,7 @@ class Roadside:
         )
 
     def exhausted(self, t_s: float) -> bool:
-        """Return whether no vehicle waits and no further one will arrive."""
+        """Return whether no vehicle waits or will arrive."""
         return (
             self._queued == len(self._arrivals)
             and not self._meter.waiting
@@ -200,13 +196,13 @@ class Roadside:
         )
 
     def update_announcements(self, t_s: float) -> bool:
-        """Update the vehicles that are about to arrive; return whether they have changed."""
+        """Update the announcements; return whether they have changed."""
         before = self._announced
         self._announced = self._announcements(t_s)
         return self._announced != before
 
     def census(self, t_s: float, on_road: Iterable[RoadVehicle]) -> Census:
-        """Return the census: vehicles on the road, announcements, and closed formations."""
+        """Return the census: vehicles on the road, announcements and closed formations."""
         vehicles = tuple(on_road)
         present = {vehicle.formation for vehicle in vehicles}
         self._closed = [closed for closed in self._closed if closed.first_block in present]
@@ -228,7 +224,7 @@ class Roadside:
         )
 
     def _announcements(self, t_s: float) -> tuple[Announcement, ...]:
-        """Return the vehicles that may enter within the announced time."""
+        """Return the vehicles that may enter within `announce_s`."""
         room = [self._announced_per_lane] * self._lanes
         coming = []
         until_s = t_s + self._announce_s

@@ -1,18 +1,15 @@
-"""Lockstep answers: which agents a tick waits for, for how long, and which have fallen silent.
+"""Lockstep answers: the agents that a tick waits for, its deadline, and silent agents.
 
-A tick waits for every agent with a token until its deadline. An agent that misses a deadline now
-and then has lost messages, and the next tick waits for it again. An agent that has not answered for
-`agent_silent_s` is *silent*: ticks no longer wait for it.
+A tick waits until its deadline for every agent with a token. After lost messages, the next tick
+waits for the agent again. An agent that has not answered for `agent_silent_s` is *silent*: ticks no
+longer wait for it. If no agent has answered for this time, ticks do not wait for new agents either.
 
-When no agent at all has answered for that long, the network is *all_silent*: no tick waits, so that
-vehicles which enter then do not each cost the same wait.
+Answers after the deadline indicate a slow machine rather than lost messages. Ticks then get more
+time, and SENSE is repeated less often, so that the road slows down and agents keep up. When answers
+are in time again, this is reversed slowly.
 
-Answers that come after their tick was closed indicate a slow machine rather than lost messages.
-Then ticks get more time, and SENSE is repeated less often, so that the road slows down instead of
-leaving its vehicles behind. When answers are in time again, this is undone slowly.
-
-Times are those of the node's clock. Each tick counts for at most its deadline: other waits of the
-road (its pace, an agent that is starting) do not count as silence.
+Times are on the node's clock. Each tick counts for at most its deadline; other waits of the road
+(pace, starting agents) do not count as silence.
 """
 
 from __future__ import annotations
@@ -26,91 +23,91 @@ from laneweave.protocol.scenario.fields import Runtime
 from laneweave.protocol.wire.messages import Name
 
 MAX_STRETCH = 8.0
-"""Ticks get at most this many times `tick_deadline_s`."""
+"""Maximum factor of `tick_deadline_s`."""
 _STRETCH, _RELAX = 1.5, 0.98
-"""Factors of the time for a tick, after a tick with and without late answers."""
+"""Change of this factor after a tick with and without late answers."""
 _LATE_AGENTS = 0.05
-"""Share of agents whose late answers do not give ticks more time."""
+"""Fraction of agents that may answer late without increasing the deadline."""
 LATE_SHARE = 2.0
-"""An agent that always answers too late is tolerated this many times longer than a silent one."""
+"""Factor of `agent_silent_s` for agents that always answer too late."""
 _ROUNDING_S = 1e-6
-"""Tolerance when sums of deadlines are compared with a multiple of a deadline."""
+"""Tolerance for comparing sums of deadlines with `agent_silent_s`."""
 
 
 @define
 class Answers:
-    """Which agents answer the bridge's ticks."""
+    """Answers of agents to the bridge's ticks."""
 
     runtime: Runtime
     up: set[Name] = field(factory=set)
     """Agents with a token."""
     silent: set[Name] = field(factory=set)
     awaited: set[Name] = field(factory=set)
-    """Agents whose answer to the current tick is awaited."""
+    """Agents for whose answers the current tick waits."""
     resend_s: float = math.inf
-    """When SENSE is repeated to them."""
+    """Time at which SENSE is repeated to awaited agents."""
     deadline_s: float = math.inf
-    """When the current tick proceeds without them."""
+    """Time at which the current tick proceeds without awaited agents."""
     _sent_s: float = 0.0
     _without_message: set[Name] = field(factory=set)
-    """Agents up when the current tick was sent that have sent nothing since."""
+    """Present agents that have sent no message since the start of the tick."""
     _silence_s: dict[Name, float] = field(factory=dict)
-    """Duration of the ticks sent to each agent since it was heard."""
+    """Total duration of ticks since the last message of each agent."""
     _late_s: dict[Name, float] = field(factory=dict)
-    """Duration of the ticks sent to each agent since it answered in time."""
+    """Total duration of ticks since the last answer in time of each agent."""
     _without_answer: set[Name] = field(factory=set)
-    """Agents up when the current tick was sent that have not answered in time."""
+    """Present agents that have not answered the current tick."""
     _late: set[Name] = field(factory=set)
-    """Agents that answered an earlier tick since the current one was sent."""
+    """Agents that have answered an earlier tick since the start of the current one."""
     _stretch: float = 1.0
     _any_message: bool = False
     _all_silent_s: float = 0.0
-    """Duration of the ticks since any agent was heard."""
+    """Total duration of ticks since the last message of any agent."""
 
     @property
     def all_silent(self) -> bool:
-        """Whether no agent at all has answered for too long."""
+        """Whether no agent has sent a message for `agent_silent_s`."""
         return self._too_long(self._all_silent_s)
 
     def agent_up(self, name: Name) -> None:
-        """Register an agent's token; all its counters start again."""
+        """Register an agent's token and reset its counters."""
         self.up.add(name)
         self._reset(name)
 
     def agent_down(self, name: Name) -> None:
-        """Remove an agent whose token vanished."""
+        """Remove an agent whose token has vanished."""
         self.up.discard(name)
         self.awaited.discard(name)
         self._reset(name)
 
     def remove(self, name: Name) -> None:
-        """Forget a vehicle that left the road; its agent may still be up."""
+        """Remove a vehicle that has left the road; its agent may still be present."""
         self.awaited.discard(name)
         self._reset(name)
 
     def on_message(self, name: Name) -> None:
-        """Register a sign of life: an answer to any tick."""
+        """Register an answer to any tick as a sign of life."""
         self._reset_silence(name)
         self._any_message = True
         self._all_silent_s = 0.0
 
     def late(self, name: Name) -> None:
-        """Register an answer that came after its tick was closed."""
+        """Register an answer to an earlier tick."""
         self._late.add(name)
 
     def in_time(self, name: Name) -> None:
-        """Register an answer that came in time."""
+        """Register an answer to the current tick."""
         self.awaited.discard(name)
         self._without_answer.discard(name)
         self._late_s.pop(name, None)
 
     def link_down(self) -> None:
-        """Register that the bridge lost its own connection: silence is no evidence then."""
+        """Register that the bridge has lost its connection, so that no agent can answer."""
         self._without_message.clear()
         self._without_answer.clear()
 
-    def finish_tick(self, now_s: float) -> list[Name]:
-        """Account for the previous tick; return the agents that have become silent."""
+    def update_durations(self, now_s: float) -> list[Name]:
+        """Update all durations after a tick; return the agents that have become silent."""
         lasted_s = min(now_s - self._sent_s, self._stretch * self.runtime.tick_deadline_s)
         for name in self._without_answer & self.up:
             self._late_s[name] = self._late_s.get(name, 0.0) + lasted_s
@@ -126,10 +123,10 @@ class Answers:
         return fallen_silent
 
     def start_tick(self, on_road: Iterable[Name], now_s: float, *, link_up: bool) -> None:
-        """Begin a tick that is sent to all vehicles on the road.
+        """Start a tick.
 
         Args:
-            on_road: all of them.
+            on_road: all vehicles on the road, which receive the tick.
             now_s: the node's clock.
             link_up: whether the bridge is connected; otherwise no agent can answer.
         """
@@ -146,7 +143,7 @@ class Answers:
         self.deadline_s = now_s + self._stretch * self.runtime.tick_deadline_s
 
     def due_resends(self, now_s: float) -> list[Name]:
-        """Return the agents to which SENSE is repeated now."""
+        """Return the agents to which SENSE must be repeated now."""
         if now_s < self.resend_s:
             return []
         self.resend_s = now_s + self._stretch * self.runtime.tick_resend_s
@@ -157,13 +154,13 @@ class Answers:
         return not self.awaited or now_s >= self.deadline_s
 
     def close(self) -> int:
-        """End the tick; return the number of missing answers."""
+        """Close the tick; return the number of missing answers."""
         missed = len(self.awaited)
         self.awaited.clear()
         return missed
 
     def always_late(self, name: Name) -> bool:
-        """Return whether an agent that may be alive has not answered in time for too long."""
+        """Return whether an agent has not answered in time for too long."""
         return self._too_long(self._late_s.get(name, 0.0) / LATE_SHARE)
 
     def _reset(self, name: Name) -> None:

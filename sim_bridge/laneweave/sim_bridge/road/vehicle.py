@@ -1,4 +1,4 @@
-"""A vehicle on the road: its body, motion controller and sensors."""
+"""A vehicle on the road: body, motion controller and sensors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 
 NEAR_M = 0.01
-"""A vehicle that enters this close to its cell need not settle."""
+"""Distance from its cell up to which an entering vehicle need not settle."""
 
 
 @define
@@ -29,9 +29,9 @@ class RoadVehicle:
     admission: Admission
     controller: MotionController
     sensors: Sensors | None = None
-    """None: it measures its own state exactly and sees no neighbours."""
+    """None: exact measurements of its own state, no neighbours."""
     formation: int | None = None
-    """Number of its formation, of its block in the rolling operation; None: not known yet."""
+    """Number of the formation, or in the rolling operation of the block; None: not known yet."""
     bridge: int = 0
     """Incarnation of the bridge."""
 
@@ -39,7 +39,7 @@ class RoadVehicle:
     def entering(
         cls, admission: Admission, t_s: float, scenario: Scenario, bridge: int = 0
     ) -> RoadVehicle:
-        """Return a vehicle that has driven at v_F since it was admitted, at road time `t_s`.
+        """Return an admitted vehicle at road time `t_s`, after driving at v_F since its admission.
 
         It settles in its cell within `formation.settle_s`.
         """
@@ -59,32 +59,32 @@ class RoadVehicle:
 
     @property
     def state(self) -> State:
-        """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2)."""
+        """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""
         return self.controller.plant.state
 
     @property
     def block(self) -> int:
-        """Number of the block in which it entered."""
+        """Number of the block in which the vehicle entered."""
         return self.controller.lattice.block_of(self.admission.cell[0])
 
     def join(self, closed: ClosedFormation) -> None:
-        """Join its closed formation: plans must cover all of its blocks."""
+        """Join a closed formation: plans must cover all of its blocks."""
         self.formation = closed.first_block
         self.controller.join(closed.blocks)
 
     @property
     def arrival(self) -> Arrival:
-        """Its demand."""
+        """Arrival at the entrance."""
         return self.admission.arrival
 
     @property
     def entered_s(self) -> float:
-        """Road time at which its front passed s = 0."""
+        """Road time at which the front passed s = 0."""
         return self.admission.t_s
 
     @property
     def cell(self) -> Cell:
-        """The cell that it holds or moves to."""
+        """Cell that the vehicle holds or moves to."""
         return self.controller.hold_cell
 
     @property
@@ -93,13 +93,13 @@ class RoadVehicle:
         return self.controller.rung_ticks
 
     def perceive(self, neighbours: ExactNeighbours) -> None:
-        """Measure its own state and its neighbours, given as exact sensors would see them."""
+        """Measure the vehicle's own state and its exact neighbours."""
         if self.sensors is not None:
             measured = self.sensors.measure(self.state)
             self.controller.perceive(measured, self.sensors.measure_neighbours(neighbours))
 
     def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
-        """Return its SENSE at the tick that begins: measurements and state of its controller."""
+        """Return the SENSE of a tick: measurements and state of the controller."""
         controller = self.controller
         neighbours = controller.neighbours
         return Sense(
@@ -128,5 +128,5 @@ class RoadVehicle:
         )
 
     def step(self, tick: int) -> None:
-        """Drive from `tick` to the next one."""
+        """Advance from `tick` to the next one."""
         self.controller.step(tick)

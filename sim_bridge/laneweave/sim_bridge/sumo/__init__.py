@@ -1,5 +1,5 @@
-"""SUMO: the road's network, bodies that it shows (`world`), vehicles that it drives (`traffic`).
+"""SUMO: the road's network, displayed bodies (`sumo_world`) and driven vehicles (`traffic`).
 
-Entry points: `world.SumoWorld`, `traffic.SumoTraffic`. `simulation` is the only module that imports
-libsumo. Imported by `sim_bridge.process`, `baselines` and launch.
+Entry points: `sumo_world.SumoWorld`, `traffic.SumoTraffic`. `simulation` is the only module that
+imports libsumo. Imported by `sim_bridge.process`, `baselines` and launch.
 """

@@ -1,12 +1,12 @@
-"""SUMO's input files: hand-written networks of one straight road, and its routes.
+"""SUMO's input files: the network of one straight road, and routes.
 
-The road runs along x: s = x, and lane i has its centre line at y = (i + 1/2) lane width. SUMO's
-edge is longer than the road by `margin_m` at both ends, so that the bodies of vehicles that have
-just entered, and vehicles that are about to be removed behind the end, lie on it. Writing the
-network directly avoids `netconvert`, which needs a much larger package than `libsumo`.
+The road runs along x: s = x, and the centre line of lane i is at y = (i + 1/2) lane width. SUMO's
+edge is longer than the road by `margin_m` at both ends, so that it contains the bodies of vehicles
+that enter or leave. The files are written without `netconvert`, which needs a much larger package
+than `libsumo`.
 
-Where SUMO drives, the edge ends with the road, and behind it each lane has an exit of its own: SUMO
-chooses the lane of a vehicle's exit before the road ends.
+If SUMO drives the vehicles, the edge ends with the road, and each lane leads to its own exit: SUMO
+chooses the lane of a vehicle's exit before the end of the road.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ MIN_MARGIN_M = 30.0
 
 
 def margin_m(scenario: Scenario) -> float:
-    """Return by how much SUMO's edge exceeds the road at each end.
+    """Return the length by which SUMO's edge exceeds the road at each end [m].
 
-    A vehicle is removed at the first tick after the end: it may have driven one tick beyond it.
+    A vehicle is removed in the first tick after the end, up to one tick beyond it.
     """
     vehicle = scenario.vehicle
     tick_m = vehicle.max_speed_mps * scenario.runtime.tick_s
@@ -33,18 +33,17 @@ def margin_m(scenario: Scenario) -> float:
 
 
 def exit_route(lane: int) -> str:
-    """Return the name of the route that leaves the road on a lane."""
+    """Return the name of the route to the exit of a lane."""
     return f"{ROUTE}-{lane}"
 
 
 def write_network(scenario: Scenario, folder: Path, *, exits: bool = False) -> tuple[str, ...]:
-    """Write network and route file of a road, and return SUMO's arguments, program name first.
+    """Write network and route files, and return SUMO's arguments, program name first.
 
     Args:
         scenario: road, vehicles and tick.
-        folder: target folder; created if missing.
-        exits: whether SUMO drives the vehicles, with LC2013 and Krauss (table `lc2013`); otherwise
-            it only shows them.
+        folder: target folder, which is created if necessary.
+        exits: whether SUMO drives the vehicles (table `lc2013`) or only displays them.
     """
     folder.mkdir(parents=True, exist_ok=True)
     network, routes = folder / "road.net.xml", folder / "road.rou.xml"
@@ -64,9 +63,9 @@ def write_network(scenario: Scenario, folder: Path, *, exits: bool = False) -> t
 
 
 def _network(scenario: Scenario, *, exits: bool) -> Iterator[str]:
-    """Yield the lines of the network: the road's edge, and with exits one more for each lane.
+    """Yield the lines of the network: the road's edge, and the edges of exits.
 
-    Where SUMO drives, the speed limit is the desired speed v_F. No lane crosses another.
+    If SUMO drives, the speed limit is the desired speed v_F. Lanes do not cross.
     """
     road, margin = scenario.road, margin_m(scenario)
     lanes, lane_m, end_m = range(road.lanes), road.lane_width_m, road.length_m
@@ -123,10 +122,10 @@ def _network(scenario: Scenario, *, exits: bool) -> Iterator[str]:
 
 
 def _routes(scenario: Scenario, *, exits: bool) -> Iterator[str]:
-    """Yield the lines of the route file: the vehicle type, and the route or one to each exit.
+    """Yield the lines of the route file: the vehicle type, and one route or one per exit.
 
-    Vehicles drive without imperfection (sigma) at equal speeds (speedDev). `tau` and `minGap` are
-    close to zero where SUMO does not drive: with its defaults it would delay insertions.
+    Vehicles drive without imperfection (sigma) and with equal desired speeds (speedDev). If SUMO
+    does not drive, `tau` and `minGap` are close to zero; the defaults would delay insertions.
     """
     vehicle, settings = scenario.vehicle, scenario.lc2013
     tau_s, min_gap_m = (settings.headway_s, settings.min_gap_m) if exits else (0.1, 0.0)

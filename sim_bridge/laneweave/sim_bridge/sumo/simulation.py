@@ -1,7 +1,7 @@
 """SUMO in this process; the only module that imports libsumo.
 
-libsumo holds its simulation in global variables: there is one `SumoSession` per process at a time.
-It is imported when the first session opens, so that other code works without it.
+libsumo stores its simulation in global variables, so a process can have one `SumoSession` at a
+time. libsumo is imported when a session opens, so that other code works without it.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ DEBIAN_PACKAGES = {
     "libGL.so.1": "libgl1",
     "libatomic.so.1": "libatomic1",
 }
-"""System libraries that libsumo loads and a slim container lacks, and their Debian packages."""
+"""System libraries that libsumo loads, and their Debian packages; slim containers lack them."""
 
 _IMPORT_SWITCH = "LIBSUMO_AS_TRACI"
 
 
 class SumoUnavailableError(CommandFailedError):
-    """libsumo or a system library that it needs cannot be loaded; the message gives the remedy."""
+    """libsumo cannot be loaded; the message names the missing packages."""
 
 
 class SumoSession:
@@ -40,19 +40,19 @@ class SumoSession:
     _open: SumoSession | None = None
 
     def __init__(self, scenario: Scenario, folder: Path, *, exits: bool = False) -> None:
-        """Load libsumo, write a road's network into a folder and start SUMO on it.
+        """Load libsumo, write the network and start SUMO.
 
         Args:
             scenario: road, vehicles and tick.
             folder: folder for SUMO's input files.
-            exits: whether SUMO drives; see `write_network`.
+            exits: whether SUMO drives, see `write_network`.
 
         Raises:
             SumoUnavailableError: libsumo cannot be loaded.
             RuntimeError: another session is open in this process.
         """
         if SumoSession._open is not None:
-            raise RuntimeError("libsumo holds one simulation per process, and one is open")
+            raise RuntimeError("libsumo supports one simulation per process, and one is open")
         self._sumo: Any = _load_libsumo()
         self._sumo.start([*write_network(scenario, folder, exits=exits)])
         self._half_body_m = 0.5 * scenario.vehicle.length_m
@@ -68,9 +68,9 @@ class SumoSession:
         self._sumo.simulationStep()
 
     def collisions(self) -> list[tuple[str, str]]:
-        """Return the pairs that SUMO reports as colliding in the last step, sorted, each once.
+        """Return the sorted pairs that SUMO reports as colliding in the last step.
 
-        SUMO misses pairs that overlap between lanes; `Bodies.overlapping_pairs` is exact.
+        SUMO misses overlaps between lanes; `Bodies.overlapping_pairs` is exact.
         """
         return sorted(
             {
@@ -80,7 +80,7 @@ class SumoSession:
         )
 
     def poses(self, vehicles: Iterable[str]) -> dict[str, Pose]:
-        """Return (s m, y m, heading rad, speed m/s) of vehicles after the last step."""
+        """Return the poses of vehicles after the last step."""
         api = self.vehicle
         position, angle, speed = api.getPosition, api.getAngle, api.getSpeed
         poses = {}
@@ -92,7 +92,7 @@ class SumoSession:
         return poses
 
     def close(self) -> None:
-        """End SUMO; a second call does nothing."""
+        """End SUMO. Idempotent."""
         if SumoSession._open is self:
             SumoSession._open = None
             self._sumo.close()
@@ -107,15 +107,15 @@ class SumoSession:
 
 
 def _load_libsumo() -> Any:  # noqa: ANN401 - libsumo has no types
-    """Import libsumo.
+    """Import libsumo without its warning about the version of pyarrow.
 
-    Its warning about another version of pyarrow is switched off: it concerns SUMO's own Parquet
-    output, which is not used. Both were tested together, imported in either order.
+    The warning concerns SUMO's Parquet output, which is not used. Both were tested together,
+    imported in either order.
     """
     previous = os.environ.get(_IMPORT_SWITCH)
     os.environ[_IMPORT_SWITCH] = "quiet"
     try:
-        import libsumo  # noqa: PLC0415 - lazily, see above
+        import libsumo  # noqa: PLC0415 - see the module
     except (ImportError, OSError) as error:
         raise SumoUnavailableError(_advice(error)) from error
     else:
@@ -128,7 +128,7 @@ def _load_libsumo() -> Any:  # noqa: ANN401 - libsumo has no types
 
 
 def _advice(error: Exception) -> str:
-    """Return what to install so that libsumo loads."""
+    """Return a message with the packages that must be installed."""
     if isinstance(error, ModuleNotFoundError):
         return "libsumo is not installed: pip install 'laneweave[sim]'"
     missing = [package for library, package in DEBIAN_PACKAGES.items() if not _loads(library)]

@@ -1,15 +1,13 @@
-"""The road in SUMO, with bodies that SUMO shows but does not drive.
+"""The road in SUMO, with bodies that SUMO displays but does not drive.
 
-SUMO shows every vehicle exactly where the plant says it is: position, lateral position, heading
-and speed, between lanes as well. It drives none of them. Each tick runs
+SUMO displays every vehicle with the position, lateral position, heading and speed of its plant,
+also between lanes. The calls of a tick are
 
     place() every vehicle  ->  step()  ->  positions(), collisions()
 
-`place` gives SUMO the middle of the front bumper and the angle (moveToXY with keepRoute=2, which
-keeps both unchanged). During its step SUMO derives a speed of its own from the displacement;
-`step` replaces it by the vehicle's (setPreviousSpeed), so the speed read back is exact, too.
-
-There is one `SumoWorld` per process at a time, see `simulation`.
+`place` passes the middle of the front bumper and the angle to SUMO (moveToXY with keepRoute=2,
+which keeps both unchanged). During its step SUMO derives a speed from the displacement; `step`
+replaces it with the plant's speed (setPreviousSpeed).
 """
 
 from __future__ import annotations
@@ -28,11 +26,11 @@ class SumoWorld(SumoSession):
     """One road with vehicles in SUMO. Close it, or use it as a context manager."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
-        """Start SUMO on an empty road; see `SumoSession`."""
+        """Start SUMO with an empty road, see `SumoSession`."""
         super().__init__(scenario, folder)
         margin = margin_m(scenario)
         self._range_m = (-margin, scenario.road.length_m + margin)
-        """Positions at which SUMO can show vehicles."""
+        """Range of positions on SUMO's edge [m]."""
         self._lane_width_m = scenario.road.lane_width_m
         self._lanes = scenario.road.lanes
         self._states: dict[str, State] = {}
@@ -40,14 +38,14 @@ class SumoWorld(SumoSession):
         self._shown: list[str] = []
 
     def add(self, vehicle: str, state: State) -> None:
-        """Put a new vehicle on the road; SUMO shows it from the next step on.
+        """Add a vehicle to the road; SUMO displays it from the next step on.
 
         Raises:
-            ValueError: it is on the road already, or `state` is not on the edge.
+            ValueError: the vehicle is already on the road, or `state` is not on the edge.
         """
         if vehicle in self._states:
             raise ValueError(f"{vehicle} is on the road already")
-        self._check(vehicle, state)  # before SUMO knows the vehicle
+        self._check(vehicle, state)  # before the vehicle is added to SUMO
         api = self.vehicle
         api.add(vehicle, ROUTE, typeID=VEHICLE_TYPE, depart="now", departPos="0", departSpeed="0")
         api.setSpeedMode(vehicle, 0)
@@ -68,12 +66,10 @@ class SumoWorld(SumoSession):
         self._move(vehicle, state)
 
     def step(self) -> None:
-        """Advance SUMO by one tick.
-
-        A vehicle that was not placed since the last step stays where it is.
+        """Advance SUMO by one tick; vehicles without a new state stay in place.
 
         Raises:
-            RuntimeError: SUMO shows other vehicles than those that were added (it never should).
+            RuntimeError: SUMO's vehicles differ from the added ones (internal error).
         """
         if len(self._placed) < len(self._states):
             for vehicle, state in self._states.items():
@@ -90,14 +86,14 @@ class SumoWorld(SumoSession):
         self._shown = list(self._states)
 
     def positions(self) -> dict[str, Pose]:
-        """Return the pose of each vehicle after the last step, in the order of addition."""
+        """Return the pose of each vehicle after the last step, in order of addition."""
         return self.poses(self._shown)
 
     def remove(self, vehicle: str) -> None:
-        """Take a vehicle off the road.
+        """Remove a vehicle from the road.
 
         Raises:
-            ValueError: it is not on the road.
+            ValueError: the vehicle is not on the road.
         """
         if self._states.pop(vehicle, None) is None:
             raise ValueError(f"{vehicle} is not on the road")
@@ -106,7 +102,7 @@ class SumoWorld(SumoSession):
         self.vehicle.remove(vehicle)
 
     def _check(self, vehicle: str, state: State) -> None:
-        """Reject a state that SUMO would map to another place."""
+        """Reject a state that SUMO would display elsewhere."""
         if not math.isfinite(sum(state)):
             raise ValueError(f"{vehicle} must be at a finite state, not {state}")
         low_m, high_m = self._range_m
@@ -116,7 +112,7 @@ class SumoWorld(SumoSession):
             )
 
     def _move(self, vehicle: str, state: State) -> None:
-        """Give SUMO the middle of the front bumper, its lane, and the angle."""
+        """Pass the middle of the front bumper, its lane and the angle to SUMO."""
         s_m, front_y_m, heading, _ = pose_of(state)
         degrees = 90.0
         if heading != 0.0:

@@ -1,14 +1,12 @@
-"""Vehicles that SUMO itself drives, with its own car following and lane changing.
+"""Vehicles that SUMO drives with its own car following and lane changing.
 
-Each tick runs
+The calls of a tick are
 
-    offer() vehicles that should enter  ->  advance() returns those that did  ->  positions()
+    offer() waiting vehicles  ->  advance(), which returns the entered ones  ->  positions()
 
-An offered vehicle waits in SUMO until there is room for it at the position where it was offered.
-Each vehicle has the route that leaves the road on its preferred lane, which SUMO's lane changing
-follows; a vehicle that does not reach that lane stops at the end of the road.
-
-There is one `SumoTraffic` per process at a time, see `simulation`.
+An offered vehicle waits in SUMO until there is room at its entry position. Its route, which SUMO's
+lane changing follows, leads to the exit of its preferred lane; a vehicle that does not reach this
+lane stops at the end of the road.
 """
 
 from __future__ import annotations
@@ -22,27 +20,27 @@ from laneweave.sim_bridge.sumo.simulation import SumoSession
 
 _NO_LANE_CHANGES = 0
 _ALL_LANE_CHANGES = 0b011001010101
-"""SUMO's default lane change mode: all kinds of lane changes."""
+"""SUMO's default lane change mode."""
 
 
 class SumoTraffic(SumoSession):
     """One road with vehicles that SUMO drives. Close it, or use it as a context manager."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
-        """Start SUMO on an empty road; see `SumoSession`."""
+        """Start SUMO with an empty road, see `SumoSession`."""
         super().__init__(scenario, folder, exits=True)
         self._margin_m = margin_m(scenario)
         self._speed_mps = scenario.formation.speed_mps
         self._on_road: dict[str, None] = {}
 
     def offer(self, vehicle: str, lane: int, preferred_lane: int, s_m: float) -> None:
-        """Let SUMO insert a vehicle at v_F in the first step in which there is room.
+        """Let SUMO insert a vehicle at v_F in the first step with sufficient room.
 
         Args:
-            vehicle: its name.
-            lane: lane on which it enters.
-            preferred_lane: lane on which it leaves.
-            s_m: position of its front bumper then.
+            vehicle: name of the vehicle.
+            lane: entry lane.
+            preferred_lane: lane of the exit.
+            s_m: entry position of the front bumper.
         """
         self.vehicle.add(
             vehicle,
@@ -55,7 +53,7 @@ class SumoTraffic(SumoSession):
         )
 
     def allow_lane_changes(self, vehicle: str, *, allowed: bool) -> None:
-        """Allow or forbid lane changes of a vehicle; they are allowed by default."""
+        """Allow (default) or forbid lane changes of a vehicle."""
         mode = _ALL_LANE_CHANGES if allowed else _NO_LANE_CHANGES
         self.vehicle.setLaneChangeMode(vehicle, mode)
 
@@ -71,6 +69,6 @@ class SumoTraffic(SumoSession):
         return self.poses(self._on_road)
 
     def remove(self, vehicle: str) -> None:
-        """Take a vehicle off the road."""
+        """Remove a vehicle from the road."""
         del self._on_road[vehicle]
         self.vehicle.remove(vehicle)

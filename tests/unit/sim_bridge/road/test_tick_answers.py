@@ -32,7 +32,7 @@ def tick(answers: Answers, now_s: float, *heard: Name, lasts_s: float = DEADLINE
         answers.on_message(name)
         answers.awaited.discard(name)
     answers.close()
-    return answers.finish_tick(now_s + lasts_s)
+    return answers.update_durations(now_s + lasts_s)
 
 
 def test_waits_for_agents_that_are_up_until_the_deadline(answers: Answers) -> None:
@@ -100,7 +100,7 @@ def test_agents_without_a_token_and_departed_ones_are_not_silent(answers: Answer
     for number in range(2 * TICKS):
         answers.start_tick((A, C), number * DEADLINE_S, link_up=True)
         answers.on_message(A)
-        assert answers.finish_tick((number + 1) * DEADLINE_S) == []
+        assert answers.update_durations((number + 1) * DEADLINE_S) == []
     for number in range(TICKS - 1):
         tick(answers, 50.0 + number * DEADLINE_S, A)
     answers.remove(B)
@@ -111,12 +111,12 @@ def test_without_a_connection_no_agent_is_awaited_or_becomes_silent(answers: Ans
     for number in range(2 * TICKS):
         answers.start_tick((A, B), number * DEADLINE_S, link_up=False)
         assert answers.awaited == set()
-        assert answers.finish_tick((number + 1) * DEADLINE_S) == []
+        assert answers.update_durations((number + 1) * DEADLINE_S) == []
     assert not answers.all_silent
     for number in range(2 * TICKS):  # lost while the tick is under way
         answers.start_tick((A, B), 50.0 + number * DEADLINE_S, link_up=True)
         answers.link_down()
-        assert answers.finish_tick(50.0 + (number + 1) * DEADLINE_S) == []
+        assert answers.update_durations(50.0 + (number + 1) * DEADLINE_S) == []
 
 
 # --- answers that come too late ---------------------------------------------------------------
@@ -134,7 +134,7 @@ def late_tick(answers: Answers, number: int, *effective: Name) -> None:
         answers.in_time(name)
         answers.awaited.discard(name)
     answers.close()
-    assert answers.finish_tick((number + 1) * DEADLINE_S) == []
+    assert answers.update_durations((number + 1) * DEADLINE_S) == []
 
 
 def test_an_agent_that_always_answers_late_is_ineffective_but_not_silent(answers: Answers) -> None:
@@ -175,7 +175,7 @@ def test_time_off_the_network_makes_no_agent_ineffective(answers: Answers) -> No
     for number in range(2 * LATE_TICKS):
         answers.start_tick((A, B), number * DEADLINE_S, link_up=number % 2 == 0)
         answers.link_down()
-        answers.finish_tick((number + 1) * DEADLINE_S)
+        answers.update_durations((number + 1) * DEADLINE_S)
     assert not answers.always_late(A)
 
 
@@ -222,7 +222,7 @@ def test_one_answer_in_a_while_is_enough(answers: Answers) -> None:
 def test_an_empty_road_is_not_silent(answers: Answers) -> None:
     for number in range(3 * TICKS):
         answers.start_tick((), number * DEADLINE_S, link_up=True)
-        assert answers.finish_tick((number + 1) * DEADLINE_S) == []
+        assert answers.update_durations((number + 1) * DEADLINE_S) == []
     assert not answers.all_silent
 
 
