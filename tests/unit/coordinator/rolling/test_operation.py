@@ -21,6 +21,7 @@ from laneweave.coordinator.rolling.operation import (
     MAX_DELAY_S,
     SNAPSHOT_S,
     RollingOperation,
+    _clusters,
 )
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.config.loading import parse_scenario
@@ -482,6 +483,11 @@ def test_vehicles_whose_promises_tell_ownership_are_in_the_roster() -> None:
     desk = bench(A, B, C, D, ways={C: ((-4, 0), (-5, 0))})
     desk.think()
     assert [transfer.roster for transfer in desk.control.transfers] == [(C,)]
+
+
+def test_groups_that_share_a_vehicle_are_one_cluster() -> None:
+    groups = [{A, B}, {C}, {D}, {B, C}]
+    assert sorted(map(sorted, _clusters(groups))) == [[A, B, C], [D]]
 
 
 def run_ballot(desk: Bench) -> Plan:
