@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from random import Random
 from typing import Any
 
+from attrs import define
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
@@ -22,6 +23,19 @@ from oracles.path_rules import check_paths
 
 DEADLINE_S = 60.0
 """Comparisons are about costs, not about times."""
+
+
+@define
+class CountingClock:
+    """A clock that goes on whenever it is read."""
+
+    tick_s: float
+    now_s: float = 0.0
+
+    def __call__(self) -> float:
+        """Return the next time."""
+        self.now_s += self.tick_s
+        return self.now_s
 
 
 def cheapest_plan(request: PlanRequest, fixed: Sequence[int] | None = None) -> int | None:

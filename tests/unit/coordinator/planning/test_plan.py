@@ -22,19 +22,7 @@ from laneweave.launch.bench.request_families import block_request, formation_req
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS
-from support.planning_oracles import cheapest_plan, requests
-
-
-class CountingClock:
-    """A clock on which each look at it takes a millisecond."""
-
-    def __init__(self) -> None:
-        """Start at zero."""
-        self.now = 0.0
-
-    def __call__(self) -> float:
-        self.now += 0.001
-        return self.now
+from support.planning_oracles import CountingClock, cheapest_plan, requests
 
 
 def _corridor(*vehicles: tuple[Cell, int], columns: int = 4) -> PlanRequest:
@@ -118,10 +106,10 @@ class TestDeadline:
         whole = block_request(25, deadline_s=3600.0)
         optimum = plan(whole).cost
         assert optimum is not None
-        clock = CountingClock()
+        clock = CountingClock(0.001)
         response = plan(attrs.evolve(whole, deadline_s=looks * 0.001), solver=solver, clock=clock)
         # Nothing looks at the clock again after the deadline, but to leave every loop.
-        assert clock.now <= (looks + 8) * 0.001
+        assert clock.now_s <= (looks + 8) * 0.001
         assert response.status in ("feasible", "timeout")
         assert response.lower_bound is not None
         assert response.lower_bound <= optimum
@@ -133,7 +121,7 @@ class TestDeadline:
         vehicles = tuple(VehicleRequest(f"v{i}", (i, 0), eligible=(i,)) for i in range(12))
         targets = tuple((11 - i, 0) for i in range(12))
         request = PlanRequest(Grid(40, 1), 1, ("node", "edge", "special-1"), vehicles, targets, 0.2)
-        response = plan(request, clock=CountingClock())
+        response = plan(request, clock=CountingClock(0.001))
         assert response.status == "timeout"
         # One look at the clock finds that there is no time for another node, few leave all loops.
         assert 150 <= response.solve_ms <= 200 + 8

@@ -13,21 +13,12 @@ from laneweave.coordinator.planning.solve import TAPPA_SHARE, plan
 from laneweave.launch.bench.request_families import block_request, formation_request
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import SOLVERS
+from support.planning_oracles import CountingClock
 
 EASY = block_request(1, vehicles=3, deadline_s=3600.0)
 HARD = block_request(25, conflicts=("node", "edge", "special-1", "closing"), deadline_s=3600.0)
 """TAPPA needs thousands of nodes for it, branching less than a hundred."""
 NODES = 400
-
-
-class Clock:
-    """Each look takes 10 ms."""
-
-    now = 0.0
-
-    def __call__(self) -> float:
-        self.now += 0.01
-        return self.now
 
 
 def test_tappa_plans_unless_another_solver_is_named() -> None:
@@ -98,7 +89,7 @@ def test_the_cheaper_path_set_and_the_higher_bound_are_kept(seed: int, nodes: in
 
 
 def test_branching_continues_when_tappa_has_spent_its_time() -> None:
-    response = plan(attrs.evolve(HARD, deadline_s=30.0), clock=Clock())
+    response = plan(attrs.evolve(HARD, deadline_s=30.0), clock=CountingClock(0.01))
     assert (response.solver, response.fallback) == ("branching", True)
     assert response.solve_ms <= 30.1e3
 

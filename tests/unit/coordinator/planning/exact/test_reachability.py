@@ -11,7 +11,7 @@ from laneweave.coordinator.planning.plan_validator import problems_of_paths, pro
 from laneweave.coordinator.planning.problem import Grid, Problem
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
-from support.planning_oracles import cheapest_plan, requests
+from support.planning_oracles import CountingClock, cheapest_plan, requests
 
 
 def _explore(request: PlanRequest, max_moves: int = 10**6) -> tuple[Problem, Reachability]:
@@ -56,8 +56,7 @@ def test_time_is_checked() -> None:
     cells = [vehicle.cell for vehicle in PUZZLE.vehicles]
     model = PUZZLE.conflict_model
     problem = Problem(PUZZLE.grid, 1, model, cells, PUZZLE.targets)
-    ticks = iter(range(1000))
-    budget = Budget(deadline=3.0, clock=lambda: float(next(ticks)))
+    budget = Budget(deadline=3.0, clock=CountingClock(1.0))
     with pytest.raises(BudgetSpentError):
         explore(problem, PUZZLE.choices(), budget, max_moves=10**9)
 

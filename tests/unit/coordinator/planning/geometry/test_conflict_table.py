@@ -240,29 +240,19 @@ def test_clearances_are_never_overestimated(
         assert least_m <= least_gap_m(bodies, (column, lane), a, b) + 1e-6
 
 
-@pytest.mark.parametrize("lateness_s", [None, 0.0, 0.2, 0.5])
-def test_driven_motions_are_not_closer_than_the_default_profile(
-    lateness_s: float | None,
-) -> None:
-    """They accelerate less and later; the profile errors of the geometry make up for it."""
-    geometry = BodyGeometry(lateness_s=lateness_s)
-    exact = attrs.evolve(geometry, profile_error_along_m=0.0, profile_error_across_m=0.0)
-    driven, assumed = min_clearances(exact, actual_paths()), min_clearances(geometry)
-    assert (driven >= assumed).all()
-    assert pairs_closer_than(exact, actual_paths()) <= conflict_table(geometry).pairs
-
-
 @pytest.mark.parametrize(
     ("lateness_s", "more", "more_with_errors"),
     [(None, 0, 0), (0.0, 0, 8), (0.2, 0, 0), (0.5, 0, 16)],
 )
-def test_the_table_nearly_equals_that_of_driven_motions(
+def test_the_table_contains_that_of_driven_motions_and_little_more(
     lateness_s: float | None, more: int, more_with_errors: int
 ) -> None:
+    """They accelerate less and later; the profile errors of the geometry make up for it."""
     geometry = BodyGeometry(lateness_s=lateness_s)
     exact = attrs.evolve(geometry, profile_error_along_m=0.0, profile_error_across_m=0.0)
     driven = pairs_closer_than(exact, actual_paths())
-    assert driven <= conflict_table(exact).pairs
+    assert (min_clearances(exact, actual_paths()) >= min_clearances(geometry)).all()
+    assert driven <= conflict_table(exact).pairs & conflict_table(geometry).pairs
     assert len(conflict_table(exact).pairs - driven) == more
     assert len(conflict_table(geometry).pairs - driven) == more_with_errors
     of_mode_1 = {step: path for step, path in actual_paths().items() if 0 in step}
