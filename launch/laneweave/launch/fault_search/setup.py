@@ -33,7 +33,7 @@ BLOCK_COLUMNS = 4
 LENGTHS = (2, 7)
 """Range of the lengths of formations with different lengths, in columns."""
 GAPS = (0, 0, 1)
-"""Choices of the number of columns between two such formations."""
+"""Choices of the gap between formations of different lengths, in columns."""
 MAX_SIZE = 6
 """Maximum number of vehicles in a formation."""
 MAX_JOINED_SIZE = 10
