@@ -49,18 +49,22 @@ def check_files(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_run(lab: Lab, road: Path, number: signal.Signals) -> None:
-    process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "10")
+@pytest.mark.parametrize("simulated", [False, True])
+def test_a_signal_ends_a_run(
+    lab: Lab, road: Path, number: signal.Signals, *, simulated: bool
+) -> None:
+    options = ("--transport", "simulated") if simulated else (*FEW_PROCESSES, "--pace", "10")
+    process = start_and_wait(lab, road, *options)
 
-    if number is signal.SIGINT:
+    if simulated or number is signal.SIGINT:
         interrupt(process, number)
     else:
         process.send_signal(number)
 
     ended = lab.finish(process, END_S)
     assert ended.status == 1
-    assert "FAILED: interrupted" in ended.out
-    assert ended.complaints == []
+    assert ("FAILED: interrupted" in ended.out) is not simulated
+    assert ended.complaints == (["interrupted"] if simulated else [])
     lab.check_nothing_left()
     check_files(lab.folder / "out")
 
@@ -77,19 +81,6 @@ def test_ctrl_c_ends_a_run_that_is_starting(lab: Lab, road: Path, role: str) -> 
     assert ended.status == 1
     assert ended.complaints in ([], ["interrupted"])
     lab.check_nothing_left()
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_simulated_run(lab: Lab, road: Path, number: signal.Signals) -> None:
-    process = start_and_wait(lab, road, "--transport", "simulated")
-
-    interrupt(process, number)
-
-    ended = lab.finish(process, END_S)
-    assert ended.status == 1
-    assert ended.complaints == ["interrupted"]
-    lab.check_nothing_left()
-    check_files(lab.folder / "out")
 
 
 def test_roles_end_when_the_supervisor_is_killed(lab: Lab, road: Path) -> None:

@@ -20,16 +20,8 @@ from laneweave.protocol.runtime.node import (
 )
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.messages import Census, Name, Report, RoadClock, Sense
-from laneweave.protocol.wire.topics import (
-    BRIDGE_ALIVE,
-    COMMAND,
-    COORDINATOR_ALIVE,
-    EVENT,
-    HEARTBEAT,
-    REPORT,
-    VEHICLE_ALIVE,
-)
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import pose_of
 from laneweave.sim_bridge.core import SHUT_DOWN_S, TickPhase
 from laneweave.sim_bridge.road.attendance import LEFT_REPEATS
@@ -62,12 +54,12 @@ def test_start(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, TWO)
     effects = desk.start()
     assert effects[:6] == [
-        Listen(COMMAND),
-        Listen(EVENT),
-        Listen(REPORT),
-        Listen(HEARTBEAT),
-        Watch(VEHICLE_ALIVE),
-        Announce(BRIDGE_ALIVE, {"incarnation": 0}),
+        Listen(topics.COMMAND),
+        Listen(topics.EVENT),
+        Listen(topics.REPORT),
+        Listen(topics.HEARTBEAT),
+        Watch(topics.VEHICLE_ALIVE),
+        Announce(topics.BRIDGE_ALIVE, {"incarnation": 0}),
     ]
     clock, census = (send.message for send in effects[6:] if isinstance(send, Send))
     assert (clock.tick, clock.t_s, clock.on_road, clock.ended) == (0, 0.0, 0, False)
@@ -204,7 +196,7 @@ def test_a_late_answer_ends_the_silence_and_does_nothing_else(desk: Desk) -> Non
     desk.drive_to_silence(B)
     desk.drive_to(desk.core.tick + 3)
     known = desk.known(B)
-    assert desk.give(Arrived(COMMAND, {"vehicle": B}, late)) == []
+    assert desk.give(Arrived(topics.COMMAND, {"vehicle": B}, late)) == []
     assert desk.known(B) == known
     assert B in desk.core._attendance  # until it claims its vehicle
     desk.answer(A)  # this tick had not asked it to be waited for
@@ -239,7 +231,7 @@ def test_an_answer_between_two_ticks_changes_nothing(desk: Desk) -> None:
     known = desk.known(A)
     early = desk.command(A, hold_cell=(-1, 0), jerks=jerks((9.0, 9.0), ticks=9))
     assert early.tick == desk.core.tick  # no agent has been asked about it yet
-    desk.give(Arrived(COMMAND, {"vehicle": A}, early))
+    desk.give(Arrived(topics.COMMAND, {"vehicle": A}, early))
     assert desk.known(A) == known
     desk.wake()
     assert desk.core._answers.awaited == {A, B}
@@ -251,7 +243,7 @@ def test_the_first_answer_of_a_known_vehicle_counts(desk: Desk) -> None:
     desk.answer(A, jerks=jerks((9.0, 0.0)))
     assert desk.known(A) == known
     ghost = evolve(desk.command(A), vehicle=Name("ghost"))
-    assert desk.give(Arrived(COMMAND, {"vehicle": "ghost"}, ghost)) == []
+    assert desk.give(Arrived(topics.COMMAND, {"vehicle": "ghost"}, ghost)) == []
 
 
 def test_a_dead_agent_is_not_waited_for(desk: Desk) -> None:
@@ -496,7 +488,7 @@ def test_the_clock_does_not_race_while_the_network_is_away(tmp_path: Path, first
     desk.start(A, B)
     desk.drive_to_entry(A, B)
     news: list[Event] = [LinkDown()]
-    news += [PeerDown(VEHICLE_ALIVE, {"vehicle": name}) for name in (A, B)]
+    news += [PeerDown(topics.VEHICLE_ALIVE, {"vehicle": name}) for name in (A, B)]
     for event in news if first == "link" else reversed(news):
         desk.give(event)
     began_s, tick = desk.now_s, desk.core.tick
@@ -519,6 +511,8 @@ def test_tokens_that_vanish_with_the_link_are_not_believed(desk: Desk) -> None:
     desk.down(A)
     assert desk.core._answers.awaited == {A, B}
     desk.give(LinkUp())
-    desk.give(PeerDown(COORDINATOR_ALIVE, {"coordinator": B, "incarnation": "1"}))  # no agent's
+    desk.give(
+        PeerDown(topics.COORDINATOR_ALIVE, {"coordinator": B, "incarnation": "1"})
+    )  # no agent's
     desk.down(A)
     assert desk.core._answers.awaited == {B}

@@ -23,6 +23,7 @@ from laneweave.launch.observe.status import (
 )
 from laneweave.protocol.runtime.node import Arrived, PeerDown, PeerUp
 from laneweave.protocol.runtime.transport import LinkDown
+from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
@@ -31,16 +32,6 @@ from laneweave.protocol.wire.messages import (
     Heartbeat,
     Name,
     RoadClock,
-)
-from laneweave.protocol.wire.topics import (
-    BRIDGE_ALIVE,
-    CENSUS,
-    CLOCK,
-    COORDINATOR_ALIVE,
-    HEARTBEAT,
-    STATE,
-    VEHICLE_ALIVE,
-    Quality,
 )
 from support.states import holding
 
@@ -57,38 +48,40 @@ class Listener:
         self, name: str, term: int, now_s: float, *, leading: bool = False, incarnation: int = 1
     ) -> None:
         message = Heartbeat(Name(name), incarnation, term, leading=leading, formations=2)
-        self.view.update(Arrived(HEARTBEAT, {"coordinator": name}, message), now_s)
+        self.view.update(Arrived(topics.HEARTBEAT, {"coordinator": name}, message), now_s)
 
     def coordinator(self, name: str, *, up: bool = True) -> None:
         kind = PeerUp if up else PeerDown
-        self.view.update(kind(COORDINATOR_ALIVE, {"coordinator": name, "incarnation": "1"}), 0.0)
+        self.view.update(
+            kind(topics.COORDINATOR_ALIVE, {"coordinator": name, "incarnation": "1"}), 0.0
+        )
 
     def bridge(self, *, up: bool = True) -> None:
         kind = PeerUp if up else PeerDown
-        self.view.update(kind(BRIDGE_ALIVE, {"incarnation": "7"}), 0.0)
+        self.view.update(kind(topics.BRIDGE_ALIVE, {"incarnation": "7"}), 0.0)
 
     def agent(self, vehicle: str) -> None:
-        self.view.update(PeerUp(VEHICLE_ALIVE, {"vehicle": vehicle}), 0.0)
+        self.view.update(PeerUp(topics.VEHICLE_ALIVE, {"vehicle": vehicle}), 0.0)
 
     def clock(self, tick: int, *, ended: bool = False, bridge: int = 7, on_road: int = 1) -> None:
         message = RoadClock(
             tick, tick / 10, demanded=9, entered=5, on_road=on_road, left=4, ended=ended,
             bridge=bridge,
         )  # fmt: skip
-        self.view.update(Arrived(CLOCK, {}, message), tick / 10)
+        self.view.update(Arrived(topics.CLOCK, {}, message), tick / 10)
 
     def census(
         self, tick: int, closed: tuple[ClosedFormation, ...] = (), **entered_s: float
     ) -> None:
         entries = tuple(CensusEntry(Name(one), (0, 0), 0, at) for one, at in entered_s.items())
         message = Census(tick / 10, entries, (), closed, bridge=7)
-        self.view.update(Arrived(CENSUS, {}, message), tick / 10)
+        self.view.update(Arrived(topics.CENSUS, {}, message), tick / 10)
 
     def states(self, vehicle: str, ticks: Iterable[int], **changes: object) -> None:
         for tick in ticks:
             values: dict[str, Any] = {"promised": None, "speed_mps": 15.0, "t_s": tick / 10}
             state = holding(Name(vehicle), **values | changes)
-            self.view.update(Arrived(STATE, {"vehicle": vehicle}, state), tick / 10)
+            self.view.update(Arrived(topics.STATE, {"vehicle": vehicle}, state), tick / 10)
 
     def status(self, now_s: float = 2.0) -> Status:
         return status_of(self.view, 0.0, now_s, ELECTION_S)
@@ -115,8 +108,8 @@ def healthy(listener: Listener) -> Listener:
 
 
 def test_an_observer_does_not_slow_publishers_down() -> None:
-    assert {topic.quality for topic in LISTENED} == {Quality.LATEST}
-    assert {STATE, CLOCK, CENSUS, HEARTBEAT} <= set(LISTENED)
+    assert {topic.quality for topic in LISTENED} == {topics.Quality.LATEST}
+    assert {topics.STATE, topics.CLOCK, topics.CENSUS, topics.HEARTBEAT} <= set(LISTENED)
 
 
 def test_a_healthy_deployment(healthy: Listener) -> None:
