@@ -6,8 +6,6 @@ import random
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
-from attrs import define, field
-
 from laneweave.coordinator.ballots.ballot_round import FAILED, PROMISED, TIME
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.formations.leader import FormationLeader
@@ -28,31 +26,19 @@ Mail = dict[tuple[str, str, str], messages.Prepare | messages.Plan]
 RESEND_S = 0.2
 
 
-@define(eq=False)
 class Leader:
     """A coordinator that has taken a formation over; the scenario plans for it."""
 
-    name: str
-    control: FormationLeader
-    incarnation: int
-
-    @classmethod
-    def taking_over(
-        cls,
-        name: str,
-        incarnation: int,
-        term: int,
-        formation: Formation,
-        now_s: float,
-        rules: RuleBook,
-    ) -> Leader:
-        """Return a leader that begins to observe."""
+    def __init__(
+        self, name: str, incarnation: int, term: int, formation: Formation, rules: RuleBook
+    ) -> None:
+        """Make a leader that has not begun to observe."""
         core = CoordinatorCore(messages.Name(name), incarnation, PAPER)
         core.election.term = term
-        rng = random.Random(0)
-        control = FormationLeader(formation, core._new_ballot, rng, resend_s=RESEND_S, rules=rules)
-        control.begin(now_s)
-        return cls(name, control, incarnation)
+        self.name, self.incarnation = name, incarnation
+        self.control = FormationLeader(
+            formation, core._new_ballot, random.Random(0), resend_s=RESEND_S, rules=rules
+        )
 
     @property
     def controls(self) -> tuple[FormationLeader, ...]:
@@ -96,27 +82,17 @@ class Leader:
             yield self.about()
 
 
-@define(eq=False)
 class Candidate:
     """A whole coordinator: election, census, blocks, joint ballots, and the real planner."""
 
-    name: str
-    core: CoordinatorCore
-    incarnation: int
-    heartbeat: messages.Heartbeat | None = None
-    """The newest that it has sent."""
-    jobs: list[node.Compute] = field(factory=list)
-    """Plannings that it has ordered."""
-
-    @classmethod
-    def starting(
-        cls, name: str, incarnation: int, mail: Mail, now_s: float, rules: RuleBook
-    ) -> Candidate:
-        """Return a process that has just started."""
-        core = CoordinatorCore(messages.Name(name), incarnation, SCENARIO, rules)
-        candidate = cls(name, core, incarnation)
-        list(candidate.handle(node.Started(), mail, now_s))
-        return candidate
+    def __init__(self, name: str, incarnation: int, rules: RuleBook) -> None:
+        """Make a process that has not started."""
+        self.name, self.incarnation = name, incarnation
+        self.core = CoordinatorCore(messages.Name(name), incarnation, SCENARIO, rules)
+        self.heartbeat: messages.Heartbeat | None = None
+        """The newest that it has sent."""
+        self.jobs: list[node.Compute] = []
+        """Plannings that it has ordered."""
 
     @property
     def leaders(self) -> dict[int, FormationLeader]:

@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterator
 from attrs import frozen
 
 from laneweave.coordinator.formations.leader import LEADER_RULES, FormationLeader
+from laneweave.coordinator.formations.roster import Formation
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.runtime.node import PeerDown, PeerUp
+from laneweave.protocol.runtime.node import PeerDown, PeerUp, Started
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
@@ -126,29 +127,25 @@ class Runner:
             raise ScenarioError(f"{name} is not put in charge")
 
     def _leader(self, name: str, term: str, roster: str) -> None:
-        formation = formation_of(self.vehicles, roster)
-        self.leaders[name] = Leader.taking_over(
-            name, 1, int(term), formation, self.t_s, self._leader_rules
-        )
+        self._start_leader(name, 1, int(term), formation_of(self.vehicles, roster))
 
-    def _candidate(self, name: str) -> None:
-        self.candidates[name] = Candidate.starting(
-            name, 1, self._mail, self.t_s, self._leader_rules
-        )
+    def _start_leader(self, name: str, incarnation: int, term: int, formation: Formation) -> None:
+        leader = Leader(name, incarnation, term, formation, self._leader_rules)
+        leader.control.begin(self.t_s)
+        self.leaders[name] = leader
+
+    def _candidate(self, name: str, incarnation: int = 1) -> None:
+        self.candidates[name] = Candidate(name, incarnation, self._leader_rules)
+        list(self.candidates[name].handle(Started(), self._mail, self.t_s))
 
     def _restarts(self, name: str) -> None:
         if name in self.processes:
             self._put_in_charge(name, self.processes[name].vehicle)
         elif name in self.leaders:
             old = self.leaders[name]
-            self.leaders[name] = Leader.taking_over(
-                name, old.incarnation + 1, 1, old.control.formation, self.t_s, self._leader_rules
-            )
+            self._start_leader(name, old.incarnation + 1, 1, old.control.formation)
         else:
-            incarnation = self.candidates[name].incarnation + 1
-            self.candidates[name] = Candidate.starting(
-                name, incarnation, self._mail, self.t_s, self._leader_rules
-            )
+            self._candidate(name, self.candidates[name].incarnation + 1)
 
     def _leaves(self, name: str) -> None:
         del self.vehicles[name]

@@ -145,21 +145,6 @@ def test_a_move_ends_in_its_cell_on_time(target: Cell) -> None:
     assert rig.off(target) < 0.02
 
 
-def test_two_moves_in_their_slots() -> None:
-    rig = up_and_running()
-    t0_tick = rig.tick + 5
-    rig.accept((0, HOME, (-1, 2)), (1, (-1, 2), (-2, 2)), t0_tick=t0_tick)
-    slot = round(SCENARIO.cycles_s[0] / TICK_S)
-    begun = []
-    for _ in range(2 * slot + 5):
-        moving = rig.shown[-1].moving
-        if rig.run().moving and not moving:
-            begun.append(rig.tick - 1)
-    assert begun == [t0_tick, t0_tick + slot]
-    assert rig.shown[-1].done
-    assert rig.off((-2, 2)) < 0.05
-
-
 def test_v7_only_when_the_body_is_there() -> None:
     """A vehicle ahead keeps it back: time is over, but the move is not."""
     rig = kept_back()

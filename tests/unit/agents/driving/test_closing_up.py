@@ -8,7 +8,6 @@ from laneweave.agents.driving.trajectory import (
     _TRACKING_ERROR_M,
     check_moves,
     move_profile,
-    plan_trajectory,
 )
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.errors import BadInputError
@@ -84,18 +83,6 @@ def test_a_vehicle_that_holds_behind_has_room_to_brake_when_another_falls_back(d
         assert spare_m(own, (0.0, 0.0), other) > 3.0
         own.step(0.0, 0.0)
         other.step(*jerk_of(-1, dy, tick))
-
-
-def test_a_move_of_least_jerk_alone_would_not_leave_it() -> None:
-    """The reason for the envelope."""
-    trajectory = plan_trajectory(LIMITS, V_F, TICK_S, 38, SCENARIO.formation.gap_m, 0.0)
-    own, other = mover((0, 1)), mover((2, 1))
-    least_m = float("inf")
-    for along, across in trajectory.jerks.tolist():
-        least_m = min(least_m, spare_m(own, (along, across), other))
-        own.step(along, across)
-        other.step(0.0, 0.0)
-    assert least_m < 0.0
 
 
 @pytest.mark.parametrize(

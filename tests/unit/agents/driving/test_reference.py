@@ -65,11 +65,6 @@ def test_moves_keep_all_limits_and_go_straight_to_rest_in_the_next_cell(dx: int,
         assert way.max() <= abs(length) + 1e-3
 
 
-def test_a_quintic_would_break_the_limit_that_moves_keep() -> None:
-    """The reason for the program: 15 m in 3.8 s as a minimum-jerk quintic."""
-    assert SCENARIO.vehicle.max_accel_mps2 < 10.0 / 3.0**0.5 * 15.0 / 3.8**2
-
-
 def test_move_to_a_neighbouring_cell_is_planned_once_per_process() -> None:
     assert move_profile(SCENARIO, 1, -1) is move_profile(Scenario(), 1, -1)
     assert not move_profile(SCENARIO, 1, -1).states.flags.writeable
@@ -89,12 +84,6 @@ def test_move_to_a_neighbouring_cell_is_planned_once_per_process() -> None:
 def test_impossible_moves_raise(table: dict[str, dict[str, float]]) -> None:
     with pytest.raises(InfeasibleTrajectoryError, match=r"15 m|30 m"):
         move_profile(parse_scenario(table), 1, 1)
-
-
-def test_the_papers_slot_of_four_seconds_is_less_harsh() -> None:
-    slow = move_profile(parse_scenario({"formation": {"cycle_s": 4.0, "move_s": 4.0}}), 1, 1)
-    fast = move_profile(SCENARIO, 1, 1)
-    assert np.square(slow.jerks).sum() < np.square(fast.jerks).sum()
 
 
 @settings(max_examples=25, deadline=None)

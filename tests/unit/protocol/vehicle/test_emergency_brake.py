@@ -192,8 +192,3 @@ def test_the_least_pitch_leaves_room_for_errors_of_measurement_and_for_nothing_m
     assert allowed is not None
     # What is named as allowed is.
     assert with_pitch(float(allowed[1])).formation.gap_m == pytest.approx(least_m, abs=1.1e-3)
-
-
-def test_worse_sensors_ask_for_a_greater_pitch() -> None:
-    noisy = with_pitch(15.0, other_speed_noise_mps=0.5)
-    assert min_pitch_m(noisy) > min_pitch_m(SCENARIO) + 1.0

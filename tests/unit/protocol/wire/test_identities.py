@@ -38,14 +38,6 @@ def test_above_near_the_floor(number: int, distance: int) -> None:
     assert result - number == max(0, (distance // STEP + 1) * STEP)
 
 
-@given(first=NUMBERS, second=NUMBERS, floor=NUMBERS)
-def test_processes_that_step_above_the_same_floor_do_not_meet(
-    first: int, second: int, floor: int
-) -> None:
-    met = above(first, floor) == above(second, floor)
-    assert not met or first % STEP == second % STEP
-
-
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The time in ns, which the test sets."""
