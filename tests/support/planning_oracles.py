@@ -12,7 +12,8 @@ from attrs import define
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
-from laneweave.coordinator.planning.problem import Bans, Grid, Path
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.problem import Bans, Path
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.lattice import Mode

@@ -6,8 +6,10 @@ import importlib
 import re
 import subprocess
 import tomllib
+from functools import cache
 from pathlib import Path
 
+import grimp
 import pytest
 
 from support.commands import python
@@ -32,6 +34,23 @@ def test_namespace_has_no_init(root: str) -> None:
     assert not (ROOT / root / "laneweave" / "__init__.py").exists()
     assert (ROOT / root / "laneweave" / root / "__init__.py").exists()
     assert (ROOT / root / "laneweave" / root / "py.typed").exists()
+
+
+@pytest.mark.parametrize("root", ROOTS)
+def test_imports_have_at_most_eight_levels_in_a_package_and_five_in_a_folder(root: str) -> None:
+    graph = grimp.build_graph(f"laneweave.{root}", cache_dir=None)
+
+    def levels(modules: frozenset[str]) -> int:
+        @cache
+        def level(module: str) -> int:
+            imported = graph.find_modules_directly_imported_by(module) & modules
+            return 1 + max(map(level, imported), default=0)
+
+        return max(map(level, modules))
+
+    assert levels(frozenset(graph.modules)) <= 8
+    for folder in graph.modules:
+        assert levels(frozenset({folder, *graph.find_children(folder)})) <= 5, folder
 
 
 def test_every_dependency_is_pinned_by_name_and_version_only() -> None:

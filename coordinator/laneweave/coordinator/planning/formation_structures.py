@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from laneweave.coordinator.planning.problem import Grid
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.protocol.lattice import Cell
 
 PARALLEL: Final = "parallel"

@@ -11,12 +11,13 @@ bits of their waits. Ties are broken in the order of bits.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import attrs
 
 from laneweave.coordinator.planning.conflict_model import ConflictModel, Move, conflict_offsets
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.protocol.lattice import Cell, Mode, displacements
 
 Path = tuple[int, ...]
@@ -32,27 +33,6 @@ def bits(mask: int) -> Iterator[int]:
         low = mask & -mask
         yield low.bit_length() - 1
         mask ^= low
-
-
-def _as_cells(cells: Iterable[Cell]) -> frozenset[Cell]:
-    return frozenset(cells)
-
-
-@attrs.frozen
-class Grid:
-    """The `columns` x `lanes` cells (column, lane) of one formation; both indices start at 0."""
-
-    columns: int
-    lanes: int
-    blocked: frozenset[Cell] = attrs.field(default=frozenset(), converter=_as_cells)
-
-    def contains(self, cell: Cell) -> bool:
-        """Return whether the cell lies on the grid, blocked or not."""
-        return 0 <= cell[0] < self.columns and 0 <= cell[1] < self.lanes
-
-    def is_free(self, cell: Cell) -> bool:
-        """Return whether a vehicle may be in this cell."""
-        return self.contains(cell) and cell not in self.blocked
 
 
 class MoveTable:

@@ -21,7 +21,8 @@ from laneweave.coordinator.planning.formation_structures import (
 )
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
-from laneweave.coordinator.planning.problem import Grid, Problem
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.problem import Problem
 from laneweave.protocol.errors import BadInputError, one_line
 from laneweave.protocol.lattice import Cell, Mode
 from laneweave.protocol.parsing import as_lists, structure

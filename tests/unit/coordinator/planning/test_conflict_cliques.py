@@ -8,7 +8,7 @@ import pytest
 from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
 from laneweave.coordinator.planning.exact.arrays import move_arrays
 from laneweave.coordinator.planning.exact.cliques import Clique, clique_patterns
-from laneweave.coordinator.planning.problem import Grid
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.protocol.lattice import Mode, displacements
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS
 from oracles.instances import EVERY_VARIANT

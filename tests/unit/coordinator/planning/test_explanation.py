@@ -7,8 +7,8 @@ from pathlib import Path
 import attrs
 import pytest
 
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.explanation import ExplainedAssignment, explain
-from laneweave.coordinator.planning.problem import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import block_request, traffic_request

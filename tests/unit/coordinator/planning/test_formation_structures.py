@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
 from laneweave.coordinator.planning.formation_structures import STRUCTURES, structure_targets
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.plan_validator import problems_of_response
-from laneweave.coordinator.planning.problem import Grid
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan

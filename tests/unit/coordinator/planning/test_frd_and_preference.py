@@ -5,13 +5,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.assignments import (
     Weights,
     cost_matrix,
     frd,
     preference_matrix,
 )
-from laneweave.coordinator.planning.problem import Grid, MoveTable
+from laneweave.coordinator.planning.problem import MoveTable
 from laneweave.coordinator.planning.request import VehicleRequest
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Mode

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
-from laneweave.coordinator.planning.problem import Grid, MoveTable, bits
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.problem import MoveTable, bits
 from laneweave.protocol.lattice import Cell, Mode, displacements
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS
 

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 
 import laneweave.coordinator
 import laneweave.protocol
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.plan_validator import problems_of_response
-from laneweave.coordinator.planning.problem import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan

@@ -5,8 +5,8 @@ from typing import Any
 import attrs
 import pytest
 
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.plan_validator import problems_of_paths, problems_of_response
-from laneweave.coordinator.planning.problem import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan

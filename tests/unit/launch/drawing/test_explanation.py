@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from matplotlib.image import imread
 
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.explanation import explain
-from laneweave.coordinator.planning.problem import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.launch.bench.request_families import traffic_request
 from laneweave.launch.cli.plan_answers import explain_request

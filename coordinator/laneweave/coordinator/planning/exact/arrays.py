@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from laneweave.coordinator.planning.conflict_model import ConflictModel
 from laneweave.coordinator.planning.exact.cliques import Clique, clique_patterns
 from laneweave.coordinator.planning.exact.lagrangian_kernel import min_steps
-from laneweave.coordinator.planning.problem import Grid
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.protocol.lattice import Cell, Mode, displacements
 
 Ints = NDArray[np.int64]

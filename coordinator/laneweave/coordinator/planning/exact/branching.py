@@ -47,7 +47,8 @@ from laneweave.coordinator.planning.exact.lagrangian_kernel import (
 )
 from laneweave.coordinator.planning.exact.negotiation import Negotiation
 from laneweave.coordinator.planning.exact.reachability import explore
-from laneweave.coordinator.planning.problem import Grid, Problem, Search, Solution
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.problem import Problem, Search, Solution
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.shortest_paths import without_needless_moves
 

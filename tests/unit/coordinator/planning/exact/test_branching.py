@@ -7,8 +7,9 @@ from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.exact.branching import Branching
 from laneweave.coordinator.planning.exact.lagrangian_bound import upper_bound_of
 from laneweave.coordinator.planning.exact.lagrangian_kernel import PER_MOVE
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.plan_validator import problems_of_response
-from laneweave.coordinator.planning.problem import Grid, Problem
+from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan

@@ -6,9 +6,10 @@ from hypothesis import given, settings
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.exact.reachability import Reachability, explore
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.plan_validator import problems_of_paths, problems_of_response
-from laneweave.coordinator.planning.problem import Grid, Problem
+from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
 from support.planning_oracles import CountingClock, cheapest_plan, requests

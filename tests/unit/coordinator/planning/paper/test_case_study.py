@@ -10,6 +10,7 @@ import pytest
 
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.assignments import (
     Assignment,
     Weights,
@@ -20,7 +21,7 @@ from laneweave.coordinator.planning.paper.assignments import (
 from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvements, Node
 from laneweave.coordinator.planning.paper.explanation import entries
 from laneweave.coordinator.planning.path_map import RelativePathMap
-from laneweave.coordinator.planning.problem import Grid, Problem, Solution
+from laneweave.coordinator.planning.problem import Problem, Solution
 
 CELLS = ((0, 0), (0, 2), (1, 1), (2, 0), (2, 2))
 VEHICLE_GROUPS = (1, 1, 2, 2, 3)

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_model import ConflictModel
-from laneweave.coordinator.planning.problem import Bans, Diagram, Grid, MoveTable, Path, bits
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.problem import Bans, Diagram, MoveTable, Path, bits
 from laneweave.coordinator.planning.shortest_paths import (
     choose_path,
     conflicting_moves,

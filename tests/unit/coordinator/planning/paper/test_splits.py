@@ -9,6 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.constraints import (
     Conflict,
     Constraint,
@@ -18,7 +19,7 @@ from laneweave.coordinator.planning.paper.constraints import (
     disjoint_constraints,
     is_at_node,
 )
-from laneweave.coordinator.planning.problem import Bans, Diagram, Grid, MoveTable, Path, bits
+from laneweave.coordinator.planning.problem import Bans, Diagram, MoveTable, Path, bits
 from laneweave.coordinator.planning.shortest_paths import choose_path, shortest_paths
 from laneweave.protocol.lattice import Mode
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS
