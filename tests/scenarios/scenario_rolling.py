@@ -100,7 +100,7 @@ class RollingRunner(Runner):
         self.streams: dict[str, StreamLeader] = {}
         self._late: dict[str, Command] = {}
         self._wrong: list[str] = []
-        self._estates = CellOwnership(self._tell)
+        self._estates = CellOwnership(self._report)
         mine: tuple[tuple[str, Callable[..., Lines | None]], ...] = (
             (r"vehicle (\w+) at (\S+)(?: from (\S+))? wants (\d+)(?:, owns (.+))?", self._enter),
             (r"stream (\w+) term (\d+)", self._stream),
@@ -113,7 +113,7 @@ class RollingRunner(Runner):
         )
         self._grammar = (*mine, *self._grammar)
 
-    def _tell(self, kind: str, t_s: float, vehicles: list[str], text: str) -> None:
+    def _report(self, kind: str, t_s: float, vehicles: list[str], text: str) -> None:
         del t_s
         self._wrong.append(f"{kind}: {' '.join(vehicles)}: {text}")
 
@@ -192,12 +192,12 @@ class RollingRunner(Runner):
     def _collects(self, name: str) -> Lines:
         leader, transfer = self.streams[name], self._transfer_of(name)
         list(leader.send(self._mail, self.t_s))
-        told: list[str] = []
+        lines: list[str] = []
         for vehicle in transfer.roster:
             self._deliver_to(vehicle, "PREPARE", transfer)
-            told += leader.hear(self._shown_by(vehicle), self.t_s)
+            lines += leader.hear(self._shown_by(vehicle), self.t_s)
         yield f"{' '.join(sorted(transfer.promises)) or 'none'} promise {written(transfer.ballot)}"
-        yield from told
+        yield from lines
 
     def _issues(self, name: str, vehicles: str) -> Lines:
         leader, transfer = self.streams[name], self._transfer_of(name)
@@ -235,7 +235,7 @@ class RollingRunner(Runner):
         return transfer
 
     def _shown_by(self, name: str) -> VehicleState:
-        """Return what a process shows, or whoever is in charge of a vehicle of this name."""
+        """Return what a process shows, or the process in charge of a vehicle of this name."""
         process = self._in_charge_of(name) if name in self.vehicles else self.processes[name]
         if process.shown is None:
             raise ScenarioError(f"{name} has shown nothing")

@@ -1,4 +1,4 @@
-"""Vehicles that enter beside their cells settle in them, whoever takes over on the way."""
+"""Vehicles that enter beside their cells settle in them, also when another process takes over."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def test_a_driver_takes_over_in_the_middle(offset_m: float, takes_over: int) -> 
     assert min(each * np.sign(offset_m) for each in along) > -0.1
 
 
-def test_settling_is_not_told_to_others() -> None:
+def test_settling_is_not_published() -> None:
     """Only moves between cells are."""
     driver = TrackingDriver(SCENARIO)
     driver.take_over(sense(body(7.5), BEGIN_TICK))

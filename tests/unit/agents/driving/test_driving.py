@@ -82,7 +82,7 @@ def test_no_vehicle_hits_one_that_brakes_to_a_stop_while_messages_stop(kind: str
     assert kind == "lane-entry" or figures["standing"] == EMERGENCIES
 
 
-def test_situations_are_of_all_sorts() -> None:
+def test_situations_cover_all_kinds() -> None:
     chosen = [emergencies.random_situation(0, number) for number in range(300)]
     assert {len(one.cells) for one in chosen} == {2, 3}
     assert {(one.kind, one.diagonal) for one in chosen} == {

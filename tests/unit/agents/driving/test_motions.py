@@ -229,7 +229,7 @@ def test_a_vehicle_behind_is_predicted_along_its_motion() -> None:
 
 
 def beyond_sensing(around: Surroundings, tick: int, *seen: Neighbour, lane: int = 1) -> bool:
-    """Tell whether anybody ahead is predicted for longer than local sensing can."""
+    """Return whether a vehicle ahead is predicted for longer than local sensing can."""
     latest = gaps(around, tick, seen, lane=lane).latest
     return latest is not None and bool(np.isfinite(latest[KNOWN + 1 :]).any())
 
@@ -339,7 +339,7 @@ def test_a_motion_counts_while_its_body_touches_a_lane_that_counts() -> None:
         attrs.evolve(motion(), begin_tick=-(2**63), tick=2**63 - 1),
     ],
 )
-def test_nonsense_changes_nothing(nonsense: Motion) -> None:
+def test_implausible_motions_are_ignored(nonsense: Motion) -> None:
     seen = neighbour(path(20), 1, 20)
     assert not beyond_sensing(hearing(nonsense), 20, seen)
     assert beyond_sensing(hearing(nonsense, motion(name=Name("third"))), 20, seen)

@@ -175,7 +175,7 @@ def test_the_fates_of_one_topic_do_not_depend_on_another() -> None:
     assert [number for number in listener.numbers if number >= 0] == received(rule, 200)
 
 
-def test_what_is_no_message_passes_untouched() -> None:
+def test_events_other_than_messages_pass_unchanged() -> None:
     core, listener = faulty(MessageRule(loss=1.0))
     events: list[node.Event] = [
         node.Started(),
@@ -209,7 +209,7 @@ def test_the_core_is_woken_when_it_wants_and_not_for_delayed_messages(wanted_s: 
     assert core.wakeup_s is None
 
 
-def test_no_more_are_held_than_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_more_messages_are_delayed_than_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(message_faults, "MAX_HELD", 5)
     board = Board()
     core, listener = faulty(MessageRule(delay_s=1.0), board=board)
@@ -234,7 +234,7 @@ def test_effects_pass() -> None:
     assert feed(core, node.Started()) == effects
 
 
-def test_the_bridge_tells_the_road_time() -> None:
+def test_the_clock_of_the_bridge_sets_the_road_time() -> None:
     board = Board()
     core, listener = faulty(board=board, receiver="bridge")
     listener.on_event = at_start(

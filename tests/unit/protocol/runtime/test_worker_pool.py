@@ -98,7 +98,7 @@ def test_a_job_is_done_by_another_process(one: Bench) -> None:
     assert one.process_id() == process_id
 
 
-def test_a_job_is_told_how_much_time_is_left(one: Bench) -> None:
+def test_a_job_knows_how_much_time_is_left(one: Bench) -> None:
     assert 4.0 < one.do(jobs.left, within_s=5.0).result <= 5.0
 
 
@@ -137,7 +137,7 @@ def test_a_deadline_that_passes_while_the_job_waits_counts(one: Bench, tmp_path:
     [lambda _: None, jobs.Shy(), jobs.lock, jobs.shy],
     ids=["job", "job there", "result", "result here"],
 )
-def test_what_cannot_be_handed_over_is_an_error_of_its_job_only(
+def test_what_cannot_be_pickled_is_an_error_of_its_job_only(
     one: Bench, work: Callable[[float], Any]
 ) -> None:
     before = one.process_id()
@@ -202,7 +202,7 @@ def test_a_worker_that_goes_on_too_long_is_killed(
     assert one.process_id() != before
 
 
-def test_ctrl_c_is_for_the_process_that_has_the_pool(one: Bench) -> None:
+def test_workers_ignore_ctrl_c(one: Bench) -> None:
     before = one.process_id()
     os.kill(before, signal.SIGINT)
     assert one.process_id() == before
@@ -225,7 +225,7 @@ def test_a_machine_that_gives_no_process_is_an_error_of_the_job(
 # --- begin and end ----------------------------------------------------------------------------
 
 
-def test_an_end_waits_for_no_job(tmp_path: Path) -> None:
+def test_closing_waits_for_no_job(tmp_path: Path) -> None:
     bench = Bench(2)
     for _ in range(5):
         bench.order(partial(jobs.hang_at_first, tmp_path / "begun"))

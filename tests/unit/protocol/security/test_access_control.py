@@ -40,7 +40,7 @@ PREFIX = "laneweave/r/"
 
 
 def may(who: str, flow: str, message: str, key: str) -> bool:
-    """Tell whether somebody may send or get a kind of Zenoh's messages on a key."""
+    """Return whether an identity may send or get a kind of Zenoh's messages on a key."""
     return any(
         rule.flow == flow and rule.message == message and matches(expression, PREFIX + key)
         for rule in rules_of(parse_identity(who), SCENARIO)
@@ -53,7 +53,7 @@ def may_send(who: str, key: str) -> bool:
 
 
 def may_read(who: str, key: str) -> bool:
-    # What somebody may subscribe to is what it is given.
+    # An identity is given what it may subscribe to.
     subscribes = may(who, "ingress", "declare_subscriber", key)
     assert subscribes == may(who, "egress", "put", key)
     return subscribes
@@ -108,7 +108,7 @@ def test_tokens_and_the_service() -> None:
 @pytest.mark.parametrize("flow", list(Flow))
 @pytest.mark.parametrize("message", ["delete", "put", "query", "declare_subscriber", "reply"])
 @pytest.mark.parametrize("key", ["**", "*", "clock/**", "../other", "@/router", "state/*/*/x"])
-def test_nobody_may_do_anything_on_what_is_no_key(flow: Flow, message: str, key: str) -> None:
+def test_no_identity_has_rights_on_a_malformed_key(flow: Flow, message: str, key: str) -> None:
     for identity in identities_of(SCENARIO):
         assert not may(identity.common_name, flow, message, key)
 
@@ -129,7 +129,7 @@ def test_all_keys_are_of_topics_of_the_realm() -> None:
             assert expression.startswith(PREFIX)
 
 
-def test_every_topic_has_somebody_on_both_sides() -> None:
+def test_every_topic_has_senders_and_readers() -> None:
     parties = set(Party)
     for topic in TOPICS:
         assert topic.sender in {*parties, "any"}, topic.name
@@ -171,7 +171,7 @@ def test_the_form_that_zenoh_takes() -> None:
     json.dumps(control, allow_nan=False)
 
 
-def test_what_is_longest() -> None:
+def test_size_limits_of_requests_and_messages() -> None:
     requests, messages = size_limits(SCENARIO)
     assert requests["size_limit"] > SCENARIO.service.max_request_bytes
     asked = [topic for topic in TOPICS if topic.exchange is Exchange.QUERIES]
@@ -224,7 +224,7 @@ def test_only_identities_have_credentials() -> None:
 
 
 @pytest.mark.parametrize("identity", ["coordinator.c9", "client.nobody", "fleet.none"])
-def test_whom_the_configuration_does_not_know_is_refused(identity: str) -> None:
+def test_an_identity_that_the_configuration_does_not_know_is_refused(identity: str) -> None:
     # The router would let it in, and let it do nothing.
     error = refusal(access_of, SCENARIO, identity, {})
     assert error.field == "identity"

@@ -40,13 +40,13 @@ def refused(given: Credentials, identity: str = NAME, host: str = "") -> BadInpu
     return refusal(examine, given, identity, host)
 
 
-def test_what_is_in_order(folder: Path) -> None:
+def test_valid_credentials_have_no_warnings(folder: Path) -> None:
     assert examine(credentials(folder), NAME).warnings == ()
     for host in ("", "router.example", "10.1.2.3", "localhost", "127.0.0.1", "::1"):
         assert examine(credentials(folder, "router"), "router", host).warnings == ()
 
 
-def test_the_key_as_text(folder: Path) -> None:
+def test_the_private_key_may_be_given_as_text(folder: Path) -> None:
     text = (folder / f"{NAME}.key").read_text()
     given = attrs.evolve(credentials(folder), private_key="", private_key_pem=text)
     assert examine(given, NAME).warnings == ()
@@ -63,7 +63,7 @@ def test_the_key_as_text(folder: Path) -> None:
      ("private_key", "private key")],
 )  # fmt: skip
 @pytest.mark.parametrize("content", [None, b"", b"text", b"\0\xff"])
-def test_a_file_that_is_none(
+def test_a_missing_or_malformed_file_is_refused(
     folder: Path, tmp_path: Path, part: str, field: str, content: bytes | None
 ) -> None:
     path = tmp_path / "file"
@@ -75,13 +75,13 @@ def test_a_file_that_is_none(
 
 
 @pytest.mark.parametrize("part", ["ca", "certificate", "private_key"])
-def test_pem_with_nothing_in_it(folder: Path, tmp_path: Path, part: str) -> None:
+def test_an_empty_certificate_is_refused(folder: Path, tmp_path: Path, part: str) -> None:
     path = tmp_path / "file"
     path.write_text("-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n")
     refused(attrs.evolve(credentials(folder), **{part: str(path)}))
 
 
-def test_somebody_elses(folder: Path) -> None:
+def test_a_certificate_or_key_of_another_identity_is_refused(folder: Path) -> None:
     error = refused(credentials(folder), "coordinator.c2")
     assert error.field == "certificate"
     assert "this one is of coordinator.c1" in error.allowed
@@ -91,7 +91,7 @@ def test_somebody_elses(folder: Path) -> None:
     assert refused(wrong_key).field == "private key"
 
 
-def test_another_authority(folder: Path, tmp_path: Path) -> None:
+def test_a_certificate_of_another_authority_is_refused(folder: Path, tmp_path: Path) -> None:
     issue(make_authority(tmp_path), tmp_path, parse_identity(NAME), days=30.0)
     mixed = attrs.evolve(credentials(tmp_path), ca=str(folder / "ca.pem"))
     assert "has signed" in refused(mixed).allowed
@@ -123,7 +123,7 @@ def test_the_router_is_where_clients_look_for_it(folder: Path) -> None:
     refused(credentials(folder, "router"), "router", "10.1.2.4")
 
 
-def test_roles_do_not_change_places(folder: Path) -> None:
+def test_certificates_of_router_and_clients_are_not_interchangeable(folder: Path) -> None:
     """The router's certificate is of no use to a client, and the other way round."""
     assert "purpose" in refused(credentials(folder, "router"), NAME).allowed
     assert "purpose" in refused(credentials(folder), "router").allowed

@@ -629,7 +629,7 @@ def test_after_close_everything_is_harmless(bed: Bed) -> None:
 # --- the link ---------------------------------------------------------------------------------
 
 
-def test_without_the_link_everybody_vanishes_and_comes_back(breakable_bed: Bed) -> None:
+def test_without_the_link_all_tokens_vanish_and_come_back(breakable_bed: Bed) -> None:
     bed = breakable_bed
     a, b = bed.join("a"), bed.join("b")
     a.transport.announce(token_key("a"))

@@ -92,7 +92,7 @@ def test_with_the_assumptions_of_a_scenario_it_is_a_tenth_of_a_metre_off_at_most
         assert way_m == pytest.approx(true_m, abs=0.02)
 
 
-def test_who_is_ahead_may_stop_speeding_up_at_once_and_brakes_hard_for_good() -> None:
+def test_the_vehicle_ahead_may_stop_accelerating_at_once_and_then_brakes_hard() -> None:
     assert lead_m(15.0, 4.0) == lead_m(15.0)
     assert lead_m(15.0, -2.0) < lead_m(15.0)
     hardest = lead_m(15.0, -ASSUMED.lead_brake_mps2)
@@ -103,11 +103,11 @@ def test_who_is_ahead_may_stop_speeding_up_at_once_and_brakes_hard_for_good() ->
 # --- what is to spare -----------------------------------------------------------------------------
 
 
-def test_without_anybody_ahead_there_is_no_end_of_room() -> None:
+def test_without_a_vehicle_ahead_the_spare_distance_is_infinite() -> None:
     assert BRAKE.spare_m(body(25.0), 5.0, (15.0, 0.0), ()) == math.inf
 
 
-def test_the_nearest_to_trouble_counts() -> None:
+def test_the_most_critical_vehicle_ahead_counts() -> None:
     slow, near = Neighbour(0, 30.0, 2.0), Neighbour(1, 12.0, 15.0)
     apart = [BRAKE.spare_m(body(15.0), 0.0, NO_JERK, [other]) for other in (slow, near)]
     assert BRAKE.spare_m(body(15.0), 0.0, NO_JERK, [slow, near]) == min(apart)

@@ -1,4 +1,4 @@
-"""Keeping behind whoever is ahead, and when a motion has ended.
+"""Keeping behind the vehicle ahead, and when a motion has ended.
 
 The other laws of `motion` are tested where they are used: tests/unit/agents, sim_bridge.
 """
@@ -126,7 +126,7 @@ def test_stops_in_time_though_it_was_speeding_up(limits: Vehicle, v_mps: float) 
     v_mps=st.floats(0.0, 20.0),
 )
 @settings(max_examples=150, deadline=None)
-def test_never_runs_into_anybody_from_where_it_can_be_avoided(
+def test_never_hits_the_vehicle_ahead_where_that_can_be_avoided(
     gap_m: float, other_mps: float, v_mps: float
 ) -> None:
     """From a gap that is enough for the vehicle's braking, which takes 0.4 s to build up."""
@@ -147,7 +147,9 @@ def test_a_row_at_equal_speed_stays_as_it_is(gap_m: float) -> None:
 
 
 @pytest.mark.parametrize(("decel_mps2", "to_mps"), [(2.0, 0.0), (6.0, 0.0), (6.0, 8.0)])
-def test_a_row_is_safe_behind_one_who_brakes_as_they_do(decel_mps2: float, to_mps: float) -> None:
+def test_a_row_is_safe_behind_a_vehicle_that_brakes_as_they_do(
+    decel_mps2: float, to_mps: float
+) -> None:
     history, states, least_accel = row(braking(decel_mps2, to_mps), [10.0] * 6)
     assert least(history) >= MIN_GAP_M - SHORT_M
     assert least_accel >= COMFORT - 1e-9
@@ -155,7 +157,7 @@ def test_a_row_is_safe_behind_one_who_brakes_as_they_do(decel_mps2: float, to_mp
         assert state[1] == pytest.approx(to_mps, abs=0.1)
 
 
-def test_a_row_does_not_crash_into_one_who_brakes_as_hard_as_can_be() -> None:
+def test_a_row_does_not_hit_a_vehicle_that_brakes_as_hard_as_possible() -> None:
     """Its first vehicle comes closer than it wants to; the others need not."""
     history, _, _ = row(braking(-LIMITS.min_accel_mps2), [18.0, 10.0, 10.0])
     firsts, *others = zip(*history, strict=True)
@@ -163,7 +165,7 @@ def test_a_row_does_not_crash_into_one_who_brakes_as_hard_as_can_be() -> None:
     assert min(map(min, others)) >= MIN_GAP_M - SHORT_M
 
 
-def test_who_is_too_close_falls_back() -> None:
+def test_a_vehicle_that_is_too_close_falls_back() -> None:
     history, (end,), _ = row(at_speed(SPEED_MPS), [1.0], seconds=30.0)
     gaps = [gaps[0] for gaps in history]
     assert min(gaps) > 0.99
@@ -171,7 +173,7 @@ def test_who_is_too_close_falls_back() -> None:
     assert end[1] == pytest.approx(SPEED_MPS, abs=0.1)
 
 
-def test_nobody_ahead_changes_nothing() -> None:
+def test_without_a_vehicle_ahead_nothing_changes() -> None:
     state = body(0.0, 12.0)
     jerk = hold_law(state, body(3.0), LIMITS, TICK_S)
     assert keep_gap(state, jerk, (), LIMITS, MIN_GAP_M, TICK_S) == jerk
@@ -219,8 +221,8 @@ def moving_back(before_s: float) -> Motion:
     return motion
 
 
-def test_who_yields_to_a_planned_move_stays_in_its_cell() -> None:
-    """It sees somebody brake and cannot know that this ends a pitch ahead: it gives way for a time.
+def test_a_vehicle_that_yields_to_a_planned_move_stays_in_its_cell() -> None:
+    """It sees the other one brake, cannot know that this ends a pitch ahead, and yields for a time.
 
     Its body stays in its cell all the same (assumption 3 of docs/SAFETY.md), and so do the bodies
     of those behind it.

@@ -46,7 +46,7 @@ def test_numbers_become_text() -> None:
     assert [key.rpartition("/")[2] for key in keys] == ["1", "True", "1.0", "1"]
 
 
-def test_who_reads_a_key_cannot_change_what_others_read() -> None:
+def test_the_parameters_of_a_key_cannot_be_changed() -> None:
     key = KEYS.key(topics.COMMAND, vehicle="v1")
     known = KEYS.read(key)
     assert known is not None

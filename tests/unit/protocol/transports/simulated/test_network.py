@@ -131,7 +131,7 @@ def test_a_message_arrives_as_the_same_object_or_an_equal_one(*, skip_codec: boo
     assert receiver.of(node.Arrived) == [arrived]
 
 
-def test_all_who_receive_the_same_bytes_share_one_message() -> None:
+def test_all_receivers_of_the_same_bytes_share_one_message() -> None:
     receivers = {name: listener() for name in ("b", "c")}
     network = network_of(Conditions(jitter_s=1.0, duplication=1.0), more=receivers, a=Recorder())
     send(network, "a", 1, 2)
@@ -170,7 +170,7 @@ def test_subscriptions_may_change_between_messages() -> None:
     assert receivers["c"].numbers == [1, 2, 3, 4]
 
 
-def test_nothing_is_sent_to_who_has_left() -> None:
+def test_nothing_is_sent_to_a_node_that_has_left() -> None:
     network = network_of(a=Recorder(), b=listener(), c=listener())
     send(network, "a", 1)
     network.kill("b")
@@ -192,7 +192,7 @@ def watched(
 
 
 @pytest.mark.parametrize("how", ["kill", "stop", "end"])
-def test_a_node_that_has_gone_is_missed_at_once(how: str) -> None:
+def test_the_end_of_a_node_is_noticed_at_once(how: str) -> None:
     network, watcher, leaver = watched()
     leaver.on_event = lambda event, _: [beat(9, "v")] if isinstance(event, node.Stopping) else []
     if how == "end":
@@ -411,7 +411,7 @@ def test_a_node_may_end_at_any_moment(moment: type) -> None:
 
 
 def crowd(seed: int = 1) -> tuple[SimulatedNetwork, dict[str, Recorder]]:
-    """Return a network in which everybody shows a token, watches all, and hears all beats."""
+    """Return a network in which every node shows a token, watches all, and hears all beats."""
     names = ("a", "b", "c", "d")
     cores = {
         name: Recorder(at_start(node.Listen(HEARTBEAT), node.Watch(VEHICLE_ALIVE), token(name)))
@@ -485,7 +485,7 @@ def test_a_node_that_is_unplugged_stays_so_when_the_router_comes_back() -> None:
     assert sorted(cores["c"].tokens[4:]) == ["+a", "+b", "+c", "+d"]
 
 
-def test_nobody_connects_while_the_router_is_lost() -> None:
+def test_no_node_connects_while_the_router_is_lost() -> None:
     network, cores = crowd()
     network.disconnect("a")
     network.lose_router()
@@ -502,7 +502,7 @@ def test_nobody_connects_while_the_router_is_lost() -> None:
     assert "+late" in cores["a"].tokens
 
 
-def test_a_sleeper_looks_for_the_router_when_it_wakes() -> None:
+def test_a_paused_node_looks_for_the_router_when_it_resumes() -> None:
     network, cores = crowd()
     network.pause("a")
     network.run(1.0)
