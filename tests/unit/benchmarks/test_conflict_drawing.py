@@ -41,6 +41,7 @@ def drawn(axes: Axes) -> Counter[str]:
     return Counter(str(mark.get_label()) for mark in marks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("geometry", [BodyGeometry(), BodyGeometry(clearance_along_m=7.0)])
 def test_each_pair_is_drawn_once_in_the_colour_of_its_verdict(geometry: BodyGeometry) -> None:
     tables = ConflictTables.of(geometry)
@@ -74,6 +75,7 @@ def test_counts_are_those_of_the_tables() -> None:
     assert ordered == sorted(ordered, reverse=True)
 
 
+@pytest.mark.slow
 def test_a_picture_is_written(tmp_path: Path) -> None:
     out = tmp_path / "images" / "conflicts.png"
     draw_conflicts(out, dpi=40)

@@ -26,6 +26,7 @@ def recording() -> Recording:
     return record(SCENARIO, instances=1, seed=3)
 
 
+@pytest.mark.slow
 def test_every_family_and_solver_gets_a_row() -> None:
     rows = compare(SCENARIO, instances=1, seed=3, repeats=1)
     names = list(dict.fromkeys(row["solver"] for row in rows))
@@ -41,6 +42,7 @@ def test_every_family_and_solver_gets_a_row() -> None:
             assert row["first_jerk_difference_mps3"]["p99"] < 0.3
 
 
+@pytest.mark.slow
 def test_a_recorded_program_is_that_of_its_tick(recording: Recording) -> None:
     """The dynamics' bounds lead from the recorded state to the predicted states."""
     condensed, parts = Condensed.of(recording.parts), recording.parts
@@ -55,6 +57,7 @@ def test_a_recorded_program_is_that_of_its_tick(recording: Recording) -> None:
         assert tracker.program.high.all.tobytes() == problem.upper.tobytes()
 
 
+@pytest.mark.slow
 def test_solvers_agree(recording: Recording) -> None:
     by_name = solvers(SCENARIO, recording.parts)
     for episode in recording.episodes:

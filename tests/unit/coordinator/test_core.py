@@ -377,6 +377,7 @@ def test_failed_planning_is_logged_and_tried_again_under_the_same_ballot(spoil: 
     assert plan.message.ballot == ballot
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cell", [(-4, 0), (77, 0), (0, 5), (-1, 1)])
 def test_cells_that_cannot_be_planned_from_do_not_stop_the_coordinator(cell: Cell) -> None:
     """Outside the block, or the cell of another vehicle."""
@@ -398,6 +399,7 @@ def test_too_late_for_any_step_settles() -> None:
     assert logged(desk.wait(5.0)) == []
 
 
+@pytest.mark.slow
 def test_failed_planning_searches_further_each_time() -> None:
     """The bound on nodes doubles, so hard tasks are solved eventually."""
     few = evolve(PAPER, formation=evolve(PAPER.formation, solver="branching", max_nodes=1))
@@ -423,6 +425,7 @@ def rosters(draw: st.DrawFn) -> tuple[Cells, dict[Name, int]]:
     return dict(zip(names, cells, strict=True)), dict(zip(names, lanes, strict=False))
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(roster=rosters(), t_s=st.floats(4.1, 40.0))
 def test_every_plan_is_executable_and_serves_all_preferences(

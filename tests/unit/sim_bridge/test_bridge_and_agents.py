@@ -179,6 +179,7 @@ def test_ticks_do_not_wait_long_for_an_agent_that_sleeps(street: Street, agent: 
 # --- an agent that dies -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [(0, 1), (-1, 2), (-2, 0)])
 @pytest.mark.parametrize("restarts", [False, True])
 def test_the_move_of_an_agent_that_died_is_finished_and_held(
@@ -250,6 +251,7 @@ def check_all_gone(street: Street) -> None:
         assert not getattr(node.core, "_agents", None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shards", [1, 2, None])
 def test_a_whole_run_counts_every_message_once_and_keeps_little_of_vehicles_that_left(
     tmp_path: Path, shards: int | None
@@ -315,6 +317,7 @@ def test_the_clock_does_not_race_while_the_bridge_is_off_the_network(tmp_path: P
 # --- the next run -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end_of_first", ["in good order", "killed"])
 def test_all_roles_start_anew_with_the_next_bridge(tmp_path: Path, end_of_first: str) -> None:
     """Its vehicles have the names of the last ones, and its road time begins at 0 again."""

@@ -106,6 +106,7 @@ def test_moves_that_cannot_be_driven_are_refused_with_what_to_change(
     assert ("room to brake" in error.allowed) == ("braking" in names)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [1, 2])
 def test_the_defaults_can_be_driven(mode: int) -> None:
     check_moves(parse_scenario({"formation": {"mode": mode}}))

@@ -70,6 +70,7 @@ EMERGENCIES = 20
 """Of each kind."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", emergencies.KINDS)
 def test_no_vehicle_hits_one_that_brakes_to_a_stop_while_messages_stop(kind: str) -> None:
     first, every = emergencies.KINDS.index(kind), len(emergencies.KINDS)

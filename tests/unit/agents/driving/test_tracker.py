@@ -110,6 +110,7 @@ def test_ideal_move_ends_in_the_target_cell_within_limits(dx: int, dy: int) -> N
     assert np.abs(error(log[-1][0], (dx, 1 + dy), 43)).max() < 0.01
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(
     st.floats(-60, 60),
@@ -199,6 +200,7 @@ def _doomed(state: State) -> bool:
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("decel", [1.0, 3.0, 6.0, 9.0])
 def test_stays_behind_a_vehicle_that_brakes_to_standstill(decel: float) -> None:
     predict = braking(10.0, decel, 10)

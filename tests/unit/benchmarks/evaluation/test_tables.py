@@ -226,6 +226,7 @@ def test_parts_that_are_not_there_anew_stay() -> None:
     assert updated_with.costs == old.costs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -186,6 +187,7 @@ def test_without_any_plan_no_vehicle_moves() -> None:
     assert sorting.short_of_room
 
 
+@pytest.mark.slow
 def test_a_search_that_ran_out_of_nodes_says_nothing_of_room() -> None:
     """With a neighbour's block as well it would only take longer."""
     cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
@@ -224,6 +226,7 @@ def test_a_structure_that_cannot_be_reached_is_planned_once() -> None:
     assert (sorting.solved, len(asked)) == (False, 1)
 
 
+@pytest.mark.slow
 def test_all_placements_share_one_deadline() -> None:
     """Each attempt takes 2 s of a deadline of 5 s, and every plan has too many steps."""
     asked, now_s = list[float](), [100.0]

@@ -46,6 +46,7 @@ def chunks(instances: int, first: int = 0) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("seeds", [range(k, k + CHUNK) for k in every], ids=str)
 
 
+@pytest.mark.slow
 @by_oracle
 @chunks(INSTANCES)
 def test_planner_agrees_with_the_oracle(seeds: range, oracle: Oracle) -> None:
@@ -71,6 +72,7 @@ def _formation(seed: int) -> dict[str, Any]:
     return formation_request(seed, vehicles=size, mode=mode, conflicts=conflicts).to_dict()
 
 
+@pytest.mark.slow
 @by_oracle
 @chunks(FORMATION_INSTANCES)
 def test_planner_agrees_with_the_oracle_on_formations_beyond_six(
@@ -101,6 +103,7 @@ def _closing(seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
     return request, {**request, "conflicts": [kind for kind in conflicts if kind != "closing"]}
 
 
+@pytest.mark.slow
 @by_oracle
 @chunks(CLOSING_INSTANCES)
 def test_planner_agrees_with_the_oracle_with_closing(seeds: range, oracle: Oracle) -> None:
@@ -150,6 +153,7 @@ def test_all_sets_of_conflicts_and_all_sizes_occur() -> None:
 CROWDED = list(product(range(8), ((3, 2, 2), (4, 1, 2), (3, 2, 3))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", range(len(EVERY_VARIANT)))
 def test_planner_agrees_with_joint_search_on_crowded_grids(code: int) -> None:
     """Many of these have no solution, which the planner must prove."""

@@ -118,6 +118,7 @@ def shortest_total_way(
     return min(totals, default=None)
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(crowds(), st.sampled_from(STRUCTURES))
 def test_targets_are_a_structure_with_the_shortest_way(

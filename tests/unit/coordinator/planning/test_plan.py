@@ -37,6 +37,7 @@ def _corridor(*vehicles: tuple[Cell, int], columns: int = 4) -> PlanRequest:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=120, deadline=None)
 @given(requests())
 def test_cost_is_optimal_or_infeasibility_is_proven(request: PlanRequest) -> None:
@@ -95,6 +96,7 @@ class TestInfeasible:
 
 
 class TestDeadline:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("solver", "looks"),
         [
@@ -128,6 +130,7 @@ class TestDeadline:
         assert response.lower_bound is not None
         assert response.lower_bound >= 72
 
+    @pytest.mark.slow
     def test_more_time_never_gives_a_worse_plan(self) -> None:
         request = block_request(29, deadline_s=3600.0)
         costs, bounds = [], []
@@ -162,6 +165,7 @@ class TestRepeatable:
         first, second = (plan(request, max_nodes=300) for _ in range(2))
         assert _without_time(first) == _without_time(second)
 
+    @pytest.mark.slow
     def test_hash_seed_does_not_matter(self) -> None:
         roots = [
             str(Path(package.__file__ or "").parents[2])

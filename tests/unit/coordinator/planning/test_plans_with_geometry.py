@@ -71,6 +71,7 @@ def compared() -> Iterator[dict[str, Any]]:
     yield from map(_request, range(INSTANCES))
 
 
+@pytest.mark.slow
 @by_oracle
 @chunks(INSTANCES)
 def test_planner_agrees_with_the_oracle(seeds: range, oracle: Oracle) -> None:
@@ -81,6 +82,7 @@ def test_planner_agrees_with_the_oracle(seeds: range, oracle: Oracle) -> None:
 CROWDED = ((3, 2, 2), (4, 1, 2), (3, 2, 3), (2, 2, 3), (2, 2, 4))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("geometry", [*GEOMETRIES, TIGHT], ids=str)
 @pytest.mark.parametrize("mode", [1, 2])
 def test_planner_agrees_with_joint_search_on_crowded_grids(
@@ -192,6 +194,7 @@ def driven() -> Profile:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lateness_s", [0.0, 0.2, 0.5])
 def test_formations_keep_the_clearance_when_agents_drive_them(lateness_s: float) -> None:
     """Eight vehicles in mode 2, by a timetable, with delays."""

@@ -434,6 +434,7 @@ def test_answers_are_forgotten_when_they_are_long(
     assert desk.orders
 
 
+@pytest.mark.slow
 def test_large_requests_leave_little_behind() -> None:
     grid = {
         "columns": 100,

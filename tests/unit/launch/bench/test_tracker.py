@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 from laneweave.agents.driving.tracker import Tracker
 from laneweave.launch.bench.tracker import SITUATIONS, bench_tracker, drive, tracker_table
 from laneweave.protocol.scenario.fields import Scenario
@@ -31,6 +33,7 @@ def test_episodes_repeat() -> None:
         assert jerks[0] == jerks[1]
 
 
+@pytest.mark.slow
 def test_json_has_a_result_for_each_situation(laneweave: Here) -> None:
     _, out, _ = laneweave("bench", "tracker", "--instances", 1, "--seed", 3, "--json")
     shown = json.loads(out)

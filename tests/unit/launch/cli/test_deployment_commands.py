@@ -31,6 +31,7 @@ def config(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_certificates_for_a_deployment(laneweave: Here, config: Path) -> None:
     folder = config.parent / "certs"
     more = ("--vehicle", "v0001", "--client", "ops", "--host", "router.example")

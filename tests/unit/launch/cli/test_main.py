@@ -8,6 +8,8 @@ import sys
 import threading
 import time
 
+import pytest
+
 INTERRUPTS = 60
 
 # Everything is loaded by the real entry point: threads inherit its signal mask.
@@ -38,6 +40,7 @@ main.main()
 """
 
 
+@pytest.mark.slow
 def test_no_interrupt_is_lost_while_osqp_solves() -> None:
     """Without the forwarding thread one in eight would be lost."""
     command = [sys.executable, "-c", SOLVING, str(INTERRUPTS)]

@@ -74,6 +74,7 @@ def test_a_panel_per_time_point_shows_all_vehicles() -> None:
     assert arrows == [4, 2, 1, 0]
 
 
+@pytest.mark.slow
 def test_panels_do_not_overlap() -> None:
     figure = plan_figure(*long_plan(10))
     figure.draw_without_rendering()
@@ -142,6 +143,7 @@ def test_the_longest_road_stays_within_memory(tmp_path: Path) -> None:
         assert 10_000 < image.width <= 30_000
 
 
+@pytest.mark.slow
 def test_a_gif_moves_and_begins_again(tmp_path: Path) -> None:
     out = tmp_path / "plan.GIF"
     request, plan = long_plan(1)

@@ -125,6 +125,7 @@ def test_of_a_long_plan_some_instants_are_drawn() -> None:
     assert (roads[0].get_ylabel(), roads[-1].get_ylabel()) == ("0.0 s", "76.0 s")
 
 
+@pytest.mark.slow
 def test_without_a_plan_the_start_is_drawn(tmp_path: Path) -> None:
     figure = road_figure(_Picture.of(REQUEST, NO_PLAN, SCENARIO))
     assert len(figure.axes) == 3
@@ -134,6 +135,7 @@ def test_without_a_plan_the_start_is_drawn(tmp_path: Path) -> None:
         assert (tmp_path / name).stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_an_animation_has_a_frame_for_each_tick(tmp_path: Path) -> None:
     request = attrs.evolve(REQUEST, vehicles=REQUEST.vehicles[:2])
     paths = tuple(path[:2] for path in PLAN.paths[:2])
@@ -151,6 +153,7 @@ def test_an_animation_has_a_frame_for_each_tick(tmp_path: Path) -> None:
 # --- the command ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scenario", "shown"), [(None, "3 steps of 4 s"), ("[formation]\ncycle_s = 6.0", "of 6 s")]
 )

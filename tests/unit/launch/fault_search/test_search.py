@@ -44,6 +44,7 @@ def test_bad_jobs(jobs: int) -> None:
         check_jobs(jobs)
 
 
+@pytest.mark.slow
 def test_several_processes_come_to_the_same_as_one() -> None:
     seeds = range(BATCH + 2)  # each process gets some
     one = search(seeds, CALM, jobs=1, digest=True)
@@ -56,6 +57,7 @@ def test_several_processes_come_to_the_same_as_one() -> None:
     assert len(set(one.digests.values())) == one.passed == len(seeds)
 
 
+@pytest.mark.slow
 def test_profiles_and_seeds_make_different_runs() -> None:
     digests = {
         run_seeds([seed], PROFILES[name], digest=True)[0].digest
@@ -85,6 +87,7 @@ def test_timeline_of_a_run() -> None:
         assert words in told
 
 
+@pytest.mark.slow
 def test_the_command() -> None:
     done = laneweave("simulate", "--seeds", "0:4", "--profile", "calm", "--jobs", "2", "--digest")
     assert done.returncode == 0
@@ -95,6 +98,7 @@ def test_the_command() -> None:
     assert done.stderr == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -120,6 +124,7 @@ def spent_s(pid: int) -> float:
     return spent
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_interrupted(jobs: str) -> None:
     process = subprocess.Popen(

@@ -158,6 +158,7 @@ def simulate(tmp_path: Path) -> Callable[[str, FaultSpec], Outcome]:
     return run
 
 
+@pytest.mark.slow
 def test_a_simulated_run_with_all_faults_is_repeatable(
     simulate: Callable[[str, FaultSpec], Outcome], tmp_path: Path
 ) -> None:
@@ -178,6 +179,7 @@ def test_a_simulated_run_with_all_faults_is_repeatable(
     assert tables[0].equals(tables[1])
 
 
+@pytest.mark.slow
 def test_a_simulated_run_supports_almost_all_faults(
     simulate: Callable[[str, FaultSpec], Outcome],
 ) -> None:

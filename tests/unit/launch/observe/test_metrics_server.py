@@ -81,6 +81,7 @@ def test_metrics_are_read_at_each_request() -> None:
         scrape(address)
 
 
+@pytest.mark.slow
 def test_the_thread_that_counts_answers() -> None:
     with pytest.raises(TimeoutError, match="no metrics within 2 s"):
         snapshot_source(lambda _: None)()

@@ -37,6 +37,7 @@ def column(data: dict[str, Any], name: str) -> NDArray[np.float64]:
     return np.frombuffer(raw, KINDS[name]) * float(data["units"][name])
 
 
+@pytest.mark.slow
 def test_data_decode_to_the_trajectories(run: Run, tracks: Tracks) -> None:
     data = json.loads(json.dumps(animation_data(run, tracks, "")))
     assert sorted(vehicle["name"] for vehicle in data["vehicles"]) == sorted(tracks.names)

@@ -69,6 +69,7 @@ def draw_all(folder: Path) -> None:
     assert all(is_picture(folder / name) for name in ("box.png", "heat.png", "road.png"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lanes", [1, 2, 3, 5])
 def test_pictures_of_any_number_of_lanes(tmp_path: Path, lanes: int) -> None:
     draw_all(make_run(tmp_path, lanes, lattice=lanes != 2))

@@ -75,6 +75,7 @@ def check_page(page: Path, pictures: int) -> Reader:
     return reader
 
 
+@pytest.mark.slow
 def test_of_a_sweep(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     folder = tmp_path / "a <b> & 'c'"  # a name that needs escaping
     shutil.copytree(swept, folder)
@@ -89,6 +90,7 @@ def test_of_a_sweep(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     assert [one["title"] for one in reader.data] == ["formation, 1600 veh/(lane·h), seed 1"]
 
 
+@pytest.mark.slow
 def test_of_a_run(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(swept / "formation-1600-1", folder)
@@ -99,6 +101,7 @@ def test_of_a_run(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     assert len(reader.data) == 1
 
 
+@pytest.mark.slow
 def test_of_a_run_without_formations(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(swept / "formation-1000-1", folder)
@@ -113,6 +116,7 @@ def test_of_a_run_without_formations(laneweave: Here, swept: Path, tmp_path: Pat
     assert {vehicle["formation"] for vehicle in reader.data[0]["vehicles"]} == {None}
 
 
+@pytest.mark.slow
 def test_of_several_runs(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     folders = [tmp_path / "first", tmp_path / "second"]
     for folder in folders:

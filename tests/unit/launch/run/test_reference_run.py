@@ -145,6 +145,7 @@ def test_an_interrupted_run_leaves_its_summary(
 # --- the command ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @each_method
 def test_the_command_leaves_all_files(laneweave: Here, tmp_path: Path, method: str) -> None:
     out = tmp_path / "run"

@@ -47,6 +47,7 @@ print(gc.get_count()[2], gc.get_freeze_count() > len(gc.get_objects()))
 """
 
 
+@pytest.mark.slow
 def test_the_fork_server_has_one_thread_and_nothing_open_and_leaves_nothing_to_collect() -> None:
     done = python(LOOK_AROUND, PRELOADED, env=os.environ | dict.fromkeys(THREAD_LIMITS, "1"))
     assert done.stdout.split() == ["1", "0", "0", "True"], done.stderr

@@ -13,6 +13,7 @@ distributed = pytest.importorskip(
 )
 
 
+@pytest.mark.slow
 def test_a_cluster_has_the_same_results(tmp_path: Path) -> None:
     scenario = short_road(tmp_path)
     lists = ("--volumes", "1200,1600", "--seeds", "3:4")

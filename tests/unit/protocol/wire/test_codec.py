@@ -163,6 +163,7 @@ def test_a_sample_comes_back_equal_and_well_typed(sample: object) -> None:
     assert set(envelope(sample)[2]) == set(map(key_of, HINTS[type(sample)]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 def test_any_value_comes_back(kind: type) -> None:
     @settings(max_examples=25, deadline=None)
@@ -418,6 +419,7 @@ def test_random_bytes_and_bodies_are_refused() -> None:
         assert not accepts_only_well_typed(head + rng.randbytes(rng.randrange(80)))
 
 
+@pytest.mark.slow
 @each_sample
 def test_flipped_bits_never_give_wrong_types(sample: object) -> None:
     payload = encode(sample)
@@ -438,6 +440,7 @@ JUNK = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(st.sampled_from(list(SAMPLES.values())), st.data())
 def test_junk_in_a_field_never_gives_wrong_types(sample: object, data: st.DataObject) -> None:

@@ -22,6 +22,7 @@ def filled(topic: topics.Topic, text: str = "x") -> dict[str, str]:
     return {name: f"{text}{index}" for index, name in enumerate(topic.parameters)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda topic: topic.name)
 def test_what_is_built_is_read_back(topic: topics.Topic) -> None:
     @given(st.tuples(*(NAMES for _ in topic.parameters)), NAMES)

@@ -72,6 +72,7 @@ def test_three_abreast_that_want_to_change_round_all_do(rule: dict[str, Any], s_
     assert [one.lane for one in sorted(road.left, key=lambda one: one.name)] == list(wanted)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     rule=st.sampled_from(METHODS),

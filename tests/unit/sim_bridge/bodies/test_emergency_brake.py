@@ -72,6 +72,7 @@ def test_what_is_to_spare_is_where_the_body_stops_that_brakes_one_tick_later(
 JERKS = st.lists(st.sampled_from((-15.0, -5.0, 0.0, 5.0, 15.0)), min_size=1, max_size=10)
 
 
+@pytest.mark.slow
 @given(
     st.tuples(st.floats(0.0, 25.0), st.floats(-9.0, 5.0)),
     st.tuples(st.floats(0.0, 25.0), st.floats(-9.0, 5.0)),

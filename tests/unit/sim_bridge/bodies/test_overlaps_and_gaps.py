@@ -58,6 +58,7 @@ def depth(pose: Pose, points: np.ndarray[tuple[int, int], np.dtype[np.float64]])
     return float(np.minimum(LENGTH_M / 2 - along, WIDTH_M / 2 - across).max())
 
 
+@pytest.mark.slow
 @given(ROADS)
 @settings(max_examples=150, deadline=None)
 def test_overlaps_agree_with_point_sampling(road: dict[str, Pose]) -> None:
@@ -118,6 +119,7 @@ def brute_gap(road: dict[str, Pose]) -> float:
     return least
 
 
+@pytest.mark.slow
 @given(st.lists(POSES, min_size=2, max_size=4))
 @settings(max_examples=60, deadline=None)
 def test_least_gap_agrees_with_slices(poses: list[Pose]) -> None:

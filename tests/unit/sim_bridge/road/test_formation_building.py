@@ -141,6 +141,7 @@ def cases(draw: st.DrawFn) -> Case:
     return Case(lanes, vehicles, columns, spread_s, interlaced, stream)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grows", [True, False], ids=["growing", "blocks of columns"])
 @given(case=cases())
 @settings(max_examples=150, deadline=None)

@@ -269,6 +269,7 @@ class CensusWatch:
         assert set(census.formations) == present
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("volume", [30.0, 1000.0, 2000.0])
 def test_a_census_reports_owners_of_columns_and_closed_ones(volume: float) -> None:
     scenario = load_scenario(

@@ -172,6 +172,7 @@ def histories(draw: st.DrawFn) -> list[Command | Cell]:
     return draw(st.permutations([*said, *late, *granted]))
 
 
+@pytest.mark.slow
 @given(histories(), st.integers(0, 20))
 @settings(max_examples=200, deadline=None)
 def test_however_orders_arrive_what_is_kept_is_sound(

@@ -61,6 +61,7 @@ def test_the_whole_road_and_every_lateral_position_are_exact(world: SumoWorld) -
         assert_exact(world, states)
 
 
+@pytest.mark.slow
 def test_random_motion_and_traffic_are_exact(world: SumoWorld) -> None:
     rng = np.random.default_rng(1)
     states: dict[str, State] = {}

@@ -23,6 +23,7 @@ def solved(request: PlanRequest, max_nodes: int | None = None) -> PlanResponse:
     return response
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("size", [7, 8])
 @pytest.mark.parametrize(
@@ -107,12 +108,14 @@ def test_a_distant_target_is_reached() -> None:
     assert response.cost == plan(request, solver="tappa").cost
 
 
+@pytest.mark.slow
 def test_arrays_above_the_memory_limit_are_not_made() -> None:
     vehicles = (VehicleRequest("a", (0, 0)),)
     request = PlanRequest(Grid(1000, 16), 1, ("geometric",), vehicles, ((999, 15),), 20.0)
     assert solved(request).cost == 999 + 15
 
 
+@pytest.mark.slow
 def test_a_limit_on_memory_ends_with_a_feasible_plan() -> None:
     """Arrays for more steps with multipliers do not fit; a path set was found before."""
     request = formation_request(0, vehicles=24, deadline_s=60.0)

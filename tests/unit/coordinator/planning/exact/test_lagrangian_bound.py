@@ -13,6 +13,7 @@ from unit.coordinator.planning.exact.test_negotiation import arrays_of
 CASES: list[tuple[int, int, Mode]] = [(0, 6, 1), (3, 9, 1), (1, 6, 2), (3, 8, 2)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "vehicles", "mode"), CASES)
 def test_bounds_rise_and_never_exceed_the_minimum_cost(
     seed: int, vehicles: int, mode: Mode
@@ -31,6 +32,7 @@ def test_bounds_rise_and_never_exceed_the_minimum_cost(
     assert whole.min_cost >= 0.9 * cost
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "vehicles", "mode"), CASES)
 def test_moves_of_an_optimal_plan_are_never_fixed(seed: int, vehicles: int, mode: Mode) -> None:
     request = formation_request(seed, vehicles=vehicles, mode=mode)

@@ -157,6 +157,7 @@ def test_waiting_in_a_crossed_cell_is_a_conflict(mode: Mode, lateness_s: float) 
 # ------------------------------------------------------------------------------ what is proven
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(geometries())
 def test_disjoint_footprints_are_never_too_close(geometry: BodyGeometry) -> None:
@@ -166,6 +167,7 @@ def test_disjoint_footprints_are_never_too_close(geometry: BodyGeometry) -> None
         assert footprints_meet(pair), pair
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(geometries())
 def test_it_is_the_same_seen_from_the_other_vehicle_or_from_the_other_side(
@@ -186,6 +188,7 @@ def test_backwards_it_forbids_the_same_or_more(geometry: BodyGeometry) -> None:
     assert (table == mirrored) == (geometry != HALF_A_SECOND)
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(geometries(), st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 0.5))
 def test_more_clearance_or_more_lateness_removes_nothing(
@@ -211,6 +214,7 @@ def test_more_clearance_or_more_lateness_removes_nothing(
 # -------------------------------------------------------------------------- against simulation
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(geometries(), st.integers(0, 10**6))
 def test_it_contains_what_simulated_bodies_do(geometry: BodyGeometry, seed: int) -> None:
@@ -226,6 +230,7 @@ def test_it_contains_what_simulated_bodies_do(geometry: BodyGeometry, seed: int)
             assert nearly_m < geometry.clearance_along_m + slack_m, pair
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [3, 8, clearances.PARTS])
 @pytest.mark.parametrize("lateness_s", [None, 0.0, 0.3, 0.7])
 def test_clearances_are_never_overestimated(

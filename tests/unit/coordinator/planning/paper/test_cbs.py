@@ -36,6 +36,7 @@ def _search(tree: ConstraintTree, limit: float = math.inf) -> Node | None:
         return None
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(requests(), EVERY_SWITCH)
 def test_cost_is_that_of_the_joint_search(request: PlanRequest, switches: Improvements) -> None:

@@ -3,6 +3,7 @@
 import math
 
 import attrs
+import pytest
 from hypothesis import given, settings
 
 from laneweave.coordinator.planning.budget import Budget
@@ -18,6 +19,7 @@ from laneweave.launch.bench.request_families import traffic_request
 from support.planning_oracles import cheapest_plan, requests
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(requests())
 def test_path_set_is_optimal_and_legal_or_there_is_none(request: PlanRequest) -> None:
@@ -42,6 +44,7 @@ def test_path_set_is_optimal_and_legal_or_there_is_none(request: PlanRequest) ->
     assert problems_of_paths(request, search.solution.assignment, rows) == []
 
 
+@pytest.mark.slow
 def test_a_crowded_formation_is_solved_while_trees_do_not_end() -> None:
     request = traffic_request(_crowded_seed())
     outcomes = []

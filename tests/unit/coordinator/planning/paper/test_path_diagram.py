@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Iterator
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -72,6 +73,7 @@ def problems(draw: st.DrawFn) -> tuple[MoveTable, int, int, Bans]:
     return table, start, target, Bans(at, since, earliest, latest)
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(problems())
 def test_diagram_holds_all_shortest_paths(case: tuple[MoveTable, int, int, Bans]) -> None:
@@ -84,6 +86,7 @@ def test_diagram_holds_all_shortest_paths(case: tuple[MoveTable, int, int, Bans]
         assert _listed(table, diagram) == set(expected)
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(problems(), st.data())
 def test_choice_has_fewest_conflicts_then_fewest_moves_then_lowest_index(

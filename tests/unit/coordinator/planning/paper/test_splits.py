@@ -132,6 +132,7 @@ def _cost_of_child(
     return total
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(conflicts())
 def test_children_cost_more_as_predicted(drawn: tuple[Case, Conflict, tuple[int, int]]) -> None:

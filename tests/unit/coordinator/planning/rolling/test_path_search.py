@@ -56,6 +56,7 @@ def is_legal(road: StreamRoad, plan: StreamPlan, vehicles: list[StreamVehicle]) 
 # --------------------------------------------------------------------------- whatever comes
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(streams())
 def test_every_stream_gets_complete_paths_without_conflicts(stream: Stream) -> None:
@@ -70,6 +71,7 @@ def test_every_stream_gets_complete_paths_without_conflicts(stream: Stream) -> N
     assert problems_of_plan(road, again, later, blocked[1:]) == []
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(streams())
 def test_vehicles_need_not_be_where_they_were_planned(stream: Stream) -> None:
@@ -206,6 +208,7 @@ def test_an_optimal_plan_is_kept_without_a_round() -> None:
 # ------------------------------------------------------------------------------ how good it is
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.8, 1.0])
 def test_streams_cost_the_minimum_nearly_always(share: float) -> None:
     """The least cost: a mixed-integer programme."""
