@@ -1,8 +1,8 @@
-"""Ask a running coordinator for a plan; the only dependency is `eclipse-zenoh`.
+"""Request a plan from a running coordinator; the only dependency is `eclipse-zenoh`.
 
 Start `laneweave router --endpoint tcp/127.0.0.1:7447` and
-`laneweave coordinator --endpoint tcp/127.0.0.1:7447` first. The optional argument is another
-endpoint.
+`laneweave coordinator --endpoint tcp/127.0.0.1:7447` first. The optional argument replaces
+this endpoint.
 """
 
 import json
