@@ -454,8 +454,8 @@ class Report:
 class LogEvent:
     """Any role to the recorder, for each event: a line in `events.jsonl`.
 
-    Currently only coordinators send events; the bridge writes its own directly. Missing, or after
-    the end of the run: not recorded. Duplicated: recorded twice.
+    Currently only coordinators send events; the bridge writes its own directly. Missing, or
+    later than the end of the run: not recorded. Duplicated: recorded twice.
     """
 
     role: Name
