@@ -51,7 +51,7 @@ def _message_topics(_: object, attribute: attrs.Attribute[Any], value: tuple[str
 
 @frozen(kw_only=True)
 class MessageRule:
-    """Message fault with a topic, a time range and parties; rules are applied one after the other.
+    """Rule for message faults; the rules of a run are applied one after the other.
 
     Raises:
         BadInputError: a value is invalid.

@@ -107,7 +107,7 @@ def metric(meaning: str, *, label: str = "", default: object = attrs.NOTHING) ->
     Args:
         meaning: description of the number, without a final full stop.
         label: meaning of the keys of a mapping.
-        default: default of the field; mandatory without it.
+        default: default value of the field, which is mandatory without it.
     """
     return attrs.field(default=default, metadata={"meaning": meaning, "label": label})
 

@@ -290,10 +290,7 @@ class Sensing:
 
 @frozen
 class Braking:
-    """Assumptions of the emergency brake.
-
-    Its own vehicle brakes with `vehicle.min_accel_mps2`, with the lag `vehicle.actuator_lag_s`.
-    """
+    """Assumptions of the emergency brake about the vehicle ahead and about delays."""
 
     lead_brake_mps2: float = field(default=10.0, validator=within(0.1, 30.0))
     """Hardest braking of the vehicle ahead."""
@@ -313,7 +310,7 @@ class Tracking:
     horizon_ticks: int | None = field(default=None, validator=optional(within(10, 200)))
     """Horizon of the tracker; None: the longest T_F."""
     min_gap_m: float = field(default=3.0, validator=within(0.0, 100.0))
-    """Net gap to the vehicle ahead, for which the tracker leaves its reference."""
+    """Minimum net gap to the vehicle ahead, which takes precedence over the reference."""
     always_solve: bool = False
     """Solve the quadratic program with OSQP in every tick, even if its unconstrained solution
     satisfies all constraints."""
@@ -371,7 +368,7 @@ class Runtime:
     agent_start_s: float = field(default=15.0, validator=within(0.1, 120.0))
     """Maximum wait at the entrance for a vehicle's agent (wall-clock seconds)."""
     announce_s: float = field(default=6.0, validator=within(0.0, 600.0))
-    """Time by which arrivals are announced ahead, for the start of their agents (road seconds)."""
+    """Lead time of announcements before arrivals, for starting agents (road seconds)."""
     max_pace: float = field(default=10.0, validator=within(0.01, 1000.0))
     """Maximum road seconds per second; network and planning take wall-clock time, which must be
     short compared with the time between a plan and its start."""

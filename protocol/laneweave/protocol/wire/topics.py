@@ -27,9 +27,9 @@ class Quality(Enum):
     """Quality of service of a topic; `transports.zenoh` maps it to Zenoh's settings."""
 
     LATEST = "latest"
-    """Periodic messages, which congestion drops."""
+    """Periodic messages, dropped under congestion."""
     ASSURED = "assured"
-    """Messages that congestion blocks; the protocol acknowledges and resends them."""
+    """Messages that wait under congestion; the protocol acknowledges and resends them."""
     LOCKSTEP = "lockstep"
     """Ticks and their answers: as ASSURED, with the highest priority."""
 
@@ -65,8 +65,7 @@ class Party(StrEnum):
 
 
 ANY_SENDER = "any"
-"""Sender of a topic of vehicles, coordinators and the bridge, with their {role} and {name} as
-keys."""
+"""Vehicles, coordinators and the bridge, whose {role} and {name} are in the key."""
 
 
 @frozen

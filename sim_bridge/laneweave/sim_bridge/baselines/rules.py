@@ -3,8 +3,8 @@
 Rule 1. Vehicles drive at v_F on their current lane in S1 and S2, and in S3 on their preferred lane.
 Rule 2. A vehicle changes to the next lane towards the preferred one when the gaps there, to the
         vehicle ahead and to the vehicle behind, satisfy the constant time headway policy.
-Rule 3. If a gap is too small, the vehicle with lower priority slows down, the more the closer it is
-        to the end.
+Rule 3. If a gap is too small, the vehicle with lower priority slows down. Its speed decreases
+        towards the end.
 
 Lane changes and speeds are pure functions of the positions.
 """

@@ -251,7 +251,7 @@ class MotionController:
         )
 
     def step(self, tick: int) -> None:
-        """Drive from `tick` to the next one."""
+        """Advance from `tick` to the next one."""
         measured, plant = self.measured, self.plant
         near: Sequence[Neighbour] = self.neighbours.ahead
         if near:

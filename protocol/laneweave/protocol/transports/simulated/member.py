@@ -195,7 +195,7 @@ class Tokens:
     """
 
     def __init__(self, simulation: Simulation, members: Mapping[str, Member]) -> None:
-        """Notify the entries that `members` has at each call."""
+        """Create an empty registry; `members` is a live view of the network's members."""
         self._simulation = simulation
         self._members = members
 
