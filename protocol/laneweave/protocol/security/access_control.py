@@ -202,8 +202,7 @@ def guard_of(scenario: Scenario, environment: Mapping[str, str] = os.environ) ->
 
 
 def access_control(scenario: Scenario) -> dict[str, Any]:
-    """Return the rights of all identities as Zenoh's `access_control`; everything else is
-    denied."""
+    """Return the rights of all identities as Zenoh's `access_control`, denied by default."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
