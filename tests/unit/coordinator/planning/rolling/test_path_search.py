@@ -209,13 +209,13 @@ def test_an_optimal_plan_is_kept_without_a_round() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [0.25, 0.5, 0.8, 1.0])
-def test_streams_cost_the_minimum_nearly_always(share: float) -> None:
+@pytest.mark.parametrize("count", [2, 5, 7, 9])
+def test_streams_cost_the_minimum_nearly_always(count: int) -> None:
     """The least cost: a mixed-integer programme."""
     random = Random(3)
     equal = 0
     for seed in range(6):
-        vehicles = dense(random, range(3), share, SHORT)
+        vehicles = random.sample(dense(random, range(3), 1.0, SHORT), count)
         plan = StreamPlanner(SHORT, seed=seed).plan(0, vehicles)
         assert is_legal(SHORT, plan, vehicles)
         cost = oracle.cost_of_plan(SHORT, plan, vehicles)
