@@ -86,6 +86,7 @@ def run_base_install(*arguments: str) -> subprocess.CompletedProcess[str]:
     return python(BASE_INSTALL, *arguments, cwd=ROOT)
 
 
+@pytest.mark.slow
 def test_base_install_plans_and_checks_a_configuration() -> None:
     done = run_base_install("plan", CASE_STUDY, "--format", "table")
     assert (done.returncode, done.stderr) == (0, "")
@@ -95,6 +96,7 @@ def test_base_install_plans_and_checks_a_configuration() -> None:
     assert "tls/router:7447" in done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "begins", "names"),
     [

@@ -44,6 +44,7 @@ def test_the_table_names_the_solver(laneweave: Here, tmp_path: Path) -> None:
         assert out.splitlines()[0].endswith(f"planned by {said}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path", sorted(CASE_STUDY.parent.glob("*.json")), ids=lambda path: path.stem
 )

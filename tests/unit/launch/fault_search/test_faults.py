@@ -87,6 +87,7 @@ def test_a_network_that_was_broken_becomes_whole(world: FaultRun, kind: str) -> 
     assert network.dropped == dropped
 
 
+@pytest.mark.slow
 def test_faults_end_by_themselves(world: FaultRun) -> None:
     conditions = world.network.conditions
     harm(world, "blackout")
@@ -113,6 +114,7 @@ def test_lasting_faults_are_counted() -> None:
     assert FaultMix.drawn(PROFILES["calm"], random.Random(1)).kinds() == {}
 
 
+@pytest.mark.slow
 def test_every_kind_in_a_profile_can_be_applied() -> None:
     for kind in sorted({kind for profile in PROFILES.values() for kind in profile.event_kinds}):
         world = FaultRun(3, PROFILES["calm"])

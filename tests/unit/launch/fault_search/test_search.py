@@ -79,6 +79,7 @@ def test_failures_are_described_with_the_command_that_replays_them() -> None:
     assert lines[-1] == "19 passed, 1 failed"
 
 
+@pytest.mark.slow
 def test_timeline_of_a_run() -> None:
     lines = list(timeline_of(1, CALM))
     assert lines[0] == "seed 1, profile calm:"

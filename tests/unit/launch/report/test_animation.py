@@ -21,6 +21,8 @@ from laneweave.launch.web import road_script
 from support.javascript import needs_node, printed_json
 from support.tracks import make_tracks
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def run(swept: Path) -> Run:
@@ -37,7 +39,6 @@ def column(data: dict[str, Any], name: str) -> NDArray[np.float64]:
     return np.frombuffer(raw, KINDS[name]) * float(data["units"][name])
 
 
-@pytest.mark.slow
 def test_data_decode_to_the_trajectories(run: Run, tracks: Tracks) -> None:
     data = json.loads(json.dumps(animation_data(run, tracks, "")))
     assert sorted(vehicle["name"] for vehicle in data["vehicles"]) == sorted(tracks.names)

@@ -101,6 +101,7 @@ def test_lanes_are_coloured_as_in_the_paper() -> None:
     assert len(set(lane_colours(8))) == 8
 
 
+@pytest.mark.slow
 def test_matplotlib_is_imported_only_to_draw() -> None:
     for module in ("figures", "snapshots"):
         assert not loads(f"laneweave.launch.report.{module}", "matplotlib")

@@ -75,6 +75,7 @@ def test_at_low_volume_all_vehicles_leave_on_their_preferred_lanes(
     assert set(rows["column"]) == {None}
 
 
+@pytest.mark.slow
 @each_method
 def test_equal_seeds_give_equal_runs(tmp_path: Path, method: str) -> None:
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):

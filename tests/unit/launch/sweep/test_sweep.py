@@ -15,6 +15,8 @@ import pytest
 from laneweave.launch.run_methods import affects
 from support.sweeping import command, results, short_road, sweep
 
+pytestmark = pytest.mark.slow
+
 LISTS = ("--volumes", "1200,1600", "--seeds", "1:3")
 
 
@@ -33,7 +35,6 @@ def whole(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.mark.slow
 def test_the_files_of_a_sweep(whole: Path) -> None:
     rows = pq.read_table(whole / "results.parquet").to_pylist()
     assert [(row["label"], row["volume_veh_per_lane_h"], row["seed"]) for row in rows] == [
@@ -60,7 +61,6 @@ def test_the_files_of_a_sweep(whole: Path) -> None:
     }
 
 
-@pytest.mark.slow
 def test_an_interrupted_sweep_is_continued(whole: Path, scenario: Path, tmp_path: Path) -> None:
     out = tmp_path / "sweep"
     process = subprocess.Popen(
@@ -102,7 +102,6 @@ def running_points(sweep_pid: int) -> list[psutil.Process]:
     raise AssertionError("no point was started")
 
 
-@pytest.mark.slow
 def test_a_run_whose_process_dies_is_a_failed_row_and_tried_again(
     scenario: Path, tmp_path: Path
 ) -> None:
@@ -121,7 +120,6 @@ def test_a_run_whose_process_dies_is_a_failed_row_and_tried_again(
     assert [row["status"] for row in results(out)] == ["done"]
 
 
-@pytest.mark.slow
 def test_a_run_that_breaks_a_promise_is_a_failed_row_with_its_numbers(tmp_path: Path) -> None:
     scenario = short_road(tmp_path)
     scenario.write_text(scenario.read_text() + "\n[runtime]\nmax_road_s = 8.0\n")
@@ -134,7 +132,6 @@ def test_a_run_that_breaks_a_promise_is_a_failed_row_with_its_numbers(tmp_path: 
     assert (tmp_path / "sweep" / "formation-1600-1" / "log.txt").is_file()
 
 
-@pytest.mark.slow
 def test_other_settings_are_refused(whole: Path, scenario: Path) -> None:
     refused = sweep(scenario, whole, *LISTS, "--duration", 7)
     assert refused.returncode == 2
@@ -170,7 +167,6 @@ def test_which_settings_affect_a_method(field: str, method: str, matters: bool) 
     assert affects(field, method) is matters
 
 
-@pytest.mark.slow
 def test_other_folders_are_refused(scenario: Path, tmp_path: Path) -> None:
     (tmp_path / "letter.txt").touch()
     refused = sweep(scenario, tmp_path)

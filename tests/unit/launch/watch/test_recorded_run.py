@@ -18,12 +18,13 @@ from laneweave.protocol.errors import BadInputError
 from support.commands import Here
 from support.older_recordings import older_recording
 
+pytestmark = pytest.mark.slow
+
 
 def frames(recording: Recording) -> list[dict[str, Any]]:
     return [json.loads(text) for text in recording.frames(0, recording.last)]
 
 
-@pytest.mark.slow
 def test_vehicles_are_at_their_recorded_positions(recorded: Path) -> None:
     recording, tracks = Recording(recorded), read_tracks(recorded)
     shown = frames(recording)

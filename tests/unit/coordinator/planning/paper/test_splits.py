@@ -102,6 +102,7 @@ def conflicts(draw: st.DrawFn) -> tuple[Case, Conflict, tuple[int, int]]:
     return case, conflict, moves
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(conflicts())
 def test_children_share_the_solutions_and_none_keeps_the_conflict(
