@@ -72,7 +72,7 @@ def test_no_rule_is_broken_and_all_vehicles_arrive_long(
 
 @pytest.mark.parametrize("profile", [name for name in PROFILES if name != "mixed"])
 def test_profile(profile: str) -> None:
-    search(profile, range(4 if profile == "rolling-dense" else 8))
+    search(profile, range({"rolling": 16, "rolling-dense": 4}.get(profile, 8)))
 
 
 @pytest.mark.full

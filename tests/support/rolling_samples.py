@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from attrs import evolve
 
 from laneweave.protocol.lattice import Cell
@@ -15,7 +17,9 @@ from laneweave.protocol.wire.messages import (
     Sense,
     VehicleState,
 )
-from support.rolling_road import LATTICE
+from laneweave.sim_bridge.bodies.motion_controller import MotionController
+from support.convoy import ROLLING
+from support.road_vehicles import controller_in
 from support.states import make_plan as plan_of
 
 A, B, C = Name("A"), Name("B"), Name("C")
@@ -27,6 +31,15 @@ BEFORE: dict[Name, tuple[Cell, ...]] = {A: (HOME, (1, 0)), B: (TARGET, (1, 1), (
 AFTER: dict[Name, tuple[Cell, ...]] = {A: (HOME, TARGET, (1, 0)), B: ((1, 1), (2, 1))}
 SLOT_S, T0_S = 4.0, 100.0
 INCARNATION = 7
+
+
+def controller_of(cells: Iterable[Cell]) -> MotionController:
+    """Return the controller of a vehicle that owns cells and holds in the first one."""
+    first, *others = cells
+    controller = controller_in(first, ROLLING)
+    for cell in (first, *others):
+        controller.assign_cell(cell)
+    return controller
 
 
 def make_plan(ballot: Ballot = MID) -> Plan:
@@ -49,7 +62,7 @@ def pending(name: Name, ballot: Ballot = MID, roster: tuple[Name, ...] = (A, B))
 def vehicle(name: Name = A, rules: RuleBook = VEHICLE_RULES) -> PlanExecution:
     cell = make_plan().start_cells[name]
     return PlanExecution(
-        name, INCARNATION, cell, LATTICE, (), rules=rules, owned=frozenset(BEFORE[name])
+        name, INCARNATION, cell, ROLLING.lattice, (), rules=rules, owned=frozenset(BEFORE[name])
     )
 
 

@@ -37,7 +37,7 @@ from laneweave.protocol.wire.messages import (
     Prepare,
 )
 from laneweave.protocol.wire.messages import VehicleState as State
-from support.rolling_road import ROLLING
+from support.convoy import ROLLING
 from support.rolling_samples import state
 
 A, B, C, D = (Name(letter) for letter in "ABCD")

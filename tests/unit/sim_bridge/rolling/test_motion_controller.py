@@ -14,8 +14,19 @@ from laneweave.protocol.wire.messages import Ballot, Command, Name, PendingTrans
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.road.attendance import Caretaker
 from support.road_vehicles import controller_in, vehicle_in
-from support.rolling_road import controller_of
-from support.rolling_samples import AFTER, BEFORE, HIGH, HOME, LOW, MID, A, B, make_plan, pending
+from support.rolling_samples import (
+    AFTER,
+    BEFORE,
+    HIGH,
+    HOME,
+    LOW,
+    MID,
+    A,
+    B,
+    controller_of,
+    make_plan,
+    pending,
+)
 
 AGENT = 7
 
