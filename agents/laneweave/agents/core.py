@@ -7,7 +7,7 @@ PLAN and handles the states of other vehicles.
 
 **The claim.** One process at a time acts for a vehicle; the motion controller decides which. An
 agent claims the vehicle with its first COMMAND, and sends nothing to other processes before a SENSE
-reports that it is in charge. While another agent is in charge, it sends nothing at all. If the
+reports that it is in charge. While another agent is in charge, it sends nothing. If the
 caretaker is in charge (because the agent hung or its messages were lost), it takes a new
 incarnation and claims the vehicle again.
 
@@ -257,7 +257,7 @@ class AgentCore:
         return [self._state()] if any(changes) else []
 
     def _request_storage(self, execution: PlanExecution) -> list[Effect]:
-        """Request the controller to store something now, before the next tick's COMMAND."""
+        """Request storage by the controller now, before the next tick's COMMAND."""
         command = self._command
         assert command is not None  # noqa: S101 (in charge: it has sent one)
         self._command = evolve(

@@ -161,7 +161,7 @@ class AgentHost:
         return effects
 
     def _on_bridge(self, incarnation: int) -> list[Effect]:
-        """Handle the token of a bridge; the vehicles of a new bridge are new despite equal names.
+        """Handle the token of a bridge; a new bridge has new vehicles, even with equal names.
 
         Agents of named vehicles detect a new bridge by its first SENSE.
         """

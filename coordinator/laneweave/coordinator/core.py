@@ -221,7 +221,7 @@ class CoordinatorCore:
             self.operation.forget()
 
     def _is_of_this_road(self, message: RoadClock | Census) -> bool:
-        """Return whether a message comes from the newest bridge, which it may introduce."""
+        """Register the bridge of a message; return whether it is the newest bridge."""
         if message.bridge:
             self._meet_bridge(message.bridge)
         return message.bridge in (0, self._bridge)

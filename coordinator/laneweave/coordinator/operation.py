@@ -21,7 +21,7 @@ class LogEntry:
 
 
 class Operation(Protocol):
-    """Leader's work for the vehicles on the road.
+    """A leader's tasks for the vehicles on the road.
 
     Times are road time (`t_s`) and the node's clock (`now_s`).
     """

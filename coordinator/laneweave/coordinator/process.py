@@ -24,7 +24,7 @@ from laneweave.protocol.wire.messages import Name
 log = structlog.get_logger(__name__)
 
 WARN_AFTER_S = 8.0
-"""Loading the planner takes 1 to 2 s, compiling it most of a minute."""
+"""Time until the warning: loading the planner takes 1 to 2 s, compiling it most of a minute."""
 
 
 def run_coordinator(

@@ -28,7 +28,7 @@ Course = tuple[Cell, Cell, int, int]
 """(origin, target, first tick, ticks) of a motion, as published to other vehicles."""
 
 
-@define  # made at each tick: frozen ones take three times as long
+@define  # created at each tick: frozen objects take three times as long
 class Drive:
     """Output of one tick for the motion controller."""
 

@@ -40,7 +40,7 @@ _LIMIT_TOLERANCE = 1e-3
 """Maximum excess over a limit [m/s, m/s2]; beyond it, jerks are limited tick by tick."""
 
 
-@define(eq=False)  # made at each tick: frozen ones take three times as long
+@define(eq=False)  # created at each tick: frozen objects take three times as long
 class TrackResult:
     """Result of one tick."""
 

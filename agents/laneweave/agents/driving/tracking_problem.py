@@ -109,7 +109,7 @@ class ErrorBounds:
     def beside(cls, states: Array, jerks: Array, limits: Vehicle) -> ErrorBounds:
         """Return the bounds for a reference with states (n, 6) and jerks (n, 2).
 
-        Adding and subtracting the tolerance makes the rounding that of the program's bounds.
+        The tolerance is added and subtracted for the same rounding as in the program's bounds.
         """
         _, speed, accel, _, slip, lateral_accel = states.T
         low, high = np.full((5, len(states)), -np.inf), np.full((5, len(states)), np.inf)

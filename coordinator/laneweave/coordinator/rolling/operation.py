@@ -39,8 +39,8 @@ SNAPSHOT_S = 0.5
 Plans are made from the states up to this time, one tick later, when all of them have arrived. So
 plans do not depend on message delays."""
 LISTEN_S = 0.5
-"""Time for which a new leader only listens (node clock). A leader that has just not received the
-heartbeats of another one must not outbid its ballots."""
+"""Time for which a new leader only listens (node clock), so that a leader that has missed the
+heartbeats of another one does not outbid its ballots."""
 MAX_DELAY_S = 1.0
 """A plan that is ready later than this after the beginning of its slot is dropped."""
 LOOKAHEAD_M = 600.0

@@ -276,7 +276,7 @@ def is_above_promise(execution: PlanExecution, prepare: Prepare) -> bool:
 
 
 def promise(execution: PlanExecution, prepare: Prepare) -> None:
-    """Promise the ballot; request the controller to store its blocks as joined."""
+    """Promise the ballot; request storage of its blocks as joined."""
     execution.promised, execution.promise_stored = prepare.ballot, False
     if execution.owned is None:
         execution.wanted_joined = tuple(sorted({*execution.wanted_joined, *prepare.formations}))
@@ -291,7 +291,7 @@ def drop_plan(execution: PlanExecution, _: object) -> None:
 
 
 def forget_progress(execution: PlanExecution, _: object) -> None:
-    """Clear progress."""
+    """Clear the progress of the other members."""
     execution.progress = {}
 
 
@@ -346,7 +346,7 @@ def transfers_only_owned_cells(execution: PlanExecution, plan: Plan) -> bool:
 
 
 def take_plan(execution: PlanExecution, plan: Plan) -> None:
-    """Take the plan, derive its dependencies; request the controller to store the acceptance."""
+    """Take the plan; derive its dependencies; request storage of the acceptance."""
     execution.plan = plan
     execution.needs = dependencies(plan, execution.vehicle)
     if execution.owned is not None:

@@ -260,7 +260,7 @@ class Sense:
     attendant: int = 0
     """Incarnation of the process in charge of the vehicle [ns]; 0: none yet."""
     motion_ticks: int = 0
-    """Duration of the move under way [ticks]; 0: the vehicle settles in its cell, or holds."""
+    """Duration of the current move [ticks]; 0: the vehicle settles in its cell, or holds."""
     caretaker: bool = False
     """Whether the caretaker is in charge, because the agent ended or stopped answering."""
     joined: tuple[int, ...] = ()
@@ -306,7 +306,7 @@ class Command:
     jerks: bytes
     """Little-endian float32 pairs (along, across) [m/s3], one per tick, from `tick` on."""
     motion_ticks: int = 0
-    """Duration of the move under way [ticks]; 0: the vehicle settles in its cell, or holds."""
+    """Duration of the current move [ticks]; 0: the vehicle settles in its cell, or holds."""
     joined: tuple[int, ...] = ()
     """Blocks that the controller adds to the joined ones."""
     accepted: Ballot | None = None
