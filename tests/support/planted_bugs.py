@@ -212,7 +212,7 @@ BUGS: tuple[Bug, ...] = (
     Bug("promise-taken-for-acceptance", "L6", "A promise counts as an acceptance.",
         "plan_lost_for_one", collides=False, replaced={ballot.is_acceptance: broken.promised_b}),
     Bug("one-acceptance-is-enough", "L6", "The leader rests when the first vehicle has the plan.",
-        "plan_lost_for_one", collides=False, replaced={ballot.is_last_acceptance: broken.always}),
+        "plan_lost_for_one", collides=False, replaced={ballot.is_last: broken.always}),
     Bug("outbid-not-noticed", "L7", "A leader that was outbid goes on.",
         "two_leaders", collides=False, replaced={ballot.has_higher_promise: broken.never}),
     Bug("restart-not-noticed", "L8", "A vehicle whose process changed counts as if it had not.",

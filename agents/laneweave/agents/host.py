@@ -161,10 +161,7 @@ class AgentHost:
         return effects
 
     def _on_bridge(self, incarnation: int) -> list[Effect]:
-        """Handle the token of a bridge; a new bridge has new vehicles, even with equal names.
-
-        Agents of named vehicles detect a new bridge by its first SENSE.
-        """
+        """Handle the token of a bridge; agents of named vehicles detect a new one by its SENSE."""
         effects: list[Effect] = []
         if incarnation < max(self._bridge, 0):
             return effects  # of an earlier run, or not a bridge

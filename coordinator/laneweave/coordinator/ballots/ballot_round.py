@@ -151,75 +151,72 @@ _WITHOUT_TIMER = (BallotPhase.PLANNING, BallotPhase.IN_FORCE, BallotPhase.ABORTE
 # --- guards and actions -----------------------------------------------------------------------
 
 
-def has_higher_promise(ballot_round: BallotRound, state: VehicleState) -> bool:
+def has_higher_promise(round_: BallotRound, state: VehicleState) -> bool:
     """The vehicle has promised a ballot above b."""
-    return (
-        ballot_round.ballot is not None
-        and state.promised is not None
-        and state.promised > ballot_round.ballot
-    )
+    ballot = round_.ballot
+    return ballot is not None and state.promised is not None and state.promised > ballot
 
 
-def had_promised(ballot_round: BallotRound, state: VehicleState) -> bool:
+def had_promised(round_: BallotRound, state: VehicleState) -> bool:
     """A promise of the vehicle is counted."""
-    return state.vehicle in ballot_round.promises
+    return state.vehicle in round_.promises
 
 
-def restarted(ballot_round: BallotRound, state: VehicleState) -> bool:
+def restarted(round_: BallotRound, state: VehicleState) -> bool:
     """Another incarnation than the reported one has promised."""
-    promise = ballot_round.promises.get(state.vehicle)
+    promise = round_.promises.get(state.vehicle)
     return promise is None or promise.incarnation != state.incarnation
 
 
-def is_promise(ballot_round: BallotRound, state: VehicleState) -> bool:
+def is_promise(round_: BallotRound, state: VehicleState) -> bool:
     """The vehicle has promised b and not accepted."""
-    return state.promised == ballot_round.ballot and not state.accepted
+    return state.promised == round_.ballot and not state.accepted
 
 
-def count_promise(ballot_round: BallotRound, state: VehicleState) -> None:
+def count_promise(round_: BallotRound, state: VehicleState) -> None:
     """Record the promise, with hold cell and incarnation."""
-    ballot_round.promises[state.vehicle] = state
-    if len(ballot_round.promises) == len(ballot_round.roster) and not ballot_round.failures:
-        ballot_round.due_s = ballot_round.now_s
+    round_.promises[state.vehicle] = state
+    if len(round_.promises) == len(round_.roster) and not round_.failures:
+        round_.due_s = round_.now_s
 
 
-def all_have_promised(ballot_round: BallotRound, _: object) -> bool:
+def all_have_promised(round_: BallotRound, _: object) -> bool:
     """The whole roster has promised."""
-    return set(ballot_round.promises) == set(ballot_round.roster)
+    return set(round_.promises) == set(round_.roster)
 
 
-def may_plan(ballot_round: BallotRound, _: object) -> bool:
+def may_plan(round_: BallotRound, _: object) -> bool:
     """The pause after a failed attempt is over."""
-    return not ballot_round.failures or ballot_round.now_s >= ballot_round.due_s
+    return not round_.failures or round_.now_s >= round_.due_s
 
 
-def order_plan(ballot_round: BallotRound, _: object) -> None:
+def order_plan(round_: BallotRound, _: object) -> None:
     """Plan from the promised hold cells."""
 
 
-def issue(ballot_round: BallotRound, plan: Plan) -> None:
+def issue(round_: BallotRound, plan: Plan) -> None:
     """Send PLAN, once per ballot."""
-    ballot_round.plan = plan
-    ballot_round.failures = 0
-    ballot_round.accepted = set()
-    ballot_round.due_s = ballot_round.now_s
-    ballot_round.until_s = ballot_round.now_s + ISSUE_S
+    round_.plan = plan
+    round_.failures = 0
+    round_.accepted = set()
+    round_.due_s = round_.now_s
+    round_.until_s = round_.now_s + ISSUE_S
 
 
-def is_acceptance(ballot_round: BallotRound, state: VehicleState) -> bool:
+def is_acceptance(round_: BallotRound, state: VehicleState) -> bool:
     """The vehicle has accepted b."""
-    return state.promised == ballot_round.ballot and state.accepted
+    return state.promised == round_.ballot and state.accepted
 
 
-def is_last_acceptance(ballot_round: BallotRound, state: VehicleState) -> bool:
+def is_last(round_: BallotRound, state: VehicleState) -> bool:
     """All other vehicles have accepted b."""
-    return ballot_round.accepted | {state.vehicle} >= set(ballot_round.roster)
+    return round_.accepted | {state.vehicle} >= set(round_.roster)
 
 
-def count_acceptance(ballot_round: BallotRound, state: VehicleState) -> None:
+def count_acceptance(round_: BallotRound, state: VehicleState) -> None:
     """Record the acceptance."""
-    ballot_round.accepted.add(state.vehicle)
-    ballot_round.back_offs = 0
+    round_.accepted.add(state.vehicle)
+    round_.back_offs = 0
 
 
 # --- transitions that both operations share ---------------------------------------------------
@@ -232,14 +229,7 @@ PLAN_RULES = (
         "L5", PROMISED, (_PREPARING,), (all_have_promised, may_plan), (order_plan,), _PLANNING
     ),
     Transition("L5", PLANNED, (_PLANNING,), (), (issue,), _ISSUING),
-    Transition(
-        "L6",
-        STATE,
-        (_ISSUING,),
-        (is_acceptance, is_last_acceptance),
-        (count_acceptance,),
-        _IN_FORCE,
-    ),
+    Transition("L6", STATE, (_ISSUING,), (is_acceptance, is_last), (count_acceptance,), _IN_FORCE),
     Transition("L6", STATE, (_ISSUING,), (is_acceptance,), (count_acceptance,)),
 )
 """Transitions from the last promise to a plan in force (L5, L6)."""

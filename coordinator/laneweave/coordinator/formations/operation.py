@@ -8,12 +8,7 @@ from collections.abc import Callable, Iterator
 from laneweave.coordinator.ballots.ballot_round import PROMISED, TIME, BallotPhase
 from laneweave.coordinator.formations.leader import LEADER_RULES, FormationLeader
 from laneweave.coordinator.formations.planning_orders import FormationPlanner
-from laneweave.coordinator.formations.roster import (
-    Formation,
-    Groups,
-    closed_formations,
-    pairs_to_join,
-)
+from laneweave.coordinator.formations.roster import Formation, Groups, closed_formations, joinable
 from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.response import PlanFunction
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
@@ -108,7 +103,7 @@ class FormationsOperation:
 
     def _update_members(self, census: Census, t_s: float, now_s: float) -> Iterator[LogEntry]:
         formations = closed_formations(census, t_s, self._scenario, self._groups)
-        for numbers in pairs_to_join(formations, t_s, self._scenario):
+        for numbers in joinable(formations, t_s, self._scenario):
             self._groups.join(numbers)
             yield LogEntry(FORMATIONS_JOINED, {"formations": list(numbers), "why": "room"})
             formations = closed_formations(census, t_s, self._scenario, self._groups)

@@ -78,12 +78,7 @@ class RoadPace:
     """Road time and node clock at the beginning of the current measurement."""
 
     def on_clock(self, t_s: float, now_s: float) -> None:
-        """Process a clock message.
-
-        Args:
-            t_s: road time; a decrease restarts the measurement.
-            now_s: node clock.
-        """
+        """Handle a message of the road's clock; a decrease of `t_s` restarts the measurement."""
         if self._since is None or t_s < self._since[0]:
             self._since = t_s, now_s
             return
@@ -94,7 +89,7 @@ class RoadPace:
 
 
 class FormationPlanner:
-    """Orders plans for formations and handles the results."""
+    """Orders plans for formations and handles the results; times as in `Operation`."""
 
     def __init__(
         self,
@@ -145,13 +140,7 @@ class FormationPlanner:
     def order(
         self, leader: FormationLeader, t_s: float, now_s: float
     ) -> Iterator[Compute | LogEntry]:
-        """Order a plan from the promises of a formation; abort if no step can be completed.
-
-        Args:
-            leader: leader in phase `PLANNING`.
-            t_s: road time.
-            now_s: node clock.
-        """
+        """Order a plan from the promises of a formation; abort if no step can be completed."""
         numbers, ballot = leader.formation.numbers, leader.ballot
         assert ballot is not None  # noqa: S101 (set before planning begins)
         formation, scenario = leader.formation, self._scenario
@@ -219,13 +208,7 @@ class FormationPlanner:
         return time_left_s([(front, 0)], 0.0, self._scenario)
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[Compute | LogEntry]:
-        """Handle a result, unless it is no longer needed, and start the next order.
-
-        Args:
-            computed: result of a job: a `Sorting`, or an error.
-            t_s: road time.
-            now_s: node clock.
-        """
+        """Handle a result, unless it is no longer needed, and start the next order."""
         if self._under_way is None or computed.job != self._under_way[0]:
             return
         _, number, ballot = self._under_way
@@ -263,10 +246,7 @@ class FormationPlanner:
         yield LogEntry(PLANNING_FAILED, data)
 
     def _join_neighbour(self, leader: FormationLeader, t_s: float) -> bool:
-        """Join a formation that lacks room with a neighbour, if possible; return whether it did.
-
-        Both plan under one ballot from now on.
-        """
+        """Join a formation that lacks room with a neighbour, if possible; return whether it did."""
         numbers, max_joined = leader.formation.numbers, self._scenario.formation.max_joined
         for other in self._neighbours(numbers):
             if other.phase is BallotPhase.ABORTED:

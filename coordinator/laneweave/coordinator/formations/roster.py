@@ -143,7 +143,7 @@ def stage_begin_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
     return lattice.passing_time_s(rear, from_m + scenario.vehicle.length_m)
 
 
-def pairs_to_join(
+def joinable(
     formations: Mapping[int, Formation], t_s: float, scenario: Scenario
 ) -> Iterator[Numbers]:
     """Yield the blocks of neighbours whose vehicles fit into one formation (paper, Fig. 2b).

@@ -104,11 +104,7 @@ class RollingOperation:
         """Ignore the clock message: plans are due by road time alone."""
 
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
-        """Handle the state of a vehicle, unless a newer one is known.
-
-        Returns:
-            None: no unfinished ballot depends on it, as for most states.
-        """
+        """Handle the state of a vehicle; None: no unfinished ballot depends on it."""
         if not self.observed.on_state(state):
             return None
         if state.promised is not None:
@@ -213,13 +209,7 @@ class RollingOperation:
         return tuple(vehicles.values()), blocked
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[LogEntry]:
-        """Handle a plan: begin ballots for its first moves.
-
-        Args:
-            computed: result of a computation; ignored unless it is the newest.
-            t_s: road time.
-            now_s: node clock.
-        """
+        """Begin ballots for the first moves of a plan, if it is the newest that was ordered."""
         if self._ordered is None or computed.job != self._ordered[0]:
             return
         slot = self._ordered[1]

@@ -117,11 +117,7 @@ class PendingRequest:
         return self.begun_s + self.timeout_s - now_s
 
     def after(self, answer: Answer | None, now_s: float) -> PlanResponse | float:
-        """Return the plan, or the pause [s] after which the request should be sent again.
-
-        Args:
-            answer: answer to the newest attempt; None: there was none.
-            now_s: time on the clock of `begun_s`.
+        """Return the plan in an answer, or the pause [s] before the request is sent again.
 
         Raises:
             PlanError: there will be no plan.
