@@ -190,12 +190,7 @@ def _new_panel(figure: Figure, row: int, column: int) -> Axes:
     left_in, bottom_in = _MARGIN_IN + column * across_in, height_in - (row + 1) * down_in
     size_in = across_in - _MARGIN_IN, down_in - _TITLE_IN
     return figure.add_axes(
-        (
-            left_in / width_in,
-            bottom_in / height_in,
-            size_in[0] / width_in,
-            size_in[1] / height_in,
-        )
+        (left_in / width_in, bottom_in / height_in, size_in[0] / width_in, size_in[1] / height_in)
     )
 
 

@@ -80,9 +80,7 @@ VARIANTS = {
             ),
         )
     ),
-    "mode 2": Variant(
-        attrs.evolve(ROAD, mode=2, model=ConflictModel(("geometric", "closing"))),
-    ),
+    "mode 2": Variant(attrs.evolve(ROAD, mode=2, model=ConflictModel(("geometric", "closing")))),
 }
 
 
@@ -103,10 +101,7 @@ def travellers(volume: float, seed: int, duration_s: float) -> list[Traveller]:
     Column c is at the beginning of the road at -c PITCH_M / SPEED_MPS.
     """
     scenario = load_scenario(
-        None,
-        seed=seed,
-        demand__volume_veh_per_lane_h=float(volume),
-        demand__duration_s=duration_s,
+        None, seed=seed, demand__volume_veh_per_lane_h=float(volume), demand__duration_s=duration_s
     )
     last: dict[int, int] = {}
     found = []

@@ -52,12 +52,7 @@ _ROW_TOLERANCE = 2e-2
 """Largest constraint violation of a valid solution."""
 _PRESSING_M = 1e-3
 _EXACT = QPSettings(
-    eps_abs=1e-7,
-    max_iter=40_000,
-    check_termination=25,
-    rho=0.3,
-    polishing=True,
-    tolerance=1e-4,
+    eps_abs=1e-7, max_iter=40_000, check_termination=25, rho=0.3, polishing=True, tolerance=1e-4
 )
 
 

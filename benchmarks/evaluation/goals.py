@@ -68,11 +68,11 @@ def _measured(row: PointRow, goal: Goal) -> str:
     return ", ".join(parts) + few
 
 
-def _safety(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
+def _safety(evidence: Evidence) -> Iterator[tuple[str, ...]]:
     """Yield the guarantees of all runs of formation control."""
     rows = [row for row in evidence.points if row.label in FORMATIONS and row.seeds]
     runs = f"{sum(len(row.seeds) for row in rows)} runs of formation control"
-    yield _one(
+    yield _row(
         "overlaps", "none", f"{sum(row.overlaps for row in rows)} in {runs}",
         [not row.overlaps for row in rows],
     )  # fmt: skip
@@ -82,25 +82,25 @@ def _safety(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
     limits = (
         f"{setting.min_accel_mps2:g} to {setting.max_accel_mps2:g} m/s2" if setting else "limits"
     )
-    yield _one(
+    yield _row(
         "accelerations", limits, f"{number(low, 2)} to {number(high, 2)} m/s2",
         [row.within_limits for row in rows],
     )  # fmt: skip
     traced = [row.traced for row in rows if row.traced is not None]
     minimum = [one.lattice_least_m for one in traced if one.lattice_least_m is not None]
     examined = f"{sum(one.lattice_pairs for one in traced):,} in {sum(one.runs for one in traced)}"
-    yield _one(
+    yield _row(
         "spacing at lattice points", "never below d_F",
         f"{number(min(minimum, default=None), 2)} m, minimum of {examined} runs",
         [one.lattice_kept for one in traced],
     )  # fmt: skip
 
 
-def _runtime(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
+def _runtime(evidence: Evidence) -> Iterator[tuple[str, ...]]:
     """Yield the goals for runs over Zenoh and for execution speed."""
     agreements = evidence.agreements
     differ = sum(not row.agreement.holds for row in agreements)
-    yield _one(
+    yield _row(
         "three points over Zenoh, one process per vehicle", "as simulated: lanes, travel times",
         f"{differ} of {len(agreements)} differ", [row.agreement.holds for row in agreements],
     )  # fmt: skip
@@ -112,25 +112,25 @@ def _runtime(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
     }
     for trial, minimum in MIN_FACTORS.items():
         factor = factors.get(trial)
-        yield _one(
+        yield _row(
             f"real-time factor at 1600, {names[trial]}", f"at least {minimum:g}",
             number(factor, 2), [] if factor is None else [factor >= minimum],
         )  # fmt: skip
     cost_ms = {row.trial: row.cost_ms for row in evidence.costs}
     known = "short" in cost_ms and "long" in cost_ms
     ratio = cost_ms["long"] / cost_ms["short"] if known else 1.0
-    yield _one(
+    yield _row(
         "cost of a vehicle on 10 km, 1,000 vehicles, against 1 km",
         f"at most {MAX_COST_RATIO:g} times", f"{ratio:.2f} times",
         [ratio <= MAX_COST_RATIO] if known else [],
     )  # fmt: skip
 
 
-def _one(what: str, asked: str, measured: str, kept: Sequence[bool]) -> tuple[str, str, str, str]:
+def _row(goal: str, required: str, measured: str, kept: Sequence[bool]) -> tuple[str, ...]:
     """Return a row of the table; `MISSING` stands for missing measurements."""
     if not kept:
-        return what, asked, MISSING, ""
-    return what, asked, measured, _verdict(all(kept))
+        return goal, required, MISSING, ""
+    return goal, required, measured, _verdict(all(kept))
 
 
 def _verdict(met: bool) -> str:

@@ -172,10 +172,10 @@ class Branching(Search):
             BudgetSpentError: they fit, but there is no time left to fill them.
         """
         displacements, cells = self._arrays.valid.shape
-        groups, rows = len(self._teams.pair), self._arrays.clique_count
+        groups, cliques = len(self._teams.pair), self._arrays.clique_count
         moves, masses = groups * displacements * cells, groups + self._arrays.residue_count
-        size = 8 * cells * len(self._teams.pair_cell) + 33 * moves + 8 * rows * (masses + 3)
-        size = int(steps * (size + nodes * (moves + 8 * rows)))
+        size = 8 * cells * len(self._teams.pair_cell) + 33 * moves + 8 * cliques * (masses + 3)
+        size = int(steps * (size + nodes * (moves + 8 * cliques)))
         if size >= self._budget.max_bytes:
             return False
         self._budget.check_time(size / _BYTES_PER_S)
@@ -362,11 +362,11 @@ class Branching(Search):
             for d in path:
                 if d == PARKED:
                     break
-                then = cell + int(self._arrays.step[d])
-                moves.append(table.number((divmod(cell, lanes), divmod(then, lanes))))
-                if then != cell:
+                next_cell = cell + int(self._arrays.step[d])
+                moves.append(table.number((divmod(cell, lanes), divmod(next_cell, lanes))))
+                if next_cell != cell:
                     arrival = len(moves)
-                cell = then
+                cell = next_cell
             moves_of.append(tuple(moves[:arrival]))
             assignment.append(self._problem.targets.index(table.bit(divmod(cell, lanes))))
         return Solution(tuple(assignment), tuple(moves_of))

@@ -44,12 +44,12 @@ def min_steps(valid, step, targets):
         queue[0] = targets[p]
         begin, end = 0, 1
         while begin < end:
-            then = queue[begin]
+            next_cell = queue[begin]
             begin += 1
             for d in range(displacements):
-                cell = then - step[d]
+                cell = next_cell - step[d]
                 if 0 <= cell < cells and valid[d, cell] and found[cell, p] == UNREACHABLE:
-                    found[cell, p] = found[then, p] + 1.0
+                    found[cell, p] = found[next_cell, p] + 1.0
                     queue[end] = cell
                     end += 1
     return found
@@ -193,7 +193,7 @@ def _fill_costs_to_go(arrays, teams, earliest, multipliers, span, scratch):
 
 @njit(cache=True)
 def _relax_moves(
-    move, move_cost, begin, end, first_pair, end_pair, clique, multipliers, here, then
+    move, move_cost, begin, end, first_pair, end_pair, clique, multipliers, costs, next_costs
 ):
     # The sum of multipliers is inlined: as a call it takes four times as long.
     max_cliques = clique.shape[2]
@@ -209,9 +209,9 @@ def _relax_moves(
             cost += multipliers[r]
         move_cost[m] = cost
         for p in range(first_pair, end_pair):
-            total = cost + then[next_cell, p]
-            if total < here[cell, p]:
-                here[cell, p] = total
+            total = cost + next_costs[next_cell, p]
+            if total < costs[cell, p]:
+                costs[cell, p] = total
 
 
 @njit(cache=True)
@@ -253,7 +253,7 @@ def _assign_targets(teams, scratch):
         while holder[at] >= 0:
             done[at] = True
             i = holder[at]
-            min_slack, then = np.inf, -1
+            min_slack, nearest = np.inf, -1
             for j in range(goals):
                 if done[j]:
                     continue
@@ -262,14 +262,14 @@ def _assign_targets(teams, scratch):
                     slack[j] = length
                     came_from[j] = at
                 if slack[j] < min_slack:
-                    min_slack, then = slack[j], j
+                    min_slack, nearest = slack[j], j
             for j in range(goals + 1):
                 if done[j]:
                     value[holder[j]] += min_slack
                     dual[j] -= min_slack
                 else:
                     slack[j] -= min_slack
-            at = then
+            at = nearest
         while at != goals:
             before = came_from[at]
             holder[at] = holder[before]
