@@ -1,4 +1,4 @@
-"""The picture of the conflict table shows what the tables say."""
+"""The drawing of the conflict table agrees with the computed tables."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def drawn(axes: Axes) -> Counter[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("geometry", [BodyGeometry(), BodyGeometry(clearance_along_m=7.0)])
-def test_each_pair_is_drawn_once_in_the_colour_of_its_verdict(geometry: BodyGeometry) -> None:
+def test_each_pair_is_drawn_once_in_the_colour_of_its_severity(geometry: BodyGeometry) -> None:
     tables = ConflictTables.of(geometry)
     panels = conflict_figure(geometry).axes
     assert [axes.get_title() for axes in panels] == list(PANELS)

@@ -1,4 +1,4 @@
-"""Runs and points made by hand, for the tests of the evaluation."""
+"""Constructed runs and points for the tests of the evaluation."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ TRACED = Traced(
 
 
 def point(label: str, volume: float, travel_s: float, traced: Traced | None = TRACED) -> PointRow:
-    """Return a point of five seeds at which nothing is wrong."""
+    """Return a point of five seeds without failures."""
     return PointRow(
         label=label,
         volume_veh_per_lane_h=volume,

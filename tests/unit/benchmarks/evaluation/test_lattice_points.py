@@ -1,4 +1,4 @@
-"""Spacing at lattice points: who counts, what is measured, and what is too near."""
+"""Spacing at lattice points: examined vehicles, distances, and the tolerance."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def parked(*vehicles: Vehicle) -> Tracks:
 
 
 def moved(tracks: Tracks, vehicle: int, slot: int, column: int) -> Tracks:
-    """Return tracks in which a vehicle goes to another column in a slot."""
+    """Return tracks in which a vehicle moves to another column in a slot."""
     rows = tracks.rows(vehicle)
     begin, end = rows.start + 40 * slot, rows.start + 40 * (slot + 1)
     columns, s_m = tracks.column.copy(), tracks.s_m.copy()
@@ -64,14 +64,14 @@ def test_too_near(near_m: float, *, kept: bool) -> None:
     assert found.keeps(LATTICE.pitch_m) is kept
 
 
-def test_the_body_counts_not_the_cell_that_it_should_be_in() -> None:
+def test_distances_are_those_of_bodies_not_of_cells() -> None:
     found = lattice_spacing(parked((0, 0, 0.0), (1, 0, -12.0)), SCENARIO)
     assert found.least_m == pytest.approx(3.0)
     assert found.worst_off_m == pytest.approx(12.0)
 
 
-def test_nearer_on_the_way_is_no_matter() -> None:
-    """One leaves a cell while another comes: only at the ends of slots do both rest."""
+def test_distances_between_lattice_points_are_ignored() -> None:
+    """A vehicle enters a cell that another leaves; both are at rest only at the ends of slots."""
     tracks = moved(parked((0, 0, 0.0), (2, 0, 0.0)), 0, slot=4, column=1)
     assert np.diff(tracks.s_m.reshape(2, -1), axis=0).min() == pytest.approx(15.0)
     found = lattice_spacing(tracks, SCENARIO)
@@ -80,7 +80,7 @@ def test_nearer_on_the_way_is_no_matter() -> None:
 
 
 def test_slots_may_end_at_any_tick() -> None:
-    """Formations have their own time points; they are found by when cells change."""
+    """Formations have different time points, which follow from the changes of cells."""
     tracks = moved(parked((0, 0, 0.0), (2, 0, 0.0)), 0, slot=4, column=1)
     shifted = evolve(tracks, t_s=tracks.t_s + 2.3, s_m=tracks.s_m + 2.3 * LATTICE.speed_mps)
     found = lattice_spacing(shifted, SCENARIO)
@@ -96,7 +96,7 @@ def test_vehicles_that_have_just_entered_do_not_count() -> None:
     assert lattice_spacing(parked((0, 0, 0.0), (1, 0, -9.0)), later).least_m is None
 
 
-def test_without_a_lattice_there_is_nothing_to_look_at() -> None:
+def test_without_a_lattice_no_distance_is_examined() -> None:
     tracks = parked((0, 0, 0.0), (1, 0, -9.0))
     found = lattice_spacing(
         evolve(tracks, column=np.full_like(tracks.column, OFF_LATTICE)), SCENARIO

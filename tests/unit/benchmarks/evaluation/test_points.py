@@ -1,4 +1,4 @@
-"""Rows of points, agreement of two runs, and what is planned."""
+"""Rows of points, agreement of two runs, and the planned points."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_runs_that_were_cut_off_are_in_no_figure() -> None:
     assert (row.travel_s, row.travel_sd_s, row.demanded) == (70.0, None, 100)
 
 
-def test_what_no_run_has_is_none() -> None:
+def test_values_without_runs_are_none() -> None:
     (row,) = point_rows(
         [
             run(
@@ -82,7 +82,7 @@ def test_rows_are_in_the_order_of_labels_and_volumes() -> None:
     ]
 
 
-def test_runs_that_cannot_stand_side_by_side() -> None:
+def test_runs_that_cannot_be_compared() -> None:
     one = run("rule", 1600.0, 1, summary(70.0))
     with pytest.raises(BadInputError, match="only once"):
         point_rows([one, evolve(one, folder=Path("other"))])
@@ -121,7 +121,7 @@ def test_runs_do_not_agree(other: list[dict[str, object]], what: str) -> None:
     assert getattr(found, what) == 1
 
 
-def test_two_empty_runs_show_nothing() -> None:
+def test_two_empty_runs_do_not_agree() -> None:
     assert not agreement([], [], 0.1).holds
 
 
@@ -179,7 +179,7 @@ def test_trials() -> None:
     assert road.length_m == 10_000.0
 
 
-def test_only_whole_trials_with_the_same_options_count(tmp_path: Path) -> None:
+def test_only_complete_trials_with_the_same_options_count(tmp_path: Path) -> None:
     trial = TRIALS[0]
     folder = tmp_path / trial.part / trial.name
     folder.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Tables, goals and statements: they follow the data, and say what is missing."""
+"""Tables, goals and statements follow the data and mark missing values."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DRIVER = Path(__file__).resolve().parents[4] / "benchmarks" / "evaluate.py"
 
 
 def cells(table: str, first: str) -> list[str]:
-    """Return the cells of the row that begins so."""
+    """Return the cells of the row with this beginning."""
     (row,) = [line for line in table.splitlines() if line.startswith(f"| {first}")]
     return [cell.strip() for cell in row.strip("|").split("|")]
 
@@ -63,7 +63,7 @@ def full() -> Evidence:
     )
 
 
-def test_what_is_missing_says_so() -> None:
+def test_missing_values_are_marked() -> None:
     parts = document_parts(Evidence())
     assert cells(parts["evaluation travel times"], "1600") == ["1600", *["missing"] * len(LABELS)]
     assert cells(parts["evaluation travel times"], "2000")[1:] == [
@@ -166,7 +166,7 @@ def test_planning_times() -> None:
     assert lines.count(shown) == 1
 
 
-def test_a_broken_promise_is_a_goal_missed() -> None:
+def test_a_violated_guarantee_is_a_missed_goal() -> None:
     bad = evolve(
         point("rolling", 2400.0, 66.0, evolve(TRACED, lattice_least_m=14.2, lattice_kept=False)),
         overlaps=1,
@@ -216,7 +216,7 @@ def test_evidence_is_what_was_written(tmp_path: Path) -> None:
         read_evidence(path)
 
 
-def test_parts_that_are_not_there_anew_stay() -> None:
+def test_parts_without_new_runs_are_kept() -> None:
     old = full()
     new = Evidence(factors=old.factors[:1])
     assert old.updated_with(new) == evolve(old, factors=old.factors[:1])

@@ -1,4 +1,4 @@
-"""The planner must answer with exactly the cost that the oracle proves, and with legal paths."""
+"""The planner must return legal paths with the cost that the oracle proves."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -91,7 +91,7 @@ def _interlaced(seed: int) -> PlanRequest:
 def test_planner_agrees_with_the_oracle_on_formations_of_six(
     family: Callable[[int], PlanRequest], seeds: range
 ) -> None:
-    """Formations of at most six vehicles, as roads have them."""
+    """Formations of at most six vehicles, as on the road."""
     assert_agreement((family(seed).to_dict() for seed in seeds), milp_oracle.optimal_cost)
 
 
@@ -113,7 +113,7 @@ def test_planner_agrees_with_the_oracle_with_closing(seeds: range, oracle: Oracl
 
 
 def compared() -> Iterator[dict[str, Any]]:
-    """Return the requests whose costs `proven` may know."""
+    """Return the requests whose costs may be in `proven`."""
     yield from map(random_request, range(INSTANCES))
     yield from map(_formation, range(FORMATION_INSTANCES))
     for seed in range(CLOSING_INSTANCES):

@@ -1,4 +1,4 @@
-"""Conflict rows: cliques that cover every conflict."""
+"""Conflict cliques cover every conflict."""
 
 from itertools import combinations
 
@@ -21,7 +21,7 @@ NEAR = range(-2, 3)
 
 
 def moves_of(pattern: Clique, mode: Mode, column: int, lane: int) -> set[Move]:
-    """Return the moves of a row with its anchor in a cell."""
+    """Return the moves of a clique with its anchor in a cell."""
     steps = displacements(mode)
     moves = set()
     for c, left, d in pattern:
@@ -36,7 +36,7 @@ def test_every_conflict_is_in_a_clique_and_every_clique_excludes(
 ) -> None:
     model = ConflictModel(kinds)
     patterns = clique_patterns(mode, model)
-    rows = [
+    cliques = [
         moves_of(pattern, mode, column, lane)
         for pattern in patterns
         for column in range(-6, 7)
@@ -57,12 +57,12 @@ def test_every_conflict_is_in_a_clique_and_every_clique_excludes(
     for a in origin:
         for b in others:
             if model.kind(a, b) is not None:
-                assert any(a in row and b in row for row in rows), (a, b)
+                assert any(a in clique and b in clique for clique in cliques), (a, b)
 
 
 @pytest.mark.parametrize(("mode", "kinds"), MODELS)
 def test_from_cells_of_a_clique_have_different_residues(mode: Mode, kinds: tuple[str, ...]) -> None:
-    """See `MoveArrays.near`."""
+    """See `MoveArrays.residue`."""
     grid, model = Grid(9, 5), ConflictModel(kinds)
     arrays = move_arrays(grid, mode, model)
     assert arrays.residue_count == (12 if "closing" in kinds else 9)
@@ -71,8 +71,8 @@ def test_from_cells_of_a_clique_have_different_residues(mode: Mode, kinds: tuple
     for d, cell, m in np.argwhere(arrays.clique >= 0).tolist():
         cells.setdefault(int(arrays.clique[d, cell, m]), set()).add(cell)
     assert len(cells) == arrays.clique_count
-    for of_row in cells.values():
-        assert len({int(arrays.residue[cell]) for cell in of_row}) == len(of_row)
+    for of_clique in cells.values():
+        assert len({int(arrays.residue[cell]) for cell in of_clique}) == len(of_clique)
 
 
 @pytest.mark.parametrize(

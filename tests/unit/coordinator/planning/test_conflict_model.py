@@ -33,7 +33,7 @@ def test_conflicts_do_not_depend_on_the_place(a: Move, b: Move, shift: Cell) -> 
 
 
 def test_all_kinds_agree_with_independent_rules() -> None:
-    """`oracles/test_oracles.py` checks these rules against cases worked out by hand."""
+    """`oracles/test_oracles.py` checks these rules against manually derived cases."""
     steps = displacements(2)
     for column, lane in itertools.product(range(-4, 5), range(-3, 4)):
         for step, other in itertools.product(steps, steps):

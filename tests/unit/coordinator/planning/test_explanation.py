@@ -1,4 +1,4 @@
-"""What `explain` tells of a run must be what the algorithms did."""
+"""The record by `explain` must agree with the run of the algorithms."""
 
 import json
 import math
@@ -21,7 +21,7 @@ def _case_study() -> PlanRequest:
 
 
 def _check_tree(one: ExplainedAssignment) -> None:
-    """Costs do not fall from parent to child; the solution has no conflicts."""
+    """Costs do not decrease from parent to child; the solution has no conflicts."""
     by_number = {node.number: node for node in one.nodes}
     assert [node.number for node in one.nodes] == list(range(1, len(one.nodes) + 1))
     for node in one.nodes[1:]:

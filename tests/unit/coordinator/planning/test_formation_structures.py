@@ -85,7 +85,7 @@ def crowds(draw: st.DrawFn) -> tuple[Grid, list[Cell], list[int | None]]:
 
 
 def cells_of(structure: str, grid: Grid, parity: int) -> list[Cell]:
-    """All cells that a structure may take."""
+    """All cells that a structure may use."""
     return [
         cell
         for cell in product(range(grid.columns), range(grid.lanes))
@@ -121,7 +121,7 @@ def shortest_total_way(
 @pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(crowds(), st.sampled_from(STRUCTURES))
-def test_targets_are_a_structure_with_the_shortest_way(
+def test_targets_are_a_structure_with_the_shortest_total_distance(
     crowd: tuple[Grid, list[Cell], list[int | None]], structure: str
 ) -> None:
     grid, cells, preferred = crowd
@@ -155,7 +155,7 @@ def test_targets_are_a_structure_with_the_shortest_way(
 def _assert_filled(
     structure: str, grid: Grid, targets: list[Cell], preferred: list[int | None]
 ) -> None:
-    """No cell behind the front is left out, unless it is behind the last one of its lane."""
+    """All cells behind the front are used, except those behind the last one of their lane."""
     front, parity = max(targets)[0], sum(targets[0]) % 2
     for lane in {lane for _, lane in targets}:
         rear = min(column for column, own in targets if own == lane)

@@ -1,4 +1,4 @@
-"""Moves as bits must say the same as moves as cells."""
+"""Moves as bits must agree with moves as cells."""
 
 from itertools import product
 

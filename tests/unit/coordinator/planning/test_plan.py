@@ -1,4 +1,4 @@
-"""The planner as a whole: exact, complete on small spaces, punctual, repeatable."""
+"""The planner: exact, complete on small spaces, punctual, repeatable."""
 
 import itertools
 import os
@@ -56,7 +56,7 @@ def test_a_vehicle_at_its_target_stays() -> None:
 
 
 def test_no_needless_moves() -> None:
-    """Vehicles that must wait anyway wait in their cells instead of driving about."""
+    """Vehicles that must wait stay in their cells."""
     for seed in range(5):
         request = formation_request(seed, deadline_s=60.0)
         response = plan(request)
@@ -66,7 +66,7 @@ def test_no_needless_moves() -> None:
 
 
 def _is_lazy(request: PlanRequest, path: tuple[Cell, ...], others: list[tuple[Cell, ...]]) -> bool:
-    """Tell whether no detour (leave a cell, come straight back) could be replaced by waiting."""
+    """Return whether no detour (leave a cell, come straight back) could be replaced by waiting."""
     model = request.conflict_model
     for k in range(len(path) - 2):
         if path[k] == path[k + 2] != path[k + 1]:

@@ -1,4 +1,4 @@
-"""Plans whose conflicts are computed from geometry: exact, and far enough apart when driven."""
+"""Plans whose conflicts are computed from geometry: exact, and driven with sufficient gaps."""
 
 from collections.abc import Iterator
 from functools import cache
@@ -54,7 +54,7 @@ TIGHT = {
     "profile_error_across_m": 0.0,
     "lateness_s": 0.0,
 }
-"""So little that vehicles may follow each other round corners."""
+"""Small enough that vehicles may follow each other around corners."""
 KINDS = (["geometric"], ["geometric"], ["node", "geometric"], ["special-1", "geometric"])
 
 INSTANCES = 60
@@ -67,7 +67,7 @@ def _request(seed: int) -> dict[str, Any]:
 
 
 def compared() -> Iterator[dict[str, Any]]:
-    """Return the requests whose costs `proven` may know."""
+    """Return the requests whose costs may be in `proven`."""
     yield from map(_request, range(INSTANCES))
 
 
@@ -142,7 +142,7 @@ def test_computing_the_conflict_table_counts_for_the_deadline(
 
 
 def test_paths_that_are_too_close_are_found() -> None:
-    """By the validator, by the rules, and by driving: the train, for which one is too late."""
+    """The validator, the rules and driven bodies detect a train in which a vehicle is too late."""
     paths = [[[i, 0], [i + 1, 0]] for i in range(4)]
     response = {"paths": paths, "assignment": [0, 1, 2, 3], "steps": 1, "cost": 4}
     late = {**TRAIN, "geometry": {"lateness_s": 1.2}}
@@ -197,7 +197,7 @@ def driven() -> Profile:
 @pytest.mark.slow
 @pytest.mark.parametrize("lateness_s", [0.0, 0.2, 0.5])
 def test_formations_keep_the_clearance_when_agents_drive_them(lateness_s: float) -> None:
-    """Eight vehicles in mode 2, by a timetable, with delays."""
+    """Eight vehicles in mode 2 follow a timetable with delays."""
     least_m = []
     for seed in range(6):
         document = formation_request(seed, vehicles=8, mode=2).to_dict()
@@ -218,7 +218,7 @@ def test_formations_keep_the_clearance_when_agents_drive_them(lateness_s: float)
 
 @pytest.mark.parametrize(("late_s", "enough"), [(1.59, True), (1.9, False)])
 def test_the_limit_of_lateness_keeps_steps_apart(late_s: float, enough: bool) -> None:
-    """The table compares moves of one step; here the one ahead arrives during the next one."""
+    """The table compares moves of one step; here the vehicle ahead arrives during the next step."""
     paths = [[(-1, 0), (0, 0), (1, 1)], [(0, 0), (1, 0), (1, 0)]]
     if enough:
         BodyGeometry(lateness_s=late_s)

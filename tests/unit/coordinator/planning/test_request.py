@@ -1,4 +1,4 @@
-"""Reading requests: what is wrong is named, with the field, the value and what is allowed."""
+"""Reading requests: errors name the field, the value and the allowed values."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Which solver plans: asked for by name, by default, and the fallback from TAPPA to branching."""
+"""The choice of the solver: by name, by default, and the fallback from TAPPA to branching."""
 
 from __future__ import annotations
 

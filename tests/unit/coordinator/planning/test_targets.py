@@ -1,4 +1,4 @@
-"""Targets: as many as vehicles, on their lanes while there is room, where the ways are short."""
+"""Targets: one for each vehicle, on its lane if possible, with short paths."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GRID = [(column, lane) for column in range(COLUMNS) for lane in range(LANES)]
 def formations(
     draw: st.DrawFn, *, most_blocked: int = 4, fitting: bool = False
 ) -> tuple[dict[Name, Cell], dict[Name, int], set[Cell]]:
-    """Draw cells, preferred lanes and blocked cells; `fitting`: no lane is wanted too often."""
+    """Draw cells, preferred lanes and blocked cells; `fitting`: no lane is overfull."""
     blocked = set(draw(st.lists(st.sampled_from(GRID), max_size=most_blocked, unique=True)))
     free = [cell for cell in GRID if cell not in blocked]
     cells = draw(st.lists(st.sampled_from(free), max_size=min(6, len(free)), unique=True))
@@ -48,7 +48,7 @@ def place_all(
 def parallel_targets(
     lane: int, cells: list[Cell], columns: int, free: list[int] | None = None
 ) -> list[Cell]:
-    """Return the targets on a lane that all vehicles need."""
+    """Return the targets on a lane that all vehicles prefer."""
     open_columns = range(columns) if free is None else free
     blocked = {(column, lane) for column in range(columns) if column not in open_columns}
     held = {Name(f"v{index}"): cell for index, cell in enumerate(cells)}
@@ -61,10 +61,10 @@ def parallel_targets(
 
 @settings(max_examples=200, deadline=None)
 @given(formations())
-def test_each_lane_offers_as_many_free_cells_as_are_wanted(
+def test_each_lane_provides_free_cells_for_those_who_prefer_it(
     drawn: tuple[dict[Name, Cell], dict[Name, int], set[Cell]],
 ) -> None:
-    """Who gets no place on its lane gets one of its own, and nobody else does."""
+    """Exactly the vehicles that do not fit on their lanes get individual targets."""
     cells, lanes, blocked = drawn
     targets = place_all(cells, lanes, blocked)
     assert len(targets.cells) == len(set(targets.cells)) == len(cells)
@@ -92,7 +92,7 @@ def test_without_blocked_cells_it_is_the_parallel_structure_of_each_lane(
 
 
 def shortest_row(lane: int, cells: list[Cell]) -> list[Cell]:
-    """Return the row of neighbouring cells with the shortest ways, tried one by one.
+    """Return the run of neighbouring cells with the shortest paths, by trying all.
 
     Among equals the one whose middle is nearest to the block's, then the rearmost.
     """
@@ -109,7 +109,7 @@ def shortest_row(lane: int, cells: list[Cell]) -> list[Cell]:
     return min(rows, key=rank) if count else []
 
 
-def test_on_an_overfull_lane_those_furthest_away_stay_out() -> None:
+def test_the_furthest_vehicles_are_displaced_from_a_full_lane() -> None:
     names = [Name(letter) for letter in "abcde"]
     cells: dict[Name, Cell] = dict(
         zip(names, [(0, 2), (1, 0), (2, 1), (3, 0), (0, 0)], strict=True)
@@ -120,13 +120,13 @@ def test_on_an_overfull_lane_those_furthest_away_stay_out() -> None:
     assert targets.cells[4] == (0, 2)
 
 
-def test_where_all_are_as_far_away_names_decide() -> None:
+def test_ties_between_displaced_vehicles_are_broken_by_name() -> None:
     cells: dict[Name, Cell] = {Name(letter): (0, 0) for letter in "cab"}
     assert set(next(placements(cells, dict.fromkeys(cells, 0), 2, 2)).off_lane) == {Name("c")}
 
 
-def test_a_vehicle_that_stays_out_gets_the_nearest_free_cell() -> None:
-    """Not its own one when somebody else needs that; among equals the rearmost."""
+def test_a_displaced_vehicle_gets_the_nearest_free_cell() -> None:
+    """Not its current one if another vehicle needs that; of equal ones the rearmost."""
     names = [Name(letter) for letter in "abcdef"]
     cells: dict[Name, Cell] = dict(
         zip(names, [(0, 2), (1, 2), (2, 2), (3, 1), (1, 0), (2, 0)], strict=True)

@@ -30,7 +30,7 @@ def test_too_many_vehicles_for_a_block_are_refused() -> None:
         FAMILIES["block"].request(0, 13, 4.0)
 
 
-def test_what_is_not_proven_has_a_gap() -> None:
+def test_plans_without_a_proof_have_a_gap() -> None:
     response = plan(formation_request(0, vehicles=4))
     assert gap_percent(response) == 0.0
     cost = response.cost

@@ -1,4 +1,4 @@
-"""`laneweave plan --explain`, as text and as a picture."""
+"""`laneweave plan --explain` as text and as a figure."""
 
 from pathlib import Path
 
@@ -28,7 +28,7 @@ def test_text_of_the_case_study(capsys: pytest.CaptureFixture[str], tmp_path: Pa
     assert imread(picture).shape[1] == 1800
 
 
-def test_a_picture_that_moves_is_refused(tmp_path: Path) -> None:
+def test_an_animation_of_an_explanation_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="--draw"):
         explain_request(CASE_STUDY, None, tmp_path / "solving.gif")
 

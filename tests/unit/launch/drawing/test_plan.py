@@ -1,4 +1,4 @@
-"""Drawings of plans: a panel for each time point, one colour for each team, or frames that move."""
+"""Figures of plans: a panel for each time point, a colour for each team; animations."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_a_gif_moves_and_begins_again(tmp_path: Path) -> None:
         assert image.info["loop"] == 0
 
 
-def test_vehicles_move_gently_between_cells() -> None:
+def test_vehicles_move_smoothly_between_cells() -> None:
     times = sorted(set(plan_drawing._frame_times(1)))
     moves = [there - here for here, there in pairwise(times)]
     assert moves[0] < 0.1 < moves[5]
@@ -163,7 +163,7 @@ def test_vehicles_move_gently_between_cells() -> None:
     assert plan_drawing._positions(REQUEST, PLAN, 0.5)[1] == (0.5, 2)
 
 
-def test_names_are_short_and_harmless() -> None:
+def test_names_are_short_and_printable() -> None:
     names = ("v1", "vehicle-000123", "a\nb", "\ud800")
     assert [plan_drawing.short_name(name) for name in names] == ["v1", "…00123", "a?b", "?"]
 
@@ -205,7 +205,7 @@ def test_a_read_only_folder_is_refused() -> None:
 
 
 @pytest.mark.parametrize("endpoint", [None, "tcp/127.0.0.1:1"])
-def test_the_answer_is_printed_and_drawn(
+def test_the_response_is_printed_and_drawn(
     laneweave: Here, endpoint: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plan_answers, "plan", lambda *_, **__: PLAN)

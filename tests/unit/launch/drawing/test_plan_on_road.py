@@ -1,4 +1,4 @@
-"""Plans on the road: driven by the vehicles' own controllers, and drawn."""
+"""Plans on the road: simulated with the vehicles' controllers, and drawn."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def driven() -> Drive:
 
 
 def errors_m(drive: Drive, paths: tuple[tuple[Cell, ...], ...]) -> NDArray[np.float64]:
-    """How far each body is from its cell, along and across, when each step ends."""
+    """Return the distance of each body from its cell, along and across, at the end of each step."""
     lattice, slot = drive.scenario.lattice, drive.slot_ticks
     found = [
         [
@@ -84,7 +84,7 @@ def test_what_the_conflict_kinds_allow_is_shown(driven: Drive) -> None:
     assert apart.min_gap_m > 0
 
 
-def test_the_scenario_says_how_fast_and_how_far() -> None:
+def test_the_scenario_determines_speeds_and_distances() -> None:
     slow = load_scenario(None, formation__cycle_s=6.0, formation__gap_m=12.0)
     drive = drive_plan(slow, NAMES, PLAN.paths)
     assert drive.time_s(drive.ticks) == pytest.approx(18.0)
@@ -110,7 +110,7 @@ def test_a_panel_for_each_instant_shows_all_bodies_where_they_are(driven: Drive)
     assert "bodies overlap, as its conflict kinds allow: 2 and 3" in figure.get_suptitle()
 
 
-def test_of_a_long_plan_some_instants_are_drawn() -> None:
+def test_long_plans_are_drawn_at_some_instants() -> None:
     request = PlanRequest.from_dict(
         {
             "schema": "laneweave.plan.request/1",
@@ -157,14 +157,14 @@ def test_an_animation_has_a_frame_for_each_tick(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("scenario", "shown"), [(None, "3 steps of 4 s"), ("[formation]\ncycle_s = 6.0", "of 6 s")]
 )
-def test_the_road_is_drawn_beside_the_answer(
+def test_the_road_is_drawn_in_addition_to_the_response(
     laneweave: Here,
     scenario: str | None,
     shown: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A configuration that names no router says how the road is; the plan is made here."""
+    """A configuration without a router defines the road; the plan is made locally."""
     titles: list[str] = []
 
     def noted(figure: Figure, out: Path, dpi: float) -> None:
@@ -188,7 +188,7 @@ def test_the_road_is_drawn_beside_the_answer(
         (["--draw-road", "road.png", "--config", "fast.toml"], "formation.move_s: got 1.0"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_in_one_line(
+def test_plans_that_cannot_be_drawn_are_rejected_in_one_line(
     laneweave: Here, options: list[str], line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""The solver by branching, beyond the comparison with the oracle in `test_against_milp`."""
+"""The solver `branching`, beyond the comparison with the oracle in `test_against_milp`."""
 
 import pytest
 from attrs import evolve
@@ -75,7 +75,7 @@ def test_infeasible_requests_are_proven_infeasible(
 
 
 def test_large_requests_without_enough_targets_are_infeasible() -> None:
-    """A path set must not be made of targets that a vehicle may not have."""
+    """A path set must only use eligible targets."""
     block = [(1 + number // 3, number % 3) for number in range(20)]
     vehicles = (
         VehicleRequest("a", (0, 0), eligible=(0,)),
@@ -96,7 +96,7 @@ def test_rounding_does_not_refute_a_cost() -> None:
 
 
 def test_a_distant_target_is_reached() -> None:
-    """Longer ways than to the nearest targets are needed."""
+    """Longer paths than those to the nearest targets are needed."""
     vehicles = (
         VehicleRequest("a", (0, 0)),
         VehicleRequest("b", (0, 1)),
@@ -126,8 +126,8 @@ def test_a_limit_on_memory_ends_with_a_feasible_plan() -> None:
     assert (unlimited.solver, unlimited.fallback) == ("branching", False)
 
 
-def test_arrays_for_too_many_targets_are_not_made() -> None:
-    """Each vehicle has a list of its own: 60 teams with 399 targets on 16,000 cells."""
+def test_arrays_for_too_many_targets_are_not_allocated() -> None:
+    """Each vehicle has a different list: 60 teams with 399 targets on 16,000 cells."""
     targets = [(column, lane) for column in range(900, 925) for lane in range(16)]
     vehicles = tuple(
         VehicleRequest(f"v{i}", (i, 0), eligible=tuple(j for j in range(400) if j != i))

@@ -1,4 +1,4 @@
-"""Bounds are bounds, and nothing that a solution needs is forbidden."""
+"""Lower bounds never exceed the minimum cost, and fixing keeps all optimal plans."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Path sets by negotiation: legal, the same each time, and better with more work."""
+"""Path sets by negotiation: legal, repeatable, and better with more work."""
 
 import numpy as np
 import pytest
@@ -78,7 +78,7 @@ def test_equal_work_gives_equal_paths() -> None:
 
 
 def test_illegal_suggested_targets_are_ignored() -> None:
-    """A node that is refuted may leave vehicles at any target."""
+    """A refuted node may leave vehicles at any target."""
     arrays, vehicles = arrays_of(formation_request(3, vehicles=6))
     whole = Relaxation(arrays, vehicles, 16)
     legal = whole.assignment()
@@ -96,7 +96,7 @@ def test_illegal_suggested_targets_are_ignored() -> None:
 
 
 @pytest.mark.parametrize("mode", [1, 2])
-def test_thirty_six_vehicles_get_an_answer_from_few_nodes(mode: Mode) -> None:
+def test_thirty_six_vehicles_get_a_plan_from_few_nodes(mode: Mode) -> None:
     request = formation_request(1, vehicles=36, mode=mode, deadline_s=60.0)
     response = plan(request, max_nodes=24)
     assert response.status == "feasible"

@@ -24,7 +24,7 @@ def _explore(request: PlanRequest, max_moves: int = 10**6) -> tuple[Problem, Rea
 
 @settings(max_examples=80, deadline=None)
 @given(requests())
-def test_verdict_agrees_with_the_joint_search(request: PlanRequest) -> None:
+def test_reachability_agrees_with_the_joint_search(request: PlanRequest) -> None:
     problem, verdict = _explore(request)
     solvable = cheapest_plan(request) is not None
     assert verdict.infeasible != solvable
@@ -81,7 +81,7 @@ def test_a_crowded_block_is_solved() -> None:
 
 
 def test_passing_without_waiting_is_possible() -> None:
-    """In wide cells two may pass each other obliquely, but special-4 forbids to pass who waits."""
+    """Wide cells allow oblique passing, but special-4 forbids passing a waiting vehicle."""
     geometry = BodyGeometry(
         length_m=3.5,
         width_m=2.0,

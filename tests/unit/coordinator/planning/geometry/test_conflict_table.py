@@ -60,13 +60,13 @@ def footprints_meet(pair: Pair) -> bool:
 
 @cache
 def actual_paths() -> dict[Cell, Floats]:
-    """The trajectories that agents of the default scenario drive."""
+    """The trajectories of agents in the default scenario."""
     return {step: move_profile(Scenario(), *step).states[:, [0, 3]] for step in STEPS}
 
 
 @st.composite
 def geometries(draw: st.DrawFn) -> BodyGeometry:
-    """Any lengths, times and clearances that fit together, close to what just fits, too."""
+    """Draw consistent lengths, times and clearances, some of them close to the limits."""
     numbers = {
         "length_m": draw(st.floats(3.0, 12.0)),
         "width_m": draw(st.floats(1.0, 2.5)),
@@ -103,7 +103,7 @@ def test_at_any_delay_it_contains_the_kinds_of_the_paper(mode: Mode, kind: str) 
 
 
 def test_the_kinds_of_the_paper_overlook_pairs_of_oblique_moves_only() -> None:
-    """All others that the table forbids at any delay are conflicts of the paper, too."""
+    """All other pairs that the table forbids at any delay are also conflicts of the paper."""
     model = ConflictModel(PAPER_KINDS)
     named = {pair for pair in every_pair() if model.kind(*moves(pair)) is not None}
     overlooked = conflict_table(ANY_DELAY).pairs & set(every_pair()) - named
@@ -115,7 +115,7 @@ def test_the_kinds_of_the_paper_overlook_pairs_of_oblique_moves_only() -> None:
     ).pairs
 
 
-def test_at_any_delay_it_is_footprints_but_for_obliques_that_share_a_corner() -> None:
+def test_at_any_delay_it_is_footprints_except_obliques_that_share_a_corner() -> None:
     meeting = {pair for pair in every_pair() if footprints_meet(pair)}
     allowed = meeting - conflict_table(ANY_DELAY).pairs
     assert len(meeting) == 360
@@ -161,7 +161,7 @@ def test_waiting_in_a_crossed_cell_is_a_conflict(mode: Mode, lateness_s: float) 
 @settings(max_examples=40, deadline=None)
 @given(geometries())
 def test_disjoint_footprints_are_never_too_close(geometry: BodyGeometry) -> None:
-    """They are separated by a column or by a lane; so the table never forbids what they allow."""
+    """They are separated by a column or by a lane, so the table forbids none of them."""
     table = conflict_table(geometry).pairs
     for pair in table:
         assert footprints_meet(pair), pair
@@ -170,7 +170,7 @@ def test_disjoint_footprints_are_never_too_close(geometry: BodyGeometry) -> None
 @pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(geometries())
-def test_it_is_the_same_seen_from_the_other_vehicle_or_from_the_other_side(
+def test_the_table_is_symmetric(
     geometry: BodyGeometry,
 ) -> None:
     table = conflict_table(geometry).pairs
@@ -181,7 +181,7 @@ def test_it_is_the_same_seen_from_the_other_vehicle_or_from_the_other_side(
 
 @pytest.mark.parametrize("geometry", [ANY_DELAY, HALF_A_SECOND, BodyGeometry(lateness_s=0.0)])
 def test_backwards_it_forbids_the_same_or_more(geometry: BodyGeometry) -> None:
-    """Bodies turn more where they fall back while they change lanes."""
+    """Bodies turn more if they fall back while they change lanes."""
     table = conflict_table(geometry).pairs
     mirrored = {((-c, lane), (-a[0], a[1]), (-b[0], b[1])) for (c, lane), a, b in table}
     assert {pair for pair in mirrored if pair[1][0] <= 0 and pair[2][0] <= 0} <= table
@@ -218,7 +218,7 @@ def test_more_clearance_or_more_lateness_removes_nothing(
 @settings(max_examples=12, deadline=None)
 @given(geometries(), st.integers(0, 10**6))
 def test_it_contains_what_simulated_bodies_do(geometry: BodyGeometry, seed: int) -> None:
-    """And little more: what is forbidden is too close with clearances a little larger."""
+    """Forbidden pairs are too close with slightly larger clearances."""
     bodies = Bodies(**attrs.asdict(geometry))
     table = conflict_table(geometry).pairs
     slack_m = 0.1 + 2.0 * 1.875 * geometry.pitch_m / geometry.move_s * geometry.move_s / 100
@@ -236,7 +236,7 @@ def test_it_contains_what_simulated_bodies_do(geometry: BodyGeometry, seed: int)
 def test_clearances_are_never_overestimated(
     parts: int, lateness_s: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However coarse it computes; then it says less."""
+    """With coarser parts they are smaller."""
     monkeypatch.setattr(clearances, "PARTS", parts)
     geometry, bodies = BodyGeometry(lateness_s=lateness_s), Bodies(lateness_s=lateness_s)
     found = min_clearances(geometry)

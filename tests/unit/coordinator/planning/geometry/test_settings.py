@@ -1,4 +1,4 @@
-"""Sizes and times of a geometry: what does not fit is named."""
+"""Sizes and times of a geometry: errors name the inconsistent field."""
 
 import math
 from collections.abc import Mapping

@@ -29,7 +29,7 @@ def _tree(request: PlanRequest, switches: Improvements, nodes: int = ENOUGH) -> 
 
 
 def _search(tree: ConstraintTree, limit: float = math.inf) -> Node | None:
-    """Search until the end or until the nodes are spent."""
+    """Search until the end or the node limit."""
     try:
         return tree.search(lambda: limit)
     except BudgetSpentError:

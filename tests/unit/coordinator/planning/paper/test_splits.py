@@ -145,7 +145,7 @@ def test_children_cost_more_as_predicted(drawn: tuple[Case, Conflict, tuple[int,
 
 
 @pytest.mark.parametrize("vehicle", [0, 1])
-def test_a_constraint_spares_a_diagram_that_it_does_not_touch(vehicle: int) -> None:
+def test_a_constraint_is_satisfied_by_paths_without_its_moves(vehicle: int) -> None:
     table = MoveTable(Grid(3, 1), 1, ConflictModel(["node"]))
     diagram = shortest_paths(table, table.bit((0, 0)), table.bit((1, 0)), Bans())
     assert diagram is not None

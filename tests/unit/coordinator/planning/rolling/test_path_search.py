@@ -1,4 +1,4 @@
-"""The stream planner: legal whatever comes, the same each time, and as good as can be proven."""
+"""The stream planner: legal for any input, repeatable, and nearly optimal."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ def dense(
 
 
 def driven(plan: StreamPlan, vehicles: list[StreamVehicle]) -> list[StreamVehicle]:
-    """Return the vehicles that are on the road in the next slot, where their ways lead."""
+    """Return the vehicles on the road in the next slot, in the next cells of their paths."""
     ways = plan.paths
     return [attrs.evolve(v, cell=ways[v.vehicle][1]) for v in vehicles if len(ways[v.vehicle]) > 2]
 
 
 def is_legal(road: StreamRoad, plan: StreamPlan, vehicles: list[StreamVehicle]) -> bool:
-    """Look at all pairs in all slots, by the rules that the tests state themselves."""
+    """Check all pairs in all slots by the independent rules of the tests."""
     starts = {v.vehicle: v.cell for v in vehicles}
     if {name: way[0] for name, way in plan.paths.items()} != starts:
         return False
@@ -75,7 +75,7 @@ def test_every_stream_gets_complete_paths_without_conflicts(stream: Stream) -> N
 @settings(max_examples=60, deadline=None)
 @given(streams())
 def test_vehicles_need_not_be_where_they_were_planned(stream: Stream) -> None:
-    """Everybody is a cell further, and some are new, held, gone, or want another lane."""
+    """All vehicles are a cell further; some are new, held, gone, or have another target lane."""
     road, slot, vehicles, blocked = stream
     planner = StreamPlanner(road)
     plan = planner.plan(slot, vehicles)
@@ -100,7 +100,7 @@ def test_an_empty_road() -> None:
 
 @pytest.mark.parametrize("column", [-400, -3, 0, 30, 66, 67, 400])
 def test_one_vehicle_from_anywhere(column: int) -> None:
-    """It reaches its lane from wherever there are slots enough."""
+    """It reaches its lane if there are enough slots."""
     for lane in range(3):
         vehicle = StreamVehicle("v", (column, lane), 0)
         plan = StreamPlanner(ROAD).plan(0, [vehicle])

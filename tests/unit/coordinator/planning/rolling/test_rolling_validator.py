@@ -1,4 +1,4 @@
-"""The check of a stream's ways finds each thing that can be wrong, and nothing where nothing is."""
+"""The validator of a stream detects each kind of error, and none in valid plans."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MODE_2 = attrs.evolve(ROAD, mode=2, model=ConflictModel(("geometric",)))
 
 
 def to_the_end(*way: Cell) -> CellPath:
-    """Let a way, from slot 0 on, stay in its last cell until the road ends."""
+    """Return a path from slot 0 on that stays in its last cell to the end of the road."""
     column = way[-1][0]
     slots = len(way) - 1
     while 15 * column + 60 * slots <= 1000:
