@@ -196,8 +196,8 @@ class Load:
     failures: list[Exception] = field(factory=list)
     outcomes: list[str] = field(factory=list)
     """Of each request: the plan's status, or the error's kind."""
-    _answered: list[tuple[float, float, float]] = field(factory=list)
-    """When each was asked and answered, and for how long it was planned, in s."""
+    _answered: list[tuple[float, float]] = field(factory=list)
+    """When each was asked and answered, in s."""
     _running: list[threading.Thread] = field(factory=list)
 
     def __enter__(self) -> Self:
@@ -246,17 +246,13 @@ class Load:
 
     def _note(self, asked_s: float, response: PlanResponse) -> None:
         self.outcomes.append(response.status)
-        self._answered.append((asked_s, time.monotonic(), response.solve_ms / 1e3))
+        self._answered.append((asked_s, time.monotonic()))
 
     def _fail(self, error: Exception) -> None:
         self.outcomes.append(type(error).__name__)
         self.failures.append(error)
         self.over.set()
 
-    def added_s(self, fault_s: float | None) -> list[float]:
-        """Return what was added to the planning of requests: of those in flight then, or of all."""
-        return [
-            answered_s - asked_s - planned_s
-            for asked_s, answered_s, planned_s in self._answered
-            if fault_s is None or asked_s < fault_s < answered_s
-        ]
+    def in_flight(self, t_s: float) -> int:
+        """Return how many of the answered requests were in flight at a time."""
+        return sum(asked_s < t_s < answered_s for asked_s, answered_s in self._answered)
