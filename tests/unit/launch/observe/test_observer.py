@@ -29,11 +29,13 @@ def test_an_empty_view() -> None:
     assert view.t_s == 0.0
 
 
-def test_road_time_does_not_go_back() -> None:
+def test_older_clocks_and_censuses_are_ignored() -> None:
     view = RoadView()
     for tick in (5, 7, 6, 7):
         view.update(clock(tick), 0.0)
+        view.update(Census(tick / 10, (), ()), 0.0)
     assert view.t_s == 0.7
+    assert view.census == Census(0.7, (), ())
 
 
 def test_messages_of_an_earlier_bridge_are_ignored() -> None:
@@ -44,13 +46,6 @@ def test_messages_of_an_earlier_bridge_are_ignored() -> None:
     assert (view.roads, view.bridge, view.t_s) == (2, 2, 0.4)
     assert view.census is not None
     assert view.census.t_s == 0.4
-
-
-def test_an_older_census_is_ignored() -> None:
-    view = RoadView()
-    for t_s in (2.0, 1.0):
-        view.update(Census(t_s, (), ()), 0.0)
-    assert view.census == Census(2.0, (), ())
 
 
 def test_the_highest_term_leads() -> None:
