@@ -86,7 +86,4 @@ def test_preferences_follow_the_lane_shares(shares: tuple[float, ...]) -> None:
 def test_a_volume_at_the_least_headway_is_regular() -> None:
     stream = arrivals(scenario(1, lanes=1, volume_veh_per_lane_h=3600.0, duration_s=10.5))
     assert [arrival.t_s for arrival in stream] == pytest.approx(range(1, 11))
-
-
-def test_one_lane_is_preferred_by_all() -> None:
-    assert {arrival.preferred_lane for arrival in arrivals(scenario(1, lanes=1))} == {0}
+    assert {arrival.preferred_lane for arrival in stream} == {0}
