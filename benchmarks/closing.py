@@ -17,7 +17,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.exact.arrays import move_arrays
 from laneweave.coordinator.planning.solve import plan, warm_up
 from laneweave.launch.bench.planner import FAMILIES

@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 from matplotlib.patheffects import withStroke
 
-from laneweave.coordinator.planning.conflict_model import (
+from laneweave.coordinator.planning.conflict_kinds import (
     MAX_OFFSET,
     PAPER_KINDS,
     ConflictModel,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from conflict_drawing import conflict
 from laneweave.agents.driving.trajectory import move_profile
-from laneweave.coordinator.planning.conflict_model import PAPER_KINDS, ConflictModel, Pair
+from laneweave.coordinator.planning.conflict_kinds import PAPER_KINDS, ConflictModel, Pair
 from laneweave.coordinator.planning.exact.cliques import clique_patterns
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry

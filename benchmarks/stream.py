@@ -19,7 +19,7 @@ import attrs
 import numpy as np
 from attrs import field, frozen
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.coordinator.planning.rolling.path_search import StreamPlanner

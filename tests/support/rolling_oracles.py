@@ -8,7 +8,7 @@ from itertools import pairwise, product
 
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.coordinator.planning.rolling.problem import (

@@ -19,7 +19,7 @@ from conflict_drawing import (
     counts,
     draw_conflicts,
 )
-from laneweave.coordinator.planning.conflict_model import Pair
+from laneweave.coordinator.planning.conflict_kinds import Pair
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.protocol.lattice import Cell, displacements

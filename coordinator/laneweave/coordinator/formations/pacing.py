@@ -18,7 +18,7 @@ from collections.abc import Iterable, Sequence
 from attrs import evolve
 
 from laneweave.coordinator.formations.roster import on_tick, start_time_s
-from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.plan_execution import TIME_TOLERANCE_S
 from laneweave.protocol.wire.messages import Plan

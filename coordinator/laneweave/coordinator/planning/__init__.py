@@ -7,8 +7,8 @@ clock that is passed in.
 
 | paper | module |
 |---|---|
-| relative motion modes 1 and 2 | `protocol.lattice`, `problem.Grid` |
-| conflict model | `conflict_model` |
+| relative motion modes 1 and 2 | `protocol.lattice`, `grid.Grid` |
+| conflict kinds | `conflict_kinds` |
 | formation relative distance, matrices C and P, assignments by cost | `paper.assignments` |
 | TAPPA, Algorithm 1 | `paper.tappa` |
 | CBSA, Algorithm 2 | `paper.cbs` |

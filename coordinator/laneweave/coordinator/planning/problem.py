@@ -16,7 +16,7 @@ from typing import Final
 
 import attrs
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel, Move, conflict_offsets
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move, conflict_offsets
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.protocol.lattice import Cell, Mode, displacements
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import attrs
 
-from laneweave.coordinator.planning.conflict_model import DEFAULT_KINDS, ConflictModel
+from laneweave.coordinator.planning.conflict_kinds import DEFAULT_KINDS, ConflictModel
 from laneweave.coordinator.planning.formation_structures import (
     STRUCTURES,
     shortage,

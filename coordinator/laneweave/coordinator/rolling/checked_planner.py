@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.rolling.path_search import StreamPlanner
 from laneweave.coordinator.planning.rolling.problem import (
     StreamCosts,

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import attrs
 
-from laneweave.coordinator.planning.conflict_model import DEFAULT_KINDS
+from laneweave.coordinator.planning.conflict_kinds import DEFAULT_KINDS
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.targets import placements

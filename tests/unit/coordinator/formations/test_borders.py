@@ -7,7 +7,7 @@ from attrs import evolve
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.formations.pacing import steps_of, with_pauses
-from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.protocol.lattice import PlannedMove
 from laneweave.protocol.runtime.node import Compute, Effect, run_job
 from laneweave.protocol.scenario.fields import Scenario

@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
 from laneweave.coordinator.planning.exact.arrays import move_arrays
 from laneweave.coordinator.planning.exact.cliques import Clique, clique_patterns
 from laneweave.coordinator.planning.grid import Grid

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import MoveTable, bits
 from laneweave.protocol.lattice import Cell, Mode, displacements

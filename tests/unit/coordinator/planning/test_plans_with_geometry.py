@@ -13,7 +13,7 @@ import pytest
 from laneweave.agents.driving.trajectory import move_profile
 from laneweave.coordinator.planning import request as request_module
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.conflict_model import ConflictTable
+from laneweave.coordinator.planning.conflict_kinds import ConflictTable
 from laneweave.coordinator.planning.exact.reachability import explore
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.exact.cliques import Clique, clique_patterns
-from laneweave.coordinator.planning.exact.lagrangian_kernel import min_steps
+from laneweave.coordinator.planning.exact.multipliers_kernel import min_steps
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.protocol.lattice import Cell, Mode, displacements
 

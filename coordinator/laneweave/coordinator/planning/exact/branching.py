@@ -36,7 +36,7 @@ from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.exact.arrays import Floats, Ints, move_arrays, teams
 from laneweave.coordinator.planning.exact.branching_kernel import FULL, STUCK, search
 from laneweave.coordinator.planning.exact.lagrangian_bound import Relaxation, Stack, upper_bound_of
-from laneweave.coordinator.planning.exact.lagrangian_kernel import (
+from laneweave.coordinator.planning.exact.multipliers_kernel import (
     BEST,
     FOUND,
     OPEN,

@@ -1,7 +1,7 @@
 """Compiled code of `branching`: the search over the open nodes, depth first.
 
 A node is decided by its lower bound or by a relaxed solution without conflicts; otherwise it is
-split at a conflict clique. See `lagrangian_kernel` for the style.
+split at a conflict clique. See `multipliers_kernel` for the style.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from laneweave.coordinator.planning.exact.lagrangian_kernel import (
+from laneweave.coordinator.planning.exact.multipliers_kernel import (
     OPEN,
     REFUTED,
     STEP_SIZE,

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from functools import lru_cache
 from itertools import product
 
-from laneweave.coordinator.planning.conflict_model import (
+from laneweave.coordinator.planning.conflict_kinds import (
     ConflictModel,
     Move,
     Offset,

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from laneweave.coordinator.planning.exact.arrays import Bools, Floats, Ints, MoveArrays, Teams
-from laneweave.coordinator.planning.exact.lagrangian_kernel import (
+from laneweave.coordinator.planning.exact.multipliers_kernel import (
     BEST,
     BOUND,
     PER_MOVE,
@@ -37,7 +37,7 @@ from laneweave.coordinator.planning.exact.lagrangian_kernel import (
 )
 
 _ESTIMATE = -1.0
-"""Value of `goal` of `lagrangian_kernel.improve`."""
+"""Value of `goal` of `multipliers_kernel.improve`."""
 _TOLERANCE = 1e-6
 
 

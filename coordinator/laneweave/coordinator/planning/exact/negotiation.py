@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from laneweave.coordinator.planning.exact.arrays import Floats, Ints, MoveArrays, Teams
-from laneweave.coordinator.planning.exact.lagrangian_kernel import PARKED, UNREACHABLE
+from laneweave.coordinator.planning.exact.multipliers_kernel import PARKED, UNREACHABLE
 from laneweave.coordinator.planning.exact.negotiation_kernel import improve_paths, negotiate
 
 _HORIZON, _HORIZON_GROWTH, _MAX_HORIZON = 2.0, 1.25, 10.0

@@ -1,11 +1,11 @@
-"""Compiled code of `negotiation`; see `lagrangian_kernel` for its style."""
+"""Compiled code of `negotiation`; see `multipliers_kernel` for its style."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from laneweave.coordinator.planning.exact.lagrangian_kernel import PARKED, PER_MOVE, penalty_of
+from laneweave.coordinator.planning.exact.multipliers_kernel import PARKED, PER_MOVE, penalty_of
 from laneweave.coordinator.planning.random_kernel import random_below
 
 NOT_IN_TIME = 1_000_000
@@ -51,7 +51,7 @@ def _find_path(arrays, teams, candidate, i):
                     total = 1.0 + cost_to_go[t + 1, cell + step[d]]
                     if d != 0:
                         total += PER_MOVE
-                    # Inlined, as in `lagrangian_kernel._relax_moves`.
+                    # Inlined, as in `multipliers_kernel._relax_moves`.
                     for m in range(max_cliques):
                         r = clique[d, cell, m]
                         if r < 0:

@@ -23,7 +23,7 @@ from typing import Final
 
 import numpy as np
 
-from laneweave.coordinator.planning.conflict_model import MAX_OFFSET, ConflictTable, Pair
+from laneweave.coordinator.planning.conflict_kinds import MAX_OFFSET, ConflictTable, Pair
 from laneweave.coordinator.planning.geometry.swept_bodies import (
     FRONT,
     LEFT,

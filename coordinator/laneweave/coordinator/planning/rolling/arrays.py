@@ -14,7 +14,7 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel, conflict_offsets
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel, conflict_offsets
 from laneweave.coordinator.planning.rolling.paths_kernel import (
     ENTERING,
     FIXED,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from attrs import Attribute, field, frozen
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.protocol.lattice import Cell, Mode
 
 CellPath = tuple[Cell, ...]

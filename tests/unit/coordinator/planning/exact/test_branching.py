@@ -6,7 +6,7 @@ from attrs import evolve
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.exact.branching import Branching
 from laneweave.coordinator.planning.exact.lagrangian_bound import upper_bound_of
-from laneweave.coordinator.planning.exact.lagrangian_kernel import PER_MOVE
+from laneweave.coordinator.planning.exact.multipliers_kernel import PER_MOVE
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.plan_validator import problems_of_response
 from laneweave.coordinator.planning.problem import Problem

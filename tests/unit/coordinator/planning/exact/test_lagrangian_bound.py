@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from laneweave.coordinator.planning.exact.lagrangian_bound import Relaxation
-from laneweave.coordinator.planning.exact.lagrangian_kernel import BOUND, PER_MOVE
+from laneweave.coordinator.planning.exact.multipliers_kernel import BOUND, PER_MOVE
 from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.lattice import Mode

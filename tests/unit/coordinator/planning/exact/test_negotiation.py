@@ -5,7 +5,7 @@ import pytest
 
 from laneweave.coordinator.planning.exact.arrays import MoveArrays, Teams, move_arrays, teams
 from laneweave.coordinator.planning.exact.lagrangian_bound import Relaxation
-from laneweave.coordinator.planning.exact.lagrangian_kernel import PARKED
+from laneweave.coordinator.planning.exact.multipliers_kernel import PARKED
 from laneweave.coordinator.planning.exact.negotiation import Negotiation
 from laneweave.coordinator.planning.plan_validator import problems_of_response
 from laneweave.coordinator.planning.request import PlanRequest

@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from laneweave.agents.driving.trajectory import move_profile
-from laneweave.coordinator.planning.conflict_model import (
+from laneweave.coordinator.planning.conflict_kinds import (
     MAX_OFFSET,
     PAPER_KINDS,
     ConflictModel,

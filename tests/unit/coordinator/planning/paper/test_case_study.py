@@ -9,7 +9,7 @@ import math
 import pytest
 
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.assignments import (
     Assignment,

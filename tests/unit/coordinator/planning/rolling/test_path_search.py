@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.rolling import search_kernel as kernel
 from laneweave.coordinator.planning.rolling.arrays import window
 from laneweave.coordinator.planning.rolling.path_search import StreamPlanner

@@ -8,7 +8,7 @@ from random import Random
 import attrs
 import pytest
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.rolling.path_search import StreamPlanner
 from laneweave.coordinator.planning.rolling.problem import CellPath, StreamPlan, StreamRoad
 from laneweave.coordinator.planning.rolling.problem import StreamVehicle as Vehicle

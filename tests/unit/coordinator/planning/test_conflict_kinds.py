@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
 from laneweave.protocol.lattice import Cell, displacements, footprint
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS
 from oracles.path_rules import conflict_kinds
