@@ -1,8 +1,8 @@
 """Compiled code of the rolling planner: paths of single vehicles.
 
 The style is that of `exact.multipliers_kernel`. The table of a window holds, for each slot, cell
-and displacement, the sum of the penalties of all vehicles whose own moves conflict (`load`). Adding a
-vehicle to the table or removing it changes a few entries; the search for a path only reads them.
+and displacement, the sum of the penalties of all vehicles whose own moves conflict (`load`). Adding
+a vehicle to the table or removing it changes a few entries; the search for a path only reads them.
 """
 
 from __future__ import annotations
