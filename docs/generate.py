@@ -235,7 +235,7 @@ def _planted_bugs() -> str:
         "|---|---|---|---|---|---|",
     ]
     for bug in BUGS:
-        end = "two vehicles in one cell" if bug.collides else "disorder, or a wait"
+        end = "two vehicles in one cell" if bug.collides else "another error, or a vehicle waits"
         seed = found.get(bug.name, "-")
         lines.append(
             f"| `{bug.name}` | {bug.rule} | {bug.text} | `{bug.scenario}` | {end} | {seed} |"

@@ -163,7 +163,7 @@ def had_promised(round_: BallotRound, state: VehicleState) -> bool:
 
 
 def restarted(round_: BallotRound, state: VehicleState) -> bool:
-    """Another incarnation than the reported one has promised."""
+    """No promise of the reported incarnation is counted."""
     promise = round_.promises.get(state.vehicle)
     return promise is None or promise.incarnation != state.incarnation
 

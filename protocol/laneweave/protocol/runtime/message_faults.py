@@ -66,7 +66,7 @@ class MessageRule:
     delay_s: float = field(default=0.0, validator=within(0.0, 60.0))
     """Delay of each copy (wall-clock time)."""
     jitter_s: float = field(default=0.0, validator=within(0.0, 60.0))
-    """Maximum of an additional uniform delay of each copy; reorders messages that follow closer."""
+    """Maximum of an additional uniform delay of each copy; reorders frequent messages."""
     from_s: float = field(default=0.0, validator=within(0.0, 1e6))
     """Road time at which the rule starts; 0: also before the road's clock starts."""
     until_s: float | None = field(

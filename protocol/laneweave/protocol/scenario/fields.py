@@ -145,7 +145,7 @@ class FormationSettings:
     sort_in_s2: bool = False
     """Rolling operation: settled vehicles also change lanes in S2."""
     reward_drift: bool = False
-    """Rolling operation: reward moves ahead of v_F that cost no other vehicle anything."""
+    """Rolling operation: reward forward moves that cost no other vehicle anything."""
     block_columns: int = field(default=4, validator=within(1, 24))
     """Columns of a formation if `close` is `columns`."""
     max_columns: int = field(default=7, validator=within(1, 24))

@@ -371,10 +371,10 @@ class Census:
 
     A change is an entry, a departure, the closing of a formation, or an announcement made or
     withdrawn. The census is complete: a vehicle is on the road at `t_s` if and only if it is
-    listed. Each lane announces at most one vehicle more than free cells pass within
-    `runtime.announce_s`, so that agents start only for vehicles that can enter soon. An agent
-    process with a shard starts an agent for each listed vehicle of its shard, and ends the agents
-    of vehicles that are no longer listed.
+    listed. On each lane, the number of announced vehicles is at most one above the number of free
+    cells that pass within `runtime.announce_s`, so that agents start only for vehicles that can
+    enter soon. An agent process with a shard starts an agent for each listed vehicle of its shard,
+    and ends the agents of vehicles that are no longer listed.
 
     Missing: the receiver uses the older census, and plans nothing for formations closed since then.
     Duplicated or older than the newest: ignored. A coordinator's road time is the newest `t_s` of
