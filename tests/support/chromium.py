@@ -15,7 +15,7 @@ from selenium.webdriver.chrome.service import Service
 
 NO_BROWSER = "no browser: chromium and chromium-driver are not installed"
 PROGRAM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-WAIT_S = 30.0
+WAIT_S = 60.0
 
 needs_chromium = pytest.mark.skipif(PROGRAM is None or DRIVER is None, reason=NO_BROWSER)
 

@@ -18,7 +18,7 @@ LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
 def run(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:  # noqa: ANN401
     """Run a command; its output is text."""
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
-    return subprocess.run(list(map(str, words)), text=True, timeout=120, check=False, **streams)
+    return subprocess.run(list(map(str, words)), text=True, timeout=240, check=False, **streams)
 
 
 def laneweave(*arguments: object) -> subprocess.CompletedProcess[str]:

@@ -42,7 +42,7 @@ LOADED = (
 """What commands load."""
 RUN_S = 240.0
 """Nothing here takes a tenth of this; it only guards against hanging."""
-END_S = 30.0
+END_S = 90.0
 """How long processes that were told to end may take."""
 
 ROAD = """\

@@ -39,7 +39,7 @@ CERTIFICATES = "/certs"
 PROGRAMS = {"laneweave": LANEWEAVE, "python": sys.executable}
 LINKS = ("vehicles", "coordinators", "simulation")
 """Hosts beside the hub, each at the end of a link."""
-END_S = 30.0
+END_S = 90.0
 """How long a process that was told to end may take, and a health check."""
 READY_S = 90.0
 """How long services may take to be healthy; numba's code may have to be compiled."""

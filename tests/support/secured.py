@@ -35,7 +35,7 @@ clients = ["plan", "other"]
 """
 QUIET_S = 0.1
 """How long to wait for what must not come; what comes, comes in milliseconds."""
-COME_S = 20.0
+COME_S = 60.0
 """Longest wait for what must come."""
 
 

@@ -110,7 +110,7 @@ def test_a_run_whose_process_dies_is_a_failed_row_and_tried_again(
         command(scenario, out, *lists), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     running_points(process.pid)[0].kill()
-    shown, _ = process.communicate(timeout=60)
+    shown, _ = process.communicate(timeout=120)
     assert process.returncode == 1
     assert "FAILED: formation-1200-1: its process was ended by SIGKILL" in shown
     (row,) = pq.read_table(out / "results.parquet").to_pylist()

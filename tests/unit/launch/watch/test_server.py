@@ -27,7 +27,7 @@ from laneweave.launch.watch.recorded_run import Recording
 from laneweave.launch.watch.server import Browser, Browsers, make_app, request_of
 from laneweave.protocol.errors import BadInputError
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 BIG = "x" * 100_000
 
 

@@ -116,7 +116,7 @@ def test_equal_seeds_give_equal_traces_in_any_process(conditions: Conditions) ->
     for hash_seed in ("0", "1", "4711"):
         path = os.pathsep.join([str(TESTS), *sys.path])
         environment = os.environ | {"PYTHONHASHSEED": hash_seed, "PYTHONPATH": path}
-        shown = subprocess.check_output([sys.executable, "-c", code], env=environment, timeout=60)
+        shown = subprocess.check_output([sys.executable, "-c", code], env=environment, timeout=120)
         assert shown.decode().strip() == digest.hexdigest()
     assert digest.events > 500
 
