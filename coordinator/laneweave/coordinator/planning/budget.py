@@ -1,4 +1,4 @@
-"""Limits on a search: a deadline, a number of nodes, and memory."""
+"""Limits on a search: a deadline, a maximum number of nodes, and memory."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Budget:
         max_memory_mb: float = DEFAULT_MEMORY_MB,
         clock: Clock = time.monotonic,
     ) -> None:
-        """Set the limits; `deadline` is a time of `clock`."""
+        """Set the limits; `deadline` is a reading of `clock`."""
         self._deadline = deadline
         self._max_nodes = max_nodes
         self._clock = clock
@@ -60,7 +60,7 @@ class Budget:
             raise BudgetSpentError
 
     def nodes_left(self, s_per_node: float) -> int:
-        """Return how many nodes may be examined before the deadline and within the limit."""
+        """Return how many more nodes fit within the deadline and the node limit."""
         left = math.inf
         if self._max_nodes is not None:
             left = self._max_nodes - self.nodes

@@ -2,11 +2,11 @@
 
 Section "Conflict model" defines node conflicts, edge conflicts and four special types of edge
 conflict. Which special types matter depends on the lane width and on the column pitch, so each can
-be chosen separately. Every kind is symmetric in the two vehicles.
+be selected separately. Every kind is symmetric in the two vehicles.
 
 Two kinds go beyond the paper. `geometric` compares footprints, the cells that the execution
-protocol reserves; with a `ConflictTable`, computed from sizes and motions (`geometry`), it is that
-table. `closing` leaves enough distance for an emergency brake.
+protocol reserves, or uses a `ConflictTable` computed from sizes and motions (`geometry`).
+`closing` leaves enough distance for emergency braking.
 
 Conflicts depend on the relative position of two vehicles only, so one table of offsets serves all
 grids (`conflict_offsets`).
@@ -25,17 +25,17 @@ from laneweave.protocol.lattice import Cell, Mode, displacements, footprint
 from laneweave.protocol.scenario.fields import BASE_CONFLICTS, CONFLICT_KINDS
 
 Move = tuple[Cell, Cell]
-"""From-cell and to-cell of one step; both are equal when the vehicle waits."""
+"""From-cell and to-cell of one step; the same cell if the vehicle waits."""
 Pair = tuple[Cell, Cell, Cell]
 """Offset from A's cell to B's, displacement of A, displacement of B."""
 Offset = tuple[int, int, int]
-"""Columns and lanes from A's cell to B's, and the number of B's displacement."""
+"""Columns and lanes from A's cell to B's, and the index of B's displacement."""
 
 PAPER_KINDS: Final = ("node", "edge", "special-1", "special-2", "special-3", "special-4")
 DEFAULT_KINDS: Final[dict[Mode, tuple[str, ...]]] = {1: BASE_CONFLICTS, 2: ("geometric",)}
 
 MAX_OFFSET: Final = 2
-"""Maximum distance of conflicting from-cells, in columns and lanes, except `_COLUMNS_OF_KIND`."""
+"""Maximum column or lane distance between conflicting from-cells; but see `_COLUMNS_OF_KIND`."""
 CLOSING_COLUMNS: Final = 3
 """Column distance of two vehicles with two free columns between them."""
 _COLUMNS_OF_KIND: Final = {"closing": CLOSING_COLUMNS}
@@ -45,31 +45,31 @@ _WAIT, _LONGITUDINAL, _LATERAL, _OBLIQUE = product((False, True), repeat=2)
 
 
 def _direction(move: Move) -> tuple[bool, bool]:
-    """Return whether a move changes the lane, and whether it changes the column."""
+    """Return whether a move changes lanes and whether it changes columns."""
     return move[0][1] != move[1][1], move[0][0] != move[1][0]
 
 
 def _node(a: Move, b: Move) -> bool:
-    """Both end in the same cell; one of them may wait there."""
+    """Return whether both end in the same cell; one may be waiting there."""
     return a[1] == b[1]
 
 
 def _edge(a: Move, b: Move) -> bool:
-    """Both move and share their midpoint: they swap cells or cross diagonally."""
+    """Return whether both move and share a midpoint: they swap cells or cross diagonally."""
     if a[0] == a[1] or b[0] == b[1]:
         return False
     return a[0][0] + a[1][0] == b[0][0] + b[1][0] and a[0][1] + a[1][1] == b[0][1] + b[1][1]
 
 
 def _special_1(a: Move, b: Move) -> bool:
-    """A moves into the cell that B is leaving."""
+    """Return whether A moves into the cell that B is leaving."""
     return a[1] == b[0] and a[0] != a[1] and b[0] != b[1]
 
 
 def _triangle(a: Move, b: Move) -> bool:
-    """A is oblique, and B starts or ends at a corner of the square between A's cells.
+    """Return whether A is oblique and B starts or ends at a corner of the square of A's cells.
 
-    The corner and A's cells are a right triangle. B's other cell may lie outside of the square: a
+    The corner and A's cells form a right triangle. B's other cell may lie outside the square: a
     vehicle that enters or leaves the corner blocks A as much as one that stays (ADR 27).
     """
     corners = {(a[0][0], a[1][1]), (a[1][0], a[0][1])}
@@ -81,7 +81,7 @@ def _geometric(a: Move, b: Move) -> bool:
 
 
 def _closing(a: Move, b: Move) -> bool:
-    """A moves forwards; B, three columns ahead, moves backwards; both touch a common lane."""
+    """Return whether A moves forwards, B backwards from three columns ahead, in a common lane."""
     return (
         a[1][0] - a[0][0] == 1
         and b[1][0] - b[0][0] == -1
@@ -126,16 +126,16 @@ class ConflictTable:
 class ConflictModel:
     """The kinds of conflict that a plan must avoid, in the order of `CONFLICT_KINDS`.
 
-    node: both vehicles end in the same cell, including a move to a waiting vehicle.
+    node: both vehicles end in the same cell, including a move into a waiting vehicle's cell.
     edge: the two paths cross or overlap: a swap, or crossing diagonals.
     special-1: A moves into B's current cell while B moves to another one; this also forbids trains
-        of vehicles in the same direction.
-    special-2, special-3, special-4: A moves obliquely, B moves longitudinally, moves laterally or
-        stays, and three of their initial and target cells form a right triangle: B leaves, enters
-        or stays at a corner of the square between A's cells.
+        of vehicles moving in the same direction.
+    special-2, special-3, special-4: A moves obliquely; B moves longitudinally, moves laterally or
+        stays, respectively. Three of their initial and target cells form a right triangle: B
+        leaves, enters or stays at a corner of the square of A's cells.
     geometric: without a table, the footprints intersect (`lattice.footprint`). The execution
         protocol reserves footprints, so this holds for any lateness. It contains all kinds above
-        and any `ConflictTable`. With a table, exactly the pairs in the table.
+        and any `ConflictTable`. With a table, the pair of moves is in the table.
     closing: A moves forwards, straight or obliquely, B moves backwards and starts three columns
         ahead of A, and some lane is the from-lane or to-lane of both. No other kind contains it.
     """
@@ -154,15 +154,15 @@ class ConflictModel:
 
     @property
     def reach(self) -> Cell:
-        """Maximum column and lane distance of the from-cells of conflicting moves."""
+        """Maximum column and lane distance between the from-cells of conflicting moves."""
         columns = max(_COLUMNS_OF_KIND.get(kind, MAX_OFFSET) for kind in self.kinds or ("node",))
         return columns, MAX_OFFSET
 
     @property
     def vehicles_share_cells(self) -> bool:
-        """Whether two vehicles may be in one cell.
+        """Whether two vehicles may share a cell.
 
-        Bodies that start or end in one cell are too close in every geometry.
+        Bodies that start or end in the same cell are too close in every geometry.
         """
         return not {"node", "geometric"} & set(self.kinds)
 
@@ -186,7 +186,7 @@ def _difference(cell: Cell, other: Cell) -> Cell:
 
 @lru_cache(maxsize=64)
 def conflict_offsets(mode: Mode, model: ConflictModel) -> tuple[tuple[Offset, ...], ...]:
-    """Return, per displacement of A, the offsets and displacements of B that conflict with it."""
+    """Return, for each displacement of A, the offsets and displacements of B in conflict."""
     steps = displacements(mode)
     columns, lanes = (range(-reach, reach + 1) for reach in model.reach)
 

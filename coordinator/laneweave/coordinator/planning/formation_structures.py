@@ -1,16 +1,16 @@
 """Targets of the two formation structures: parallel and interlaced (paper, Sections 2.2 and 5.2.1).
 
-The cells of a structure are free cells of its lanes: all of them if it is parallel; those with an
-even, or those with an odd, column + lane if it is interlaced. On each lane a structure takes as
-many neighbouring cells as it has vehicles there, without gaps except for blocked cells:
+The cells of a structure are free cells in its lanes: all of them if it is parallel; only those with
+even column + lane, or only those with odd column + lane, if it is interlaced. In each lane, a
+structure takes as many neighbouring cells as it has vehicles there, with no gaps but blocked cells:
 
-- If every vehicle names a lane, the cells of each lane minimize the total distance of its vehicles.
+- If every vehicle names a lane, the cells in each lane minimize its vehicles' total distance.
 - Otherwise cells are filled from a common front to the rear, column by column, and in each column
-  from the right lane to the left. The cells of a lane go to the vehicles that name it first, then
-  to vehicles that name none. The front minimizes the total distance along the road.
+  from the right lane to the left. A lane's cells go first to the vehicles that name it, then to
+  vehicles that name none. The front is the one that minimizes the total distance along the road.
 
-The interlaced structure with the shorter total distance is chosen, the even one if both are equal.
-Of equal positions the one nearest to the middle of the grid is chosen.
+The interlaced structure with the shorter total distance is chosen; ties go to the even one.
+Ties between positions go to the one nearest the middle of the grid.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def structure_targets(
     cells: Sequence[Cell],
     preferred: Sequence[int | None],
 ) -> tuple[Cell, ...]:
-    """Return the targets of a structure, one for each vehicle, by lane and column.
+    """Return the targets of a structure, one for each vehicle, sorted by lane and column.
 
     Args:
         structure: one of `STRUCTURES`.
@@ -76,19 +76,19 @@ def shortage(
 def ranked_runs(
     columns: Sequence[int], free: Sequence[int], width: int, *, ahead: bool = False
 ) -> list[tuple[float, int]]:
-    """Return the runs of neighbouring cells of a lane, those nearest to its vehicles first.
+    """Return the runs of neighbouring cells in a lane, nearest to its vehicles first.
 
-    Assigning the cells to vehicles in the order of columns minimizes the total distance.
+    Assigning the cells to vehicles in column order minimizes the total distance.
 
     Args:
-        columns: of the vehicles; at most as many as there are in `free`.
+        columns: columns of the vehicles; at most as many as there are in `free`.
         free: columns of the cells that may be taken, ascending.
-        width: columns of the grid.
-        ahead: of equal runs, the one further ahead comes first, not the one nearer to the middle.
+        width: number of columns of the grid.
+        ahead: whether ties go to the run further ahead, not to the one nearer the middle.
 
     Returns:
-        For each run, the total distance along the road plus a small tie-breaker, and the index in
-        `free` of its first cell.
+        For each run, the total distance along the road plus a small tie-breaker, and the index of
+        its first cell in `free`.
     """
     runs = np.lib.stride_tricks.sliding_window_view(np.asarray(free), len(columns))
     tie_breaker = (
@@ -148,7 +148,7 @@ def _place(
 def _filled(
     columns: _Columns, grid: Grid, starts: Sequence[int], preferred: Sequence[int | None]
 ) -> _Placed:
-    """Return the nearest of the structures that are filled from each possible front."""
+    """Fill a structure from each possible front; return the nearest one."""
     lanes_of: dict[int, list[int]] = {}
     for lane in sorted(columns):
         for column in columns[lane]:

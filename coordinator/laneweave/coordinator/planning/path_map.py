@@ -37,7 +37,7 @@ class RelativePathMap:
         return sum(final_arrival(row) for row in self.rows)
 
     def __str__(self) -> str:
-        """Return the table as text; columns are headed by the time point, from 1."""
+        """Return the table as text; column headings number the time points from 1."""
         cells = [[f"({c},{lane})" for c, lane in row] for row in self.rows]
         header = ["Vehicle ID", *(f"step {k + 1}" for k in range(self.steps + 1))]
         # Ids are user input: replace characters that would break the table or control the terminal.

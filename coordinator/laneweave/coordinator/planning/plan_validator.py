@@ -14,7 +14,7 @@ from laneweave.protocol.lattice import Cell
 
 
 def problems_of_response(request: PlanRequest, response: PlanResponse) -> list[str]:
-    """Return the errors in a response; a response without a plan has none."""
+    """Return the errors in a response, with or without a plan."""
     if request.structure is not None:
         problems = list(_problems_of_targets(request, response.targets or ()))
         if problems:
@@ -62,7 +62,7 @@ def _problems_of_targets(request: PlanRequest, targets: Sequence[Cell]) -> Itera
         if not request.grid.contains(cell) or not request.grid.is_free(cell):
             yield f"target {cell} is blocked or outside the grid"
         if cell[1] not in request.structure_lanes:
-            yield f"target {cell} is not on a lane of the structure"
+            yield f"target {cell} is not in a lane of the structure"
     if request.structure == "interlaced" and len({sum(cell) % 2 for cell in targets}) > 1:
         yield "targets of an interlaced structure have even and odd column + lane"
 

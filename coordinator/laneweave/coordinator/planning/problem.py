@@ -6,7 +6,7 @@ or that conflict with a given move, are found with a few bit operations.
 Cells are numbered column by column, with two unused lanes between columns so that nothing wraps
 around. Each cell has one bit per displacement: bit `cell_bit + d` is the move from that cell with
 displacement `d`, and bit `cell_bit` itself (d = 0) is waiting there. A set of *cells* uses the
-bits of their waits. Ties are broken in the order of bits.
+bits of their waits. Ties go to the lowest bit.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Path = tuple[int, ...]
 """The moves of one vehicle until its final arrival."""
 
 _MAX_CACHED_BITS: Final = 1 << 15
-"""On larger grids conflict sets are not cached."""
+"""Size in bits above which conflict sets are not cached."""
 
 
 def bits(mask: int) -> Iterator[int]:
-    """Yield the numbers of the bits that are set, lowest first."""
+    """Yield the indices of the set bits, lowest first."""
     while mask:
         low = mask & -mask
         yield low.bit_length() - 1
@@ -66,7 +66,7 @@ class MoveTable:
         return free
 
     def bit(self, cell: Cell) -> int:
-        """Return the bit of a cell, which is also the bit of waiting in it."""
+        """Return the bit index of a cell, which its wait move shares."""
         return (cell[0] * self.width + cell[1]) * self.fan
 
     def cell(self, bit: int) -> Cell:
@@ -80,12 +80,12 @@ class MoveTable:
         return (column, lane), (column + step[0], lane + step[1])
 
     def number(self, move: Move) -> int:
-        """Return the bit of a move given as two cells."""
+        """Return the bit index of a move given as two cells."""
         (column, lane), (to_column, to_lane) = move
         return self.bit(move[0]) + self.steps.index((to_column - column, to_lane - lane))
 
     def landing(self, bit: int) -> int:
-        """Return the bit of the cell in which the move ends."""
+        """Return the bit index of the cell in which the move ends."""
         d = bit % self.fan
         return bit - d + self.shifts[d]
 
@@ -119,7 +119,7 @@ class MoveTable:
         return cells
 
     def distances(self, cells: int) -> dict[int, int]:
-        """Return the minimum number of steps between each cell and the nearest of some cells."""
+        """Return the minimum number of steps between each cell and the nearest of these cells."""
         found: dict[int, int] = {}
         reached, steps = cells, 0
         while cells:
@@ -172,8 +172,8 @@ class _ConflictSets(dict[int, int]):
 class Bans:
     """The moves a vehicle must not make; steps count from 0.
 
-    at: sets of moves for single steps.
-    since: sets of moves that are banned in a step and all later ones.
+    at: moves that are banned in a single step, by step.
+    since: moves that are banned in a step and all later ones, by step.
     earliest, latest: the minimum and maximum number of steps until the final arrival.
     """
 
@@ -187,8 +187,8 @@ class Bans:
 class Diagram:
     """All minimum-cost paths of a vehicle to a target, as a multi-valued decision diagram.
 
-    layers: per step, the moves that lie on at least one such path; there are `cost` steps.
-    target: the bit of the target cell, which is also that of waiting there.
+    layers: for each of the `cost` steps, the moves that lie on at least one such path.
+    target: bit index of the target cell, which its wait move shares.
     """
 
     layers: tuple[int, ...]
@@ -222,11 +222,11 @@ class Search:
     """Base class of the solvers: a search for the cheapest path set.
 
     best: the cheapest path set so far.
-    lower_bound: on the cost of all path sets; infinite: there is none.
-    finished: whether `best` is proven optimal, or that no path set exists.
+    lower_bound: lower bound on the cost of all path sets; infinite: there is none.
+    finished: whether it is proven that `best` is optimal or that no path set exists.
     aborted: whether this solver cannot decide the problem within its limits; another one may.
     tried: number of assignments that were examined one by one.
-    has_fewest_moves: whether it is proven that no path set of equal cost has fewer moves.
+    has_fewest_moves: whether it is proven that no path set of the same cost has fewer moves.
     """
 
     best: Solution | None = None
@@ -244,8 +244,8 @@ class Search:
 class Problem:
     """Vehicles and targets on a grid.
 
-    starts, targets: bits of their cells.
-    free_paths: cache of `shortest_paths.free_paths`, which all constraint trees share.
+    starts, targets: bit indices of the start cells and of the target cells.
+    free_paths: cache of `shortest_paths.free_paths`, shared by all constraint trees.
     """
 
     def __init__(

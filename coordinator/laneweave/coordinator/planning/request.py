@@ -51,7 +51,7 @@ class VehicleRequest:
     eligible: tuple[int, ...] | None = None
 
     def choice(self, targets: Sequence[Cell]) -> frozenset[int]:
-        """Return the indices of eligible targets: `eligible`, those on `lane`, or all."""
+        """Return the indices of eligible targets: `eligible`, those in `lane`, or all."""
         if self.eligible is not None:
             return frozenset(self.eligible)
         lane = self.lane
@@ -67,7 +67,7 @@ class PlanRequest:
     lanes: lanes of the structure; None: all.
     geometry: defines the conflict kind `geometric`; None: footprints.
     solver: one of `SOLVERS`; None: the planner's default.
-    id: a service answers a repeated id with the same response. Empty: none.
+    id: a service answers a repeated id with the same response; empty: no id.
     """
 
     grid: Grid
@@ -144,7 +144,7 @@ class PlanRequest:
         )
 
     def with_targets(self, targets: Sequence[Cell]) -> PlanRequest:
-        """Return the request with other targets and without a structure."""
+        """Return the request with these targets and without a structure."""
         return attrs.evolve(self, targets=tuple(targets), structure=None, lanes=None)
 
     @classmethod
@@ -266,7 +266,7 @@ def _check_count(field: str, values: Sequence[object], maximum: int) -> None:
 
 
 def _check_unique(field: str, values: Sequence[object], allowed: str, name: str = "") -> None:
-    """Reject a value that occurs twice; `name`: suffix of the field in each item."""
+    """Reject duplicate values; `name` is the suffix of the field in each item."""
     first: dict[object, int] = {}
     for i, value in enumerate(values):
         if first.setdefault(value, i) != i:

@@ -30,15 +30,15 @@ class PlanResponse:
     status: `optimal` is proven without any bound on the number of steps, `feasible` means that the
         budget was spent first, `infeasible` is proven, `timeout` means that no plan was found in
         time.
-    cost, steps: None without a plan. lower_bound: proven; None if infeasible.
+    cost, steps: None without a plan. lower_bound: proven lower bound; None if infeasible.
     assignment: per vehicle, the index of its target; empty without a plan.
     paths: per vehicle, its cells at all `steps` + 1 time points; empty without a plan.
     solver: the last solver that ran; None: a response from a version without a choice of solvers.
-    fallback: `solver` replaced the requested one, which reached its share of the deadline or of
-        the nodes, or cannot solve such requests; `paths` are the cheapest of both.
-    targets: of the requested structure, in the order of `assignment`'s indices; None: the request
-        named its targets.
-    waited_ms: how long the request waited for a worker of a service; None: it was planned locally.
+    fallback: whether `solver` replaced the requested one, which used up its share of the deadline
+        or nodes, or cannot solve such requests; `paths` is the cheaper of the two path sets.
+    targets: targets of the requested structure, to which `assignment` refers; None: the request
+        listed its targets.
+    waited_ms: time that the request waited for a service worker; None: it was planned locally.
     """
 
     status: Status
@@ -81,7 +81,7 @@ class PlanResponse:
 
 
 PlanFunction = Callable[..., PlanResponse]
-"""Plans a `PlanRequest`, with keyword arguments as `solve.plan` has them."""
+"""Function that plans a `PlanRequest`, with the keyword arguments of `solve.plan`."""
 
 
 def _is_given(attribute: attrs.Attribute[Any], value: object) -> bool:

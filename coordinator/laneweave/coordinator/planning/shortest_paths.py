@@ -3,7 +3,7 @@
 The paper uses A* in space and time. Here all shortest paths of a vehicle under its constraints are
 computed at once, as sets of moves per step (`Diagram`): a forward pass collects the moves up to the
 earliest final arrival, a backward pass removes those that do not lead to it. `choose_path` selects
-the path with the fewest conflicts with other vehicles, then fewest moves, then lowest index.
+the path with the fewest conflicts with other vehicles, then the fewest moves, then lowest bits.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def shortest_paths(table: MoveTable, start: int, target: int, bans: Bans) -> Dia
 
 
 def free_paths(problem: Problem, vehicle: int, target: int) -> Diagram | None:
-    """Return the shortest paths of a vehicle to a target (an index) without constraints."""
+    """Return a vehicle's unconstrained shortest paths to a target (an index)."""
     key = vehicle, target
     if key not in problem.free_paths:
         problem.free_paths[key] = shortest_paths(

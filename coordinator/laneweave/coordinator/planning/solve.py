@@ -28,7 +28,7 @@ With six to eight vehicles TAPPA needs 3 to 5 s of CPU for 15,000 of the 20,000 
 branching needs 0.1 s for such formations (95th percentile), at most 0.6 s.
 """
 MAX_NODES: Final = 500_000
-"""Limits the memory of TAPPA's trees to about 1 GB, which takes minutes to reach."""
+"""Node limit that keeps TAPPA's trees below about 1 GB; reaching it takes minutes."""
 
 
 @attrs.frozen
@@ -52,19 +52,19 @@ def plan(
 ) -> PlanResponse:
     """Plan one request, and check the plan with `plan_validator`.
 
-    Equal requests get equal plans unless the deadline passes first.
+    Identical requests get identical plans unless the deadline passes first.
 
     Args:
         request: what to plan.
         max_nodes: limit on search nodes, for repeatable results; at most `MAX_NODES`.
         max_memory_mb: limit on the arrays of branch and bound. When it is reached, the other
-            solver continues; with a path set and no proof the status is `feasible`.
-        weights: of the formation relative distance, which must be a lower bound on steps.
-        solver: one of `SOLVERS`, instead of the request's; if neither names one, the default.
-        fallback: branching continues when TAPPA has spent `TAPPA_SHARE`, and the cheaper of both
-            path sets is returned; False: TAPPA may spend everything. A solver that cannot handle
-            the request at all is always replaced by the other one.
-        clock: returns the time in s.
+            solver continues; a path set that is not proven optimal has status `feasible`.
+        weights: weights of the formation relative distance, which must not exceed the steps.
+        solver: one of `SOLVERS`, overriding the request's; if neither names one, the default.
+        fallback: branching continues when TAPPA has spent `TAPPA_SHARE`, and the cheaper path set
+            is returned; False: TAPPA may spend the whole budget. A solver that cannot handle the
+            request at all is always replaced by the other one.
+        clock: returns the time [s].
 
     Raises:
         RuntimeError: the plan is invalid because of an error in the planner.

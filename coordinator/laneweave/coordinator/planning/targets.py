@@ -1,6 +1,6 @@
 """Targets of a formation: the parallel structure after lane sorting (paper, Section 5.2.1).
 
-Each lane provides as many neighbouring cells as vehicles prefer it, where their paths are shortest.
+Each lane provides neighbouring cells, one per vehicle that prefers it, where paths are shortest.
 Vehicles without an agent keep their cells, which are blocked for others. If more vehicles prefer a
 lane than it has free cells, those furthest from it get the nearest other cells.
 """
@@ -25,7 +25,7 @@ class Targets:
     cells: tuple[Cell, ...]
     """All targets, one for each vehicle."""
     off_lane: dict[Name, Cell]
-    """Targets of the vehicles that do not fit on their lanes."""
+    """Targets of the vehicles that do not fit in their preferred lanes."""
 
 
 def placements(
@@ -41,12 +41,12 @@ def placements(
 
     Args:
         cells: current cell of each vehicle.
-        preferred_lanes: of each vehicle.
-        columns: columns of the grid.
-        lanes: lanes of the grid.
+        preferred_lanes: preferred lane of each vehicle.
+        columns: number of columns of the grid.
+        lanes: number of lanes of the grid.
         blocked: cells that cannot be targets.
-        ahead: of placements with equal paths, the one further ahead comes first, not the one nearer
-            to the middle of the grid.
+        ahead: whether ties go to the placement further ahead, not to the one nearer the middle of
+            the grid.
     """
     choices: list[list[tuple[float, list[Cell]]]] = []
     displaced: list[Name] = []
@@ -92,7 +92,7 @@ def _combinations(choices: Sequence[Sequence[tuple[float, list[Cell]]]]) -> Iter
 def _ranked_targets(
     lane: int, cells: Sequence[Cell], columns: int, free: Sequence[int], *, ahead: bool
 ) -> list[tuple[float, list[Cell]]]:
-    """Return all runs of neighbouring cells on a lane, each with its rank, the best one first."""
+    """Return all runs of neighbouring cells in a lane, each with its rank, best first."""
     count = len(cells)
     if count == 0:
         return [(0.0, [])]

@@ -28,20 +28,20 @@ Bools = NDArray[np.bool_]
 class MoveArrays(NamedTuple):
     """The moves of a grid under a conflict model.
 
-    Shapes: D displacements, X cells, M maximum number of cliques that contain a move.
+    Shapes: D displacements, X cells, at most M cliques that contain a move.
     """
 
     lanes: int
     step: Ints
-    """(D,) difference of cell numbers."""
+    """(D,) difference between cell numbers."""
     valid: Bools
     """(D, X) whether the move stays on free cells."""
     clique: Ints
-    """(D, X, M) numbers of the cliques that contain a move, then -1."""
+    """(D, X, M) indices of the cliques that contain a move, padded with -1."""
     clique_count: int
     residue: Ints
-    """(X,) a number from 0 to `residue_count` - 1 that differs between the from-cells of the moves
-    in one clique: column and lane modulo one more than the reach of conflicts."""
+    """(X,) label below `residue_count` that differs between the from-cells of the moves in a
+    clique: column and lane modulo the reach of conflicts plus one."""
     residue_count: int
 
 
@@ -49,21 +49,21 @@ class Teams(NamedTuple):
     """Vehicles and targets. Shapes: N vehicles, J targets, K teams, P pairs, X cells."""
 
     start: Ints
-    """(N,) cells."""
+    """(N,) start cell of each vehicle."""
     team: Ints
-    """(N,) numbers of the vehicles' teams."""
+    """(N,) team index of each vehicle."""
     target: Ints
-    """(J,) cells."""
+    """(J,) cell of each target."""
     pairs_from: Ints
     """(K + 1,) team k has the pairs from `pairs_from[k]` to `pairs_from[k + 1] - 1`."""
     pair_target: Ints
-    """(P,) number of the target."""
+    """(P,) target index of each pair."""
     pair_cell: Ints
-    """(P,) its cell."""
+    """(P,) cell of each pair's target."""
     pair: Ints
-    """(K, J) number of a pair; -1: the team may not have the target."""
+    """(K, J) pair index; -1: target not eligible for the team."""
     distance: Floats
-    """(X, P) minimum steps from each cell to a target; `UNREACHABLE`: there is no path."""
+    """(X, P) minimum steps from each cell to a pair's target; `UNREACHABLE`: no path."""
 
 
 @lru_cache(maxsize=16)
@@ -94,7 +94,7 @@ def move_arrays(grid: Grid, mode: Mode, model: ConflictModel) -> MoveArrays:
 def _cliques(
     grid: Grid, patterns: tuple[Clique, ...], displacement_count: int, valid: Bools
 ) -> tuple[Ints, int]:
-    """Place the patterns on the grid and number them, except those with a single move."""
+    """Return each move's cliques of at least two moves on the grid, and the number of cliques."""
     members: dict[tuple[int, int, int], list[tuple[int, int]]] = {}
     for number, pattern in enumerate(patterns):
         for c, across, d in pattern:
@@ -120,7 +120,7 @@ def teams(
     targets: Sequence[Cell],
     choices: Sequence[frozenset[int]],
 ) -> Teams:
-    """Return vehicles and targets as arrays, teams in the order of their first vehicles."""
+    """Return vehicles and targets as arrays; teams are ordered by their first vehicles."""
     numbers: dict[frozenset[int], int] = {}
     team = [numbers.setdefault(choice, len(numbers)) for choice in choices]
     pair_target = [j for choice in numbers for j in sorted(choice)]

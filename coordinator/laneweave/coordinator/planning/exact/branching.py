@@ -1,23 +1,23 @@
 """The solver for large formations: branch and bound with Lagrange multipliers.
 
 1. Multipliers of the conflict cliques give a lower bound and reduced costs (`lagrangian_bound`).
-2. For the lowest cost that is still possible a search decides whether there is a solution of this
-   cost. In each of its nodes multipliers are improved, and moves that no such solution contains are
-   forbidden by their reduced cost. Then either the lower bound exceeds the cost; or the cheapest
-   paths of the vehicles do not conflict, which is a solution; or the node is split at a clique: at
-   most one of its moves is made in its step, so either all moves of a team (or from a cell) are
-   forbidden in this clique, or all others (`branching_kernel`; branching on sets: Beale and Tomlin,
+2. For the lowest cost that is still possible, a search decides whether a solution of this cost
+   exists. At each node, multipliers are improved, and moves that no such solution contains are
+   forbidden by reduced cost. Then either the lower bound exceeds the cost; or the vehicles'
+   cheapest paths do not conflict and are a solution; or the node is split at a clique: at most one
+   of its moves is made in its step, so either all its moves by one team (or from one cell) are
+   forbidden, or all its other moves (`branching_kernel`; branching on sets: Beale and Tomlin,
    Proc. 5th Int. Conf. on Operational Research, 1970).
 3. If no node is left, the next cost is tried.
 
-The first cost with a solution is the minimum. Moves have a small cost, so that the search continues
-for a solution of equal cost with fewer moves, for about half as many nodes as before.
+The first cost with a solution is the minimum. Moves have a small cost, so the search continues, for
+about half as many nodes again, to find a solution that costs the same but has fewer moves.
 
 The gap between the cost and the lower bound is small, so few moves remain, and most nodes are
 decided quickly. Unlike in conflict trees, interchangeable vehicles do not multiply the nodes.
 
-Every few nodes, negotiation (`negotiation`) looks for path sets, so that there is a plan if the
-deadline comes first; if it fails, a joint search (`reachability`) looks for a path set or proves
+Every few nodes, negotiation (`negotiation`) looks for path sets, so that a plan exists if the
+deadline passes first; if it fails, a joint search (`reachability`) looks for a path set or proves
 that there is none.
 """
 
@@ -55,21 +55,21 @@ from laneweave.coordinator.planning.shortest_paths import without_needless_moves
 _SPARE_STEPS, _MORE_STEPS = 8, 6
 """Steps with multipliers beyond the longest path; steps added when a solution may need more."""
 _ITERATIONS, _FEW_ITERATIONS, _BATCH = 40, 10, 10
-"""Iterations for the first multipliers with many or few vehicles; iterations between two checks."""
+"""Iterations at the root with many and with few vehicles; iterations between checks."""
 _FEW_VEHICLES = 11
 _FIRST_STACK = 16
 _CHUNK_S = 0.005
-"""Approximate time between two readings of the clock."""
+"""Approximate time between clock readings."""
 _NODES_BETWEEN = 8
-"""Nodes between two attempts to find path sets by heuristics."""
+"""Nodes between attempts to find path sets by heuristics."""
 _MANY_VEHICLES = 20
-"""Size from which formations, which then take long to decide, get a path set first."""
+"""Formation size from which a path set is sought first, since the search takes long."""
 _FIRST_WORK, _WORK_FOR_GAP, _STALE = 200, 100, 100
-"""Passes of negotiation until there is a path set; later, passes for a gap of 100 %, and the number
-of passes without improvement that halves them."""
+"""Maximum negotiation passes per call until a path set is found; then the passes at a gap of 100 %
+and the number of passes without improvement that halves them."""
 _EXPLORE_NODES, _EXPLORE_MOVES, _MAX_EXPLORE_MOVES, _GROWTH = 16, 5_000, 1_500_000, 4
-"""Nodes before the joint search is tried, if there is no path set yet, and its limit of joint
-moves; both grow by `_GROWTH`."""
+"""Nodes after which the joint search is tried if no path set is known, and its initial and maximum
+limit on joint moves; nodes and limit grow by the factor `_GROWTH`."""
 _TIE_NODES = 10
 _WARM_UP_WORK = 8
 _BYTES_PER_S = 1_000_000_000
@@ -154,7 +154,7 @@ class Branching(Search):
         return self.best is not None and self.best.cost <= self.lower_bound
 
     def _improve(self, root: Relaxation, iterations: int) -> None:
-        """Improve the first multipliers; check the clock every few iterations."""
+        """Improve the root's multipliers; check the clock every few iterations."""
         while iterations > 0:
             count = max(1, min(iterations, int(_CHUNK_S / max(self._s_per_iteration, 1e-6))))
             started = time.thread_time()
@@ -166,7 +166,7 @@ class Branching(Search):
         self.lower_bound = max(self.lower_bound, root.min_cost)
 
     def _fits(self, steps: int, nodes: int) -> bool:
-        """Return whether the arrays for a number of steps and nodes fit into the memory limit.
+        """Return whether the arrays for a number of steps and nodes fit within the memory limit.
 
         Raises:
             BudgetSpentError: they fit, but there is no time left to fill them.
@@ -186,7 +186,7 @@ class Branching(Search):
         return Relaxation(self._arrays, self._teams, steps)
 
     def _longest_path(self) -> int:
-        """Return the steps of the longest path when targets are assigned at minimum cost."""
+        """Return the steps in the longest path when targets are assigned at minimum cost."""
         pairs = self._teams.pair[self._teams.team]
         distances = np.where(
             pairs >= 0, self._teams.distance[self._teams.start[:, None], pairs], UNREACHABLE
@@ -195,7 +195,7 @@ class Branching(Search):
         return int(max(steps[steps < UNREACHABLE], default=0))
 
     def _decide(self, root: Relaxation, nodes: Stack, cost: int) -> Stack:
-        """Find a solution of a cost, prove that there is none, or add steps with multipliers."""
+        """Find a solution of this cost, prove that none exists, or add steps with multipliers."""
         self._budget.check_time()
         upper_bound = upper_bound_of(cost)
         may_exist = root.put(nodes, upper_bound)
@@ -241,7 +241,7 @@ class Branching(Search):
         return root.stack(len(nodes.step_size))
 
     def _break_ties(self, root: Relaxation, nodes: Stack) -> Stack:
-        """Search for a solution of the same cost as the best one with fewer moves."""
+        """Search for a solution that costs the same as the best one but has fewer moves."""
         upper_bound = self._best_value - 0.5 * PER_MOVE
         may_exist = root.put(nodes, upper_bound)
         if may_exist:
@@ -251,7 +251,7 @@ class Branching(Search):
         return nodes
 
     def _search_fewer_moves(self, root: Relaxation, nodes: Stack, depth: int) -> None:
-        """Continue a search for about half as many nodes, at most until the deadline."""
+        """Continue a search for about half as many nodes again, or until the deadline."""
         left = self._nodes // 2 + _TIE_NODES
         try:
             while left > 0 and depth > 0:
@@ -273,7 +273,7 @@ class Branching(Search):
         chunk = max(1, int(_CHUNK_S / max(self._s_per_node, 1e-5)))
         if left < 1:
             raise BudgetSpentError
-        # By default up to the next check, which does not depend on the speed of the machine.
+        # By default, stop at the next check, which does not depend on the machine's speed.
         if max_nodes is None:
             max_nodes = max(1, self._next_check - self._nodes)
         count = min(chunk, left, max_nodes)
@@ -290,7 +290,7 @@ class Branching(Search):
         return outcome, depth
 
     def _keep_relaxed_solution(self, root: Relaxation) -> None:
-        """Keep the best relaxed solution without conflicts, if there is one."""
+        """Keep the best conflict-free relaxed solution if it is better than the best so far."""
         if root.state[BEST] < self._best_value - 0.5 * PER_MOVE:
             self._keep_if_better(self._solution(root.scratch.best_path))
 
@@ -337,13 +337,13 @@ class Branching(Search):
             )
 
     def _keep_if_better(self, solution: Solution) -> None:
-        """Keep a path set if it is cheaper than the best so far, or equal with fewer moves."""
+        """Keep a path set that is cheaper than the best so far, or as cheap with fewer moves."""
         value = self._value(solution)
         if value < self._best_value:
             self.best, self._best_value = solution, value
 
     def _value(self, solution: Solution) -> float:
-        """Return the cost including `PER_MOVE`."""
+        """Return the cost plus `PER_MOVE` for each move."""
         landing = self._problem.table.landing
         moves = 0
         for start, path in zip(self._problem.starts, solution.paths, strict=True):

@@ -25,7 +25,7 @@ STUCK, FULL = 3, 4
 BY_TEAM, BY_CELL = 0, 1
 _ITERATIONS = 10
 _KEPT = 0.8
-"""If a smaller fraction of the moves remains, multipliers are improved again before branching."""
+"""Fraction of moves kept below which multipliers are improved again before branching."""
 _ROUNDS = 12
 """Rounds without a choice by mass after which any choice is accepted."""
 _ABOVE_UPPER_BOUND = 0.5
@@ -40,8 +40,8 @@ _MULTIPLIER_WEIGHT = 10.0
 def search(arrays, teams, stack, depth, scratch, state, upper_bound, nodes):
     """Examine up to `nodes` nodes of the stack, depth first.
 
-    Returns FOUND, STUCK or FULL immediately, REFUTED when the stack is empty, or else OPEN; the new
-    depth; and the number of examined nodes. After FOUND its node is still on the stack.
+    Returns the outcome, the new depth and the number of examined nodes. FOUND (its node stays on
+    the stack), STUCK and FULL are returned at once, REFUTED if the stack is empty, otherwise OPEN.
     """
     choice = np.zeros(5, np.int64)
     for examined in range(nodes):
@@ -73,7 +73,7 @@ def search(arrays, teams, stack, depth, scratch, state, upper_bound, nodes):
 def _examine(arrays, teams, allowed, earliest, multipliers, scratch, state, upper_bound, choice):
     """Decide a node, or choose what to branch on.
 
-    Multipliers are improved and moves fixed by reduced cost for as long as that removes many moves.
+    Multipliers are improved and moves fixed by reduced cost as long as that removes many moves.
     """
     moves, span = list_moves(arrays, allowed, scratch)
     start_over(multipliers, span, scratch, state)
@@ -118,13 +118,13 @@ def _examine(arrays, teams, allowed, earliest, multipliers, scratch, state, uppe
 
 @njit(cache=True)
 def _choose(arrays, teams, allowed, earliest, multipliers, span, scratch, state, choice, by_mass):
-    """Choose a clique, and a part of its moves to branch on: those of a team, or from a cell.
+    """Choose a clique and the part of its moves to branch on: by one team, or from one cell.
 
     The best clique has a high multiplier, and both its parts have a large mass, that is, weight in
-    the relaxed solutions. Without masses all moves count equally.
+    the relaxed solutions. Unless `by_mass`, all moves count equally.
 
-    choice: step, clique, `BY_TEAM` or `BY_CELL`, number of the team or cell, 1 if its part has the
-        larger mass.
+    choice: set to step, clique, `BY_TEAM` or `BY_CELL`, team index or cell residue, and 1 if that
+        part has the larger mass.
     """
     mass = scratch.mass
     groups = len(mass)

@@ -1,11 +1,11 @@
-"""Conflict cliques: sets of moves at most one of which is made in a step.
+"""Conflict cliques: sets of moves of which at most one can be made in a step.
 
-A linear relaxation with only the pairs of conflicting moves is weak, so they are grouped into
-cliques of the conflict relation, which are maximal and cover every conflicting pair. With
+A linear relaxation with only the pairs of conflicting moves is weak, so moves are grouped into
+maximal cliques of the conflict relation that together cover every conflicting pair. With
 footprints (mode 1 with node, edge and special-1; geometric) one pattern is enough: all moves whose
-footprint contains a cell. Tables computed from a geometry, and `closing`, take more patterns.
+footprint contains a given cell. Tables computed from a geometry, and `closing`, need more.
 
-Conflicts are the same everywhere on the lattice, so a clique is a pattern that is placed on every
+Conflicts are the same everywhere on the lattice, so a clique is a pattern that is placed at every
 cell, its anchor.
 """
 
@@ -24,7 +24,7 @@ from laneweave.coordinator.planning.conflict_kinds import (
 from laneweave.protocol.lattice import Mode, displacements
 
 Clique = tuple[Offset, ...]
-"""Columns and lanes from the anchor to the from-cell of each move, and its displacement."""
+"""Columns and lanes from the anchor to each move's from-cell, and the displacement index."""
 
 
 @lru_cache(maxsize=64)
@@ -64,7 +64,7 @@ class _Relation:
         return (column, lane), (column + step[0], lane + step[1])
 
     def pairs(self) -> set[tuple[Offset, Offset]]:
-        """Return all conflicting pairs, each once for all places on the lattice."""
+        """Return all conflicting pairs, unique up to translation."""
         return {
             _normal_pair((0, 0, d), other)
             for d, offsets in enumerate(conflict_offsets(self._mode, self._model))
@@ -73,7 +73,7 @@ class _Relation:
         }
 
     def maximal_cliques(self) -> set[Clique]:
-        """Return the maximal cliques that contain a move from the origin, each once."""
+        """Return all maximal cliques, unique up to translation."""
         found: set[Clique] = set()
         for d in range(len(self.steps)):
             origin = (0, 0, d)
@@ -84,7 +84,7 @@ class _Relation:
         return found
 
     def _exclude(self, a: Offset, b: Offset) -> bool:
-        """Return whether two vehicles cannot make both moves; they never share a cell."""
+        """Return whether two moves exclude each other; vehicles never share a cell."""
         return a[:2] == b[:2] or self._model.kind(self.move(a), self.move(b)) is not None
 
 
@@ -103,7 +103,7 @@ def _cliques(
 
 
 def _normal(members: Clique) -> Clique:
-    """Return the members with the anchor at the lowest of their from-cells."""
+    """Return the members with their lowest from-cell as the anchor."""
     column, lane = min((member[0], member[1]) for member in members)
     return tuple(sorted((c - column, left - lane, d) for c, left, d in members))
 

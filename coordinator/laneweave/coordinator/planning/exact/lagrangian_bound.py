@@ -3,15 +3,15 @@
 Without conflicts the problem decomposes: each vehicle takes a shortest path, and targets are
 assigned at minimum cost. Every conflict clique in every step has a Lagrange multiplier, the cost of
 each move in the clique. The shortest paths then avoid contested cliques, and their cost minus the
-sum of all multipliers is a lower bound on every solution, whatever its number of steps: beyond the
-last step with multipliers vehicles ignore each other. Good multipliers are found by a subgradient
+sum of all multipliers is a lower bound on every solution's cost, whatever its length: beyond the
+last step with multipliers, vehicles ignore each other. Good multipliers are found by a subgradient
 method (Held, Wolfe and Crowder, Mathematical Programming 6, 1974) with momentum.
 
-At given multipliers each move of a team has a reduced cost, a lower bound on what it adds to every
+At given multipliers, each move of a team has a reduced cost, a lower bound on what it adds to every
 solution that contains it. So for a given upper bound, moves whose reduced cost is too high are
 forbidden (reduced-cost fixing), which shrinks the problem and raises its lower bound.
 
-Costs are steps until the final arrival, and `PER_MOVE` for each move that is not a wait.
+Costs are the steps until final arrival plus `PER_MOVE` for each move that is not a wait.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ from laneweave.coordinator.planning.exact.multipliers_kernel import (
 )
 
 _ESTIMATE = -1.0
-"""Value of `goal` of `multipliers_kernel.improve`."""
+"""Value of `goal` that makes `multipliers_kernel.improve` estimate it."""
 _TOLERANCE = 1e-6
 
 
 class Scratch(NamedTuple):
-    """Working memory of the compiled code. Shapes: T steps, R cliques; others as in `arrays`."""
+    """Working memory for the compiled code. Shapes: T steps, R cliques; others as in `arrays`."""
 
     cost_to_go: Floats
-    """(T + 1, X, P) minimum cost from a cell before a step to the target of a pair."""
+    """(T + 1, X, P) minimum cost, before each step, from each cell to each pair's target."""
     parked: Floats
-    """(T + 1, P) multipliers of waiting at the target from a step on."""
+    """(T + 1, P) sum of multipliers for waiting at the target from each step on."""
     move: Ints
     """(moves, 3) displacement, from-cell and to-cell of the allowed moves, by step and team."""
     move_from: Ints
-    """(T, K + 1) where the moves of a step and team begin."""
+    """(T, K + 1) index in `move` at which the moves of each step and team begin."""
     move_cost: Floats
     """(moves,) cost of each move in `move`."""
     present: Floats
@@ -59,40 +59,40 @@ class Scratch(NamedTuple):
     direction: Floats
     """(T, R) subgradient with momentum."""
     use: Floats
-    """(T, R) number of vehicles in each clique on their cheapest paths; then the subgradient."""
+    """(T, R) number of cheapest paths that use each clique; then the subgradient."""
     mass: Floats
-    """(K, T, D, X) weights of the relaxed solutions that contain a move."""
+    """(K, T, D, X) total weight of the relaxed solutions that contain each move."""
     mass_of_team: Floats
-    """(T, R, K) mass of the moves of a team in a clique."""
+    """(T, R, K) mass of each team's moves in each clique."""
     mass_of_cell: Floats
-    """(T, R, `residue_count`) mass of the moves from a cell in a clique."""
+    """(T, R, `residue_count`) mass of the moves from each cell in each clique."""
     reach: Floats
-    """(K, T + 1, X) minimum reduced cost at which a team reaches a cell before a step."""
+    """(K, T + 1, X) minimum reduced cost at which a team is in a cell before a step."""
     min_cost: Floats
-    """(K, T + 1, X) minimum of `cost_to_go` minus the dual value of the target."""
+    """(K, T + 1, X) minimum over a team's targets of `cost_to_go` minus the dual value."""
     cost: Floats
-    """(N, J) minimum cost of each vehicle and target."""
+    """(N, J) minimum cost for each vehicle to reach each target."""
     holder: Ints
-    """(J,) the vehicle that has a target; -1: none."""
+    """(J,) vehicle assigned to each target; -1: none."""
     dual: Floats
     """(J,) dual values of the targets."""
     path: Ints
     """(N, T) displacements of the vehicles; `PARKED`: arrived."""
     best_path: Ints
-    """(N, T) paths of the best relaxed solution without conflicts."""
+    """(N, T) paths of the best conflict-free relaxed solution."""
 
 
 class Stack(NamedTuple):
-    """The open nodes of branch and bound. Shapes: S nodes; others as above."""
+    """The open nodes of branch and bound. Shapes: S nodes; others as in `Scratch`."""
 
     allowed: Bools
-    """(S, K, T, D, X) moves that a team may make."""
+    """(S, K, T, D, X) whether each team may make each move."""
     earliest: Ints
-    """(S, P) earliest step before which a vehicle may have finally arrived."""
+    """(S, P) earliest step by whose start a vehicle may have arrived for good."""
     multipliers: Floats
     """(S, T, R) Lagrange multipliers."""
     step_size: Floats
-    """(S,) factor of the step size."""
+    """(S,) step-size factor."""
 
 
 def scratch(arrays: MoveArrays, teams: Teams, steps: int) -> Scratch:
@@ -124,7 +124,7 @@ def scratch(arrays: MoveArrays, teams: Teams, steps: int) -> Scratch:
 
 
 def upper_bound_of(cost: int) -> float:
-    """Return an upper bound on the value of solutions of a cost, for any number of moves.
+    """Return an upper bound on the value of solutions of this cost, for any number of moves.
 
     Values are multiples of `PER_MOVE`, so half of it is a margin for rounding.
     """
@@ -132,7 +132,7 @@ def upper_bound_of(cost: int) -> float:
 
 
 class Relaxation:
-    """The relaxed problem at its best multipliers so far.
+    """The relaxed problem with the best multipliers so far.
 
     multipliers: (T, R); T is the number of steps in which cliques have multipliers.
     """
@@ -179,7 +179,7 @@ class Relaxation:
 
     @property
     def min_cost(self) -> float:
-        """Lower bound on every solution, as a number of steps; infinite: there is none."""
+        """Lower bound on the cost of every solution, in steps; infinite: there is none."""
         bound = float(self.state[BOUND])
         if bound >= UNREACHABLE:
             return math.inf
@@ -211,20 +211,20 @@ class Relaxation:
         )
 
     def assignment(self) -> Ints:
-        """Return (N,) the number of the best target of each vehicle at the multipliers."""
+        """Return the best target index (N,) of each vehicle at the current multipliers."""
         self._begin()
         evaluate(self.arrays, self.teams, self.earliest, self.multipliers, self._span, self.scratch)
         return self.held_targets()
 
     def held_targets(self) -> Ints:
-        """Return (N,) the number of the target of each vehicle in the last relaxed solution."""
+        """Return the target index (N,) of each vehicle in the last relaxed solution."""
         target = np.zeros(len(self.teams.start), dtype=np.int64)
         taken = np.flatnonzero(self.scratch.holder >= 0)
         target[self.scratch.holder[taken]] = taken
         return target
 
     def put(self, nodes: Stack, upper_bound: float) -> bool | None:
-        """Start a stack with the moves that solutions below an upper bound may contain.
+        """Initialize a stack with the moves that solutions below an upper bound may contain.
 
         Returns:
             Whether such a solution may exist; None: it may need more steps than have multipliers.
@@ -243,7 +243,7 @@ class Relaxation:
         return True
 
     def set_multipliers(self, multipliers: Floats) -> None:
-        """Continue from other multipliers."""
+        """Continue from these multipliers."""
         self.multipliers = multipliers.copy()
 
     def lengthen(self, steps: int) -> None:

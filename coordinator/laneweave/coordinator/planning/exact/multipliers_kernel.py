@@ -1,8 +1,7 @@
 """Compiled code of `lagrangian_bound`.
 
 Parameters are the named tuples of `arrays` and `lagrangian_bound`. Arrays are read from their
-tuples
-before loops, and inner loops are separate functions: otherwise they take five times as long.
+tuples before loops, and inner loops are separate functions; otherwise they take five times as long.
 """
 
 from __future__ import annotations
@@ -13,15 +12,15 @@ from numba import njit
 UNREACHABLE = 1e9
 """Represents infinity in sums of costs."""
 PER_MOVE = 1e-5
-"""Cost of each move that is not a wait, so that of equal costs the fewest moves win."""
+"""Cost of each move that is not a wait, so that ties go to the fewest moves."""
 PARKED = -1
 """In a path: the vehicle has finally arrived."""
 REFUTED, FOUND, OPEN = 0, 1, 2
-"""No solution below the upper bound; a solution below it; neither is known yet."""
+"""No solution below the upper bound exists; one has been found; undecided."""
 BOUND, STEP_SIZE, STALE, WEIGHT, WEIGHTS, BEST = range(6)
-"""Indices in the state of `improve`: the best lower bound, the factor of the step size, iterations
+"""Indices into the state of `improve`: the best lower bound, the step-size factor, iterations
 without a better bound, the weight of the next relaxed solution, the sum of all weights, the value
-of the best relaxed solution without conflicts."""
+of the best conflict-free relaxed solution."""
 _HALF = 0.5 * UNREACHABLE
 _TOLERANCE = 1e-7
 _MOMENTUM = 0.6
@@ -35,7 +34,7 @@ _FADING = 0.92
 
 @njit(cache=True, nogil=True)
 def min_steps(valid, step, targets):
-    """Return (X, P) the minimum steps from every cell to each target, without other vehicles."""
+    """Return the minimum steps (X, P) from every cell to each target, ignoring other vehicles."""
     displacements, cells = valid.shape
     found = np.full((cells, len(targets)), UNREACHABLE)
     queue = np.empty(cells, np.int64)
@@ -59,7 +58,7 @@ def min_steps(valid, step, targets):
 def list_moves(arrays, allowed, scratch):
     """List the allowed moves of every step.
 
-    Returns their number, and the number of steps up to the last one with any.
+    Returns the number of moves, and the number of steps up to the last one with a move.
     """
     teams, steps, displacements, cells = allowed.shape
     move, move_from, step = scratch.move, scratch.move_from, arrays.step
@@ -94,9 +93,9 @@ def start_over(multipliers, span, scratch, state):
 def improve(
     arrays, teams, allowed, earliest, multipliers, span, scratch, state, count, upper_bound, goal
 ):
-    """Run the subgradient method until the bound passes `upper_bound` or a solution is below it.
+    """Run the subgradient method until the bound exceeds `upper_bound` or a solution is below it.
 
-    goal: the value that the step size aims at; negative: estimate it.
+    count: maximum number of iterations. goal: target value for the step size; negative: estimate.
     """
     cliques = multipliers.shape[1]
     present, direction, use = scratch.present, scratch.direction, scratch.use
@@ -141,7 +140,7 @@ def improve(
 
 @njit(cache=True, nogil=True)
 def evaluate(arrays, teams, earliest, multipliers, span, scratch):
-    """Return the bound at some multipliers; fill in costs to go and the assignment."""
+    """Return the bound at these multipliers; fill in costs to go and the assignment."""
     _fill_costs_to_go(arrays, teams, earliest, multipliers, span, scratch)
     total = 0.0
     for t in range(span):
@@ -152,9 +151,9 @@ def evaluate(arrays, teams, earliest, multipliers, span, scratch):
 
 @njit(cache=True)
 def _fill_costs_to_go(arrays, teams, earliest, multipliers, span, scratch):
-    """Fill in the minimum cost from each cell before each step to the target of each pair.
+    """Fill in the minimum cost, before each step, from each cell to each pair's target.
 
-    Every step until the final arrival costs 1, and each move the multipliers of its cliques. A
+    Every step until the final arrival costs 1, plus the multipliers of the move's cliques. A
     vehicle that has arrived waits, which also costs multipliers.
     """
     cost_to_go, parked = scratch.cost_to_go, scratch.parked
@@ -195,7 +194,7 @@ def _fill_costs_to_go(arrays, teams, earliest, multipliers, span, scratch):
 def _relax_moves(
     move, move_cost, begin, end, first_pair, end_pair, clique, multipliers, costs, next_costs
 ):
-    # The sum of multipliers is inlined: as a call it takes four times as long.
+    # The sum of multipliers is inlined: a call would take four times as long.
     max_cliques = clique.shape[2]
     for m in range(begin, end):
         d, cell, next_cell = move[m, 0], move[m, 1], move[m, 2]
@@ -228,7 +227,7 @@ def penalty_of(clique, multipliers, t, d, cell):
 
 @njit(cache=True)
 def _assign_targets(teams, scratch):
-    """Assign targets at minimum cost; fill in each target's vehicle (or -1) and dual value.
+    """Assign targets at minimum cost; set each target's vehicle (or -1) and dual value.
 
     Successive shortest paths with potentials (Jonker and Volgenant, Computing 38, 1987).
     """
@@ -286,7 +285,7 @@ def _assign_targets(teams, scratch):
 def _follow_paths(arrays, teams, allowed, earliest, multipliers, span, scratch, state):
     """Follow each vehicle's cheapest path; count the uses of cliques and add up masses.
 
-    Returns the sum of costs, and whether all vehicles arrive.
+    Returns the total cost and whether all vehicles arrive.
     """
     clique, step = arrays.clique, arrays.step
     cost_to_go, parked = scratch.cost_to_go, scratch.parked
@@ -340,7 +339,7 @@ def _follow_paths(arrays, teams, allowed, earliest, multipliers, span, scratch, 
 def _excess(multipliers, use, span):
     """Turn uses of cliques into a subgradient.
 
-    Returns whether a clique is used twice, and the square of the subgradient.
+    Returns whether any clique is used more than once, and the subgradient's squared norm.
     """
     clash, square = False, 0.0
     for t in range(span):
@@ -408,7 +407,7 @@ def fix_by_reduced_cost(arrays, teams, allowed, earliest, multipliers, span, scr
 
 @njit(cache=True, nogil=True)
 def may_need_more_steps(teams, steps, scratch, budget):
-    """Return whether a vehicle may be away from its targets after all steps, within a budget."""
+    """Return whether, within a budget, a vehicle may be off its targets after the last step."""
     reach = scratch.reach
     for k in range(len(reach)):
         for cell in range(reach.shape[2]):

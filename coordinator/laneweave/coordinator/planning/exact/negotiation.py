@@ -1,12 +1,12 @@
 """Path sets by negotiation: early solutions for any number of vehicles.
 
 Vehicles first take their cheapest paths, which may conflict. Then all vehicles on contested cliques
-are rerouted repeatedly, one after the other; the cost of cliques in use rises with each pass, that
-of contested ones permanently. This nearly always ends without conflicts (McMurchie and Ebeling,
-PathFinder, FPGA 1995, a method for routing wires).
+are rerouted repeatedly, one after another; the cost of cliques in use rises with each pass, and
+contested cliques gain a permanent cost. This nearly always resolves all conflicts (McMurchie and
+Ebeling, PathFinder, FPGA 1995, a method for routing wires).
 
-After that a few vehicles at a time are removed, may exchange targets, and negotiate again around
-all others; the result is kept if it is not worse (large-neighbourhood search). After many attempts
+After that, a few vehicles at a time are removed, may exchange targets, and negotiate again around
+the others; the result is kept unless it is worse (large-neighbourhood search). After many attempts
 without improvement, negotiation restarts from the latest suggested multipliers and targets.
 """
 
@@ -23,15 +23,15 @@ from laneweave.coordinator.planning.exact.multipliers_kernel import PARKED, UNRE
 from laneweave.coordinator.planning.exact.negotiation_kernel import improve_paths, negotiate
 
 _HORIZON, _HORIZON_GROWTH, _MAX_HORIZON = 2.0, 1.25, 10.0
-"""The horizon relative to the steps with multipliers, and its growth if it is too short."""
+"""Horizon relative to the steps with multipliers, its growth if it is too short, its maximum."""
 _PASSES = 300
 _SPARE_STEPS = 4
 _ATTEMPTS = 4
 """Attempts to improve the path set in one pass."""
 _MAX_REMOVED = (6, 12)
-"""Maximum numbers of vehicles that are removed together; they alternate."""
+"""Maximum number of vehicles removed together; the two values alternate."""
 _IDLE_ATTEMPTS = 800
-"""Attempts without an improvement after which negotiation restarts."""
+"""Attempts without improvement after which negotiation restarts."""
 
 
 class CandidatePaths(NamedTuple):
@@ -42,27 +42,27 @@ class CandidatePaths(NamedTuple):
     cost: Ints
     """(N,) cost of each path."""
     target: Ints
-    """(N,) number of the target of each vehicle."""
+    """(N,) target index of each vehicle."""
     use: Floats
     """(T, R) number of vehicles in each clique."""
     own: Floats
-    """(T, R) the same for the removed vehicles."""
+    """(T, R) number of removed vehicles in each clique."""
     history: Floats
     """(T, R) permanent cost of contested cliques."""
     weight: Floats
     """(T, R) current cost of each clique."""
     cost_to_go: Floats
-    """(T + 1, X) minimum cost from a cell before a step to the target of one vehicle."""
+    """(T + 1, X) minimum cost, before each step, from each cell to one vehicle's target."""
     parked: Floats
-    """(T + 1,) cost of staying at the target from a step on."""
+    """(T + 1,) cost of staying at the target from each step on."""
     random: NDArray[np.uint64]
-    """(1,) state of the random numbers."""
+    """(1,) state of the random number generator."""
 
 
 def candidate_paths(
     arrays: MoveArrays, path: Ints, target: Ints, history: Floats
 ) -> CandidatePaths:
-    """Return a candidate with paths (N, T) and without counted uses of cliques."""
+    """Return a candidate with paths (N, T) whose uses of cliques are not yet counted."""
     shape = history.shape
     return CandidatePaths(
         path=path,
@@ -81,9 +81,9 @@ def candidate_paths(
 class Negotiation:
     """A deterministic negotiation and its best path set so far.
 
-    cost: of the best path set; None: there is none yet.
-    path: (N, T) its displacements.
-    stale: number of calls of `work` since it was found.
+    cost: cost of the best path set; None: there is none yet.
+    path: (N, T) displacements of the best path set.
+    stale: number of calls to `work` since the best path set was found.
     """
 
     def __init__(self, arrays: MoveArrays, teams: Teams, multipliers: Floats, target: Ints) -> None:
@@ -93,7 +93,7 @@ class Negotiation:
             arrays: the moves.
             teams: the vehicles.
             multipliers: (T, R) initial costs of cliques.
-            target: (N,) initial target of each vehicle, by number.
+            target: (N,) initial target index of each vehicle.
         """
         self.cost: int | None = None
         self.path: Ints = np.empty((0, 0), dtype=np.int64)
@@ -107,7 +107,7 @@ class Negotiation:
         self._restart()
 
     def suggest(self, multipliers: Floats, target: Ints) -> None:
-        """Start the next round from other multipliers, and from other targets if they are legal."""
+        """Start the next round from these multipliers, and from these targets if valid."""
         self._multipliers = multipliers
         pair = self._teams.pair[self._teams.team, target]
         reachable = self._teams.distance[self._teams.start, pair] < UNREACHABLE
@@ -128,7 +128,7 @@ class Negotiation:
     def work(self, check_time: Callable[[], None]) -> bool:
         """Run one pass; return whether it found a better path set.
 
-        `check_time` may raise an error to end the work.
+        `check_time` may raise an error to stop the work.
         """
         check_time()
         self.stale += 1
@@ -157,7 +157,7 @@ class Negotiation:
         return better
 
     def _keep(self) -> bool:
-        """Keep the candidate if it is the best; return whether it is."""
+        """Keep the candidate if it is the best so far; return whether it is."""
         cost = int(self._candidate.cost.sum())
         if self.cost is not None and cost >= self.cost:
             return False
@@ -165,7 +165,7 @@ class Negotiation:
         return True
 
     def _drop_idle_steps(self) -> None:
-        """Drop the last steps, in which no vehicle moves, except a few."""
+        """Drop all but a few of the final steps, in which no vehicle moves."""
         old = self._candidate
         steps = int(old.cost.max()) + _SPARE_STEPS
         if steps < old.path.shape[1]:

@@ -9,24 +9,24 @@ from laneweave.coordinator.planning.exact.multipliers_kernel import PARKED, PER_
 from laneweave.coordinator.planning.random_kernel import random_below
 
 NOT_IN_TIME = 1_000_000
-"""Cost of a vehicle that does not arrive within the horizon, and of a clique that is in use."""
+"""Cost of failing to arrive within the horizon, and of a clique used by a fixed vehicle."""
 _DETOUR = 10.0
-"""Cost per step to the target at the end of the horizon."""
+"""Cost of each step that is left to the target at the end of the horizon."""
 _FIRST_COST, _GROWTH, _MAX_COST = 2.0, 1.01, 50.0
-"""Cost of a clique that another vehicle uses; it grows with each pass."""
+"""Cost of a clique that another vehicle uses: initial value, growth per pass, maximum."""
 _HISTORY = 1.0
-"""Permanently added to the cost of a clique in each pass in which it is used twice."""
+"""Permanent cost that each excess use adds to a clique in each pass."""
 _ROUNDS, _ROUND_GROWTH, _ROUND_HISTORY = 10, 1.5, 0.5
-"""Passes, growth and permanent cost when only removed vehicles negotiate."""
+"""Passes, cost growth and permanent cost when only removed vehicles negotiate."""
 _BLUR = 15.0
 _DELAY_WEIGHT = 0.5
 _SWAP_SHARE = 60
-"""Percentage of attempts that exchange targets inside teams."""
+"""Percentage of attempts in which vehicles may exchange eligible targets."""
 
 
 @njit(cache=True)
 def _find_path(arrays, teams, candidate, i):
-    """Set the cheapest path of one vehicle at the current clique costs, and its cost."""
+    """Set one vehicle's cheapest path at the current clique costs, and the cost of the path."""
     valid, step, clique = arrays.valid, arrays.step, arrays.clique
     weight, cost_to_go, parked = candidate.weight, candidate.cost_to_go, candidate.parked
     pair = teams.pair[teams.team[i], candidate.target[i]]
@@ -83,7 +83,7 @@ def _find_path(arrays, teams, candidate, i):
 
 @njit(cache=True)
 def add_uses(arrays, start, path, use, times):
-    """Count the cliques on a path `times` times; -1 removes them."""
+    """Add `times` uses to each clique on a path; -1 removes one."""
     clique, step = arrays.clique, arrays.step
     cell = start
     for t in range(len(path)):
@@ -121,9 +121,9 @@ def _shuffle(items, random):
 
 @njit(cache=True, nogil=True)
 def negotiate(arrays, teams, candidate, number):
-    """Run pass `number` (from 0) of a negotiation; return whether no clique is used twice.
+    """Run pass `number` (from 0) of a negotiation; return whether a path set was found.
 
-    All vehicles on contested cliques are rerouted, one after the other.
+    All vehicles that are late or on contested cliques are rerouted, one after another.
     """
     use, history, weight = candidate.use, candidate.history, candidate.weight
     steps, cliques = use.shape
@@ -201,7 +201,7 @@ def improve_paths(arrays, teams, candidate, attempts, max_size):
 
 @njit(cache=True)
 def _negotiate_among(arrays, teams, candidate, chosen, max_cost):
-    """Negotiate among removed vehicles; the cliques that all others use are forbidden."""
+    """Negotiate among removed vehicles around all others; return whether that succeeded."""
     use, own, history, weight = candidate.use, candidate.own, candidate.history, candidate.weight
     path, start, cost = candidate.path, teams.start, candidate.cost
     steps, cliques = use.shape

@@ -1,9 +1,9 @@
 """Joint search for small state spaces: find any path set, or prove that there is none.
 
-Branch and bound and conflict trees may not terminate if no path set exists. A search over the cells
-of all vehicles together does: vehicles with the same eligible targets form a team and are
+Branch and bound and conflict trees may not terminate if no path set exists. A joint search over the
+cells of all vehicles does: vehicles with the same eligible targets form a team and are
 interchangeable, so a state is the set of cells of each team. States whose vehicles are close to
-their targets come first, so a path set is found soon if there is one. After a given number of joint
+their targets come first, so a path set is found soon if one exists. After a given number of joint
 moves the search ends without a result.
 """
 
@@ -28,7 +28,7 @@ class Reachability:
     """The result of the search.
 
     solution: a path set, if one was found; not necessarily optimal.
-    infeasible: no state with all vehicles at their targets can be reached.
+    infeasible: whether no state with all vehicles at their targets can be reached.
     """
 
     solution: Solution | None = None
@@ -37,7 +37,7 @@ class Reachability:
 
 @attrs.frozen
 class _Step:
-    """The joint move that first reached a state; `order` permutes the vehicles into its order."""
+    """The joint move from `state` that first reached another; `order` re-sorts the vehicles."""
 
     state: State
     moves: tuple[int, ...]
@@ -86,10 +86,10 @@ def _can_be_made_one_after_another(table: MoveTable) -> bool:
     """Return whether the moves of any step could also be made one after another.
 
     True if no vehicle moves into a cell that another one is leaving, and if passing a waiting
-    vehicle is forbidden only together with every overlap of footprints. It is true for a computed
+    vehicle is forbidden only together with every overlap of footprints. Also true for a computed
     table that holds for any lateness, because one vehicle may then wait until the other has
-    arrived. With limited lateness vehicles may follow each other that could not move one by one.
-    `closing` needs two vehicles that both move, so it never blocks a single one.
+    arrived. With limited lateness, vehicles that cannot move one by one may follow each other.
+    `closing` needs two moving vehicles, so it never blocks a single one.
     """
     kinds, conflicts = table.model.kinds, table.model.table
     if "geometric" in kinds:
@@ -113,7 +113,7 @@ def _single_moves(table: MoveTable, state: State) -> Iterator[tuple[int, ...]]:
 def _joint_moves(
     table: MoveTable, state: State, chosen: tuple[int, ...] = (), forbidden: int = 0
 ) -> Iterator[tuple[int, ...]]:
-    """Yield all joint moves without conflicts."""
+    """Yield all conflict-free joint moves."""
     if len(chosen) == len(state):
         yield chosen
         return

@@ -1,12 +1,12 @@
 """The conflict table computed from geometry: pairs of moves that bring two bodies too close.
 
 Two vehicles make one move each in the same step, from cells that lie an offset apart. Their
-clearance is the smallest gap between bumpers over all moments at which the bodies are less than
-`clearance_across_m` apart sideways:
+clearance is the smallest gap between bumpers while the bodies are less than `clearance_across_m`
+apart sideways. The minimum is taken over
 
 - all pairs of moments of both moves, beginning and end included, if each may be late by any amount
   (`BodyGeometry.lateness_s` is None): one may not have started, or may have arrived long ago;
-- all pairs of moments that may coincide if neither move is later than `lateness_s`.
+- otherwise, all pairs of moments that may coincide if neither move is later than `lateness_s`.
 
 The computation is conservative. A move is cut into parts of 1/160 of its time, 24 ms; during a
 part the body stays in the box around all its outlines (`swept_bodies.outline`), and two parts count
@@ -57,7 +57,7 @@ def min_clearances(geometry: BodyGeometry, paths: Mapping[Cell, Floats] | None =
 
     Returns:
         [m], (7, 7, D, D): columns from A's cell to B's (-3 to 3), lanes (-3 to 3), and A's and B's
-        displacement by their number in `displacements(2)`; D is 9, or 5 if `paths` are only those
+        displacement, in the order of `displacements(2)`; D is 9, or 5 if `paths` are only those
         of mode 1. Negative: bodies overlap along the road. Infinite: bodies are never close
         sideways.
     """

@@ -1,7 +1,7 @@
 """Sizes and motions of bodies, from which conflicts are computed (`conflict_table`).
 
-A vehicle's position is the middle of its front bumper along the road and its body's centre across
-it, in metres from its position in the cell that it leaves. A body points in its direction of
+A vehicle's position is that of its front bumper along the road and of its body's centre across it,
+in metres from its position in the cell that it leaves. A body points in its direction of
 travel, so it turns while it changes lanes; `outline` covers it with axis-aligned boxes.
 """
 
@@ -51,16 +51,16 @@ def outline(
 ) -> Floats:
     """Return axis-aligned boxes around a body that turns along its path.
 
-    Edges may be interpolated linearly between samples: each box is enlarged by an upper bound of
+    Edges may be interpolated linearly between samples: each box is enlarged by an upper bound on
     the interpolation error, an eighth of the largest second difference. (At 0.1 s and 6 m/s2 that
-    is 8 mm.) Speeds are central differences of fourth order.
+    is 8 mm.) Velocities are fourth-order central differences.
 
     Args:
         path: positions (n + 1, 2) [m], evenly spaced in time, n >= 2; at rest at both ends.
-        duration_s: time of the whole path.
-        speed_mps: of the lattice; determines how far a body turns.
-        length_m: of the body.
-        width_m: of the body.
+        duration_s: duration of the whole path.
+        speed_mps: speed of the lattice; determines how far a body turns.
+        length_m: length of the body.
+        width_m: width of the body.
 
     Returns:
         (n + 1, 4) [m]: rear, front, right and left edge.
@@ -94,14 +94,14 @@ class BodyGeometry:
     """Sizes, times and clearances that decide whether two moves bring two bodies too close.
 
     Two bodies are *too close* if at some moment they are less than `clearance_across_m` apart
-    sideways and their bumpers less than `clearance_along_m`. The defaults are the paper's sizes and
-    times.
+    sideways and the gap between their bumpers is below `clearance_along_m`. The defaults are the
+    paper's sizes and times.
 
-    The minimum gap for which a vehicle's tracker follows its plan is 3 m (`tracking.min_gap_m`);
+    A vehicle's tracker needs a gap of at least 3 m to follow its plan (`tracking.min_gap_m`);
     the default clearance of 5 m leaves 2 m for errors and for braking. Two vehicles that follow
     each other are 10 m apart when both are on time, 6.4 m when the one ahead is 0.5 s late.
-    Bodies at rest on neighbouring lanes are 1.7 m apart. For any lateness, all clearances across
-    from 0 to 1.4 m give the same table.
+    Bodies at rest in neighbouring lanes are 1.7 m apart. With unlimited lateness, all values of
+    `clearance_across_m` from 0 to 1.4 m give the same table.
     """
 
     length_m: float = field(default=5.0, validator=within(1, 30))
@@ -114,15 +114,15 @@ class BodyGeometry:
     slot_s: float = field(default=4.0, validator=within(0.5, 60))
     """Time from the start of one step to that of the next, T_F."""
     speed_mps: float = field(default=15.0, validator=within(1, 60))
-    """Speed of the lattice, v_F; the faster, the less bodies turn."""
+    """Speed of the lattice, v_F; the higher the speed, the less bodies turn."""
     clearance_along_m: float = field(default=5.0, validator=within(0, 200))
     clearance_across_m: float = field(default=0.3, validator=within(0, 10))
     profile_error_along_m: float = field(default=0.6, validator=within(0, 50))
     """Upper bound on how much smaller gaps are with the actual motions than with the default
-    profile. The default covers minimum-jerk trajectories within the default limits of acceleration
+    profile. The default covers minimum-jerk trajectories within the default acceleration limits
     (0.55 m)."""
     profile_error_across_m: float = field(default=0.1, validator=within(0, 10))
-    """The same across the road (0.05 m)."""
+    """The same bound across the road (0.05 m)."""
     lateness_s: float | None = field(
         default=None, validator=attrs.validators.optional(within(0, 60))
     )
@@ -196,14 +196,14 @@ class BodyGeometry:
         }
 
     def outline(self, path: Floats) -> Floats:
-        """Return what a body covers on a path (n + 1, 2) [m] of `move_s`; see `outline`."""
+        """Return the boxes around a body on a path (n + 1, 2) [m] of `move_s`; see `outline`."""
         return outline(path, self.move_s, self.speed_mps, self.length_m, self.width_m)
 
     def _min_gaps_m(self) -> tuple[float, float]:
         """Return the minimum gaps along and across between vehicles with disjoint footprints.
 
-        Their rectangles of cells are separated by a column or by a lane, and bodies extend beyond
-        their rectangles only because they turn.
+        Disjoint footprints, rectangles of cells, have no column or no lane in common, and bodies
+        extend beyond their rectangles only because they turn.
         """
         along_m = across_m = 0.0
         for (c, lane), path in self.paths().items():
@@ -226,9 +226,9 @@ class BodyGeometry:
     def _max_lateness_s(self, along_m: float, across_m: float) -> float:
         """Return the maximum lateness at which moves keep clear of those of the next step.
 
-        A late move ends after moves of the next step have begun. The rest of its distance and the
-        distance that they have travelled add up to at most the distance travelled in the overlap
-        of both, since the fraction of distance is convex in the first half of a move.
+        A late move overlaps the next step's moves in time. Its remaining distance plus the distance
+        they have covered is at most what a move covers in the overlap from rest, since the covered
+        fraction is convex in time in the first half of a move.
         """
         share = min(
             (along_m - self.clearance_along_m) / self.pitch_m,

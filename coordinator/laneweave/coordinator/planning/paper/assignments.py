@@ -5,23 +5,23 @@ The cost matrix C holds the formation relative distance, FRD (equation `rd`):
     d^r_ij = l^o N^{r,o}_ij + l^s N^{r,s}_ij
 
 N^{r,o} counts the oblique edges of a shortest path, the smaller of the two coordinate differences;
-N^{r,s} counts its straight edges, the rest of the larger one. The paper sets l^s = l^o = 1, which
-is the number of steps in mode 2. In mode 1 an oblique edge takes two steps, hence l^o = 2 there.
-TAPPA stops as soon as the next assignment costs no less than the best path set, which is correct
+N^{r,s} counts its straight edges, the rest of the larger one. The paper sets l^s = l^o = 1, so that
+FRD counts steps in mode 2. In mode 1 an oblique edge takes two steps, hence l^o = 2 there.
+TAPPA stops once the next assignment costs at least as much as the best path set, which is correct
 only if C is a lower bound on steps; other weights are rejected.
 
 The preference matrix P says which vehicle may be assigned to which target. The paper multiplies
-the costs of forbidden pairs by a large number M. Here P is boolean and forbidden pairs do not exist
-for the assignment, so the result does not depend on a choice of M.
+the costs of forbidden pairs by a large number M. Here P is boolean and forbidden pairs are never
+assigned, so the result does not depend on a choice of M.
 
 Assignments are enumerated by Murty's method: the set of all assignments is split into parts that
-are described by a prefix of fixed pairs and by forbidden targets for the row after it. Taking the
-best assignment out of its part splits the part again. Each new part differs from its parent in one
+are described by a prefix of fixed pairs and by forbidden targets for the next row. Taking the best
+assignment out of its part splits the part again. Each new part differs from its parent in one
 freed vehicle, so its best assignment is found by one shortest augmenting path from the parent's
 dual variables.
 
-Costs are whole numbers. Among assignments of equal cost the lexicographically smallest vector
-comes first: the cost is extended by the vector read as a number with one digit per vehicle, which
+Costs are whole numbers. Ties between assignments go to the lexicographically smallest vector:
+the cost is extended by the vector read as a number with one digit per vehicle, which
 makes all costs distinct and the order independent of the algorithm.
 """
 
@@ -59,7 +59,7 @@ class Weights:
         return cls(straight=1, oblique=2 if mode == 1 else 1)
 
     def checked(self, mode: Mode) -> Weights:
-        """Return the weights.
+        """Return the weights if they are valid in this mode.
 
         Raises:
             BadInputError: they give no lower bound on steps in this mode.
@@ -82,7 +82,7 @@ def frd(vehicle: Cell, target: Cell, weights: Weights) -> int:
 
 
 def cost_matrix(vehicles: Sequence[Cell], targets: Sequence[Cell], weights: Weights) -> IntMatrix:
-    """Return C: row i, column j holds the distance of vehicle i to target j."""
+    """Return C: row i, column j holds the distance from vehicle i to target j."""
     rows = [[frd(v, t, weights) for t in targets] for v in vehicles]
     return np.array(rows, dtype=np.int64).reshape(len(vehicles), len(targets))
 
@@ -101,7 +101,7 @@ def matrices(
     """Return the cost matrix C and the preference matrix P of a request.
 
     Blocked cells may make a path longer than the formation relative distance, or impossible. Both
-    only improve the lower bound: C takes the larger number, P drops unreachable targets.
+    only improve the lower bound: C takes the longer distance, and P drops unreachable targets.
     """
     starts = [vehicle.cell for vehicle in request.vehicles]
     costs = cost_matrix(starts, request.targets, weights)
@@ -149,7 +149,7 @@ class _Matching:
     def augment(self, costs: Sequence[Row], row: int, fixed: int, banned: frozenset[int]) -> bool:
         """Match the free `row` along a shortest augmenting path; return whether there is one.
 
-        Rows before `fixed` keep their targets; `row` itself must not take a `banned` one.
+        Rows before `fixed` keep their targets; `row` itself must not take a `banned` target.
         """
         distance: dict[int, int] = {}
         reached_from: dict[int, int] = {}
@@ -192,7 +192,7 @@ class _Matching:
 
 @attrs.define(order=True)
 class _Part:
-    """A part of the set of all assignments, ordered by the cost of its best one."""
+    """A part of the set of all assignments, ordered by the cost of its best assignment."""
 
     key: int
     matching: _Matching = attrs.field(order=False)
@@ -231,7 +231,7 @@ def assignments(
 
 
 def _extended_costs(costs: IntMatrix, allowed: BoolMatrix, scale: int) -> list[Row]:
-    """Return the costs with the tie-breaking digits, then a row of zeros per idle target."""
+    """Return the costs with tie-breaking digits, followed by a row of zeros per idle target."""
     vehicle_count, target_count = costs.shape
     rows = []
     digit = scale

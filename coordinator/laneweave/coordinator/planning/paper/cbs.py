@@ -6,8 +6,8 @@ a node's conflict list. `Improvements` change which constraints the children of 
 the search early (`limit`).
 
 Among the shortest paths of a vehicle, SPPA chooses one with the fewest conflicts with the paths of
-the other vehicles (`shortest_paths`); the paper leaves this choice open. In the root, paths are
-planned without regard to others.
+the other vehicles (`shortest_paths`); the paper leaves this choice open. At the root, paths are
+planned independently.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ from laneweave.coordinator.planning.shortest_paths import (
 )
 
 Limit = Callable[[], float]
-"""Returns the cost that a path set must be below; called before each node."""
+"""Function that returns the cost that a path set must stay below; called before each node."""
 
 
 @attrs.frozen
 class Improvements:
     """Additions to Algorithms 1 and 2; without any of them the algorithms are the paper's.
 
-    The result stays exact with each of them. `benchmarks/planner_switches.py` measures their
+    The result stays exact with each addition. `benchmarks/planner_switches.py` measures their
     effects; docs/PLANNING.md has the figures.
 
     cutoff: CBSA of an assignment ends as soon as it cannot find a path set that costs less than
         C'* (`tappa`).
-    cardinal: a node gets children for one of its conflicts, the one that raises their costs most,
-        instead of for all of them (`constraints`).
-    bicliques: the constraints of its two children are sets of moves, and no path set satisfies
-        both (`constraints`). Has an effect with `cardinal` only.
+    cardinal: a node gets children for only one of its conflicts, the one that raises their costs
+        most, instead of for all conflicts (`constraints`).
+    bicliques: the constraints of a node's two children are sets of moves, and no path set
+        satisfies both (`constraints`). Has an effect only with `cardinal`.
     joint: when a tree grows large, A* over the cells of all vehicles runs in parallel
         (`joint_search`).
     """
@@ -65,7 +65,7 @@ class Improvements:
 
     @classmethod
     def none(cls) -> Improvements:
-        """Return the algorithms as the paper prints them."""
+        """Return no improvements: the algorithms as the paper prints them."""
         return cls(cutoff=False, cardinal=False, bicliques=False, joint=False)
 
 
@@ -73,13 +73,13 @@ class Improvements:
 class Node:
     """A node N_i of the constraint tree.
 
-    constraints: of this node and of all nodes above it.
+    constraints: the constraints of this node and of all its ancestors.
     paths: the path set M_i.
-    conflicts: of the path set.
+    conflicts: the conflicts in the path set.
     diagrams: all shortest paths of each vehicle under the constraints; M_i is chosen from them.
-    number: i; nodes count from 1 in the order in which they are made.
+    number: i, counted from 1 in order of creation.
     parent: number of the parent; 0: none.
-    expanded: whether its children have been made.
+    expanded: whether the node's children have been created.
     """
 
     constraints: tuple[Constraint, ...]
@@ -109,7 +109,7 @@ class ConstraintTree:
     """The constraint tree T of one assignment.
 
     nodes: all nodes, if they are recorded.
-    solution: the node that ended the search, if there is one.
+    solution: the node with the optimal path set, if it was found.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class ConstraintTree:
         return None
 
     def _add(self, node: Node) -> None:
-        """Add a node to T; among equal L_i the one with the fewest conflicts is taken first."""
+        """Add a node to T; ties in L_i go to the node with the fewest conflicts."""
         self._count += 1
         node.number = self._count
         heapq.heappush(self._open, (node.cost, len(node.conflicts), node.number, node))
@@ -208,7 +208,7 @@ class ConstraintTree:
             yield from constraints_of(table, conflict, moves)
 
     def _most_cardinal(self, node: Node) -> Conflict:
-        """Return the conflict that raises the cost of most children; of equal ones the first."""
+        """Return the conflict that raises the cost of the most children; ties go to the first."""
         table = self._problem.table
         best, highest = node.conflicts[0], -1
         for conflict in node.conflicts:
@@ -220,7 +220,7 @@ class ConstraintTree:
         return best
 
     def _child(self, node: Node, added: Constraint) -> Node | None:
-        """Apply SPPA under one more constraint; None: a vehicle has no path."""
+        """Return the child with one more constraint, by SPPA; None: a vehicle has no path."""
         problem, table = self._problem, self._problem.table
         constraints = (*node.constraints, added)
         diagrams, paths = list(node.diagrams), list(node.paths)
@@ -275,7 +275,7 @@ class ConstraintTree:
 
 
 def _is_among(path: Path, diagram: Diagram) -> bool:
-    """Return whether a path is one of the diagram's."""
+    """Return whether a diagram contains a path."""
     return len(path) == diagram.cost and all(
         layer >> move & 1 for layer, move in zip(diagram.layers, path, strict=True)
     )

@@ -2,21 +2,21 @@
 
 A conflict C^f of two vehicles has an entry for each of them, written {N | (x, y), step, id} or {E |
 (x1, y1), (x2, y2), step, id}; the constraint C^t derived from it is written in the same way and
-forbids that vehicle to arrive at the node, or to travel along the edge, in that step.
+forbids that vehicle to enter the node, or to travel along the edge, in that step.
 
 The paper's children for all conflicts of a node overlap: a solution may be found below several of
 them. One conflict is enough, since a solution contains at most one of its two moves. Improvements
-of the paper's tree (`cbs.Improvements`) use this:
+to the paper's tree (`cbs.Improvements`) use this:
 
 - Cardinal conflicts first (Boyarski et al., IJCAI 2015): where all shortest paths of both vehicles
   conflict, both children cost more than their parent (`cardinality`).
 - Bicliques (Li et al., ICAPS 2019, call them mutex propagation and positive constraints): S_A and
   S_B may be any sets of moves in the same step such that every move of S_A conflicts with every
-  move of S_B. Either A makes no move of S_A, or it makes one; then no other vehicle makes a move
-  that conflicts with all of S_A, which includes S_B. No solution satisfies both
+  move of S_B. Either A makes no move of S_A, or A makes one and no other vehicle makes a move that
+  conflicts with all of S_A, which excludes all of S_B. No solution satisfies both
   (`disjoint_constraints`).
-- Likewise, either a vehicle has finally arrived before a step, and from then on no vehicle crosses
-  its target, or it has not.
+- Likewise, either a vehicle has finally arrived before a step and no other vehicle crosses its
+  target from then on, or it has not arrived.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CARDINAL = 2
 class Conflict(NamedTuple):
     """Two vehicles whose moves in a step conflict; `first` < `second`, steps count from 0.
 
-    on_edge: whether it is not a node conflict. Node conflicts sort first in each step.
+    on_edge: false for a node conflict. Node conflicts sort first in each step.
     """
 
     step: int
@@ -44,15 +44,15 @@ class Conflict(NamedTuple):
 
 
 class Constraint(NamedTuple):
-    """The constraint that a child adds to those of its parent; steps count from 0.
+    """The constraint that a child adds to its parent's constraints; steps count from 0.
 
     The paper's constraints forbid a set of moves to one vehicle: `own`. `others` and `arrived`
     belong to the improvement `bicliques`.
 
-    arrived is None: in this step `vehicle` must not make a move of `own`, and no other vehicle one
-        of `others`.
+    arrived is None: in this step, `vehicle` must not make a move in `own`, and no other vehicle
+        may make a move in `others`.
     arrived is True: `vehicle` has finally arrived at its target before this step, and from this
-        step on, no other vehicle makes a move of `others`.
+        step on, no other vehicle makes a move in `others`.
     arrived is False: `vehicle` has not finally arrived before this step. It may wait at its target
         in this step and leave it later.
     """
@@ -116,7 +116,7 @@ def constraints_of(
 ) -> tuple[Constraint, Constraint]:
     """Return the constraints C^t of both vehicles of a conflict (paper, definition `constraint`).
 
-    A node conflict forbids all moves to the node, any other one the move that is an edge.
+    A node conflict forbids all moves to the node; any other conflict forbids only the move itself.
     """
     first, second = (
         1 << move if conflict.on_edge else table.leading_to(1 << table.landing(move))
@@ -129,7 +129,7 @@ def constraints_of(
 
 
 def is_at_node(table: MoveTable, a: int, b: int) -> bool:
-    """Return whether two conflicting moves are a node conflict, the first of the kinds."""
+    """Return whether two conflicting moves form a node conflict, the first of the kinds."""
     return "node" in table.model.kinds and table.landing(a) == table.landing(b)
 
 
@@ -159,8 +159,8 @@ def cardinality(
 ) -> int:
     """Return how many children of a conflict are certain to cost more than their parent.
 
-    2: cardinal, all shortest paths of both conflict in this step. 1: semi-cardinal, all shortest
-    paths of one conflict with the move of the other.
+    2: cardinal, all shortest paths of both vehicles conflict in this step. 1: semi-cardinal, all
+    shortest paths of one vehicle conflict with the other's move.
     """
     first = diagrams[conflict.first].layer(conflict.step)
     second = diagrams[conflict.second].layer(conflict.step)
@@ -197,7 +197,7 @@ def disjoint_constraints(
 def _side_to_branch_on(sets: tuple[int, int], layers: tuple[int, int]) -> int:
     """Return the vehicle (0 or 1) whose set covers the larger share of its shortest paths.
 
-    A share of 1 means that its cost rises.
+    If the share is 1, forbidding the set raises the vehicle's cost.
     """
     first, second = (
         (chosen & layer).bit_count() / layer.bit_count()

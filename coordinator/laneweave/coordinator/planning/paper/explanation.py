@@ -1,7 +1,7 @@
 """A record of a run of Algorithms 1 and 2: assignments, constraint trees, stop reason.
 
-The trees are the paper's literal ones if they are small, otherwise those of the improved
-algorithms.
+Small trees are literally the paper's; if they grow large, the trees of the improved algorithms
+are recorded instead.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from laneweave.coordinator.planning.problem import MoveTable, Problem, Solution
 from laneweave.coordinator.planning.request import PlanRequest
 
 MAX_LITERAL_NODES: Final = 150
-"""Limit on nodes of literal trees; beyond it the improved ones are recorded."""
+"""Node limit for literal trees; beyond it, improved trees are recorded."""
 MAX_NODES: Final = 50_000
-"""Limit on nodes of improved trees; the record ends there."""
+"""Node limit for improved trees; the record ends there."""
 
 NodeStatus = Literal["expanded", "solution", "open"]
 """open: still in T when the search ended."""
@@ -35,8 +35,8 @@ NodeStatus = Literal["expanded", "solution", "open"]
 class ExplainedNode:
     """A node N_i of a constraint tree.
 
-    number, parent: i; 0: the root has no parent.
-    constraint: the one that it adds to those of its parent; empty: the root.
+    number, parent: i of this node and of its parent; the root's parent is 0.
+    constraint: the constraint that it adds to its parent's; empty for the root.
     conflicts: its conflict list in the paper's notation.
     path_map: the relative path map of its path set M_i.
     cost: L_i.
@@ -59,7 +59,7 @@ class ExplainedAssignment:
     cost: C_k.
     best_cost: C'_k; None: no path set that costs less than C'* was found.
     best_so_far: C'* after this assignment.
-    nodes: the constraint tree in the order in which its nodes were made.
+    nodes: the nodes of the constraint tree in order of creation.
     """
 
     targets: tuple[int, ...]
@@ -71,10 +71,10 @@ class ExplainedAssignment:
 
 @attrs.frozen
 class Explanation:
-    """The run of Algorithm 1.
+    """The record of a run of Algorithm 1.
 
     literal: whether the trees are those of the paper, with all improvements off.
-    optimal: whether C'* is proven optimal, or that there is no path set.
+    optimal: whether it is proven that C'* is optimal or that there is no path set.
     joint_bound: lower bound proven by the joint search; 0: none.
     joint_cost: C'* if the joint search found it, else None.
     next_cost: C_{k+1}; None: there is no further assignment, or it was not examined.
@@ -90,7 +90,7 @@ class Explanation:
 
     @property
     def stop_reason(self) -> str:
-        """Return one line that says why no further assignment was tried."""
+        """Return one line explaining why no further assignment was tried."""
         k = len(self.assignments)
         best = "infinite" if math.isinf(self.best_cost) else f"{self.best_cost:g}"
         if not self.optimal:

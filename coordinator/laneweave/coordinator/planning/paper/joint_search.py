@@ -1,7 +1,7 @@
-"""Improvement of TAPPA: A* over the cells of all vehicles together.
+"""Improvement to TAPPA: A* over the cells of all vehicles together.
 
 Where there are few empty cells, most combinations of cheapest paths conflict, and constraint trees
-grow without bound; an unsolvable tree never ends. All vehicles planned together (one meta-agent, in
+grow without bound if there is no solution. All vehicles planned together (one meta-agent, in
 the terms of Sharon et al., AIJ 219, 2015, section 7) have a finite state space, which is small in
 these cases. Vehicles with the same eligible targets form a team and are interchangeable, so one
 search covers all assignments: its lower bound holds for every C'_k, and its path set is optimal.
@@ -27,7 +27,7 @@ from laneweave.coordinator.planning.problem import Problem, Solution, bits
 
 Cells = tuple[int, ...]
 Labels = tuple[int, ...]
-"""2 * team + (1 if active), for each cell that is occupied."""
+"""2 * team + (1 if active), for each occupied cell."""
 State = tuple[Cells, Labels]
 
 _MAX_GOALS = 2_000
@@ -36,15 +36,15 @@ _MAX_MOVES = 2_000_000
 
 
 JointMove = tuple[Cells, Callable[[Labels], Labels]]
-"""The cells before it, sorted, and a function that picks their labels from those after it, which
-are given twice: as they are, and with all vehicles active. Moving vehicles are active before."""
+"""The sorted cells before the move, and a function that picks their labels from two copies of the
+labels after it: as they are, and with all vehicles active. Moving vehicles are active before it."""
 
 
 class JointSearch:
-    """The search, which runs in portions.
+    """The joint search, which runs in portions.
 
-    lower_bound: on the path sets of all assignments; infinite: there is none.
-    solution: the optimal path set, when it is found.
+    lower_bound: lower bound on the cost of all path sets; infinite: there is none.
+    solution: the optimal path set, once found.
     ended: whether the search is complete or has reached its limits.
     """
 
@@ -79,7 +79,7 @@ class JointSearch:
         self._add_goals(teams, sizes)
 
     def work(self, moves: int) -> None:
-        """Make about `moves` more joint moves; an excess is deducted from the next call."""
+        """Make about `moves` more joint moves; any excess is deducted from the next call."""
         self._credit += moves
         while self._credit > 0 and not self.ended:
             before = self._move_count
@@ -106,7 +106,7 @@ class JointSearch:
             self.lower_bound, self.ended = math.inf, True
 
     def _open_state(self, state: State, cost: int) -> bool:
-        """Add a state to the open ones; return whether it can be reached from the start."""
+        """Add a state to the open list; return whether it can be reached from the start."""
         steps = active = inactive_steps = 0
         for cell, label in zip(*state, strict=True):
             distance = self._distance[label >> 1].get(cell)
@@ -150,7 +150,7 @@ class JointSearch:
             self.ended = True
 
     def _joint_moves_to(self, cells: Cells) -> list[JointMove]:
-        """Return all joint moves without conflicts that end in these cells."""
+        """Return all conflict-free joint moves that end in these cells."""
         found = self._joint_moves.get(cells)
         if found is not None:
             return found
@@ -176,7 +176,7 @@ class JointSearch:
         return found
 
     def _moves_into_cell(self, cell: int) -> list[tuple[int, int, int]]:
-        """Return the moves that end in a cell: as a set, with its start and the excluded moves."""
+        """Return each move into a cell as a one-bit set, its start, and the moves it excludes."""
         found = self._moves_into.get(cell)
         if found is None:
             table = self._problem.table

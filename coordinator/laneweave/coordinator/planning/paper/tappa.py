@@ -1,12 +1,12 @@
 """TAPPA, the target assignment and path planning algorithm (paper, Algorithm 1).
 
 Assignments A_1, A_2, ... are taken in order of their cost C_k. CBSA finds the best path set P_k of
-each, with cost C'_k (`cbs`). As soon as the next assignment costs no less than C'*, the cost of the
-best path set so far, that path set P* is optimal.
+each, with cost C'_k (`cbs`). As soon as the next assignment costs at least C'*, the cost of the
+best path set P* so far, P* is optimal.
 
 Two improvements (`cbs.Improvements`) end CBSA and the sequence of assignments earlier: CBSA looks
 only for path sets that cost less than C'*; and a search over the cells of all vehicles together
-(`joint_search`), which runs beside large constraint trees, has a lower bound for every C'_k.
+(`joint_search`), which runs beside large constraint trees, gives a lower bound on every C'_k.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from laneweave.coordinator.planning.problem import Problem, Search, Solution
 from laneweave.coordinator.planning.request import PlanRequest
 
 _JOINT_AFTER = 32
-"""Number of nodes before the joint search begins."""
+"""Number of nodes after which the joint search begins."""
 _MAX_JOINT_MOVES_PER_NODE = 150
 """Upper bound on the joint moves made at a node; node n makes min(n, bound) of them. The joint
-search then takes up to about two thirds of the time. It ends first in crowded blocks, the trees
-end first in others."""
+search then takes up to about two thirds of the time. In crowded blocks it finishes first; in
+others the trees do."""
 
 
 @attrs.frozen
@@ -54,7 +54,7 @@ class Tappa(Search):
 
     best: the best path set P* so far; its cost is C'*.
     tried: k, the number of assignments to which CBSA was applied.
-    attempts: the record of each of them, if recording is on.
+    attempts: the record of each of these assignments, if recording is on.
     next_cost: C_{k+1}; None: there is no further assignment.
     """
 
@@ -73,7 +73,7 @@ class Tappa(Search):
         Args:
             request: what to plan.
             problem: the same request in the form that the searches use.
-            weights: of the formation relative distance.
+            weights: weights of the formation relative distance.
             budget: deadline and limit on nodes.
             improvements: additions to the paper's algorithms; None: all.
             record: whether to keep all constraint trees.

@@ -1,4 +1,4 @@
-"""The planner of the rolling operation: a path for every vehicle of the stream, in each slot.
+"""The planner for rolling operation: in each slot, a path for every vehicle in the stream.
 
 Entry point: `path_search`. `rolling_validator` checks its plans and shares no code with the search.
 Imported by `coordinator.rolling`.

@@ -38,14 +38,14 @@ class Table(NamedTuple):
     """The moves of all vehicles, and the penalties of conflicting moves."""
 
     load: Singles
-    """Sum of the penalties of all vehicles whose moves conflict with this one, and `FIXED` for
-    forbidden moves; (slots, displacements, lanes, columns)."""
+    """Sum of the penalties of all vehicles whose moves conflict with this move, plus a multiple of
+    `FIXED` if it is forbidden; (slots, displacements, lanes, columns)."""
     vehicle: NDArray[np.int32]
-    """The vehicle in a cell at the beginning of a slot, -1: none; (slots, lanes, columns)."""
+    """Vehicle in each cell at the beginning of each slot, -1: none; (slots, lanes, columns)."""
     move: NDArray[np.int8]
     """Displacement of that vehicle in the slot; same shape."""
     offsets: Ints
-    """Column, lane and displacement of a conflicting move, and the factor of its penalty;
+    """Column, lane and displacement of a conflicting move, and its penalty factor;
     (conflicts, 4)."""
     first: Ints
     """Index in `offsets` of the first conflict of each displacement; (displacements + 1)."""
@@ -58,25 +58,25 @@ class Table(NamedTuple):
 
 
 class Paths(NamedTuple):
-    """The vehicles, by column, and their paths; first index: vehicle."""
+    """The vehicles, sorted by column, and their paths; the first index is the vehicle."""
 
     column: Ints
-    """At the beginning of each slot; (vehicles, slots + 1)."""
+    """Column at the beginning of each slot; (vehicles, slots + 1)."""
     lane: Ints
     move: NDArray[np.int8]
     """Displacements; (vehicles, slots)."""
     slots: Ints
-    """Number of slots of the path up to the end of the road."""
+    """Number of slots in the path up to the end of the road."""
     target_lane: Ints
     held: Bools
     missing_cost: Floats
     """Cost of ending off the target lane."""
     min_cost: Floats
-    """Lower bound on the cost of paths that end on the target lane."""
+    """Lower bound on the cost of paths that end in the target lane."""
     can_arrive: Bools
-    """Whether there are enough slots to reach the target lane without other vehicles."""
+    """Whether there are enough slots to reach the target lane, ignoring other vehicles."""
     penalty: Ints
-    """Cost of a conflict with this vehicle, for others."""
+    """Cost to other vehicles of a conflict with this one."""
     cost: Floats
     placed: Bools
     """Whether the path is in the table."""
@@ -102,11 +102,11 @@ class Saved(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of the search, allocated once."""
+    """Working memory of the search, allocated once."""
 
     saved: Saved
     marked: Bools
-    """Vehicles whose paths are saved."""
+    """Whether each vehicle's path is saved."""
     value: Singles
     """Minimum cost of reaching a cell; (slots + 1, lanes, columns around the start, and one unused
     column on either side)."""
@@ -119,14 +119,14 @@ class Scratch(NamedTuple):
     chosen: Ints
     off_lane: Ints
     costly: Ints
-    """The work lists each hold up to all vehicles."""
+    """These work lists have room for all vehicles."""
 
 
 class Window(NamedTuple):
     """All arrays for planning one slot."""
 
     low: int
-    """Column of the lattice that is the window's lowest."""
+    """Lattice column of the window's lowest column."""
     table: Table
     paths: Paths
     costs: Costs
@@ -140,7 +140,7 @@ def window(
     vehicles: Sequence[StreamVehicle],
     blocked: Collection[Cell],
 ) -> Window:
-    """Return the arrays for vehicles on the road, sorted by column, without paths."""
+    """Return the arrays, without paths yet, for the vehicles on the road, sorted by column."""
     start_m, end_m = road.sorting_m
     # Upper bound on the moves of a vehicle: the slots that it takes to pass S3.
     reach = max(0, int((end_m - start_m) / road.advance_m) + 1)

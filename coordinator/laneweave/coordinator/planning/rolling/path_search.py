@@ -1,14 +1,14 @@
 """Planning of a whole stream: a complete path for every vehicle, replanned each slot.
 
 The problem is that of the paper's Section 3, without formations: every vehicle on the road gets a
-path from its cell to the end of the road, in one window of the lattice that moves with it. The
+path from its cell to the end of the road, in one window that moves with the lattice. The
 paths never conflict, so that each plan can be executed. A vehicle whose path misses its lane is
 planned again in the next slot.
 
 A path is found by exact dynamic programming over (slot, column, lane) around all others. If a
 vehicle then misses its lane, *ejection chains* make room: the vehicle takes a path through others
-at a penalty, the vehicles that it hits are rerouted in turn, and the chain is kept if the sum of
-costs decreases. In between, neighbours are removed and rerouted in another order
+at a penalty, the vehicles that it hits are rerouted in turn, and the chain is kept if the total
+cost decreases. In between, neighbours are removed and rerouted in another order
 (large-neighbourhood search). Paths are carried over from slot to slot.
 
 Conflicts are those of the `ConflictModel`, as for the other planners.
@@ -48,7 +48,7 @@ class StreamPlanner:
     """Plans a stream slot by slot; a plan depends only on the arguments of `plan` and the seed."""
 
     def __init__(self, road: StreamRoad, costs: StreamCosts | None = None, seed: int = 0) -> None:
-        """Prepare; `seed` determines all random choices."""
+        """Prepare the planner; `seed` determines all random choices."""
         self.road = road
         self.costs = costs or StreamCosts()
         self._seed = seed
@@ -65,11 +65,11 @@ class StreamPlanner:
         Args:
             slot: number of the slot; in slot 0, column 0 is at the start of the road.
             vehicles: all vehicles on the road, each in a different cell.
-            before: an earlier plan; vehicles start from its paths that are still valid.
+            before: an earlier plan; the search starts from its paths that are still valid.
             blocked: cells that must not be entered; a vehicle in one may leave it.
 
         Raises:
-            ValueError: two vehicles are in one cell, or one is off the lanes.
+            ValueError: two vehicles share a cell, or one is off the lanes.
         """
         began_s = time.monotonic()
         _check(self.road, vehicles)

@@ -15,13 +15,13 @@ FIXED = 100_000
 PENALTY = 8
 """Initial penalty of a conflict with a vehicle."""
 ENTERING = 8
-"""Factor of the penalty of a conflicting move. It is 1 for waiting in the cell in which the other
+"""Penalty factor of a conflicting move. The factor is 1 for waiting in the cell in which the other
 vehicle waits, so that taking its place is not penalized again in each slot."""
 MAX_EJECTED = 100
 """Maximum number of vehicles hit by one ejection chain."""
 _IMPASSABLE = 5e3
-"""Cost from which paths are rejected, and factor of forbidden conflicts. Paths without conflicts
-cost at most a hundredth of it; a conflict with a `FIXED` vehicle costs more."""
+"""Cost at which paths are rejected, and factor of forbidden conflicts. Conflict-free paths cost at
+most a hundredth of this; a conflict with a `FIXED` vehicle costs more than this."""
 _UNREACHED = 1e9
 NO_PATH = 1e9
 """Cost of a vehicle without a path."""
@@ -57,11 +57,11 @@ def _relax(here, there, load, base, scale):
 
 @njit(cache=True, nogil=True)
 def find_path(table, paths, costs, v, softness, upper_bound, scratch):
-    """Set the cheapest path of a vehicle that is not in the table; return its own cost.
+    """Set the cheapest path of a vehicle that is not in the table; return the path's own cost.
 
-    Dynamic programming over slots, lanes and columns, for a path below `upper_bound`. With a
-    softness of 0 conflicts are forbidden; otherwise a conflict costs softness per `PENALTY`, and
-    only `FIXED` vehicles are avoided. Without such a path: returns `NO_PATH` and sets nothing.
+    Dynamic programming over slots, lanes and columns, for a path below `upper_bound`. If softness
+    is 0, conflicts are forbidden; otherwise a conflict costs softness per `PENALTY`, and only
+    `FIXED` vehicles are avoided. If there is no such path, returns `NO_PATH` and sets nothing.
     """
     load, steps, of_move, value = table.load, table.steps, costs.of_move, scratch.value
     scratch.searches[0] += 1
@@ -151,7 +151,7 @@ def own_cost(paths, costs, v):
 
 @njit(cache=True, nogil=True)
 def follow(table, paths, costs, v, cells):
-    """Set an earlier path if it is still valid and without conflicts; return whether it was set.
+    """Set an earlier path if it is still valid and conflict-free; return whether it was set.
 
     `cells`: columns and lanes at the beginning of each slot, up to the end of the road.
     """
@@ -217,7 +217,7 @@ def find_hit(table, paths, v, hit):
 
 @njit(cache=True, nogil=True)
 def save(paths, saved, count, v):
-    """Save a vehicle's path as number `count`."""
+    """Save a vehicle's path at index `count`."""
     saved.vehicle[count] = v
     saved.slots[count] = paths.slots[v]
     saved.cost[count] = paths.cost[v]
@@ -228,7 +228,7 @@ def save(paths, saved, count, v):
 
 @njit(cache=True, nogil=True)
 def restore(table, paths, saved, begin, count):
-    """Restore saved paths in the table, replacing the current ones of these vehicles."""
+    """Restore saved paths in the table, replacing the current paths of these vehicles."""
     for i in range(begin, count):
         if paths.placed[saved.vehicle[i]]:
             put(table, paths, saved.vehicle[i], -1)

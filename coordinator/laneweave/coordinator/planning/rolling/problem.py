@@ -49,13 +49,13 @@ class StreamCosts:
 
     move: float = 0.3
     off_lane: float = 0.1
-    """For each slot that begins off the target lane."""
+    """Cost of each slot that begins off the target lane."""
     backward: float = 2.0
     """Extra cost of a move that loses a column."""
     forward: float = 0.0
-    """Extra cost of a move that gains a column; negative: rewards driving ahead of v_F."""
+    """Extra cost of a move that gains a column; a negative cost rewards gaining columns."""
     missing: float = 60.0
-    """Ending off the target lane; up to twice as much near the end of the road."""
+    """Cost of ending off the target lane; up to twice as much near the end of the road."""
 
 
 @frozen
@@ -67,7 +67,7 @@ class StreamVehicle:
     lane: int
     """The target lane."""
     held: bool = False
-    """Whether it must stay in its cell."""
+    """Whether the vehicle must stay in its cell."""
 
 
 @frozen
@@ -77,7 +77,7 @@ class StreamPlan:
     slot: int
     paths: Mapping[str, CellPath]
     missed: tuple[str, ...]
-    """Vehicles whose paths do not end on their target lanes."""
+    """Vehicles whose paths do not end in their target lanes."""
     rounds: int = 0
     """Number of rounds of improvement."""
     solve_ms: float = field(default=0.0, eq=False)

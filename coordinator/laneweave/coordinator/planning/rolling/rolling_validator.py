@@ -116,7 +116,7 @@ def _conflicts(road: StreamRoad, plan: StreamPlan) -> Iterator[str]:
 
 @lru_cache(maxsize=256)
 def _near(mode: Mode, model: ConflictModel, step: Cell) -> dict[Cell, dict[Cell, str]]:
-    """Return the conflicting displacements and their kinds, by offset of the other vehicle."""
+    """Return the conflicting displacements and conflict kinds, by offset of the other vehicle."""
     columns, lanes = model.reach
     found: dict[Cell, dict[Cell, str]] = {}
     for column in range(-columns, columns + 1):

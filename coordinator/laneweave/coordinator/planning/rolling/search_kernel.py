@@ -23,18 +23,18 @@ from laneweave.coordinator.planning.rolling.paths_kernel import (
 )
 
 _PENALTY_GROWTH = 3
-"""Added to the penalty of a vehicle each time that a chain hits it."""
+"""Increase in a vehicle's penalty each time a chain hits it."""
 _MIN_SOFTNESS, _SOFTNESS_RANGE = 15.0, 25.0
 """Cost of a conflict in a chain: minimum, and range of a random addition."""
 _MAX_DELAY_COST = 0.9
 _TRIES = 4
 """Maximum number of ejection chains for a vehicle without a path."""
 _FIRST_SLACK, _COOLED_AFTER = 16.0, 0.67
-"""Initial increase allowed for the sum of costs, and the share of the work after which it is 0."""
+"""Initially allowed increase in total cost, and the share of the work after which it is 0."""
 _REORDER_EVERY = 8
 _MAX_REORDERED = 13
 _IDLE_ROUNDS = 200
-"""Rounds of improvement after all vehicles end on their lanes."""
+"""Maximum rounds of improvement in which no vehicle misses a reachable lane."""
 _IDLE_SOFTNESS = 3.0
 _ROUNDING = 1e-4
 
@@ -43,7 +43,7 @@ _ROUNDING = 1e-4
 def set_paths(table, paths, costs, kept, first, rng, scratch):
     """Add every vehicle to the table, on its earlier path if that is still valid.
 
-    kept: columns and lanes of the earlier paths, one vehicle after the other; (cells, 2).
+    kept: columns and lanes of the earlier paths, one vehicle after another; (cells, 2).
     first: index in `kept` of the first cell of each vehicle.
     """
     count = len(paths.cost)
@@ -54,7 +54,7 @@ def set_paths(table, paths, costs, kept, first, rng, scratch):
     for v in range(count):
         if not paths.held[v] and follow(table, paths, costs, v, kept[first[v] : first[v + 1]]):
             put(table, paths, v, 1)
-    # Foremost first: they have the least time left.
+    # Foremost vehicles first: they have the least time left.
     for v in range(count - 1, -1, -1):
         if paths.placed[v]:
             continue
@@ -72,7 +72,7 @@ def set_paths(table, paths, costs, kept, first, rng, scratch):
 
 @njit(cache=True, nogil=True)
 def _hold(table, paths, costs, start, scratch):
-    """Make a vehicle without a path, and every vehicle in conflict with that, stay in its cell.
+    """Make a vehicle without a path stay in its cell, and in turn every vehicle it conflicts with.
 
     No conflicts remain, since vehicles that stay never conflict.
     """
@@ -92,11 +92,11 @@ def _hold(table, paths, costs, start, scratch):
 
 @njit(cache=True, nogil=True)
 def _eject(table, paths, costs, start, softness, slack, rng, scratch):
-    """Reroute a vehicle through others by an ejection chain; return the decrease of the costs.
+    """Reroute a vehicle through others by an ejection chain; return the decrease in total cost.
 
     Vehicles that are hit are rerouted in turn, and may hit others (ejection chains: Glover 1996).
-    Each hit raises the penalty of the vehicle. The chain is undone, and the decrease is 0, if it
-    hits more than `MAX_EJECTED` or the sum of costs grows by `slack` or more.
+    Each hit raises the penalty of the vehicle hit. The chain is undone, and the decrease is 0, if
+    there are more than `MAX_EJECTED` hits or the total cost grows by `slack` or more.
     """
     saved, queue, hit, marked = scratch.saved, scratch.queue, scratch.hit, scratch.marked
     was_placed = paths.placed[start]
@@ -142,9 +142,9 @@ def _eject(table, paths, costs, start, softness, slack, rng, scratch):
 
 @njit(cache=True, nogil=True)
 def _draw_delays(delay, rng):
-    """Draw a random extra cost of moves in each slot.
+    """Draw a random extra cost for moves in each slot.
 
-    Without it two vehicles that must swap would compete for the same slot forever.
+    Without this, two vehicles that must swap would compete for the same slot forever.
     """
     for s in range(len(delay)):
         delay[s] = np.float32(_MAX_DELAY_COST * random_below(rng, 1000) / 1000.0)
@@ -152,7 +152,7 @@ def _draw_delays(delay, rng):
 
 @njit(cache=True, nogil=True)
 def _finish_chain(table, paths, kept, better, was_placed, scratch):
-    """End a chain that has changed `kept` paths: reset the penalties, or undo the chain."""
+    """End a chain that changed `kept` paths: reset penalties; undo the chain unless `better`."""
     saved = scratch.saved
     for k in range(kept):
         v = saved.vehicle[k]
@@ -201,7 +201,7 @@ def _remove_neighbours(table, paths, seed, size, share, rng, scratch):
 
 @njit(cache=True, nogil=True)
 def _reorder(table, paths, costs, seed, size, slack, rng, scratch):
-    """Remove some neighbours and reroute them in another order; return the decrease of costs.
+    """Remove some neighbours and reroute them in another order; return the decrease in cost.
 
     (Large neighbourhood search: Shaw 1998.)
     """
@@ -227,7 +227,7 @@ def _reorder(table, paths, costs, seed, size, slack, rng, scratch):
 
 @njit(cache=True, nogil=True)
 def _list_costly(paths, off_lane, costly):
-    """List the vehicles that miss a reachable lane, and those without the cheapest path."""
+    """List the vehicles that miss a reachable lane, and those that exceed their minimum cost."""
     missing_count = costly_count = 0
     for v in range(len(paths.cost)):
         if paths.can_arrive[v]:
