@@ -28,7 +28,7 @@ class BadInputError(ValueError):
         """Return the message as one line."""
         try:
             shown = _SHORT.repr(self.value)
-        except ValueError:  # an integer of thousands of digits
+        except ValueError:  # an integer with thousands of digits
             shown = f"a huge {type(self.value).__name__}"
         field, value, allowed = one_line(self.field, 120), one_line(shown, 80), self.allowed
         return f"{field}: got {value}; allowed: {one_line(allowed)}"
@@ -51,4 +51,4 @@ class RefusedError(Exception):
 
 
 class CommandFailedError(RuntimeError):
-    """A command failed although its input is valid; the message is the reason. Exit status 1."""
+    """A command failed although its input is valid; the message says why. Exit status 1."""

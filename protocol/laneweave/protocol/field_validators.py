@@ -18,7 +18,7 @@ NAME_RULE = "letters, digits, `_`, `-`, `.`; at least 1, at most 64"
 HOST_PORT_RULE = "HOST:PORT with a port from 1 to 65535, or nothing"
 ENDPOINT_RULE = "unixsock-stream/PATH, tcp/HOST:PORT or tls/HOST:PORT"
 _NETWORK = re.compile(r"(?:tcp|tls)/(?P<host>\[[0-9A-Fa-f:.%]+\]|[^\s/:?#\[\]]+):(?P<port>\d{1,5})")
-# Zenoh reads session settings, those of TLS included, after `?` and `#`.
+# Zenoh reads session settings, including those of TLS, after `?` and `#`.
 _SOCKET = re.compile(r"unixsock-stream/[^?#]+")
 Validator = Callable[[Any, "attrs.Attribute[Any]", Any], None]
 
@@ -66,7 +66,7 @@ def host_port(_: object, attribute: attrs.Attribute[Any], value: str) -> None:
 
 
 def host_and_port(name: str, text: str) -> tuple[str, int]:
-    """Return host and port of HOST:PORT, where an IPv6 address is in brackets.
+    """Return the host and port of HOST:PORT; IPv6 addresses are in brackets.
 
     Raises:
         BadInputError: the text does not have this form.
@@ -80,7 +80,7 @@ def host_and_port(name: str, text: str) -> tuple[str, int]:
 
 
 def check_endpoint(endpoint: str, name: str = "network.endpoint") -> str:
-    """Return a Zenoh endpoint unchanged if it is valid; `name` is the field for the error.
+    """Return a Zenoh endpoint unchanged if it is valid; `name` is the field named in the error.
 
     Raises:
         BadInputError: the endpoint is malformed, or the Zenoh wheel lacks its protocol.

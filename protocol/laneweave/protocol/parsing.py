@@ -1,8 +1,8 @@
 """Strict conversion of untyped maps (TOML, MessagePack, JSON) into attrs classes, with cattrs.
 
 Values are not coerced: a string is not a number, a bool is not an int, text is not a list. The only
-exception is an int for a float. Unknown keys are errors. Every failure raises one `BadInputError`
-that names the path of the field.
+exception: an int is valid as a float. Unknown keys are errors. Every failure raises one
+`BadInputError` that names the path of the field.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Hook = Callable[[Any, Any], Any]
 NumberOrRange = float | tuple[float, float]
 """A number, or the range from which it is drawn."""
 TextOrTexts = str | tuple[str, ...]
-"""A text or several."""
+"""One text or several."""
 
 
 def _exactly(kind: type, name: str) -> Hook:
@@ -45,7 +45,7 @@ def _exactly(kind: type, name: str) -> Hook:
 def _number(value: object, _: type) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise BadInputError("", value, "a number")
-    # NaN fails the comparison; so does an int that no float can hold.
+    # NaN fails the comparison; so does an int that is too large for a float.
     if not abs(value) <= sys.float_info.max:
         raise BadInputError("", value, "a finite number")
     return float(value)
@@ -184,7 +184,7 @@ def structure(data: Mapping[str, Any], kind: type[T]) -> T:
 
 
 def as_lists(_: object, __: object, value: object) -> object:
-    """Return tuples and sorted sets as lists; a serializer for `attrs.asdict`."""
+    """Return tuples and frozensets (sorted) as lists, for `attrs.asdict`."""
     if isinstance(value, frozenset):
         value = tuple(sorted(value))
     return [as_lists(_, __, item) for item in value] if isinstance(value, tuple) else value

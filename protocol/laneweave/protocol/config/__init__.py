@@ -1,5 +1,5 @@
-"""Loading of scenario files, and rules between their fields.
+"""Loading of scenario files, and checks between their fields.
 
-Entry point: `loading.load_scenario`. `cross_checks` has the rules between fields, `participants`
-the names of all processes. Imported by `security`, `transports` and the other packages.
+Entry point: `loading.load_scenario`. `cross_checks` checks fields against each other,
+`participants` names all processes. Imported by `security`, `transports` and the other packages.
 """

@@ -15,9 +15,9 @@ from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
 from laneweave.protocol.wire.identities import MAX_COMMON_NAME
 
 MIN_GAP_M = 1.0
-"""Minimum gap between bumpers of neighbouring cells, for rotated bodies and tracking errors."""
+"""Minimum gap between bumpers in neighbouring cells; covers rotation and tracking errors."""
 MIN_SIDE_GAP_M = 0.5
-"""The same between bodies side by side."""
+"""Minimum lateral gap between bodies side by side; covers the same errors."""
 MAX_TICKS = 200
 """Maximum horizon of the tracker [ticks]."""
 MAX_SECURED_VEHICLES = 5000
@@ -154,7 +154,7 @@ def _check_motion(scenario: Scenario) -> None:
 
 
 def _check_structures(scenario: Scenario) -> None:
-    """Check that structures ascend along the road, end before S3 and use existing lanes."""
+    """Check that structures ascend along the road, begin before S3 and use existing lanes."""
     road, before_m = scenario.road, -1.0
     for number, structure in enumerate(scenario.formation.structures):
         name = f"formation.structures[{number}]"
@@ -170,7 +170,7 @@ def _check_structures(scenario: Scenario) -> None:
             len(set(lanes)) == len(lanes) and set(lanes) <= set(range(road.lanes)),
             f"{name}.lanes",
             list(lanes),
-            f"some of 0 to {road.lanes - 1}, each once",
+            f"distinct lanes from 0 to {road.lanes - 1}",
         )
 
 
@@ -191,7 +191,7 @@ def _check_timing(scenario: Scenario) -> None:
         ("cycle_s", longest_s),
         ("move_s", shortest_s - formation.slack_s),
     ):
-        allowed = f"a multiple of runtime.tick_s = {runtime.tick_s:g}, at least twice it"
+        allowed = f"a multiple of runtime.tick_s = {runtime.tick_s:g}, at least two ticks"
         _require(_in_ticks(scenario, value, 2), f"formation.{name}", value, allowed)
     _require(
         scenario.horizon_ticks * runtime.tick_s >= longest_move_s - 1e-6,
@@ -205,7 +205,7 @@ def _check_timing(scenario: Scenario) -> None:
         runtime.tick_s,
         f"long enough for the longest T_F, {longest_s:g} s, to have at most {MAX_TICKS} ticks",
     )
-    what = "runtime.agent_silent_s, so that a lost session is noticed before its agent is silent"
+    what = "runtime.agent_silent_s, so a lost session is detected before its agent counts as silent"
     deadline_s = runtime.tick_deadline_s
     _compare(
         scenario,
@@ -235,7 +235,7 @@ def _check_braking(scenario: Scenario) -> None:
         "formation.gap_m",
         gap_m,
         f"at least {math.ceil(1000.0 * min_m) / 1000.0:g}: a vehicle that holds behind another at "
-        f"formation.speed_mps = {scenario.formation.speed_mps:g} must not brake in emergency "
+        f"formation.speed_mps = {scenario.formation.speed_mps:g} must not need emergency braking "
         "(vehicle.length_m, the tables braking and sensing)",
     )
 
@@ -260,7 +260,7 @@ def _check_settling(scenario: Scenario) -> None:
         "formation.settle_s",
         formation.settle_s,
         f"at least {math.ceil(10.0 * min_s) / 10.0:g}: a vehicle that enters up to "
-        f"{offset_m:g} m beside its cell settles there within its limits",
+        f"{offset_m:g} m from its cell settles there within its limits",
     )
 
 

@@ -21,7 +21,7 @@ def load_scenario(path: Path | None, **overrides: object) -> Scenario:
 
     Args:
         path: a TOML file; None: the defaults (the paper's road, formations of six).
-        **overrides: values that replace those of the file; `None` keeps the file's value.
+        **overrides: values that replace the file's values; `None` keeps the file's value.
             `table__field` names a field of a table.
 
     Raises:
@@ -47,7 +47,7 @@ def load_scenario(path: Path | None, **overrides: object) -> Scenario:
 
 
 def _resolve_folder(data: dict[str, Any], path: Path) -> None:
-    """Make the folder of certificates relative to the file."""
+    """Resolve the certificate folder relative to the scenario file."""
     security = data.get("security")
     if isinstance(security, dict):
         folder = security.get("folder", Security().folder)
@@ -74,7 +74,7 @@ def parse_scenario(data: Mapping[str, Any]) -> Scenario:
     """Build a scenario from nested tables and check it.
 
     Raises:
-        BadInputError: a field is unknown, has a wrong type or value, or contradicts others.
+        BadInputError: a field is unknown, has a wrong type or value, or contradicts another field.
     """
     scenario = structure(_with_current_names(data), Scenario)
     check_scenario(scenario)
@@ -82,7 +82,7 @@ def parse_scenario(data: Mapping[str, Any]) -> Scenario:
 
 
 def _with_current_names(data: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the tables with the former value `operation = "paper"` replaced by its meaning."""
+    """Return the tables with the former value `operation = "paper"` replaced by current fields."""
     formation = data.get("formation") if isinstance(data, Mapping) else None
     if not isinstance(formation, Mapping) or formation.get("operation") != "paper":
         return data

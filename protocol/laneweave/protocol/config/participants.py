@@ -1,7 +1,7 @@
 """Names of all processes and vehicles of a deployment, derived from its scenario.
 
-The bridge numbers vehicles in order of arrival. Launcher and router need their names in advance, to
-start agents and to grant rights.
+The bridge numbers vehicles in order of arrival. The launcher needs the vehicles' names in advance
+to start agents, the router to grant rights.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ def vehicle_name(number: int) -> str:
 def max_vehicles(demand: Demand, lanes: int) -> int:
     """Return an upper bound on the number of arriving vehicles.
 
-    The number of arrivals on a lane varies less than a Poisson variable of equal mean, so it
-    exceeds six standard deviations in fewer than one of 10^8 cases. In addition, each lane has at
-    most one arrival per `demand.min_headway_s`.
+    The number of arrivals varies less than a Poisson variable with the same mean, so it exceeds the
+    mean by more than six standard deviations in fewer than one in 10^8 cases. In addition, each
+    lane has at most one arrival per `demand.min_headway_s`.
     """
     mean = lanes * demand.volume_veh_per_lane_h * demand.duration_s / 3600.0
     likely = math.ceil(mean + 6.0 * math.sqrt(mean)) + 10
@@ -41,7 +41,7 @@ def demanded_vehicles(scenario: Scenario) -> tuple[str, ...]:
 
 
 def members_of(members: FleetMembers, vehicles: Iterable[str]) -> tuple[str, ...]:
-    """Return the vehicles of a fleet; `vehicles`: those from which a shard selects."""
+    """Return the vehicles of a fleet; a shard selects from `vehicles`."""
     if isinstance(members, str):
         shard = parse_shard(members, "security.fleets")
         return tuple(vehicle for vehicle in vehicles if shard.contains(vehicle))

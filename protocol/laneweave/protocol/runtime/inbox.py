@@ -13,9 +13,9 @@ from laneweave.protocol.runtime.node import Computed, Stopping
 from laneweave.protocol.runtime.transport import Delivery, Query
 
 MAX_QUERY_WAIT_S = 0.02
-"""Longest time a query waits while other work is queued, unless that exceeds `QUERY_SHARE`."""
+"""Longest time a query waits while other work is queued, unless `QUERY_SHARE` requires more."""
 QUERY_SHARE = 0.1
-"""Maximum fraction of time for queries while other work is queued."""
+"""Maximum fraction of time spent on queries while other work is queued."""
 
 Item = Delivery | Computed | SnapshotRequest | Stopping
 """Input of a node."""
@@ -24,8 +24,8 @@ Item = Delivery | Computed | SnapshotRequest | Stopping
 class Inbox:
     """Input queue of a node.
 
-    Queries wait for other work, at most `MAX_QUERY_WAIT_S`: a flood of queries must not block a
-    leader.
+    Queries yield to other work for at most `MAX_QUERY_WAIT_S`. `QUERY_SHARE` keeps a flood of
+    queries from blocking a leader.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class Inbox:
         """Time from which a query is taken even if other work is queued."""
 
     def put(self, item: Item) -> None:
-        """Add an input; safe in any thread, callback and signal handler (`put` is reentrant)."""
+        """Add an input; safe in any thread, callback or signal handler (`put` is reentrant)."""
         if isinstance(item, Query):
             self._queries.append(item)
             self._items.put(None)  # wake up `take`
@@ -44,7 +44,7 @@ class Inbox:
             self._items.put(item)
 
     def take(self, timeout_s: float) -> Iterator[Item]:
-        """Yield the inputs that arrive within a timeout: at most one query and one other input."""
+        """Wait for an input until a timeout; yield at most one query and one other input."""
         with contextlib.suppress(queue.Empty):
             item = self._items.get(timeout=0.0 if self._queries else timeout_s)
             if item is not None:

@@ -1,10 +1,10 @@
 """Message faults above the transport: a core wrapper that drops, duplicates and delays messages.
 
-`FaultyCore` is between a node and its core, so faults are independent for each receiver and work
+`FaultyCore` sits between a node and its core, so faults are independent for each receiver and work
 with any transport. Liveliness tokens, link events and queries are not affected.
 
-Each topic has its own random generator, seeded with the run's seed and the process's label: equal
-seeds and equal arrivals give equal faults.
+Each topic has its own random generator, seeded with the run's seed and the process's label: the
+same seed and arrivals give the same faults.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from laneweave.protocol.wire.messages import RoadClock
 from laneweave.protocol.wire.topics import TOPICS
 
 SENDER_OF_ROLE = {"agent": "vehicle", "coordinator": "coordinator", "bridge": "bridge"}
-"""Kind of sender in rules, by role."""
+"""Kind of sender in message rules, by role."""
 SENDERS = tuple(SENDER_OF_ROLE.values())
 MESSAGE_TOPICS = tuple(topic.name for topic in TOPICS if topic.kind is not None)
 CoreWrapper = Callable[[Core], Core]
@@ -51,14 +51,14 @@ def _message_topics(_: object, attribute: attrs.Attribute[Any], value: tuple[str
 
 @frozen(kw_only=True)
 class MessageRule:
-    """Rule for message faults; the rules of a run are applied one after the other.
+    """Rule for message faults; the rules of a run are applied in order.
 
     Raises:
         BadInputError: a value is invalid.
     """
 
     topics: tuple[str, ...] = field(default=(), validator=_message_topics)
-    """Names of topics; empty: all that carry messages."""
+    """Topic names; empty: all topics that carry messages."""
     loss: float = field(default=0.0, validator=within(0.0, 1.0))
     """Probability that a receiver loses a message."""
     duplication: float = field(default=0.0, validator=within(0.0, 1.0))
@@ -66,7 +66,7 @@ class MessageRule:
     delay_s: float = field(default=0.0, validator=within(0.0, 60.0))
     """Delay of each copy (wall-clock time)."""
     jitter_s: float = field(default=0.0, validator=within(0.0, 60.0))
-    """Maximum of an additional uniform delay of each copy; reorders frequent messages."""
+    """Maximum additional delay of each copy, drawn uniformly; reorders frequent messages."""
     from_s: float = field(default=0.0, validator=within(0.0, 1e6))
     """Road time at which the rule starts; 0: also before the road's clock starts."""
     until_s: float | None = field(
@@ -91,7 +91,7 @@ class MessageRule:
 
 
 class FaultBoard(Protocol):
-    """State that the processes of a run share outside of messages."""
+    """State that the processes of a run share without sending messages."""
 
     road_s: float
     """Road time, written by the bridge's `FaultyCore` and read by all others."""
@@ -100,7 +100,7 @@ class FaultBoard(Protocol):
 
 
 class FaultyCore:
-    """A `Core` that injects message faults into the input of another one."""
+    """A `Core` that injects message faults into the input of another core."""
 
     def __init__(
         self,
@@ -143,7 +143,7 @@ class FaultyCore:
         return self._held[0][0] if wakeup_s is None else min(wakeup_s, self._held[0][0])
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
-        """Handle an event, see `Core`."""
+        """Handle an event; see `Core`."""
         match event:
             case Arrived():
                 effects: Iterable[Effect] = self._on_arrived(event, now_s)

@@ -4,8 +4,8 @@ A *snapshot* is a frozen attrs class with a class variable `ABOUT` and one field
 a float, a bool, or a mapping from text to numbers, described by `metric`. Field names end with a
 base unit, and with `_total` if the value never decreases.
 
-A reader does not access the counters of another thread: it queues a `SnapshotRequest` as an input
-of the process, and the thread that counts answers it (`snapshot_source`).
+A reader does not access another thread's counters: it queues a `SnapshotRequest` as an input of
+the process, and the counting thread answers it (`snapshot_source`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class MetricsSnapshot(attrs.AttrsInstance, Protocol):
     """Metrics of one subject at one moment."""
 
     ABOUT: ClassVar[str]
-    """First part of the metrics' names."""
+    """Part of the metrics' names after `PREFIX`."""
 
 
 Source = Callable[[], Iterable[MetricsSnapshot]]
@@ -37,17 +37,17 @@ Observe = Callable[[Source], None]
 
 
 def unobserved(_: Source) -> None:
-    """Ignore the metrics source; the `Observe` of a process without a metrics server."""
+    """Ignore the metrics source; the `Observe` for a process without a metrics server."""
 
 
 @frozen
 class SnapshotRequest:
-    """Request for the metrics of a process, answered by the thread that counts."""
+    """Request for the metrics of a process, answered by its counting thread."""
 
     _answers: queue.SimpleQueue[Iterable[MetricsSnapshot]] = attrs.field(factory=queue.SimpleQueue)
 
     def answer(self, snapshots: Iterable[MetricsSnapshot]) -> None:
-        """Set the answer; called by the thread that counts."""
+        """Set the answer; called by the counting thread."""
         self._answers.put(snapshots)
 
     def wait(self) -> Iterable[MetricsSnapshot]:
@@ -81,10 +81,9 @@ class Metric:
     """Full name, such as `laneweave_node_published_total`."""
     meaning: str
     label: str
-    """Name of the label that distinguishes the samples; empty: there is one sample without
-    label."""
+    """Name of the label that distinguishes the samples; empty: a single, unlabelled sample."""
     field: str
-    """Name of the snapshot's field."""
+    """Name of the snapshot field."""
 
     @property
     def counts(self) -> bool:
@@ -92,7 +91,7 @@ class Metric:
         return self.name.endswith("_total")
 
     def samples(self, snapshot: MetricsSnapshot) -> Iterator[tuple[tuple[str, ...], float]]:
-        """Yield (label values, number) of each sample."""
+        """Yield (label values, value) for each sample."""
         value = getattr(snapshot, self.field)
         if self.label:
             for part, number in value.items():
@@ -105,9 +104,9 @@ def metric(meaning: str, *, label: str = "", default: object = attrs.NOTHING) ->
     """Return the attrs field of a metric.
 
     Args:
-        meaning: description of the number, without a final full stop.
-        label: meaning of the keys of a mapping.
-        default: default value of the field, which is mandatory without it.
+        meaning: description of the value, without a final full stop.
+        label: name of the label for the keys of a mapping.
+        default: default value; a field without one is mandatory.
     """
     return attrs.field(default=default, metadata={"meaning": meaning, "label": label})
 
@@ -135,7 +134,7 @@ class NodeMetrics:
     received_total: Mapping[str, int] = metric("Valid messages received", label="topic")
     rejected_total: int = metric("Invalid messages received")
     events_total: int = metric("Events handled by the core: messages, tokens, timers, results")
-    handling_seconds_total: float = metric("Time spent on handling events")
+    handling_seconds_total: float = metric("Time spent handling events")
 
 
 @frozen

@@ -1,6 +1,6 @@
 """Events, effects, and the node that drives a pure core over a transport.
 
-A *core* is a state machine without I/O, clock, threads and unseeded randomness: `handle` takes an
+A *core* is a state machine without I/O, clock, threads or unseeded randomness: `handle` takes an
 event and the time and returns effects; `wakeup_s` is the time of the next wakeup. A `Node` decodes
 payloads into typed events and executes effects through the transport. It counts and drops malformed
 input, so a core never receives it.
@@ -54,7 +54,7 @@ class Arrived:
 
 @frozen
 class _OnTopic:
-    """A topic and parameters of its keys; missing parameters match all values."""
+    """A topic and parameters of its keys; missing parameters match any value."""
 
     topic: Topic
     parameters: Mapping[str, Any] = field(factory=dict)
@@ -77,7 +77,7 @@ class Wakeup:
 
 @frozen
 class Computed:
-    """A computation of the core has ended; `error` is not empty if it failed."""
+    """A computation requested by the core is complete; `error` is empty if it succeeded."""
 
     job: int
     result: Any
@@ -96,7 +96,7 @@ class QueryArrived:
 
 @frozen
 class Stopping:
-    """Last event of a core: the process is about to end."""
+    """Last event of a core: the process is about to exit."""
 
 
 Event = (
@@ -173,7 +173,7 @@ class Decline:
 
 @frozen
 class Compute:
-    """Run `work` in another thread, after earlier jobs; `Computed` has its result."""
+    """Run `work` in another thread, after earlier jobs; `Computed` carries the result."""
 
     job: int
     work: Callable[[], Any]
@@ -181,10 +181,10 @@ class Compute:
 
 @frozen
 class Delegate:
-    """Run `work` in a worker process; `Computed` has its result.
+    """Run `work` in a worker process; `Computed` carries the result.
 
-    `work` must be picklable. It is called with the time left until `deadline_s` [s]; without time
-    left the job fails. A worker that exceeds the deadline by `worker_pool.OVERDUE_S` is killed.
+    `work` must be picklable. It is called with the time left until `deadline_s` [s]; if none is
+    left, the job fails. A worker that exceeds the deadline by `worker_pool.OVERDUE_S` is killed.
     """
 
     job: int
@@ -275,7 +275,7 @@ class Node:
         self._read = read or partial(read_message, keys)
         self._write = write
         self._encoded: tuple[object, bytes] = (None, b"")
-        """Newest message and its bytes, since a plan is sent to several vehicles."""
+        """Last encoded message and its bytes, reused because a plan goes to several vehicles."""
 
     def deliver(self, delivery: Delivery, now_s: float) -> None:
         """Convert a delivery into an event and dispatch it."""
@@ -405,7 +405,7 @@ def run_job(job: Compute) -> Computed:
 
 
 def run_delegated(job: Delegate, now_s: Callable[[], float]) -> Computed:
-    """Run a delegated computation in this process unless its deadline on `now_s` has passed."""
+    """Run a delegated computation in this process unless its deadline has passed by `now_s`."""
     left_s = job.deadline_s - now_s()
     if left_s <= 0:
         return Computed(job.job, None, TOO_LATE)

@@ -13,7 +13,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def die_with_parent() -> None:
-    """Request SIGTERM from the kernel when the parent of this process dies."""
+    """Have the kernel send SIGTERM to this process when its parent dies."""
     parent = os.getppid()
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if os.getppid() != parent:
@@ -24,7 +24,7 @@ def die_with_parent() -> None:
 def stop_signals(stop: Callable[[], None]) -> Iterator[None]:
     """Call `stop` on SIGINT and SIGTERM until the block ends.
 
-    `stop` must neither take a lock nor log: it may interrupt code that holds the lock.
+    `stop` must neither take a lock nor log: it may interrupt code that holds that lock.
     """
 
     def on_signal(_number: int, _frame: object) -> None:

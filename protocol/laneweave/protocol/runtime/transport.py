@@ -32,7 +32,7 @@ class TokenUp:
 
 @frozen
 class TokenDown:
-    """A liveliness token vanished: its process ended or hangs, or this node lost its connection.
+    """A liveliness token vanished: its process exited or hangs, or this node lost its connection.
 
     In the last case `LinkDown` is delivered at the same time, before or after this event.
     """
@@ -47,7 +47,7 @@ class LinkUp:
 
 @frozen
 class LinkDown:
-    """The connection to the network is lost, and so are messages published meanwhile."""
+    """The connection to the network is lost; messages published until `LinkUp` are lost too."""
 
 
 @frozen
@@ -72,7 +72,7 @@ class Answer:
 
 
 def update_tokens(tokens: dict[str, None], event: TokenUp | TokenDown) -> bool:
-    """Apply a token event to the visible tokens; return whether it changed them."""
+    """Apply a token event to the visible tokens; return whether they changed."""
     known = event.key in tokens
     if isinstance(event, TokenUp):
         tokens[event.key] = None
@@ -86,7 +86,7 @@ Deliver = Callable[[Delivery], None]
 
 
 class Transport(Protocol):
-    """Network operations of a node, which neither block for long nor raise if the link is lost."""
+    """Network operations of a node; none blocks for long or raises if the link is lost."""
 
     def publish(self, key: str, payload: bytes, quality: Quality) -> None:
         """Send a payload to all subscribers of a key, including this node."""
@@ -104,19 +104,19 @@ class Transport(Protocol):
         """Withdraw a liveliness token; unknown keys are ignored."""
 
     def watch(self, key_expression: str) -> None:
-        """Deliver appearing and vanishing tokens, beginning with the existing ones.
+        """Deliver an event for each token that exists, appears or vanishes.
 
         The node's own tokens are included. For each key, `TokenUp` and `TokenDown` alternate,
         beginning with `TokenUp`. A short-lived token of this node may appear and vanish twice,
-        because the network reports it as well. If several nodes declare a token on one key, it
-        vanishes when the last of them withdraws it.
+        because the network also reports it. If several nodes declare a token on one key, it
+        vanishes when the last node withdraws it.
         """
 
     def serve(self, key: str) -> None:
         """Deliver queries on a key."""
 
     def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
-        """Answer a query once; unknown tokens are ignored."""
+        """Answer a query; unknown tokens, or those of answered queries, are ignored."""
 
     def decline(self, token: int) -> None:
         """Leave a query to the other servers of its key; unknown tokens are ignored."""

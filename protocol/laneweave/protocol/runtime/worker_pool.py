@@ -1,9 +1,9 @@
 """Worker processes that run the `Delegate` effects of a core.
 
-One thread per worker sends the next job to its process and waits for the result, for the death of
-the process, or until `OVERDUE_S` after the deadline. In the last two cases the process is replaced,
-and only that job fails. (The pools of the standard library and of pebble fail completely when an
-idle worker is killed.)
+One thread per worker sends the next job to its process and waits until the result arrives, the
+process dies, or the deadline has been exceeded by `OVERDUE_S`. In the last two cases the process is
+replaced, and only that job fails. (The pools of the standard library and of pebble fail completely
+when an idle worker is killed.)
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ log = structlog.get_logger(__name__)
 OVERDUE_S = 5.0
 """Time by which a worker may exceed the deadline of its job before it is killed."""
 END_S = 2.0
-"""Maximum wait for the end of a killed process."""
+"""Maximum wait for a killed process to exit."""
 CHECK_S = 1.0
 """Interval at which an idle thread checks that its process is alive."""
 PAUSE_S = 0.5
-"""Delay before the replacement of a process that died within this time after its start, so that
-failing starts do not load the machine."""
+"""Delay before replacing a process that died within this time of its start, so that repeated
+failures do not load the machine."""
 
 # A fork would inherit the sockets and locked state of Zenoh.
 _CONTEXT = multiprocessing.get_context("spawn")
@@ -45,7 +45,7 @@ class WorkerPool:
     """Pool of worker processes, which die with their parent."""
 
     def __init__(self, workers: int, warm_up: Callable[[], None] | None = None) -> None:
-        """Create the pool; processes start with the first job, or with `start`.
+        """Create the pool; processes start at the first call of `submit` or `start`.
 
         Args:
             workers: maximum number of concurrent jobs.
@@ -100,7 +100,7 @@ class _Worker:
 
     @property
     def process_id(self) -> int:
-        """Process id; 0 without a process."""
+        """Process id; 0 if there is no process."""
         process = self._process
         return 0 if process is None or process.pid is None else process.pid
 
@@ -127,7 +127,7 @@ class _Worker:
             try:
                 result = self._run(job)
             except Exception as error:
-                # If the thread ended, its share of the requests would wait forever.
+                # If the thread ended, jobs could wait forever.
                 log.exception("a worker is replaced after an error", job=job.job)
                 self._discard_process()
                 result = Computed(job.job, None, error_text(error))
@@ -141,7 +141,7 @@ class _Worker:
         """Start a process, replacing the previous one.
 
         Returns:
-            The connection to it; None if the pool is ending or the process cannot be started.
+            The connection to the new process; None if the pool is closing or the start fails.
         """
         self._discard_process()
         if time.monotonic() < self._started_s + PAUSE_S:
@@ -190,7 +190,7 @@ class _Worker:
         except (EOFError, OSError):
             return None
         except Exception as error:
-            # Pickling failed. The pipe transfers complete messages, so it is still usable.
+            # Pickling failed. The pipe transfers only complete messages, so it is still usable.
             log.exception("a job or its result cannot be transferred", job=job.job)
             return Computed(job.job, None, error_text(error))
         self._discard_process()
@@ -211,9 +211,9 @@ def _start(warm_up: Callable[[], None] | None) -> tuple[SpawnProcess, Connection
 
 
 def _work(connection: Connection, warm_up: Callable[[], None] | None) -> None:
-    """Run jobs until the other end is closed; main function of a worker process."""
+    """Run jobs until the parent closes its connection; main function of a worker process."""
     die_with_parent()
-    # Ctrl-C reaches the whole process group, but the parent ends its workers.
+    # Ctrl-C reaches the whole process group, but the parent stops its workers itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if warm_up is not None:
@@ -227,10 +227,10 @@ def _run_next(connection: Connection) -> None:
     """Run one job.
 
     Raises:
-        EOFError, OSError: the other end is closed.
+        EOFError, OSError: the parent has closed its connection.
     """
     try:
-        # `time.monotonic` is the same in all processes of a machine.
+        # `time.monotonic` reads the same clock in all processes of a machine.
         computed = run_delegated(connection.recv(), time.monotonic)
         connection.send((computed.result, computed.error))
     except (EOFError, OSError):

@@ -22,7 +22,7 @@ MAX_SHARDS = 10_000
 
 @frozen
 class Shard:
-    """Part `index` of `count` of the announced vehicles, by a hash of their names."""
+    """Part `index` of the announced vehicles, split into `count` parts by a hash of their names."""
 
     index: int
     count: int
@@ -58,11 +58,11 @@ class Network:
     lease_s: float = field(default=1.0, validator=within(0.1, 60.0))
     """Time after which a silent session is closed (Zenoh's transport lease)."""
     connect_timeout_s: float = field(default=0.0, validator=within(0.0, 86_400.0))
-    """Time for which a role tries to connect, if the router starts later; 0: one attempt."""
+    """Time for which a role keeps trying to connect if the router starts later; 0: one attempt."""
     heartbeat_s: float = field(default=0.1, validator=within(0.01, 10.0))
     election_s: float = field(default=0.7, validator=within(0.05, 60.0))
-    """Election timeout: a candidate leads after it has been the best-ranked one for this time. It
-    detects processes that hang; a liveliness token reports a dead one at once."""
+    """Election timeout: a candidate leads after it has been the best-ranked one for this time. The
+    timeout detects hanging processes; liveliness tokens report dead ones at once."""
     resend_s: float = field(default=0.2, validator=within(0.01, 10.0))
     """Time without an answer after which PREPARE and PLAN are sent again."""
 
@@ -89,7 +89,7 @@ class Security:
     mode: str = field(default="off", validator=one_of("off", "mtls"))
     """`mtls`: every process has a certificate, whose name determines its rights."""
     folder: str = "certs"
-    """Folder of the certificates, relative to the file."""
+    """Folder of the certificates, relative to the scenario file."""
     fleets: Mapping[str, FleetMembers] = field(factory=dict, validator=_fleets, hash=False)
     """Agent processes that drive several vehicles, by name: a shard `I/N`, or names of vehicles."""
     vehicles: tuple[str, ...] = field(default=(), validator=key_parts)
@@ -107,8 +107,8 @@ class Service:
     workers: int = field(default=0, validator=within(0, 256))
     """Number of worker processes; 0: one less than the number of cores, at least one."""
     worker_memory_mb: float = field(default=1500.0, validator=within(50.0, 1_000_000.0))
-    """Limit on the arrays of branch and bound in each worker; the other solver completes a plan
-    that reaches it, which without a proof has the status `feasible`."""
+    """Memory limit for the arrays of branch and bound in each worker. When a plan reaches it, the
+    other solver completes the plan; without an optimality proof its status is `feasible`."""
     queue_limit: int = field(default=256, validator=within(1, 100_000))
     """Maximum number of waiting and running requests; further ones are rejected."""
     max_request_bytes: int = field(default=262_144, validator=within(1024, 1 << 20))

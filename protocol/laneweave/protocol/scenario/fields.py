@@ -42,7 +42,7 @@ SLACK_S = 0.2
 PAPERS_FORMATIONS: Mapping[str, object] = MappingProxyType(
     {"entry": "interlaced", "close": "columns", "cycle_s": 4.0}
 )
-"""Values of the table `formation` for which `operation = "paper"` stands."""
+"""Values of the table `formation` that the former `operation = "paper"` selects."""
 
 SOLVERS: Final = ("tappa", "branching")
 """`tappa`: the paper's algorithm. `branching`: branch and bound, for large formations."""
@@ -98,7 +98,7 @@ class Road:
 
 @frozen
 class Demand:
-    """Random arrivals on each lane: minimum plus exponential headways of mean 3600 / volume."""
+    """Random arrivals in each lane: minimum plus exponential headways with mean 3600 / volume."""
 
     volume_veh_per_lane_h: float = field(default=1000.0, validator=within(0, 3600, open_low=True))
     duration_s: float = field(default=300.0, validator=within(0, 86_400, open_low=True))
@@ -126,7 +126,7 @@ class FormationSettings:
     """`formations`: closed formations, each sorted by one plan, as in the paper. `rolling`: no
     formations; the whole stream is replanned in each slot."""
     entry: str = field(default="free", validator=one_of("free", "interlaced"))
-    """Formations: cells that vehicles may enter, all or those of the interlaced structure."""
+    """Formations: cells that vehicles may enter, all or only those of the interlaced structure."""
     close: str = field(default="vehicles", validator=one_of("vehicles", "columns"))
     """Formations: `vehicles`: a formation ends at `max_vehicles` vehicles or `max_columns` columns;
     `columns`: each formation has `block_columns` columns, as in the paper."""
@@ -147,7 +147,7 @@ class FormationSettings:
     reward_drift: bool = False
     """Rolling operation: reward forward moves that cost no other vehicle anything."""
     block_columns: int = field(default=4, validator=within(1, 24))
-    """Columns of a formation if `close` is `columns`."""
+    """Number of columns of a formation if `close` is `columns`."""
     max_columns: int = field(default=7, validator=within(1, 24))
     """Maximum length of a formation if `close` is `vehicles`."""
     max_vehicles: int = field(default=6, validator=within(1, 36))
@@ -155,11 +155,11 @@ class FormationSettings:
     max_joined: int = field(default=1, validator=within(1, 4))
     """Maximum number of neighbouring formations in one ballot."""
     join: str = field(default="needed", validator=one_of("needed", "room"))
-    """Condition for joining neighbouring formations. `needed`: one alone lacks room for sorting.
-    `room`: also if the vehicles of both fit into one formation."""
+    """Condition for joining neighbouring formations. `needed`: one alone has too little room to
+    sort. `room`: also if the vehicles of both fit into one formation."""
     structures: tuple[DrivingStructure, ...] = ()
-    """Structures that formations take on, one after the other, before they sort in S3; empty: they
-    stay in the cells in which they entered."""
+    """Structures that formations take on in turn before they sort in S3; empty: vehicles stay in
+    the cells in which they entered."""
     mode: int = field(default=1, validator=one_of(1, 2))
     """Relative motion mode."""
     conflicts: tuple[str, ...] = field(default=(), validator=_conflict_kinds)
@@ -190,12 +190,12 @@ class FormationSettings:
 
     @property
     def closes_by_vehicles(self) -> bool:
-        """Whether the length of formations follows the traffic."""
+        """Whether the length of formations depends on the traffic."""
         return not self.rolling and self.close == "vehicles"
 
     @property
     def block_width(self) -> int:
-        """Columns of a block; a formation owns one or several blocks."""
+        """Number of columns of a block; a formation owns one or more blocks."""
         return 1 if self.closes_by_vehicles else self.block_columns
 
     @property
@@ -212,12 +212,12 @@ class FormationSettings:
 
     @property
     def entry_spacing_s(self) -> float:
-        """Time between two successive cells of a lane that may be entered."""
+        """Time between successive cells of a lane that vehicles may enter."""
         return (2.0 if self.interlaced else 1.0) * self.gap_m / self.speed_mps
 
     @property
     def bound_veh_per_lane_h(self) -> float:
-        """Maximum flow [vehicles/(lane h)]: one vehicle for each cell that may be entered.
+        """Maximum flow [vehicles/(lane h)]: one vehicle for each cell that vehicles may enter.
 
         V_u = 3600 v_F / (2 d_F) with interlaced entry (paper, Section 5.2.3), twice that with free
         entry.
@@ -229,8 +229,8 @@ class FormationSettings:
         """Maximum time between a vehicle and its cell as they pass the start of the road.
 
         With half of the time between two cells, a vehicle waits only if it is too close behind
-        another one. Formations use three quarters: vehicles catch up with cells that stayed empty,
-        and queues dissolve sooner.
+        another vehicle. Formations use three quarters: vehicles catch up with cells left empty, so
+        queues dissolve sooner.
         """
         return (0.5 if self.rolling else 0.75) * self.entry_spacing_s
 
@@ -268,7 +268,7 @@ class Vehicle:
     max_slip_ratio: float = field(default=0.25, validator=within(0.01, 1.0))
     """Maximum ratio of lateral to forward speed."""
     actuator_lag_s: float = field(default=0.2, validator=within(0.0, 2.0))
-    """The body's acceleration follows its set-point as a first-order lag of this time constant."""
+    """Time constant of the first-order lag from the acceleration set-point to the acceleration."""
     lateral_actuator_lag_s: float = field(default=0.1, validator=within(0.0, 2.0))
 
 
@@ -318,22 +318,22 @@ class Tracking:
 
 @frozen
 class RuleSettings:
-    """The rule-based reference method (paper, Section 5.2.2; interpreted in decision 20)."""
+    """The rule-based reference method (paper, Section 5.2.2; decision 20 interprets it)."""
 
     standstill_gap_m: float = field(default=5.0, validator=within(0.0, 100.0))
-    """d_0 of the gap d_R = d_0 + v tau (d_R in the paper's table)."""
+    """d_0 in d_R = d_0 + v tau (called d_R in the paper's table)."""
     headway_s: float = field(default=0.66, validator=within(0.0, 10.0))
-    """tau of the gap d_R."""
+    """tau in d_R = d_0 + v tau."""
     stop_distance_m: float = field(default=150.0, validator=within(1.0, 20_000.0))
-    """d_stop: a vehicle that yields closer to the end stops (d_end in the paper's table)."""
+    """d_stop: distance from the end within which yielding vehicles stop (paper's table: d_end)."""
     gap: str = field(default="front-to-front", validator=one_of("front-to-front", "net"))
     """Definition of d_R: between front bumpers, or bumper to bumper."""
     yielding: str = field(default="unsorted", validator=one_of("unsorted", "all"))
-    """Vehicles that slow down for vehicles of higher priority: those off their lane, or all."""
+    """Vehicles that slow down for vehicles with higher priority: those off their lane, or all."""
     slow_down_mps2: float = field(default=3.0, validator=within(0.1, 20.0))
-    """Braking of a vehicle that yields; car following brakes as hard as necessary."""
+    """Deceleration of a vehicle that yields; car following brakes as hard as necessary."""
     lane_change_s: float = field(default=0.0, validator=within(0.0, 20.0))
-    """Time that a lane change takes; 0: none."""
+    """Lane change duration; 0: instantaneous."""
     min_gap_m: float = field(default=1.0, validator=within(0.1, 50.0))
     """Minimum net gap; d_R between front bumpers alone would let vehicles touch."""
 
@@ -343,13 +343,13 @@ class Lc2013Settings:
     """The reference method `lc2013`: SUMO's LC2013 lane changing and Krauss car following."""
 
     headway_s: float = field(default=0.66, validator=within(0.0, 10.0, open_low=True))
-    """tau of the car following, bumper to bumper."""
+    """tau of the car-following model, bumper to bumper."""
     min_gap_m: float = field(default=0.0, validator=within(0.0, 50.0))
     """Net gap at standstill."""
     lane_change_s: float = field(default=0.0, validator=within(0.0, 20.0))
-    """Time that a lane change takes; 0: none."""
+    """Lane change duration; 0: instantaneous."""
     lane_changes: str = field(default="sorting", validator=one_of("sorting", "everywhere"))
-    """Part of the road with lane changes: S3, or the whole road."""
+    """Part of the road in which vehicles change lanes: S3, or the whole road."""
 
 
 @frozen
@@ -368,14 +368,14 @@ class Runtime:
     agent_start_s: float = field(default=15.0, validator=within(0.1, 120.0))
     """Maximum wait at the entrance for a vehicle's agent (wall-clock seconds)."""
     announce_s: float = field(default=6.0, validator=within(0.0, 600.0))
-    """Lead time of announcements before arrivals, for starting agents (road seconds)."""
+    """Lead time of announcements before arrivals, so that agents can start (road seconds)."""
     max_pace: float = field(default=10.0, validator=within(0.01, 1000.0))
-    """Maximum road seconds per second; network and planning take wall-clock time, which must be
-    short compared with the time between a plan and its start."""
+    """Maximum road seconds per wall-clock second. Network and planning take wall-clock time, which
+    must be short compared with the time between a plan and its start."""
     coordinators: int = field(default=3, validator=within(1, 9))
     vehicles_per_process: int = field(default=1, validator=within(1, 1000))
     max_road_s: float = field(default=100_000.0, validator=within(1.0, 1e6))
-    """Road time after which an incomplete run is ended and counts as failed."""
+    """Road time after which an incomplete run is stopped and counts as failed."""
 
 
 @frozen
@@ -431,7 +431,7 @@ class Scenario:
 
     @property
     def comfortable_cycle_s(self) -> float:
-        """Shortest T_F in which no move exceeds `COMFORT_MPS2`, otherwise the longest [s].
+        """Shortest T_F [s] in which no move exceeds `COMFORT_MPS2`; if there is none, the longest.
 
         A minimum-jerk move by d in T has a peak acceleration of 10 / sqrt(3) d / T^2.
         """
@@ -452,7 +452,7 @@ class Scenario:
         return self.cycles_s[0] - self.formation.slack_s
 
     def move_ticks(self, slot_s: float) -> int:
-        """Return the duration of a move in ticks, in slots of this length."""
+        """Return the duration of a move [ticks] in slots of this length."""
         return round((slot_s - self.formation.slack_s) / self.runtime.tick_s)
 
     @property
@@ -462,7 +462,7 @@ class Scenario:
 
     @property
     def moves_from_m(self) -> float:
-        """Position from which vehicles may move from cell to cell: in S3, or also in S2 [m]."""
+        """Position [m] from which vehicles may move between cells: the start of S3, or in S2."""
         start_m, formation = self.road.sorting_start_m, self.formation
         if not (formation.rolling and formation.sort_in_s2):
             return start_m

@@ -2,7 +2,7 @@
 
 Each right follows from a row of `topics.TOPICS`: senders may send on keys that contain their name,
 readers may read all keys of the topic, the addressee only keys that contain its name. A router
-checks both directions, so each right has a flow as seen from the router. Without I/O.
+checks both directions, so each right has a flow as seen from the router. This module does no I/O.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ REQUEST_MARGIN = 2
 """Factor by which the router's size limit exceeds the service's, so that the service can reject a
 request with a reason."""
 EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 (not an address to listen at)
-"""Hosts that mean all interfaces; clients cannot connect to them."""
+"""Hosts that stand for all interfaces; clients cannot connect to them."""
 
 
 class Flow(StrEnum):

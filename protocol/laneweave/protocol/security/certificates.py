@@ -1,7 +1,7 @@
 """Checks of a process's certificate, key and authority before their use.
 
-The process makes a TLS handshake with itself in memory: peers accept what OpenSSL accepts here. An
-error is reported in one line instead of as a failed connection.
+The process performs a TLS handshake with itself in memory: peers accept what OpenSSL accepts here.
+An error is reported in one line instead of as a failed connection.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from laneweave.protocol.wire.topics import Party
 log = structlog.get_logger(__name__)
 
 EXPIRY_WARNING_S = 7 * 86400.0
-"""Time before the expiry of a certificate from which a warning is logged."""
+"""Remaining validity of a certificate below which a warning is logged."""
 _EXPIRED, _NOT_YET = 10, 9
 """OpenSSL's error codes for certificates outside their validity period."""
 
@@ -38,7 +38,7 @@ class Findings:
     valid_until_s: float
     """Expiry of the certificate (Unix time)."""
     warnings: tuple[str, ...]
-    """Warnings of one line each."""
+    """One-line warnings."""
 
 
 def check_credentials(credentials: Credentials, identity: str, host: str = "") -> Findings:
@@ -55,7 +55,7 @@ def check_credentials(credentials: Credentials, identity: str, host: str = "") -
 
 @cache
 def _warn(identity: str, warning: str) -> None:
-    """Log a warning once, also over several attempts to connect."""
+    """Log a warning only once, even over several attempts to connect."""
     log.warning("certificate", identity=identity, warning=warning)
 
 
@@ -69,7 +69,7 @@ def examine(credentials: Credentials, identity: str, host: str = "") -> Findings
             other identities.
 
     Raises:
-        BadInputError: an invalid file, and the reason.
+        BadInputError: a file is invalid; the message names the file and the reason.
     """
     is_router = identity == Party.ROUTER
     _check_readable("certificate authority", credentials.ca)
@@ -98,7 +98,7 @@ def examine(credentials: Credentials, identity: str, host: str = "") -> Findings
         raise BadInputError(
             "certificate",
             credentials.certificate,
-            f"a certificate of {identity}; this one is of {', '.join(names) or 'no name'}",
+            f"a certificate for {identity}; this one is for {', '.join(names) or 'no name'}",
         )
     until_s = float(ssl.cert_time_to_seconds(presented["notAfter"]))
     return Findings(until_s, tuple(_warnings(credentials, until_s)))
@@ -132,7 +132,7 @@ def _load_own(context: ssl.SSLContext, credentials: Credentials) -> None:
 
 @contextlib.contextmanager
 def _key_file(credentials: Credentials) -> Iterator[str]:
-    """Yield a path of the private key; a key given as text stays in memory."""
+    """Yield a path to the private key; a key given as text stays in memory."""
     if not credentials.private_key_pem:
         yield credentials.private_key
         return

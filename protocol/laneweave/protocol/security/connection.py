@@ -33,13 +33,13 @@ class Access:
     """Zenoh endpoint of the router."""
     realm: str = "default"
     lease_s: float = 1.0
-    """Time of silence after which other processes consider this one lost."""
+    """Duration of silence after which other processes consider this one lost."""
     credentials: Credentials | None = None
     """None: the network is not secured."""
     identity: str = ""
     """Common name of the process's certificate."""
     connect_timeout_s: float = 0.0
-    """Time for which to retry; 0: one attempt."""
+    """Time for which to retry connecting; 0: one attempt."""
 
 
 @frozen

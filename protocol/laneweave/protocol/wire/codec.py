@@ -1,7 +1,7 @@
 """MessagePack codec of the messages: [version, kind, fields].
 
-Decoding checks size, version, kind, field names, types, finiteness and ranges. For invalid bytes it
-raises `BadInputError` only.
+Decoding checks size, version, kind, field names, types, finiteness and ranges. Invalid bytes raise
+only `BadInputError`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ KINDS: dict[str, type] = {
 }
 _MIN_INT, _MAX_INT = -(2**63), 2**63 - 1
 _MIN_FLOAT, _MAX_FLOAT = -1e12, 1e12
-"""Range of floats: larger than every position, speed and time, and safe in calculations."""
+"""Range of floats: wider than any position, speed or time, and safe in calculations."""
 _MAX_DEPTH = 8
 
 

@@ -5,7 +5,7 @@
 The *identity* is the common name of a process's certificate and determines its rights
 (`security.access_control`). The *incarnation* identifies one start of a process: a time in ns whose
 low bits are the process id. Incarnations ascend, and two live processes of a machine never have the
-same one, even after `above` has raised a number beyond the clock.
+same one, even after `above` has raised one beyond the clock.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ IDENTITY_RULE = (
     f"at most {MAX_COMMON_NAME} characters"
 )
 _PROCESS_BITS = 22
-"""Number of bits of a Linux process id; the remaining bits have a step of 4 ms."""
+"""Number of bits of a Linux process id; the bits above them count steps of 4 ms."""
 _STEP = 1 << _PROCESS_BITS
 
 

@@ -20,10 +20,10 @@ Name = NewType("Name", str)
 
 
 class Ballot(NamedTuple):
-    """Identifier of one attempt of one leader process to have one plan executed.
+    """Identifier of one attempt by one leader process to have one plan executed.
 
     Part of several messages. Ballots are compared field by field, in this order. No two plans share
-    a ballot: a coordinator that restarts has another incarnation.
+    a ballot: a restarted coordinator has a new incarnation.
     """
 
     term: int
@@ -60,7 +60,7 @@ class Heartbeat:
 
 @frozen
 class PendingTransfer:
-    """Transfer of cells by one plan of the rolling operation, as one vehicle stores it.
+    """Transfer of cells by one plan of the rolling operation, as stored by one vehicle.
 
     Part of other messages. The vehicle owns the cells `before` until it knows that the start gate
     is open, and the cells `after` from then on.
@@ -82,13 +82,13 @@ class PendingTransfer:
 class Prepare:
     """Leader to each vehicle of the roster that has not promised, every `network.resend_s`.
 
-    Missing: sent again. Duplicated, late, or of a lower ballot than the promised one: no effect,
+    Missing: sent again. Duplicated, late, or with a lower ballot than the promised one: no effect,
     but the vehicle answers with its state, which contains the promised ballot.
     """
 
     ballot: Ballot
     formations: tuple[int, ...]
-    """Blocks that the plan may use, ascending: those of one formation or of joined formations."""
+    """Blocks that the plan may use, ascending: the blocks of one formation or several joined."""
     roster: tuple[Name, ...]
     """All vehicles on the road that entered in these blocks; in the rolling operation, the vehicles
     that move and the owners of the cells that they need."""
@@ -98,7 +98,7 @@ class Prepare:
 class Plan:
     """Leader to each vehicle of the roster that has not accepted, every `network.resend_s`.
 
-    There is one per ballot. Missing: sent again; no vehicle moves before all have accepted (start
+    There is one per ballot. Missing: sent again; no vehicle moves until all have accepted (start
     gate). Duplicated or late: ignored. A plan is also ignored (V3) if its ballot is not the
     promised one, it cannot be executed safely, its blocks are not exactly the joined ones, its
     territory leaves them, or its cell transfers are invalid. Vehicles derive the dependencies
@@ -134,7 +134,7 @@ class VehicleState:
 
     It serves as promise, acceptance and progress report. Missing: vehicles that wait for it hold.
     Late or duplicated: harmless to vehicles, since "completed k moves of ballot b" stays true;
-    leaders drop states older than the newest of that vehicle. With another ballot than that of the
+    leaders drop states older than that vehicle's newest. With a ballot other than that of the
     receiver's plan: not used for this plan.
     """
 
@@ -163,7 +163,7 @@ class VehicleState:
     done: bool
     """Whether all moves of the accepted plan are completed."""
     overdue: bool
-    """Whether the next move has been due for 1.5 slots, or for a slot and 2 s if that is less."""
+    """Whether the next move has been due for 1.5 slots, or for a slot plus 2 s if that is less."""
     attended: bool
     """Whether an agent drives the vehicle; otherwise its caretaker is in charge, and it holds."""
     s_m: float
@@ -188,9 +188,9 @@ class Motion:
     Sent when the motion begins and every 10 ticks while it lasts; a vehicle that holds sends
     nothing. The trajectory follows from the scenario, which all vehicles share. Only the trackers
     of other vehicles use the message, and only if they sense a vehicle at the position that follows
-    from it. Missing, late, or not repeated for 30 ticks: they rely on their sensors alone.
+    from it. Missing, late, or not repeated for 30 ticks: trackers rely on their sensors alone.
     Duplicated: no effect. Older than the newest motion of that vehicle (by incarnation, then by
-    `begin_tick`), or not a move of the scenario: ignored.
+    `begin_tick`), or not a possible move in the scenario: ignored.
     """
 
     vehicle: Name
@@ -198,7 +198,7 @@ class Motion:
     incarnation: int
     """Incarnation of the sending process [ns]."""
     stretch: int
-    """Number of the stretch of columns in which the motion began."""
+    """Index of the stretch of columns in which the motion began."""
     origin: Cell
     target: Cell
     begin_tick: int
@@ -230,8 +230,8 @@ class Sense:
     vehicle continues its last trajectory. Duplicated: the agent repeats its answer. Older than the
     newest tick of the same bridge, or from an earlier bridge: ignored. From a newer bridge: the
     agent discards its state of the earlier road and takes a new incarnation. A message with `left`
-    is repeated for 20 ticks or until the agent's token vanishes; at the end of a run each vehicle
-    on the road receives one.
+    is repeated for 20 ticks or until the agent's token vanishes; when a run ends, each vehicle on
+    the road receives one.
     """
 
     vehicle: Name
@@ -243,9 +243,9 @@ class Sense:
     """Measured (s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2]); s is the front bumper
     along the road, y the body centre from the right edge."""
     hold_cell: Cell
-    """Cell in which the motion controller will hold without a new command."""
+    """Cell in which the motion controller will hold unless it receives a new command."""
     motion_end_tick: int
-    """Tick at which the current motion ends; not after `tick` if the vehicle holds."""
+    """Tick at which the current motion ends; at most `tick` if the vehicle holds."""
     motion_origin: Cell
     """Cell in which the current motion began; `hold_cell` if the vehicle holds."""
     preferred_lane: int
@@ -262,13 +262,13 @@ class Sense:
     motion_ticks: int = 0
     """Duration of the current move [ticks]; 0: the vehicle settles in its cell, or holds."""
     caretaker: bool = False
-    """Whether the caretaker is in charge, because the agent ended or stopped answering."""
+    """Whether the caretaker is in charge because the agent is absent or does not answer in time."""
     joined: tuple[int, ...] = ()
     """Blocks that the controller has stored as joined."""
     accepted: Ballot | None = None
     """Ballot of the newest plan that the process in charge has accepted, as stored."""
     left: bool = False
-    """Whether the vehicle has left the road; its agent then sends its report and ends."""
+    """Whether the vehicle has left the road; its agent then sends its report and stops."""
     owned: Annotated[tuple[Cell, ...], override(rename="estate")] = ()
     """Rolling operation: cells that the vehicle owns. Key on the wire: `estate`."""
     promised: Ballot | None = None
@@ -276,19 +276,19 @@ class Sense:
     transfer: Annotated[PendingTransfer | None, override(rename="deed")] = None
     """Rolling operation: newest transfer of cells. Key on the wire: `deed`."""
     bridge: int = 0
-    """Incarnation of the bridge [ns]: another one means another road; 0: not given."""
+    """Incarnation of the bridge [ns]; a new value means a new road; 0: not given."""
 
 
 @frozen
 class Command:
-    """Agent to the motion controller of its vehicle (in the bridge), the answer to each `Sense`.
+    """Agent to the motion controller of its vehicle (in the bridge), in answer to each `Sense`.
 
-    It contains the complete remaining trajectory. Missing: the controller executes the trajectory
-    that it has, then holds. Duplicated: no effect. Only an answer to the current tick that arrives
+    It contains the complete remaining trajectory. Missing: the controller executes its stored
+    trajectory, then holds. Duplicated: no effect. Only an answer to the current tick that arrives
     in time is executed; a late answer only ends the agent's silence. From an older incarnation than
     the one in charge: refused. From a newer one: that process takes charge. `joined`, `accepted`,
     `promised` and `transfer` are stored for any tick, and confirmed in the next SENSE. With jerks
-    that are not finite pairs, or cells outside the lanes of the road: refused and logged.
+    that are not pairs of finite numbers, or cells outside the road's lanes: refused and logged.
     """
 
     vehicle: Name
@@ -359,7 +359,7 @@ class Announcement:
 
     vehicle: Name
     lane: int
-    """Lane on which it arrives."""
+    """Lane in which it arrives."""
     preferred_lane: int
     arrival_s: float
     """Road time at which it would pass s = 0 without other vehicles [s]."""
@@ -371,14 +371,14 @@ class Census:
 
     A change is an entry, a departure, the closing of a formation, or an announcement made or
     withdrawn. The census is complete: a vehicle is on the road at `t_s` if and only if it is
-    listed. On each lane, the number of announced vehicles is at most one above the number of free
-    cells that pass within `runtime.announce_s`, so that agents start only for vehicles that can
+    listed. In each lane, the number of announced vehicles exceeds the number of free cells that
+    pass within `runtime.announce_s` by at most one, so that agents start only for vehicles that can
     enter soon. An agent process with a shard starts an agent for each listed vehicle of its shard,
-    and ends the agents of vehicles that are no longer listed.
+    and stops the agents of vehicles that are no longer listed.
 
     Missing: the receiver uses the older census, and plans nothing for formations closed since then.
-    Duplicated or older than the newest: ignored. A coordinator's road time is the newest `t_s` of
-    census and clock.
+    Duplicated or older than the newest: ignored. A coordinator's road time is the newest `t_s` from
+    the census and the clock.
     """
 
     t_s: float
@@ -393,15 +393,15 @@ class Census:
     closed_to: int = -1
     """All blocks up to this number are closed: their vehicles are listed or have left."""
     bridge: int = 0
-    """Incarnation of the bridge [ns]: another one means another road; 0: not given."""
+    """Incarnation of the bridge [ns]; a new value means a new road; 0: not given."""
 
 
 @frozen
 class RoadClock:
     """Bridge to coordinators and observers, each tick: road time and progress.
 
-    Missing: the coordinator's road time stands still until the next clock or census, so it begins
-    nothing new. Late or duplicated: ignored. Agents take road time from `Sense`.
+    Missing: the coordinator's road time stops until the next clock or census, so the coordinator
+    begins nothing new. Late or duplicated: ignored. Agents take road time from `Sense`.
     """
 
     tick: int
@@ -418,18 +418,18 @@ class RoadClock:
     ended: bool
     """Whether the run is over."""
     bridge: int = 0
-    """Incarnation of the bridge [ns]: another one means another road; 0: not given."""
+    """Incarnation of the bridge [ns]; a new value means a new road; 0: not given."""
 
 
 @frozen
 class Report:
     """Any role to the recorder: its counters.
 
-    Sent by agents when their vehicle has left or they are stopped, by the bridge at the end of its
-    run, and by coordinators every 2 s and when they are stopped. Missing: not included in the
-    summary; at the end of a run the bridge waits up to 2 s for the reports of all its agents. Late:
-    not recorded. Duplicated: the newest report of a sender counts. The summary takes the maximum of
-    a process's counters over its senders, and the sum of all others.
+    Sent by agents when their vehicle has left or they are stopped, by the bridge when its run ends,
+    and by coordinators every 2 s and when they are stopped. Missing: not included in the
+    summary; when a run ends, the bridge waits up to 2 s for the reports from all agents. Late: not
+    recorded. Duplicated: the newest report from a sender counts. The summary takes the maximum of a
+    process's counters over its senders, and the sum of all other counters.
     """
 
     role: Name
@@ -455,7 +455,7 @@ class LogEvent:
     """Any role to the recorder, for each event: a line in `events.jsonl`.
 
     Currently only coordinators send events; the bridge writes its own directly. Missing, or
-    later than the end of the run: not recorded. Duplicated: recorded twice.
+    late because the run has ended: not recorded. Duplicated: recorded twice.
     """
 
     role: Name

@@ -70,25 +70,25 @@ ANY_SENDER = "any"
 
 @frozen
 class Topic:
-    """A kind of keys, with their messages, senders and readers.
+    """A class of keys with its messages, senders and readers.
 
     The rights that a router grants (`security.access_control`) follow from these fields.
     """
 
     name: str
     pattern: str
-    """Key without prefix and realm, with {parameters}."""
+    """Key without prefix or realm, with {parameters}."""
     kind: type | None
     """Message class; None for tokens and the planning service."""
     sender: str
-    """A `Party`, or `ANY_SENDER`. Keys with the name of a process are reserved for this process."""
+    """A `Party`, or `ANY_SENDER`. Keys with the name of a process are reserved for that process."""
     quality: Quality
     readers: tuple[Party, ...] = ()
     """Parties that read all keys of the topic."""
     addressee: Party | None = None
     """Party that reads only keys that contain its name."""
     deputy: Party | None = None
-    """Party that may send in place of any sender."""
+    """Party that may send on behalf of any sender."""
     exchange: Exchange = Exchange.MESSAGES
     remark: str = ""
     """Remark for the table of docs/PROTOCOL.md."""
@@ -106,7 +106,7 @@ CLOCK = Topic(
 CENSUS = Topic(
     "census", "census", messages.Census, Party.BRIDGE, Quality.LATEST,
     readers=(Party.COORDINATOR, Party.FLEET, Party.OBSERVER),
-    remark="of fleets those with a shard",
+    remark="fleets: only those with a shard",
 )  # fmt: skip
 SENSE = Topic(
     "sense", "sense/{vehicle}", messages.Sense, Party.BRIDGE, Quality.LOCKSTEP,
@@ -116,12 +116,12 @@ COMMAND = Topic(
     "command", "command/{vehicle}", messages.Command, Party.VEHICLE, Quality.LOCKSTEP,
     readers=(Party.BRIDGE,),
 )  # fmt: skip
-# Vehicles read the states of those that must leave their cells first. For a vehicle without an
-# agent, its caretaker in the bridge sends.
+# Vehicles read the states of the vehicles that they wait for. For a vehicle without an agent, its
+# caretaker in the bridge sends the state.
 STATE = Topic(
     "state", "state/{formation}/{vehicle}", messages.VehicleState, Party.VEHICLE, Quality.LATEST,
     readers=(Party.COORDINATOR, Party.VEHICLE, Party.OBSERVER), deputy=Party.BRIDGE,
-    remark="of coordinators the leader; of vehicles those of the formation that wait",
+    remark="coordinators: only the leader; vehicles: only waiting ones of the formation",
 )  # fmt: skip
 MOTION = Topic(
     "motion", "motion/{stretch}/{vehicle}", messages.Motion, Party.VEHICLE, Quality.LATEST,

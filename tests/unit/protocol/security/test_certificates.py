@@ -84,7 +84,7 @@ def test_an_empty_certificate_is_refused(folder: Path, tmp_path: Path, part: str
 def test_a_certificate_or_key_of_another_identity_is_refused(folder: Path) -> None:
     error = refused(credentials(folder), "coordinator.c2")
     assert error.field == "certificate"
-    assert "this one is of coordinator.c1" in error.allowed
+    assert "this one is for coordinator.c1" in error.allowed
     wrong_key = attrs.evolve(
         credentials(folder), private_key=credentials(folder, "vehicle.v1").private_key
     )

@@ -30,9 +30,9 @@ from laneweave.protocol.transports.simulated.virtual_time import Clock, Item, Si
 from laneweave.protocol.wire.topics import matches_any
 
 WAKE_AGAIN_S = 0.001
-"""Delay of a wakeup that a core requests for a past time, so that virtual time advances."""
+"""Delay of a wakeup requested for a past time, so that virtual time advances."""
 INJECTED_FAILURE = "injected failure"
-"""Error of a computation that fails because of `Conditions.compute_failure`."""
+"""Error of a computation that `Conditions.compute_failure` makes fail."""
 _DELIVERIES = (Received, TokenUp, TokenDown, LinkUp, LinkDown, Query)
 
 
@@ -46,7 +46,7 @@ class Member:
         """Start connected and running; the network sets `node` and `transport`."""
         self.name = name
         self.number = number
-        """Number in the order in which members join."""
+        """Position in the order in which members joined, from 0."""
         self.subscriptions: dict[str, None] = {}
         self.watched: dict[str, None] = {}
         self.tokens: dict[str, None] = {}
@@ -56,25 +56,25 @@ class Member:
         """None: virtual time."""
         self.connected = True
         self.unplugged = False
-        """Disconnected individually: a returning router does not reconnect it."""
+        """Disconnected individually: a restored router does not reconnect it."""
         self.connection = 0
-        """Number of the current connection; messages of earlier connections are dropped."""
+        """Id of the current connection; messages sent over earlier connections are dropped."""
         self.paused = False
         self.pauses = 0
         self.lapsed = False
         """Paused for longer than the lease."""
         self.last_token_s = 0.0
-        """Arrival time of the newest token event, since token events stay in order."""
+        """Arrival time of the newest token event, which later token events must not overtake."""
         self.seen: dict[str, None] = {}
         """Tokens that the node has been notified of."""
         self._simulation = simulation
         self._backlog: list[Item] = []
         self._alarm = 0
-        """Number of the newest alarm; older alarms are ignored."""
+        """Id of the newest alarm; older alarms are ignored."""
         self._alarm_s = math.inf
         """Virtual time of the newest alarm; infinite: none."""
         self._computed_s = {Compute: 0.0, Delegate: 0.0}
-        """End of the newest computation of each kind, in virtual time."""
+        """Virtual time at which the newest computation of each kind ends."""
 
     @property
     def visible(self) -> bool:
@@ -141,7 +141,7 @@ class Member:
     def _set_alarm(self, min_s: float = 0.0) -> None:
         """Set an alarm for the core's wakeup unless an earlier alarm is set.
 
-        An alarm that is too early sets the next one. This is rarer than postponed wakeups.
+        A postponed wakeup does not move the alarm, which then rings too early and sets the next.
         """
         if self.closed or self.paused:
             return
@@ -181,17 +181,17 @@ class Member:
             computed = (
                 run_job(job) if isinstance(job, Compute) else run_delegated(job, self._local_s)
             )
-        # As with one thread and one worker, jobs of a kind end in the order of their requests.
+        # As with one thread and one worker, jobs of a kind end in the order in which they start.
         end_s = max(self._computed_s[type(job)], simulation.now_s + duration_s)
         self._computed_s[type(job)] = end_s
         simulation.at(end_s, self.handle, computed)
 
 
 class Tokens:
-    """Liveliness tokens: notifies members of appearing and vanishing tokens that they watch.
+    """Liveliness tokens: notifies members when tokens that they watch appear or vanish.
 
-    If several nodes declare a token on one key, it appears with the first and vanishes with the
-    last. Notifications are never lost and stay in order, as on Zenoh.
+    If several nodes declare a token on one key, it appears when the first declares it and vanishes
+    when the last withdraws it. Notifications are never lost and stay in order, as on Zenoh.
     """
 
     def __init__(self, simulation: Simulation, members: Mapping[str, Member]) -> None:

@@ -1,14 +1,14 @@
 """The transport in virtual time: a network inside one process.
 
 Nodes, messages and computations share one event queue; time jumps from event to event. Loss,
-duplication, delay and reordering are drawn for each message and receiver from one seeded generator:
-equal seeds give equal runs. Nodes can be killed, paused, resumed and disconnected, the router can
-be lost, and clocks can be wrong. Liveliness behaves as measured on Zenoh: a killed process is
-detected at once, a silent one after its lease, and for a node without connection all tokens vanish.
+duplication and delay are drawn for each message and receiver from one seeded generator: the same
+seed gives the same run. Nodes can be killed, paused, resumed and disconnected, the router can be
+lost, and clocks can be wrong. Liveliness behaves as measured on Zenoh: a killed process is detected
+at once, a silent one when its lease expires; for a node without a connection all tokens vanish.
 
 Messages are sent as bytes and checked on receipt, as on Zenoh. All receivers of the same bytes
 share one decoded message, so cores must not modify it. With `skip_codec`, messages are sent as
-objects, without codec and checks, for speed.
+objects, without encoding or checks, for speed.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from laneweave.protocol.wire.topics import Keys, Quality, Topic, matches, matche
 KILL_SEEN_S = 0.005
 """Time until others detect a killed process (measured on Zenoh: 2 to 9 ms)."""
 REJOIN_S = (0.2, 0.9)
-"""Range of the time in which nodes reconnect to a restored router (measured on Zenoh)."""
+"""Range of the time that nodes take to reconnect to a restored router (measured on Zenoh)."""
 _CACHE_SIZE = 4096
 """Size of the shared caches of decoded messages."""
 
@@ -87,12 +87,12 @@ class _Reader:
 
 @frozen
 class _OpenQuery:
-    """A query at one of the servers that may answer it."""
+    """A query as sent to one of the servers that may answer it."""
 
     server: Member
     answer: Callable[[Answer | None], None]
     tokens: set[int]
-    """Tokens of all servers that may still answer; shared by their entries."""
+    """Tokens of this query for all servers that may still answer; shared by their entries."""
 
 
 class _Transport:
@@ -159,9 +159,9 @@ class SimulatedNetwork(Simulation):
         self.tokens = Tokens(self, self._members)
         self._clocks: dict[str, Clock] = {}
         self._routes: dict[str, tuple[Member, ...]] = {}
-        """Receivers of each key, in order of their start."""
+        """Receivers of each key, in the order in which they started."""
         self._keys_by_prefix: dict[str, list[str]] = {}
-        """Keys with routes, by key without its last part."""
+        """Keys with routes, grouped by the key without its last part."""
         self._cut: Callable[[str, str], bool] | None = None
         self._router_up = True
         self._outages = 0
@@ -208,7 +208,7 @@ class SimulatedNetwork(Simulation):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the nodes, in order of their start."""
+        """Names of the nodes, in the order in which they started."""
         return tuple(self._members)
 
     def node(self, name: str) -> Node:
@@ -222,7 +222,7 @@ class SimulatedNetwork(Simulation):
         self._vanish(name, KILL_SEEN_S)
 
     def stop(self, name: str) -> None:
-        """Request the end of a node, as SIGTERM does; a paused node ends when it is resumed."""
+        """Ask a node to stop, as SIGTERM does; a paused node stops when it is resumed."""
         member = self._members.get(name)
         if member is not None:
             member.handle(Stopping())
@@ -251,7 +251,7 @@ class SimulatedNetwork(Simulation):
         """Set a node's clock to `offset_s + rate * t` at virtual time t.
 
         The clock belongs to the machine: later nodes of this name have the same clock. For a
-        running node time jumps.
+        running node, time jumps.
 
         Raises:
             ValueError: an argument is not finite, or the rate is not positive.
@@ -267,9 +267,9 @@ class SimulatedNetwork(Simulation):
         self._cut = blocked
 
     def disconnect(self, name: str) -> None:
-        """Disconnect a node; its tokens vanish for all others at once.
+        """Disconnect a node; its tokens vanish for all other nodes at once.
 
-        For the node itself all tokens vanish, with `LinkDown` at a random place among these events.
+        For the node itself, all tokens vanish; `LinkDown` is placed at random among these events.
         """
         member = self._members[name]
         member.unplugged = True
@@ -283,7 +283,7 @@ class SimulatedNetwork(Simulation):
             self._join(member)
 
     def lose_router(self) -> None:
-        """Disconnect all nodes; for each of them all tokens vanish at once."""
+        """Disconnect all nodes; for each node, all tokens vanish at once."""
         if self._router_up:
             self._router_up = False
             self._outages += 1
@@ -331,7 +331,7 @@ class SimulatedNetwork(Simulation):
     def query(self, key: str, payload: bytes, answer: Callable[[Answer | None], None]) -> None:
         """Query all servers of a key and pass the first answer to `answer`.
 
-        The answer is None if there is no server, or if all have declined, ended or disconnected.
+        The answer is None if there is no server, or if all have declined, exited or disconnected.
         """
         servers = [
             member for member in self._members.values() if member.connected and key in member.served
@@ -345,7 +345,7 @@ class SimulatedNetwork(Simulation):
             self.at(self.now_s + self.delay_s(), answer, None)
 
     def accept_answer(self, server: Member, token: int, given: Answer | None) -> None:
-        """Process the answer of a server; None: it declines."""
+        """Process a server's answer; None: the server declines."""
         if token in self._queries and server.connected and not server.closed:
             self._settle(token, given)
 
@@ -383,7 +383,7 @@ class SimulatedNetwork(Simulation):
         return [key for key in self._routes if matches(expression, key)]
 
     def remove(self, name: str) -> None:
-        """Remove a node that has left the network itself."""
+        """Remove a node that has left the network on its own."""
         self._vanish(name, self.conditions.delay_s)
 
     # --- internals --------------------------------------------------------------------------

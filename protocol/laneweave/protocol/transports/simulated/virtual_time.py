@@ -25,7 +25,7 @@ from laneweave.protocol.runtime.transport import (
 Item = Delivery | Computed | Started | Stopping | Wakeup
 """Input of a node."""
 Trace = Callable[[float, str, Item], None]
-"""Called with virtual time, node name and input, in order."""
+"""Called with the virtual time, node name and content of each input, in order."""
 Action = Callable[..., None]
 
 _SHARE = and_(ge(0.0), le(1.0))
@@ -34,11 +34,11 @@ _TIME = and_(ge(0.0), lt(math.inf))
 
 @frozen
 class Conditions:
-    """Message faults, and durations of computations."""
+    """Message faults, and computation times."""
 
     delay_s: float = field(default=0.002, validator=_TIME)
     jitter_s: float = field(default=0.003, validator=_TIME)
-    """The delay is uniform in [delay, delay + jitter], so messages overtake each other."""
+    """The delay is uniform in [delay, delay + jitter], so messages may overtake each other."""
     loss: float = field(default=0.0, validator=_SHARE)
     """Probability that a receiver loses a message."""
     duplication: float = field(default=0.0, validator=_SHARE)
@@ -86,12 +86,12 @@ class Simulation:
         self.trace: Trace | None = None
         """Called with every input of every node; None: no trace."""
         self.dropped = 0
-        """Lost messages, counted per receiver."""
+        """Number of lost messages, counted per receiver."""
         self.delivered = 0
         """Number of deliveries to nodes."""
         self.random = random.Random(seed)  # noqa: S311 (simulation, not secrets)
         self.queue: list[tuple[float, int, Action, tuple[Any, ...]]] = []
-        """(time, order among equal times, action, arguments) of each future event."""
+        """(time, tie-breaker, action, arguments) of each future event."""
         self.order = count()
 
     def at(self, time_s: float, action: Action, *arguments: object) -> None:
@@ -126,7 +126,7 @@ class Simulation:
 class TraceDigest:
     """A trace that computes a hash of all inputs of all nodes, to compare two runs.
 
-    It omits the results of computations, which may be any object but affect later messages.
+    Results of computations, which may be any object, are omitted: they affect later messages.
     """
 
     def __init__(self) -> None:

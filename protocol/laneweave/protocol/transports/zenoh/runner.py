@@ -45,7 +45,7 @@ def run_core(
     """Run a core over Zenoh until it ends or the process receives SIGINT or SIGTERM.
 
     Must be called in the main thread. `Compute` jobs run in a thread, `Delegate` jobs in `pool`,
-    which only a core that delegates needs. `observe` registers the metrics of node and core.
+    which only a core that delegates needs. `observe` registers the metrics of the node and core.
 
     Raises:
         BadInputError: the realm is malformed, or no router answers at the endpoint within
@@ -64,7 +64,7 @@ def run_core(
             inbox.put(Computed(job.job, None, "this process has no workers"))
 
     with stop_signals(lambda: inbox.put(Stopping())):
-        # Before the connection, the inbox can contain only `Stopping`.
+        # Until the process is connected, the inbox can contain only `Stopping`.
         transport = connect(access, inbox.put, lambda wait_s: any(inbox.take(wait_s)))
         if transport is None:
             return
@@ -106,7 +106,7 @@ def _handle(node: Node, item: Item) -> None:
 
 
 class _Worker:
-    """Daemon thread for computations, started with the first one."""
+    """Daemon thread for computations, started when the first one is submitted."""
 
     def __init__(self, done: Callable[[Computed], None]) -> None:
         """Create the worker; `done` is called from its thread."""

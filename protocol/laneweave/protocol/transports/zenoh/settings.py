@@ -13,8 +13,8 @@ from laneweave.protocol.security.connection import Access, Credentials, RouterGu
 
 DROP_AFTER_US = 50
 OPEN_MS = 2000
-"""Timeout of one attempt to connect. An attempt on a cut link waits until its timeout, even if the
-link is restored before."""
+"""Timeout of one attempt to connect. An attempt over a cut link lasts until its timeout, even if
+the link is restored earlier."""
 Setting = tuple[str, Any]
 
 
@@ -71,5 +71,5 @@ def _tls_settings(credentials: Credentials, side: str) -> Iterator[Setting]:
     yield f"{tls}/enable_mtls", True
     yield f"{tls}/verify_name_on_connect", True
     yield f"{tls}/close_link_on_expiration", True
-    # Only TLS, for any endpoint.
+    # Allow only TLS, for any endpoint.
     yield "transport/link/protocols", ["tls"]

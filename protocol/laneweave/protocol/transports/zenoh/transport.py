@@ -56,7 +56,7 @@ _QUALITY: dict[Quality, dict[str, Any]] = {
 MAX_OPEN_QUERIES = 4096
 """Maximum number of open queries; further ones are declined."""
 TOO_LONG = bytes(MAX_BYTES + 1)
-"""Replacement of a payload that is too long to be read."""
+"""Substitute for a payload that is too long to read."""
 ROUTER_RUNTIME = "(rx: (worker_threads: 64))"
 """Zenoh's default is two receiving threads. Closing an expired connection blocks one of them for up
 to 10 s (the linger of its socket), and without a free thread no messages are forwarded. When a host
@@ -67,7 +67,7 @@ CLIENT_RUNTIME = (
     "net: (handover: app))"
 )
 """A single thread for all of Zenoh's task pools in a client: with one process per vehicle, passing
-messages between threads costs about a tenth of the time of two cores."""
+messages between threads takes about a tenth of the CPU time of two cores."""
 CONNECT_AGAIN_S = 0.5
 """Interval between attempts to connect."""
 
@@ -138,7 +138,7 @@ class ZenohTransport:
         )
 
     def publish(self, key: str, payload: bytes, quality: Quality) -> None:
-        """Send a payload, which is silently lost without a connection."""
+        """Send a payload; without a connection it is silently lost."""
         with contextlib.suppress(zenoh.ZError):
             self._session.put(key, payload, **_QUALITY[quality])
 
@@ -174,12 +174,12 @@ class ZenohTransport:
             )
 
     def serve(self, key: str) -> None:
-        """Answer queries on a key."""
+        """Deliver queries on a key."""
         if key not in self._served and not self._closed:
             self._served[key] = self._session.declare_queryable(key, self._on_query)
 
     def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
-        """Answer a query once."""
+        """Answer a query; unknown tokens are ignored."""
         query = self._pop_query(token)
         if query is None:
             return
@@ -206,7 +206,7 @@ class ZenohTransport:
         """Query the servers of a key.
 
         Returns:
-            A future of the first answer. None: the key has no server, or all have declined, ended
+            A future for the first answer. None: the key has no server, or all have declined, exited
             or disconnected. The future raises `TimeoutError` if no server answers in time.
         """
         first: Future[Answer | None] = Future()
@@ -230,7 +230,7 @@ class ZenohTransport:
         return first
 
     def close(self) -> None:
-        """Close the session; otherwise its subscribers would block the exit of the interpreter."""
+        """Close the session; its subscribers would keep the interpreter from exiting."""
         if not self._closed:
             self._closed = True
             # Closing undeclares everything; later calls must not access the closed session.
@@ -275,10 +275,10 @@ def connect(
     Args:
         access: see `ZenohTransport`.
         deliver: see `ZenohTransport`.
-        stopped: waits for some seconds and returns whether the process is to end.
+        stopped: waits for the given seconds and returns whether the process should stop.
 
     Returns:
-        The session; None if the process is to end.
+        The session; None if the process should stop.
 
     Raises:
         BadInputError: the endpoint is malformed, or no router answers there in time.
@@ -300,7 +300,7 @@ def connect(
 
 
 def connect_blocking(access: Access, deliver: Deliver) -> ZenohTransport:
-    """Connect as `connect` does, in a process that is not stopped by a callback.
+    """Connect as `connect` does, without a callback that can stop it.
 
     Raises:
         BadInputError: see `connect`.
@@ -321,12 +321,12 @@ def run_router(
     """Run a Zenoh router until SIGINT or SIGTERM.
 
     Args:
-        listen: endpoints at which it listens; a socket file left by a killed router is replaced.
-        lease_s: time of silence after which clients consider the router lost.
-        ready: called when the router listens.
-        field: field of the endpoints, for errors.
+        listen: endpoints at which to listen; a socket file left by a killed router is replaced.
+        lease_s: silence [s] after which clients consider the router lost.
+        ready: called once the router is listening.
+        field: name of the endpoints' field, for errors.
         guard: rights and credentials; None: all clients have all rights.
-        observe: registers the metrics source when the router listens.
+        observe: registers the metrics source once the router is listening.
 
     Raises:
         BadInputError: the router cannot listen at an endpoint, or its credentials are invalid.
