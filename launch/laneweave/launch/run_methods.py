@@ -1,4 +1,4 @@
-"""Control methods, and the labels that sweeps give to methods with settings."""
+"""Control methods, and their labelled variants for sweeps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_TAPPA_VEHICLES: Final = 6
 
 
 class KeepTrajectories(StrEnum):
-    """The runs of a sweep whose trajectories are kept."""
+    """Runs of a sweep whose trajectories are kept."""
 
     none = "none"
     first_seed = "first-seed"
@@ -32,12 +32,12 @@ class KeepTrajectories(StrEnum):
 
 @frozen
 class LabelledMethod:
-    """A control method with settings of the scenario."""
+    """A control method with scenario settings."""
 
     method: str
     """Value of `laneweave run --method`."""
     overrides: Mapping[str, object] = field(factory=dict)
-    """Values that replace those of the scenario, by `table.field`."""
+    """Scenario settings to replace, as `table.field`: value."""
 
     def settings(self, base: Scenario) -> Scenario:
         """Return the scenario with these settings.
@@ -81,7 +81,7 @@ def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
 
 
 def _solver(max_vehicles: int) -> dict[str, object]:
-    """Return the setting of the solver for formations of at most `max_vehicles`."""
+    """Return the solver setting for formations of at most `max_vehicles`."""
     return {"formation.solver": "tappa" if max_vehicles <= MAX_TAPPA_VEHICLES else "branching"}
 
 
@@ -117,7 +117,7 @@ def affects(field_name: str, method: str) -> bool:
 
 
 def parse_methods(text: str) -> tuple[str, ...]:
-    """Return the labels of a comma-separated list.
+    """Return the labels in a comma-separated list.
 
     Raises:
         BadInputError: a label is unknown or repeated.
@@ -132,6 +132,6 @@ def parse_methods(text: str) -> tuple[str, ...]:
 
 
 def rank(label: str) -> tuple[int, str]:
-    """Return the sort key of a label: the order of `METHODS`, unknown labels last."""
+    """Return the sort key of a label: in the order of `METHODS`, unknown labels last."""
     known = list(METHODS)
     return (known.index(label) if label in METHODS else len(known), label)

@@ -27,7 +27,7 @@ def bench(
     what: Annotated[Benchmark, typer.Argument(help="runtime, planner or tracker.")],
     vehicles: Annotated[
         str | None,
-        typer.Option("--vehicles", help="Comma-separated numbers; see above for the defaults."),
+        typer.Option("--vehicles", help="Comma-separated vehicle counts; defaults: see above."),
     ] = None,
     per_process: Annotated[
         int, typer.Option("--vehicles-per-process", min=1, help="runtime: agents per process.")
@@ -59,7 +59,7 @@ def bench(
     seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Measure this machine: roads of 30, 60 and 90 vehicles, plans for 6 to 36, or tracking."""
+    """Benchmark this machine: roads with 30, 60 and 90 vehicles, plans for 6 to 36, or tracking."""
     from laneweave.coordinator.planning.request import checked_solver
     from laneweave.launch.bench.planner import FAMILIES, bench_planner, planner_table
     from laneweave.launch.bench.runtime import bench_runtime, machine, runtime_table

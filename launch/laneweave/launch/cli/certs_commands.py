@@ -21,7 +21,7 @@ app = typer.Typer(help="Make test certificates.", add_completion=False)
 DEFAULT_DAYS = 365.0
 MAX_DAYS = 3650.0
 
-Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the certificates.")]
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder for the certificates.")]
 Hosts = Annotated[
     list[str] | None,
     typer.Option("--host", metavar="NAME_OR_IP", help="Host of the router; repeatable."),
@@ -97,7 +97,7 @@ def add(
     days: Days = DEFAULT_DAYS,
     force: Force = False,
 ) -> None:
-    """Make another certificate with the existing authority."""
+    """Issue another certificate from the existing authority."""
     from laneweave.launch.deploy.certificate_authority import issue, load_authority
 
     _check_days(days)
@@ -105,7 +105,7 @@ def add(
     if host and wanted.party is not Party.ROUTER:
         raise BadInputError("--host", host[0], "only for the router")
     issue(load_authority(folder), folder, wanted, days=days, hosts=host or (), replace=force)
-    typer.echo(f"{folder}: a certificate of {wanted.common_name}")
+    typer.echo(f"{folder}: a certificate for {wanted.common_name}")
 
 
 def _check_days(days: float) -> None:
@@ -129,7 +129,7 @@ def _wanted(settings: Scenario, clients: list[str], vehicles: list[str]) -> Iter
 
 
 def _hosts(settings: Scenario) -> Iterator[str]:
-    """Yield the hosts of a configuration's endpoints."""
+    """Yield the hosts in a configuration's endpoints."""
     for endpoint in (settings.network.endpoint, *settings.network.listen):
         host = host_of(endpoint)
         if host:

@@ -32,7 +32,7 @@ def check(
     ] = None,
     name: Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the role.")] = "",
 ) -> None:
-    """Check a configuration; with --role also the certificate files of that role on this host."""
+    """Check a configuration and, with --role, that role's certificate files on this host."""
     settings = load_scenario(file)
     if name and role is None:
         raise BadInputError("--name", name, "only with --role")

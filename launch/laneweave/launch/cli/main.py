@@ -88,7 +88,7 @@ def _status(arguments: list[str]) -> int:
     from laneweave.launch.run.logs import log_to_terminal
     from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 
-    # Handle SIGTERM like Ctrl-C, to complete files and remove temporary folders. Roles install
+    # Handle SIGTERM like Ctrl-C: complete files and remove temporary folders. Roles install
     # their own handlers.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     log_to_terminal()
@@ -103,7 +103,7 @@ def _status(arguments: list[str]) -> int:
         sys.stderr.write("interrupted\n")
         return 1
     except typer.TyperException as error:
-        # Unknown option or argument; print one line instead of typer's report of several lines.
+        # Unknown option or argument; print one line instead of typer's multi-line report.
         return _bad_input(getattr(error, "format_message", error.__str__)())
     except BrokenPipeError:
         return 1

@@ -71,7 +71,7 @@ def load_deployment(config: Path | None, endpoint: str | None, **overrides: obje
 
     Args:
         config: path of a DEPLOYMENT.toml; None: the default configuration.
-        endpoint: endpoint of the router; overrides that of the file.
+        endpoint: endpoint of the router; overrides the one in the file.
         **overrides: see `load_scenario`.
 
     Raises:
@@ -99,7 +99,7 @@ def parse_seeds(text: str, max_seeds: int = MAX_SEEDS) -> range:
 
 
 def check_jobs(jobs: int | None) -> int:
-    """Return the number of processes to use; by default the number of cores.
+    """Return the number of processes to use; default: the number of cores.
 
     Raises:
         BadInputError: the number is out of range.
@@ -125,8 +125,8 @@ def reject_unused_options(where: str, **options: object) -> None:
     """Reject options that would have no effect.
 
     Args:
-        where: circumstance in which they have no effect, such as `with --method rule`.
-        **options: value of each option, by its name with underscores; None: not given.
+        where: when they have no effect, such as `with --method rule`.
+        **options: option values by name (with underscores); None: not given.
 
     Raises:
         BadInputError: one of the options is given.

@@ -29,7 +29,7 @@ from laneweave.protocol.security.connection import Access
 
 MAX_WAIT_S = 3600.0
 ANSWER_MARGIN_S = 8.0
-"""Time to wait beyond the deadline, so that the coordinator can report a worker that hangs
+"""Time to wait beyond the deadline, so that the coordinator can report a hung worker
 (`worker_pool.OVERDUE_S`)."""
 
 
@@ -39,7 +39,7 @@ def access_for(
     """Return how to connect to a coordinator; None: plan in this process.
 
     Args:
-        endpoint: endpoint of the router; overrides that of the configuration.
+        endpoint: endpoint of the router; overrides the configured one.
         realm: realm of the coordinator if there is no configuration; None: the default realm.
         config: configuration of the deployment.
         client: client name in a secured deployment; None: `plan`.
@@ -73,10 +73,10 @@ def answer_request(
     scenario: Scenario | None = None,
     wait_s: float = 0.0,
 ) -> None:
-    """Read and plan a request, then print and draw the response; with `access` a coordinator plans.
+    """Read and plan a request, then print and draw the plan; with `access`, a coordinator plans.
 
     `drawing` shows the relative coordinate system, `road_drawing` the road of `scenario`. `wait_s`
-    is the time to wait for a coordinator. A deadline and a solver override those of the request.
+    is the time to wait for a coordinator. `deadline_s` and `solver` override the request's values.
 
     Raises:
         BadInputError: the request is unreadable or invalid, no coordinator is reachable, or a
@@ -108,7 +108,7 @@ def answer_request(
 
 
 def explain_request(path: Path, deadline_s: float | None, drawing: Path | None = None) -> None:
-    """Read a request, run TAPPA on it, then print the steps and draw them.
+    """Read a request, run TAPPA on it, then print and draw its steps.
 
     Raises:
         BadInputError: the request is unreadable or invalid, or the drawing cannot be written or is

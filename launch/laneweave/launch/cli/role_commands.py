@@ -1,4 +1,4 @@
-"""Commands that each run one role of a deployment.
+"""Commands, each of which runs one role of a deployment.
 
 A command imports its dependencies when it runs: an agent starts without SUMO, a coordinator without
 OSQP.
@@ -148,7 +148,7 @@ def bridge(
     outcome = complete_summary(folder, problems=())
     print_outcome(outcome, Console())
     draw_report(folder)
-    # A role that ends because of a signal has not failed, even if its run is incomplete.
+    # A role stopped by a signal has not failed, even if its run is incomplete.
     interrupted = outcome.summary is not None and outcome.summary.ending == "interrupted"
     broken = outcome.summary is None or outcome.summary.safety.overlaps
     raise typer.Exit(1 if broken else 0 if interrupted else outcome.exit_status)

@@ -54,7 +54,7 @@ class Operation(StrEnum):
 def run(
     scenario: ScenarioArgument = None,
     volume: Annotated[
-        float | None, typer.Option("--volume", help="Vehicles per lane and hour.")
+        float | None, typer.Option("--volume", help="Vehicles per lane per hour.")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of all random draws.")] = None,
     duration: Duration = None,

@@ -1,4 +1,4 @@
-"""`laneweave simulate`: search for faults that violate a guarantee."""
+"""`laneweave simulate`: search for violations of the guarantees under faults."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def simulate(
     ] = False,
     verbose: Annotated[
         bool,
-        typer.Option("--verbose", help="Print the timeline of the only or the first failed seed."),
+        typer.Option("--verbose", help="Print the timeline of the first failed, or only, seed."),
     ] = False,
     no_progress: NoProgress = False,
 ) -> None:

@@ -35,7 +35,7 @@ from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.wire.topics import Keys
 
 WAIT_S = 0.1
-"""Maximum wait for a message between two checks for the end of listening."""
+"""Maximum wait for a message before checking again whether to stop listening."""
 
 
 class Role(StrEnum):
@@ -63,7 +63,7 @@ def status(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Listen to a deployment and print its state; exit status 1: the deployment is unhealthy."""
+    """Listen to a deployment and print its state; exit with status 1 if it is unhealthy."""
     settings = load_deployment(config, endpoint, network__realm=realm)
     health = _role_health(role, name, shard)
     found = listen(settings, seconds, health)
@@ -95,7 +95,7 @@ def listen(settings: Scenario, seconds: float, health: RoleHealth | None = None)
 
     Args:
         settings: the deployment.
-        seconds: time to listen; a health check of one process ends when it succeeds.
+        seconds: listening time; a health check of one process stops once it succeeds.
         health: check of one process; None: check the whole deployment.
 
     Raises:
@@ -125,7 +125,7 @@ def listen(settings: Scenario, seconds: float, health: RoleHealth | None = None)
                 now_s = time.monotonic()
                 view.update(event, now_s)
                 if now_s >= end_s:
-                    break  # a flood of messages must not delay the end
+                    break  # a flood of messages must not extend the time
             now_s = time.monotonic()
             if health is not None and health.may_end_early(view) and problem() is None:
                 break

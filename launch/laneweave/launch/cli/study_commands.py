@@ -33,7 +33,7 @@ def sweep(
         str, typer.Option("--methods", metavar="LIST", help=f"Some of {', '.join(METHODS)}.")
     ] = "formation",
     volumes: Annotated[
-        str, typer.Option("--volumes", metavar="LIST", help="Vehicles per lane and hour.")
+        str, typer.Option("--volumes", metavar="LIST", help="Vehicles per lane per hour.")
     ] = VOLUMES,
     seeds: Seeds = "1:4",
     duration: Duration = None,
@@ -43,11 +43,11 @@ def sweep(
         typer.Option(
             "--out",
             metavar="DIR",
-            help="Default: a new folder in runs/. A sweep in this folder is continued.",
+            help="Default: a new folder in runs/. An existing sweep is continued.",
         ),
     ] = None,
     keep_trajectories: Annotated[
-        KeepTrajectories, typer.Option("--keep-trajectories", help="Runs that keep theirs.")
+        KeepTrajectories, typer.Option("--keep-trajectories", help="Runs to keep them for.")
     ] = KeepTrajectories.first_seed,
     dask: Annotated[
         str | None,
@@ -107,7 +107,7 @@ def report(
         typer.Option(
             "--out",
             metavar="DIR",
-            help="Folder of a comparison; default: a new one in runs/.",
+            help="Folder for a comparison; default: a new one in runs/.",
         ),
     ] = None,
 ) -> None:

@@ -29,10 +29,10 @@ class AssignedVehicles:
 def assigned_vehicles(
     security: Security, vehicles: Sequence[str], shard: str | None, fleet: str | None
 ) -> AssignedVehicles:
-    """Return vehicles and identity of an agent process from its command-line arguments.
+    """Return the vehicles and identity of an agent process from its command-line arguments.
 
     Raises:
-        BadInputError: arguments contradict each other, or a secured deployment has no such fleet.
+        BadInputError: arguments contradict each other, or a secured deployment lacks the fleet.
     """
     for vehicle in vehicles:
         if not NAME_PATTERN.fullmatch(vehicle):
@@ -70,7 +70,7 @@ def _of_fleet(
 
 
 def _fleet_of_shard(security: Security, shard: Shard) -> str:
-    """Return the name of the fleet that consists of a shard, or any name without security."""
+    """Return the name of the fleet defined as a shard; without security, any name."""
     for name, members in security.fleets.items():
         if _shard(members) == shard:
             return name

@@ -1,7 +1,7 @@
 """A certificate authority for tests: X.509 certificates with P-256 keys as PEM files.
 
-The key of the authority permits the impersonation of every process. It is intended for trials and
-test beds; otherwise use an existing authority with the same common names.
+The authority's key can impersonate every process, so use this authority only in trials and test
+beds; elsewhere, use an existing authority with the same common names.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from laneweave.protocol.wire.topics import Party
 CA_NAME = "laneweave test authority"
 CA_DAYS = 3650.0
 CLOCKS_APART = dt.timedelta(minutes=10)
-"""Time before now at which validity begins, because the clocks of hosts differ."""
+"""Time by which validity is backdated, because the clocks of hosts differ."""
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 
 
@@ -43,7 +43,7 @@ def make_authority(folder: Path, *, days: float = CA_DAYS, replace: bool = False
     """Create an authority and write its files.
 
     Args:
-        folder: folder of the files; created if necessary.
+        folder: folder for the files; created if necessary.
         days: validity of the certificate in days.
         replace: whether to replace an existing authority, which invalidates all its certificates.
 
@@ -73,7 +73,7 @@ def load_authority(folder: Path) -> Authority:
     """Read the authority of a folder.
 
     Raises:
-        BadInputError: the folder has no authority, or it cannot be read.
+        BadInputError: the folder has no readable authority.
     """
     path = ca_path(folder)
     try:
@@ -104,7 +104,7 @@ def issue(
 
     Args:
         authority: authority that signs the certificate.
-        folder: folder of the files.
+        folder: folder for the files.
         identity: identity of the process.
         days: validity in days.
         hosts: names and addresses of the router; ignored for other processes.
@@ -117,7 +117,7 @@ def issue(
     path = certificate_path(folder, name)
     if path.exists() and not replace:
         raise BadInputError(
-            "IDENTITY", name, f"an identity without certificate in {folder}, or --force"
+            "IDENTITY", name, f"an identity without a certificate in {folder}, or --force"
         )
     key = ec.generate_private_key(ec.SECP256R1())
     builder = _builder(_name(name), authority.certificate.subject, key.public_key(), days)
@@ -179,10 +179,10 @@ def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
 
 
 def host_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
-    """Return the subject alternative name of a certificate for some hosts.
+    """Return the subject alternative name of a certificate for these hosts.
 
     Raises:
-        BadInputError: a name is not that of a host.
+        BadInputError: a name is not a valid host name.
     """
     return x509.SubjectAlternativeName([_general_name(host) for host in dict.fromkeys(hosts)])
 

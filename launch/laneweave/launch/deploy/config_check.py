@@ -37,7 +37,7 @@ class Report:
 def check_deployment(
     scenario: Scenario, identity: Identity | None, environment: Mapping[str, str] = os.environ
 ) -> Report:
-    """Check what loading a configuration does not check; with `identity` also certificate files."""
+    """Check what loading a configuration does not; with `identity`, also its certificate files."""
     report = Report()
     _check_network(scenario, report)
     _check_moves(scenario, report)
@@ -74,7 +74,7 @@ def _check_network(scenario: Scenario, report: Report) -> None:
 
 
 def _check_moves(scenario: Scenario, report: Report) -> None:
-    """Make the checks that agents make at their start, if the extra `agent` is installed."""
+    """Run the checks that agents run at start-up, if the extra `agent` is installed."""
     try:
         from laneweave.agents.driving.trajectory import check_moves  # noqa: PLC0415 (an extra)
     except ModuleNotFoundError:

@@ -1,9 +1,9 @@
 """Checks of cell ownership in the rolling operation; part of the checker.
 
 The checks read the motion controllers. A vehicle with a pending transfer does not know its owned
-cells, but the checker does: those after the transfer if any vehicle of its roster has taken
-possession, otherwise those before. Therefore every cell must have at most one owner at any time. If
-an agent opens its gate and ends before its controller is informed, its vehicle has not moved, and
+cells, but the checker does: the cells after the transfer if any vehicle of its roster has taken
+possession, otherwise the cells before it. So every cell must have at most one owner at any time. If
+an agent opens its gate and exits before its controller is informed, its vehicle has not moved, and
 no cell has been transferred.
 """
 
@@ -37,7 +37,7 @@ class Holding:
 
 
 class CellOwnership:
-    """Checker of the ownership of all cells in a run."""
+    """Checker of cell ownership in a run."""
 
     def __init__(self, report: Report) -> None:
         """Start without vehicles; `report` is called once for each violation."""
@@ -57,7 +57,7 @@ class CellOwnership:
         transfer: PendingTransfer | None,
         body: Cells | None = None,
     ) -> None:
-        """Update owned cells, newest transfer and, if not None, body cells of a vehicle."""
+        """Update a vehicle's owned cells and newest transfer, and its body cells unless None."""
         holding = Holding(frozenset(cells), transfer)
         if body is not None:
             self._bodies[vehicle] = body
@@ -74,7 +74,7 @@ class CellOwnership:
         self._check(t_s)
 
     def move(self, t_s: float, vehicle: str, ballot: Ballot) -> None:
-        """Check the start of a motion under a ballot."""
+        """Check that a motion may begin under a ballot."""
         if ballot not in self._opened:
             self._report("gate", t_s, [vehicle], "moves although no vehicle has taken possession")
 

@@ -6,15 +6,15 @@ machines of the processes, and shares no code with them.
 | kind | violation |
 |---|---|
 | `overlap` | two bodies (rectangles) overlap |
-| `cell` | two vehicles occupy a cell: the hold cell, or the bounding box of a motion |
+| `cell` | two vehicles occupy one cell with their hold cells or bounding boxes of motions |
 | `motion` | a body begins a motion that is not the next move in the published plan of its agent |
-| `interleaved` | two plans with a common vehicle have motions at the same time |
+| `interleaved` | two plans that share a vehicle have motions at the same time |
 | `owner` | a cell has two owners (rolling operation, see `cell_ownership`) |
 | `trespass` | a body is in a cell that its vehicle does not own (rolling operation) |
 | `gate` | a motion begins before any vehicle of the plan has taken possession (rolling operation) |
-| `monotone` | a process revokes a promise, an acceptance, progress, joined formations, or charge |
+| `monotone` | a process revokes a promise, an acceptance, progress, a join, or a takeover |
 | `two-plans` | two different plans are sent under one ballot |
-| `stuck` | a vehicle is not on its preferred lane long after the end of all faults |
+| `stuck` | a vehicle is not in its preferred lane long after all faults have ended |
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from laneweave.protocol.wire.messages import (
 )
 
 MAX_VIOLATIONS = 20
-"""Number of violations recorded per run."""
+"""Maximum number of violations recorded per run."""
 
 
 @frozen
@@ -94,19 +94,19 @@ class Checker:
         """End time, target cell and ballot of the motion of each moving body."""
         self._checked_s = 0.0
         self._states: dict[str, dict[int, VehicleState]] = {}
-        """Newest published state of each vehicle by the incarnation of the process."""
+        """Newest published state of each vehicle by process incarnation."""
         self._begun: dict[tuple[str, int, Cell], Ballot | None] = {}
         """Ballot of each published move: (vehicle, incarnation, target cell)."""
         self._done: dict[tuple[Ballot, str], int] = {}
         """Number of motions begun by each vehicle under each plan."""
         self._motions_of: dict[Ballot, _PlanMotions] = {}
         self._charge: dict[str, tuple[int, frozenset[int]]] = {}
-        """Process in charge and joined formations of each motion controller."""
+        """Process in charge and reported joined formations of each motion controller."""
 
     # --- the road -----------------------------------------------------------------------------
 
     def enter(self, t_s: float, vehicle: str, cell: Cell) -> None:
-        """Record the entry of a vehicle."""
+        """Record that a vehicle has entered the road."""
         self._log(t_s, f"{vehicle} enters in {cell}")
         self.advance(t_s)
         self._bodies[vehicle] = Body.standing(self._geometry, cell, t_s)
@@ -115,7 +115,7 @@ class Checker:
     def own(
         self, t_s: float, vehicle: str, owned: tuple[Cell, ...], transfer: PendingTransfer | None
     ) -> None:
-        """Record the owned cells and the newest transfer of a motion controller."""
+        """Record a motion controller's owned cells and newest transfer."""
         if self._ownership is not None:
             self._ownership.show(t_s, vehicle, owned, transfer)
 
@@ -158,7 +158,7 @@ class Checker:
             self._check_members(t_s, vehicle, ballot)
 
     def advance(self, t_s: float) -> None:
-        """Check for overlaps since the last call, and end completed motions."""
+        """Check for overlaps since the last call, and close completed motions."""
         from_s = self._checked_s
         self._checked_s = t_s
         movers = [name for name, body in self._bodies.items() if body.end_s > from_s]
@@ -176,7 +176,7 @@ class Checker:
             self._end_motion(vehicle)
 
     def stuck(self, t_s: float, vehicle: str, text: str) -> None:
-        """Record that a vehicle has not arrived long after the end of all faults."""
+        """Record that a vehicle has not arrived long after all faults have ended."""
         self._report("stuck", t_s, [vehicle], text)
 
     def _end_motion(self, vehicle: str) -> None:
@@ -287,7 +287,7 @@ class Checker:
 
 
 def _revoked(before: VehicleState, state: VehicleState) -> Iterator[str]:
-    """Yield descriptions of what a process has revoked of its previous state."""
+    """Yield a description of each part of its previous state that a process has revoked."""
     if before.promised is None:
         return
     if state.promised is None or state.promised < before.promised:

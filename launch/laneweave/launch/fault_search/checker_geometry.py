@@ -16,12 +16,12 @@ Cells = frozenset[tuple[int, int]]
 
 DONE_ALONG_M = 1.0
 DONE_ACROSS_M = 0.5
-"""Distance from its end at which the checker considers a motion ended: twice that of agents."""
+"""Remaining distances at which the checker considers a motion complete: twice the agents'."""
 
 
 @frozen
 class Geometry:
-    """Sizes in m."""
+    """Sizes of cells and bodies in m."""
 
     pitch_m: float
     lane_width_m: float
@@ -84,12 +84,12 @@ class Body:
         self.cells = self.geometry.swept(self.origin, self.target)
 
     def rest(self, cell: tuple[int, int]) -> None:
-        """Occupy only the target cell, at or close to the end of a motion."""
+        """Occupy only the target cell, once a motion is complete."""
         self.cells = frozenset({cell})
 
     @property
     def done_s(self) -> float:
-        """Time at which the body is close enough to the target for the motion to end."""
+        """Time at which the body is close enough to its target to complete the motion."""
         shares = [
             tolerance_m / abs(path_m)
             for tolerance_m, path_m in (
@@ -103,11 +103,11 @@ class Body:
 
 
 def overlap_between(mine: Body, other: Body, from_s: float, to_s: float) -> float | None:
-    """Return the first time at which two bodies overlap; None: they do not.
+    """Return the first time at which two bodies overlap; None: no overlap.
 
-    Neither body may begin a motion between `from_s` and `to_s`; motions may end. The result is
-    exact: rectangles that move in straight lines overlap in x during one interval, and in y during
-    another one.
+    No motion may begin between `from_s` and `to_s`, but motions may end. The result is exact:
+    while rectangles move in straight lines, they overlap in x during one interval, and in y during
+    another.
     """
     ends = sorted({end for end in (mine.end_s, other.end_s) if from_s < end < to_s})
     starts = [from_s, *ends]

@@ -1,7 +1,7 @@
 """A run of the fault search: real cores, a light road, random faults, and the checker.
 
 During the fault phase, preferred lanes change repeatedly, which requires new plans. Then all faults
-end, and all vehicles must arrive. Equal seeds give equal runs.
+end, and all vehicles must arrive. The same seed gives the same run.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ COORDINATORS = ("c1", "c2", "c3")
 MAX_MOTION_SLOTS = 3.0
 """Maximum duration of a slow motion, in slots."""
 NEW_PREFERENCES_S = (0.8, 3.0)
-"""Range of the time between changes of the preferred lanes during the fault phase."""
+"""Range of intervals at which the preferred lanes change during the fault phase."""
 PATIENCE_S = 90.0
-"""Maximum time after the fault phase in which all vehicles must arrive."""
+"""Time limit for all vehicles to arrive after the fault phase."""
 MAX_FUTILE_PLANS = 5
-"""Number of plans without motion of a vehicle after which it counts as stuck."""
+"""Number of plans after which a vehicle that has not moved counts as stuck."""
 HEALTHY_SLOTS = 8
 """Number of slots after the fault phase (rolling operation)."""
 CHECK_S = 0.5
-"""Virtual time between checks for the end of a run."""
+"""Virtual time between checks whether a run is over."""
 MAX_OLD_MESSAGES = 400
-"""Number of old messages that are kept to be replayed or damaged."""
+"""Maximum number of old messages kept for replay or corruption."""
 KEEP_EVERY = 7
-"""One of this number of sent messages is kept."""
+"""One in this many sent messages is kept."""
 _REPLAYABLE = (Prepare, Plan, VehicleState, Command, Sense)
 
 
@@ -137,10 +137,10 @@ class FaultRun:
         """Draw the setup and start all processes.
 
         Args:
-            seed: determines all draws, together with the name of the profile.
+            seed: determines all draws, together with the profile name.
             profile: profile from which the setup is drawn.
-            vehicle_rules: rules of plan execution, which tests replace by faulty ones.
-            leader_rules: rules of leaders, which tests replace by faulty ones.
+            vehicle_rules: rules of plan execution, which tests replace with faulty ones.
+            leader_rules: rules of leaders, which tests replace with faulty ones.
             timeline: timeline to which events are added.
             digest: whether to compute a digest of all delivered messages.
         """
@@ -170,7 +170,7 @@ class FaultRun:
             self.network, self, mix, self._rng, scenario.network.realm, self._log
         )
         self._proposed: Counter[str] = Counter()
-        """Number of plans since the fault phase that move or hold each vehicle."""
+        """Number of plans after the fault phase that move or hold each vehicle."""
         self._first_cells: dict[Name, Cell] = {}
         """First cell of each vehicle after the fault phase (rolling operation)."""
         self._moved: set[Name] = set()
@@ -219,7 +219,7 @@ class FaultRun:
 
     @property
     def agents(self) -> tuple[str, ...]:
-        """Agents of the vehicles that have not left."""
+        """Agents of the vehicles that have not left the road."""
         now_s = self.network.now_s
         return tuple(
             visit.vehicle
@@ -258,7 +258,7 @@ class FaultRun:
         self.network.add(name, _ListenedCore(core, name, self._on_message), scenario.network.realm)
 
     def _make_planner(self, scenario: Scenario) -> Planner:
-        """Return a planner that counts its plans for each vehicle after the fault phase."""
+        """Return a planner that, after the fault phase, counts its plans for each vehicle."""
         exact = self.setup.uses_stream_planner
         planner = stream_planner(scenario) if exact else LightPlanner(scenario).plan
 
@@ -280,7 +280,7 @@ class FaultRun:
         return plan
 
     def old_payload(self, rng: random.Random) -> tuple[str, bytes] | None:
-        """Return key and payload of a random old message; None: there are none."""
+        """Return the key and payload of a random old message; None: there are none."""
         if not self._old_messages:
             return None
         old = rng.choice(self._old_messages)
@@ -334,7 +334,7 @@ class FaultRun:
         if self._timeline is not None:
             self._timeline.add(self.network.now_s, text)
 
-    # --- the end ------------------------------------------------------------------------------
+    # --- outcome ------------------------------------------------------------------------------
 
     def _is_over(self) -> bool:
         if self.profile.rolling:
@@ -350,7 +350,7 @@ class FaultRun:
         return PATIENCE_S
 
     def _not_arrived(self) -> list[Name]:
-        """Return the vehicles that should be at rest on their preferred lanes, but are not."""
+        """Return the vehicles that should be at rest in their preferred lanes, but are not."""
         if self.checker.violations or not self.faults.healed:
             return []
         now_s = self.network.now_s
@@ -367,7 +367,7 @@ class FaultRun:
     def _is_stuck(self, name: Name) -> bool:
         """Return whether a vehicle has not moved although plans move it (rolling operation).
 
-        A vehicle that has moved need not be on its preferred lane, which may be full.
+        A vehicle that has moved need not be in its preferred lane, which may be full.
         """
         cell = self.road.vehicles[name].controller.hold_cell
         moved = self._first_cells.setdefault(name, cell) != cell

@@ -23,11 +23,11 @@ ROAD = "road"
 FIRST_S = 0.3
 """Earliest time of a fault event."""
 SHORT_S = (0.05, 2.5)
-"""Range of the time for which a process is killed, paused or disconnected."""
+"""Range of times for which a process is dead, paused or disconnected."""
 LONG_S = (0.3, 4.0)
 """Range of the duration of network faults."""
 NO_RESTART = 0.25
-"""Share of killed agents that are not restarted during the fault phase."""
+"""Share of killed agents that are restarted only after the fault phase."""
 LEASE_S = 0.5
 COMPUTE_S = 0.05
 GARBAGE = 20
@@ -35,7 +35,7 @@ GARBAGE = 20
 REPLAYED = 20
 """Number of old messages per event."""
 _TARGETED = ("leader", "coordinator", "agent", "cut")
-"""Prefixes of the kinds of events with a target."""
+"""Prefixes of the event kinds that have a target."""
 CLOCK_OFFSET_S = 0.05
 CLOCK_DRIFT = 0.05
 
@@ -98,7 +98,7 @@ class Processes(Protocol):
 
     @property
     def agents(self) -> tuple[str, ...]:
-        """Agents of the vehicles that have not left."""
+        """Agents of the vehicles that have not left the road."""
 
     @property
     def leaders(self) -> tuple[str, ...]:
@@ -111,7 +111,7 @@ class Processes(Protocol):
         """Start a second process for the vehicle of an agent, and return its name."""
 
     def old_payload(self, rng: random.Random) -> tuple[str, bytes] | None:
-        """Return key and payload of a random old message; None: there are none."""
+        """Return the key and payload of a random old message; None: there are none."""
 
 
 class RandomFaults:
@@ -141,7 +141,7 @@ class RandomFaults:
         self._twins: list[str] = []
 
     def plan(self, kinds: Sequence[str]) -> None:
-        """Draw kinds and times of the fault events."""
+        """Draw the kinds and times of the fault events."""
         for _ in range(self._mix.events):
             time_s = self._rng.uniform(FIRST_S, self._mix.fault_s - 0.3)
             self._network.at(time_s, self._apply, self._rng.choice(kinds))
@@ -157,7 +157,7 @@ class RandomFaults:
         for name in self._twins:
             network.kill(name)
         for name in network.names:
-            # A resumed node processes its queued messages, and may end.
+            # A resumed node processes its queued messages, and may exit.
             network.resume(name)
             self._if_present(name, network.reconnect)
         for name in (*self._processes.coordinators, *self._processes.agents):
@@ -201,7 +201,7 @@ class RandomFaults:
         return rng.choice(processes.coordinators)
 
     def _later(self, span_s: tuple[float, float], action: Callable[[], None], what: str) -> None:
-        """Schedule the end of a fault, which is skipped if all faults end before."""
+        """Schedule the end of a fault; skipped if all faults have already ended."""
         time_s = self._network.now_s + self._rng.uniform(*span_s)
         self._network.at(time_s, self._undo, action, what)
 

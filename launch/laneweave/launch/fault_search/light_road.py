@@ -1,7 +1,7 @@
 """The light road: a bridge without SUMO that does not wait for agents.
 
-Every vehicle gets a SENSE in each tick, COMMANDs are executed whenever they arrive, and bodies move
-in straight lines to the hold cells of their motion controllers. The real `MotionController`,
+Every vehicle gets a SENSE in each tick, COMMANDs are executed on arrival, and bodies move in
+straight lines to the hold cells of their motion controllers. The real `MotionController`,
 `Answers` and `Attendance` decide which process may command a vehicle, which agents are silent, and
 what caretakers publish.
 """
@@ -48,9 +48,9 @@ from laneweave.sim_bridge.road.roadside import CENSUS_EVERY_TICKS
 
 CLOCK_EVERY_TICKS = 2
 AGENT_START_S = 1.0
-"""Time after the entry of a vehicle without an agent at which its caretaker takes charge."""
+"""Time after which a caretaker takes charge of a vehicle that entered without an agent."""
 NONE_CLOSED = -(2**31)
-"""Lower bound of the numbers of blocks."""
+"""Number less than that of any block: no formation has closed."""
 
 
 class LightRoad:
@@ -74,11 +74,11 @@ class LightRoad:
             scenario: lattice and timing.
             visits: the vehicles with their times of entry and exit.
             preferred_lanes: preferred lane of each vehicle at its entry.
-            checker: checker, to be informed about events on the road.
-            new_incarnation: returns the incarnation number of a caretaker.
+            checker: checker to inform about events on the road.
+            new_incarnation: returns the incarnation number for a caretaker.
             move_lasts_s: draws the duration of the next motion.
             lost: draws whether the next SENSE or COMMAND is lost, in addition to network loss.
-            formations: blocks and closing time of each formation.
+            formations: the formations with their blocks and closing times.
             grants: assignments of the empty cells to owners.
         """
         self.tick = -1

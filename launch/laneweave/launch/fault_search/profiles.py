@@ -1,4 +1,4 @@
-"""Profiles: kinds and severity of the faults in the runs of a search.
+"""Profiles: kinds and severity of the faults in a search.
 
 A profile defines the ranges and choices from which each seed draws. Shares are probabilities; times
 are in virtual seconds.
@@ -37,14 +37,14 @@ class Profile:
     """Share of runs with formations of different lengths."""
     max_joined: Span = (1, 2)
     crowding: float = 0.5
-    """Share of runs in which more vehicles of a block may prefer a lane than it has cells there."""
+    """Share of runs in which more vehicles may prefer a lane than their block has cells in it."""
     leavers: float = 0.15
     """Share of vehicles that leave the road during the fault phase."""
     loss: tuple[float, ...] = (0.0, 0.0, 0.1, 0.3, 0.5, 0.8)
     """Probability that a receiver loses a message."""
     duplication: tuple[float, ...] = (0.0, 0.0, 0.3)
     jitter_s: tuple[float, ...] = (0.003, 0.003, 0.003, 0.05, 0.05, 0.3, 0.3, 1.0, 5.0)
-    """Maximum delay of a message; the minimum is 2 ms."""
+    """Maximum additional delay of a message; the minimum delay is 2 ms."""
     command_loss: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
     """Additional loss of SENSE and COMMAND messages."""
     slow_moves: tuple[float, ...] = (0.0, 0.2, 0.5)
@@ -63,7 +63,7 @@ class Profile:
 
 
 def _load() -> Iterator[Profile]:
-    """Yield the profiles of `profiles.toml`, completed with the values of their bases."""
+    """Yield the profiles of `profiles.toml`, completed with values from their base profiles."""
     text = files("laneweave.launch.fault_search").joinpath("profiles.toml").read_text("utf-8")
     tables = tomllib.loads(text)
     for name, table in tables.items():
@@ -75,7 +75,7 @@ PROFILES = {profile.name: profile for profile in _load()}
 
 
 def profile_named(name: str) -> Profile:
-    """Return the profile of a name.
+    """Return a profile by name.
 
     Raises:
         BadInputError: there is no such profile.

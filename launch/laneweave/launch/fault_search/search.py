@@ -27,9 +27,9 @@ from laneweave.protocol.errors import CommandFailedError
 BATCH = 20
 """Seeds per task of a worker process."""
 SHOWN_VIOLATIONS = 5
-"""Number of violations printed per seed."""
+"""Maximum number of violations printed per seed."""
 SHOWN_SEEDS = 20
-"""Number of failed seeds described in detail."""
+"""Maximum number of failed seeds described in detail."""
 
 
 @frozen
@@ -124,7 +124,7 @@ def _batches(
 
 
 def _quiet() -> None:
-    """Prepare a worker process: ignore Ctrl-C, log errors only, and end with the parent."""
+    """Prepare a worker: ignore Ctrl-C, log critical errors only, and exit with the parent."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with_supervisor()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -153,7 +153,7 @@ def _with(result: SearchResult, outcomes: Sequence[SeedResult]) -> SearchResult:
 
 
 def describe(result: SearchResult, profile: Profile) -> Iterator[str]:
-    """Yield lines that describe the result of a search; the last one has the counts."""
+    """Yield lines that describe the result of a search; the last line has the counts."""
     for outcome in result.failed[:SHOWN_SEEDS]:
         yield f"seed {outcome.seed} failed:"
         for violation in outcome.violations[:SHOWN_VIOLATIONS]:

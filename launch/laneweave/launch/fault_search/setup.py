@@ -22,33 +22,33 @@ from laneweave.protocol.wire.messages import ClosedFormation, Name
 
 TICK_S = 0.1
 LEAVES_S = (2.0, 9.0)
-"""Range of the time on the road of vehicles that leave during the fault phase."""
+"""Range of times that vehicles spend on the road if they leave during the fault phase."""
 
 # Operation in formations
 SLOT_S, MOVE_S = 1.0, 0.8
 LAST_COLUMNS = (1, 1, -3, -7)
-"""Choices of the rear column of the rearmost formation. Vehicles in columns above 0 are on the road
-at the start; the others enter one after the other, and the formation closes after 3 or 7 s."""
+"""Rear columns of the rearmost formation to draw from. Vehicles in columns >= 0 are on the road at
+the start; the others enter later, and the formation closes when its rear column enters."""
 BLOCK_COLUMNS = 4
 LENGTHS = (2, 7)
-"""Range of the lengths of formations with different lengths, in columns."""
+"""Range of formation lengths if they differ, in columns."""
 GAPS = (0, 0, 1)
-"""Choices of the gap between formations of different lengths, in columns."""
+"""Gaps to draw from, between formations of different lengths, in columns."""
 MAX_SIZE = 6
 """Maximum number of vehicles in a formation."""
 MAX_JOINED_SIZE = 10
-"""Maximum number of vehicles in two formations that may join, because of the planning time."""
+"""Maximum number of vehicles in two formations that may join, to limit planning time."""
 
 # Rolling operation
 SLOTS_S = (1.0, 1.0, 1.0, 2.0)
-"""Choices of the slot length. Ballots are often aborted in the shortest one."""
+"""Slot lengths to draw from. Ballots often abort with the shortest."""
 MODES = (1, 1, 2)
 MOVE_SHARE = 0.8
 """Duration of a move as a share of the slot."""
 SLOTS_ON_ROAD = 45
-"""Length of the road: slots in which a column passes it."""
+"""Length of the road, as the number of slots that a column takes to pass it."""
 MAX_BEHIND = 3
-"""Number of empty cells behind the last vehicle of a lane that it owns."""
+"""Number of empty cells that the last vehicle in a lane owns behind it."""
 STREAM_PLANNER = 0.05
 """Share of runs with the stream planner, which takes ten times as long as the rest of a run."""
 
@@ -62,7 +62,7 @@ def make_scenario(lanes: int, max_joined: int, *, growing: bool = False) -> Scen
         cycle_s=SLOT_S,
         move_s=MOVE_S,
         max_joined=max_joined,
-        # Limit planning by the number of nodes: a deadline would depend on the machine.
+        # Limit planning by the number of nodes: a deadline would make plans depend on the machine.
         planning_deadline_s=3600.0,
         max_nodes=500,
     )
@@ -99,10 +99,10 @@ class Setup:
     scenario: Scenario
     mix: FaultMix
     formations: tuple[ClosedFormation, ...]
-    """Formations, the foremost first."""
+    """Formations, foremost first."""
     visits: tuple[Visit, ...]
     crowded: bool
-    """Whether more vehicles of a block may prefer a lane than it has cells there."""
+    """Whether more vehicles may prefer a lane than their block has cells in it."""
     grants: tuple[Grant, ...] = ()
     """Assignments of empty cells to owners (rolling operation)."""
     stretch_columns: int = 0
@@ -158,8 +158,8 @@ class Setup:
     def preferences(self, rng: random.Random, *, last: bool) -> dict[Name, int]:
         """Draw the preferred lane of each vehicle.
 
-        The last preferences can be satisfied: no lane is preferred by more vehicles of a formation
-        (or of two formations that may join) than it has cells there.
+        The last preferences can be satisfied: in each formation (or two formations that may join),
+        no lane is preferred by more vehicles than it has cells.
         """
         lanes, lattice = self.scenario.road.lanes, self.scenario.lattice
         columns = [len(one.columns(lattice)) for one in self.formations]
@@ -203,7 +203,7 @@ def _draw_lanes(
 def _draw_formations(
     profile: Profile, scenario: Scenario, rng: random.Random
 ) -> list[ClosedFormation]:
-    """Draw the formations from the rearmost to the foremost; return the foremost first."""
+    """Draw the formations from rear to front; return them foremost first."""
     lattice, growing = scenario.lattice, scenario.formation.closes_by_vehicles
     rear, formations = rng.choice(LAST_COLUMNS), []
     for _ in range(rng.randint(*profile.blocks)):
@@ -265,10 +265,10 @@ def _visit(
 def _grants(
     scenario: Scenario, first: int, columns: int, visits: Sequence[Visit]
 ) -> Iterator[Grant]:
-    """Yield the assignments of empty cells to the vehicles that last entered on their lanes.
+    """Yield the assignment of each empty cell to the last vehicle that entered in its lane.
 
-    A cell is granted when vehicles can no longer enter in it. Cells ahead of all vehicles belong to
-    the first one; the bridge would leave them without owners, but this stretch is short.
+    A cell is granted once vehicles can no longer enter it. Cells ahead of all vehicles go to the
+    first one; the bridge would leave these cells without owners, but this stretch is short.
     """
     lattice, spread_s = scenario.lattice, scenario.formation.entry_spread_s
     by_cell = {visit.cell: visit for visit in visits}

@@ -25,21 +25,21 @@ from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 UNNEEDED_MOVES = 0.4
-"""Probability with which the planner moves a vehicle that is on its preferred lane."""
+"""Probability with which the planner moves a vehicle that is in its preferred lane."""
 SYNC_S = 1.0
-"""Interval between synchronizations of a vehicle's clock, between which the clock drifts."""
+"""Interval at which a vehicle's clock is synchronized; it drifts in between."""
 
 
 @frozen
 class Visit:
-    """Times and place of entry and exit of a vehicle, and errors of its clock."""
+    """A vehicle's entry cell, entry and exit times, and clock errors."""
 
     vehicle: Name
     cell: Cell
     """Cell in which the vehicle enters."""
     enters_s: float
     leaves_s: float | None
-    """Time of exit; None: the vehicle stays to the end of the road."""
+    """Exit time; None: the vehicle stays until the end of the road."""
     clock_offset_s: float = 0.0
     clock_drift: float = 0.0
     """Error of the clock rate: seconds gained per second."""
@@ -55,7 +55,7 @@ class Grant:
 
 
 class LightBody(Plant):
-    """Body that moves between cells in straight lines in a given time."""
+    """Body that moves straight from cell to cell in given times."""
 
     def __init__(self, scenario: Scenario, cell: Cell) -> None:
         """Start at rest in a cell."""
@@ -116,7 +116,7 @@ class LightVehicle(RoadVehicle):
         return self.admission.arrival.preferred_lane
 
     def leaves_by(self, t_s: float) -> bool:
-        """Return whether the vehicle leaves the road at or before a time."""
+        """Return whether the vehicle leaves the road by a given time."""
         return self._visit.leaves_s is not None and t_s >= self._visit.leaves_s
 
     def prefer(self, lane: int) -> None:
@@ -125,7 +125,7 @@ class LightVehicle(RoadVehicle):
         self.admission = attrs.evolve(self.admission, arrival=arrival)
 
     def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
-        """Return the SENSE message according to the clock of the vehicle.
+        """Return the SENSE message as seen by the vehicle's own clock.
 
         The vehicle knows its position in the lattice from its neighbours: a wrong clock makes it
         act early or late, but does not shift its cell.
@@ -143,12 +143,12 @@ class LightVehicle(RoadVehicle):
 class LightDriver:
     """Driver without trajectories, whose commands contain only cells and ticks.
 
-    Like `TrackingDriver`, it considers a motion ended when its time is over and the body is in the
-    target cell.
+    Like `TrackingDriver`, it considers a motion complete when its time is over and the body is in
+    the target cell.
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        """Create a driver without knowledge of its vehicle."""
+        """Create a driver that has not taken over a vehicle yet."""
         self._lattice = scenario.lattice
         self._origin: Cell = (0, 0)
         self._goal: Cell = (0, 0)
@@ -165,7 +165,7 @@ class LightDriver:
         self._end_tick, self._ticks = sense.motion_end_tick, sense.motion_ticks
 
     def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
-        """Begin a move at a tick; it takes `ticks` ticks."""
+        """Begin a move of `ticks` ticks at a tick."""
         _, self._origin, self._goal = move
         self._end_tick, self._ticks = tick + ticks, ticks
 
@@ -176,22 +176,22 @@ class LightDriver:
         )
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
-        """Return the end of the current motion, without jerks."""
+        """Return a command with the end of the current motion, and without jerks."""
         end_tick = max(self._end_tick, sense.tick + 1) if moving else 0
         return Drive(end_tick, self._origin, self._ticks, b"")
 
     def motion(self, tick: int) -> None:
-        """Publish no motions, which would only slow down the search."""
+        """Publish no motion; motions would only slow down the search."""
 
     def on_motion(self, motion: Motion) -> None:
         """Ignore motions of other vehicles."""
 
 
 class LightPlanner:
-    """Planner of one slot of the rolling operation: moves to preferred lanes, or random ones.
+    """Planner for one slot of the rolling operation: moves to preferred lanes, or random moves.
 
     It moves as many vehicles as possible, to transfer more cells than the stream planner would.
-    Equal arguments give equal plans.
+    The same arguments give the same plan.
     """
 
     def __init__(self, scenario: Scenario) -> None:

@@ -16,12 +16,12 @@ from laneweave.protocol.wire.messages import (
 )
 
 BEFORE_S = 4.0
-"""Length of the printed timeline before a violation."""
+"""Time before the first violation from which the timeline is printed."""
 AFTER_S = 0.2
 
 
 class Timeline:
-    """Log of events and messages, without repetitions."""
+    """Log of events and messages, without repeated messages."""
 
     def __init__(self) -> None:
         """Start with an empty log."""

@@ -1,8 +1,8 @@
-"""Failover times: from a fault of the leader to the next leader and to the next plan.
+"""Failover times: from a leader fault to the next leader and to the next plan.
 
-The next plan is the first plan of a formation that comes into force after the fault. If its
-formation closed after the fault, the time is measured from the closing, because there was no work
-to do before.
+The next plan is the first formation plan that comes into force after the fault. If its formation
+closed after the fault, the time is measured from when it closed, because there was nothing to plan
+earlier.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from laneweave.protocol.wire.messages import LogEvent
 
 IN_FORCE = "plan-in-force"
 IN_FLIGHT_S = 0.05
-"""Maximum delay of messages that a leader has sent before a pause."""
+"""Maximum delay of messages sent by a leader before it was paused."""
 
 
 @define
 class Failover:
-    """Measurement of recovery from faults of leaders; all times are on one clock, in seconds."""
+    """Measurement of recovery from leader faults; all times are from one clock, in seconds."""
 
     lease_s: float
     recovery_s: list[float] = field(factory=list)
@@ -30,11 +30,11 @@ class Failover:
     plan_recovery_s: list[float] = field(factory=list)
     """Time to the next plan in force, for each leader killed or paused."""
     _lost: tuple[str | None, int] | None = None
-    """Name and incarnation of the failed leader; None: there is a new leader."""
+    """Name and incarnation of the failed leader; None: no failover in progress."""
     _lost_s: float = 0.0
     _awake_s: float = math.inf
     _target: str | None = None
-    """Target of the newest fault; None: a plan has followed."""
+    """Target of the newest fault until the next plan; then None."""
     _target_s: float = 0.0
     _killed: bool = False
     _led_again: bool = False
@@ -55,7 +55,7 @@ class Failover:
         view.leader = None
 
     def update(self, view: RoadView, now_s: float) -> None:
-        """Update leader and plans from the observed state."""
+        """Update the leader and the recovery times from the observed state."""
         if not self._road_s or view.t_s > self._road_s[-1]:
             self._road_s.append(view.t_s)
             self._seen_s.append(now_s)

@@ -1,7 +1,7 @@
 """The fault engine, which applies a fault specification to a local or a simulated run.
 
 Kills and pauses affect roles through `RoleControl`, which both kinds of runs implement. Message
-faults and partitions are rules that roles receive at their start; in local runs, network namespaces
+faults and partitions are rules that roles receive at start-up; in local runs, network namespaces
 may implement partitions instead.
 """
 
@@ -33,7 +33,7 @@ log = structlog.get_logger(__name__)
 
 
 class RoleControl(Protocol):
-    """Operations of faults on the roles of a run, which are identified by name."""
+    """Operations that faults perform on the roles of a run, by name."""
 
     @property
     def running(self) -> Collection[str]:
@@ -47,16 +47,16 @@ class RoleControl(Protocol):
         """Return the role that drives a vehicle; None: not started."""
 
     def kill(self, name: str) -> None:
-        """End a role immediately, without clean-up."""
+        """Kill a role immediately, without clean-up."""
 
     def pause(self, name: str) -> None:
         """Suspend a role."""
 
     def resume(self, name: str) -> None:
-        """Resume a paused role, unless it has ended."""
+        """Resume a paused role, unless it has exited."""
 
     def restart(self, name: str) -> None:
-        """Start a killed role again with an empty memory."""
+        """Restart a killed role with empty memory."""
 
 
 @define
@@ -71,17 +71,17 @@ class FaultInjection:
     network: GroupNetwork | None = None
     """Namespaces for partitions; None: partitions drop messages."""
     no_network_reason: str = ""
-    """Reason why there are no namespaces."""
+    """Why there are no namespaces."""
     injected: list[dict[str, Any]] = field(factory=list)
     """Applied faults: road time, name of the fault, and the effect with its target."""
     failover: Failover = field(init=False)
     schedule: FaultSchedule = field(init=False)
     _starts: dict[str, int] = field(factory=dict)
-    """Number of starts of each role."""
+    """Number of times that each role was started."""
     _waiting: list[FaultEvent] = field(factory=list)
     """Due events that wait for a target."""
     _recoveries: list[tuple[float, str, Callable[[str], None]]] = field(factory=list)
-    """Future resumes and restarts: time on the clock of `now_s`, role, and action."""
+    """Pending resumes and restarts: time on the clock of `now_s`, role, and action."""
     _targets: dict[str, set[str]] = field(factory=dict)
     """Targets of each fault; a fault affects each agent at most once."""
     _paused: set[str] = field(factory=set)
@@ -95,7 +95,7 @@ class FaultInjection:
 
     @property
     def wakeup_s(self) -> float | None:
-        """Latest time of the next call of `step`, on the clock of `now_s`; None: no limit."""
+        """Time by which `step` must be called, on the clock of `now_s`; None: any time."""
         return min((due_s for due_s, _, _ in self._recoveries), default=None)
 
     def message_rules(self) -> tuple[MessageRule, ...]:
@@ -120,7 +120,7 @@ class FaultInjection:
         Args:
             road_s: road time.
             now_s: wall-clock time, or virtual time of the simulated network.
-            view: observed leader and census; the leader is removed when it becomes a target.
+            view: observed leader and census; `leader` is cleared when it becomes a target.
 
         Raises:
             CommandFailedError: a role cannot be restarted, or a link cannot be changed.
@@ -138,7 +138,7 @@ class FaultInjection:
         self._partition(road_s)
 
     def unused_faults(self) -> list[str]:
-        """Return a line for each fault without effect."""
+        """Return a line for each fault that had no effect."""
         return self.schedule.unused_faults(set(self._targets))
 
     def results(self, dropped: int) -> dict[str, Any]:
@@ -156,7 +156,7 @@ class FaultInjection:
         return {"failover": self.failover, "dropped": dropped, "faults": faults}
 
     def close(self) -> None:
-        """Release the network namespaces; to be called after the end of all roles."""
+        """Release the network namespaces; call this after all roles have exited."""
         if self.network is not None:
             self.network.close()
 

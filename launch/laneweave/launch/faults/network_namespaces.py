@@ -1,13 +1,13 @@
 """Network namespaces for groups of processes, so that partitions affect real connections.
 
 The namespaces form a star. The router runs in the hub, which has the same address for all groups. A
-pair of virtual Ethernet devices (veth) connects each group to the hub; setting the hub's end down
-disconnects the group: packets are lost, connections end with their leases, and the group loses the
-liveliness tokens of all others. The launcher reaches the router through a Unix socket, which is
-independent of namespaces.
+pair of virtual Ethernet devices (veth) connects each group to the hub; taking the hub's end down
+disconnects the group: packets are lost, connections end when their leases expire, and the group
+loses the liveliness tokens of all others. The launcher reaches the router through a Unix socket,
+which is independent of namespaces.
 
 The namespaces have no names; each is held by a process of the run. The kernel removes a namespace
-with its devices and addresses when its last process ends, so nothing remains after a run. This
+with its devices and addresses when its last process exits, so nothing remains after a run. This
 requires CAP_SYS_ADMIN and the program `ip`.
 """
 
@@ -37,15 +37,15 @@ HUB = "hub"
 _CLONE_NEWNET = 0x40000000
 _PATH = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"))
 _UPLINK = "uplink"
-"""A group's end of its pair of devices; the hub's end has the name of the group."""
+"""A group's end of its device pair; the hub's end is named after the group."""
 
 
 class NamespacesUnavailableError(RuntimeError):
-    """Network namespaces cannot be created or used; the message has the reason."""
+    """Network namespaces cannot be created or used; the message gives the reason."""
 
 
 def join_namespace(process_id: int) -> None:
-    """Move this process, which must have a single thread, into the namespace of another process.
+    """Move this process, which must be single-threaded, into the namespace of another process.
 
     Raises:
         OSError: permission is missing, or the other process does not exist.
@@ -58,8 +58,8 @@ def join_namespace(process_id: int) -> None:
 def hold_namespace(connection: Connection) -> None:
     """Create a network namespace, and run commands in it until the connection is closed.
 
-    Receives each command as a list of words. Sends an error text, empty on success, for the
-    creation of the namespace and for each command.
+    Receives each command as a list of words. Sends an error text (empty on success) after creating
+    the namespace and after each command.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -151,7 +151,7 @@ class GroupNetwork:
         """Create the namespaces and their links.
 
         Raises:
-            NamespacesUnavailableError: the creation failed; nothing remains.
+            NamespacesUnavailableError: creation failed; nothing remains.
         """
         try:
             for name in (HUB, *self.groups):
@@ -193,7 +193,7 @@ class GroupNetwork:
         return f"tcp/{HUB_ADDRESS}:{PORT}"
 
     def cut_off(self, groups: Collection[str]) -> set[str]:
-        """Set the links of these groups down and all others up; return the changed groups.
+        """Take the links of these groups down, bring all others up; return the changed groups.
 
         Raises:
             NamespacesUnavailableError: a command failed.
@@ -207,7 +207,7 @@ class GroupNetwork:
         return changed
 
     def close(self) -> None:
-        """Release the namespaces; to be called after the end of the roles in them."""
+        """Release the namespaces; call this after the roles in them have exited."""
         for namespace in self._namespaces.values():
             namespace.close()
         self._namespaces.clear()

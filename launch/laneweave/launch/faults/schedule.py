@@ -1,7 +1,7 @@
 """Schedule of the kills and pauses of a fault specification.
 
 Each fault has separate random generators, so that adding a fault does not change the times of
-others.
+the others.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class FaultEvent:
     due_s: float
     """Road time."""
     draw: random.Random = field(eq=False, repr=False)
-    """Generator for the choice among several targets."""
+    """Generator for choosing among several targets."""
     for_s: float | None = None
     """Length of a pause in wall-clock seconds."""
     restart_after_s: float | None = None
@@ -63,9 +63,9 @@ class FaultSchedule:
             self._next = next(self._coming, None)
 
     def unused_faults(self, applied: set[str]) -> list[str]:
-        """Return a line for each fault that had no effect before the end of the run.
+        """Return a line for each fault that had no effect during the run.
 
-        `applied` contains the names of the faults with an applied event.
+        `applied` contains the names of the faults with at least one applied event.
         """
         lines = [
             f"the run ended before {fault.target} was {fault.verb} at {fault.from_s:g} s"
@@ -100,7 +100,7 @@ def _events(seed: int, name: str, fault: RoleFault) -> Iterator[FaultEvent]:
 
 
 def _times(seed: int, name: str, fault: RoleFault) -> Iterator[float]:
-    """Yield the times of a fault in ascending order, each repeated for every target."""
+    """Yield the times of a fault in ascending order, repeating each one for every target."""
     if fault.between_s is not None:
         draw = random.Random(f"{seed}/{name}")  # noqa: S311 (no secrets)
         drawn = fault.count * (fault.times or 1)

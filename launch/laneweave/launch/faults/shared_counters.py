@@ -27,7 +27,7 @@ class LocalBoard:
 
 
 class SharedBoard:
-    """The shared file in the launcher, which assigns the counters and reads all of them."""
+    """The shared file as seen by the launcher, which assigns and reads all counters."""
 
     def __init__(self, path: Path) -> None:
         """Create the file with road time 0."""
@@ -49,7 +49,7 @@ class SharedBoard:
 
     @property
     def dropped(self) -> int:
-        """Number of messages dropped by faults in all current and ended processes."""
+        """Number of messages dropped by faults in all current and past processes."""
         content = self.path.read_bytes()[WORD:]
         return sum(struct.unpack(f"={len(content) // WORD}Q", content))
 
@@ -104,6 +104,6 @@ class MessageFaults:
     seed: str
 
     def wrap(self, core: Core) -> Core:
-        """Return the core wrapped by message faults."""
+        """Return a core that applies these message faults to `core`."""
         board = BoardWord(self.board, self.word)
         return FaultyCore(core, self.rules, board, receiver=self.receiver, seed=self.seed)

@@ -1,7 +1,7 @@
 """The fault specification of a run: the format of fault files (reference: docs/FAULTS.md).
 
 A file has any number of tables `[[messages]]`, `[[kill]]`, `[[pause]]` and `[[partition]]`. Faults
-begin at a road time; durations are wall-clock time. The package contains preset files, which are
+begin at a road time; durations are in wall-clock time. The package contains preset files, which are
 selected by name.
 """
 
@@ -52,14 +52,14 @@ def _duration(_: object, attribute: attrs.Attribute[Any], value: NumberOrRange) 
 
 @frozen(kw_only=True)
 class RoleFault:
-    """Fields that kills and pauses have in common: target and times.
+    """Fields that kills and pauses share: target and times.
 
     Raises:
         BadInputError: a value is not allowed, or values contradict each other.
     """
 
     verb: ClassVar[str]
-    """Effect on the target, as a past participle."""
+    """What happened to the target, as a past participle."""
 
     target: str = LEADER
     """`leader`, `router`, `coordinator` (any), `agent` (any on the road), or the name of a
@@ -73,7 +73,7 @@ class RoleFault:
     every_s: float | None = field(default=None, validator=optional(within(MIN_EVERY_S, MAX_S)))
     """Road time between repetitions; only with `at_s`."""
     times: int | None = field(default=None, validator=optional(within(1, MAX_TIMES)))
-    """Number of repetitions; None: one, or with `every_s` until the end of the run."""
+    """Number of repetitions; None: one, or unlimited with `every_s`."""
 
     def __attrs_post_init__(self) -> None:
         """Check that the fields do not contradict each other."""
@@ -98,7 +98,7 @@ class RoleFault:
 
 @frozen(kw_only=True)
 class Kill(RoleFault):
-    """Kill roles with SIGKILL, and optionally restart them with an empty memory."""
+    """Kill roles with SIGKILL, and optionally restart them with empty memory."""
 
     verb = "killed"
 
@@ -116,7 +116,7 @@ class Kill(RoleFault):
 
 @frozen(kw_only=True)
 class Pause(RoleFault):
-    """Pause roles with SIGSTOP, and resume them later with SIGCONT and outdated state."""
+    """Pause roles with SIGSTOP, and resume them later with SIGCONT and stale state."""
 
     verb = "paused"
 
@@ -126,7 +126,7 @@ class Pause(RoleFault):
 
 @frozen(kw_only=True)
 class Partition:
-    """Separate one group from all others, or two groups from each other, during some road time.
+    """Separate one group from all others, or two groups from each other, for a period of road time.
 
     Raises:
         BadInputError: a value is not allowed, or values contradict each other.
@@ -136,7 +136,7 @@ class Partition:
     """Two groups, or a group and `others` (all processes outside the group)."""
     from_s: float = field(default=0.0, validator=within(0.0, MAX_S))
     until_s: float | None = field(default=None, validator=optional(within(0.0, MAX_S)))
-    """Road time of the end; None: the end of the run."""
+    """End (road time); None: the end of the run."""
     method: str = field(default=AUTO, validator=one_of(AUTO, NAMESPACES, MESSAGES))
 
     def __attrs_post_init__(self) -> None:
@@ -157,7 +157,7 @@ class Partition:
 
     @property
     def may_use_links(self) -> bool:
-        """Whether setting a network link down can implement this partition."""
+        """Whether taking a network link down can implement this partition."""
         return self.between[1] == OTHERS and self.method != MESSAGES
 
     def message_rules(self) -> Iterator[MessageRule]:

@@ -45,7 +45,7 @@ class Formations:
     """Formations with disjoint columns."""
 
     listed: tuple[FormationColumns, ...] = field(converter=_rearmost_first, default=())
-    """Formations, the rearmost first."""
+    """Formations, rearmost first."""
 
     @classmethod
     def of_census(cls, closed: Iterable[ClosedFormation], lattice: Lattice) -> Formations:
@@ -54,7 +54,7 @@ class Formations:
 
     @property
     def by_number(self) -> dict[int, FormationColumns]:
-        """Formations by number, the foremost first."""
+        """Formations by number, foremost first."""
         return {one.number: one for one in reversed(self.listed)}
 
     def at(self, column: int) -> FormationColumns | None:
@@ -65,7 +65,7 @@ class Formations:
         """Return the numbers of formations that plan together, in groups of at least two.
 
         Args:
-            groups: numbers of blocks that plan together; groups may overlap.
+            groups: groups of block numbers that plan together; groups may overlap.
             lattice: lattice with the blocks.
         """
         found: list[set[int]] = []
@@ -80,7 +80,7 @@ class Formations:
 
 
 def read_events(folder: Path, *kinds: str) -> Iterator[Mapping[str, Any]]:
-    """Yield the recorded events of some kinds, in the order in which they were written.
+    """Yield the recorded events of the given kinds, in the order in which they were written.
 
     Raises:
         OSError, ValueError, TypeError: the events cannot be read.
@@ -104,7 +104,7 @@ def closed_formations(folder: Path, scenario: Scenario) -> Formations:
 def recorded_formations(folder: Path, lattice: Lattice) -> Formations:
     """Return the formations of a recorded run that contained vehicles.
 
-    In recordings without `formation-closed` events and of the rolling operation, each block of the
+    In the rolling operation, and in recordings without `formation-closed` events, each block of the
     lattice counts as a formation.
 
     Raises:

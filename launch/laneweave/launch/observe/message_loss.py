@@ -1,9 +1,9 @@
 """Message loss measured by an observer: clocks and states that did not arrive.
 
 In each tick of road time the bridge publishes its clock, and every vehicle on the road its state; a
-census lists the vehicles on the road. Therefore the expected messages of a tick are known. States
-of a vehicle are expected after the first received one, at the latest `CONNECT_S` after its entry,
-because its agent may not be connected before.
+census lists the vehicles on the road, so the expected messages of a tick are known. The states of a
+vehicle are expected from its first received state, or from `CONNECT_S` after its entry if that is
+earlier, because its agent may connect late.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from attrs import define, field
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name, RoadClock, VehicleState
 
 GRACE_TICKS = 5
-"""Number of ticks that a message may be late without counting as lost."""
+"""Number of ticks by which a message may be late without counting as lost."""
 CONNECT_S = 1.0
 TOLERANCE_S = 1e-6
 
@@ -39,14 +39,14 @@ class LossMeter:
     _next_tick: int = 0
     """Next tick to close."""
     _closed: deque[tuple[int, int, bool]] = field(init=False)
-    """Numbers of expected and lost states of each closed tick, and whether its clock arrived."""
+    """Expected and lost states of each closed tick, and whether its clock message arrived."""
 
     @_closed.default
     def _empty_window(self) -> deque[tuple[int, int, bool]]:
         return deque(maxlen=self.window_ticks)
 
     def on_state(self, state: VehicleState) -> None:
-        """Count a state; ignore repetitions for the same vehicle and tick."""
+        """Count a state; ignore duplicates for the same vehicle and tick."""
         if self._tick_s == 0.0:
             return
         tick = self._tick(state.t_s)
@@ -55,7 +55,7 @@ class LossMeter:
             self._first_tick.setdefault(state.vehicle, tick)
 
     def on_census(self, census: Census) -> None:
-        """Process a census that is newer than all earlier ones."""
+        """Process a census newer than all previous ones."""
         if not self.window_ticks:
             return
         self._censuses.append(census)
@@ -70,7 +70,7 @@ class LossMeter:
         if not self.window_ticks or not clock.tick:
             return
         if self._tick_s == 0.0:
-            # Messages that were published before the start of this observer did not reach it.
+            # Messages published before this observer started did not reach it.
             self._tick_s, self._next_tick = clock.t_s / clock.tick, clock.tick + 1
         self._clocks.add(clock.tick)
         # Close no more ticks than the window can hold.

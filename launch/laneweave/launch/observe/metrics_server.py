@@ -34,12 +34,12 @@ class MetricsCollector(Collector):
     """Collector that reads the metrics of a process at each request."""
 
     def __init__(self, labels: dict[str, str]) -> None:
-        """Start without a source; `labels` describe the process."""
+        """Start without a metrics source; `labels` describe the process."""
         self._labels = labels
         self._source: Source | None = None
 
     def register(self, source: Source) -> None:
-        """Set the source of metrics; called when the process has started."""
+        """Set the source of metrics; called once the process has started."""
         self._source = source
 
     def collect(self) -> Iterator[Metric]:
@@ -82,9 +82,9 @@ class _Server(ThreadingHTTPServer):
 
 @contextlib.contextmanager
 def serve_metrics(address: str, **labels: str) -> Iterator[Observe]:
-    """Serve metrics until the end of the context.
+    """Serve metrics until the context exits.
 
-    All threads are daemons, so that clients do not delay the end of the process.
+    All threads are daemons, so that clients do not delay process exit.
 
     Args:
         address: HOST:PORT to listen on.

@@ -28,7 +28,7 @@ TOPICS = (CLOCK, CENSUS, HEARTBEAT, EVENT)
 
 @define
 class Observer:
-    """Reader of the deliveries of a transport, which can update a view."""
+    """Reader of a transport's deliveries, with a view that they can update."""
 
     keys: Keys
     inbox: queue.SimpleQueue[Delivery] = field(factory=queue.SimpleQueue)

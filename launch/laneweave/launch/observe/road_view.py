@@ -1,7 +1,7 @@
 """Observed state of a deployment: newest road, coordinators, processes.
 
-Bridge processes are numbered (their incarnations). A clock or census of a newer bridge starts a new
-road; those of older bridges are ignored.
+Each bridge process has an incarnation number. A clock or census from a newer bridge starts a new
+road; those from older bridges are ignored.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from laneweave.protocol.wire.topics import (
 NetworkEvent = Arrived | PeerUp | PeerDown | LinkUp | LinkDown
 
 MAX_EVENTS = 1000
-"""Maximum number of log events that are kept for `take_events`."""
+"""Maximum number of log events kept for `take_events`."""
 FORGET_S = 5.0
 """Difference from the road clock above which a state belongs to an earlier road."""
 REMEMBERED_S = 60.0
@@ -50,19 +50,19 @@ class Coordinator:
     coordinator: Name
     incarnation: int
     leading: bool
-    """Whether it claims to lead, and its last heartbeat is newer than the election timeout."""
+    """Whether the process claims to lead and its last heartbeat has not timed out."""
     term: int | None
-    """None here and in the next two fields: no heartbeat was received."""
+    """None, here and in the next two fields: no heartbeat was received."""
     plans_in_force: int | None
     heard_s_ago: float | None
     token: bool
-    """Whether its liveliness token exists."""
+    """Whether the process has a liveliness token."""
 
 
 def claims_of(coordinators: Sequence[Coordinator]) -> list[Coordinator]:
     """Return the coordinators that claim to lead; the first one leads.
 
-    The highest term leads; among equal terms, the lowest name leads.
+    The highest term leads; ties go to the lowest name.
     """
     return sorted(
         (one for one in coordinators if one.leading),
@@ -96,7 +96,7 @@ class RoadView:
     """Clock with the lowest tick."""
     first_clock_received_s: float = 0.0
     heartbeats: dict[Process, tuple[Heartbeat, float]] = field(factory=dict)
-    """Newest heartbeat of each process, and its time of arrival."""
+    """Newest heartbeat of each process, and when it arrived."""
     linked: bool = True
     """Whether the observer is connected to the router."""
     message_counts: Counter[str] = field(factory=Counter)
@@ -120,7 +120,7 @@ class RoadView:
         return self.clock.t_s if self.clock is not None else 0.0
 
     def update(self, event: object, now_s: float) -> None:
-        """Process a message or another `NetworkEvent`; ignore messages older than known ones.
+        """Process a message or another `NetworkEvent`; ignore outdated messages.
 
         Args:
             event: message or event.
@@ -159,7 +159,7 @@ class RoadView:
 
         Args:
             now_s: current time on the clock of the observer.
-            election_s: time without a heartbeat after which a coordinator does not lead.
+            election_s: time without a heartbeat after which a coordinator no longer leads.
         """
         self.heartbeats = {
             process: (heartbeat, heard_s)

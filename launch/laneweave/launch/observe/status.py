@@ -1,4 +1,4 @@
-"""State of a deployment, and health checks of the deployment and of single processes."""
+"""State of a deployment, and health checks of the deployment and of individual processes."""
 
 from __future__ import annotations
 
@@ -62,16 +62,16 @@ class Road:
 
 @frozen
 class Vehicles:
-    """Numbers of vehicles in the census, by the sender of their states."""
+    """Vehicle counts in the census, by the sender of the vehicles' states."""
 
     attended: int
     """Vehicles driven by an agent."""
     unattended: int
     """Vehicles without an agent, whose states are published by caretakers."""
     unheard: int
-    """Vehicles of which no state was received."""
+    """Vehicles from which no state was received."""
     agents: int
-    """Agents with a token, of vehicles on the road or announced ones."""
+    """Agents with a token, including those of announced vehicles."""
 
 
 @frozen
@@ -122,9 +122,9 @@ def status_of(
 
     Args:
         view: observed state.
-        began_s: start of the observation on the clock of the observer.
-        now_s: end of the observation.
-        election_s: time without a heartbeat after which a coordinator does not lead.
+        began_s: when observation began, on the clock of the observer.
+        now_s: current time on this clock.
+        election_s: time without a heartbeat after which a coordinator no longer leads.
         endpoint: endpoint of the router.
         realm: realm of the deployment.
     """
@@ -216,7 +216,7 @@ class RoleHealth:
         if not unattended:
             return None
         count = len(unattended)
-        return f"shard {self.name}: {count} vehicles without agent, such as {unattended[0]}"
+        return f"shard {self.name}: {count} vehicles without an agent, such as {unattended[0]}"
 
 
 LINK_LOST = "the connection to the router was lost"

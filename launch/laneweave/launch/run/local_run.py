@@ -1,7 +1,7 @@
-"""A run over Zenoh with router, coordinators, bridge and agents as processes of this machine.
+"""A run over Zenoh with router, coordinators, bridge and agents as processes on this machine.
 
-The launcher starts them and an agent for each announced vehicle, monitors them, applies faults, and
-ends all of them on success, failure, Ctrl-C, or the death of a process.
+The launcher starts these roles (agents once their vehicles are announced), monitors them, applies
+faults, and terminates all of them on success, on failure and on Ctrl-C.
 """
 
 from __future__ import annotations
@@ -45,25 +45,25 @@ MAX_TEMPORARY_BYTES = 70
 """Maximum length of TMPDIR: socket paths are up to 37 bytes longer, and limited to 107 bytes."""
 ROUTER_START_S = 20.0
 STALL_S = 90.0
-"""Time without progress of the road clock after which a run fails."""
+"""Time after which a run fails if the road clock does not advance."""
 MAX_FAILED_AGENTS = 5
-"""Number of agents that may end with an error before the run is aborted."""
+"""Maximum number of agents that may exit with an error; one more aborts the run."""
 LEADER_S = 5.0
-"""Maximum time to wait for a leader, beyond two election timeouts, before the bridge is started."""
+"""Maximum wait for a leader, beyond two election timeouts, before the bridge starts."""
 POLL_S = 0.1
 _GROUP_OF_SENDER = {sender: group for group, sender in SENDER_OF_GROUP.items()}
 
 
 @define
 class _StallDetector:
-    """Detector of a road clock that does not advance."""
+    """Detector for a stalled road clock."""
 
     scenario: Scenario
     advanced_s: float
     road_s: float = -1.0
 
     def is_stalled(self, road_s: float, now_s: float) -> bool:
-        """Return whether the clock has not advanced for too long."""
+        """Return whether the clock has been stopped for too long."""
         if road_s != self.road_s:
             self.road_s, self.advanced_s = road_s, now_s
         # The clock also waits until the agent of an entering vehicle has started.
@@ -82,21 +82,21 @@ class LocalRun:
     show_progress: bool = True
     pace: float | None = None
     watch: Callable[[RoadView, Mapping[str, int]], None] | None = None
-    """Callback, called ten times per second with observed state and process ids of the roles."""
+    """Called ten times per second with the observed state and the process ids of the roles."""
     _processes: RoleProcesses = field(init=False)
     _options: dict[str, Any] = field(init=False)
     """Options of all roles."""
     _injection: FaultInjection | None = None
     _board: SharedBoard = field(init=False)
     _group_of: dict[str, int] = field(init=False)
-    """Group of each vehicle; successive arrivals form a group, which shares an agent process."""
+    """Group index of each vehicle; a group of successive arrivals shares an agent process."""
     _started_groups: set[int] = field(factory=set)
     _problems: list[str] = field(factory=list)
     _failed_agents: int = 0
     _stop: bool = False
 
     def __attrs_post_init__(self) -> None:
-        """Assign the vehicles of the demand to groups."""
+        """Assign the demanded vehicles to groups."""
         per_process = self.scenario.runtime.vehicles_per_process
         self._group_of = {
             arrival.vehicle: index // per_process
@@ -110,7 +110,7 @@ class LocalRun:
             BadInputError: the run is not possible in this environment.
         """
         check_temporary_folder()
-        warm_up()  # compile once instead of in each coordinator
+        warm_up()  # compile once, not in every coordinator
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
             tempfile.TemporaryDirectory(prefix="laneweave-") as temporary,
@@ -166,7 +166,7 @@ class LocalRun:
             observer.subscribe(transport)
             for name in processes.coordinators:
                 processes.start("coordinator", name)
-            # Road time must not start before a coordinator can plan.
+            # Start road time only once a coordinator can plan.
             self._await_leader(observer)
             processes.start("bridge", "bridge")
             stall = _StallDetector(self.scenario, time.monotonic())
@@ -179,7 +179,7 @@ class LocalRun:
                 road_s = view.t_s
                 if injection is not None:
                     injection.step(self._board.road_s, now, view)
-                    # Faults may drop clock messages on their way to the launcher.
+                    # Faults may drop clock messages to the launcher.
                     road_s = max(road_s, self._board.road_s)
                 if self.watch is not None:
                     self.watch(view, processes.ids)
@@ -210,7 +210,7 @@ class LocalRun:
             observer.wait(POLL_S)
 
     def _check_processes(self) -> bool:
-        """Record the processes that have ended; return whether the run continues."""
+        """Record the processes that have exited; return whether the run continues."""
         for end in self._processes.ended():
             if end.name in ("bridge", ROUTER):
                 if end.status != 0 or end.name == ROUTER:
@@ -245,7 +245,7 @@ class LocalRun:
 def fault_injection(
     faults: FaultSpec, scenario: Scenario, processes: RoleProcesses
 ) -> FaultInjection:
-    """Return the fault engine of a run whose processes have not been started.
+    """Return the fault engine for a run; call this before starting its processes.
 
     Raises:
         BadInputError: a partition requires network namespaces, which cannot be created.
@@ -282,7 +282,7 @@ def add_faults(
 
 
 def check_temporary_folder() -> None:
-    """Check that the path of the temporary folder is short enough for sockets in it.
+    """Check that the path of the temporary folder is short enough for socket paths.
 
     Raises:
         BadInputError: the path is too long.

@@ -25,7 +25,7 @@ class LogFormat(StrEnum):
 
 
 class LogLevel(StrEnum):
-    """Minimum level of log entries."""
+    """Lowest level that is logged."""
 
     debug = "debug"
     info = "info"
@@ -68,7 +68,7 @@ def log_to_terminal(level: LogLevel = LogLevel.warning) -> None:
 
 
 def last_error(path: Path, name: str) -> str:
-    """Return the last error that a process of a run has logged, in one line; empty: none."""
+    """Return the last error logged by a process of a run, as one line; empty: none."""
     found = ""
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     for line in lines:
@@ -83,14 +83,14 @@ def last_error(path: Path, name: str) -> str:
 
 
 def log_to_file(path: Path, role: str, name: str) -> None:
-    """Append JSON lines to a file that all processes of a run share."""
+    """Log JSON lines to a file that all processes of a run share."""
     # Lines of different processes do not interleave, because each line is one write.
     stream = path.open("a", buffering=1, encoding="utf-8")
     _log_json(lambda *_: structlog.WriteLogger(_lossy(stream)), role, name, LogLevel.info)
 
 
 class _LossyStream(io.TextIOBase):
-    """Stream that ignores write errors, so that a full disk does not end a role."""
+    """Stream that ignores write errors, so that a full disk does not stop a role."""
 
     def __init__(self, stream: TextIO) -> None:
         """Write to `stream`."""

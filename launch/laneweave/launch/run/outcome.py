@@ -1,4 +1,4 @@
-"""The outcome of a run: its summary, completed by the launcher, and the reasons of its failure."""
+"""The outcome of a run: its summary, completed by the launcher, and the reasons for failure."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Outcome:
 
     folder: Path
     summary: RunSummary | None
-    """Summary; None: the run ended before it was written."""
+    """Summary; None: the run wrote no summary."""
     problems: tuple[str, ...]
-    """Reasons of a failure; empty: the run succeeded."""
+    """Reasons for failure; empty: the run succeeded."""
 
     @property
     def exit_status(self) -> int:
@@ -40,14 +40,14 @@ def complete_summary(
     dropped: int = 0,
     faults: dict[str, Any] | None = None,
 ) -> Outcome:
-    """Complete the summary of a run with data of the launcher, and judge the run.
+    """Complete the summary of a run with the launcher's data, and judge the run.
 
     Args:
         folder: the run's folder.
         problems: problems known so far.
         processes: maximum number of simultaneous role processes; None: unknown.
-        failover: measured recoveries from faults of the leader; None: no faults.
-        dropped: messages that faults dropped.
+        failover: measured recoveries from leader faults; None: no faults.
+        dropped: number of messages dropped by faults.
         faults: record of the injected faults; None: no faults.
     """
     summary = read_summary(folder)

@@ -1,9 +1,9 @@
 """Preparation of the fork server before its first fork; only the fork server imports this module.
 
-The import loads libraries, generates the code that converts messages and scenarios, and computes
-the reference motions for the default limits, once for all role processes. It opens no session,
-thread or file. Finally it excludes all objects from garbage collection, which writes to every
-object that it visits, so that each process would copy all of them.
+Importing this module loads libraries, generates the code that converts messages and scenarios, and
+computes the reference motions for the default limits, once for all role processes. It starts no
+thread and opens no session or file. Finally it excludes all objects from garbage collection: a
+collection writes to every object that it visits, so each process would copy all of them.
 """
 
 from __future__ import annotations

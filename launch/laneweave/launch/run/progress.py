@@ -12,10 +12,10 @@ from laneweave.protocol.scenario.fields import Scenario
 
 
 class RunProgress(Progress):
-    """Progress bar with simulated time, vehicles on the road, leader and real-time factor."""
+    """Progress bar with road time, vehicles on the road, leader and real-time factor."""
 
     def __init__(self, scenario: Scenario, *, show: bool) -> None:
-        """Create a bar that ends when the last vehicle can leave; hidden if not `show`."""
+        """Create a bar that is full when the last vehicle can have left; hidden unless `show`."""
         super().__init__(
             TextColumn("{task.fields[now]}"),
             BarColumn(bar_width=None),

@@ -1,4 +1,4 @@
-"""A run of a reference method in this process, without agents, coordinators and messages."""
+"""A run with a reference method in this process, without agents, coordinators or messages."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PROGRESS_EVERY_TICKS = 50
 
 @define
 class ReferenceRun:
-    """A run of a reference method, as fast as possible; call `run` once."""
+    """A run with a reference method, as fast as possible; call `run` once."""
 
     scenario: Scenario
     folder: Path

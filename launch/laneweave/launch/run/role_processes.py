@@ -1,4 +1,4 @@
-"""Control of the role processes of a local run by name."""
+"""Control of the role processes of a local run, by name."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from laneweave.launch.run.roles import start_role
 log = structlog.get_logger(__name__)
 
 STOP_S = 5.0
-"""Time that processes have to end after SIGTERM; then they are killed."""
+"""Grace period after SIGTERM before processes are killed."""
 ROUTER = "router"
 
 
 @frozen
 class RoleStart:
-    """Arguments of the start and of restarts of a role."""
+    """Arguments with which a role is started and restarted."""
 
     role: str
     name: str
@@ -33,7 +33,7 @@ class RoleStart:
 
 @frozen
 class RoleExit:
-    """Name and exit status of a process that has ended."""
+    """Name and exit status of a process that has exited."""
 
     name: str
     status: int | None
@@ -79,7 +79,7 @@ class RoleProcesses:
         return process is not None and process.is_alive()
 
     def ended(self) -> Iterator[RoleExit]:
-        """Yield the processes that have ended by themselves since the last call."""
+        """Yield the processes that have exited on their own since the last call."""
         names = {process.sentinel: name for name, process in self._running.items()}
         for sentinel in wait_for_sentinels(list(names), timeout=0):
             assert isinstance(sentinel, int)  # noqa: S101 (narrows the type)
@@ -93,7 +93,7 @@ class RoleProcesses:
 
     @property
     def running(self) -> Collection[str]:
-        """Names of the roles not known to have ended."""
+        """Names of the roles whose exit has not been observed."""
         return self._running.keys()
 
     def agent_of(self, vehicle: str) -> str | None:
@@ -101,7 +101,7 @@ class RoleProcesses:
         return self._process_of.get(vehicle)
 
     def kill(self, name: str) -> None:
-        """End a role with SIGKILL."""
+        """Kill a role with SIGKILL."""
         self._paused.discard(name)
         process = self._running.pop(name)
         process.kill()
@@ -119,7 +119,7 @@ class RoleProcesses:
             self._signal(name, signal.SIGCONT)
 
     def restart(self, name: str) -> None:
-        """Start an ended role again with its original arguments.
+        """Restart a role that has exited, with its original arguments.
 
         Raises:
             CommandFailedError: the process cannot be created.
@@ -132,10 +132,10 @@ class RoleProcesses:
         if process is not None and process.pid is not None and process.is_alive():
             os.kill(process.pid, number)
 
-    # --- the end ------------------------------------------------------------------------------
+    # --- shutdown -----------------------------------------------------------------------------
 
     def end_all(self) -> None:
-        """End every process with SIGTERM, then SIGKILL if necessary; the router last."""
+        """Terminate all processes with SIGTERM, then SIGKILL if necessary; the router last."""
         for name in list(self._paused):
             self.resume(name)
         router = self._running.pop(ROUTER, None)
@@ -152,7 +152,7 @@ def _end(processes: list[ForkServerProcess]) -> None:
     for process in processes:
         process.join(max(0.0, deadline - time.monotonic()))
         if process.is_alive():
-            log.warning("killing a process that did not end", process=process.name)
+            log.warning("killing a process that did not exit", process=process.name)
             process.kill()
             process.join(STOP_S)
         process.close()

@@ -1,7 +1,7 @@
-"""Start of a role in a new process, and its execution there.
+"""Start a role in a new process, and run it there.
 
 The processes are forked from a server that has imported and prepared what roles need (`preload`),
-which is much cheaper than the start of an interpreter.
+which is much cheaper than starting an interpreter.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ AGENT_NICENESS = 5
 RECONNECT_S = 0.1
 """Time between attempts to connect in runs with faults."""
 ORPHAN_S = 5.0
-"""Time that a process has to shut down cleanly after the death of its launcher."""
+"""Grace period of a process after its launcher has died."""
 GC_THRESHOLD = 50_000
-"""New objects between garbage collections; the default of 700 slows a run down by 6 %."""
+"""New objects between garbage collections; the default of 700 slows down a run by 6 %."""
 _PR_SET_NAME = 15
 
 
 def tune_garbage_collector() -> None:
     """Exclude existing objects from garbage collection, and raise the threshold.
 
-    Roles create almost no reference cycles, for which the garbage collector searches.
+    Roles create almost no reference cycles, and the collector frees nothing else.
     """
     gc.collect()
     gc.freeze()
@@ -66,8 +66,8 @@ def fork_server() -> ForkServerContext:
         os.environ.setdefault(name, "1")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([PRELOADED])
-    # Ctrl-C reaches the whole process group. Role processes inherit that SIGINT is ignored, because
-    # the launcher ends them in the right order.
+    # Ctrl-C reaches the whole process group. Role processes inherit the ignored SIGINT, because
+    # the launcher terminates them in the right order.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         forkserver.ensure_running()
@@ -95,7 +95,7 @@ def start_role(
             `MessageFaults` of the role.
 
     Raises:
-        CommandFailedError: the fork server has ended, or the process cannot be created.
+        CommandFailedError: the fork server has exited, or the process cannot be created.
     """
     process = context.Process(target=run_role, args=(role, name, tables, options), name=name)
     try:
@@ -107,7 +107,7 @@ def start_role(
 
 
 def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
-    """Run a role in this process until it ends; the target of `start_role`."""
+    """Run a role in this process to completion; the target of `start_role`."""
     die_with_parent()
     if "namespace" in options:
         # Namespaces are properties of threads: join before other threads start.
@@ -128,7 +128,7 @@ def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, An
 
 
 def _run_once(role: str, name: str, tables: dict[str, Any], options: dict[str, Any]) -> bool:
-    """Run a role; return False to retry, because a fault prevented the connection."""
+    """Run a role; return False (retry) if a fault prevented it from connecting."""
     try:
         _ROLES[role](name, tables, options)
     except BadInputError as error:
@@ -140,9 +140,9 @@ def _run_once(role: str, name: str, tables: dict[str, Any], options: dict[str, A
 
 
 def die_with_supervisor() -> None:
-    """End this process when the launcher ends for any reason.
+    """Terminate this process when the launcher exits for any reason.
 
-    The parent process is the fork server, which runs until its last child process has ended.
+    The parent process is the fork server, which runs until its last child process has exited.
     """
     supervisor = multiprocessing.parent_process()
     if supervisor is None:
@@ -162,7 +162,7 @@ def die_with_supervisor() -> None:
 
 
 def resume_children(parent: int) -> None:
-    """Resume processes paused by faults, so that they detect the death of the launcher."""
+    """Resume processes paused by faults, so that they notice that the launcher has died."""
     with contextlib.suppress(OSError):
         children = Path(f"/proc/{parent}/task/{parent}/children").read_text(encoding="ascii")
         for child in children.split():
@@ -203,7 +203,7 @@ def _bridge(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
 def _agent(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     from laneweave.agents.process import run_agents
 
-    # Bridge, router and coordinators get a higher priority, because all roles wait for them.
+    # Bridge, router and coordinators take priority, because all roles wait for them.
     os.nice(AGENT_NICENESS)
     scenario, vehicles = parse_scenario(tables), options["vehicles"]
     run_agents(

@@ -1,4 +1,4 @@
-"""A repeatable run in this process: all cores over the simulated network, in virtual time."""
+"""A reproducible run in this process: all cores over the simulated network, in virtual time."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 
 STALL_S = 600.0
-"""Virtual time without progress of the road clock after which a run fails."""
+"""Virtual time after which a run fails if the road clock does not advance."""
 STRIDE_S = 0.02
 """Virtual time between checks of a run without faults.
 
-The network may run for this long after the end of the bridge, which does not affect the results."""
+The network may run for this long after the bridge has ended, which does not affect the results."""
 PROGRESS_EVERY_TICKS = 20
 AGENT_PREFIX = "agent-"
 
@@ -67,9 +67,9 @@ class SimulatedRoles:
     network: SimulatedNetwork
     coordinators: tuple[str, ...]
     start: Callable[[str], None]
-    """Starts the coordinator or agent of a name."""
+    """Starts a coordinator or agent by name."""
     agents: dict[str, str] = field(factory=dict)
-    """Name of the agent of each vehicle."""
+    """Agent name of each vehicle."""
     _router_runs: bool = True
 
     @property
@@ -84,7 +84,7 @@ class SimulatedRoles:
         return self.agents.get(vehicle)
 
     def kill(self, name: str) -> None:
-        """End a role immediately, without clean-up."""
+        """Kill a role immediately, without clean-up."""
         if name == ROUTER:
             self._router_runs = False
             self.network.lose_router()
@@ -101,7 +101,7 @@ class SimulatedRoles:
             self.network.resume(name)
 
     def restart(self, name: str) -> None:
-        """Start a killed role again."""
+        """Restart a killed role."""
         if name == ROUTER:
             self._router_runs = True
             self.network.restore_router()
@@ -124,9 +124,9 @@ class SimulatedRun:
     _injection: FaultInjection | None = None
     _board: LocalBoard = field(factory=LocalBoard)
     _injected_road_s: float = -1.0
-    """Road time of the newest application of faults."""
+    """Road time at which faults were last applied."""
     _incarnations: Iterator[int] = field(factory=lambda: count(1))
-    """Unique incarnation numbers of agents and caretakers."""
+    """Unique incarnation numbers for agents and caretakers."""
     _coordinator_incarnations: Iterator[int] = field(factory=lambda: count(1))
     _problems: list[str] = field(factory=list)
 

@@ -1,7 +1,7 @@
 """Messages between server and page: one scene, then frames, all as compact JSON.
 
-Lengths are in m, speeds in m/s; `t` is road time and `w` wall-clock time in s. Frames do not depend
-on earlier frames, so any of them may be skipped.
+Lengths are in m, speeds in m/s; `t` is road time and `w` wall-clock time in s. A frame does not
+depend on earlier frames, so any frame may be skipped.
 
 **Scene**, the first message: `{"scene": {...}}`
 
@@ -14,7 +14,7 @@ on earlier frames, so any of them may be skipped.
 | `step_s` | time between two frames: wall-clock time if live, road time if recorded |
 | `first`, `last` | numbers of the available frames; `last` < `first`: none |
 | `road`, `body_m`, `lattice`, `shade`, `colours`, `names` | parameters for drawing the road |
-| `rolling` | vehicles own cells; otherwise formations own columns |
+| `rolling` | true: vehicles own cells; false: formations own columns |
 | `losses` | recorded: message counts of the summary; live: null |
 
 **Frame**: live frames are pushed on changes, at most every `step_s`; recorded frames and earlier
@@ -41,10 +41,10 @@ live frames are sent on request.
 front bumper, y of the body centre, preferred lane (-1: unknown), number of the closed formation
 (-1: none), hold cell and target cell as [column, lane] or 0, sum of flags (1 moves, 2 has no agent,
 4 not heard from, 8 overdue), and the other owned cells as column, lane, column, lane, ... The
-target is the last cell of the plan that the vehicle has accepted and not completed.
+target is the last cell of the plan that the vehicle has accepted but not completed.
 
-**Request** of the page: `{"want": [from, to]}`, at most `MAX_REQUESTED` frame numbers. The response
-is `{"reel": [from, to], "first": n, "last": n, "frames": [...]}` with the available ones.
+**Request** from the page: `{"want": [from, to]}`, at most `MAX_REQUESTED` frame numbers. The response has
+the available frames: `{"reel": [from, to], "first": n, "last": n, "frames": [...]}`.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ MAX_NUMBER: Final = 1e12
 FREQUENT_EVENTS: Final = (
     *PLAN_EVENTS, PLAN_IN_FORCE, FORMATION_CLOSED, ENTERED, LEFT,
 )  # fmt: skip
-"""Events that are not shown because they would displace all others."""
+"""Events not shown, because they would displace all others."""
 
 
 class FrameSource(Protocol):
@@ -164,7 +164,7 @@ class EventFeed:
 
 
 def _details(data: Mapping[str, Any]) -> str:
-    """Return the data of an event as one short line."""
+    """Return the data of an event as a short line."""
     text = ", ".join(f"{name} {_brief(value)}" for name, value in data.items())
     if len(text) <= MAX_EVENT_CHARACTERS:
         return text
@@ -180,7 +180,7 @@ def _brief(value: object) -> str:
 
 
 def plan_row(t_s: float, kind: str, data: Mapping[str, Any]) -> list[Any] | None:
-    """Return the `plan` field of a frame for an event; None: the event is not that of a plan."""
+    """Return the `plan` field of a frame for an event; None: not a plan event."""
     if kind not in PLAN_EVENTS:
         return None
     return [
@@ -193,7 +193,7 @@ def plan_row(t_s: float, kind: str, data: Mapping[str, Any]) -> list[Any] | None
 
 
 def _number(value: object) -> float:
-    """Return the rounded number, or 0 for a value that is no number or too large."""
+    """Return the rounded number, or 0 if the value is not a number or is too large."""
     if isinstance(value, (int, float)) and abs(value) < MAX_NUMBER:
         return round(float(value), 2)
     return 0.0

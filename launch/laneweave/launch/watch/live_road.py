@@ -1,8 +1,8 @@
 """The live road: observed state of a deployment, and the frames that show it.
 
 A pure core that turns messages and times into frames. Every vehicle publishes its state in each
-tick; until the next state arrives, its position is extrapolated with its speed. After `UNHEARD_S`
-without a state it is drawn in its cell and marked: a vehicle without new information holds its
+tick; until the next state arrives, its position is extrapolated from its speed. After `UNHEARD_S`
+without a state, the vehicle is drawn in its cell and marked: without new information it holds its
 cell, but its position is unknown.
 """
 
@@ -35,11 +35,11 @@ from laneweave.protocol.wire.messages import (
 from laneweave.protocol.wire.topics import CENSUS, CLOCK, EVENT, HEARTBEAT, PLAN, STATE
 
 TOPICS = (STATE, CLOCK, CENSUS, HEARTBEAT, PLAN, EVENT)
-"""Subscribed topics, the most frequent first."""
+"""Subscribed topics, most frequent first."""
 UNHEARD_S = 1.0
-"""Road time without a state after which a vehicle counts as not heard from."""
+"""Age (road time) of the newest state above which a vehicle counts as not heard from."""
 STILL_S = 2.0
-"""Wall-clock time without a clock message after which the road clock counts as stopped."""
+"""Age (wall-clock time) of the newest clock message above which the clock counts as stopped."""
 MAX_PLANS = 500
 MAX_COORDINATORS = 32
 LOSS_WINDOW_TICKS = 100
@@ -61,7 +61,7 @@ class LiveRoad:
         """Run, status and tick of the last frame."""
 
     def update(self, event: object, wall_s: float) -> None:
-        """Process a message or a change of the connection at a wall-clock time."""
+        """Process a message, or a connection gained or lost, at a wall-clock time."""
         roads = self.view.roads
         self.view.update(event, wall_s)
         if 0 < roads < self.view.roads:
@@ -84,7 +84,7 @@ class LiveRoad:
             del self._targets[next(iter(self._targets))]
 
     def changed(self, wall_s: float) -> bool:
-        """Return whether tick or status have changed since the last frame."""
+        """Return whether the run, status or tick has changed since the last frame."""
         return self._shown != self._identity(wall_s)
 
     def frame(self, number: int, wall_s: float) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """The process of `laneweave watch`: socket, signals, observer thread.
 
-The thread processes deliveries of Zenoh and makes frames; the event loop serves browsers. Only
+The thread processes Zenoh deliveries and makes frames; the event loop serves browsers. Only
 complete frames are passed from the thread to the loop.
 """
 
@@ -37,18 +37,18 @@ log = structlog.get_logger(__name__)
 STEP_S: Final = 0.1
 """Wall-clock time between two frames."""
 SLACK_S: Final = 0.02
-"""Tolerance by which a frame may be early, so that each slightly irregular tick has a frame."""
+"""Time by which a frame may be early, so that each tick gets a frame despite irregular timing."""
 IDLE_S: Final = 1.0
 """Maximum time between two frames if nothing changes."""
 POLL_S: Final = 0.02
 MAX_BATCH: Final = 5_000
-"""Maximum number of messages that are processed between two frames."""
+"""Maximum number of messages processed between two frames."""
 IDENTITY: Final = "observer.watch"
 """Identity of the process in a secured network."""
 MAX_QUEUED: Final = 20_000
 """Maximum number of queued messages; further ones are dropped."""
 END_S: Final = 1.0
-"""Time that browsers have to disconnect at shutdown."""
+"""Grace period for browsers to disconnect at shutdown."""
 LISTEN_RULE: Final = "HOST:PORT, an address of this machine; port 0: any free port"
 
 
@@ -67,7 +67,7 @@ def watch_recorded(folder: Path, listen: str, ready: Callable[[str], None]) -> N
     """Serve the page of a recorded run until SIGINT or SIGTERM.
 
     Raises:
-        BadInputError: the folder is not that of a finished run, or the address cannot be used.
+        BadInputError: the folder does not hold a finished run, or the address cannot be used.
     """
     from laneweave.launch.watch.recorded_run import Recording  # noqa: PLC0415 (needs pyarrow)
 
@@ -111,7 +111,7 @@ class _LiveObserver:
         self.buffer = FrameBuffer(scene_of(scenario, "live", scenario.network.realm, STEP_S))
         self._observer = Observer(Keys(scenario.network.realm), topics=TOPICS)
         self._transport = connect_blocking(access_of(scenario, IDENTITY), self._deliver)
-        # Wall-clock time that does not jump when the system clock is set.
+        # Offset for wall-clock times that do not jump when the system clock is set.
         self._offset_s = time.time() - time.monotonic()
         self._road = LiveRoad(scenario, self._wall_s())
         self._made_s = self._wall_s()
@@ -134,7 +134,7 @@ class _LiveObserver:
         self._transport.close()
 
     def start(self, abort: Callable[[], None]) -> None:
-        """Subscribe and start the thread (in the event loop); `abort` ends the process."""
+        """In the event loop, subscribe and start the thread; `abort` ends the process."""
         self._loop, self._abort = asyncio.get_running_loop(), abort
         self._observer.subscribe(self._transport)
         self._thread.start()
@@ -181,7 +181,7 @@ class _LiveObserver:
             self._call(self._publish, compact(frame))
 
     def _publish(self, frame: str) -> None:
-        """Send a frame to all browsers (in the event loop)."""
+        """In the event loop, send a frame to all browsers."""
         self.buffer.append(frame)
         self.browsers.offer(frame)
 
@@ -197,7 +197,7 @@ class _Server(uvicorn.Server):
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Capture no signals: the handler of uvicorn would raise them again."""
+        """Capture no signals: uvicorn's handler would raise them again."""
         yield
 
 

@@ -1,6 +1,6 @@
 """Frames of a recorded run, made on request.
 
-The files of a run contain only the current cell or move of each vehicle; owned cells, further plans
+The files of a run contain only the current cell or move of each vehicle; owned cells, later moves
 and lost messages are not recorded. The scene contains the message counts of the summary.
 """
 
@@ -51,7 +51,7 @@ class Recording:
         """Read the folder of a run.
 
         Raises:
-            BadInputError: the folder is not that of a finished run with trajectories.
+            BadInputError: the folder does not hold a finished run with trajectories.
         """
         run = single_run(folder)
         try:
@@ -70,7 +70,7 @@ class Recording:
         self._step_s = stride * tick_s
         self._numbers, self._rows = _frames_of(self._tracks, tick_s, stride)
         self.first = 0
-        # The last frame follows the last recorded one, and has no vehicles.
+        # An additional last frame shows no vehicles.
         self.last = int(self._numbers[-1]) + 1 if len(self._numbers) else 0
         demands_s = [float(trip["demanded_s"]) for trip in self._trips.values()]
         self._demands_s = np.sort(np.array(demands_s, dtype=np.float64))
@@ -88,7 +88,7 @@ class Recording:
         return [compact(self.frame(number)) for number in numbers]
 
     def frame(self, number: int) -> dict[str, Any]:
-        """Return the frame of a number; see `frames`."""
+        """Return one frame; see the module `frames`."""
         t_s = number * self._step_s
         moment = self._moments[max(0, bisect_right(self._times_s, t_s + 1e-6) - 1)]
         rows = list(self._vehicles(number, t_s))
@@ -177,6 +177,6 @@ def _moments(folder: Path) -> Iterator[_Moment]:
 
 
 def _losses(run: Run) -> dict[str, int]:
-    """Return the numbers of published messages and of messages dropped by injected faults."""
+    """Return how many messages were published, and how many were dropped by injected faults."""
     names = ("published", "dropped_by_faults")
     return {name: getattr(run.summary.messages, name) if run.summary else 0 for name in names}

@@ -55,22 +55,22 @@ class Browser:
     frame: str | None = None
     request: tuple[int, int] | None = None
     skipped: int = 0
-    """Number of unsent frames that newer ones have replaced."""
+    """Number of unsent frames replaced by newer ones."""
     _pending: asyncio.Event = field(factory=asyncio.Event)
 
     def offer(self, frame: str) -> None:
-        """Set the next frame, which replaces an unsent one."""
+        """Set the next frame, replacing an unsent one."""
         self.skipped += self.frame is not None
         self.frame = frame
         self._pending.set()
 
     def set_request(self, request: tuple[int, int]) -> None:
-        """Set the next request, which replaces an unanswered one."""
+        """Set the next request, replacing an unanswered one."""
         self.request = request
         self._pending.set()
 
     async def next(self, source: FrameSource) -> str:
-        """Return the next message to send once there is one; responses precede live frames."""
+        """Wait for the next message to send, and return it; responses precede live frames."""
         while self.request is None and self.frame is None:
             self._pending.clear()
             await self._pending.wait()
@@ -129,14 +129,14 @@ def make_app(source: FrameSource, browsers: Browsers, health: Health) -> Starlet
 def same_origin(socket: WebSocket) -> bool:
     """Return whether the socket was opened by a page of this server, or outside a browser.
 
-    Browsers let any page open a websocket to any server, and send the origin of the page.
+    Browsers let any page open a websocket to any server, and send the page's origin.
     """
     origin = socket.headers.get("origin")
     return origin is None or urlsplit(origin).netloc == socket.headers.get("host")
 
 
 def request_of(text: str | None) -> tuple[int, int] | None:
-    """Return the frame numbers that a message of the page requests; None: malformed."""
+    """Return the frame range that a message from the page requests; None: malformed."""
     if text is None or len(text) > MAX_REQUEST_CHARACTERS:
         return None
     with contextlib.suppress(ValueError, TypeError, KeyError, RecursionError):

@@ -287,10 +287,10 @@ def test_health_of_agents(listener: Listener) -> None:
     assert not shard.may_end_early(listener.view)
     listener.census(10, a=0.0, b=0.0, c=0.0)
     assert shard.may_end_early(listener.view)
-    assert problem(listener, shard) == "shard 0/2: 2 vehicles without agent, such as a"
+    assert problem(listener, shard) == "shard 0/2: 2 vehicles without an agent, such as a"
     listener.agent("a")
     listener.agent("b")
     assert problem(listener, alone) is None
     assert problem(listener, shard) is None
     listener.states("b", [10], attended=False)
-    assert problem(listener, shard) == "shard 0/2: 1 vehicles without agent, such as b"
+    assert problem(listener, shard) == "shard 0/2: 1 vehicles without an agent, such as b"
