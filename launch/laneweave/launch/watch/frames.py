@@ -43,8 +43,8 @@ front bumper, y of the body centre, preferred lane (-1: unknown), number of the 
 4 not heard from, 8 overdue), and the other owned cells as column, lane, column, lane, ... The
 target is the last cell of the plan that the vehicle has accepted but not completed.
 
-**Request** from the page: `{"want": [from, to]}`, at most `MAX_REQUESTED` frame numbers. The response has
-the available frames: `{"reel": [from, to], "first": n, "last": n, "frames": [...]}`.
+**Request** from the page: `{"want": [from, to]}`, at most `MAX_REQUESTED` frame numbers. The
+response has the available frames: `{"reel": [from, to], "first": n, "last": n, "frames": [...]}`.
 """
 
 from __future__ import annotations
