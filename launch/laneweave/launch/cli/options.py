@@ -125,7 +125,7 @@ def reject_unused_options(where: str, **options: object) -> None:
     """Reject options that would have no effect.
 
     Args:
-        where: when they have no effect, such as `with --method rule`.
+        where: case in which they have no effect, such as `with --method rule`.
         **options: option values by name (with underscores); None: not given.
 
     Raises:

@@ -6,7 +6,7 @@ machines of the processes, and shares no code with them.
 | kind | violation |
 |---|---|
 | `overlap` | two bodies (rectangles) overlap |
-| `cell` | two vehicles occupy one cell with their hold cells or bounding boxes of motions |
+| `cell` | two vehicles occupy one cell: a hold cell, or any cell in the bounding box of a motion |
 | `motion` | a body begins a motion that is not the next move in the published plan of its agent |
 | `interleaved` | two plans that share a vehicle have motions at the same time |
 | `owner` | a cell has two owners (rolling operation, see `cell_ownership`) |

@@ -54,7 +54,7 @@ MAX_FUTILE_PLANS = 5
 HEALTHY_SLOTS = 8
 """Number of slots after the fault phase (rolling operation)."""
 CHECK_S = 0.5
-"""Virtual time between checks whether a run is over."""
+"""Virtual time between checks of whether a run is over."""
 MAX_OLD_MESSAGES = 400
 """Maximum number of old messages kept for replay or corruption."""
 KEEP_EVERY = 7

@@ -25,7 +25,7 @@ FIRST_S = 0.3
 SHORT_S = (0.05, 2.5)
 """Range of times for which a process is dead, paused or disconnected."""
 LONG_S = (0.3, 4.0)
-"""Range of the duration of network faults."""
+"""Range of durations of network faults."""
 NO_RESTART = 0.25
 """Share of killed agents that are restarted only after the fault phase."""
 LEASE_S = 0.5
@@ -229,7 +229,7 @@ class RandomFaults:
         return True
 
     def _start_twin(self, name: str) -> bool:
-        """Start a second process for a vehicle; the first one receives no more SENSE messages."""
+        """Start a second process for a vehicle; for some time, the first one receives no SENSE."""
         if name not in self._network:
             return False
         twin = self._processes.start_twin(name)

@@ -50,7 +50,7 @@ CLOCK_EVERY_TICKS = 2
 AGENT_START_S = 1.0
 """Time after which a caretaker takes charge of a vehicle that entered without an agent."""
 NONE_CLOSED = -(2**31)
-"""Number less than that of any block: no formation has closed."""
+"""Less than all block numbers: no formation has closed."""
 
 
 class LightRoad:

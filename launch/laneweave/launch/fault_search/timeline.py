@@ -16,7 +16,7 @@ from laneweave.protocol.wire.messages import (
 )
 
 BEFORE_S = 4.0
-"""Time before the first violation from which the timeline is printed."""
+"""How long before the first violation the printed timeline begins."""
 AFTER_S = 0.2
 
 
@@ -33,7 +33,7 @@ class Timeline:
         self._lines.append((t_s, text))
 
     def add_message(self, t_s: float, sender: str, effect: Send) -> None:
-        """Add a message, unless it repeats the last one of this sender and key."""
+        """Add a message, unless it repeats the last one from this sender under this key."""
         text = _text_of(effect)
         if text is None:
             return

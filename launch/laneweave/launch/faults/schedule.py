@@ -32,7 +32,7 @@ class FaultEvent:
     """Name of the fault in the file, such as `kill[0]`."""
     fault: RoleFault
     due_s: float
-    """Road time."""
+    """Road time at which it is due."""
     draw: random.Random = field(eq=False, repr=False)
     """Generator for choosing among several targets."""
     for_s: float | None = None

@@ -1,4 +1,4 @@
-"""Observer of a deployment, which publishes nothing."""
+"""Observer of a deployment; it publishes nothing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TOPICS = (CLOCK, CENSUS, HEARTBEAT, EVENT)
 
 @define
 class Observer:
-    """Reader of a transport's deliveries, with a view that they can update."""
+    """Reader of transport deliveries, which can update a view."""
 
     keys: Keys
     inbox: queue.SimpleQueue[Delivery] = field(factory=queue.SimpleQueue)

@@ -88,7 +88,7 @@ class Status:
 
     healthy: bool
     problem: str | None
-    """Reason why the deployment is unhealthy."""
+    """Why the deployment is unhealthy; None: it is healthy."""
     endpoint: str
     realm: str
     listened_s: float

@@ -1,5 +1,5 @@
 "use strict";
-// Stores the frames of the server, and interpolates between them. Does not need a browser.
+// Stores frames from the server, and interpolates between them. Does not need a browser.
 // Messages of the websocket: laneweave/launch/watch/frames.py.
 
 const laneweaveFrames = (() => {
@@ -26,7 +26,7 @@ const laneweaveFrames = (() => {
       this.waiting = false; // for a response
     }
 
-    /** Process a message of the server; return "scene", "frame" or "reel". */
+    /** Process a message from the server; return "scene", "frame" or "reel". */
     take(text) {
       const message = JSON.parse(text);
       if (message.scene) {
@@ -61,7 +61,7 @@ const laneweaveFrames = (() => {
       if (this.texts.size > KEPT) this.texts.delete(this.texts.keys().next().value);
     }
 
-    /** Return the frame of a number; null: not received. */
+    /** Return a frame by number; null: not received. */
     get(number) {
       let frame = this.parsed.get(number);
       if (frame) return frame;
@@ -73,7 +73,7 @@ const laneweaveFrames = (() => {
       return frame;
     }
 
-    /** Return the numbers [from, to] of missing frames among the next `ahead` ones, or null. */
+    /** Return the range [from, to] of missing frames among the next `ahead` ones, or null. */
     missing(place, ahead) {
       if (this.waiting) return null;
       const from = Math.max(this.first, Math.floor(place));
