@@ -6,13 +6,13 @@ answers with a COMMAND that contains a trajectory (`driver`). Between ticks it a
 PLAN and handles the states of other vehicles.
 
 **The claim.** One process at a time acts for a vehicle; the motion controller decides which. An
-agent claims the vehicle with its first COMMAND, and sends nothing to other processes before a SENSE
-reports that it is in charge. While another agent is in charge, it sends nothing. If the
-caretaker is in charge (because the agent hung or its messages were lost), it takes a new
+agent claims the vehicle with its first COMMAND, and sends nothing to other processes until a SENSE
+reports that it is in charge. While another agent is in charge, it sends nothing at all. If the
+caretaker is in charge (because the agent hung or its messages were lost), the agent takes a new
 incarnation and claims the vehicle again.
 
 **The road.** A SENSE names its bridge. A newer bridge has another road and begins at tick 0: the
-agent discards its state, takes a new incarnation, and ignores late messages of the earlier bridge.
+agent discards its state, takes a new incarnation, and ignores late messages from the old one.
 """
 
 from __future__ import annotations
@@ -72,13 +72,13 @@ class AgentCore:
         make_driver: Callable[[Scenario], Driver] = TrackingDriver,
         rules: RuleBook = VEHICLE_RULES,
     ) -> None:
-        """Make an agent that has not received a SENSE yet (V1).
+        """Make an agent that has not yet received a SENSE (V1).
 
         Args:
             vehicle: name of the vehicle.
-            new_incarnation: returns a number greater than all incarnations before.
+            new_incarnation: returns a number greater than all previous incarnations.
             scenario: lattice, limits, timing.
-            make_driver: returns the vehicle's driver; the fault search has a cheaper one.
+            make_driver: returns the vehicle's driver; the fault search passes a cheaper one.
             rules: rules of plan execution; tests plant bugs here.
         """
         self.vehicle = vehicle
@@ -92,13 +92,13 @@ class AgentCore:
         self._rules = rules
         self._formation: int | None = None
         self.wanted_motions: tuple[int, ...] = ()
-        """Stretches of columns whose motions are needed now; empty while it is not in charge."""
+        """Stretches of columns whose motions are needed now; empty while not in charge."""
         self.wanted_states: tuple[int, ...] = ()
         """Formations whose states are needed now."""
         self._move: PlannedMove | None = None
-        """Newest move that has begun."""
+        """Most recently begun move."""
         self._move_ticks = 0
-        """Duration of that move."""
+        """Duration of `_move`."""
         self._sense: Sense | None = None
         self._command: Command | None = None
         self._own = {"vehicle": vehicle}
@@ -123,7 +123,7 @@ class AgentCore:
 
     @property
     def solver_stats(self) -> SolverStats:
-        """Counters and durations of tracking."""
+        """Solve counters and solve times."""
         return self._driver.solver_stats
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
@@ -257,7 +257,7 @@ class AgentCore:
         return [self._state()] if any(changes) else []
 
     def _request_storage(self, execution: PlanExecution) -> list[Effect]:
-        """Request storage by the controller now, before the next tick's COMMAND."""
+        """Ask the controller to store changes now rather than with the next tick's COMMAND."""
         command = self._command
         assert command is not None  # noqa: S101 (in charge: it has sent one)
         self._command = evolve(
@@ -276,7 +276,7 @@ class AgentCore:
         self.wanted_motions, self.wanted_states = (), ()
 
     def _take_over(self, sense: Sense) -> None:
-        """V1: continue the current motion of the motion controller."""
+        """V1: continue the motion controller's current motion."""
         self._formation, self._move = sense.formation, None
         self._state_parameters = {"formation": sense.formation, "vehicle": self.vehicle}
         self._driver.take_over(sense)
@@ -315,7 +315,7 @@ class AgentCore:
         return Send(STATE, state, self._state_parameters)
 
     def leave(self) -> list[Effect]:
-        """End because the vehicle has left the road."""
+        """Shut down: the vehicle has left the road."""
         if self.ended:
             return []
         self.ended, self.wanted_motions, self.wanted_states = True, (), ()

@@ -1,4 +1,4 @@
-"""Core of an agent process: agents of named vehicles, or of a shard of the announced vehicles."""
+"""Core of an agent process, for named vehicles or for a shard of the announced vehicles."""
 
 from __future__ import annotations
 
@@ -35,23 +35,23 @@ from laneweave.protocol.wire.topics import (
 )
 
 NO_BRIDGE_S = 60.0
-"""Time without a bridge after which agents of named vehicles end (node clock)."""
+"""Time without a bridge after which a process for named vehicles exits (node clock)."""
 
 
 @frozen
 class AgentMetrics:
-    """Counters of the vehicles of one process."""
+    """Counters for the vehicles of one process."""
 
     ABOUT: ClassVar[str] = "agent"
 
     vehicles: int = metric("Vehicles that this process has agents for")
     vehicles_in_charge: int = metric("Vehicles on the road that this process is in charge of")
-    solves_total: int = metric("Solutions of the tracker, one per tick and vehicle")
-    unusable_total: int = metric("Solutions of the tracker that were not usable")
+    solves_total: int = metric("Tracker solves, one per vehicle per tick")
+    unusable_total: int = metric("Tracker solves without a usable result")
 
 
 class AgentHost:
-    """Core of an agent process: dispatches events to the agents that they concern."""
+    """Core of an agent process: dispatches each event to the agents that it concerns."""
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class AgentHost:
         self._agents: dict[Name, AgentCore] = {name: make_agent(name) for name in vehicles}
         self._seen: set[Name] = set(self._agents)
         self._subscribed: dict[Topic, set[int]] = {MOTION: set(), STATE: set()}
-        """Stretches and blocks with a subscription."""
+        """Stretches and blocks subscribed to."""
         self._motions: list[tuple[int, ...]] = []
         """Stretches whose motions each vehicle needed at the last update."""
         self._states: list[tuple[int, ...]] = []
@@ -74,13 +74,13 @@ class AgentHost:
         self._bridge = -1
         """Incarnation of the newest bridge."""
         self._no_bridge_since_s: float | None = 0.0
-        """Time at which the bridge was lost; None: there is a bridge."""
+        """Time at which the bridge was lost; None: a bridge is up."""
         self._solves = self._unusable = 0
-        """Counters of agents that have ended."""
+        """Counters of agents that have been removed."""
 
     @property
     def metrics(self) -> tuple[MetricsSnapshot, ...]:
-        """Counters of all agents."""
+        """Counters summed over all agents."""
         agents = self._agents.values()
         stats = [agent.solver_stats for agent in agents]
         return (
@@ -94,7 +94,7 @@ class AgentHost:
 
     @property
     def wakeup_s(self) -> float | None:
-        """Time at which to stop waiting for a bridge; None for a shard, which never stops."""
+        """Time at which to stop waiting for a bridge; None: a bridge is up, or this is a shard."""
         if self._shard is not None or self._no_bridge_since_s is None:
             return None
         return self._no_bridge_since_s + NO_BRIDGE_S
@@ -161,10 +161,10 @@ class AgentHost:
         return effects
 
     def _on_bridge(self, incarnation: int) -> list[Effect]:
-        """Handle the token of a bridge; agents of named vehicles detect a new one by its SENSE."""
+        """Handle a bridge's token; agents of named vehicles detect a new bridge by its SENSE."""
         effects: list[Effect] = []
         if incarnation < max(self._bridge, 0):
-            return effects  # of an earlier run, or not a bridge
+            return effects  # from an earlier run, or not a bridge
         self._no_bridge_since_s = None
         if self._shard is not None and self._bridge not in (-1, incarnation):
             for name in list(self._agents):
@@ -197,7 +197,7 @@ class AgentHost:
         effects: list[Effect] = []
         shard = self._shard
         if shard is None or census.bridge not in (0, self._bridge):
-            return effects  # of another road
+            return effects  # from another road
         if census.t_s < self._census_s:
             return effects
         self._census_s = census.t_s
@@ -216,7 +216,7 @@ class AgentHost:
     def _update_subscriptions(self, effects: list[Effect]) -> None:
         """Subscribe only to the motions and states that are needed now.
 
-        States are most of the traffic, and vehicles rarely need those of others.
+        States make up most of the traffic, and vehicles rarely need each other's.
         """
         motions = [agent.wanted_motions for agent in self._agents.values()]
         states = [agent.wanted_states for agent in self._agents.values()]

@@ -1,4 +1,4 @@
-"""The agent process over Zenoh, for one or several vehicles."""
+"""The agent process, over Zenoh, for one or more vehicles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from laneweave.protocol.wire.messages import Name, Sense
 
 
 def warm_up(scenario: Scenario) -> None:
-    """Plan all moves and drive one tick in advance, for processes forked from this one."""
+    """Plan every move and drive one tick, to warm up the caches of forked processes."""
     driver = TrackingDriver(scenario)
     column, lane = cell = (0, 1)
     for (dx, dy), ticks in product(product((-1, 0, 1), repeat=2), scenario.move_durations):

@@ -84,9 +84,9 @@ class CoordinatorCore:
             name: name of the candidate; candidates are ranked by name.
             incarnation: a number that no process of this name has used before.
             scenario: road, formations, timing.
-            rules: rules of leaders of formations; tests replace some.
+            rules: rules for formation leaders; tests replace some.
             make_planner: returns the planner of the rolling operation.
-            workers: number of client requests that are planned at a time.
+            workers: number of client requests to plan concurrently.
         """
         self.name = name
         self.scenario = scenario
@@ -97,9 +97,9 @@ class CoordinatorCore:
         self.census: Census | None = None
         self.t_s = 0.0
         self._formation_of: dict[Name, int] = {}
-        """Block in which each vehicle of the census entered."""
+        """Block in which each vehicle in the census entered."""
         self._handled_s = self._awake_since_s = 0.0
-        """Time of the last event; start of the time without gaps between events (node clock)."""
+        """Time of the last event; start of the current gap-free series of events (node clock)."""
         self._incarnation = incarnation
         self._seq = 0
         self._last_job = 0
@@ -141,19 +141,19 @@ class CoordinatorCore:
 
     @property
     def wakeup_s(self) -> float | None:
-        """Time of the next heartbeat, election or timer of the operation."""
+        """Time of the next heartbeat, report, election timeout or other timer."""
         return self._wakeup_s
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Handle an event; see `Core`."""
         if now_s > self._handled_s + self.election.election_s / 2:
-            # After a pause a leader knows no more than one that has just been elected.
+            # After a pause, a leader knows no more than a newly elected one.
             self._awake_since_s = now_s
         self._handled_s = now_s
         if isinstance(event, Arrived) and isinstance(event.message, VehicleState):
             outcomes = self._on_state(event.message, now_s)
             if outcomes is None and self._wakeup_s is not None and now_s < self._wakeup_s:
-                return []  # most states: nothing depends on it, and nothing is due
+                return []  # most states: nothing depends on them, and nothing is due
             effects = list(self._effects(outcomes or ()))
         else:
             effects = list(self._on_event(event, now_s))
@@ -212,7 +212,7 @@ class CoordinatorCore:
         self.election.on_token_up(name, incarnation, now_s)
 
     def _meet_bridge(self, incarnation: int) -> None:
-        """Discard the road of an earlier bridge; the clock of a new one starts at 0."""
+        """Reset the road state if the bridge is new; its clock starts again at 0."""
         if incarnation > self._bridge:
             self._bridge = incarnation
             self.census = None
@@ -221,7 +221,7 @@ class CoordinatorCore:
             self.operation.forget()
 
     def _is_of_this_road(self, message: RoadClock | Census) -> bool:
-        """Register the bridge of a message; return whether it is the newest bridge."""
+        """Register a message's bridge; return whether it is the newest bridge."""
         if message.bridge:
             self._meet_bridge(message.bridge)
         return message.bridge in (0, self._bridge)
@@ -249,7 +249,7 @@ class CoordinatorCore:
                 pass
 
     def _on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
-        """Handle the state of a vehicle; None: nothing depends on it.
+        """Handle the state of a vehicle; return None if nothing depends on it.
 
         A leader ignores vehicles that its census does not list, for example those that have left.
         """
@@ -316,7 +316,7 @@ class CoordinatorCore:
         return ballot
 
     def _effects(self, outcomes: Iterable[Effect | LogEntry]) -> Iterator[Effect]:
-        """Return outcomes as effects; log entries become messages."""
+        """Yield outcomes as effects; log entries become messages."""
         for outcome in outcomes:
             if isinstance(outcome, LogEntry):
                 yield self._log(outcome.kind, **outcome.data)

@@ -2,7 +2,7 @@
 
 A candidate leads when it has run for an election timeout (`network.election_s`) and has received
 nothing from a higher-ranked candidate for that long. Candidates are ranked by name. The election
-serves progress, not safety: two leaders at once are harmless, because vehicles promise one ballot
+ensures progress, not safety: two leaders at once are harmless, because vehicles promise one ballot
 at a time.
 """
 
@@ -44,14 +44,14 @@ class Election:
     leading: bool = False
     link_up: bool = True
     won: int = 0
-    """Number of times that this candidate has begun to lead."""
+    """Number of times that this candidate has become leader."""
     _peers: dict[str, _Peer] = field(factory=dict)
     _dead: set[tuple[str, int]] = field(factory=set)
 
     def on_heartbeat(self, heartbeat: Heartbeat, now_s: float) -> None:
-        """Record that a candidate is alive, unless its process is known to have ended.
+        """Record that a candidate is alive, unless its process is known to have exited.
 
-        A heartbeat that was in flight when its sender's connection closed must not revive it.
+        A heartbeat still in flight when its sender's connection closed must not revive the sender.
         """
         if heartbeat.coordinator == self.name:
             return
@@ -84,11 +84,11 @@ class Election:
         return peer
 
     def on_token_down(self, coordinator: str, incarnation: int) -> None:
-        """Remove a process that has ended.
+        """Remove a process that has exited.
 
         When this candidate loses its own connection, all tokens vanish, shortly before or after it
-        notices the loss. While it is disconnected, vanished tokens are ignored; before it notices,
-        two leaders are harmless.
+        notices the loss. While disconnected, it ignores vanishing tokens; until it notices, two
+        leaders are harmless.
         """
         if not self.link_up or coordinator == self.name:
             return
@@ -98,18 +98,18 @@ class Election:
             del self._peers[coordinator]
 
     def on_link(self, *, up: bool, now_s: float) -> None:
-        """Restart this candidate's own age: its connection was lost or restored."""
+        """Restart this candidate's election timeout: its connection was lost or restored."""
         self.link_up = up
         self.started_s = now_s
 
     def see_term(self, term: int) -> None:
         """Adopt a higher term; a leader continues one term above it."""
         if self.term < term <= MAX_TERM:
-            # A leader that was paused while another one led must not continue below its term.
+            # A leader that was paused while another led must not continue below that one's term.
             self.term = term + 1 if self.leading else term
 
     def update(self, now_s: float) -> bool:
-        """Decide whether to lead; return whether this has changed."""
+        """Decide whether to lead; return whether the decision has changed."""
         rival = any(
             name < self.name
             and now_s < peer.heard_s + self.election_s
@@ -130,7 +130,7 @@ class Election:
         self.term = max(self.term, above + 1)
 
     def living(self, now_s: float) -> Iterator[str]:
-        """Yield the other candidates with a message within the election timeout."""
+        """Yield the other candidates whose last message is within the election timeout."""
         for name, peer in self._peers.items():
             if now_s < peer.heard_s + self.election_s:
                 yield name
@@ -138,12 +138,12 @@ class Election:
     def _patience_s(self, peer: _Peer) -> float:
         """Return the time until which a leader waits for a higher-ranked new candidate to lead.
 
-        A new candidate may not lead at once; stepping down earlier would leave no leader.
+        A new candidate must not lead immediately; stepping down earlier would leave no leader.
         """
         return peer.since_s + NEWCOMER_FACTOR * self.election_s
 
     def next_change_s(self, now_s: float) -> float:
-        """Return when the decision may next change after `now_s` without any message."""
+        """Return when the decision may next change after `now_s` if no message arrives."""
         times = [
             time_s
             for name, peer in self._peers.items()

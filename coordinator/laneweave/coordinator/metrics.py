@@ -16,8 +16,8 @@ class CoordinatorMetrics:
     ABOUT: ClassVar[str] = "coordinator"
 
     leading: bool = metric("1 while this candidate leads, else 0")
-    term: int = metric("Highest term that it has seen; its own term while it leads")
-    candidates: int = metric("Candidates with recent heartbeats, itself included")
-    elections_total: int = metric("Number of times that this process has begun to lead")
-    plans_in_force: int = metric("Plans in force while it leads, of formations or of this slot")
-    road_seconds: float = metric("Newest road time that it has received")
+    term: int = metric("Highest term seen; the candidate's own term while it leads")
+    candidates: int = metric("Candidates with recent heartbeats, including this one")
+    elections_total: int = metric("Number of times that this process has become leader")
+    plans_in_force: int = metric("Plans in force while leading, for formations or for this slot")
+    road_seconds: float = metric("Newest road time received")

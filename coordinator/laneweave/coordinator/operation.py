@@ -23,31 +23,31 @@ class LogEntry:
 class Operation(Protocol):
     """A leader's tasks for the vehicles on the road.
 
-    Times are road time (`t_s`) and the node's clock (`now_s`).
+    `t_s` is road time, `now_s` is the time of the node's clock.
     """
 
     def forget(self) -> None:
-        """Discard all state: there is another road."""
+        """Discard all state: this is a new road."""
 
     def take_over(self) -> None:
         """Reset because this coordinator has begun or stopped leading."""
 
     def on_clock(self, t_s: float, now_s: float) -> None:
-        """Handle a message of the road's clock, also while not leading."""
+        """Handle a road clock message, even while not leading."""
 
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
-        """Handle the state of a vehicle on the road; None: nothing depends on it."""
+        """Handle the state of a vehicle on the road; return None if nothing depends on it."""
 
     def lead(
         self, census: Census, t_s: float, now_s: float, *, changed: bool
     ) -> Iterable[Effect | LogEntry]:
-        """Handle expired timers, order plans, and send or repeat messages.
+        """Handle expired timers, request plans, and send or resend messages.
 
         Args:
             census: the newest census.
             t_s: road time.
             now_s: node clock.
-            changed: whether census, road time or leader have changed since the last call.
+            changed: whether the census, road time or leader has changed since the last call.
         """
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterable[Compute | LogEntry]:

@@ -24,7 +24,7 @@ from laneweave.protocol.wire.messages import Name
 log = structlog.get_logger(__name__)
 
 WARN_AFTER_S = 8.0
-"""Time until the warning: loading the planner takes 1 to 2 s, compiling it most of a minute."""
+"""Time until a warning; loading the planner takes 1 to 2 s, compiling it nearly a minute."""
 
 
 def run_coordinator(
@@ -44,7 +44,7 @@ def run_coordinator(
         name: name of the candidate; candidates are ranked by name.
         wrap: wraps the core, to inject faults.
         observe: registers the metrics source.
-        workers_at_once: whether the worker processes of the planning service start now, not with
+        workers_at_once: whether the planning service starts its worker processes now rather than at
             its first request.
 
     Raises:
@@ -64,8 +64,8 @@ def run_coordinator(
 def _exits_on_sigterm() -> Iterator[None]:
     """Exit with status 0 on SIGTERM: there is nothing to complete yet.
 
-    An exception raised by a signal handler inside a callback of the compiler would only be printed,
-    so a thread waits for the byte that Python writes when a signal arrives.
+    An exception that a signal handler raises in a compiler callback would only be printed, so a
+    thread waits for the byte that Python writes when a signal arrives.
     """
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
@@ -88,7 +88,7 @@ def _exits_on_sigterm() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _warns_when_slow() -> Iterator[None]:
-    """Warn if the planner has to be compiled, not only loaded."""
+    """Warn if the planner has to be compiled rather than just loaded."""
     timer = threading.Timer(
         WARN_AFTER_S, log.warning, ("compiling the planner once; this takes about a minute",)
     )

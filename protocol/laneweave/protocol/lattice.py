@@ -1,8 +1,8 @@
 """The lattice: the relative coordinate system (RCS) of the paper, Section 2.2.
 
 One endless lattice moves at the formation speed v_F along the road. A cell is (column, lane):
-columns increase in the direction of travel, lanes to the left; both may be any integer. The pitch
-of cells is d_F along the road and the lane width across. Positions follow from the road clock:
+columns increase in the direction of travel, lanes to the left; both may be any integer. The cell
+pitch is d_F along the road and the lane width across. Positions follow from the road clock:
 
     s(cell, t) = v_F t + column d_F         (front bumper, road start at s = 0)
     y(cell)    = (lane + 1/2) lane width    (body centre, right road edge at y = 0)
@@ -31,14 +31,14 @@ OBLIQUE: tuple[Cell, ...] = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 def displacements(mode: Mode) -> tuple[Cell, ...]:
     """Return the displacements that a vehicle may make in one step, in tie-breaking order.
 
-    Waiting comes first, then straight moves, then oblique ones, so that planners prefer the
-    simplest of equally good paths.
+    Waiting comes first, then straight moves, then oblique ones, so that planners
+    break ties in favour of the simplest path.
     """
     return (WAIT, *STRAIGHT) if mode == 1 else (WAIT, *STRAIGHT, *OBLIQUE)
 
 
 STRETCH_COLUMNS = 4
-"""Columns of a stretch; a vehicle receives motions of its own and both adjacent stretches."""
+"""Columns per stretch; a vehicle receives motions in its own and both adjacent stretches."""
 
 PlannedMove = tuple[int, Cell, Cell]
 """(step, from, to): move to a neighbouring cell in a step of a plan."""
@@ -70,8 +70,8 @@ def stretch_of(column: int) -> int:
 class Lattice:
     """Geometry of the moving lattice and of its blocks of columns.
 
-    Block number b has the columns -(b + 1) W + 1 .. -b W for block width W. The number is a
-    function of the column, and columns are never reused. A formation owns one block or several
+    Block number b has the columns -(b + 1) W + 1 .. -b W for block width W. Neither columns nor
+    block numbers are ever reused. A formation owns one block or several
     consecutive ones; its number is that of its foremost block.
     """
 

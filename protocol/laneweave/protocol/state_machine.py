@@ -15,18 +15,18 @@ from typing import Any
 from attrs import frozen
 
 Function = Callable[..., Any]
-"""A guard or an action, of (machine, message)."""
+"""A guard or an action: a function of (machine, message)."""
 
 
 @frozen
 class Transition:
-    """Row of the table: on `event` in one of `sources`, if all guards hold, call the actions."""
+    """Row of a table: on `event` in one of `sources`, if all guards hold, call the actions."""
 
     rule: str
     """Name of the rule in docs/PROTOCOL.md; several transitions may belong to one rule."""
     event: str
     sources: tuple[Enum, ...]
-    """Phases in which it may be taken."""
+    """Phases in which the transition may be taken."""
     guards: tuple[Function, ...]
     """Conditions that must all hold."""
     actions: tuple[Function, ...]

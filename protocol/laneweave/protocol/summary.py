@@ -1,6 +1,6 @@
 """`summary.json`: the results of one run.
 
-The bridge writes the file at the end of a run; the launcher adds the fields that only it knows.
+The bridge writes the file when a run ends; the launcher adds the fields that only it knows.
 Fields with a default are absent in summaries of earlier versions and of runs without these results.
 """
 
@@ -23,15 +23,15 @@ SCHEMA = "laneweave.summary/1"
 
 @frozen(kw_only=True)
 class VehicleCounts:
-    """Numbers of vehicles."""
+    """Vehicle counts."""
 
     demanded: int
     entered: int
     left: int
     on_preferred_lane: int
-    """Vehicles that left the road on their preferred lane."""
+    """Vehicles that left the road in their preferred lane."""
     peak: int
-    """Maximum number on the road at the same time."""
+    """Maximum number of vehicles on the road at once."""
     left_off_lane: int | None = None
     left_unattended: int | None = None
 
@@ -51,7 +51,7 @@ class Safety:
     """Counts and extremes over all vehicles and ticks; None: nothing was measured."""
 
     overlaps: int
-    """Pairs of bodies that intersected at any tick."""
+    """Pairs of bodies that intersected at some tick."""
     sumo_collisions: int
     min_gap_m: float | None
     min_headway_s: float | None
@@ -80,7 +80,7 @@ class DurationMs:
 
 @frozen(kw_only=True)
 class Planning:
-    """Counts of plans, over all coordinators."""
+    """Plan counts over all coordinators."""
 
     plans: int
     optimal: int
@@ -92,7 +92,7 @@ class Planning:
 
 @frozen(kw_only=True)
 class Tracking:
-    """Counts of tracking by agents, and of fallbacks."""
+    """Solve counts of agents, and counts of fallbacks."""
 
     solves: int
     osqp_solves: int | None = None
@@ -108,12 +108,12 @@ class Tracking:
 
 @frozen(kw_only=True)
 class RuntimeFigures:
-    """Processes, and the speed of the run."""
+    """Process counts, and the speed of the run."""
 
     real_time_factor: float
     wall_s: float
     processes: int | None
-    """Maximum number at the same time; None: unknown."""
+    """Maximum number of processes at once; None: unknown."""
     vehicles_per_process: int
     tick_ms: DurationMs
 
@@ -129,14 +129,14 @@ class Messages:
 
 @frozen(kw_only=True)
 class LeaderChanges:
-    """Changes of the leader."""
+    """Leadership changes."""
 
     leader_changes: int
     recovery_s: list[float]
-    """Times without a leader [s]; with injected faults: from each fault of a leader until another
-    one led."""
+    """Leaderless periods [s]; with injected faults: from each leader fault until another candidate
+    led."""
     plan_recovery_s: list[float] | None = None
-    """Times from each fault of a leader until the next plan was in force [s]."""
+    """Times from each leader fault until the next plan was in force [s]."""
 
 
 @frozen(kw_only=True)
@@ -166,7 +166,7 @@ class RunSummary:
 
     @classmethod
     def from_json(cls, data: object) -> RunSummary:
-        """Return the summary in a JSON object.
+        """Read a summary from a JSON object.
 
         Raises:
             BadInputError: the object is not a summary.
@@ -182,7 +182,7 @@ class RunSummary:
 
     @property
     def preferred_percent(self) -> float | None:
-        """Percentage of the departed vehicles that left on their preferred lane."""
+        """Percentage of the departed vehicles that left in their preferred lane."""
         left = self.vehicles.left
         return 100.0 * self.vehicles.on_preferred_lane / left if left else None
 

@@ -1,7 +1,7 @@
-"""Driving: tracks the reference of a cell or a move.
+"""Driving: tracks the reference for a cell or a move.
 
-Entry point: `driver.Driver`. `trajectory` plans moves between cells, `reference` puts them on the
-road clock, `tracker` tracks them (`tracking_problem`: the quadratic program, `regulator`: its
+Entry point: `driver.Driver`. `trajectory` plans moves between cells, `reference` gives them
+road times, `tracker` tracks them (`tracking_problem`: the quadratic program, `regulator`: its
 unconstrained solution), `surroundings` predicts neighbours. Only `qp_solver` imports osqp. No I/O;
 imported by `agents.core`, `agents.process` and launch.
 """

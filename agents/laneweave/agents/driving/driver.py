@@ -1,7 +1,7 @@
 """The driver: computes jerks for the motion controller from the cell to hold or the move to make.
 
 It makes a reference through the lattice points (`reference`) and tracks it (`tracker`). If a
-solution is not usable, it returns no jerks, and the motion controller continues with the last
+solution is unusable, the driver returns no jerks, and the motion controller continues with the last
 usable trajectory and its fallbacks (`sim_bridge.bodies.motion_controller`). The driver is
 independent of the protocol.
 """
@@ -30,7 +30,7 @@ Course = tuple[Cell, Cell, int, int]
 
 @define  # created at each tick: frozen objects take three times as long
 class Drive:
-    """Output of one tick for the motion controller."""
+    """Output to the motion controller at one tick."""
 
     motion_end_tick: int
     """End of the current motion; 0 if the vehicle holds."""
@@ -44,27 +44,27 @@ class Drive:
 
 @frozen
 class SolverStats:
-    """Counters and durations of tracking."""
+    """Solve counters and solve times."""
 
     solves: int = 0
     unusable: int = 0
     osqp_solves: int = 0
-    """Solves for which OSQP ran."""
+    """Solves in which OSQP ran."""
     solve_ms: bytes = b""
-    """Little-endian float32 CPU milliseconds of each solve."""
+    """CPU time of each solve [ms], as little-endian float32."""
 
 
 class Driver(Protocol):
     """Drives one vehicle; agents use `TrackingDriver`, the fault search a cheaper driver."""
 
     def take_over(self, sense: Sense) -> None:
-        """Continue the current motion of the motion controller."""
+        """Continue the motion controller's current motion."""
 
     def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
-        """Begin a move of `ticks` ticks at a tick."""
+        """Begin a move at `tick` that lasts `ticks` ticks."""
 
     def at_rest(self, sense: Sense) -> bool:
-        """Return whether the current motion has ended."""
+        """Return whether the current motion is complete."""
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         """Return the motion and the jerks from this tick on."""
@@ -73,18 +73,18 @@ class Driver(Protocol):
         """Return the motion to publish at a tick; None: none is due."""
 
     def on_motion(self, motion: Motion) -> None:
-        """Handle the announced motion of another vehicle."""
+        """Handle another vehicle's announced motion."""
 
     @property
     def solver_stats(self) -> SolverStats:
-        """Counters and durations of tracking."""
+        """Solve counters and solve times."""
 
 
 class TrackingDriver:
     """Driver that tracks a reference at each tick."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Make a driver without a reference; `take_over` must be called first."""
+        """Make a driver without a reference; call `take_over` first."""
         self._scenario = scenario
         self._tracker = Tracker(scenario)
         self._reference: Reference | None = None
@@ -101,12 +101,12 @@ class TrackingDriver:
 
     @property
     def solver_stats(self) -> SolverStats:
-        """Counters and durations of tracking."""
+        """Solve counters and solve times."""
         solve_ms = np.array(self._solve_ms, dtype=_FLOAT32).tobytes()
         return SolverStats(len(self._solve_ms), self._unusable, self._osqp_solves, solve_ms)
 
     def take_over(self, sense: Sense) -> None:
-        """Continue the current motion of the motion controller."""
+        """Continue the motion controller's current motion."""
         scenario = self._scenario
         self._goal = sense.hold_cell
         if sense.motion_origin == sense.hold_cell and sense.motion_end_tick > sense.tick + 3:
@@ -121,12 +121,12 @@ class TrackingDriver:
             self._reference = Reference.hold(scenario, sense.hold_cell)
 
     def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
-        """Begin a move of `ticks` ticks at a tick."""
+        """Begin a move at `tick` that lasts `ticks` ticks."""
         self._goal, self._ticks = move[2], ticks
         self._reference = Reference.move(self._scenario, move[1], move[2], tick, ticks)
 
     def at_rest(self, sense: Sense) -> bool:
-        """Return whether the time of the motion is over and the body has arrived."""
+        """Return whether the motion's time has passed and the body has arrived."""
         return sense.tick >= self._current.end_tick and at_rest_in_cell(
             sense.state, self._lattice, self._goal, sense.t_s
         )
@@ -163,7 +163,7 @@ class TrackingDriver:
         return reference.origin, self._goal, reference.start_tick, self._ticks
 
     def on_motion(self, motion: Motion) -> None:
-        """Handle the announced motion of another vehicle."""
+        """Handle another vehicle's announced motion."""
         self._surroundings.on_motion(motion)
 
     @property

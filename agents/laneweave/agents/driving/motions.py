@@ -19,21 +19,21 @@ from laneweave.protocol.wire.messages import Motion, Name
 Array = NDArray[np.float64]
 
 REPEAT_TICKS = 10
-"""Interval at which a motion is repeated after its beginning."""
+"""Interval at which a motion in progress is published again."""
 FRESH_TICKS = 3 * REPEAT_TICKS
-"""Time without repetition after which a motion is dropped."""
+"""Time since it was last sent after which a motion is dropped."""
 NEAR_M = 1.0
-"""Maximum distance along the road between a neighbour and a motion that matches."""
+"""Maximum distance along the road between a neighbour and a matching motion."""
 NEAR_MPS = 1.0
-"""Maximum difference of their speeds."""
+"""Maximum difference between their speeds."""
 TURNED_M = 0.4
-"""Additional distance at which a body touches a lane, because it lags behind its reference and
+"""Extra sideways reach of a body that changes lanes, because it lags behind its reference and
 turns."""
 
 
 @frozen(eq=False)
 class _MoveTable:
-    """Trajectory of all moves with the same displacement and duration."""
+    """Trajectory shared by all moves with the same displacement and duration."""
 
     ticks: int
 
@@ -42,7 +42,7 @@ class _MoveTable:
     speeds_mps: list[float]
     """Speed on the road, by tick."""
     ahead_m: Array
-    """(ticks, N + 1): distance from each tick's position to those of the following horizon."""
+    """(ticks, N + 1): distance from each tick's position to the positions over the next horizon."""
     entered: int
     """First tick at which the body touches the target lane."""
     left: int
@@ -57,7 +57,7 @@ class _MoveTable:
         advance_m = scenario.formation.speed_mps * scenario.runtime.tick_s
         reach_m = scenario.vehicle.width_m / 2.0 + TURNED_M
         aside, half_m = np.abs(states[:, 3]), scenario.road.lane_width_m / 2.0
-        # Without a lane change the lane of origin is the target lane all the time.
+        # Without a lane change, the lane of origin is the target lane throughout.
         return cls(
             ticks,
             along[:ticks].tolist(),
@@ -75,11 +75,11 @@ class _Known:
     motion: Motion
     table: _MoveTable
     tick: int
-    """Tick at which it was last sent."""
+    """Tick at which the motion was last sent."""
     start_m: float
-    """Position of its origin, relative to the lattice."""
+    """Position of the motion's origin, relative to the lattice."""
     low_m: float
-    """Lowest position at which its vehicle can be sensed, relative to the lattice."""
+    """Lowest position at which the vehicle can be sensed, relative to the lattice."""
     high_m: float
     """Highest such position."""
 
@@ -99,13 +99,13 @@ class Motions:
         self.known: dict[Name, _Known] = {}
         """Motions by vehicle; may include outdated ones until `advance` drops them."""
         self._places: list[tuple[float, float, _Known]] | None = None
-        """(`low_m`, `high_m`, motion) of each motion; None after a change of `known`."""
+        """(`low_m`, `high_m`, motion) of each motion; None after `known` has changed."""
         self._tick = 0
         self._expiry_tick = 0
-        """Tick at which the next motion becomes outdated."""
+        """Earliest tick at which a motion becomes outdated."""
 
     def add(self, motion: Motion) -> None:
-        """Add a motion if it is a possible move and no newer one of its vehicle is known."""
+        """Add a motion that is a possible move, unless a newer one of its vehicle is known."""
         known = self.known.get(motion.vehicle)
         if known is not None:
             newest = known.motion
@@ -131,11 +131,11 @@ class Motions:
         self._expiry_tick = -1  # the motion may have ended already
 
     def advance(self, tick: int) -> None:
-        """Set the current tick; drop motions that have ended, expired or begin much later."""
+        """Set the current tick; drop motions that are over, have expired or begin much later."""
         if self._tick <= tick < self._expiry_tick:
             self._tick = tick
             return
-        self._tick = tick  # a lower tick is that of another road
+        self._tick = tick  # a lower tick means another road
         outdated = [
             name
             for name, known in self.known.items()
@@ -164,7 +164,7 @@ class Motions:
         """Return the predicted positions of a sensed neighbour with an announced motion.
 
         Args:
-            lane: lane in which the neighbour is sensed, a relevant one.
+            lane: relevant lane in which the neighbour is sensed.
             s_m: commanded position of its front bumper.
             speed_mps: its commanded speed.
             lanes: the first and the last relevant lane.
@@ -199,5 +199,5 @@ class Motions:
 
 
 def _content(motion: Motion) -> tuple[int, int, Cell, Cell]:
-    """Return the fields that repetitions share; those of a newer motion are greater."""
+    """Return the fields that repetitions share; those of a newer motion compare greater."""
     return motion.incarnation, motion.begin_tick, motion.origin, motion.target

@@ -1,11 +1,11 @@
-"""Quadratic programs, solved with OSQP; only this module imports it.
+"""Quadratic programs, solved with OSQP, which only this module imports.
 
     minimise    1/2 x' P x
     subject to  lower <= A x <= upper
 
 P and A are set up once; the bounds change between solves. The module checks every solution, and
-what OSQP 1.1 does not: OSQP accepts vectors of the wrong length, prints a message and uses old data
-if lower > upper, keeps a NaN in its warm start, and returns a finite x for an infeasible problem.
+what OSQP 1.1 does not check: it accepts vectors of the wrong length, prints a message and uses old
+data if lower > upper, keeps a NaN in its warm start, and returns a finite x if infeasible.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ _INFINITY = float(ext_builtin.OSQP_INFTY)
 
 @frozen
 class QPSettings:
-    """Settings of OSQP, without a time limit: equal inputs must give equal results."""
+    """OSQP settings; there is no time limit, because equal inputs must give equal results."""
 
     eps_abs: float = 1e-3
     """Maximum primal (in units of the constraints) and dual residual of an accepted iterate."""
     max_iter: int = 400
     check_termination: int = 5
-    """Iterations between two termination tests."""
+    """Iterations between termination tests."""
     rho: float = 0.1
-    """Initial step size of the iteration (ADMM)."""
+    """Initial step size of ADMM."""
     adaptive_rho_interval: int = 50
-    """Iterations between two changes of rho; 0: rho is fixed."""
+    """Iterations between updates of rho; 0: rho is fixed."""
     alpha: float = 1.6
-    """Over-relaxation of the iteration, in (0, 2)."""
+    """Over-relaxation parameter of ADMM, in (0, 2)."""
     eps_infeasible: float = 1e-4
-    """Accuracy of the certificate of infeasibility."""
+    """Tolerance of the infeasibility certificate."""
     polishing: bool = False
-    """Whether solutions are refined on their active constraints, usually to machine accuracy."""
+    """Whether OSQP polishes solutions on the active set, usually to machine precision."""
     tolerance: float = 2e-3
     """Maximum violation of a constraint by a usable result, independent of OSQP's status."""
 
@@ -58,8 +58,8 @@ class QPSettings:
 class QPScale:
     """Units in which OSQP receives a program, in addition to its own scaling (Ruiz).
 
-    They determine its speed: a constraint with a large factor is enforced with a large step size,
-    and both kinds of units weight the residuals in the termination test.
+    The units determine OSQP's speed: a constraint with a large factor is enforced with a large step
+    size, and both kinds of units weight the residuals in the termination test.
     """
 
     constraints: Vector
@@ -77,7 +77,7 @@ class QPResult:
     usable: bool
     """Whether OSQP terminated and x satisfies all constraints within the tolerance."""
     status: int
-    """Status of OSQP: 1 solved, 2 inaccurate, 7 out of iterations, others: no solution."""
+    """OSQP's status: 1 solved, 2 inaccurate, 7 out of iterations; others: no solution."""
     iterations: int
     violation: float
     """Maximum violation of a constraint by x; infinite without a solution."""
@@ -105,12 +105,12 @@ class QuadraticProgram:
             constraints: A, sparse (m, n).
             lower: lower bounds (m,); -inf for none.
             upper: upper bounds (m,); +inf for none.
-            settings: settings of OSQP; None: the defaults.
-            scale: units in which OSQP receives the program; None: those of the caller.
+            settings: OSQP settings; None: the defaults.
+            scale: units in which OSQP receives the program; None: the caller's units.
 
         Raises:
-            ValueError: the matrices or vectors do not fit, are not finite, lower > upper, or a
-                scale is not positive.
+            ValueError: the shapes do not match, a matrix is not finite, a bound is NaN,
+                lower > upper, or a scale is not positive.
         """
         m, n = constraints.shape
         if cost.shape != (n, n):
@@ -153,18 +153,18 @@ class QuadraticProgram:
 
         Raises:
             ValueError: a shape is wrong, a number is NaN, a lower bound is +inf, an upper bound
-                -inf, or lower > upper. The program is unchanged.
+                is -inf, or lower > upper. The program is then unchanged.
         """
         self._check_bounds(lower, upper)
         if self._solver.update_data_vec(q=None, l=self._lower, u=self._upper):
             raise ValueError("OSQP refused the vectors")
 
     def solve(self) -> QPResult:
-        """Solve, starting from the previous solution."""
+        """Solve, warm-started from the previous solution."""
         solver = self._solver
         solver.solve()
         if int(solver.info.status_val) == INTERRUPTED:
-            # The signal was sent to the process, not to OSQP.
+            # The signal was meant for the process, not for OSQP.
             signal.raise_signal(signal.SIGINT)
             solver.solve()
         info = solver.info
@@ -196,7 +196,7 @@ class QuadraticProgram:
         return max(float(self._above.max()), 0.0) if self._above.size else 0.0
 
     def _check_bounds(self, lower: Vector, upper: Vector) -> None:
-        """Copy checked bounds, clipped to OSQP's infinity, or raise and change nothing."""
+        """Check and store the bounds, clipped to OSQP's infinity; on an error, change nothing."""
         shape = self._lower.shape
         if lower.shape != shape or upper.shape != shape:
             raise ValueError(f"bounds have shapes {lower.shape}, {upper.shape}, expected {shape}")

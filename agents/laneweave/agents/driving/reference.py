@@ -1,4 +1,4 @@
-"""References: motions on the road clock, which the tracker follows.
+"""References: motions in road time, which the tracker follows.
 
 A `Reference` holds a cell, makes one move to a neighbouring cell, or settles in a cell. Where it
 would run into the vehicle ahead, it is replaced by a yielding path (`yield_behind`).
@@ -19,28 +19,28 @@ from laneweave.protocol.vehicle.motion import State, cell_state, integrate, limi
 Array = NDArray[np.float64]
 
 _BUFFER_M = 0.5
-"""Extra distance of the yielding path, so that gap constraints stay inactive."""
+"""Extra distance kept by a yielding path, so that gap constraints stay inactive."""
 _REACT_S = 1.0
-"""Time after which a gap that is violated now must be restored."""
+"""Time allowed to restore a violated gap."""
 _BRAKE_SHARE = 0.9
 _ACCEL_SHARE = 0.6
 """Fractions of the vehicle's limits that a yielding path may use."""
 _LATERAL_GAINS = (1.3, 3.6, 3.0)
-"""Jerk per error of (y, v_y, a_y) [1/s3, 1/s2, 1/s]: poles near -0.6 and -1.2 +- 0.8i 1/s."""
+"""Jerk per error in (y, v_y, a_y) [1/s3, 1/s2, 1/s]: poles near -0.6 and -1.2 +- 0.8i 1/s."""
 
 
 @define(eq=False)
 class Window:
-    """Part of a reference: N ticks from some tick on."""
+    """N consecutive ticks of a reference."""
 
     states: Array
-    """States (N + 1, 6): s, v, a, y, v_y, a_y on the road [m, s]."""
+    """States (N + 1, 6): s, v, a, y, v_y, a_y on the road, in SI units."""
     jerks: Array
     """Jerks (N, 2): j_s, j_y [m/s3]."""
     bounds: ErrorBounds | None = None
     """Admissible errors from the next tick on; None: not computed."""
     defect: Array | None = None
-    """Violation c (N, 3) of the dynamics along the road; None: none."""
+    """Violation c (N, 3) of the dynamics along the road; None: zero."""
 
 
 class Reference:
@@ -53,12 +53,12 @@ class Reference:
         trajectory: Trajectory | None = None,
         start_tick: int = 0,
     ) -> None:
-        """Lay out the reference.
+        """Build the reference.
 
         Args:
             scenario: lattice, tick and horizon.
-            origin: cell that is held before; the trajectory is relative to it.
-            trajectory: the motion; None: the cell is held.
+            origin: cell held before the motion; the trajectory is relative to it.
+            trajectory: the motion; None: hold the cell.
             start_tick: tick at which the trajectory begins.
         """
         n = self._horizon = scenario.horizon_ticks
@@ -67,7 +67,7 @@ class Reference:
         self.start_tick = start_tick
         """Tick at which the motion begins."""
         self.end_tick = start_tick
-        """Tick from which on the last cell is held."""
+        """Tick from which the last cell is held."""
         rest = np.zeros((1, 6))
         states, jerks = [np.zeros((n, 6))], [np.zeros((n, 2))]
         if trajectory is not None:
@@ -84,7 +84,7 @@ class Reference:
         self._ramp = self._advance_m * np.arange(n + 1)
         self._limits = scenario.vehicle
         self._bounds: ErrorBounds | None = None
-        """Bounds of the whole reference; they do not depend on the road clock."""
+        """Bounds for the whole reference, independent of road time; None: not computed."""
 
     @classmethod
     def hold(cls, scenario: Scenario, cell: Cell) -> Reference:
@@ -100,7 +100,7 @@ class Reference:
         start_tick: int,
         ticks: int | None = None,
     ) -> Reference:
-        """Return the reference of one move to a neighbouring cell; see `move_profile`.
+        """Return the reference for one move to a neighbouring cell; see `move_profile`.
 
         Raises:
             InfeasibleTrajectoryError: the move cannot be driven within the limits.
@@ -115,7 +115,7 @@ class Reference:
     ) -> Reference:
         """Return the reference from a commanded state at `tick` to rest in a cell at `end_tick`.
 
-        It takes at least three ticks; see `settling_trajectory`.
+        The motion must last at least three ticks; see `settling_trajectory`.
         """
         goal = cell_state(scenario.lattice, cell, tick * scenario.runtime.tick_s)
         trajectory = settling_trajectory(scenario, np.array(state) - goal, end_tick - tick)
@@ -142,14 +142,14 @@ def yield_behind(
 ) -> None:
     """Replace the part of a reference that is beyond the yielding path, in place.
 
-    The gap constraints alone would suffice, but against a reference far beyond them the program
-    takes ten times as long. The yielding path is the gentlest constant deceleration from the
+    The gap constraints alone would suffice, but the program takes ten times as long if the
+    reference is far beyond them. The yielding path is the gentlest constant deceleration from the
     vehicle's own state that stays behind:
 
         d = max over t of 2 (s + v t - latest(t)) / t^2
 
-    It reaches d with limited jerk, ends at standstill, never goes backwards, and applies until the
-    reference is behind it. The distance lost by limited jerk is compensated by d of the next tick.
+    The path reaches d with limited jerk, ends at standstill, never goes backwards, and applies
+    until the reference is behind it. The next tick's d makes up the distance lost to limited jerk.
     Across the road the vehicle follows the reference as well as possible at its speed, without
     sliding sideways. Along the road the result may violate the dynamics where the path begins or
     ends.
@@ -158,7 +158,7 @@ def yield_behind(
         state: (s, v, a, y, v_y, a_y) of the vehicle now.
         states: states of the reference (N + 1, 6).
         jerks: jerks of the reference (N, 2).
-        latest_m: upper bounds (N + 1,) of the front bumper; +inf for none.
+        latest_m: upper bounds (N + 1,) on the front bumper; +inf for none.
         tick_s: length of the tick [s].
         limits: the vehicle's limits.
     """

@@ -2,7 +2,7 @@
 
 Each axis of a vehicle is a triple integrator (position, speed, acceleration) with constant jerk
 during a tick. With the weights below, the jerks that minimise the cost over an infinite horizon are
-w_k = -K e_k, where K follows from the fixed point of the Riccati recursion. `Regulator` contains
+w_k = -K e_k, where K follows from the fixed point of the Riccati recursion. `Regulator` holds
 this solution for a whole horizon as one matrix, with the values of all constraints.
 """
 
@@ -24,7 +24,7 @@ LATERAL_WEIGHTS = np.diag((2.0, 0.8, 0.2))
 JERK_WEIGHT = 0.02
 
 _AT_REST = np.array((0.5, 0.5, 0.5, 0.3, 0.3, 0.5))
-"""Assumed errors of a vehicle that holds its cell: several times those of its sensors."""
+"""Assumed errors of a vehicle that holds its cell: several times its sensor errors."""
 
 
 def axis_matrices(h: float) -> tuple[Array, Array]:
@@ -50,7 +50,7 @@ def cost_to_go(weights: Array, h: float) -> Array:
 
 
 def _gain(cost: Array, h: float) -> Array:
-    """Return the gain K (1, 3) of the tick before a cost to go (3, 3)."""
+    """Return the gain K (1, 3) for a tick that is followed by a cost to go (3, 3)."""
     transition, effect = axis_matrices(h)
     gain: Array = effect.T @ cost @ transition / (JERK_WEIGHT + effect.T @ cost @ effect)
     return gain

@@ -1,10 +1,10 @@
 """Surroundings: free positions between the sensed vehicles ahead and behind.
 
-Relevant are neighbours in the lanes that the body touches and in the lane that it enters. They are
-predicted at constant speed for `SENSED_S`. A neighbour that matches an announced motion (`motions`)
-is also predicted along its trajectory, from the sensed position on. The nearer prediction of each
-tick counts, so an announcement cannot relax the limits from sensors. All positions are commanded
-ones (`protocol.vehicle.motion`): bodies of equal lag keep the distances of their commanded states.
+Neighbours in the lanes that the body touches or enters are relevant. They are predicted at constant
+speed for `SENSED_S`. A neighbour that matches an announced motion (`motions`) is also predicted
+along the motion's trajectory, from the sensed position on. At each tick the nearer prediction
+counts, so an announcement cannot relax the limits from sensors. All positions are commanded ones
+(`protocol.vehicle.motion`): bodies of equal lag keep the distances between their commanded states.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class _Side:
     sign: float
     nearest: Callable[[Any, Any], Any]
     free: float
-    """Limit without a neighbour."""
+    """Limit where there is no neighbour."""
 
 
 _AHEAD = _Side(1.0, np.minimum, np.inf)
@@ -66,16 +66,16 @@ class Surroundings:
         self._beyond = self._times_s > SENSED_S + 1e-9
 
     def on_motion(self, motion: Motion) -> None:
-        """Handle the announced motion of another vehicle."""
+        """Handle another vehicle's announced motion."""
         self._motions.add(motion)
 
     def gaps(self, sense: Sense, state: State, lane: int) -> Gaps:
-        """Return the gaps between neighbours, ignoring those out of reach.
+        """Return the gaps between neighbours, ignoring neighbours out of reach.
 
         Args:
             sense: sensor measurements.
             state: commanded state of this vehicle.
-            lane: lane that it is in or enters.
+            lane: lane that this vehicle is in or enters.
         """
         first, last = self._lattice.lanes_touched(sense.state[3], self._width_m)
         touched = first, last, lane
@@ -104,9 +104,9 @@ class Surroundings:
         sign: float,
         change_m: float,
     ) -> tuple[list[_Sensed], list[_Sensed]]:
-        """Return neighbours in relevant lanes (if motions are known), and those of them in reach.
+        """Return neighbours in relevant lanes (if motions are known) and the ones within reach.
 
-        It is called twice per tick and vehicle; usually no neighbour is in reach.
+        Called twice per tick per vehicle; usually no neighbour is within reach.
 
         Args:
             sense: sensor measurements.
@@ -114,8 +114,8 @@ class Surroundings:
             others: the neighbours in one direction.
             touched: the first and the last lane that the body touches; the lane that it enters.
             sign: 1 ahead, -1 behind.
-            change_m: distance by which acceleration can bring the vehicle closer to them during
-                the prediction; negative behind.
+            change_m: distance by which acceleration can bring the vehicle closer to its neighbours
+                during the prediction; negative behind.
         """
         first, last, lane = touched
         motions_known, lag_s = self._motions.known, self._lag_s
@@ -138,7 +138,7 @@ class Surroundings:
         return relevant, near
 
     def _at_constant_speed(self, others: list[_Sensed], side: _Side) -> Array:
-        """Return the nearest limits (N + 1,) of neighbours predicted at constant speed."""
+        """Return the nearest limits (N + 1,) set by neighbours predicted at constant speed."""
         positions = np.full(self._times_s.shape, side.free)
         for _, front_m, speed_mps in others:
             positions = side.nearest(positions, front_m + speed_mps * self._times_s)

@@ -3,14 +3,14 @@
 At each tick it solves the quadratic program of `tracking_problem` for the commanded state
 (`protocol.vehicle.motion`), which compensates the lag of the actuators.
 
-**Fast path.** Without active inequality constraints, the solution is that of the regulator,
+**Fast path.** Without active inequality constraints, the solution is the regulator's,
 w_k = -K e_k. Jerks and values of all constraints are one precomputed matrix times e_0. If they
 satisfy all constraints, OSQP does not run, unless `tracking.always_solve` is set.
 
 **Other references.** A reference that runs into the vehicle ahead yields
 (`reference.yield_behind`). Far from the reference (for example after an emergency brake), or
 without a usable solution, the hold law's path to the reference replaces it, and the bounds are
-widened so that zero is a solution. Both keep errors small and OSQP fast.
+widened so that zero is feasible. Both measures keep errors small and OSQP fast.
 
 Solutions are checked: the returned jerks have been integrated exactly, and limited by
 `limited_jerk` tick by tick where necessary.
@@ -89,7 +89,7 @@ class Tracker:
         """Return the jerks that take a vehicle from its commanded state to its reference.
 
         Raises:
-            ValueError: a shape is wrong, a number is NaN or the state not finite.
+            ValueError: a shape is wrong, a number is NaN, or the state is not finite.
         """
         start = time.thread_time()
         shapes = window.states.shape, window.jerks.shape
@@ -131,13 +131,13 @@ class Tracker:
     def rest(self, state: State, goal: State) -> TrackResult | None:
         """Return the jerks that keep a vehicle in its cell while no other vehicle is near.
 
-        They equal those of `solve`, but need less time: so close to the cell no constraint can
-        bind. None: the commanded state is not close enough to `goal`, rest in the cell.
+        `solve` would return the same jerks, but takes longer: this close to the cell, no constraint
+        can bind. None: the commanded state is not close enough to `goal`, rest in the cell.
         """
         if self._regulator is None:
             return None
         start = time.thread_time()
-        # Unrolled, since it runs at each tick of each vehicle.
+        # Unrolled, since it runs every tick for every vehicle.
         max_s, max_v, max_a, max_y, max_vy, max_ay = self.unconstrained_errors
         s = state[0] - goal[0]
         if not -max_s <= s <= max_s:
@@ -196,7 +196,7 @@ class Tracker:
         return Window(states, jerks, None, defect)
 
     def _path_back(self, state: State, states: Array) -> Window:
-        """Return the path of the hold law from a state to a reference."""
+        """Return the hold law's path from a state to a reference."""
         path, inputs = [state], []
         for row in states[:-1].tolist():
             jerk = hold_law(path[-1], tuple(row), self._limits, self._tick_s)
@@ -217,7 +217,7 @@ class Tracker:
         return jerk
 
     def _excess(self, state: State, jerk: Array) -> float:
-        """Return the maximum excess over a limit of the states that follow from jerks (N, 2)."""
+        """Return the maximum by which the states that jerks (N, 2) lead to exceed a limit."""
         limits, h = self._limits, self._tick_s
         rate = np.cumsum(jerk, axis=0)
         rate *= h

@@ -50,21 +50,21 @@ SETTINGS = QPSettings(
     tolerance=2e-2,
 )
 _GAP_SCALE, _JERK_SCALE = 20.0, 0.4
-"""Scales of constraints for OSQP; all others have 1. With 1, active gaps take 300 iterations."""
+"""Scales of these constraints for OSQP, 1 for all others; at 1, active gaps take 300 iterations."""
 _STATE_SCALE = 0.3
-"""Scale of states and slacks for OSQP; jerks have 1, because their gradient must vanish."""
+"""Scale of states and slacks for OSQP; 1 for jerks, because their gradient must vanish."""
 FAR_M = 1e4
-"""Bound of a gap without a vehicle: finite, so that OSQP keeps the constraint's type."""
+"""Bound where there is no vehicle: finite, so that OSQP keeps the constraint's type."""
 _MAX_PUSH_M = 1.0
-"""Maximum distance ahead of its reference to which vehicles behind push a vehicle."""
+"""Maximum distance by which vehicles behind push a vehicle ahead of its reference."""
 _SPEED_TOLERANCE_MPS = 0.3
 _SLIP_TOLERANCE_MPS = 0.1
-"""Maximum violation of these limits by OSQP's prediction near standstill."""
+"""Tolerances by which OSQP's predictions may violate these limits near standstill."""
 
 
 @frozen(eq=False)
 class Gaps:
-    """Bounds on the front bumper set by other vehicles, now and at N ticks [m].
+    """Bounds on the front bumper set by other vehicles, now and at the next N ticks [m].
 
     Commanded positions (N + 1,), infinite at ticks without a bound.
     """
@@ -91,10 +91,10 @@ NO_GAPS = Gaps()
 
 @define(eq=False)
 class ErrorBounds:
-    """Bounds on the errors relative to a reference within which no limit is exceeded, for n ticks.
+    """Bounds for n ticks on the errors from a reference that keep all limits.
 
-    Unlike the program's bounds they have no tolerance near standstill, so that the fast path of
-    the tracker is exact.
+    Unlike the program's bounds, they have no tolerance near standstill, so that the tracker's fast
+    path is exact.
     """
 
     low: Array
@@ -109,7 +109,7 @@ class ErrorBounds:
     def beside(cls, states: Array, jerks: Array, limits: Vehicle) -> ErrorBounds:
         """Return the bounds for a reference with states (n, 6) and jerks (n, 2).
 
-        The tolerance is added and subtracted for the same rounding as in the program's bounds.
+        The tolerance is added and subtracted to get the same rounding as in the program's bounds.
         """
         _, speed, accel, _, slip, lateral_accel = states.T
         low, high = np.full((5, len(states)), -np.inf), np.full((5, len(states)), np.inf)
@@ -126,7 +126,7 @@ class ErrorBounds:
         return cls(low, high, -(max_jerk + jerks), max_jerk - jerks)
 
     def part(self, first: int, end: int) -> ErrorBounds:
-        """Return the bounds of ticks `first` to `end`, excluding `end`."""
+        """Return the bounds for ticks `first` (inclusive) to `end` (exclusive)."""
         return ErrorBounds(
             self.low[:, first:end],
             self.high[:, first:end],
@@ -136,7 +136,7 @@ class ErrorBounds:
 
 
 class ConstraintBounds:
-    """Bounds (14 N,) of all constraints on one side, with views of its blocks."""
+    """Lower or upper bounds (14 N,) of all constraints, with a view of each block."""
 
     def __init__(self, n: int) -> None:
         """Initialise with zeros for N ticks."""
@@ -156,7 +156,7 @@ class TrackingProgram:
     """The quadratic program of one vehicle; its bounds change at each tick."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Prepare the bounds; OSQP is set up at its first use.
+        """Prepare the bounds; OSQP is set up on first use.
 
         Most vehicles never need OSQP, and its set-up takes as long as hundreds of ticks.
         """
@@ -176,11 +176,11 @@ class TrackingProgram:
         self._stale = False
 
     def discard_solution(self) -> None:
-        """Do not start the next solve from the previous solution."""
+        """Make the next solve start without the previous solution."""
         self._stale = True
 
     def solve(self) -> QPResult:
-        """Solve with the bounds written last."""
+        """Solve with the most recently written bounds."""
         qp = self._qp
         if qp is None:
             qp = self.set_up()
@@ -191,7 +191,7 @@ class TrackingProgram:
         return qp.solve()
 
     def set_up(self) -> QuadraticProgram:
-        """Set OSQP up with initial bounds, so that results are independent of its time."""
+        """Set up OSQP with initial bounds, so that results do not depend on when this happens."""
         low, high = _initial_bounds(self._n)
         self._qp = QuadraticProgram(
             self.cost,
@@ -216,7 +216,7 @@ class TrackingProgram:
             error: e_0.
             states: states of the reference (N + 1, 6).
             jerks: jerks of the reference (N, 2).
-            defect: c (N, 3) of the axis along the road; None: zero.
+            defect: c (N, 3) along the road; None: zero.
             gaps: bounds set by other vehicles.
         """
         low, high, limits = self.low, self.high, self._limits
@@ -261,13 +261,13 @@ class TrackingProgram:
         self._gaps = gaps
 
     def admit_zero(self) -> None:
-        """Widen the bounds of the limits so that zero, the reference itself, is a solution."""
+        """Widen the bounds of the limits so that zero, the reference itself, is feasible."""
         np.minimum(self.low.limits, 0.0, out=self.low.limits)
         np.maximum(self.high.limits, 0.0, out=self.high.limits)
 
 
 def program_scale(n: int) -> QPScale:
-    """Return the units in which OSQP quickly solves the program over n ticks."""
+    """Return units in which OSQP solves the program over n ticks quickly."""
     factors = ConstraintBounds(n)
     factors.all[:] = 1.0
     factors.jerk[:] = _JERK_SCALE
@@ -278,7 +278,7 @@ def program_scale(n: int) -> QPScale:
 
 
 def _initial_bounds(n: int) -> tuple[ConstraintBounds, ConstraintBounds]:
-    """Return lower and upper bounds with those that never change."""
+    """Return lower and upper bounds, with the constant ones filled in."""
     low, high = ConstraintBounds(n), ConstraintBounds(n)
     low.slip_left[:] = -np.inf
     high.slip_right[:] = np.inf

@@ -1,4 +1,4 @@
-"""Trajectories between cells: minimum-jerk motions that keep every limit of the vehicle.
+"""Trajectories between cells: minimum-jerk motions that keep all limits of the vehicle.
 
 In the moving frame a vehicle goes from rest to rest. A minimum-jerk quintic over one cell in 3.8 s
 needs 6 m/s2, more than the vehicle's limit. A move is therefore the solution of a quadratic program
@@ -8,19 +8,19 @@ over n ticks of h seconds,
     subject to  z_{k+1} = A z_k + B u_k,  z_0 = 0,  z_n = (ds, 0, 0, dy, 0, 0)
                 speed, acceleration, jerk and slip within a fraction of the vehicle's limits
 
-which is solved once per kind of move and process. The jerks are then integrated exactly and the
+which each process solves once per kind of move. The jerks are then integrated exactly and the
 result is checked against all limits, independent of the solver's status.
 
 States are commanded states (`protocol.vehicle.motion`): the body follows them with the lag of its
 actuators, and is 0.1 m short of its cell at the end of the move, 0.04 m at the end of the slot
-(default lags). A move forwards approaches a vehicle that holds in the cell beyond the target. It
+(default lags). A forward move may approach a vehicle that holds in the cell beyond the target; it
 stays far enough behind that the emergency brake (`protocol.vehicle.emergency_brake`) does not act,
 with a margin for errors:
 
     s_k+r + (lag + r h) v_F + (v_F + v_k+r)^2 / (2 b)
         <=  2 d_F - L + braking distance of the vehicle ahead - margin - errors
 
-for every tick k and r ticks of reaction; the square is replaced by its tangents.
+for every tick k, with r ticks of reaction time; the square is replaced by its tangents.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ LIMIT_SHARE = 0.96
 _END_TOLERANCE = 1e-3
 """Maximum error at the end of a trajectory [m, m/s, m/s2]."""
 _LIMIT_TOLERANCE = 1e-4
-"""Maximum excess over a fraction of a limit [m/s, m/s2, m/s3]."""
+"""Maximum excess over `LIMIT_SHARE` of a limit [m/s, m/s2, m/s3]."""
 _TRACKING_ERROR_M = 0.25
 """Margin for tracking errors behind the vehicle ahead."""
 _CLOSING_SPEEDUP = 0.5
@@ -93,7 +93,7 @@ class Trajectory:
 
 @frozen
 class Envelope:
-    """Bound on position and speed behind a vehicle that holds, which leaves room to brake."""
+    """Bound on position and speed that leaves room to brake behind a vehicle that holds."""
 
     ticks: int
     """Reaction time [ticks]."""
@@ -103,7 +103,7 @@ class Envelope:
 
     @classmethod
     def behind(cls, scenario: Scenario, gap_m: float) -> Envelope:
-        """Return the envelope of a move that starts with a net gap of `gap_m` to the vehicle."""
+        """Return the envelope for a move that starts with a net gap of `gap_m` to that vehicle."""
         speed_mps, braking = scenario.formation.speed_mps, scenario.braking
         ticks = max(round(braking.reaction_s / scenario.runtime.tick_s), 1)
         lost_s = scenario.vehicle.actuator_lag_s + ticks * scenario.runtime.tick_s
@@ -149,7 +149,7 @@ def check_moves(scenario: Scenario) -> None:
     """Check that all moves of a scenario, for all T_F, can be driven within the vehicle's limits.
 
     Raises:
-        BadInputError: a move cannot.
+        BadInputError: a move cannot be driven.
     """
     for slot_s in scenario.slots_s:
         for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)):
@@ -185,7 +185,7 @@ def plan_trajectory(
         ticks: duration.
         ds_m: distance along the road, relative to the lattice.
         dy_m: distance across the road.
-        envelope: bound behind a vehicle that holds ahead; None: none.
+        envelope: bound that leaves room to brake; None: no bound.
 
     Raises:
         InfeasibleTrajectoryError: there is no trajectory within the limits.
@@ -193,7 +193,7 @@ def plan_trajectory(
     """
     if ds_m == 0.0 and dy_m == 0.0:
         return _integrated(np.zeros((ticks, 2)), tick_s)
-    # A unit of time near an eighth of the duration makes all states of similar magnitude.
+    # A unit of time of an eighth of the duration gives all states similar magnitudes.
     unit_s = ticks * tick_s / 8.0
     program = _trajectory_program(
         limits, speed_mps, tick_s / unit_s, unit_s, ticks, (ds_m, dy_m), envelope
@@ -292,12 +292,12 @@ def _both(limit: float) -> tuple[float, float]:
 def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Trajectory:
     """Return the trajectory of minimum squared jerk from a state to rest at the origin.
 
-    Limits are not checked: a vehicle that enters has enough time for 1.5 columns to stay far from
+    Limits are not checked: an entering vehicle has enough time for 1.5 columns to stay well within
     them.
 
     Args:
-        scenario: tick.
-        start: state (6,) relative to the lattice point at the end.
+        scenario: source of the tick length.
+        start: state (6,) relative to the final lattice point.
         ticks: duration, at least three.
     """
     tick_s = scenario.runtime.tick_s
@@ -309,7 +309,7 @@ def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Traject
 
 @lru_cache(maxsize=256)
 def _reach(tick_s: float, ticks: int) -> tuple[Array, Array]:
-    """Return the matrices from jerks (3, ticks) and initial state (3, 3) to the last state."""
+    """Return the matrices that map jerks (3, ticks) and initial state (3, 3) to the final state."""
     transition, effect = axis_matrices(tick_s)
     power: Array = np.eye(3)
     effects = []
@@ -320,7 +320,7 @@ def _reach(tick_s: float, ticks: int) -> tuple[Array, Array]:
 
 
 def _integrated(jerks: Array, tick_s: float, start: Array | None = None) -> Trajectory:
-    """Return the trajectory of jerks (n, 2) from a state, by default rest at the origin."""
+    """Return the trajectory that jerks (n, 2) give from a state, by default rest at the origin."""
     transition, effect = axis_matrices(tick_s)
     states = np.zeros((len(jerks) + 1, 6))
     if start is not None:
@@ -336,7 +336,7 @@ def _integrated(jerks: Array, tick_s: float, start: Array | None = None) -> Traj
 
 
 def _excess(trajectory: Trajectory, limits: Vehicle, speed_mps: float) -> float:
-    """Return the maximum excess over a fraction of a limit [m/s, m/s2, m/s3]; NaN propagates."""
+    """Return the maximum excess over `LIMIT_SHARE` of a limit [m/s, m/s2, m/s3]; NaN propagates."""
     _, v, a, _, v_y, a_y = trajectory.states.T
     jerk = np.abs(trajectory.jerks).max(axis=0)
     share = LIMIT_SHARE

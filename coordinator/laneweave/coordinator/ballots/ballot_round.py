@@ -1,14 +1,14 @@
-"""One ballot of a leader: prepare, promise, plan, accept (rules L4 to L8).
+"""One ballot held by a leader: prepare, promise, plan, accept (rules L4 to L8).
 
-The leader requests a promise from every vehicle of the roster, has a plan made from the hold cells
-in the promises, and issues that plan under the ballot. Safety needs only two properties of this: a
-ballot is never used twice, and a plan is made only from promises of the *whole* roster. Vehicles
+The leader requests a promise from every vehicle in the roster, has a plan made from the hold cells
+in the promises, and issues that plan under the ballot. Safety requires only two things: a ballot
+is never used twice, and a plan is made only from promises of the *whole* roster. Vehicles
 check everything else.
 
-Each operation has its own table, which contains `PLAN_RULES`. The tables differ in the handling of
-ballots that are outbid, of restarted vehicles and of failed planning: formations try again, the
-rolling operation aborts the ballot. Between the events `PROMISED` and `PLANNED` the plan is made,
-by a computation outside the core (formations) or at once from the promises (rolling).
+Each operation has its own table, which contains `PLAN_RULES`. The tables differ in how they handle
+outbid ballots, restarted vehicles and failed planning: formations try again, the rolling operation
+aborts the ballot. The plan is made between the events `PROMISED` and `PLANNED`: by a computation
+outside the core (formations) or directly from the promises (rolling).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from laneweave.protocol.state_machine import RuleBook, Transition
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, VehicleState
 
 ISSUE_S = 30.0
-"""A plan that not all vehicles have accepted in this time is abandoned (L8)."""
+"""Time for all vehicles to accept a plan; after that, it is abandoned (L8)."""
 
 
 class BallotPhase(Enum):
@@ -53,11 +53,11 @@ PROMISED, PLANNED, FAILED, TOO_LATE = "promised", "planned", "planning failed", 
 
 @define(kw_only=True)
 class BallotRound:
-    """A leader's state of one ballot at a time; subclasses define the roster and pass events."""
+    """A leader's state for one ballot at a time; subclasses define the roster and take events."""
 
     rules: RuleBook
     resend_s: float
-    """Period after which PREPARE and PLAN are repeated."""
+    """Interval at which PREPARE and PLAN are resent."""
     phase: BallotPhase = BallotPhase.PREPARING
     ballot: Ballot | None = None
     plan: Plan | None = None
@@ -66,13 +66,13 @@ class BallotRound:
     failures: int = 0
     """Number of failed planning attempts under this ballot."""
     back_offs: int = 0
-    """Number of consecutive pauses without an acceptance between them."""
+    """Number of back-offs since the last acceptance."""
     now_s: float = 0.0
     """Time of the current event (node clock)."""
     due_s: float = 0.0
-    """Time of the next timer or repeated message (node clock)."""
+    """Time of the next timer or resend (node clock)."""
     until_s: float = 0.0
-    """End of the phase's time limit (node clock)."""
+    """Time at which the phase times out (node clock)."""
 
     @property
     def roster(self) -> tuple[Name, ...]:
@@ -122,7 +122,7 @@ class BallotRound:
         return self.rules.take(self, event, message) is not None
 
     def outgoing(self, now_s: float) -> Iterable[tuple[Name, Prepare | Plan]]:
-        """Return the messages to send or repeat now, each with its receiver."""
+        """Return the messages to send or resend now, each with its receiver."""
         if now_s < self.due_s or self.ballot is None:
             return []
         if self.phase is BallotPhase.PREPARING:
@@ -139,7 +139,7 @@ class BallotRound:
 
     @property
     def wakeup_s(self) -> float | None:
-        """Time of the next timer or repeated message; None: there is none."""
+        """Time of the next timer or resend; None: there is none."""
         if self.phase in _WITHOUT_TIMER:
             return None
         return self.due_s
@@ -158,18 +158,18 @@ def has_higher_promise(round_: BallotRound, state: VehicleState) -> bool:
 
 
 def had_promised(round_: BallotRound, state: VehicleState) -> bool:
-    """A promise of the vehicle is counted."""
+    """A promise from the vehicle is on record."""
     return state.vehicle in round_.promises
 
 
 def restarted(round_: BallotRound, state: VehicleState) -> bool:
-    """No promise of the reported incarnation is counted."""
+    """No promise from the reported incarnation is on record."""
     promise = round_.promises.get(state.vehicle)
     return promise is None or promise.incarnation != state.incarnation
 
 
 def is_promise(round_: BallotRound, state: VehicleState) -> bool:
-    """The vehicle has promised b and not accepted."""
+    """The vehicle has promised but not accepted b."""
     return state.promised == round_.ballot and not state.accepted
 
 
@@ -239,7 +239,7 @@ def is_older(state: VehicleState, other: VehicleState) -> bool:
     """Return whether a state was sent before another state of the same vehicle.
 
     States sent between two ticks have equal times. Their order follows from the promise and the
-    acceptance, which never go back.
+    acceptance, which are never undone.
     """
     if state.incarnation == other.incarnation and state.t_s != other.t_s:
         return state.t_s < other.t_s

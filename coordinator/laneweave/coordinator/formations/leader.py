@@ -35,12 +35,12 @@ from laneweave.protocol.state_machine import RuleBook, Transition
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, VehicleState
 
 OBSERVE_S = 1.0
-"""Longest time for which a new leader waits for the states of a roster (L2)."""
+"""Longest time for which a new leader waits for the states of all members (L2)."""
 BACK_OFF_S = (0.05, 0.3)
-"""Range of the random pause before a leader outbids another one (L7). It doubles with each
-consecutive pause, so that one of two leaders has time to plan."""
+"""Range of the random back-off before a leader outbids another one (L7). It doubles with each
+consecutive back-off, so that one of two leaders has time to plan."""
 MAX_BACK_OFFS = 6
-"""Maximum number of doublings of the pause."""
+"""Maximum number of doublings of the back-off."""
 RETRY_S = 1.0
 """First pause after failed planning; it doubles with each failure (L5)."""
 LONGEST_RETRY_S = 8.0
@@ -52,7 +52,7 @@ class FormationLeader(BallotRound):
 
     formation: Formation
     new_ballot: Callable[[Ballot | None], Ballot]
-    """Returns a new ballot, above the given one if there is one."""
+    """Returns a new ballot, above the given one, if any."""
     rng: random.Random
     rules: RuleBook = field(factory=lambda: LEADER_RULES, kw_only=True)
     phase: BallotPhase = field(default=BallotPhase.OBSERVING, kw_only=True)
@@ -151,7 +151,7 @@ def adopt(leader: FormationLeader, _: object) -> None:
 
 
 def time_is_up(leader: FormationLeader, _: object) -> bool:
-    """The time limit of the phase has passed."""
+    """The phase has timed out."""
     return leader.now_s >= leader.until_s
 
 
@@ -166,7 +166,7 @@ def prepare(leader: FormationLeader, _: object) -> None:
 
 
 def back_off(leader: FormationLeader, _: object) -> None:
-    """Pause for 0.05 to 0.3 s, doubled with each consecutive pause."""
+    """Pause for 0.05 to 0.3 s, doubled with each consecutive back-off."""
     pause_s = leader.rng.uniform(*BACK_OFF_S) * 2.0 ** min(leader.back_offs, MAX_BACK_OFFS)
     leader.back_offs += 1
     leader.until_s = leader.due_s = leader.now_s + pause_s
@@ -194,7 +194,7 @@ def stalls(_: FormationLeader, state: VehicleState) -> bool:
 
 
 def is_off_lane(leader: FormationLeader, state: VehicleState) -> bool:
-    """The vehicle has completed the plan off its preferred lane, although it is within reach.
+    """The vehicle has completed the plan outside its preferred lane, which is within reach.
 
     An adopted plan may have been made for other targets.
     """
@@ -211,7 +211,7 @@ def is_off_lane(leader: FormationLeader, state: VehicleState) -> bool:
 
 
 def has_new_targets(leader: FormationLeader, formation: Formation) -> bool:
-    """Targets, members or the structure to form are new."""
+    """There are new members or targets, or the structure to form has changed."""
     return formation.stage != leader.formation.stage or not (
         set(formation.members) <= set(leader.formation.members)
     )

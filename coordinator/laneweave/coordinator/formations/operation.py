@@ -1,4 +1,4 @@
-"""The paper's operation: formations on the road, each led by its own ballots."""
+"""The paper's operation: formations on the road, each under its own ballots."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from laneweave.protocol.wire.events import FORMATIONS_JOINED, PLAN_IN_FORCE
 from laneweave.protocol.wire.messages import Ballot, Census, VehicleState
 
 JUST_CLOSED_S = 1.0
-"""Road time after a formation closes within which no leader can have planned for it."""
+"""Age (road time) up to which no leader can have planned for a closed formation."""
 
 
 class FormationsOperation:
@@ -38,13 +38,13 @@ class FormationsOperation:
 
         Args:
             scenario: road, formations, timing.
-            new_ballot: returns a new ballot, above the given one if there is one.
-            new_job: returns the number of a new computation.
-            has_watched: returns whether, at a time of the node's clock, this leader has handled
-                events without gaps for an election timeout.
+            new_ballot: returns a new ballot, above the given one, if any.
+            new_job: returns the id of a new computation.
+            has_watched: returns whether, at a given node time, this leader has handled events
+                without gaps for an election timeout.
             rng: source of random pauses.
             plan: plans one request.
-            rules: rules of a leader; tests replace some.
+            rules: rules for formation leaders; tests replace some.
         """
         self.leaders: dict[int, FormationLeader] = {}
         """Leaders by the lowest block number of their formation."""
@@ -57,7 +57,7 @@ class FormationsOperation:
         self._planner = FormationPlanner(scenario, self._groups, self.leaders, new_job, plan)
 
     def forget(self) -> None:
-        """Discard all formations, and which of them are joined."""
+        """Discard all formations and all joins."""
         self._groups.forget()
         self.take_over()
 
@@ -88,7 +88,7 @@ class FormationsOperation:
     def lead(
         self, census: Census, t_s: float, now_s: float, *, changed: bool
     ) -> Iterator[Effect | LogEntry]:
-        """Update members, handle expired timers, order plans, send messages."""
+        """Update members, handle expired timers, request plans, send messages."""
         if changed or self._groups.changed:
             yield from self._update_members(census, t_s, now_s)
             self._groups.changed = False

@@ -1,12 +1,12 @@
-"""Timing of a plan: start, length of the slots, pauses for neighbouring formations.
+"""Timing of a plan: start, slot length, pauses for neighbouring formations.
 
 Lanes are changed in S3 only (paper, Section 5.2.1). If the scenario does not fix T_F, the slots of
-a plan are as long as the road allows, and the plan begins as soon as no lane change takes place
-before S3. Moves along the road may begin earlier, as may lane changes of vehicles that are already
-in S3 while the rear of the formation is not.
+a plan are as long as the road allows, and the plan begins as early as possible without any lane
+change before S3. Before the rear of the formation is in S3, vehicles may already move along the
+road, and those in S3 may change lanes.
 
 Plans stay in the blocks of their formations, so their footprints never intersect. But two moves
-towards each other across the border of two formations (conflict kind `closing`) would trigger the
+towards each other across the border between formations (conflict kind `closing`) would trigger the
 emergency brake. Formations are planned one after the other, and the later plan pauses for a slot to
 avoid such moves.
 """
@@ -24,9 +24,9 @@ from laneweave.protocol.vehicle.plan_execution import TIME_TOLERANCE_S
 from laneweave.protocol.wire.messages import Plan
 
 RESERVE_S = 3.0
-"""Reserve of road time after the last slot, for lost messages."""
+"""Spare road time after the last slot, for lost messages."""
 MIN_RESERVE_S = 1.0
-"""Reserve if `RESERVE_S` would leave too little time for comfortable moves."""
+"""Spare time if `RESERVE_S` would leave too little for comfortable moves."""
 
 _MODEL = ConflictModel(("closing",))
 
@@ -37,7 +37,7 @@ def steps_of(plan: Plan) -> int:
 
 
 def comfortable_steps(start_s: float, end_s: float, scenario: Scenario) -> int:
-    """Return the number of steps of comfortable length, or of the given T_F, between two times."""
+    """Return how many steps of comfortable length, or of a given T_F, fit between two times."""
     shortest_s, longest_s = scenario.cycles_s
     if shortest_s == longest_s:
         return int((end_s - start_s) / longest_s)
@@ -47,15 +47,15 @@ def comfortable_steps(start_s: float, end_s: float, scenario: Scenario) -> int:
 def paced(
     plan: Plan, others: Sequence[Plan], not_before_s: float, end_s: float, scenario: Scenario
 ) -> Plan:
-    """Return a plan with the longest slots with which it ends in time, or with the shortest.
+    """Return a plan with the longest slots that let it end in time, else with the shortest.
 
-    The plan pauses where its moves would close up with moves of its neighbours.
+    The plan pauses where its moves and its neighbours' would be in conflict (`closing`).
 
     Args:
         plan: plan with the latest start: when all of its vehicles are in S3.
         others: plans of neighbouring formations, which are not changed.
         not_before_s: earliest start (road time).
-        end_s: road time by which the plan should have ended.
+        end_s: road time by which the plan should be complete.
         scenario: road, lattice, T_F.
     """
     slots_s, slack_s = scenario.slots_s[::-1], scenario.formation.slack_s
@@ -77,7 +77,7 @@ def paced(
 
 
 def _start_s(plan: Plan, slot_s: float, not_before_s: float, scenario: Scenario) -> float:
-    """Return the earliest start of a plan with which no lane change takes place before S3."""
+    """Return the earliest start of a plan that allows no lane change before S3."""
     in_time = [
         start_time_s([origin], 0.0, scenario) - step * slot_s
         for moves in plan.moves.values()
@@ -88,7 +88,7 @@ def _start_s(plan: Plan, slot_s: float, not_before_s: float, scenario: Scenario)
 
 
 def with_pauses(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: int) -> Plan:
-    """Return a plan with pauses, so that no move closes up with a move of another plan.
+    """Return a plan with pauses, so that no move is in conflict (`closing`) with another plan.
 
     All vehicles pause together, so the order of moves does not change.
 
@@ -96,7 +96,7 @@ def with_pauses(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: i
         plan: the new plan.
         others: plans of neighbouring formations, which are not changed.
         slack_s: difference between the length of a slot and the duration of a move [s].
-        max_steps: maximum number of slots. Moves that still close up then rely on the emergency
+        max_steps: maximum number of slots. Moves still in conflict then rely on the emergency
             brake, because a delay is better than a wrong lane.
     """
     theirs = [
@@ -129,7 +129,7 @@ def with_pauses(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: i
 
 
 def _paused(plan: Plan, pause: int) -> Plan:
-    """Return a plan whose moves from a step on begin one slot later."""
+    """Return a plan whose moves from step `pause` on begin one slot later."""
     return evolve(
         plan,
         moves={

@@ -1,7 +1,7 @@
-"""Planning orders of formations, and their results (rule L5).
+"""Planning requests for formations, and their results (rule L5).
 
-The planner runs outside the core (`Compute`), for one formation at a time. This module writes the
-orders. It turns the results into plans or failures, or joins formations if one alone lacks room.
+The planner runs outside the core (`Compute`), for one formation at a time. This module makes the
+requests. It turns results into plans or failures, or joins formations if one alone lacks room.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ from laneweave.protocol.wire.messages import Ballot, Plan
 START_MARGIN_S = 0.5
 """Minimum road time between the completion of a plan and its start."""
 ROOM_S = 2.5
-"""Maximum time for which a formation that lacks room waits for the next to close (road time)."""
+"""Maximum time that a formation that lacks room waits for the next one to close (road time)."""
 SHORTEST_DEADLINE_S = 1.0
-"""Deadline of planning if the first move could begin at once."""
+"""Planning deadline if the first move could begin at once."""
 LONGEST_DEADLINE_S = 15.0
-"""Deadline of planning if the first move is far off; other formations wait meanwhile."""
+"""Planning deadline if the first move is far off; other formations wait meanwhile."""
 MAX_DOUBLINGS = 4
 """The node limit doubles with each failed attempt, up to this number of times."""
 PACE_WINDOW_S = 2.0
-"""Measurement window of the road's pace (node clock)."""
+"""Measurement window for the road's pace (node clock)."""
 LOGGED = (
     *("status", "cost", "lower_bound", "steps", "solve_ms"),
     *("assignments_tried", "nodes_expanded", "solver", "fallback"),
@@ -78,7 +78,7 @@ class RoadPace:
     """Road time and node clock at the beginning of the current measurement."""
 
     def on_clock(self, t_s: float, now_s: float) -> None:
-        """Handle a message of the road's clock; a decrease of `t_s` restarts the measurement."""
+        """Handle a road clock message; a decrease in `t_s` restarts the measurement."""
         if self._since is None or t_s < self._since[0]:
             self._since = t_s, now_s
             return
@@ -89,7 +89,7 @@ class RoadPace:
 
 
 class FormationPlanner:
-    """Orders plans for formations and handles the results; times as in `Operation`."""
+    """Requests plans for formations and handles results; times as in `Operation`."""
 
     def __init__(
         self,
@@ -99,13 +99,13 @@ class FormationPlanner:
         new_job: Callable[[], int],
         plan: PlanFunction,
     ) -> None:
-        """Begin without orders.
+        """Begin without requests.
 
         Args:
-            scenario: road, lattice, settings of planning.
-            groups: joined blocks; joins of formations are added.
+            scenario: road, lattice, planning settings.
+            groups: joined blocks; new joins are added.
             leaders: leaders of all formations by lowest block number.
-            new_job: returns the number of a new computation.
+            new_job: returns the id of a new computation.
             plan: plans one request.
         """
         self._scenario = scenario
@@ -113,9 +113,9 @@ class FormationPlanner:
         self._leaders = leaders
         self._new_job = new_job
         self._waiting: dict[int, tuple[Ballot, Callable[[], Sorting]]] = {}
-        """Orders that have not begun, oldest first: ballot and computation of each formation."""
+        """Waiting requests, oldest first: ballot and computation of each formation."""
         self._under_way: tuple[int, int, Ballot] | None = None
-        """Number, formation and ballot of the current computation."""
+        """Id, formation and ballot of the current computation."""
         self.pace = RoadPace()
         """Pace of the road, for deadlines."""
         formation = scenario.formation
@@ -126,11 +126,11 @@ class FormationPlanner:
         self._make_plan = partial(plan, weights=weights)
 
     def forget(self) -> None:
-        """Discard all orders that have not begun."""
+        """Discard all waiting requests."""
         self._waiting.clear()
 
     def _deadline_s(self, start_s: float, t_s: float) -> float:
-        """Return the deadline of the scenario, or the time until the first move."""
+        """Return the scenario's deadline if given, else the time until the first move."""
         given_s = self._scenario.formation.planning_deadline_s
         if given_s is not None:
             return given_s
@@ -140,7 +140,7 @@ class FormationPlanner:
     def order(
         self, leader: FormationLeader, t_s: float, now_s: float
     ) -> Iterator[Compute | LogEntry]:
-        """Order a plan from the promises of a formation; abort if no step can be completed."""
+        """Request a plan based on a formation's promises; abort if no step can be completed."""
         numbers, ballot = leader.formation.numbers, leader.ballot
         assert ballot is not None  # noqa: S101 (set before planning begins)
         formation, scenario = leader.formation, self._scenario
@@ -169,9 +169,9 @@ class FormationPlanner:
             None if formation.sorts else scenario.formation.structures[formation.stage],
         )
         nodes = scenario.formation.max_nodes * 2 ** min(leader.failures, MAX_DOUBLINGS)
-        # Replaces an order under an earlier ballot, at the end of the queue.
+        # Replaces a request under an earlier ballot, at the end of the queue.
         self._waiting.pop(numbers[0], None)
-        # Invalid promises fail inside the job, like any other failed planning.
+        # Invalid promises make the job fail, like any other planning failure.
         self._waiting[numbers[0]] = (
             ballot,
             partial(sort_lanes, task, nodes, self._make_plan),
@@ -179,7 +179,7 @@ class FormationPlanner:
         yield from self._begin()
 
     def _begin(self) -> Iterator[Compute]:
-        """Start the oldest order that is still needed, unless a computation is running."""
+        """Start the oldest request that is still needed, unless a computation is running."""
         while self._waiting and self._under_way is None:
             number = next(iter(self._waiting))
             ballot, work = self._waiting.pop(number)
@@ -197,9 +197,9 @@ class FormationPlanner:
         )
 
     def _end_s(self, formation: Formation) -> float:
-        """Return the road time by which the plan of a formation should have ended.
+        """Return the road time by which a formation's plan should be complete.
 
-        That is the time of its next planning, or the time at which its front leaves the road.
+        That is when the formation is planned next, or when its front leaves the road.
         """
         if not formation.sorts:
             next_s = stage_begin_s(formation.numbers, formation.stage + 1, self._scenario)
@@ -208,7 +208,7 @@ class FormationPlanner:
         return time_left_s([(front, 0)], 0.0, self._scenario)
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[Compute | LogEntry]:
-        """Handle a result, unless it is no longer needed, and start the next order."""
+        """Handle a result, unless it is no longer needed, and start the next request."""
         if self._under_way is None or computed.job != self._under_way[0]:
             return
         _, number, ballot = self._under_way
@@ -246,7 +246,7 @@ class FormationPlanner:
         yield LogEntry(PLANNING_FAILED, data)
 
     def _join_neighbour(self, leader: FormationLeader, t_s: float) -> bool:
-        """Join a formation that lacks room with a neighbour, if possible; return whether it did."""
+        """Join a formation that lacks room with a neighbour; return whether this was possible."""
         numbers, max_joined = leader.formation.numbers, self._scenario.formation.max_joined
         for other in self._neighbours(numbers):
             if other.phase is BallotPhase.ABORTED:
@@ -259,7 +259,7 @@ class FormationPlanner:
         return False
 
     def _steps_left_in(self, numbers: Numbers, t_s: float) -> int:
-        """Return the number of steps that remain for all cells of some blocks."""
+        """Return the number of steps that remain for vehicles in any cells of some blocks."""
         cells, scenario = self._block_cells(numbers), self._scenario
         start_s = start_time_s(cells, t_s + START_MARGIN_S, scenario)
         return steps_left(cells, start_s, scenario.cycles_s[0], scenario)
@@ -290,7 +290,7 @@ class FormationPlanner:
         return leader.make_plan(leader.formation.numbers, sorting.moves, t0_s, slot_s)
 
     def _paced(self, plan: Plan, leader: FormationLeader, t_s: float) -> Plan:
-        """Choose start and slots of a plan, so that its vehicles have settled before it begins."""
+        """Choose a plan's start and slots so that its vehicles have settled before it begins."""
         formation, cells = leader.formation, plan.start_cells.values()
         others = self._neighbouring_plans(plan)
         if not formation.sorts:
@@ -300,7 +300,7 @@ class FormationPlanner:
         return paced(plan, others, not_before_s, end_s, self._scenario)
 
     def _neighbouring_plans(self, plan: Plan) -> list[Plan]:
-        """Return the plans of neighbours that this leader has made and that may be executed."""
+        """Return the neighbours' plans that this leader has made and that may be executed."""
         if "closing" not in self._scenario.formation.conflict_kinds:
             return []
         return [
@@ -320,7 +320,7 @@ class FormationPlanner:
         return on_tick(max(begin_s, self._settled_s(cells), t_s + START_MARGIN_S), self._scenario)
 
     def _settled_s(self, cells: Collection[Cell]) -> float:
-        """Return the road time at which vehicles that entered in some cells have settled."""
+        """Return the road time by which vehicles that entered in some cells have settled."""
         formation, lattice = self._scenario.formation, self._scenario.lattice
         rear = min(column for column, _ in cells)
         return lattice.passing_time_s(rear) + formation.entry_spread_s + formation.settle_s

@@ -1,13 +1,13 @@
 """Formations derived from the census, and their time on the road.
 
 The roadside builds formations from the stream of arrivals and assigns blocks of columns to them. A
-formation is *closed* when no more vehicles can enter its blocks; from that census on, its roster is
-complete.
+formation is *closed* when no more vehicles can enter its blocks; once a census reports this, its
+roster is complete.
 
-**Joined formations** plan under one ballot. Such a plan may use the blocks of all of them, and its
-roster is all vehicles that entered there. After a plan has used two blocks, a vehicle of either may
-be in the other, so no later plan may use one of them without the vehicles of both: formations stay
-joined until their vehicles have left. Every vehicle stores the joined blocks
+**Joined formations** are planned under one ballot. Such a plan may use the blocks of all of them,
+and its roster is all vehicles that entered there. After a plan has used two blocks, a vehicle of
+either may be in the other, so no later plan may use one of them without the vehicles of both:
+formations stay joined until their vehicles have left. Every vehicle stores the joined blocks
 (`VehicleState.joined`), so every leader learns them from the promises.
 """
 
@@ -24,11 +24,11 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name
 
 STAGE_LEAD_S = 5.0
-"""Time before a change of structure at which it is planned: longer than planning takes. By then the
-previous plan has ended."""
+"""Lead time for planning a change of structure: longer than planning takes. The previous plan is
+complete by then."""
 
 Numbers = tuple[int, ...]
-"""Numbers of blocks, ascending."""
+"""Block numbers, ascending."""
 
 
 @frozen
@@ -38,11 +38,11 @@ class Formation:
     numbers: Numbers
     """Block numbers, ascending."""
     members: tuple[CensusEntry, ...]
-    """Members in the order of their names."""
+    """Members, sorted by name."""
     closed_s: float = 0.0
     """Road time at which the last of the formations was closed."""
     joined: int = 1
-    """Number of formations."""
+    """Number of formations that are joined."""
     deserted: Numbers = ()
     """Blocks of joined formations whose vehicles have all left the road. Plans avoid them, since
     vehicles of formations joined under another leader may be there."""
@@ -59,14 +59,14 @@ class Formation:
 
 @define
 class Groups:
-    """Groups of blocks that plan together, as known to one leader; groups only grow."""
+    """Groups of blocks planned together, as known to one leader; groups only grow."""
 
     changed: bool = False
     """Set when blocks are joined; the reader resets it."""
     _group: dict[int, Numbers] = field(factory=dict)
 
     def of(self, number: int) -> Numbers:
-        """Return the group of a block, itself included."""
+        """Return the group of a block, including the block itself."""
         return self._group.get(number, (number,))
 
     def join(self, numbers: Iterable[int]) -> bool:
@@ -79,7 +79,7 @@ class Groups:
         return True
 
     def forget(self) -> None:
-        """Discard all groups: another road has other formations."""
+        """Discard all groups: a new road has other formations."""
         self._group.clear()
 
 
@@ -95,7 +95,7 @@ def closed_formations(
         census: vehicles on the road, and the blocks of each formation.
         t_s: road time.
         scenario: lattice, structures.
-        groups: blocks that plan together; the blocks of each closed formation are merged in it.
+        groups: blocks planned together; the blocks of each closed formation are merged here.
     """
     lattice = scenario.lattice
     closed_s: dict[int, list[float]] = {}
@@ -126,7 +126,7 @@ def closed_formations(
 def stage_at(numbers: Numbers, t_s: float, scenario: Scenario) -> int:
     """Return the index of the structure that a formation should plan at a road time.
 
-    The first structure is planned at once. Each later structure, and the sorting after the last
+    The first structure is planned at once. Each later structure, and lane sorting after the last
     one, is planned `STAGE_LEAD_S` before the rear of the formation reaches its position.
     """
     structures = scenario.formation.structures
@@ -170,7 +170,7 @@ def joinable(
 def start_time_s(cells: Collection[Cell], not_before_s: float, scenario: Scenario) -> float:
     """Return the tick [s] from which vehicles in these cells may change lanes.
 
-    The rearmost body is in S3 then, and it is not before `not_before_s`.
+    The rearmost body is in S3 by then; the tick is >= `not_before_s`.
     """
     lattice, road = scenario.lattice, scenario.road
     in_sorting_s = lattice.passing_time_s(

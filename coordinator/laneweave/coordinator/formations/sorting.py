@@ -1,8 +1,8 @@
 """Lane sorting of one formation, or of joined ones: from promises to moves.
 
 The grid consists of the blocks of the formations. Vehicles without an agent block their cells. If
-complete sorting is impossible, one vehicle after the other is exempted from reaching its lane, so
-that a single blocked vehicle does not prevent all others from sorting. Before it sorts, a formation
+complete sorting is infeasible, one vehicle after another is exempted from reaching its lane, so
+that a single blocked vehicle does not prevent all others from sorting. Before sorting, a formation
 may form other structures, in which every vehicle may take any place.
 """
 
@@ -28,14 +28,14 @@ from laneweave.protocol.scenario.fields import DrivingStructure, Scenario
 from laneweave.protocol.wire.messages import Name
 
 MAX_PLACEMENTS = 6
-"""Maximum number of target placements that are tried if the first one takes too many steps."""
+"""Maximum number of target placements to try if the first one takes too many steps."""
 MIN_DEADLINE_S = 0.05
 """Minimum deadline of one attempt."""
 
 
 @frozen
 class SortingTask:
-    """Input of a sorting."""
+    """Input of lane sorting."""
 
     numbers: Numbers
     """Blocks that may be used, ascending."""
@@ -94,7 +94,7 @@ class SortingTask:
 
 @frozen
 class Sorting:
-    """The result of a sorting."""
+    """Result of lane sorting."""
 
     response: PlanResponse | None
     """Response of the planner; None: no vehicle can move."""
@@ -105,7 +105,7 @@ class Sorting:
     short_of_room: bool
     """Whether a member that can move does not reach its lane, so more blocks could help."""
     impossible: str = ""
-    """Reason why the structure has too few cells, so that no member moves; empty: it has enough."""
+    """Why the structure has too few cells, in which case no member moves; empty: it has enough."""
 
     @property
     def solved(self) -> bool:
@@ -174,11 +174,11 @@ def sort_lanes(
     plan: PlanFunction,
     clock: Clock = time.monotonic,
 ) -> Sorting:
-    """Plan a sorting; if it is impossible, exempt one member from reaching its lane.
+    """Plan lane sorting; if it is infeasible, exempt one member from reaching its lane.
 
     Args:
-        task: input of the sorting.
-        max_nodes: maximum number of search nodes of each attempt.
+        task: the sorting task.
+        max_nodes: maximum number of search nodes per attempt.
         plan: plans one request.
         clock: returns the time for the deadline [s].
     """

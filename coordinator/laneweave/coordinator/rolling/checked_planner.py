@@ -1,4 +1,4 @@
-"""The rolling planner for a scenario's road, with a check of every plan."""
+"""The rolling planner for a scenario's road; every plan is checked."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def stream_planner(scenario: Scenario) -> Planner:
 
 
 def stream_road(scenario: Scenario) -> StreamRoad:
-    """Return a scenario's road as input of the rolling planner."""
+    """Return a scenario's road as input for the rolling planner."""
     formation, road = scenario.formation, scenario.road
     mode: Mode = 1 if formation.mode == 1 else 2
     return StreamRoad(

@@ -1,7 +1,7 @@
-"""States and census that a leader has received, as of now and of the previous tick.
+"""States and census that a leader has received, now and one tick ago.
 
-Plans are made from the states at one road time, so they do not depend on message delays. That time
-is at most one tick ago, so the two newest states of each vehicle suffice.
+Each plan is made from the states at one road time, so it does not depend on message delays. That
+time is at most one tick ago, so the two newest states of each vehicle suffice.
 """
 
 from __future__ import annotations
@@ -25,31 +25,31 @@ class Snapshot:
     states: Mapping[Name, VehicleState]
     """States of the vehicles on the road; vehicles without a state are missing."""
     gone: frozenset[Name]
-    """Vehicles in the rosters of pending transfers that had left the road."""
+    """Vehicles in rosters of pending transfers, if they had left the road by then."""
 
 
 class ObservedRoad:
     """The newest and the previous states and census."""
 
     def __init__(self) -> None:
-        """Begin without states and census."""
+        """Begin without states or census."""
         self.states: dict[Name, VehicleState] = {}
         """The newest state of each vehicle on the road."""
         self.census: Census | None = None
         """The newest census."""
         self._before: dict[Name, VehicleState] = {}
-        """Newest state of each vehicle with an earlier time."""
+        """Newest earlier state of each vehicle."""
         self._left: dict[Name, VehicleState] = {}
         """Newest state of each vehicle that has left since the last snapshot."""
         self._census_before: Census | None = None
 
     def forget(self) -> None:
-        """Discard everything: there is another road."""
+        """Discard everything: this is a new road."""
         self.states.clear()
         self.take_over()
 
     def take_over(self) -> None:
-        """Discard positions; what states report of transfers stays true."""
+        """Discard positions; what states report about transfers stays true."""
         self._before.clear()
         self._left.clear()
         self.census = self._census_before = None
@@ -79,7 +79,7 @@ class ObservedRoad:
 
     @property
     def gone(self) -> frozenset[Name]:
-        """Vehicles in the rosters of pending transfers that have left the road."""
+        """Vehicles in rosters of pending transfers, if they have left the road."""
         return _gone(self.states.values(), self.census)
 
     def at(self, t_s: float) -> Snapshot:

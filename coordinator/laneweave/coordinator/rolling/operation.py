@@ -1,9 +1,9 @@
-"""The rolling operation under a leader: all vehicles on the road are planned anew in each slot.
+"""The rolling operation under a leader: all vehicles on the road are replanned in every slot.
 
-Shortly after a slot has begun, the hold cell of every vehicle at its end is known. From these cells
-the rolling planner plans complete paths for all vehicles. While the moves of this slot are in
-progress, their moves in the next slot are put into force by ballots over only the vehicles
-concerned (`transfer`). No vehicle stops for a new plan: a vehicle that misses one holds, and the
+Shortly after a slot begins, every vehicle's hold cell at its end is known. From these cells the
+rolling planner plans complete paths for all vehicles. While the moves of this slot are in progress,
+ballots that include only the vehicles concerned put the moves of the next slot into force
+(`transfer`). No vehicle stops for a new plan: a vehicle that misses one holds, and the
 next plan starts from its cell.
 """
 
@@ -34,17 +34,17 @@ from laneweave.protocol.wire.events import (
 from laneweave.protocol.wire.messages import Ballot, Census, Name, Plan, Prepare, VehicleState
 
 SNAPSHOT_S = 0.5
-"""Time after the beginning of a slot at which all its moves have begun and been reported.
+"""Time into a slot at which all its moves have begun and been reported.
 
-Plans are made from the states up to this time, one tick later, when all of them have arrived. So
-plans do not depend on message delays."""
+Plans are made one tick later, from the states up to this time, all of which have arrived by then.
+So plans do not depend on message delays."""
 LISTEN_S = 0.5
-"""Time for which a new leader only listens (node clock), so that a leader that has missed the
-heartbeats of another one does not outbid its ballots."""
+"""Time for which a new leader only listens (node clock), so that it does not outbid a leader whose
+heartbeats it has missed."""
 MAX_DELAY_S = 1.0
-"""A plan that is ready later than this after the beginning of its slot is dropped."""
+"""A plan that is ready later than this into its slot is dropped."""
 LOOKAHEAD_M = 600.0
-"""Distance before the first moves from which on vehicles are planned for: the length of S3, so that
+"""Distance before the first moves at which planning for a vehicle begins: the length of S3, so that
 all vehicles that can interact there are included in time."""
 MARGIN_COLUMNS = 10
 """Columns ahead of the foremost and behind the rearmost vehicle that plans may use."""
@@ -64,8 +64,8 @@ class RollingOperation:
 
         Args:
             scenario: road, lattice, timing.
-            new_ballot: returns a new ballot, above the given one if there is one.
-            new_job: returns the number of a new computation.
+            new_ballot: returns a new ballot, above the given one, if any.
+            new_job: returns the id of a new computation.
             planner: plans all vehicles.
         """
         self._scenario = scenario
@@ -80,12 +80,12 @@ class RollingOperation:
         self._since: tuple[float, float] | None = None
         """Road time and node clock at which this leader began to receive states."""
         self._ordered: tuple[int, int] | None = None
-        """Numbers of the computation in progress and of the slot that it plans."""
+        """Id of the computation in progress, and index of the slot that it plans."""
         self._newest_slot = -1
         self._last_plan: StreamPlan | None = None
 
     def forget(self) -> None:
-        """Discard everything: there is another road."""
+        """Discard everything: this is a new road."""
         self.take_over()
         self.observed.forget()
         self._last_plan, self._newest_slot = None, -1
@@ -93,7 +93,7 @@ class RollingOperation:
     def take_over(self) -> None:
         """Reset: listen for `LISTEN_S` before planning, and drop the ballots of the earlier term.
 
-        What vehicles have reported of transfers stays true, but not their positions.
+        What vehicles have reported about transfers stays true; their positions do not.
         """
         self.transfers.clear()
         self._transfer_of.clear()
@@ -104,7 +104,7 @@ class RollingOperation:
         """Ignore the clock message: plans are due by road time alone."""
 
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
-        """Handle the state of a vehicle; None: no unfinished ballot depends on it."""
+        """Handle the state of a vehicle; return None if no unfinished ballot depends on it."""
         if not self.observed.on_state(state):
             return None
         if state.promised is not None:
@@ -125,7 +125,7 @@ class RollingOperation:
     def lead(
         self, census: Census, t_s: float, now_s: float, *, changed: bool
     ) -> Iterator[Effect | LogEntry]:
-        """Order the plan of the next slot when it is due; send messages."""
+        """Request the plan for the next slot when it is due; send messages."""
         if changed:
             self.on_census(census)
             yield from self.order(t_s, now_s)
@@ -140,12 +140,12 @@ class RollingOperation:
                 transfer.on_left(name)
 
     def outgoing(self, now_s: float) -> Iterator[tuple[Name, Prepare | Plan]]:
-        """Yield the messages to send or repeat now, each with its receiver."""
+        """Yield the messages to send or resend now, each with its receiver."""
         for transfer in self.transfers:
             yield from transfer.outgoing(now_s)
 
     def order(self, t_s: float, now_s: float) -> Iterator[Compute]:
-        """Order the plan of the next slot when it is due."""
+        """Request the plan for the next slot when it is due."""
         census = self.observed.census
         if census is None:
             return
@@ -178,7 +178,7 @@ class RollingOperation:
         since_s = self._since[0] - 1e-6 if self._since is not None else 0.0
         far_m = self._scenario.moves_from_m - LOOKAHEAD_M
         snapshot = self.observed.at(snapshot_s)
-        # Last: vehicles without a state may have moved, and others may hold in their cells.
+        # Vehicles without a state come last: they may have moved, and others may hold their cells.
         for entry in sorted(
             snapshot.census.on_road, key=lambda entry: entry.vehicle not in snapshot.states
         ):
@@ -209,7 +209,7 @@ class RollingOperation:
         return tuple(vehicles.values()), blocked
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[LogEntry]:
-        """Begin ballots for the first moves of a plan, if it is the newest that was ordered."""
+        """Begin ballots for the first moves of a plan, if it is the one requested last."""
         if self._ordered is None or computed.job != self._ordered[0]:
             return
         slot = self._ordered[1]
@@ -287,12 +287,12 @@ class RollingOperation:
 
     @property
     def wakeups(self) -> list[float]:
-        """Times at which messages are repeated."""
+        """Times at which messages are resent."""
         return [each.wakeup_s for each in self.transfers if each.wakeup_s is not None]
 
     @property
     def in_force(self) -> int:
-        """Number of ballots of this slot that are in force."""
+        """Number of ballots for this slot that are in force."""
         return sum(transfer.phase is BallotPhase.IN_FORCE for transfer in self.transfers)
 
 

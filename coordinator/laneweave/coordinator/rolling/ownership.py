@@ -2,7 +2,7 @@
 
 A plan gives every vehicle of its roster a *pending transfer*: the vehicle owns the cells `before`
 until it knows that the start gate is open, and the cells `after` from then on. A vehicle with a
-closed gate alone cannot determine which of the two holds, since others may have opened theirs.
+closed gate cannot determine alone which of the two applies, since others may have opened theirs.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ def owned_cells(
     """Return the cells that a vehicle owns, from its state and the states of others.
 
     The gate of its pending transfer is open if a vehicle of the roster reports it open. It never
-    opens if one of them has promised a higher ballot without storing the transfer, or if all have
-    promised higher ballots with closed gates. If a vehicle can no longer report the gate, because
-    it has a newer transfer or has left the road, only cells in both `before` and `after` are
-    certain; while the vehicle moves, nothing is, since it may still be in another cell.
+    opens if one of these has promised a higher ballot without storing the transfer, or if all have
+    promised higher ballots with closed gates. If one of these can no longer report the gate,
+    because it has a newer transfer or has left the road, only cells in both `before` and `after`
+    are certain; none are while the queried vehicle moves, since it may still be in another cell.
 
     Args:
         state: state of the vehicle, with owned cells.
-        states: newest states of all vehicles; what they report of transfers stays true.
+        states: newest states of all vehicles; what they report about transfers stays true.
         gone: vehicles that have left the road.
 
     Returns:
@@ -60,7 +60,7 @@ def certain_cells(
 
 
 def partners(state: VehicleState, states: States) -> frozenset[Name]:
-    """Return the vehicles whose promises determine what a vehicle owns; none if it is known."""
+    """Return the vehicles whose promises determine what a vehicle owns; none if that is known."""
     transfer = state.transfer
     if transfer is None or transfer.open:
         return frozenset()
@@ -71,7 +71,7 @@ def partners(state: VehicleState, states: States) -> frozenset[Name]:
 
 
 class _Sign(Enum):
-    """Evidence from one vehicle on the start gate of a transfer; all but `NONE` stays true."""
+    """One vehicle's evidence about the start gate of a transfer; all but `NONE` stays true."""
 
     OPEN = "the gate is open"
     CLOSED = "the vehicle has promised a higher ballot with a closed gate"

@@ -1,8 +1,8 @@
-"""One ballot of the rolling operation: vehicles move, and the cells for it change owners.
+"""One ballot of the rolling operation: vehicles move, and the cells that they need change owners.
 
-The roster is the vehicles that move and the owners of the cells of their footprints. Each vehicle
-makes at most one move, all in one slot. A ballot is aborted if it is outbid, a vehicle restarts, or
-it is not in force in time; its vehicles then hold, and the next slot is planned from there.
+The roster comprises the vehicles that move and the owners of the cells in their footprints. Each
+vehicle makes at most one move, all in one slot. A ballot is aborted if it is outbid, a vehicle
+restarts, or time runs out; its vehicles then hold, and the next slot is planned from there.
 `TRANSFER_RULES` is the table, shown in docs/PROTOCOL.md.
 """
 
@@ -41,7 +41,7 @@ Steps = Mapping[Name, tuple[Cell, Cell]]
 
 @define(kw_only=True)
 class CellTransfer(BallotRound):
-    """A leader's state of a single ballot."""
+    """A leader's state for a single ballot."""
 
     rules: RuleBook = field(factory=lambda: TRANSFER_RULES)
     ballot: Ballot
@@ -51,7 +51,7 @@ class CellTransfer(BallotRound):
     """Road time at which the moves begin."""
     slot_s: float
     gone: frozenset[Name] = frozenset()
-    """Vehicles in the rosters of pending transfers that have left the road."""
+    """Vehicles in rosters of pending transfers, if they have left the road."""
     reason: str = ""
     """Why the ballot was aborted."""
 
@@ -72,11 +72,11 @@ class CellTransfer(BallotRound):
         self.rules.take(self, MEMBERS, f"{vehicle} has left")
 
     def abort(self, reason: str) -> None:
-        """Abort because no time is left, unless the ballot is in force."""
+        """Abort because it is too late, unless the ballot is in force."""
         self.rules.take(self, TOO_LATE, reason)
 
     def _make_plan(self, states: States) -> Plan | str:
-        """Return the plan from the promises, or why it cannot be made."""
+        """Return the plan from the promises, or the reason why there is none."""
         before: dict[Name, frozenset[Cell]] = {}
         for name, promise in self.promises.items():
             owned = owned_cells(promise, dict(states) | self.promises, self.gone)
@@ -113,17 +113,17 @@ def reports_owned_cells(_: CellTransfer, state: VehicleState) -> bool:
 
 
 def record_outbid(transfer: CellTransfer, _: object) -> None:
-    """Abort until the next slot."""
+    """Record the reason; wait for the next slot."""
     transfer.reason = "outbid"
 
 
 def record_restart(transfer: CellTransfer, state: VehicleState) -> None:
-    """Abort until the next slot."""
+    """Record the reason; wait for the next slot."""
     transfer.reason = f"{state.vehicle} has restarted"
 
 
 def record_reason(transfer: CellTransfer, reason: str) -> None:
-    """Abort until the next slot."""
+    """Record the reason; wait for the next slot."""
     transfer.reason = reason
 
 

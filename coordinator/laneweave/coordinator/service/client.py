@@ -6,12 +6,12 @@
     async with AsyncPlanClient("tcp/127.0.0.1:7447") as client:
         response = await client.plan(request, timeout_s=10.0)
 
-A client of a deployment, secured or not, reads its configuration file and has a name:
+A client of a deployment, secured or not, reads the deployment's configuration and has a name:
 
     PlanClient(client_access(Path("deployment.toml"), "dispatch"))
 
-Several threads, or tasks, may share a client. If a coordinator ends before it has answered, the
-client sends the request again under the same id.
+Several threads, or tasks, may share a client. If a coordinator exits before it has answered,
+the client sends the request again under the same id.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ LONGEST_ATTEMPT_S = 86_400.0
 FIRST_PAUSE_S = 0.02
 LONGEST_PAUSE_S = 0.5
 ABSENT_S = 3.0
-"""Time without any answer after which the service counts as absent. The failure of a killed
-coordinator is detected at once, that of a hanging one after `network.lease_s`; a restarted router
-is found in less than a second."""
+"""Time without any answer after which the service counts as absent. A killed coordinator
+is detected at once, a hanging one after `network.lease_s`; a restarted router is found in less than
+a second."""
 
 
 class PlanError(Exception):
@@ -74,7 +74,7 @@ class RequestRefusedError(PlanError):
 
 
 class ServiceUnavailableError(PlanError):
-    """There is no answer because no coordinator can be reached on this network."""
+    """No coordinator on this network can be reached."""
 
 
 class ServiceOverloadedError(PlanError):
@@ -94,7 +94,7 @@ class PendingRequest:
     """One plan request over all attempts: decides what to do after each; pure, without a clock.
 
     A request may be sent repeatedly: coordinators recognise it by its id, and planning it twice is
-    harmless. It is sent again if there is no answer (its coordinator has ended or is disconnected,
+    harmless. It is sent again if there is no answer (its coordinator has exited or is disconnected,
     and the others have not noticed yet), or if its coordinator is overloaded.
     """
 
@@ -117,7 +117,7 @@ class PendingRequest:
         return self.begun_s + self.timeout_s - now_s
 
     def after(self, answer: Answer | None, now_s: float) -> PlanResponse | float:
-        """Return the plan in an answer, or the pause [s] before the request is sent again.
+        """Return the plan in an answer, or the pause [s] before sending the request again.
 
         Raises:
             PlanError: there will be no plan.
@@ -171,19 +171,19 @@ def _parse(answer: Answer) -> dict[str, object]:
 
 
 def client_access(config: Path, name: str = "plan", endpoint: str | None = None) -> Access:
-    """Return the access of a client to the network of a deployment, secured or not.
+    """Return a client's access to the network of a deployment, secured or not.
 
     Args:
-        config: the DEPLOYMENT.toml.
+        config: path of DEPLOYMENT.toml.
         name: name of the client; in a secured deployment its certificate is `client.NAME`.
-        endpoint: endpoint of the router; overrides that of the file.
+        endpoint: the router's endpoint; overrides the one in the file.
 
     Raises:
         BadInputError: the file is not valid, or there is no endpoint.
     """
     scenario = load_scenario(config, network__endpoint=endpoint)
     if not scenario.network.endpoint:
-        raise BadInputError("network.endpoint", "", "an endpoint, in the file or beside it")
+        raise BadInputError("network.endpoint", "", "an endpoint, in the file or as an argument")
     return access_of(scenario, Identity(Party.CLIENT, name).common_name)
 
 
@@ -231,13 +231,13 @@ class PlanClient(_Connection):
 
         Args:
             request: the request; if it has no id, it gets one.
-            timeout_s: timeout of all attempts together.
+            timeout_s: timeout for all attempts together.
 
         Raises:
             RequestRefusedError: the request is not valid.
             ServiceUnavailableError: there is no coordinator, or this client is closed.
             ServiceOverloadedError: the coordinators were overloaded at every attempt.
-            DeadlinePassedError: no worker was free before its deadline.
+            DeadlinePassedError: no worker was free before the request's deadline.
             PlanningFailedError: an error occurred in the service.
             TimeoutError: no answer within `timeout_s`.
         """

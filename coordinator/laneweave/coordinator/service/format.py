@@ -1,4 +1,4 @@
-"""Encoding of requests and answers as JSON or MessagePack; answers use that of their request."""
+"""Encoding of requests and answers as JSON or MessagePack; answers use their request's encoding."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Refusal:
     message: str
     """One readable line."""
     field: str
-    """The invalid field of the request; empty: none in particular."""
+    """The invalid field of the request; empty: no particular field."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the error reply as a map."""
@@ -88,6 +88,6 @@ def format_of(payload: bytes, encoding: str) -> Format:
     for form in (JSON, MSGPACK):
         if kind == form.encoding:
             return form
-    # Only a byte-order mark makes a JSON text begin with a byte that begins a MessagePack map.
+    # Only with a byte-order mark can JSON text begin like a MessagePack map.
     looks_packed = payload[:1] >= b"\x80" and not payload.startswith(codecs.BOM_UTF8)
     return MSGPACK if looks_packed else JSON

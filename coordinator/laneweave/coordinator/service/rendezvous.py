@@ -1,9 +1,9 @@
 """Rendezvous hashing: assigns each request to one of several coordinators.
 
 Each coordinator hashes every name with the request; the highest hash wins. Coordinators that know
-the same names agree. When one ends, only its requests are assigned anew. While the known names
-differ, a request may be assigned to two coordinators, which make the same plan, or to none; the
-client then sends it again.
+the same names agree. When one exits, only its requests are reassigned. While their known names
+differ, a request may be assigned to two coordinators, which make the same plan, or to none, so that
+the client sends it again.
 
 Thaler and Ravishankar, "Using name-based mappings to increase hit rates", IEEE/ACM Transactions on
 Networking 6(1), 1998.

@@ -1,9 +1,9 @@
 """The planning service: answers plan requests from clients on the network.
 
 Every coordinator receives every request and accepts those that are assigned to it (`rendezvous`),
-so any number of coordinators share the load without messages between them. A request waits until a
-worker is free, at most until its deadline, and is planned in the remaining time. A repeated request
-with the same id gets the same answer.
+so any number of coordinators share the load without messages between them. A request waits for a
+free worker until its deadline at the latest, and is planned in the remaining time. A repeated
+request with the same id gets the same answer.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class ServiceMetrics:
     left_total: int = metric("Requests assigned to other coordinators", default=0)
     answered_total: int = metric("Requests planned and answered", default=0)
     repeated_total: int = metric(
-        "Repeated requests, by id, that got the answer of an earlier one", default=0
+        "Repeated requests (same id) that got the earlier answer", default=0
     )
     invalid_total: int = metric("Requests refused because they are not valid", default=0)
     overloaded_total: int = metric("Requests refused because of overload", default=0)
@@ -64,7 +64,7 @@ class ServiceMetrics:
     failed_total: int = metric("Requests whose planning failed", default=0)
     planning_seconds_total: float = metric("Time spent in solvers", default=0.0)
     service_seconds_total: float = metric(
-        "Time from the arrival of requests to their answers, without solvers", default=0.0
+        "Time from the arrival of requests to their answers, excluding solvers", default=0.0
     )
     waiting: int = metric("Requests waiting for a worker", default=0)
     planning: int = metric("Requests handed to workers", default=0)
@@ -80,7 +80,7 @@ class _Entry:
     clients: list[tuple[int, Format]] = field(factory=list)
     """Token and format of each query that waits for the answer."""
     dropped: bool = False
-    """Whether the request was answered before its computation ended."""
+    """Whether the request was answered before its computation finished."""
 
     @property
     def deadline_s(self) -> float:
@@ -113,7 +113,7 @@ class PlanningService:
         Args:
             name: name of the coordinator.
             settings: limits.
-            workers: number of requests that are planned at a time.
+            workers: number of requests to plan concurrently.
             plan: plans one request, in a worker process.
             solver: solver for requests that name none.
         """
@@ -164,7 +164,7 @@ class PlanningService:
             token: token of the query.
             payload: encoded request.
             encoding: MIME type given by the client, if any.
-            job: number for the computation of the request.
+            job: id for the computation of the request.
             others: names of the other live coordinators.
             now_s: node clock.
         """
@@ -251,7 +251,7 @@ class PlanningService:
             yield Delegate(entry.job, job, entry.deadline_s)
 
     def finish(self, job: int, result: object, error: str, now_s: float) -> Iterator[Effect]:
-        """Answer a request whose computation has ended."""
+        """Answer a request whose computation has finished."""
         entry = self._planning.pop(job)
         if not entry.dropped:
             yield from self._end(entry, self._outcome(entry, result, error, now_s), now_s)
@@ -268,7 +268,7 @@ class PlanningService:
         return Refusal(FAILED, f"planning failed: {error}", "")
 
     def drop_late(self, now_s: float) -> Iterator[Effect]:
-        """Drop requests that have waited until their deadlines."""
+        """Drop requests whose deadlines have passed while waiting."""
         late = [entry for entry in self._not_begun() if entry.deadline_s <= now_s]
         for entry in late:
             if entry.job in self._planning:
@@ -287,7 +287,7 @@ class PlanningService:
         return Refusal(LATE, text, "deadline_s")
 
     def _end(self, entry: _Entry, answer: PlanResponse | Refusal, now_s: float) -> Iterator[Effect]:
-        """Answer all queries for a request, and cache a plan."""
+        """Answer all queries for a request; if the answer is a plan, cache it."""
         if isinstance(answer, PlanResponse):
             self._count("answered_total")
             planned_s = answer.solve_ms / 1e3

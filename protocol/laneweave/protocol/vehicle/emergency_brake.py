@@ -1,9 +1,9 @@
 """The emergency brake: decides from a vehicle's own sensors whether it must brake now.
 
-At each tick, the vehicle compares two stopping points: that of the vehicle ahead if it brakes as
-hard as it can from now on, and its own if it brakes from the next tick on. If the second is behind
-the first, it continues for one tick. Otherwise it brakes now, without jerk limit, because
-jerk-limited braking would be too late. By induction there is no impact (docs/SAFETY.md has the
+At each tick, the vehicle compares two stopping points: that of the vehicle ahead under full braking
+from now on, and its own under braking from the next tick on. If its own is behind the other, it
+continues for one tick. Otherwise it brakes now, without a jerk limit, because jerk-limited braking
+would be too late. By induction there is no impact (docs/SAFETY.md has the
 derivation, with measurement errors).
 
 A body that moves at v with acceleration a and brakes with b through a first-order lag L travels
@@ -37,7 +37,7 @@ def stopping_distance_m(
         speed_mps: initial speed, >= 0.
         accel_mps2: initial acceleration.
         brake_mps2: commanded deceleration, > 0.
-        lag_s: time constant with which the acceleration approaches it.
+        lag_s: time constant with which the acceleration approaches the command.
     """
     change = accel_mps2 + brake_mps2
     gained = speed_mps + lag_s * change
@@ -47,9 +47,9 @@ def stopping_distance_m(
 
 
 def own_braking_mps2(scenario: Scenario) -> float:
-    """Return the deceleration that a vehicle assumes for itself: not above that of the one ahead.
+    """Return the deceleration a vehicle assumes for itself: at most that of the vehicle ahead.
 
-    If it braked harder, the gap could be smallest before both stand still.
+    If it braked harder, the gap could be smallest before both have stopped.
     """
     return min(-scenario.vehicle.min_accel_mps2, scenario.braking.lead_brake_mps2)
 
@@ -71,7 +71,7 @@ def spare_error_m(scenario: Scenario, speed_mps: float) -> float:
 
     Args:
         scenario: tables `sensing`, `braking` and `vehicle`.
-        speed_mps: speed of the vehicle; the one ahead drives at v_F.
+        speed_mps: speed of the vehicle; the vehicle ahead drives at v_F.
     """
     noise, assumed, limits = scenario.sensing, scenario.braking, scenario.vehicle
     own_s = limits.actuator_lag_s + assumed.reaction_s + speed_mps / own_braking_mps2(scenario)
@@ -86,7 +86,7 @@ def spare_error_m(scenario: Scenario, speed_mps: float) -> float:
 
 
 def last_tick_m(brake_mps2: float, tick_s: float) -> float:
-    """Return the maximum extra distance of braking that ends with a whole tick.
+    """Return the maximum extra distance due to braking that ends on a whole tick.
 
     In its last tick a body brakes just hard enough to stand still at the end of the tick.
     """
@@ -94,10 +94,10 @@ def last_tick_m(brake_mps2: float, tick_s: float) -> float:
 
 
 class EmergencyBrake:
-    """Decides when a vehicle must brake, independent of its commands."""
+    """Decides when a vehicle must brake, independently of its commands."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Take the assumptions from the tables `braking` and `vehicle`, and the tick."""
+        """Take the tick and the assumptions in the tables `braking` and `vehicle`."""
         limits, assumed = scenario.vehicle, scenario.braking
         self._brake_mps2 = own_braking_mps2(scenario)
         self._lag_s = limits.actuator_lag_s

@@ -14,8 +14,8 @@ tracker and the references use commanded states. The constant lag v_F is left ou
 that holds has equal true and commanded states.
 
 All functions are pure functions of floats. The agent plans with them, the motion controller drives
-with them when the agent's commands end, and the plant integrates with them, so the results of all
-three are bit-identical.
+with them when the agent's commands run out, and the plant integrates with them, so the results of
+all three are bit-identical.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Jerk = tuple[float, float]
 
 ARRIVED_ALONG_M = 0.5
 ARRIVED_ACROSS_M = 0.3
-"""Distance from the target point at which a body has arrived, after the time of the motion."""
+"""Distances from the target point at which a body has arrived once the motion's time has passed."""
 
 # Poles of the hold law near -0.6 and -1.2 +- 0.8i 1/s: hardly any overshoot, and slow enough for
 # ticks of 0.1 s.
@@ -52,12 +52,12 @@ _CATCH_UP_SHARE = 0.25
 """Maximum speed towards the cell along the road, as a fraction of the cell's speed."""
 
 _PLENTY = 0.3
-"""More than the 1/4 of `_min_accel`, with ample room for rounding errors."""
+"""More than the 1/4 in `_min_accel`, with ample room for rounding errors."""
 
 _OPEN_GAIN = 0.6
-"""Speed at which a gap that is too small is widened, per missing metre [1/s]."""
+"""Speed at which too small a gap is widened, per missing metre [1/s]."""
 _SETTLE_TICKS = 2.0
-"""Number of ticks within which the safe speed is reached."""
+"""Number of ticks in which the safe speed is reached."""
 
 
 def integrate(state: State, jerk: Jerk, tick_s: float) -> State:
@@ -121,7 +121,7 @@ def limited_jerk(state: State, jerk: Jerk, limits: Vehicle, tick_s: float) -> Je
     for the acceleration to return to zero before the vehicle would roll backwards. From a state
     that was reached within the limits, the jerk limits suffice. From other states (after an
     emergency brake) the speed limits take precedence over the jerk limits, and the acceleration
-    limits over the speed limits. The state must be finite; a jerk that is NaN counts as zero.
+    limits over the speed limits. The state must be finite; a NaN jerk counts as zero.
     """
     _, v, a, _, v_y, a_y = state
     a_next = limited_accel(v, a, jerk[0], limits, tick_s)
@@ -132,7 +132,7 @@ def limited_jerk(state: State, jerk: Jerk, limits: Vehicle, tick_s: float) -> Je
 def limited_accel(v: float, a: float, jerk: float, limits: Vehicle, tick_s: float) -> float:
     """Return the acceleration along the road after a tick of the jerk that `limited_jerk` allows.
 
-    `v`, `a` and `jerk` are along the road in m and s; a jerk that is NaN counts as zero.
+    `v`, `a` and `jerk` are longitudinal, in SI units; a NaN jerk counts as zero.
     """
     j_max = limits.max_jerk_mps3
     step = j_max * tick_s
@@ -158,7 +158,7 @@ def _limited_lateral_accel(
     """Return the acceleration across the road after a tick of the jerk that `limited_jerk` allows.
 
     Args:
-        motion: (v, a, v_y, a_y) in m and s.
+        motion: (v, a, v_y, a_y) in SI units.
         a_next: acceleration along the road after the tick [m/s2].
         jerk: requested j_y [m/s3]; NaN counts as zero.
         limits: the vehicle's limits.
@@ -219,7 +219,7 @@ def keep_gap(
     min_gap_m: float,
     tick_s: float,
 ) -> Jerk:
-    """Return `jerk`, or one that brakes harder if this is needed to stay behind other vehicles.
+    """Return `jerk`, or one that brakes harder if necessary to stay behind other vehicles.
 
     The safe speed after Gipps ("A behavioural car-following model for computer simulation",
     Transportation Research B 15, 1981): if the vehicle ahead brakes with b to standstill, this one,
@@ -232,10 +232,10 @@ def keep_gap(
     accelerating; the speed that it gains until then is added, too.
 
     There are two exceptions. A vehicle at least `min_gap_m` behind may always be as fast as the one
-    ahead, so a queue at equal speed keeps its gaps; if they are below v T, it relies on `min_gap_m`
-    when the first vehicle brakes. A vehicle closer than `min_gap_m` falls back. Since time is
-    discrete, up to 0.1 m of the gap may be missing with ticks of 0.1 s, and up to 2 m with ticks of
-    0.4 s (measured). The result keeps the limits as in `limited_jerk`.
+    ahead, so a queue at equal speed keeps its gaps; if these are below v T, the queue relies on
+    `min_gap_m` when its first vehicle brakes. A vehicle closer than `min_gap_m` falls back. Since
+    time is discrete, up to 0.1 m of the gap may be missing with ticks of 0.1 s, and up to 2 m with
+    ticks of 0.4 s (measured). The result keeps the limits as in `limited_jerk`.
 
     Args:
         state: finite state.
@@ -247,7 +247,7 @@ def keep_gap(
     """
     _, v, a, _, _, _ = state
     brake = -_BRAKE_SHARE * limits.min_accel_mps2
-    # Limited jerk ends an acceleration only after some time.
+    # With limited jerk, an acceleration ends only after some time.
     fade_s = max(a, 0.0) / limits.max_jerk_mps3
     gained_v = max(a, 0.0) * (0.5 * fade_s + tick_s)
     delay_s = brake / (2.0 * limits.max_jerk_mps3) + 2.0 * tick_s + fade_s
@@ -272,10 +272,10 @@ def _clamp(value: float, low: float, high: float) -> float:
 def _min_accel(share: float, step: float) -> float:
     """Return the minimum rate after this tick with which a speed can stay above its lower bound.
 
-    The margin is the speed above that bound [m/s] and the rate its derivative [m/s2]. Raising the
-    rate from -x jerk tick_s to zero, by whole ticks at full jerk and a partial one, uses
-    jerk tick_s^2 / 2 times the linear interpolation of m^2 at x of the margin, and this tick uses
-    the mean of both rates. The minimum rate uses all of the margin:
+    The margin is the speed above that bound [m/s], the rate its derivative [m/s2]. Raising the rate
+    from -x jerk tick_s to zero, in whole ticks at full jerk and a partial one, reduces the margin
+    by jerk tick_s^2 / 2 times the linear interpolation of m^2 at x; this tick changes it by tick_s
+    times the mean of both rates. The minimum rate uses up the margin:
 
         x + interp(m^2)(x) = 2 (margin + rate tick_s / 2) / (jerk tick_s^2)
 

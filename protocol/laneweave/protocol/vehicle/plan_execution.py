@@ -2,7 +2,7 @@
 
 A vehicle holds its cell until all conditions of its next move are *known* to be true: it has
 accepted a plan, every member of the roster has reported that it accepted the same plan (start
-gate), and every vehicle with an earlier interfering move has reported its completion. The clock can
+gate), and every vehicle with an earlier interfering move has reported completing it. The clock can
 delay moves, but never release one; without messages vehicles hold. `VEHICLE_RULES` is the table;
 the first lines of its guards and actions are shown in docs/PROTOCOL.md. docs/SAFETY.md has the
 proof.
@@ -31,7 +31,7 @@ from laneweave.protocol.wire.messages import (
 )
 
 LISTEN_S = 1.0
-"""Time before a move is due at which the vehicle subscribes to the states of the others."""
+"""Lead time before a move is due at which the vehicle subscribes to the others' states."""
 OVERDUE_SLOTS = 1.5
 OVERDUE_S = 2.0
 """A move that has been due for 1.5 slots, or a slot and 2 s if that is less, is overdue."""
@@ -63,7 +63,7 @@ GATE, TICK, REST = "tick (gate)", "tick (move)", "motion ends"
 class PlanExecution:
     """State machine of one vehicle: handles messages and ticks, and decides when moves begin.
 
-    It begins without promise and plan (V1). `hold_cell`, `moving`, `joined`, `owned` and
+    It begins without a promise or a plan (V1). `hold_cell`, `moving`, `joined`, `owned` and
     `stored_transfer` mirror the motion controller, which outlives this object.
     """
 
@@ -89,11 +89,11 @@ class PlanExecution:
     t_s: float = 0.0
     """Road time of the tick."""
     promise_stored: bool = False
-    """Whether the motion controller has stored the promise; only then it counts."""
+    """Whether the motion controller has stored the promise; only then does it count."""
     owned: frozenset[Cell] | None = None
     """Cells that the vehicle owns, as stored by the controller; None: formations own blocks."""
     transfer: PendingTransfer | None = None
-    """Transfer of the newest plan that was taken."""
+    """Transfer in the newest plan taken."""
     stored_transfer: PendingTransfer | None = None
     """Newest transfer that the controller has stored."""
     rules: RuleBook = field(factory=lambda: VEHICLE_RULES)
@@ -103,19 +103,19 @@ class PlanExecution:
         self.wanted_joined = self.joined
 
     def on_prepare(self, prepare: Prepare) -> bool:
-        """V2: promise a ballot; return whether the state should be published at once."""
+        """V2: promise a ballot; return whether to publish the state at once."""
         return self.rules.take(self, PREPARE, prepare) is not None
 
     def on_plan(self, plan: Plan) -> bool:
-        """V3: take the plan of the promised ballot, once; return whether it is taken now.
+        """V3: take the promised ballot's plan, once; return whether it was taken now.
 
-        A plan that cannot be executed safely is never taken. A taken plan is accepted when the
+        A plan that cannot be executed safely is never taken. A taken plan is accepted once the
         motion controller has stored it for this process (`on_stored`).
         """
         return self.rules.take(self, PLAN, plan) is not None
 
     def on_stored(self, ballot: Ballot | None) -> bool:
-        """V3: handle the accepted plan that the controller reports; return whether that is new."""
+        """V3: handle the accepted plan that the controller reports; return whether it is new."""
         return self.rules.take(self, STORED, ballot) is not None
 
     def on_joined(self, formations: tuple[int, ...]) -> bool:
@@ -132,7 +132,7 @@ class PlanExecution:
     def on_owned(self, sense: Sense) -> bool:
         """Copy what the controller stores; return whether the promise is newly stored.
 
-        A promise of an earlier process binds this one and is treated like a PREPARE. No effect if
+        A promise from an earlier process binds this one and is treated like a PREPARE. No effect if
         formations own blocks.
         """
         if self.owned is None:
@@ -157,7 +157,7 @@ class PlanExecution:
         return self.next_move
 
     def end_motion(self) -> None:
-        """V7: handle the end of the current motion."""
+        """V7: complete the current motion."""
         self.rules.take(self, REST, None)
 
     @property
@@ -177,7 +177,7 @@ class PlanExecution:
 
     @property
     def done(self) -> bool:
-        """Whether all moves of the accepted plan are completed."""
+        """Whether all moves of the accepted plan are complete."""
         return self.accepted and self.next_move is None
 
     @property
@@ -226,8 +226,8 @@ class PlanExecution:
     def needs_states(self, t_s: float) -> bool:
         """Return whether the states of other vehicles are needed now.
 
-        They are needed until the gate is open, and from `LISTEN_S` before the next move is due
-        until it is released. States are repeated, so missing some in between is harmless.
+        They are needed until the gate opens, and from `LISTEN_S` before the next move is due until
+        it is released. States are repeated, so missing some in between is harmless.
         """
         plan = self.plan
         if plan is None:
@@ -241,7 +241,7 @@ class PlanExecution:
 
     @property
     def next_move(self) -> PlannedMove | None:
-        """First move of the plan that is not completed; None: there is none."""
+        """First move of the plan not yet completed; None: there is none."""
         if self.plan is None or self.completed >= len(self.plan.moves[self.vehicle]):
             return None
         return self.plan.moves[self.vehicle][self.completed]

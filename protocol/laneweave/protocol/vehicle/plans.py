@@ -17,7 +17,7 @@ Needs = dict[Name, int]
 
 
 def dependencies(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
-    """Return for each move of a vehicle how many moves others must have completed before.
+    """Return, for each move of a vehicle, how many moves others must complete first.
 
     For a move in step s and another vehicle A, this is 1 + the index of A's last move before step s
     whose footprint intersects that of the move. Vehicles without such a move are left out.
@@ -39,9 +39,9 @@ def dependencies(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
 def plan_problems(plan: Plan) -> list[str]:
     """Return the reasons why a plan cannot be executed safely; empty: it can.
 
-    The maps must cover the roster, and slots have a positive length. The moves of each vehicle must
-    form a chain of neighbouring cells from its start cell, with ascending steps. The cells that
-    vehicles occupy during a step (footprint of a move, or hold cell) must be disjoint. The
+    The maps must cover the roster, and slots must have a positive length. The moves of each vehicle
+    must form a chain of neighbouring cells from its start cell, with ascending steps. The cells
+    that vehicles occupy during a step (footprint of a move, or hold cell) must be disjoint. The
     territory must contain all occupied cells.
     """
     problems = list(_roster_problems(plan))
