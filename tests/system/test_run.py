@@ -69,7 +69,7 @@ def test_a_run_prints_a_table_and_nothing_else(finished_run: FinishedRun) -> Non
     folder = finished_run("zenoh")
 
     out = (folder / "stdout.txt").read_text(encoding="utf-8")
-    assert "on their preferred lane" in out
+    assert "in their preferred lane" in out
     assert "(100.00%)" in out
     assert "FAILED" not in out
     err = (folder / "stderr.txt").read_text(encoding="utf-8")

@@ -1,7 +1,7 @@
 """`laneweave bench planner`: seeded formations of growing size (`request_families`).
 
-Measures the CPU time of one thread with loaded compiled parts: median and 95th percentile over the
-instances of a size and family. Instances that reach the deadline count with the deadline.
+Measures single-thread CPU time with compiled code loaded: median and 95th percentile over the
+instances of a size and family. An instance that reaches the deadline counts as taking that long.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from laneweave.sim_bridge.recording.trips import percentiles_of
 
 @attrs.frozen
 class Family:
-    """A motion mode with conflict kinds, and the generator of the formations.
+    """A motion mode, conflict kinds, and a generator of formations.
 
-    make: a function of `request_families`, called with a seed.
+    make: a function from `request_families`, called with a seed.
     """
 
     mode: Mode
@@ -82,11 +82,11 @@ def bench_planner(
 
     Args:
         vehicles: formation sizes.
-        families: some of `FAMILIES`.
+        families: names from `FAMILIES`.
         instances: number of instances per size and family.
-        seed: of the first instance; each further one adds 1.
-        deadline_s: of each request.
-        solver: runs without a fallback; see `plan`.
+        seed: seed of the first instance; it increases by 1 per instance.
+        deadline_s: deadline of each request.
+        solver: solver to run, without a fallback; see `plan`.
 
     Yields:
         One row per family and size.
@@ -133,7 +133,7 @@ def _measured(requests: Sequence[PlanRequest], solver: str) -> dict[str, Any]:
 
 
 def _plan(request: PlanRequest, solver: str) -> PlanResponse:
-    """Plan within a deadline in CPU time, so that other processes do not change the results."""
+    """Plan within a deadline in CPU time, so that other processes do not affect the results."""
     return plan(request, solver=solver, fallback=False, clock=time.thread_time)
 
 

@@ -1,9 +1,9 @@
 """Seeded families of planning requests, for `laneweave bench planner` and for tests.
 
-Vehicles prefer random lanes, and the targets are parallel: as many on each lane as vehicles prefer
-it. In `block_request` and `formation_request` vehicles start interlaced (on a checkerboard), and
-the targets are in the middle columns. In `traffic_request` the starts are those of random traffic,
-and `targets.placements` places the targets as for a formation on the road.
+Vehicles prefer random lanes, and the targets are parallel: each lane has one per vehicle that
+prefers it. In `block_request` and `formation_request`, vehicles start interlaced (on a
+checkerboard), and the targets are in the middle columns. In `traffic_request`, random traffic
+defines the starts, and `targets.placements` places the targets as for a formation on the road.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def traffic_request(
     conflicts: Sequence[str] = TRAFFIC_KINDS,
     deadline_s: float = 4.0,
 ) -> PlanRequest:
-    """Return a formation that random traffic forms on three lanes.
+    """Return a formation that random traffic forms in three lanes.
 
     The volume is between 1000 and 2000 veh/(lane h). A formation has 3 to 7 columns: it ends with
     its last vehicle, before a column with too many vehicles, or with its seventh column. The second
@@ -103,14 +103,14 @@ def traffic_request(
 
 @attrs.define
 class _Vehicle:
-    """A vehicle that arrives on a lane at a time [s] and prefers a lane."""
+    """A vehicle's arrival time [s] in its lane, and its preferred lane."""
 
     arrival_s: float
     preferred_lane: int
 
 
 class _Arrivals:
-    """Vehicles that arrive on each lane while one column of cells passes per second.
+    """Vehicles that arrive in each lane while one column of cells passes per second.
 
     A headway is 1 s plus an exponentially distributed time.
     """
@@ -124,7 +124,7 @@ class _Arrivals:
         self._last_s = [0.0] * _TRAFFIC_LANES
 
     def _first_vehicles(self) -> list[tuple[int, _Vehicle]]:
-        """Return lane and vehicle of those that may enter the next column, in order of arrival."""
+        """Return (lane, vehicle) pairs that may enter the next column, in order of arrival."""
         first = []
         for lane, queue in enumerate(self._waiting):
             while not queue or self._last_s[lane] <= self._column:
@@ -136,7 +136,7 @@ class _Arrivals:
         return sorted(first, key=lambda head: (head[1].arrival_s, head[0]))
 
     def formation(self) -> tuple[int, list[tuple[Cell, int]]]:
-        """Return the columns of the next formation, and cell and preferred lane of its vehicles."""
+        """Return the next formation's column count, and each vehicle's cell and preferred lane."""
         shortest, longest = _TRAFFIC_COLUMNS
         self._column = max(
             self._column, math.ceil(min(q[0].arrival_s for q in self._nonempty_queues()))
@@ -148,7 +148,7 @@ class _Arrivals:
             preferred = [preferred_lane for _, _, preferred_lane in entered]
             entering = []
             for lane, vehicle in self._first_vehicles():
-                # A vehicle waits if the formation is too short for all who prefer its lane.
+                # A vehicle waits if its preferred lane has no target left for it.
                 if preferred.count(vehicle.preferred_lane) < max_per_lane:
                     preferred.append(vehicle.preferred_lane)
                     entering.append(lane)
@@ -186,7 +186,7 @@ def _checkerboard(vehicles: int, columns: int, lanes: int, first_column: int) ->
 def _preferred_lanes(rng: random.Random, vehicles: int, lanes: int, columns: int) -> list[int]:
     """Draw preferred lanes until no lane is preferred by more vehicles than it has columns."""
     if vehicles > columns * lanes:
-        raise ValueError(f"{vehicles} vehicles do not fit on {lanes} lanes of {columns} columns")
+        raise ValueError(f"{vehicles} vehicles do not fit in {lanes} lanes of {columns} columns")
     while True:
         preferred = [rng.randrange(lanes) for _ in range(vehicles)]
         if all(preferred.count(lane) <= columns for lane in range(lanes)):

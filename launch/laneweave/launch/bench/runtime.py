@@ -29,7 +29,7 @@ from laneweave.sim_bridge.recording.trips import percentiles_of
 ROLES = ("router", "coordinator", "bridge", "agent")
 CPU_PERIOD_S = 0.3
 WARM_UP_S = 10.0
-"""Time on the road between the filled road and the first measurement."""
+"""Road time from when the road is full to the first measurement."""
 
 
 @define
@@ -39,7 +39,7 @@ class _Window:
     begin_s: float
     end_s: float
     seen: dict[str, tuple[psutil.Process, float]] = field(factory=dict)
-    """Each process, and its CPU time at the last measurement."""
+    """Each process and its CPU time at the last measurement."""
     measured_s: float = 0.0
     began: tuple[float, float] | None = None
     ended: tuple[float, float] | None = None
@@ -80,7 +80,7 @@ class _Window:
 
 
 def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int) -> dict[str, Any]:
-    """Measure a run with about `vehicles` on the road and `per_process` of them per process.
+    """Measure a run with about `vehicles` vehicles on the road, `per_process` in each process.
 
     Returns:
         Real-time factor, tick time, CPU and memory per role, over `seconds` of road time.
@@ -117,7 +117,7 @@ def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int)
 
 
 def machine() -> dict[str, Any]:
-    """Return the properties of the machine that the figures depend on."""
+    """Return the properties of the machine on which the figures depend."""
     return {
         "cores": os.cpu_count(),
         "python": platform.python_version(),

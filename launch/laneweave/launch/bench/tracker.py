@@ -1,8 +1,8 @@
-"""`laneweave bench tracker`: CPU time of one tick of tracking.
+"""`laneweave bench tracker`: CPU time of tracking per tick.
 
 Ticks are recorded in seeded closed loops with small measurement errors: situations in which another
 vehicle limits the motion, and undisturbed holds and moves. They are then solved again in order,
-several times; the result is the median of each tick. CPU time of one thread.
+several times; the result is each tick's median CPU time on one thread.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ class Episode:
     reference: Reference
     ticks: int
     rear_m: Callable[[Array], Array] | None = None
-    """Rear bumper of the vehicle ahead at given times [s]."""
+    """Function that returns the vehicle ahead's rear bumper positions at given times [s]."""
     seen_s: float = 0.0
-    """Time at which that vehicle is first seen."""
+    """Time at which the vehicle ahead is first seen."""
     planned: bool = True
-    """Whether its motion is known; otherwise it is sensed and extrapolated."""
+    """Whether the motion of the vehicle ahead is known; otherwise it is extrapolated."""
     pushes: tuple[tuple[float, float], ...] = ()
-    """Changes of position [m] and speed [m/s] that are applied to the body every `_PUSH_TICKS`."""
+    """Changes in position [m] and speed [m/s] that are applied to the body every `_PUSH_TICKS`."""
 
 
 @frozen(eq=False)
@@ -66,8 +66,8 @@ def drive(tracker: Tracker, scenario: Scenario, name: str, seed: str) -> Iterato
     Args:
         tracker: a new tracker.
         scenario: limits, tick and horizon.
-        name: of the situation, see `SITUATIONS`.
-        seed: of the episode.
+        name: name of the situation; see `SITUATIONS`.
+        seed: seed of the episode.
     """
     rng = random.Random(seed)  # noqa: S311 (not for secrets)
     episode = SITUATIONS[name](scenario, rng)
@@ -97,7 +97,7 @@ def bench_tracker(
     Args:
         scenario: limits, tick and horizon.
         instances: episodes per situation.
-        seed: of all episodes.
+        seed: seed for all episodes.
         repeats: number of measurements of each tick.
 
     Returns:
@@ -162,7 +162,7 @@ def tracker_table(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def _predicted(episode: Episode, now_s: float, ahead_s: Array) -> Array | None:
-    """Return the predicted positions of the rear bumper ahead; None: no vehicle is seen."""
+    """Return the predicted rear bumper positions of the vehicle ahead; None: none is seen."""
     if episode.rear_m is None or now_s < episode.seen_s:
         return None
     if episode.planned:
@@ -181,14 +181,14 @@ def _as_state(numbers: Array) -> State:
 def _braking(
     scenario: Scenario, gap_m: float, start_s: float, decel: float, speed_mps: float
 ) -> Callable[[Array], Array]:
-    """Return the rear bumper's position over time of a vehicle that brakes from v_F.
+    """Return the rear bumper position, as a function of time, of a vehicle that brakes from v_F.
 
     Args:
-        scenario: v_F.
+        scenario: defines v_F.
         gap_m: initial distance from the front bumper of a vehicle in column 0.
-        start_s: time at which it begins to brake.
-        decel: its deceleration [m/s2].
-        speed_mps: its final speed.
+        start_s: time at which the vehicle begins to brake.
+        decel: deceleration [m/s2].
+        speed_mps: final speed.
     """
     before_mps = scenario.lattice.speed_mps
     until_s = (before_mps - speed_mps) / decel
@@ -221,7 +221,7 @@ def _closing(scenario: Scenario, rng: random.Random) -> Episode:
 
 
 def _falling_back(scenario: Scenario, rng: random.Random) -> Episode:
-    """Return a late move to the rear from close behind a vehicle that brakes."""
+    """Return a late backward move that begins close behind a braking vehicle."""
     start_s, decel, speed_mps = rng.uniform(0.5, 2.0), rng.uniform(1.0, 3.0), rng.uniform(8.0, 12.0)
     rear = _braking(scenario, rng.uniform(4.0, 10.0), start_s, decel, speed_mps)
     reference = Reference.move(scenario, (0, 1), (-1, 1), rng.randrange(15))
@@ -241,10 +241,10 @@ def _pushes(rng: random.Random) -> tuple[tuple[float, float], ...]:
 
 
 def _entering(scenario: Scenario, rng: random.Random) -> Episode:
-    """Return a change into a lane in which a slow vehicle is seen when the change begins."""
+    """Return a change to a lane in which a slow vehicle is seen when the change begins."""
     start, tick_s = rng.randrange(10), scenario.runtime.tick_s
     seen_s, gap_m, speed_mps = start * tick_s, rng.uniform(4.0, 10.0), rng.uniform(8.0, 12.0)
-    # It has its final speed when it is first seen.
+    # The vehicle ahead is at its final speed when it is first seen.
     rear = _braking(scenario, gap_m, seen_s - tick_s, 15.0 / tick_s, speed_mps)
     reference = Reference.move(scenario, (0, 1), (0, rng.choice((0, 2))), start)
     return Episode(reference, 80, rear, seen_s, planned=_is_planned(rng))
@@ -256,7 +256,7 @@ def _is_planned(rng: random.Random) -> bool:
 
 
 def _undisturbed(scenario: Scenario, rng: random.Random) -> Episode:
-    """Return a hold or a move, in half of the episodes with a vehicle two cells ahead."""
+    """Return a hold or a move; in half of the episodes there is a vehicle two cells ahead."""
     dx, dy = rng.choice([(0, 0), (0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
     reference = Reference.move(scenario, (0, 1), (dx, 1 + dy), 10) if dx or dy else None
     reference = reference or Reference.hold(scenario, (0, 1))

@@ -42,7 +42,7 @@ def lane_names(lanes: int) -> tuple[str, ...]:
 
 
 def road_scene(scenario: Scenario) -> dict[str, Any]:
-    """Return road, bodies, lattice and colours in the format of `web/road.js`."""
+    """Return the road, bodies, lattice and colours in the format that `web/road.js` reads."""
     road, formation = scenario.road, scenario.formation
     return {
         "road": {

@@ -1,4 +1,4 @@
-"""Create figures, write texts into them, and save them.
+"""Create figures, write text into them, and save them.
 
 matplotlib is imported when the first figure is drawn, so that the command line starts fast.
 """
@@ -40,7 +40,7 @@ def write(
     size_pt: float,
     **style: Any,  # noqa: ANN401 (properties of a text)
 ) -> Text:
-    """Write a text, in which a dollar sign does not start a formula."""
+    """Write text in which a dollar sign does not start a formula."""
     found = axes.text(*point, text, size=size_pt, color=INK, va="center", parse_math=False)
     found.set(**style)
     return found

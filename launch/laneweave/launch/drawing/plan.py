@@ -25,17 +25,17 @@ from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, sa
 from laneweave.protocol.errors import BadInputError
 
 Position = tuple[float, float]
-"""Column and lane, between two cells while a vehicle moves."""
+"""Column and lane; fractional while a vehicle moves between cells."""
 
 SUFFIXES: Final = (".png", ".gif")
 MAX_PANELS: Final = 120
-"""Maximum number of time points that are drawn."""
+"""Maximum number of time points drawn."""
 FRAMES_PER_STEP: Final = 10
 MAX_MOVING_FRAMES: Final = 300
 """Limit on frames, which are all in memory at once; long plans have fewer frames per step."""
 FRAMES_PER_S: Final = 12
 HELD_FRAMES: Final = (4, 18)
-"""Additional frames for the start and for the end."""
+"""Additional frames that show the start and the end."""
 
 _PALETTE = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442")
 """The palette of Okabe and Ito, which is safe for colour-blind readers."""
@@ -43,7 +43,7 @@ _SHADES = ((0.0, 0.0), (0.45, 0.0), (0.5, 1.0))
 """Shades of the palette (plain, darker, lighter): fraction and brightness of added grey."""
 _CELL, _BORDER, _BLOCKED = "#f1f2f4", "#d3d6db", "#a3a9b1"
 _LANE_HEIGHT, _BODY_LENGTH, _BODY_WIDTH, _OUTLINE = 0.8, 0.68, 0.46, 0.9
-"""In lengths of a cell; the outline as a fraction of the cell."""
+"""In cell lengths; the outline as a fraction of a cell."""
 _MAX_PANEL_COLUMNS, _MAX_WIDTH_IN, _MIN_WIDTH_IN = 4, 12.0, 5.6
 _MIN_CELL_IN, _MAX_CELL_IN = 0.34, 0.62
 _LEFT_IN, _BETWEEN_IN, _TITLE_IN = 0.32, 0.5, 0.64
@@ -80,7 +80,7 @@ def check_drawing(out: Path, option: str = "--draw") -> None:
 
 
 def draw_plan(request: PlanRequest, response: PlanResponse, out: Path) -> None:
-    """Write a figure or an animation, as the suffix of `out` selects."""
+    """Write a figure or an animation, depending on the suffix of `out`."""
     (write_gif if out.suffix.lower() == ".gif" else write_png)(request, response, out)
 
 
@@ -161,7 +161,7 @@ class _Vehicles:
 
     @classmethod
     def draw(cls, axes: Axes, request: PlanRequest, cell_in: float) -> _Vehicles:
-        """Draw the vehicles on their start cells, with names that fit into them."""
+        """Draw the vehicles in their start cells, labelled with names that fit."""
         names = [short_name(vehicle.id) for vehicle in request.vehicles]
         cell_pt, longest = 72 * cell_in, max(map(len, names))
         size_pt = min(11.0, 0.3 * cell_pt, _BODY_LENGTH * cell_pt / (0.75 * longest))
@@ -193,7 +193,7 @@ def _steps(response: PlanResponse) -> int:
 
 
 def _positions(request: PlanRequest, response: PlanResponse, time: float) -> list[Position]:
-    """Return the positions of the vehicles at a time [steps]; after the end they are constant."""
+    """Return the positions of the vehicles at a time [steps]; they are constant after the end."""
     if not response.paths:
         return [vehicle.cell for vehicle in request.vehicles]
     step = min(math.floor(time), _steps(response))
@@ -273,7 +273,7 @@ def _draw_target(axes: Axes, cell: Position, colours: Sequence[str]) -> None:
 
 
 def _draw_moves(axes: Axes, here: Sequence[Position], there: Sequence[Position]) -> None:
-    """Draw an arrow for each move, clear of the names of vehicles."""
+    """Draw an arrow for each move, clear of the vehicles' names."""
     for a, b in zip(here, there, strict=True):
         if a == b:
             continue
@@ -314,7 +314,7 @@ def _colour(team: int) -> str:
 
 
 def _ink_on(colour: str) -> str:
-    """Return a text colour that is readable on a colour."""
+    """Return a text colour that is readable on a background colour."""
     red, green, blue = to_rgb(colour)
     return "#ffffff" if 0.3 * red + 0.59 * green + 0.11 * blue < 0.5 else "#000000"
 

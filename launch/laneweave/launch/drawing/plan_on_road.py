@@ -47,7 +47,7 @@ MAX_INSTANTS: Final = 8
 MAX_FRAMES: Final = 240
 GIF_DPI: Final = 90
 _HELD_FRAMES: Final = 8
-"""Additional frames for the start and for the end."""
+"""Additional frames that show the start and the end."""
 
 _WIDTH_IN, _LANE_IN, _ROAD_GAP_IN, _TIMES_IN = 11.0, 0.24, 0.24, 2.3
 _MARGIN_M = 10.0
@@ -60,11 +60,11 @@ class Drive:
     """Motions of all vehicles from the start to the end of a plan.
 
     states: (vehicles, ticks + 1, 6): s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2] on the
-        road; s is the front bumper, 0 where the rear column is at time 0; y is the body's centre,
-        from the right road edge.
-    slot_ticks: ticks of a step.
+        road; s is the front bumper's position, 0 where the rear column is at time 0; y is the
+        body centre's distance from the right road edge.
+    slot_ticks: ticks per step.
     overlaps: pairs of vehicles whose bodies overlapped.
-    min_gap_m: shortest gap between bodies on one lane; infinite: there was none.
+    min_gap_m: shortest gap between bodies in the same lane; infinite: there was no gap.
     """
 
     scenario: Scenario
@@ -80,7 +80,7 @@ class Drive:
 
     @property
     def steps(self) -> int:
-        """Number of steps of the plan."""
+        """Number of steps in the plan."""
         return self.ticks // self.slot_ticks
 
     def time_s(self, tick: int) -> float:
@@ -105,7 +105,7 @@ def drive_plan(scenario: Scenario, names: Sequence[str], paths: Sequence[Sequenc
     Args:
         scenario: v_F, d_F, T_F, lane width, vehicles and tracking; see `scenario_in_mode`.
         names: names of the vehicles.
-        paths: cells of each vehicle at all time points; one time point: all hold.
+        paths: cells of each vehicle at all time points; with one time point, all vehicles hold.
     """
     slot_ticks = round(scenario.cycles_s[0] / scenario.runtime.tick_s)
     ticks = slot_ticks * (len(paths[0]) - 1)
@@ -140,9 +140,9 @@ def _drive_vehicle(
 
 
 def draw_road(request: PlanRequest, response: PlanResponse, scenario: Scenario, out: Path) -> None:
-    """Simulate a plan and draw a figure or an animation, as the suffix of `out` selects.
+    """Simulate a plan and draw a figure or an animation, depending on the suffix of `out`.
 
-    Without a plan the start is drawn. `scenario` defines the road, speeds and vehicles.
+    Without a plan, the start is drawn. `scenario` defines the road, speeds and vehicles.
     """
     picture = _Picture.of(request, response, scenario)
     if out.suffix.lower() == ".gif":
@@ -177,7 +177,7 @@ class _Picture:
 
     @property
     def extent_m(self) -> tuple[float, float]:
-        """Part of the road that is drawn."""
+        """Start and end [m] of the stretch of road that is drawn."""
         along_m = self.drive.states[:, :, 0]
         length_m = self.drive.scenario.vehicle.length_m
         return float(along_m.min()) - length_m - _MARGIN_M, float(along_m.max()) + _MARGIN_M
@@ -208,7 +208,7 @@ def road_figure(picture: _Picture) -> Figure:
 
 
 def _draw_instant(axes: Axes, picture: _Picture, tick: int) -> None:
-    """Draw the vehicles at a tick, with the path of each one since the start."""
+    """Draw the vehicles at a tick, with each vehicle's path since the start."""
     _label_time(axes, picture.drive.time_s(tick))
     for number, colour in enumerate(picture.colours):
         along_m, _, _, across_m, _, _ = picture.drive.states[number, : tick + 1].T
@@ -217,7 +217,7 @@ def _draw_instant(axes: Axes, picture: _Picture, tick: int) -> None:
 
 
 def _draw_empty_road(axes: Axes, picture: _Picture, *, label_axis: bool) -> None:
-    """Draw the lanes, and the label of the axis if `label_axis`."""
+    """Draw the lanes, and if `label_axis`, the label of the axis."""
     width_m = picture.drive.scenario.road.lane_width_m
     axes.set_xlim(*picture.extent_m)
     axes.set_ylim(-0.3, picture.lanes * width_m + 0.3)
@@ -297,7 +297,7 @@ def _label_vehicles(
     offset_pt: tuple[float, float],
     alignment: str,
 ) -> None:
-    """Write names beside positions; vehicles at the same position share a text."""
+    """Write names beside positions; vehicles at the same position share a label."""
     names: dict[int, list[str]] = {}
     for name, position in zip(labels, positions, strict=True):
         names.setdefault(round(position), []).append(name)

@@ -1,4 +1,4 @@
-"""A figure of the steps of TAPPA on a request, in the style of the paper's case study.
+"""A figure of TAPPA's steps on a request, in the style of the paper's case study.
 
 From top to bottom: the sequence of assignments with C_k and C'_k, the constraint tree of the
 assignment with the best path set, and relative path maps of some nodes. This module needs
@@ -42,7 +42,7 @@ _ARROW: Final[dict[str, Any]] = {
 }
 
 Layer = tuple[list[ExplainedNode], int]
-"""Drawn nodes of one depth of a tree, and the number of nodes that are left out."""
+"""Nodes drawn at one depth of a tree, and the number of nodes left out."""
 
 
 def draw_explanation(explanation: Explanation, out: Path) -> None:
@@ -82,7 +82,7 @@ def explanation_figure(explanation: Explanation) -> Figure:
 def _best_assignment(
     assignments: Sequence[ExplainedAssignment],
 ) -> tuple[int, ExplainedAssignment] | None:
-    """Return k and A_k of the best path set; without a path set, of the first tree."""
+    """Return k and A_k for the best path set or, if there is none, for the first tree."""
     found = [(k, one) for k, one in enumerate(assignments, start=1) if one.best_cost is not None]
     if not found:
         return (1, assignments[0]) if assignments and assignments[0].nodes else None

@@ -14,7 +14,7 @@ from laneweave.coordinator.planning.paper.explanation import (
 )
 
 MAX_NODES_PRINTED: Final = 40
-"""Maximum number of printed nodes of a tree."""
+"""Maximum number of nodes printed per tree."""
 MAX_TREES_PRINTED: Final = 12
 
 LITERAL = "the paper's constraint trees: one child for each entry of a node's conflict list"
@@ -58,7 +58,7 @@ def vector(targets: Sequence[int]) -> str:
 
 
 def number(cost: float | None) -> str:
-    """Return a cost as text; a dash if there is none."""
+    """Return a cost as text, or a dash if there is no cost."""
     return "-" if cost is None or math.isinf(cost) else f"{cost:g}"
 
 

@@ -1,4 +1,4 @@
-"""A table over runs, with a row per run and a column per number of the summaries; its aggregation.
+"""A table with a row per run and a column per number in the summaries, and its aggregation.
 
 Columns are named after the path in the summary: `travel_time_s_mean` contains `travel_time_s.mean`.
 A sweep writes the table as `results.parquet`.
@@ -20,13 +20,13 @@ from laneweave.protocol.summary import RunSummary
 
 SCHEMA_KEY, SCHEMA = b"laneweave.schema", b"laneweave.sweep.results/1"
 KEYS = ["label", "volume_veh_per_lane_h"]
-"""Columns that identify the runs that differ only in their seeds."""
+"""Columns whose values are the same for runs that differ only in their seeds."""
 PREFERRED = "preferred_percent"
-"""Column with the share of vehicles that left on their preferred lanes [%]."""
+"""Column with the share of vehicles that left in their preferred lanes [%]."""
 
 
 def results_table(runs: Iterable[Run]) -> pa.Table:
-    """Return the table of some runs, in the given order.
+    """Return the table of these runs, in the given order.
 
     Counts are integers, other numbers floats; missing numbers are null.
     """
@@ -50,7 +50,7 @@ def results_table(runs: Iterable[Run]) -> pa.Table:
 
 
 def write_results(runs: Iterable[Run], path: Path) -> None:
-    """Write the table of some runs atomically."""
+    """Write the table of these runs atomically."""
     table = results_table(runs)
     write_atomically(path, lambda part: pq.write_table(table, part, compression="zstd"))
 
@@ -60,11 +60,11 @@ def over_seeds(table: pa.Table, wanted: Iterable[tuple[str, str]]) -> list[dict[
 
     Args:
         table: result of `results_table`.
-        wanted: (column, aggregation function of pyarrow) pairs; `stddev` is that of a sample.
+        wanted: (column, pyarrow aggregation function) pairs; `stddev` is the sample deviation.
 
     Returns:
         Rows with `KEYS`, `runs` (number of runs), and `COLUMN_FUNCTION` for each pair: None if no
-        run has the number.
+        run has a value.
     """
     pairs = list(wanted)
     for column in dict.fromkeys(column for column, _ in pairs):
@@ -92,7 +92,7 @@ def flatten(tables: Mapping[str, Any], separator: str) -> dict[str, Any]:
 
 
 def _figures(summary: RunSummary) -> dict[str, float | int | None]:
-    """Return all numbers of a summary by path; unknown ones are None."""
+    """Return all numbers in a summary by path; unknown numbers are None."""
     return {
         name: value
         for name, value in flatten(summary.to_json(), "_").items()

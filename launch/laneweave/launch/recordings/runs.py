@@ -30,16 +30,16 @@ class Run:
 
     folder: Path
     label: str
-    """Label of the method with settings in sweeps; for other runs the method."""
+    """In sweeps, the label of the method with its settings; for other runs, the method."""
     method: str
     """Value of `laneweave run --method`."""
     scenario: Scenario
     summary: RunSummary | None
-    """Summary; None: the run failed without one."""
+    """Summary; None: the run failed without a summary."""
     reason: str = ""
-    """Reason of the failure; empty: success."""
+    """Reason for the failure; empty: success."""
     wall_s: float | None = None
-    """Run time of its process; None: unknown."""
+    """Run time of the run's process; None: unknown."""
 
     @property
     def status(self) -> str:
@@ -72,7 +72,7 @@ class Comparison:
 
     @classmethod
     def of(cls, runs: Iterable[Run]) -> Comparison:
-        """Sort runs; the labels of runs with equal settings are the names of their folders."""
+        """Sort runs; runs with the same label, volume and seed are labelled by folder name."""
         listed = list(runs)
         counts = Counter(run.order for run in listed)
         named = [
@@ -104,7 +104,7 @@ class Comparison:
         )
 
     def representative(self, label: str, volume_veh_per_lane_h: float) -> Run | None:
-        """Return the first run with trajectories of a label at a volume; None: there is none."""
+        """Return a label's first run with trajectories at a volume; None: there is none."""
         runs = self.at(label, volume_veh_per_lane_h)
         return next((run for run in runs if run.has_trajectories), None)
 
@@ -115,7 +115,7 @@ class Comparison:
 
 
 def scenario_of(path: Path) -> Scenario:
-    """Return the scenario in the metadata of a Parquet file of a run; by default `Scenario()`."""
+    """Return the scenario in the metadata of a run's Parquet file; by default `Scenario()`."""
     metadata = pq.read_schema(path).metadata or {}
     text = metadata.get(SCENARIO_KEY)
     data: dict[str, Any] = json.loads(text) if text else {}
@@ -172,7 +172,7 @@ def sweep_runs(out: Path) -> list[Run]:
 
 
 def write_point(run: Run, folder: Path) -> None:
-    """Write the record of a run of a sweep to a folder."""
+    """Write the record of a sweep's run to a folder."""
     data = {
         "schema": POINT_SCHEMA,
         "label": run.label,

@@ -1,4 +1,4 @@
-"""Trajectories of a run as arrays, sorted by vehicle; trips of a run."""
+"""Trajectories of a run, as arrays sorted by vehicle, and trips of a run."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ class Tracks:
 
     @property
     def vehicle(self) -> Ints:
-        """Index of the vehicle of each row."""
+        """Vehicle index of each row."""
         return np.repeat(np.arange(len(self.names)), np.diff(self.starts))
 
     @property
     def changed(self) -> Bools:
-        """Whether the cell of the vehicle differs from that in the previous row."""
+        """Whether the vehicle's cell in each row differs from its cell in the previous row."""
         changed = np.zeros(len(self.t_s), dtype=np.bool_)
         changed[1:] = (np.diff(self.column) != 0) | (np.diff(self.lane) != 0)
         changed[self.starts[:-1]] = False
@@ -56,7 +56,7 @@ class Tracks:
         return slice(int(self.starts[number]), int(self.starts[number + 1]))
 
     def sampled(self, number: int, name: str, times_s: Floats) -> Floats:
-        """Return a column of a vehicle, interpolated at the given times."""
+        """Return a vehicle's values in a column, interpolated at the given times."""
         rows = self.rows(number)
         return np.asarray(np.interp(times_s, self.t_s[rows], getattr(self, name)[rows]))
 

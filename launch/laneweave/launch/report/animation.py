@@ -2,8 +2,8 @@
 
 All vehicles are sampled at common times, `step_s` apart. A sample consists of three little-endian
 integers: longitudinal and lateral position (16 bits each) and speed (8 bits), each with a separate
-unit. Each of these columns is one base64 text with the samples of all vehicles, one vehicle after
-the other. The player interpolates between samples.
+unit. Each of these columns is one base64 string with the samples of all vehicles, one vehicle
+after another. The player interpolates between samples.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MAX_SAMPLES: Final = 600_000
 
 
 def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
-    """Return the data of the player as a JSON object."""
+    """Return the data for the player as a JSON object."""
     scenario, road = run.scenario, run.scenario.road
     formations = closed_formations(run.folder, scenario)
     samples = _sample(run, tracks, formations)
@@ -102,7 +102,7 @@ def _sample(run: Run, tracks: Tracks, formations: Formations) -> _Samples:
 
 
 def _busy_s(run: Run, end_s: float) -> float:
-    """Return when the first vehicle reaches the end of the road, at most half of `end_s`."""
+    """Return the time at which the first vehicle reaches the road's end, at most half `end_s`."""
     return min(run.scenario.road.length_m / run.scenario.formation.speed_mps, 0.5 * end_s)
 
 

@@ -33,7 +33,7 @@ TRAVEL_CAPTION = (
 )
 FLOW_CAPTION = (
     "Left: rate at which vehicles pass the end of the road, between the first and the last "
-    "counted one. Right: share of vehicles that left on their preferred lanes. Small dots: runs; "
+    "counted one. Right: share of vehicles that left in their preferred lanes. Small dots: runs; "
     "bars: standard deviations over seeds."
 )
 SPEED_CAPTION = (
@@ -41,7 +41,7 @@ SPEED_CAPTION = (
     "volume. Grey: no vehicle. Dashed: start of lane sorting."
 )
 SPACING_CAPTION = (
-    "Spacing: distance between the front bumpers of successive vehicles on a lane, sampled every "
+    "Spacing: distance between the front bumpers of successive vehicles in a lane, sampled every "
     "second. Time headway: spacing divided by the speed of the following, moving vehicle. "
     "Dashed: pitch d_F of the lattice, and the headway d_F / v_F. Samples from 60 s to the end of "
     "the demand, or of the whole run if that time is too short."
@@ -55,7 +55,7 @@ COMFORT_CAPTION = (
 
 @define
 class _Report:
-    """Report under construction."""
+    """A report under construction."""
 
     figures: Path
     """Folder of the pictures."""
@@ -65,7 +65,7 @@ class _Report:
     def draw(
         self, name: str, draw: Callable[[Path, int], None], caption: str, alt: str
     ) -> list[Picture]:
-        """Draw a picture, and return it as a list of one."""
+        """Draw a picture and return it in a list."""
         path = self.figures / name
         draw(path, self.dpi)
         return [Picture(path, self.dpi, caption, alt)]
@@ -112,7 +112,7 @@ def report_comparison(
     """Write pictures and page of several runs; return the path of the page.
 
     Args:
-        comparison: the runs, at least one of them without failure.
+        comparison: the runs, of which at least one succeeded.
         out: folder of the page and of the folder `figures`.
         title: title of the page.
         formation: formation whose path map is drawn; None: the one with the most moves.
@@ -132,7 +132,7 @@ def report_comparison(
 def _sections(
     comparison: Comparison, report: _Report, names: Mapping[str, str], formation: int | None
 ) -> list[Section]:
-    """Return all sections; `names` replaces names of pictures (report of one run)."""
+    """Return all sections; `names` renames pictures (for the report of one run)."""
     several = not names
     busiest = [run for run in map(comparison.busiest, comparison.labels) if run is not None]
     shown = [(run, read_tracks(run.folder)) for run in busiest]
@@ -157,7 +157,7 @@ def _sections(
             "flows.png",
             partial(figures.draw_flows, comparison),
             FLOW_CAPTION,
-            "Throughput and share on the preferred lane against traffic volume",
+            "Throughput and share in the preferred lane against traffic volume",
         )
     if busiest:
         report.add(
@@ -205,7 +205,7 @@ def _add_path_map(report: _Report, driven: DrivenMap | None) -> None:
 
 
 def _add_distributions(report: _Report, comparison: Comparison, example: Run) -> None:
-    """Add the distributions over all runs with trajectories, read one after the other."""
+    """Add the distributions over all runs with trajectories, which are read one by one."""
     counted: dict[tuple[str, float], distributions.Counts] = {}
     for run in comparison.runs:
         if run.has_trajectories:

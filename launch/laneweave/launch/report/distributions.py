@@ -1,7 +1,7 @@
 """Distributions of spacing, headway, deceleration and comfort over runs: histograms and figures.
 
-The samples are those of steady traffic, from the end of the warm-up (`trips.py: WARM_UP_S`) to the
-end of the demand, or of the whole run if that time is too short.
+The samples are from steady traffic, between the end of the warm-up (`trips.py: WARM_UP_S`) and the
+end of the demand, or from the whole run if that period is too short.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 SAMPLE_S: Final = 1.0
 """Sampling period of spacings, which change slowly."""
 MIN_STEADY_S: Final = 10.0
-"""Minimum time of steady traffic for enough samples."""
+"""Minimum duration of steady traffic for enough samples."""
 STANDING_MPS: Final = 0.5
 """Speed below which a vehicle has no time headway."""
 
 
 @frozen(eq=False)
 class Quantity:
-    """A quantity with its histogram bins, and how it is shown."""
+    """A quantity with its histogram bins and the way in which it is shown."""
 
     name: str
     unit: str
@@ -56,7 +56,7 @@ def _centred(step: float, last: float) -> Floats:
 
 
 SPACING: Final = Quantity("spacing", "m", _centred(0.5, 90.0), exceedance=False)
-"""Distance between the front bumpers of successive vehicles on a lane."""
+"""Distance between the front bumpers of successive vehicles in a lane."""
 HEADWAY: Final = Quantity("time headway", "s", _centred(0.05, 6.0), exceedance=False)
 """Spacing divided by the speed of the following vehicle."""
 DECELERATION: Final = Quantity("deceleration", "m/s²", np.linspace(0.0, 10.0, 201), exceedance=True)
@@ -70,12 +70,12 @@ LATERAL: Final = Quantity(
 
 @frozen
 class Counts:
-    """Histogram of each quantity."""
+    """A histogram for each quantity."""
 
     of: dict[str, Floats] = field(factory=dict)
 
     def __add__(self, other: Counts) -> Counts:
-        """Return the sums of both histograms."""
+        """Return the sum of both histograms of each quantity."""
         names = dict.fromkeys([*self.of, *other.of])
         return Counts(
             {name: np.asarray(self.of.get(name, 0.0) + other.of.get(name, 0.0)) for name in names}
@@ -87,7 +87,7 @@ class Counts:
         return np.asarray(np.cumsum(counts)[:-1] / max(1.0, counts.sum()))
 
     def exceedance(self, quantity: Quantity) -> Floats:
-        """Return the share of values not below each edge except the last."""
+        """Return the share of values at or above each edge but the last."""
         counts = self.of[quantity.name]
         return np.asarray(np.cumsum(counts[::-1])[::-1] / max(1.0, counts.sum()))
 
@@ -121,7 +121,7 @@ def _steady(tracks: Tracks, scenario: Scenario) -> Bools:
 
 
 def _spacings(tracks: Tracks, scenario: Scenario, steady: Bools) -> tuple[Floats, Floats]:
-    """Return spacings [m] and time headways [s] of all vehicles that follow another one."""
+    """Return spacings [m] and time headways [s] of all vehicles that follow another vehicle."""
     sample = np.rint(tracks.t_s / SAMPLE_S)
     chosen = steady & (np.abs(tracks.t_s - sample * SAMPLE_S) < 0.5 * scenario.runtime.tick_s)
     lane = np.clip(tracks.y_m // scenario.road.lane_width_m, 0, scenario.road.lanes - 1)
@@ -142,7 +142,7 @@ def _histogram(values: Floats, edges: Floats) -> Floats:
 
 
 Counted = Mapping[tuple[str, float], Counts]
-"""Histograms of each label and volume."""
+"""Histograms for each label and volume."""
 
 MIN_SHARE = 1e-5
 """Lower limit of the exceedance scale."""
@@ -154,7 +154,7 @@ def draw_spacings(counted: Counted, scenario: Scenario, out: Path, dpi: int) -> 
 
 
 def draw_comfort(counted: Counted, scenario: Scenario, out: Path, dpi: int) -> None:
-    """Draw decelerations, jerks and lateral accelerations in the same arrangement."""
+    """Draw decelerations, jerks and lateral accelerations in the same layout."""
     _draw(counted, (DECELERATION, JERK, LATERAL), scenario, out, dpi)
 
 
@@ -203,7 +203,7 @@ def _draw_one(axes: Axes, counts: Counts, quantity: Quantity, label: str, colour
 
 
 def _set_value(quantity: Quantity, scenario: Scenario) -> float:
-    """Return the upper limit of a quantity, or the nominal value of formations."""
+    """Return the upper limit of a quantity, or its nominal value in formations."""
     vehicle, formation = scenario.vehicle, scenario.formation
     return {
         SPACING.name: formation.gap_m,

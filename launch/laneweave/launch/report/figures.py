@@ -37,7 +37,7 @@ MARGIN = 0.04
 LOWER_SHARE = 0.66
 """Share of the height below the break of the axis, for methods without jams."""
 BIN_M, BIN_S = 20.0, 5.0
-"""Sizes of the bins of mean speeds."""
+"""Bin sizes for mean speeds."""
 
 
 def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
@@ -102,7 +102,7 @@ def _break(times_s: Iterable[Floats]) -> float | None:
 
 
 def _break_axis(upper: Axes, lower: Axes, break_s: float) -> None:
-    """Show times above the break in the upper axes with a separate scale, the others below."""
+    """Show times above the break in the upper axes, on a separate scale, and others below."""
     lowest_s, top_s = lower.dataLim.ymin, lower.get_ylim()[1]
     lower.set_ylim(lowest_s - MARGIN * (break_s - lowest_s), break_s)
     upper.set_ylim(break_s, top_s)
@@ -117,7 +117,7 @@ def _break_axis(upper: Axes, lower: Axes, break_s: float) -> None:
 def _places(labels: int, volumes: int, width: float = 0.8) -> Floats:
     """Return positions along the axis, shape (labels, volumes), with labels side by side.
 
-    `width` is the total width of the labels of a volume; the distance of volumes is 1.
+    `width` is the total width of the labels at a volume; the distance between volumes is 1.
     """
     shifts = (np.arange(labels) - 0.5 * (labels - 1)) * width / max(1, labels)
     return np.asarray(np.arange(volumes) + shifts[:, None])
@@ -160,7 +160,7 @@ def _travel_times(runs: Iterable[Run]) -> Floats:
 
 
 def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
-    """Draw throughput and the share on the preferred lane against the demand."""
+    """Draw throughput and the share of vehicles in the preferred lane against the demand."""
     volumes = np.array(comparison.volumes)
     range_veh_per_lane_h = float(np.ptp(volumes)) or 400.0
     span = volumes[[0, -1]] + np.array([-0.06, 0.06]) * range_veh_per_lane_h
@@ -170,7 +170,7 @@ def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
         text = "dashed: throughput = demand"
         left.annotate(text, (0.97, 0.04), xycoords="axes fraction", ha="right", **SMALL_TEXT)
         left.set_ylabel("throughput (veh/(lane·h))")
-        right.set_ylabel("left on the preferred lane (%)")
+        right.set_ylabel("left in the preferred lane (%)")
         for axes, figure_name in (
             (left, "throughput_veh_per_lane_h"),
             (right, "preferred_percent"),
@@ -189,7 +189,7 @@ def _draw_seeds(
 ) -> None:
     """Draw each run as a dot, and means over seeds with standard deviations as a line.
 
-    The labels are shifted, because several labels may have the same values.
+    The labels are shifted sideways, because several labels may have the same values.
     """
     colours, labels, nothing = label_colours(comparison.labels), comparison.labels, True
     for number, label in enumerate(labels):

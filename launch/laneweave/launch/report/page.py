@@ -20,12 +20,12 @@ PAGE_FILE: Final = "report.html"
 _PACKAGE: Final = "laneweave.launch.report"
 _PACES: Final = (0.5, 1, 2, 5, 10)
 _CSS_PIXELS_PER_IN = 110
-"""Slightly more than the standard 96, so that text of 8 pt is legible."""
+"""Slightly more than the standard 96, so that 8 pt text is legible."""
 
 
 @frozen
 class Picture:
-    """A PNG file that is embedded in the page in its natural size."""
+    """A PNG file that is embedded in the page at its natural size."""
 
     path: Path
     dpi: float
@@ -47,7 +47,7 @@ class Picture:
 
 @frozen
 class Animation:
-    """An animated road, with data of `animation.animation_data`."""
+    """An animated road, with data from `animation.animation_data`."""
 
     data: Mapping[str, Any]
 
@@ -69,7 +69,7 @@ class Section:
 
 
 def render_page(title: str, lead: str, sections: Sequence[Section]) -> str:
-    """Return the HTML of a page with escaped texts."""
+    """Return the HTML of a page; text is escaped."""
     environment = Environment(
         loader=PackageLoader(_PACKAGE), autoescape=True, undefined=StrictUndefined
     )

@@ -1,8 +1,8 @@
 """The driven relative path map (paper, Section 3.3) of a formation, and its figure.
 
 The map has a row per vehicle and a column per time point at intervals of T_F. The first time point
-and T_F are those of the driven plan; in recordings without them, the map begins with the first move
-and uses T_F of the scenario. The cell of a moving vehicle is the target of its move, which it
+and T_F are those of the driven plan; if the recording lacks these, the map begins with the first
+move and uses the scenario's T_F. The cell of a moving vehicle is the target of its move, which it
 reaches by the end of the slot.
 """
 
@@ -38,13 +38,13 @@ _MAX_LISTED = 8
 
 @frozen
 class DrivenMap:
-    """Driven relative path map of a formation."""
+    """The driven relative path map of a formation."""
 
     formation: int
     rolling: bool
-    """Whether the run had no formations; the vehicles are those that entered in a block."""
+    """Whether the run had no formations; the vehicles are then those that entered in a block."""
     path_map: RelativePathMap
-    """Path map with columns relative to the rearmost one of the formation."""
+    """Path map with columns relative to the formation's rearmost column."""
     preferred_lanes: tuple[int, ...]
     """Preferred lane of the vehicle in each row."""
     start_s: float
@@ -66,7 +66,7 @@ class DrivenMap:
 
 
 def driven_map(run: Run, tracks: Tracks, formation: int | None) -> DrivenMap | None:
-    """Return the path map of a formation, by default of that with most moves; None: no formations.
+    """Return a formation's path map, by default the one with the most moves; None: there is none.
 
     Raises:
         BadInputError: the run has no such formation.
@@ -133,9 +133,9 @@ def _map_of(
 def _driven_slots(
     run: Run, formation: int, entered_s: float, changes_s: list[float]
 ) -> tuple[float, float]:
-    """Return road time of the first slot of a formation, and length of the slots.
+    """Return the road time of a formation's first slot and the slot length.
 
-    They are those of the last plan under which the formation moved, if any.
+    Both are from the last plan under which the formation moved, if there is one.
     """
     tick_s, slot_s = run.scenario.runtime.tick_s, run.scenario.cycles_s[0]
     last_s = max(changes_s, default=math.inf) + 0.5 * tick_s
@@ -156,7 +156,7 @@ def _driven_slots(
 
 
 def draw_path_map(driven: DrivenMap, out: Path, dpi: int) -> None:
-    """Draw the table; cells have the colour of their lane, strong if it is the preferred one."""
+    """Draw the table; cells have the colour of their lane, strong if the lane is preferred."""
     path_map = driven.path_map
     rows, points = len(path_map.rows), path_map.steps + 1
     with picture(2.3 + 1.12 * points, 0.8 + 0.36 * (rows + 1), out, dpi) as figure:
@@ -178,7 +178,7 @@ def draw_path_map(driven: DrivenMap, out: Path, dpi: int) -> None:
 
 
 def _draw_row(axes: Axes, row: int, driven: DrivenMap) -> None:
-    """Draw the row of a vehicle: name with the colour of the preferred lane, then the cells."""
+    """Draw a vehicle's row: its name with the colour of the preferred lane, then its cells."""
     from matplotlib.patches import FancyBboxPatch, Rectangle  # noqa: PLC0415 - lazily
 
     colours, preferred = lane_colours(driven.lanes), driven.preferred_lanes[row]
@@ -198,5 +198,5 @@ def _draw_row(axes: Axes, row: int, driven: DrivenMap) -> None:
 
 
 def _write(axes: Axes, point: int, y: float, text: str, **style: Any) -> None:  # noqa: ANN401
-    """Write into the centre of the column of a time point."""
+    """Write text into the centre of a time point's column."""
     axes.text(point + 0.5, y, text, ha="center", va="center", **{"fontsize": 8.5} | style)

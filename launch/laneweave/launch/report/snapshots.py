@@ -1,4 +1,4 @@
-"""Snapshots of the road at some times, drawn from the Parquet files of a run."""
+"""Snapshots of the road at given times, drawn from the Parquet files of a run."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 _ASPHALT, _PAINT = "#eeeff1", "#ffffff"
 _OWNED = ("#e2e4e8", "#d5d8dd")
-"""Alternating colours of the columns of formations."""
+"""Alternating colours for the columns of formations."""
 _ACROSS_SCALE = 1.8
 """Scale across the road relative to the scale along it; lanes would be too thin otherwise."""
 _HEADROOM_M = 4.5
-"""Space above the road for the numbers of formations."""
+"""Space above the road for formation numbers."""
 
 
 def road_snapshots(
@@ -42,18 +42,18 @@ def road_snapshots(
     stretch_m: tuple[float, float] | None = None,
     dpi: int = DPI,
 ) -> None:
-    """Draw a stretch of road at some times, one strip below the other.
+    """Draw a stretch of road at given times, one strip below another.
 
     Vehicles have the colour of their preferred lane; faster vehicles are lighter. Left lanes are on
-    top, traffic moves to the right. The columns of formations have alternating shades of grey, with
-    the numbers of the formations above the road.
+    top, and traffic moves to the right. The columns of formations are in alternating shades of
+    grey, with the formation numbers above the road.
 
     Args:
         folder: folder of the run.
         out: file of the picture; its suffix defines the format.
         times: road times [s]; empty: the four times at intervals of the shortest T_F at which most
             vehicles are between two lanes.
-        stretch_m: (from m, to m); None: from 20 m before lane sorting begins to 300 m behind that
+        stretch_m: (from m, to m); None: from 20 m before lane sorting begins to 300 m beyond that
             point.
         dpi: resolution in dots per inch.
     """
@@ -163,7 +163,7 @@ def _draw_vehicle(
     centre = np.array([s_m - 0.5 * length_m * np.cos(heading), y_m])
 
     def shape(rear: float, front: float, half: float) -> Floats:
-        """Return the corners of a part of the body, shape (4, 2), from shares of its size."""
+        """Return the corners (4, 2) of a part of the body, given as fractions of its size."""
         box = np.array([[rear, -half], [front, -half], [front, half], [rear, half]])
         return np.asarray((box * [length_m, width_m]) @ turn + centre, dtype=np.float64)
 
@@ -211,8 +211,8 @@ def _shade(colour: str, over_mps: float) -> tuple[float, float, float]:
 def _instants(tracks: Tracks, scenario: Scenario, stretch_m: tuple[float, float]) -> list[float]:
     """Return four times at intervals of the shortest T_F at which most vehicles change lanes.
 
-    There are fewer if the recording ends earlier. A vehicle on the stretch counts with its distance
-    from the nearest lane centre, plus a small constant.
+    Fewer are returned if the recording ends earlier. A vehicle on the stretch is weighted by its
+    distance from the nearest lane centre, plus a small constant.
     """
     t_s, s_m, y_m = tracks.t_s, tracks.s_m, tracks.y_m
     if not len(t_s):

@@ -1,4 +1,4 @@
-"""Style of the figures of reports: colours of labels, axes, legends, panels."""
+"""Style of the figures in reports: colours of labels, axes, legends, panels."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ _STYLE: Final[Any] = {
 REFERENCE: Final[dict[str, Any]] = {"color": "#8a9099", "linewidth": 1.0, "linestyle": "--"}
 """Style of lines for limits and nominal values."""
 SMALL_TEXT: Final[dict[str, Any]] = {"fontsize": 7.5, "color": FAINT_INK}
-"""Style of small texts."""
+"""Style of small text."""
 MAX_COLUMNS: Final = 6
 """Maximum number of volumes side by side."""
 
 
 @contextlib.contextmanager
 def picture(width_in: float, height_in: float, out: Path, dpi: float) -> Iterator[Figure]:
-    """Yield an empty figure in the style of reports, and save it at the end of the context."""
+    """Yield an empty figure in the style of reports, and save it when the context exits."""
     import matplotlib as mpl  # noqa: PLC0415 - lazily
 
     with mpl.rc_context(_STYLE):
@@ -68,7 +68,7 @@ def picture(width_in: float, height_in: float, out: Path, dpi: float) -> Iterato
 
 
 def label_colours(labels: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each label; those of `METHODS` always have the same colours.
+    """Return a colour for each label; labels in `METHODS` always have the same colours.
 
     Other labels get unused colours, which repeat if there are too few.
     """
@@ -105,5 +105,5 @@ def legend_above(figure: Figure) -> None:
 
 
 def explain_empty_axes(axes: Axes, text: str) -> None:
-    """Write the reason into the centre of empty axes."""
+    """Write the reason in the centre of empty axes."""
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", **SMALL_TEXT)

@@ -1,4 +1,4 @@
-"""The result table of a run, printed at its end and contained in its report."""
+"""The result table of a run, printed when the run ends and included in its report."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MAX_LISTED = 5
 
 
 def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
-    """Return the rows (figure, value) of the table of a run."""
+    """Return the rows (figure, value) of a run's table."""
     return [*_traffic_rows(summary), *_control_rows(summary), *_fault_rows(summary)]
 
 
@@ -26,7 +26,7 @@ def _traffic_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ("simulated time", f"{summary.simulated_s:.1f} s"),
         ("vehicles left / entered", f"{vehicles.left} / {vehicles.entered}"),
         ("maximum at one time", f"{vehicles.peak}"),
-        ("on their preferred lane", f"{vehicles.on_preferred_lane} ({share:.2%})"),
+        ("in their preferred lane", f"{vehicles.on_preferred_lane} ({share:.2%})"),
         ("travel time mean / p95 / max", _join(travel_s.mean, travel_s.p95, travel_s.max) + " s"),
         ("ticks driven without an agent", _count(tracking.hold_law_ticks)),
         ("ticks of emergency braking", _count(tracking.emergency_ticks)),
@@ -40,7 +40,7 @@ def _traffic_rows(summary: RunSummary) -> list[tuple[str, str]]:
 
 
 def _discomfort(safety: Safety) -> str:
-    """Return a remark about accelerations beyond comfort; empty: none."""
+    """Return a remark about uncomfortable accelerations; empty: there were none."""
     found = (safety.min_accel_mps2, safety.max_accel_mps2)
     if all(value is None or round(abs(value), 2) <= COMFORT_MPS2 for value in found):
         return ""
@@ -70,7 +70,7 @@ def _control_rows(summary: RunSummary) -> list[tuple[str, str]]:
 
 
 def _recoveries(seconds: list[float]) -> str:
-    """Return the times without a leader in brackets, or their median and maximum if many."""
+    """Return the leaderless periods in brackets or, if there are many, their statistics."""
     if not seconds:
         return ""
     if len(seconds) <= MAX_LISTED:
@@ -79,7 +79,7 @@ def _recoveries(seconds: list[float]) -> str:
 
 
 def _by_solver(planning: Planning) -> str:
-    """Return the number of plans of each solver; "-" for summaries of earlier versions."""
+    """Return the number of plans by each solver; "-" for summaries from earlier versions."""
     if planning.by_solver is None:
         return "-"
     made = [f"{solver} {plans}" for solver, plans in planning.by_solver.items() if plans]

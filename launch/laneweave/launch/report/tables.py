@@ -17,14 +17,14 @@ from laneweave.launch.recordings.runs import Comparison, Run
 from laneweave.launch.report.summary_table import summary_rows
 
 _Column = tuple[str, str, str, int]
-"""Heading, column of the results, aggregation over seeds (empty: text), number of digits."""
+"""Heading, column of the results, aggregation over seeds (empty: text), number of decimals."""
 
 _TRAFFIC: Final[tuple[_Column, ...]] = (
     ("runs", "runs", "", 0),
     ("travel time mean (s)", "travel_time_s_mean", "mean", 2),
     ("p95 (s)", "travel_time_s_p95", "mean", 2),
     ("throughput (veh/(lane·h))", "throughput_veh_per_lane_h", "mean", 0),
-    ("on the preferred lane (%)", PREFERRED, "mean", 2),
+    ("in the preferred lane (%)", PREFERRED, "mean", 2),
 )
 _SAFETY: Final[tuple[_Column, ...]] = (
     ("smallest gap (m)", "safety_min_gap_m", "min", 2),
@@ -47,7 +47,7 @@ _BY_SOLVER: Final = "planning_by_solver_"
 
 @frozen
 class Table:
-    """A table of a page, which is shown only if it has rows."""
+    """A table on a page, which is shown only if it has rows."""
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -58,7 +58,7 @@ class Table:
 
 
 def tables_of(comparison: Comparison) -> list[Table]:
-    """Return the tables of a report: of a single run, or of runs side by side."""
+    """Return the tables of a report on a single run, or on several runs side by side."""
     if len(comparison.runs) == 1 and not comparison.failed:
         return [run_table(comparison.runs[0])]
     results = results_table(comparison.runs)
@@ -103,7 +103,7 @@ def _table(rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column], captio
 
 
 def _cell(row: Mapping[str, Any], wanted: _Column) -> str:
-    """Return the text of a cell; means have their standard deviation if known."""
+    """Return the text of a cell; a mean is followed by its standard deviation, if known."""
     _, column, function, digits = wanted
     if not function:
         return str(row[column])
@@ -116,7 +116,7 @@ def _cell(row: Mapping[str, Any], wanted: _Column) -> str:
 
 
 def _solvers(row: Mapping[str, Any]) -> str:
-    """Return the number of plans of each solver."""
+    """Return the number of plans by each solver."""
     plans = {
         name.removeprefix(_BY_SOLVER).removesuffix("_sum"): count
         for name, count in row.items()

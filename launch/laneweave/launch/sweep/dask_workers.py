@@ -1,4 +1,4 @@
-"""The points of a sweep as tasks of an existing Dask cluster.
+"""The points of a sweep as tasks on an existing Dask cluster.
 
 Workers need laneweave, but no shared disk: tasks return the files of their points, which the client
 writes. Like a local sweep, each task starts a process, because a worker may run several tasks in
@@ -24,13 +24,13 @@ CONNECT_S = 10.0
 
 
 TaskResult = tuple[PointResult, dict[str, bytes]]
-"""Result of a task: result of the point on the worker, and the contents of its files."""
+"""Result of a task: the point's result on the worker, and the contents of its files."""
 
 
 def run_on_dask(
     points: Sequence[Point], unfinished: Path, address: str
 ) -> Generator[PointResult, None, None]:
-    """Run all points on a cluster, and yield their results; closing the generator ends them.
+    """Run all points on a cluster and yield their results; closing the generator stops them.
 
     Args:
         points: the points.
@@ -64,7 +64,7 @@ def run_on_dask(
 
 
 def run_as_task(point: Point, sweep: str) -> TaskResult:
-    """Run a point on a worker; the function of the tasks."""
+    """Run a point on a worker, as a Dask task."""
     stop = Event(sweep)
     with tempfile.TemporaryDirectory(prefix="laneweave-point-") as temporary:
         result = run_in_process(point, Path(temporary) / point.name, stop.is_set)
@@ -78,7 +78,7 @@ async def _check_connection(address: str) -> None:
 
 
 def _received(future: Future[TaskResult], point: Point, unfinished: Path) -> PointResult:
-    """Write the files that a task has returned; a failed task is a failed run."""
+    """Write the files that a task returned; a failed task is a failed run."""
     folder = unfinished / point.name
     folder.mkdir(parents=True)
     if future.status != "finished":

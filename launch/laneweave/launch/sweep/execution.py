@@ -1,7 +1,7 @@
-"""Execution of points in separate processes: libsumo supports one simulation, and may crash.
+"""Execution of points in separate processes, as libsumo supports one simulation and may crash.
 
 A process reads its job from `job.json` in its folder, and writes the files of the run there,
-`result.json` last. If the process ends without a result, the run has failed.
+`result.json` last. If the process exits without a result, the run has failed.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ POINT_PROCESS = "laneweave.launch.sweep.point_process"
 POLL_S = 0.2
 """Period at which workers check whether the sweep has been stopped."""
 END_S = 10.0
-"""Time that processes have to end after SIGTERM."""
+"""Grace period after SIGTERM before processes are killed."""
 
 
 @frozen
 class PointResult:
-    """Result of a point; its files are in `folder`."""
+    """The result of a point, whose files are in `folder`."""
 
     point: Point
     folder: Path
     problems: tuple[str, ...]
-    """Reasons of a failure; empty: success."""
+    """Reasons for a failure; empty: success."""
     wall_s: float
 
 
@@ -51,14 +51,14 @@ def kept_files(point: Point) -> tuple[str, ...]:
 
 
 class StoppedError(Exception):
-    """The sweep has been stopped before the end of this run."""
+    """The sweep was stopped before this run finished."""
 
 
 def run_in_process(point: Point, folder: Path, stopped: Callable[[], bool]) -> PointResult:
-    """Run a point in a process that writes to a new `folder`; end it if `stopped` returns True.
+    """Run a point in a process that writes to a new `folder`; stop it if `stopped` returns True.
 
     Raises:
-        StoppedError: the sweep has been stopped, and the process has ended.
+        StoppedError: the sweep was stopped, and the process has exited.
         OSError: files or processes cannot be created.
     """
     if stopped():
@@ -74,7 +74,7 @@ def run_in_process(point: Point, folder: Path, stopped: Callable[[], bool]) -> P
             stdout=log,
             stderr=log,
             env=_environment(folder),
-            # Keep Ctrl-C from the process: the sweep ends its processes.
+            # Shield the process from Ctrl-C: the sweep stops its processes.
             process_group=0,
         )
     wait_for_exit(process, point.name, stopped)
@@ -85,7 +85,7 @@ def run_in_process(point: Point, folder: Path, stopped: Callable[[], bool]) -> P
 def run_locally(
     points: Sequence[Point], unfinished: Path, workers: int
 ) -> Generator[PointResult, None, None]:
-    """Run all points on this machine, and yield their results; closing the generator ends them.
+    """Run all points on this machine and yield their results; closing the generator stops them.
 
     Args:
         points: the points.
@@ -110,10 +110,10 @@ def run_locally(
 
 
 def wait_for_exit(process: subprocess.Popen[bytes], name: str, stopped: Callable[[], bool]) -> None:
-    """Wait for a process of the run `name`; end it if `stopped` returns True or an error is raised.
+    """Wait for a process of run `name`; stop it if `stopped` returns True or an error is raised.
 
     Raises:
-        StoppedError: the process has been stopped.
+        StoppedError: the process was stopped.
     """
     try:
         while process.poll() is None:

@@ -41,7 +41,7 @@ SCHEMA = {"schema": "laneweave.sweep/1"}
 
 
 class SweepFolder:
-    """Context manager of the folder of a sweep, which one sweep at a time may write."""
+    """Context manager for the folder of a sweep; only one sweep at a time may write to it."""
 
     def __init__(self, out: Path) -> None:
         """Open the folder of a new or an interrupted sweep.
@@ -88,7 +88,7 @@ class SweepFolder:
         return self._runs
 
     def check_settings(self, base: Scenario) -> None:
-        """Check that the completed points have the same settings.
+        """Check that the completed points have the same settings as this sweep.
 
         Args:
             base: scenario of this sweep; its volume and seed are ignored.
@@ -112,7 +112,7 @@ class SweepFolder:
                     raise BadInputError(field, own, f"{value}, {where}")
 
     def is_finished(self, point: Point) -> bool:
-        """Return whether a point has succeeded, and all its files to keep exist."""
+        """Return whether a point has succeeded and all files that it should keep exist."""
         run = self._runs.get(point.name)
         return (
             run is not None

@@ -20,17 +20,17 @@ from laneweave.protocol.runtime.processes import die_with_parent
 
 
 def main(folder: Path, parent: int) -> None:
-    """Run the job in a folder; failures end this process with a status and a log.
+    """Run the job in a folder; on failure, this process exits with an error status and a log.
 
     Args:
         folder: folder with `job.json`.
-        parent: id of the process that started this one; the run ends with it.
+        parent: id of the process that started this one; this process exits when it does.
     """
     # Handle SIGTERM like Ctrl-C, to complete files and remove temporary folders.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     die_with_parent()
     if os.getppid() != parent:
-        sys.exit("the sweep has ended")
+        sys.exit("the sweep has exited")
     log_to_terminal()
     tune_garbage_collector()
     job = json.loads((folder / JOB_FILE).read_text(encoding="utf-8"))

@@ -36,7 +36,7 @@ class Point:
 
 
 def volume_text(volume_veh_per_lane_h: float) -> str:
-    """Return a volume as text for names."""
+    """Return a volume as text for use in names."""
     return f"{volume_veh_per_lane_h:.10g}"
 
 

@@ -20,11 +20,11 @@ from laneweave.launch.sweep.points import Point, volume_text
 from laneweave.protocol.errors import CommandFailedError
 
 Runner = Callable[[Sequence[Point], Path], Generator[PointResult, None, None]]
-"""Runs points in a folder, and yields their results; closing the generator ends all of them."""
+"""Function that runs points in a folder and yields results; closing the generator stops them."""
 
 
 def run_sweep(points: Sequence[Point], folder: SweepFolder, run: Runner, *, show: bool) -> int:
-    """Run the points that are not finished, and return the number of failed points.
+    """Run the unfinished points, and return the number of failed points.
 
     Raises:
         CommandFailedError: files or processes cannot be created.
@@ -75,7 +75,7 @@ class _Progress(Progress):
 
 
 def print_results(points: Sequence[Point], folder: SweepFolder, console: Console) -> None:
-    """Print the means of a sweep over its seeds, and the reasons of failed runs."""
+    """Print a sweep's means over seeds, and the reasons why runs failed."""
     runs = [folder.runs[point.name] for point in points]
     done = [folder.runs[point.name] for point in points if folder.is_finished(point)]
     columns = ("travel_time_s_mean", "throughput_veh_per_lane_h", PREFERRED)
@@ -83,7 +83,7 @@ def print_results(points: Sequence[Point], folder: SweepFolder, console: Console
     means = {(row["label"], row["volume_veh_per_lane_h"]): row for row in found}
     table = Table(title=f"laneweave sweep: {folder.out}")
     table.add_column("label")
-    for heading in ("veh/(lane h)", "done", "failed", "travel time", "throughput", "on lane"):
+    for heading in ("veh/(lane h)", "done", "failed", "travel time", "throughput", "in lane"):
         table.add_column(heading, justify="right")
     for (label, volume), count in Counter(
         (run.label, run.volume_veh_per_lane_h) for run in runs
