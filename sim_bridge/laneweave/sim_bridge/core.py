@@ -63,7 +63,7 @@ log = structlog.get_logger(__name__)
 
 BRIDGE = Name("bridge")
 SHUT_DOWN_S = 2.0
-"""Maximum wait for final reports at the end of a run."""
+"""Maximum wait for final reports after a run has ended."""
 
 
 @frozen
@@ -75,7 +75,7 @@ class BridgeMetrics:
     road_seconds: float = metric("Road time")
     ticks_total: int = metric("Completed ticks of the road")
     missed_answers_total: int = metric(
-        "Answers of agents that were missing at their tick's deadline"
+        "Answers from agents that were missing at the tick's deadline"
     )
     vehicles_demanded_total: int = metric("Vehicles that have arrived at the entrance")
     vehicles_entered_total: int = metric("Vehicles that have entered the road")
@@ -120,7 +120,7 @@ class BridgeCore:
             new_incarnation: returns an unused incarnation, for caretakers.
             pace: maximum road seconds per second of the node's clock; None: the scenario's.
             incarnation: distinguishes this road from earlier roads of the same deployment.
-            stopwatch: clock [s] for measuring the duration of ticks.
+            stopwatch: clock [s] that measures how long ticks take.
         """
         self.scenario = scenario
         self.tick = 0
@@ -181,7 +181,7 @@ class BridgeCore:
                 return None
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
-        """Handle an event, see `Core`."""
+        """Handle an event; see `Core`."""
         if isinstance(event, Arrived) and isinstance(event.message, Command):
             effects = self._on_command(event.message)  # most events
         else:
@@ -260,14 +260,14 @@ class BridgeCore:
     def _on_report(self, report: Report) -> None:
         if report.role in ("agent", "bridge"):
             if report.name not in self._unreported:
-                return  # a vehicle of an earlier run, or a duplicate
+                return  # from an earlier run, or a duplicate
             self._unreported.discard(report.name)
         self._record.on_report(report)
 
     # --- the tick -----------------------------------------------------------------------------
 
     def _proceed(self, now_s: float) -> Iterator[Effect]:
-        """Advance through the phases, by at most one tick, until one has to wait."""
+        """Advance through the phases, by at most one tick, until a phase has to wait."""
         if self.phase is TickPhase.PACE and now_s >= self._until_s:
             self._open_tick(now_s)
         if self.phase is TickPhase.AGENTS:
@@ -283,7 +283,7 @@ class BridgeCore:
             yield End()
 
     def _open_tick(self, now_s: float) -> None:
-        """Admit vehicles at the entrance and start to wait for their agents."""
+        """Admit vehicles at the entrance and start waiting for their agents."""
         self._opened_s = now_s
         self._tick_began = self._stopwatch()
         for arrival in self._roadside.newly_demanded(self.t_s):
@@ -330,7 +330,7 @@ class BridgeCore:
             self._record.on_closed(closed, [vehicle.name for vehicle in members])
 
     def _start_caretakers(self, now_s: float) -> Iterator[Effect]:
-        """Put caretakers in charge of vehicles whose agents are absent, silent or too late."""
+        """Put caretakers in charge of vehicles whose agents are absent, silent or always late."""
         for name in self._answers.update_durations(now_s):
             self._record.event(self.t_s, AGENT_SILENT, vehicle=name)
         for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
@@ -357,7 +357,7 @@ class BridgeCore:
             return
         min_s = self._tick_duration_s
         if self._answers.all_silent or not self._attendance.link_up:
-            # No agent can answer: run at most in real time during a network failure.
+            # No agent can answer: run no faster than real time during a network failure.
             min_s = max(min_s, self.scenario.runtime.tick_s)
         self._until_s = max(now_s, self._opened_s + min_s)
         self.phase = TickPhase.PACE

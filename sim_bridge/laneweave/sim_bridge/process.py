@@ -31,7 +31,7 @@ def run_bridge(
         scenario: complete configuration.
         folder: the run's folder.
         method: name of the control method in the summary.
-        pace: maximum road seconds per second; None: the scenario's.
+        pace: maximum road seconds per wall-clock second; None: the scenario's.
         wrap: wraps the core, to inject faults.
         observe: registers the metrics source.
 

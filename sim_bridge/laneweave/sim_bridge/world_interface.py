@@ -14,7 +14,7 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 
 class World(Protocol):
-    """Display of bodies; tests replace `SumoWorld`."""
+    """Display of bodies: `SumoWorld`, or a substitute in tests."""
 
     def add(self, vehicle: str, state: State) -> None:
         """Add a vehicle to the road."""

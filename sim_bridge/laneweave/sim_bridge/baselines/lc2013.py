@@ -1,7 +1,7 @@
 """SUMO's own lane changing (LC2013) and car following (Krauss), for automated vehicles.
 
-Headway and desired speed are those of the other methods; all vehicles are equal and drive without
-imperfection. A vehicle's route leads to the exit of its preferred lane. In S1 and S2 lane changes
+Headway and desired speed are those of the other methods; vehicles are identical, with no driver
+imperfection. A vehicle's route leads to the exit of its preferred lane. In S1 and S2, lane changes
 are disabled unless the scenario allows them everywhere.
 """
 
@@ -24,7 +24,7 @@ class Lc2013Traffic:
         self._sumo = sumo
         self._vehicles: dict[str, ReferenceVehicle] = {}
         self._offered: dict[str, int] = {}
-        """Lane of each vehicle that waits in SUMO for insertion, at most one per lane."""
+        """Lane of each vehicle that waits for SUMO to insert it, at most one per lane."""
         self._kept_on_lane: set[ReferenceVehicle] = set()
         """Vehicles that may not change lanes yet."""
         self._poses: dict[str, Pose] = {}

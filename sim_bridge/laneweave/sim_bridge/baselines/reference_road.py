@@ -21,7 +21,7 @@ from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S
 
 @define(eq=False)
 class ReferenceVehicle:
-    """A vehicle on the road, without formation and motion controller."""
+    """A vehicle on the road, without a formation or motion controller."""
 
     arrival: Arrival
     entered_s: float
@@ -32,7 +32,7 @@ class ReferenceVehicle:
     y_m: float
     """Position of the body's centre across the road."""
     lane: int
-    """Current lane; during a lane change the new lane."""
+    """Current lane; during a lane change, the new lane."""
     accel_mps2: float = 0.0
     lateral_speed_mps: float = 0.0
     previous_lane: int | None = None
@@ -46,12 +46,12 @@ class ReferenceVehicle:
 
     @property
     def preferred_lane(self) -> int:
-        """Lane on which the vehicle wants to leave the road."""
+        """Lane in which the vehicle wants to leave the road."""
         return self.arrival.preferred_lane
 
     @property
     def finished(self) -> bool:
-        """Whether all lane changes are finished."""
+        """Whether the vehicle has completed all lane changes."""
         return self.lane == self.preferred_lane and self.previous_lane is None
 
     @property
@@ -71,7 +71,7 @@ class ReferenceVehicle:
 
 
 class Entrance:
-    """Queues of waiting vehicles on each lane, in order of arrival."""
+    """Queue of waiting vehicles for each lane, in order of arrival."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Create empty queues."""
@@ -88,7 +88,7 @@ class Entrance:
         self._queues[arrival.lane].append(arrival)
 
     def next_on(self, lane: int) -> Arrival | None:
-        """Return the next vehicle on a lane, if any."""
+        """Return the next vehicle in the queue of a lane, if any."""
         return self._queues[lane][0] if self._queues[lane] else None
 
     def max_entry_m(self, arrival: Arrival, t_s: float) -> float:
@@ -99,7 +99,7 @@ class Entrance:
         return self._speed_mps * min(max(t_s - arrival.t_s, 0.0), self._tick_s)
 
     def take(self, lane: int) -> Arrival:
-        """Remove and return the next vehicle on a lane."""
+        """Remove and return the next vehicle in the queue of a lane."""
         return self._queues[lane].popleft()
 
 
@@ -151,7 +151,7 @@ class ReferenceRoad:
 
     @property
     def ending(self) -> Ending | None:
-        """Reason for the end of the run; None while it continues."""
+        """Reason why the run has ended; None while it continues."""
         if self._left == len(self._arrivals):
             return Ending.COMPLETE
         if self.t_s >= self._scenario.runtime.max_road_s:

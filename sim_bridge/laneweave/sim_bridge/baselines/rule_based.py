@@ -69,7 +69,7 @@ class RuleTraffic:
     def _move_along(
         self, vehicle: ReferenceVehicle, leaders: Iterable[ReferenceVehicle], *, slows_down: bool
     ) -> None:
-        """Move a vehicle along the road by one tick, after all vehicles ahead of it."""
+        """Move a vehicle along the road by one tick, once all vehicles ahead have moved."""
         s_m, before_mps, tick_s = vehicle.s_m, vehicle.speed_mps, self._tick_s
         wanted_mps = min(
             self._rules.approach_speed_mps(vehicle),
@@ -129,7 +129,7 @@ class RuleTraffic:
         return entered
 
     def _room_m(self, lane: int, max_entry_m: float) -> float | None:
-        """Return the position at which a vehicle can enter a lane at v_F; None without room."""
+        """Return the position at which a vehicle can enter a lane at v_F; None if it cannot."""
         if not self._lanes[lane]:
             return max_entry_m
         ahead, speed_mps = self._lanes[lane][-1], self._speed_mps

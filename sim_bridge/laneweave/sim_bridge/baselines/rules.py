@@ -1,10 +1,10 @@
-"""The rules of the rule-based method (paper, Section 5.2.2; interpreted in decision 20).
+"""The rules of the rule-based method (paper, Section 5.2.2; decision 20 interprets it).
 
-Rule 1. Vehicles drive at v_F on their current lane in S1 and S2, and in S3 on their preferred lane.
+Rule 1. Vehicles drive at v_F: in S1 and S2 in their current lane, in S3 in their preferred lane.
 Rule 2. A vehicle changes to the next lane towards the preferred one when the gaps there, to the
         vehicle ahead and to the vehicle behind, satisfy the constant time headway policy.
 Rule 3. If a gap is too small, the vehicle with lower priority slows down. Its speed decreases
-        towards the end.
+        towards the end of the road.
 
 Lane changes and speeds are pure functions of the positions.
 """
@@ -21,7 +21,7 @@ from laneweave.sim_bridge.baselines.reference_road import ReferenceVehicle
 
 
 def priority(vehicle: ReferenceVehicle) -> tuple[float, str]:
-    """Return the sort key: vehicles closer to the end come first.
+    """Return the sort key: vehicles closer to the end of the road come first.
 
     Ties are broken by name; otherwise three vehicles side by side would wait for each other
     forever.
@@ -33,8 +33,8 @@ class Following:
     """Car following: gaps and speeds behind a vehicle ahead.
 
     Positions are those of front bumpers. Speeds are chosen from front to rear, so a follower knows
-    the position of the vehicle ahead at the end of the tick. Both have constant acceleration during
-    a tick.
+    the position of the vehicle ahead at the end of the tick. Both vehicles have constant
+    acceleration during a tick.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -78,8 +78,8 @@ class Following:
           with maximum deceleration. This is Krauss' condition for a follower that reacts within the
           tick.
 
-        Position and speed of the follower are given for the beginning of the tick, those of the
-        vehicle ahead for its end.
+        The position and speed of the follower are given for the beginning of the tick, those of the
+        vehicle ahead for the end of the tick.
         """
         half_s, braking = 0.5 * self._tick_s, self._braking_mps2
         room_m = ahead_s_m - s_m - speed_mps * half_s
@@ -92,24 +92,24 @@ class Following:
 
 
 class Lanes:
-    """The vehicles on each lane by priority; during a lane change a vehicle is on two lanes."""
+    """The vehicles in each lane by priority; during a lane change a vehicle is in two lanes."""
 
     def __init__(self, lanes: int) -> None:
         """Begin with an empty road."""
         self._lanes: list[list[ReferenceVehicle]] = [[] for _ in range(lanes)]
 
     def __getitem__(self, lane: int) -> Sequence[ReferenceVehicle]:
-        """Return the vehicles on a lane, from front to rear."""
+        """Return the vehicles in a lane, from front to rear."""
         return self._lanes[lane]
 
     def __iter__(self) -> Iterator[Sequence[ReferenceVehicle]]:
-        """Yield the vehicles of each lane."""
+        """Yield the vehicles in each lane."""
         return iter(self._lanes)
 
     def neighbours(
         self, vehicle: ReferenceVehicle, lane: int
     ) -> tuple[ReferenceVehicle | None, ReferenceVehicle | None]:
-        """Return the next vehicles ahead and behind on another lane."""
+        """Return the next vehicles ahead and behind in another lane."""
         there = self._lanes[lane]
         place = bisect_left(there, priority(vehicle), key=priority)
         return (
@@ -128,7 +128,7 @@ class Lanes:
         self._lanes[vehicle.lane].remove(vehicle)
 
     def begin_change(self, vehicle: ReferenceVehicle, lane: int) -> None:
-        """Begin a lane change; until its end the vehicle is on both lanes."""
+        """Begin a lane change; the vehicle is in both lanes until `end_change`."""
         self.enter(vehicle, lane)
         vehicle.previous_lane, vehicle.lane = vehicle.lane, lane
 
@@ -141,7 +141,7 @@ class Lanes:
     def leaders(self) -> dict[ReferenceVehicle, list[ReferenceVehicle]]:
         """Return the next vehicles ahead of each vehicle, one per lane that it occupies.
 
-        During a lane change a vehicle follows both: the nearer one need not be the slower one.
+        During a lane change a vehicle follows both leaders: the nearer need not be the slower.
         """
         found: dict[ReferenceVehicle, list[ReferenceVehicle]] = {}
         for lane in self._lanes:
@@ -168,7 +168,7 @@ class Rules:
     def sort(self, lanes: Lanes) -> set[ReferenceVehicle]:
         """Apply rules 2 and 3 to all vehicles off their preferred lane, by priority.
 
-        A lane change occupies the gap on the new lane at once.
+        A lane change occupies the gap in the new lane at once.
 
         Returns:
             The vehicles that slow down, for another vehicle or to reach a gap behind it.
@@ -205,7 +205,7 @@ class Rules:
         ahead: ReferenceVehicle | None,
         behind: ReferenceVehicle | None,
     ) -> Iterator[ReferenceVehicle]:
-        """Yield the vehicles that must slow down for a lane change."""
+        """Yield the vehicles that must slow down before a vehicle can change lanes."""
         is_safe = self.following.is_safe
         if ahead is not None and not is_safe(
             vehicle.s_m, vehicle.speed_mps, ahead.s_m, ahead.speed_mps
@@ -214,8 +214,8 @@ class Rules:
         if behind is not None and not is_safe(
             behind.s_m, behind.speed_mps, vehicle.s_m, vehicle.speed_mps
         ):
-            # By rule 1 a vehicle that has finished continues at v_F, and the other one waits. A
-            # vehicle that is still changing may be blocked by the other one on its old lane.
+            # By rule 1, a vehicle that has finished continues at v_F, and the other one waits. A
+            # vehicle that is still changing may be blocked by the other one in its old lane.
             yields = self._all_yield or not behind.finished
             yield behind if yields else vehicle
 
@@ -226,11 +226,11 @@ class Rules:
         return self._speed_mps * min(max(share, 0.0), 1.0)
 
     def approach_speed_mps(self, vehicle: ReferenceVehicle) -> float:
-        """Return the maximum speed near the end of the road: v_F on the preferred lane.
+        """Return the maximum speed near the end of the road: v_F in the preferred lane.
 
-        On other lanes, the distance of the remaining lane changes is reserved before the end, and
-        speed decreases linearly over the distance d_stop before that point. A vehicle beside it
-        that yields stops farther behind, so that a gap opens.
+        In other lanes, the distance for the remaining lane changes is reserved before the end, and
+        speed decreases linearly over the distance d_stop before that point. A yielding vehicle in
+        the next lane stops farther back, so that a gap opens.
         """
         remaining = abs(vehicle.preferred_lane - vehicle.lane)
         if remaining == 0:

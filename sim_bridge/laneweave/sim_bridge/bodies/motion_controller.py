@@ -2,14 +2,14 @@
 
 It drives on one of the rungs of a fallback ladder (`Rung`):
 
-    execute     executes the trajectory of the newest command until its end
+    execute     executes the trajectory of the newest command
     hold        steers into the cell of the newest command, and stays in it at v_F
-    give way    the same, with comfortable braking behind a vehicle ahead
+    give way    as hold, but brakes comfortably behind a vehicle ahead
     emergency   brakes as hard as possible while `EmergencyBrake` requires it
 
-Without an agent, or without new commands, it executes the trajectory to its end. A trajectory that
-has ended or was interrupted by an emergency is not resumed: only a new command leads back to
-`execute`. The emergency brake acts on every rung and uses only local sensing.
+Without an agent or new commands, it executes the trajectory to its end. A trajectory that has ended
+or was interrupted by an emergency is not resumed: only a new command leads back to `execute`. The
+emergency brake acts on every rung and uses only local sensing.
 
 The controller also stores the data that must survive the agent: the process in charge, the joined
 formations, the newest accepted plan, and in the rolling operation the highest promise and the owned
@@ -45,10 +45,10 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, Neighbo
 from laneweave.sim_bridge.bodies.plant import Plant
 
 MAX_COLUMN = 2**31 - 1
-"""Maximum column, which is recorded with 32 bits. Formation numbers are smaller."""
+"""Maximum column: columns are recorded as 32-bit integers. Formation numbers are smaller."""
 RELEASE_M = 1.0
-"""Margin beyond the distance of one tick at which an emergency ends. Without it, favourable
-measurement errors would release the brake again and again, and accumulate."""
+"""Spare distance, beyond the distance driven in a tick, at which an emergency ends. Without it,
+favourable measurement errors would release the brake repeatedly, and accumulate."""
 
 
 class Rung(IntEnum):
@@ -88,7 +88,7 @@ class MotionController:
     command_tick: int = -1
     """Tick of the newest command; -1: none."""
     rung: Rung = Rung.HOLD
-    """Rung of the last tick."""
+    """Rung in the last tick."""
     rung_ticks: dict[Rung, int] = field(init=False)
     """Number of ticks on each rung."""
     neighbours: Neighbours = NO_NEIGHBOURS
@@ -106,7 +106,7 @@ class MotionController:
         """Begin without a trajectory, in the formation of the cell."""
         self.lattice = self._scenario.lattice
         self.tick_s = self._scenario.runtime.tick_s
-        # The other blocks of the formation are known when it is closed.
+        # The other blocks of the formation are not known until it is closed.
         self.joined = (self.lattice.block_of(self.hold_cell[0]),)
         self.motion_origin = self.hold_cell
         self.rung_ticks = dict.fromkeys(Rung, 0)
@@ -128,13 +128,13 @@ class MotionController:
         self._measured, self.neighbours = measured, neighbours
 
     def accept_command(self, command: Command) -> bool:
-        """Accept a command of the process in charge, or of a process that takes charge with it.
+        """Accept a command from the process in charge, or from one that takes charge with it.
 
-        Rejected are commands of an older incarnation than the process in charge, commands that are
-        not newer than the newest one, and commands with a hold cell that the vehicle does not own
-        (rolling operation). A newer incarnation takes charge. Its first command must keep the hold
-        cell: no plan can allow it to move before it was in charge. A rejected process may try again
-        at the next tick.
+        A command is rejected if its incarnation is older than that of the process in charge, if its
+        tick is not later than that of the last command, or if the vehicle does not own its hold
+        cell (rolling operation). A newer incarnation takes charge. Its first command must keep the
+        hold cell: no plan can allow a process to move the vehicle before it is in charge. A
+        rejected process may try again at the next tick.
 
         A command without jerks and with the current hold cell does not change the motion.
 
@@ -142,7 +142,7 @@ class MotionController:
             Whether the command was accepted.
 
         Raises:
-            BadInputError: the jerks are not pairs of finite numbers, a cell is not on a lane, or a
+            BadInputError: the jerks are not pairs of finite numbers, a cell is not in a lane, or a
                 number is out of range.
         """
         if command.incarnation < self.attendant or command.tick <= self.command_tick:
@@ -179,8 +179,8 @@ class MotionController:
     def store_requests(self, command: Command) -> bool:
         """Store formations, promise, transfer and acceptance from a command of any tick.
 
-        Commands of other processes than the one in charge are ignored. Returns whether anything has
-        changed.
+        Commands from processes other than the one in charge are ignored. Returns whether anything
+        has changed.
         """
         if command.incarnation != self.attendant:
             return False
@@ -202,7 +202,7 @@ class MotionController:
         return (self.joined, self.accepted, self.promised, self.transfer) != before
 
     def store_acceptance(self, ballot: Ballot) -> None:
-        """Store an acceptance of the process in charge unless a newer one is stored.
+        """Store an acceptance by the process in charge unless a newer one is stored.
 
         In the rolling operation the transfer of this ballot must be pending.
         """
@@ -242,7 +242,7 @@ class MotionController:
         self.joined = tuple(sorted({*self.joined, *formations}))
 
     def moving(self, tick: int) -> bool:
-        """Return whether the current motion has not ended at `tick`.
+        """Return whether a motion is still in progress at `tick`.
 
         A late body continues to move after the planned end of its motion.
         """
@@ -271,7 +271,7 @@ class MotionController:
     def _checked_jerks(self, command: Command) -> array[float]:
         for cell in (command.hold_cell, command.motion_origin):
             if not (0 <= cell[1] < self.lattice.lanes and abs(cell[0]) <= MAX_COLUMN):
-                raise BadInputError("Command", cell, f"cells on {self.lattice.lanes} lanes")
+                raise BadInputError("Command", cell, f"cells in {self.lattice.lanes} lanes")
         if not _in_range(command.joined):
             raise BadInputError("Command.joined", command.joined, f"at most {MAX_COLUMN}")
         if len(command.jerks) % 8:
@@ -285,7 +285,7 @@ class MotionController:
         return jerks
 
     def _next(self, tick: int, near: Iterable[Neighbour]) -> tuple[Rung, Jerk]:
-        """Return rung and jerk of a tick if there is no emergency."""
+        """Return the rung and jerk for a tick without an emergency."""
         index = 2 * (tick - self._jerks_tick)
         if 0 <= index < len(self._jerks):
             return Rung.EXECUTE, (self._jerks[index], self._jerks[index + 1])
@@ -319,7 +319,7 @@ class MotionController:
         return spare_m < 0.0
 
     def _relevant(self, others: Iterable[Neighbour], y_m: float) -> list[Neighbour]:
-        """Return the neighbours on lanes that the body touches or enters."""
+        """Return the neighbours in lanes that the body touches or enters."""
         first, last = self.lattice.lanes_touched(y_m, self._scenario.vehicle.width_m)
         goal = self.hold_cell[1]
         return [other for other in others if first <= other.lane <= last or other.lane == goal]

@@ -1,4 +1,4 @@
-"""Overlaps of bodies, gaps between them, and exact neighbours of each vehicle.
+"""Overlaps between bodies, gaps between them, and exact neighbours of each vehicle.
 
 A vehicle's body is a rectangle of length L and width W. Its pose consists of
 
@@ -8,7 +8,7 @@ A vehicle's body is a rectangle of length L and width W. Its pose consists of
 
 The body's centre is (s - L/2 cos heading, y). The overlap test is exact for these rectangles and
 determines the safety of a run. SUMO's collision list, which misses overlaps between two lanes, is
-recorded in addition.
+also recorded.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ Pose = tuple[float, float, float, float]
 _Point = tuple[float, float]
 
 _TOUCH_M = 1e-9
-"""Tolerance: touching bodies do not overlap, and a body that touches a lane border is inside."""
+"""Tolerance: touching bodies do not overlap; a body that touches a lane's border stays inside."""
 
 
 class MinGaps(NamedTuple):
-    """Minimum gap and headway of vehicles in line; infinite without such vehicles."""
+    """Minimum gap and headway of vehicles in line; infinite if there are none."""
 
     gap_m: float
     """Bumper-to-bumper distance along the road."""
@@ -78,7 +78,7 @@ def corners(pose: Pose, length_m: float, width_m: float) -> tuple[_Point, _Point
 
 
 class Bodies:
-    """All bodies on the road at one time, of equal size; sorted once for all queries."""
+    """All bodies on the road at one time, all of the same size, sorted once for all queries."""
 
     def __init__(self, poses: Mapping[str, Pose], length_m: float, width_m: float) -> None:
         """Sort the bodies along the road.
@@ -127,7 +127,7 @@ class Bodies:
         bodies.
         """
         length_m, width_m = self._length_m, self._width_m
-        # For equal fronts the order does not depend on names.
+        # Sorted by pose, so that ties between fronts do not depend on names.
         bodies = sorted(zip(self._poses, self._extents, strict=True))
         # A vehicle farther ahead can have the smaller gap only if its front is closer than rotation
         # can extend a body.
@@ -170,13 +170,12 @@ class Bodies:
         They are the nearest vehicle ahead and behind in each lane that the vehicle's body touches
         and in the adjacent lanes. A vehicle that straddles two lanes is in both. The
         bumper-to-bumper gap ignores rotation and is negative for vehicles side by side. The vehicle
-        whose front is farther ahead counts as ahead; at equal positions, the vehicle with the later
-        name.
+        whose front is farther ahead counts as ahead; ties go to the vehicle with the later name.
 
         Args:
             lanes: number of lanes.
             lane_width_m: width of a lane.
-            accels_mps2: acceleration of each vehicle; default: zero.
+            accels_mps2: acceleration by vehicle; zero for vehicles that are not included.
         """
         touched = []
         """First and last lane that each body touches."""
@@ -188,7 +187,7 @@ class Bodies:
         accels = [accels_mps2.get(name, 0.0) for name in names]
 
         def nearest(order: Iterable[int], sign: float) -> list[list[ExactNeighbour]]:
-            """Return the neighbours of each vehicle among its predecessors in an order."""
+            """Return the neighbours of each vehicle among the vehicles before it in `order`."""
             last_seen = [-1] * lanes
             seen: list[list[ExactNeighbour]] = [[]] * len(names)
             for index in order:

@@ -3,7 +3,7 @@
 Along and across the road, the acceleration set-point changes with a jerk that is constant during a
 tick, and the body's acceleration follows it with a first-order lag: the body follows a commanded
 state (`protocol.vehicle.motion`). The plant keeps the commanded state within the vehicle's limits
-and integrates both exactly.
+and integrates both states exactly.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Plant:
         lag_s, lag_y_s = self._lag_s, self._lag_y_s
         next_s, next_v, a = _follow((s, v, a), along, to_along, jerk[0], lag_s, self._decay)
         y, v_y, a_y = _follow((y, v_y, a_y), across, to_across, jerk[1], lag_y_s, self._decay_y)
-        # Neither braking nor rounding moves a body backwards.
+        # Neither braking nor rounding may move a body backwards.
         next_s, next_v = max(next_s, s), max(next_v, 0.0)
         slip = self._slip_ratio * next_v
         if abs(v_y) > slip:
@@ -87,10 +87,10 @@ class Plant:
 def _follow(
     body: Axis, commanded: Axis, then: Axis, jerk: float, lag_s: float, decay: float
 ) -> Axis:
-    """Return one axis of a body after a tick with constant jerk of the commanded state.
+    """Return one axis of a body after a tick in which the commanded state has constant jerk.
 
     The commanded position is a cubic in time. The body converges to another cubic; its deviation
-    from that decays by the factor `decay`.
+    from this cubic decays by the factor `decay`.
     """
     if lag_s <= 0.0:
         return then

@@ -1,7 +1,7 @@
 """A vehicle's sensors, with independent normally distributed measurement errors.
 
 The errors (table `sensing` of the scenario) are seeded with the scenario's seed and the vehicle's
-name, so equal seeds give equal runs.
+name, so the same seed gives the same run.
 """
 
 from __future__ import annotations

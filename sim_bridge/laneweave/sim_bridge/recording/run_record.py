@@ -1,12 +1,12 @@
 """The record of a run: its files, and the results of all roles in `summary.json`.
 
-    trajectories.parquet   one row per vehicle and tick, written in row groups during the run
+    trajectories.parquet   one row per vehicle per tick, written in row groups during the run
     trips.parquet          one row per demanded vehicle, written at the end
     ticks.parquet          one row per tick, written at the end
     events.jsonl           one JSON object per line, flushed line by line
 
-The metadata of the first two contain the scenario as JSON (key `SCENARIO_KEY`), so that figures can
-be drawn from them alone.
+The metadata of the first two files contain the scenario as JSON (key `SCENARIO_KEY`), so that
+figures can be drawn from these files alone.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class RecordedVehicle(Protocol):
 
     @property
     def cell(self) -> tuple[int | None, int]:
-        """(column, lane) that the vehicle holds or moves to; column None off the lattice."""
+        """(column, lane) that the vehicle holds or moves to; column None: off the lattice."""
 
     @property
     def rung_ticks(self) -> Mapping[Rung, int]:
@@ -101,7 +101,7 @@ class RecordedVehicle(Protocol):
 
 @define
 class _Leadership:
-    """The leader and its changes, according to heartbeats."""
+    """Leadership as reported by heartbeats."""
 
     leader: tuple[Name, int] | None = None
     last_heartbeat_s: float = 0.0
@@ -110,7 +110,7 @@ class _Leadership:
 
 
 class Ending(Enum):
-    """Reason for the end of a run."""
+    """Reason why a run ended."""
 
     COMPLETE = "complete"
     """All demanded vehicles have left."""
@@ -121,7 +121,7 @@ class Ending(Enum):
 
 
 class RunRecord:
-    """Collector of a run's measurements, and writer of its folder."""
+    """Collector of a run's measurements, and writer of its files."""
 
     def __init__(
         self, folder: Path, scenario: Scenario, method: str, stopwatch: Callable[[], float]
@@ -211,7 +211,7 @@ class RunRecord:
             self.event(left_s, LEFT_OFF_LANE, **lanes, attended=attended)
 
     def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
-        """Record a vehicle that remains on the road at the end of the run."""
+        """Record a vehicle that is still on the road when the run ends."""
         self._rung_ticks.update(vehicle.rung_ticks)
 
     def on_missed(self, agents: int) -> None:
@@ -237,7 +237,7 @@ class RunRecord:
         collisions: Iterable[tuple[str, str]],
         gaps: MinGaps,
     ) -> None:
-        """Record positions, overlaps, collisions and gaps of a tick."""
+        """Record positions, overlaps, collisions and gaps after a tick."""
         overlaps = list(overlaps)
         for pair in overlaps:
             self.event(t_s, OVERLAP, vehicles=pair)
@@ -252,7 +252,7 @@ class RunRecord:
 
     def on_event(self, event: LogEvent) -> None:
         """Record an event of another role."""
-        # Role and name of the message replace those in its data.
+        # The message's role and name override those in its data.
         data = event.data | {"role": event.role, "name": event.name}
         self._write_event(event.t_s, event.kind, data)
         if event.kind in PLAN_EVENTS:
@@ -262,11 +262,11 @@ class RunRecord:
                 self._plans_by_solver[solver] += 1
 
     def on_report(self, report: Report) -> None:
-        """Record the counters of a role, which replace its earlier ones."""
+        """Record the counters of a role, replacing its earlier ones."""
         self._reports[report.role, report.name] = report
 
     def on_heartbeat(self, heartbeat: Heartbeat, t_s: float, now_s: float) -> None:
-        """Record changes of the leader and times without one; `now_s` is the node's clock."""
+        """Record leader changes and leaderless periods; `now_s` is the node's clock."""
         leadership = self._leadership
         sender = (heartbeat.coordinator, heartbeat.incarnation)
         if not heartbeat.leading:
@@ -307,7 +307,7 @@ class RunRecord:
             self._events.write(json.dumps({**own, **data, **own}, default=str) + "\n")
 
     def _write_ticks(self) -> None:
-        """Write `ticks.parquet`: duration of each tick and number of vehicles on the road."""
+        """Write `ticks.parquet`: the duration of each tick, and the vehicle count on the road."""
         types = {"t_s": pa.float64(), "on_road": pa.int32(), "tick_ms": pa.float32()}
         columns = zip(*self._ticks, strict=True) if self._ticks else ((), (), ())
         table = pa.table(
@@ -405,7 +405,7 @@ def _sample(vehicle: RecordedVehicle) -> Sample:
 
 
 def _per_process(reports: Iterable[Report], counter: str) -> int:
-    """Return the sum of a counter over processes, which may report it for several vehicles."""
+    """Return the sum of a counter over processes; one may report it for several vehicles."""
     newest: dict[Name, int] = {}
     for report in reports:
         newest[report.process] = max(newest.get(report.process, 0), getattr(report, counter))
@@ -417,7 +417,7 @@ def _number(value: object) -> float:
 
 
 def _milliseconds(packed: Iterable[bytes]) -> NDArray[np.float64]:
-    """Return the valid durations in reports of other processes."""
+    """Return the valid durations in reports from other processes."""
     whole = b"".join(each for each in packed if len(each) % 4 == 0)
     values = np.frombuffer(whole, dtype="<f4").astype(np.float64)
     return values[np.isfinite(values) & (values >= 0.0)]

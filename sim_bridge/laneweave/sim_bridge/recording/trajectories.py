@@ -1,4 +1,4 @@
-"""Trajectories: one row per vehicle and tick in `trajectories.parquet`, and extreme values."""
+"""Trajectories: one row per vehicle per tick in `trajectories.parquet`, and extreme values."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Trajectories:
     def __init__(self, path: Path, metadata: Metadata, min_accel_mps2: float) -> None:
         """Open the file; `min_accel_mps2` is the braking limit."""
         self.peak = 0
-        """Maximum number of vehicles in a tick."""
+        """Maximum number of vehicles on the road at a tick."""
         self._schema = pa.schema(_COLUMNS, metadata)
         self._writer = pq.ParquetWriter(
             path,
@@ -57,7 +57,7 @@ class Trajectories:
         """Buffered rows; `_times` contains their times."""
         self._brake_mps2 = EMERGENCY_SHARE * min_accel_mps2
         self._last_s, self._last_accels = -math.inf, dict[str, float]()
-        """Time of the last tick, and accelerations of all vehicles in it."""
+        """Time of the last tick, and accelerations of all vehicles at that tick."""
         self._overlaps: set[tuple[str, str]] = set()
         self._collisions: set[tuple[str, str]] = set()
         self._min_gap_m = self._min_headway_s = math.inf

@@ -22,7 +22,7 @@ Metadata = dict[bytes | str, bytes | str]
 SCENARIO_KEY = b"laneweave.scenario"
 """Key of the scenario in the metadata of a run's Parquet files."""
 WARM_UP_S = 60.0
-"""Road time before which entering vehicles are not counted, since the road is still empty."""
+"""Road time from which entering vehicles are counted; until then the road fills up."""
 
 _COLUMNS: list[pa.Field[Any]] = [
     pa.field("vehicle", pa.string(), nullable=False),
@@ -94,7 +94,7 @@ def travel_time(trips: pa.Table) -> TravelTime:
 def throughput(trips: pa.Table, lanes: int) -> float | None:
     """Return the flow at the end of the road [vehicles/(lane h)]; None if undefined.
 
-    It is measured between the first and the last counted vehicle that leave.
+    It is measured from the time the first counted vehicle leaves until the last one leaves.
     """
     counted_s = trips.filter(pc.field("counted"))["left_s"].to_numpy()
     if not len(counted_s) or counted_s.max() <= counted_s.min():
@@ -112,7 +112,7 @@ def finite(value: float) -> float | None:
 def percentiles_of(
     values: NDArray[Any], *percentiles: int, largest: bool = False
 ) -> dict[str, float | None]:
-    """Return percentiles by name, with `largest` also `max`; None without values."""
+    """Return percentiles by name (with `largest`, also `max`); None if there are no values."""
     ranks = {f"p{percentile}": percentile for percentile in percentiles}
     if largest:
         ranks["max"] = 100

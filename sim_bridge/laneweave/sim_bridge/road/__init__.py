@@ -1,4 +1,4 @@
-"""The road and its traffic: entry of vehicles, and the process in charge of each of them.
+"""The road and its traffic: entry of vehicles, and the process in charge of each vehicle.
 
 Entry points: `roadside.Roadside` (admits vehicles with `demand`, `entry` and `formation_building`;
 publishes the census), `vehicle.RoadVehicle` (one vehicle on the road), `attendance.Attendance`

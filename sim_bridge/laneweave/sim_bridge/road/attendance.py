@@ -1,7 +1,7 @@
 """Attendance: the process in charge of each vehicle, its agent or a caretaker.
 
-Rules for agents that are present or silent, for the beginning and end of caretakers, and for
-notifying agents that their vehicles have left. The bridge and the fault search share them.
+Rules for when an agent is present or silent, when a caretaker takes charge and is replaced, and how
+agents are notified that their vehicles have left. The bridge and the fault search share them.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from laneweave.sim_bridge.road.tick_answers import Answers
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 LEFT_REPEATS = 20
-"""Number of ticks in which the agent of a departed vehicle is notified."""
+"""Number of ticks at which the agent of a departed vehicle is notified."""
 
 
 class Absence(StrEnum):
-    """Reason for a caretaker."""
+    """Reason why a caretaker takes charge."""
 
     ABSENT = "absent"
     """The agent has no token."""
@@ -36,14 +36,14 @@ class Absence(StrEnum):
 
 
 class Caretaker:
-    """Representative of a vehicle whose agent is dead, silent or missing.
+    """Substitute for a vehicle's agent that is absent, silent or always late.
 
     It runs the same plan execution as an agent and publishes the same states, but it never starts a
     move, and accepts only plans in which its vehicle does not move. The vehicle promises to stay in
     its cell, and the leader plans around it.
 
-    The motion controller finishes its trajectory and holds. The caretaker ends when an agent claims
-    the vehicle with a COMMAND.
+    The motion controller finishes its trajectory and holds. The caretaker is removed when an agent
+    claims the vehicle with a COMMAND.
     """
 
     def __init__(self, vehicle: RoadVehicle, incarnation: int, tick: int) -> None:
@@ -90,7 +90,7 @@ class Caretaker:
         return self.state(tick) if accepted else None
 
     def state(self, tick: int) -> VehicleState:
-        """Return the state to publish in a tick; end the motion if the controller has (V7)."""
+        """Return the state to publish; end the motion if the controller has completed it (V7)."""
         vehicle, execution = self._vehicle, self._execution
         if execution.moving and not vehicle.controller.moving(tick):
             execution.end_motion()
@@ -156,7 +156,7 @@ class Attendance:
         """Register a COMMAND as a sign of life, and store its requests in the controller.
 
         Returns:
-            Whether the controller has stored a change, which the agent waits for.
+            Whether the controller has stored a change that the agent waits for.
         """
         # Late answers also show that an agent is present, but a replaced agent says nothing about
         # its successor.
@@ -167,7 +167,7 @@ class Attendance:
     def accept_command(
         self, vehicle: RoadVehicle, command: Command
     ) -> Generator[Effect, None, bool]:
-        """Pass a COMMAND to the vehicle's motion controller; a claim ends the caretaker.
+        """Pass a COMMAND to the vehicle's motion controller; a claim removes the caretaker.
 
         Returns:
             Whether the controller accepts it.
@@ -193,7 +193,7 @@ class Attendance:
         yield from self._end_caretaker(vehicle.name)
 
     def notify_departed(self, tick: int) -> Iterator[Effect]:
-        """Notify the present agents of departed vehicles again."""
+        """Notify the agents of departed vehicles again if they are still present."""
         for name, (vehicle, repeats) in list(self.departed.items()):
             if name not in self.answers.up or repeats == 0:
                 del self.departed[name]
@@ -241,7 +241,7 @@ class Attendance:
             yield _state_effect(caretaker.state(tick))
 
     def _end_caretaker(self, vehicle: Name) -> Iterator[Effect]:
-        """End a vehicle's caretaker, if it has one."""
+        """Remove a vehicle's caretaker, if it has one."""
         if self._caretakers.pop(vehicle, None) is not None:
             yield Unlisten(PREPARE, {"vehicle": vehicle})
             yield Unlisten(PLAN, {"vehicle": vehicle})
@@ -252,6 +252,6 @@ def _state_effect(state: VehicleState) -> Effect:
 
 
 def notify_left(vehicle: RoadVehicle, tick: int) -> Effect:
-    """Return the SENSE that makes the agent of a departed vehicle report and end."""
+    """Return the SENSE that makes the agent of a departed vehicle report and stop."""
     sense = vehicle.sense(tick, caretaker=False, left=True)
     return Send(SENSE, sense, {"vehicle": vehicle.name})

@@ -1,13 +1,13 @@
 """Random arrivals at the start of the road.
 
-On each lane the headway between two arrivals is
+In each lane the headway between two arrivals is
 
     min_headway + Exp(3600 / volume - min_headway)      (mean 3600 / volume seconds),
 
 and the preferred lane of each vehicle is drawn from the scenario's lane shares. Every lane has one
-random generator for headways and one for preferences, seeded with the scenario's seed. Equal seeds
-give equal arrivals, the arrivals on a lane do not depend on other lanes, and arrivals of a longer
-duration begin with those of a shorter one, including names.
+random generator for headways and one for preferences, seeded with the scenario's seed. The same
+seed gives the same arrivals, arrivals in a lane do not depend on other lanes, and a longer duration
+only appends arrivals, without changing the names of earlier ones.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class Arrival:
     """Arrival of a vehicle at the entrance."""
 
     vehicle: str
-    """Name: `v` and the number in order of arrival on all lanes, from 1."""
+    """Name: `v` and the number in order of arrival over all lanes, from 1."""
     lane: int
     """Lane of the arrival; 0 is the rightmost."""
     preferred_lane: int
-    """Lane on which the vehicle wants to leave the road."""
+    """Lane in which the vehicle wants to leave the road."""
     t_s: float
     """Road time at which the vehicle would pass the start of an empty road."""
 
@@ -52,14 +52,14 @@ def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
 
 
 def _arrivals_on(lane: int, scenario: Scenario) -> list[tuple[float, int]]:
-    """Return (time [s], preferred lane) of each arrival on one lane."""
+    """Return (time [s], preferred lane) of each arrival in one lane."""
     demand = scenario.demand
     mean_excess_s = max(0.0, 3600.0 / demand.volume_veh_per_lane_h - demand.min_headway_s)
     headways, preferences = (
         default_rng(SeedSequence(scenario.seed, spawn_key=(purpose, lane)))
         for purpose in (_HEADWAYS, _PREFERENCES)
     )
-    # Without the last bound, rounding cannot exclude a draw in [0, 1).
+    # Drop the last bound: rounded to less than 1, it would exclude some draws in [0, 1).
     bounds = np.array([*accumulate(scenario.lane_shares)][:-1])
     result: list[tuple[float, int]] = []
     t_s = 0.0

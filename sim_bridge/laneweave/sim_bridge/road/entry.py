@@ -3,11 +3,11 @@
 A vehicle enters at s = 0 with the lattice speed v_F. It gets the first free cell of its lane behind
 its predecessor that passes s = 0 at most `spread_s` before or after the vehicle, and settles in
 this cell. With interlaced entry only every other cell may be entered, as in the paper's driving
-structure. Vehicles of a lane enter in order of arrival, at least the time of one column apart.
+structure. Vehicles of a lane enter in order of arrival, at least one column's time apart.
 
 With formations, `formation_building` decides whether a formation admits a vehicle.
 
-Decisions do not depend on later arrivals: they are made in order of time, and at equal times from
+Decisions do not depend on later arrivals: they are made in order of time; at the same time, from
 the right lane to the left.
 """
 
@@ -23,7 +23,7 @@ from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.formation_building import FormationBuilder
 
 TIME_TOLERANCE_S = 1e-9
-"""Tolerance for comparing ticks with passing times, due to rounding."""
+"""Rounding tolerance for comparing ticks with passing times."""
 
 
 @frozen
@@ -64,21 +64,21 @@ class EntryMeter:
         self._queues: list[list[Arrival]] = [[] for _ in range(lattice.lanes)]
         self._names: set[str] = set()
         self._columns = [0] * lattice.lanes
-        """Next column of each lane that can be entered."""
+        """Next column of each lane that vehicles can enter."""
         self._free_s = [-math.inf] * lattice.lanes
         """Earliest time at which the next vehicle of each lane may enter."""
 
     @property
     def waiting(self) -> tuple[Arrival, ...]:
-        """Queued vehicles, by lane."""
+        """Queued vehicles, ordered by lane."""
         return tuple(arrival for queue in self._queues for arrival in queue)
 
     def closed_column(self, lane: int) -> int:
-        """Return the last column of a lane that can no longer be entered."""
+        """Return the last column of a lane that vehicles can no longer enter."""
         return self._columns[lane] + 1
 
     def demand(self, arrival: Arrival) -> None:
-        """Queue a vehicle on its lane in order of arrival, before or after its arrival time.
+        """Queue a vehicle for its lane in order of arrival; its arrival time may lie ahead.
 
         Raises:
             ValueError: a lane does not exist, or the vehicle is already queued.
@@ -124,7 +124,7 @@ class EntryMeter:
         return max(ready_s, self._lattice.passing_time_s(self._columns[lane]) - self._spread_s)
 
     def _skip(self, lane: int, t_s: float) -> None:
-        """Advance to the first column of a lane that can be entered at a time."""
+        """Advance a lane to its first column that vehicles can enter at `t_s`."""
         lattice, column = self._lattice, self._columns[lane]
         if self._builder is not None:
             column = int(min(column, self._builder.first_open_column))

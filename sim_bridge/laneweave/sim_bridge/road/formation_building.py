@@ -5,13 +5,13 @@ Each column belongs to at most one closed formation, permanently: plans of diffe
 on this.
 
 - `ColumnBlocks`, as in the paper: all formations have the same number of columns.
-- `GrowingFormations`, the default: the length follows the traffic. A formation begins with the
+- `GrowingFormations`, the default: the length depends on the traffic. A formation begins with the
   column of its first vehicle. It ends at its maximum number of vehicles, at its maximum length, or
-  before a vehicle that would need more places on a lane than the shortest formation has. Behind the
+  before a vehicle that would need more places in a lane than the shortest formation has. Behind the
   last vehicle it gets the columns that sorting needs: at least as many free cells as lanes, and as
-  many columns as vehicles prefer the same lane.
+  many columns as there are vehicles that prefer the same lane.
 
-Both close a formation before it needs more places on a lane than it has, unlike the paper, which
+Both close a formation before it needs more places in a lane than it has, unlike the paper, which
 groups vehicles regardless of their preferences.
 """
 
@@ -57,7 +57,7 @@ class ColumnBlocks:
         return True
 
     def closed(self, t_s: float) -> list[ClosedFormation]:
-        """Return the formations closed since the last call, whose last columns have passed."""
+        """Return the formations whose last columns have passed since the last call."""
         closed = []
         while (closed_s := self._closing_s(self._next)) <= t_s:
             if self._taken[self._next]:
@@ -67,7 +67,7 @@ class ColumnBlocks:
 
     @property
     def closed_to(self) -> int:
-        """Number up to which all blocks are closed; -1: none."""
+        """Block up to which all blocks are closed; -1: none."""
         return self._next - 1
 
     def _closing_s(self, block: int) -> float:
@@ -77,7 +77,7 @@ class ColumnBlocks:
 
 @define
 class GrowingFormations:
-    """Formations whose length follows the traffic; blocks are single columns."""
+    """Formations whose length depends on the traffic; blocks are single columns."""
 
     lattice: Lattice
     max_vehicles: int
@@ -97,7 +97,7 @@ class GrowingFormations:
 
     @property
     def shortest_length(self) -> int:
-        """Columns of a full formation without additional cells."""
+        """Number of columns of a full formation without additional cells."""
         return self._length_for(self.max_vehicles)
 
     def try_add(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
@@ -124,7 +124,7 @@ class GrowingFormations:
 
     @property
     def closed_to(self) -> int:
-        """Number up to which all blocks are closed; -1: none."""
+        """Block up to which all blocks are closed; -1: none."""
         return self.lattice.block_of(int(self.first_open_column)) - 1
 
     def closed(self, t_s: float) -> list[ClosedFormation]:
@@ -154,7 +154,7 @@ class GrowingFormations:
         self._preferring.clear()
 
     def _length_for(self, vehicles: int) -> int:
-        """Return the number of columns for some vehicles and as many free cells as lanes."""
+        """Return the number of columns for some vehicles plus as many free cells as lanes."""
         lanes = self.lattice.lanes
         return math.ceil((vehicles + lanes) / lanes) if lanes > 1 else vehicles
 
@@ -164,7 +164,7 @@ FormationBuilder = ColumnBlocks | GrowingFormations
 
 
 def formation_builder(scenario: Scenario) -> FormationBuilder | None:
-    """Return the builder of a scenario's formations, if it has formations."""
+    """Return the builder of a scenario's formations; None in the rolling operation."""
     formation, lattice = scenario.formation, scenario.lattice
     spread_s = formation.entry_spread_s
     if formation.rolling:

@@ -28,8 +28,8 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 CENSUS_EVERY_TICKS = 10
 MAX_EMPTY = 12
-"""Maximum distance in columns between a vehicle and empty cells assigned to it. It is smaller if
-moves begin soon: all cells must be assigned before a plan can transfer them."""
+"""Maximum distance in columns between a vehicle and empty cells assigned to it; smaller if moves
+begin near the entrance, since all cells must be assigned before a plan can transfer them."""
 
 
 class Roadside:
@@ -58,11 +58,11 @@ class Roadside:
         self._recent: list[tuple[int, int, Name]] = []
         """(column, lane, name) of recently entered vehicles."""
         self._next: list[list[tuple[int, Name]]] = [[] for _ in range(self._lanes)]
-        """Vehicles by lane that have entered since cells were last assigned, foremost first."""
+        """Vehicles that have entered since cells were last assigned, by lane, foremost first."""
         self._unassigned: list[Cell] = []
         """Empty cells without an owner."""
         self._assigned_to = [1 + MAX_EMPTY] * self._lanes
-        """Last processed column of each lane."""
+        """Last column of each lane whose cells have been processed."""
         columns = int(scenario.moves_from_m / lattice.pitch_m)
         self._max_empty = max(0, min(MAX_EMPTY, columns - 2))
         self._arrivals = arrivals(scenario)
@@ -87,7 +87,7 @@ class Roadside:
 
     def admit(self, t_s: float) -> list[Admission]:
         """Return the vehicles that have entered since the last call."""
-        # Also queue arrivals before the next tick, since cells pass between ticks.
+        # Also queue vehicles that arrive before the next tick, since cells pass between ticks.
         while (
             self._queued < len(self._arrivals)
             and self._arrivals[self._queued].t_s <= t_s + self._tick_s
@@ -119,8 +119,8 @@ class Roadside:
     def assign_empty_cells(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
         """Assign empty cells at the entrance to vehicles near them (rolling operation).
 
-        A cell is assigned when no vehicle can enter in it any more. Cells without a vehicle nearby
-        wait for the next vehicles; cells too far ahead of these stay without an owner.
+        A cell is assigned once no vehicle can enter in it any more. A cell without a vehicle nearby
+        waits for the next vehicles; if it is too far ahead of them, it remains without an owner.
         """
         if not self._rolling:
             return
@@ -138,7 +138,7 @@ class Roadside:
                 self._assign(cell, vehicles)
 
     def _assign(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
-        """Assign an empty cell to a nearby vehicle, preferably one ahead on the same lane."""
+        """Assign an empty cell to a nearby vehicle, preferably one ahead in the same lane."""
         column, lane = cell
         first, last = column - self._max_empty, column + self._max_empty
         near = [
@@ -165,7 +165,7 @@ class Roadside:
     def publish(
         self, tick: int, t_s: float, on_road: Collection[RoadVehicle], *, ended: bool = False
     ) -> Iterator[Effect]:
-        """Publish the clock, and the census on every change, every 10 ticks, and at the end."""
+        """Publish the clock; publish the census on changes, every 10 ticks, and when a run ends."""
         yield Send(CLOCK, self.clock(tick, t_s, len(on_road), ended=ended))
         due = ended or tick >= self._census_sent_tick + CENSUS_EVERY_TICKS
         announced = self.update_announcements(t_s)

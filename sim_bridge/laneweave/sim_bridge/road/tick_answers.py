@@ -1,12 +1,12 @@
 """Lockstep answers: the agents that a tick waits for, its deadline, and silent agents.
 
-A tick waits until its deadline for every agent with a token. After lost messages, the next tick
+A tick waits until its deadline for every agent with a token. If messages are lost, the next tick
 waits for the agent again. An agent that has not answered for `agent_silent_s` is *silent*: ticks no
 longer wait for it. If no agent has answered for this time, ticks do not wait for new agents either.
 
 Answers after the deadline indicate a slow machine rather than lost messages. Ticks then get more
 time, and SENSE is repeated less often, so that the road slows down and agents keep up. When answers
-are in time again, this is reversed slowly.
+arrive in time again, the extra time slowly shrinks.
 
 Times are on the node's clock. Each tick counts for at most its deadline; other waits of the road
 (pace, starting agents) do not count as silence.
@@ -25,11 +25,11 @@ from laneweave.protocol.wire.messages import Name
 MAX_STRETCH = 8.0
 """Maximum factor of `tick_deadline_s`."""
 _STRETCH, _RELAX = 1.5, 0.98
-"""Change of this factor after a tick with and without late answers."""
+"""Multipliers of that factor after a tick with too many late answers, and after other ticks."""
 _LATE_AGENTS = 0.05
 """Fraction of agents that may answer late without increasing the deadline."""
 LATE_SHARE = 2.0
-"""Factor of `agent_silent_s` for agents that always answer too late."""
+"""Multiple of `agent_silent_s` after which an agent that always answers late is replaced."""
 _ROUNDING_S = 1e-6
 """Tolerance for comparing sums of deadlines with `agent_silent_s`."""
 
@@ -43,26 +43,26 @@ class Answers:
     """Agents with a token."""
     silent: set[Name] = field(factory=set)
     awaited: set[Name] = field(factory=set)
-    """Agents for whose answers the current tick waits."""
+    """Agents whose answers the current tick awaits."""
     resend_s: float = math.inf
     """Time at which SENSE is repeated to awaited agents."""
     deadline_s: float = math.inf
     """Time at which the current tick proceeds without awaited agents."""
     _sent_s: float = 0.0
     _without_message: set[Name] = field(factory=set)
-    """Present agents that have sent no message since the start of the tick."""
+    """Present agents that have sent no message since the tick started."""
     _silence_s: dict[Name, float] = field(factory=dict)
-    """Total duration of ticks since the last message of each agent."""
+    """Total duration of ticks since the last message from each agent."""
     _late_s: dict[Name, float] = field(factory=dict)
-    """Total duration of ticks since the last answer in time of each agent."""
+    """Total duration of ticks since each agent last answered in time."""
     _without_answer: set[Name] = field(factory=set)
     """Present agents that have not answered the current tick."""
     _late: set[Name] = field(factory=set)
-    """Agents that have answered an earlier tick since the start of the current one."""
+    """Agents that have answered an earlier tick since the current tick started."""
     _stretch: float = 1.0
     _any_message: bool = False
     _all_silent_s: float = 0.0
-    """Total duration of ticks since the last message of any agent."""
+    """Total duration of ticks since the last message from any agent."""
 
     @property
     def all_silent(self) -> bool:
@@ -160,7 +160,7 @@ class Answers:
         return missed
 
     def always_late(self, name: Name) -> bool:
-        """Return whether an agent has not answered in time for too long."""
+        """Return whether an agent has been answering only late for too long."""
         return self._too_long(self._late_s.get(name, 0.0) / LATE_SHARE)
 
     def _reset(self, name: Name) -> None:

@@ -29,9 +29,9 @@ class RoadVehicle:
     admission: Admission
     controller: MotionController
     sensors: Sensors | None = None
-    """None: exact measurements of its own state, no neighbours."""
+    """None: the vehicle knows its exact state, and no neighbours."""
     formation: int | None = None
-    """Number of the formation, or in the rolling operation of the block; None: not known yet."""
+    """Formation number (rolling operation: block number); None: not known yet."""
     bridge: int = 0
     """Incarnation of the bridge."""
 
@@ -41,7 +41,7 @@ class RoadVehicle:
     ) -> RoadVehicle:
         """Return an admitted vehicle at road time `t_s`, after driving at v_F since its admission.
 
-        It settles in its cell within `formation.settle_s`.
+        The vehicle settles in its cell within `formation.settle_s`.
         """
         lattice, tick_s = scenario.lattice, scenario.runtime.tick_s
         rest = cell_state(lattice, admission.cell, t_s)

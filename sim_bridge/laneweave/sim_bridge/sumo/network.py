@@ -6,7 +6,7 @@ that enter or leave. The files are written without `netconvert`, which needs a m
 than `libsumo`.
 
 If SUMO drives the vehicles, the edge ends with the road, and each lane leads to its own exit: SUMO
-chooses the lane of a vehicle's exit before the end of the road.
+moves a vehicle to the lane of its exit before the end of the road.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MIN_MARGIN_M = 30.0
 def margin_m(scenario: Scenario) -> float:
     """Return the length by which SUMO's edge exceeds the road at each end [m].
 
-    A vehicle is removed in the first tick after the end, up to one tick beyond it.
+    When a vehicle is removed, it is up to one tick's travel beyond the end.
     """
     vehicle = scenario.vehicle
     tick_m = vehicle.max_speed_mps * scenario.runtime.tick_s
@@ -38,11 +38,11 @@ def exit_route(lane: int) -> str:
 
 
 def write_network(scenario: Scenario, folder: Path, *, exits: bool = False) -> tuple[str, ...]:
-    """Write network and route files, and return SUMO's arguments, program name first.
+    """Write network and route files; return SUMO's command line, program name included.
 
     Args:
         scenario: road, vehicles and tick.
-        folder: target folder, which is created if necessary.
+        folder: target folder, created if necessary.
         exits: whether SUMO drives the vehicles (table `lc2013`) or only displays them.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -63,7 +63,7 @@ def write_network(scenario: Scenario, folder: Path, *, exits: bool = False) -> t
 
 
 def _network(scenario: Scenario, *, exits: bool) -> Iterator[str]:
-    """Yield the lines of the network: the road's edge, and the edges of exits.
+    """Yield the lines of the network file: the road's edge, and the edges of exits.
 
     If SUMO drives, the speed limit is the desired speed v_F. Lanes do not cross.
     """
@@ -124,8 +124,8 @@ def _network(scenario: Scenario, *, exits: bool) -> Iterator[str]:
 def _routes(scenario: Scenario, *, exits: bool) -> Iterator[str]:
     """Yield the lines of the route file: the vehicle type, and one route or one per exit.
 
-    Vehicles drive without imperfection (sigma) and with equal desired speeds (speedDev). If SUMO
-    does not drive, `tau` and `minGap` are close to zero; the defaults would delay insertions.
+    Drivers have no imperfection (sigma) and the same desired speed (speedDev). If SUMO does not
+    drive, `tau` and `minGap` are close to zero; the defaults would delay insertions.
     """
     vehicle, settings = scenario.vehicle, scenario.lc2013
     tau_s, min_gap_m = (settings.headway_s, settings.min_gap_m) if exits else (0.1, 0.0)

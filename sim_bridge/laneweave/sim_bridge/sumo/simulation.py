@@ -1,6 +1,6 @@
 """SUMO in this process; the only module that imports libsumo.
 
-libsumo stores its simulation in global variables, so a process can have one `SumoSession` at a
+libsumo stores its simulation in global variables, so a process can have only one `SumoSession` at a
 time. libsumo is imported when a session opens, so that other code works without it.
 """
 
@@ -45,7 +45,7 @@ class SumoSession:
         Args:
             scenario: road, vehicles and tick.
             folder: folder for SUMO's input files.
-            exits: whether SUMO drives, see `write_network`.
+            exits: whether SUMO drives; see `write_network`.
 
         Raises:
             SumoUnavailableError: libsumo cannot be loaded.
@@ -60,7 +60,7 @@ class SumoSession:
 
     @property
     def vehicle(self) -> Any:  # noqa: ANN401 - libsumo has no types
-        """The vehicle functions of libsumo."""
+        """libsumo's functions for vehicles."""
         return self._sumo.vehicle
 
     def step(self) -> None:
@@ -92,7 +92,7 @@ class SumoSession:
         return poses
 
     def close(self) -> None:
-        """End SUMO. Idempotent."""
+        """Stop SUMO. Idempotent."""
         if SumoSession._open is self:
             SumoSession._open = None
             self._sumo.close()
@@ -109,8 +109,8 @@ class SumoSession:
 def _load_libsumo() -> Any:  # noqa: ANN401 - libsumo has no types
     """Import libsumo without its warning about the version of pyarrow.
 
-    The warning concerns SUMO's Parquet output, which is not used. Both were tested together,
-    imported in either order.
+    The warning concerns SUMO's Parquet output, which is not used. libsumo and pyarrow were tested
+    together, imported in either order.
     """
     previous = os.environ.get(_IMPORT_SWITCH)
     os.environ[_IMPORT_SWITCH] = "quiet"

@@ -1,7 +1,7 @@
 """The road in SUMO, with bodies that SUMO displays but does not drive.
 
 SUMO displays every vehicle with the position, lateral position, heading and speed of its plant,
-also between lanes. The calls of a tick are
+also between lanes. The calls in each tick are
 
     place() every vehicle  ->  step()  ->  positions(), collisions()
 
@@ -26,7 +26,7 @@ class SumoWorld(SumoSession):
     """One road with vehicles in SUMO. Close it, or use it as a context manager."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
-        """Start SUMO with an empty road, see `SumoSession`."""
+        """Start SUMO with an empty road; see `SumoSession`."""
         super().__init__(scenario, folder)
         margin = margin_m(scenario)
         self._range_m = (-margin, scenario.road.length_m + margin)
@@ -44,7 +44,7 @@ class SumoWorld(SumoSession):
             ValueError: the vehicle is already on the road, or `state` is not on the edge.
         """
         if vehicle in self._states:
-            raise ValueError(f"{vehicle} is on the road already")
+            raise ValueError(f"{vehicle} is already on the road")
         self._check(vehicle, state)  # before the vehicle is added to SUMO
         api = self.vehicle
         api.add(vehicle, ROUTE, typeID=VEHICLE_TYPE, depart="now", departPos="0", departSpeed="0")
@@ -69,7 +69,7 @@ class SumoWorld(SumoSession):
         """Advance SUMO by one tick; vehicles without a new state stay in place.
 
         Raises:
-            RuntimeError: SUMO's vehicles differ from the added ones (internal error).
+            RuntimeError: SUMO does not have exactly the added vehicles (internal error).
         """
         if len(self._placed) < len(self._states):
             for vehicle, state in self._states.items():
@@ -86,7 +86,7 @@ class SumoWorld(SumoSession):
         self._shown = list(self._states)
 
     def positions(self) -> dict[str, Pose]:
-        """Return the pose of each vehicle after the last step, in order of addition."""
+        """Return the pose of each vehicle after the last step, in the order of `add` calls."""
         return self.poses(self._shown)
 
     def remove(self, vehicle: str) -> None:
@@ -104,7 +104,7 @@ class SumoWorld(SumoSession):
     def _check(self, vehicle: str, state: State) -> None:
         """Reject a state that SUMO would display elsewhere."""
         if not math.isfinite(sum(state)):
-            raise ValueError(f"{vehicle} must be at a finite state, not {state}")
+            raise ValueError(f"{vehicle} must have a finite state, not {state}")
         low_m, high_m = self._range_m
         if not low_m <= state[0] <= high_m:
             raise ValueError(

@@ -1,8 +1,8 @@
 """Vehicles that SUMO drives with its own car following and lane changing.
 
-The calls of a tick are
+The calls in each tick are
 
-    offer() waiting vehicles  ->  advance(), which returns the entered ones  ->  positions()
+    offer() waiting vehicles  ->  advance(), which returns those that entered  ->  positions()
 
 An offered vehicle waits in SUMO until there is room at its entry position. Its route, which SUMO's
 lane changing follows, leads to the exit of its preferred lane; a vehicle that does not reach this
@@ -27,7 +27,7 @@ class SumoTraffic(SumoSession):
     """One road with vehicles that SUMO drives. Close it, or use it as a context manager."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
-        """Start SUMO with an empty road, see `SumoSession`."""
+        """Start SUMO with an empty road; see `SumoSession`."""
         super().__init__(scenario, folder, exits=True)
         self._margin_m = margin_m(scenario)
         self._speed_mps = scenario.formation.speed_mps
@@ -53,7 +53,7 @@ class SumoTraffic(SumoSession):
         )
 
     def allow_lane_changes(self, vehicle: str, *, allowed: bool) -> None:
-        """Allow (default) or forbid lane changes of a vehicle."""
+        """Allow (SUMO's default) or forbid a vehicle to change lanes."""
         mode = _ALL_LANE_CHANGES if allowed else _NO_LANE_CHANGES
         self.vehicle.setLaneChangeMode(vehicle, mode)
 

@@ -133,7 +133,7 @@ def test_sumo_reports_a_collision_and_leaves_the_vehicles_where_they_are(world: 
 
 def test_misuse_is_refused(world: SumoWorld, tmp_path: Path) -> None:
     world.add("v1", cruising(0.0, 1.75))
-    with pytest.raises(ValueError, match="on the road already"):
+    with pytest.raises(ValueError, match="already on the road"):
         world.add("v1", cruising(0.0, 1.75))
     with pytest.raises(ValueError, match="not on the road"):
         world.place("v2", cruising(0.0, 1.75))
