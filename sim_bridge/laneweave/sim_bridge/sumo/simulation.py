@@ -60,7 +60,7 @@ class SumoSession:
 
     @property
     def vehicle(self) -> Any:  # noqa: ANN401 - libsumo has no types
-        """libsumo's functions for vehicles."""
+        """Libsumo's functions for vehicles."""
         return self._sumo.vehicle
 
     def step(self) -> None:
