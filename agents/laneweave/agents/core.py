@@ -12,7 +12,7 @@ caretaker is in charge (because the agent hung or its messages were lost), the a
 incarnation and claims the vehicle again.
 
 **The road.** A SENSE names its bridge. A newer bridge has another road and begins at tick 0: the
-agent discards its state, takes a new incarnation, and ignores late messages from the old one.
+agent discards its state, takes a new incarnation, and ignores late messages from the old bridge.
 """
 
 from __future__ import annotations
@@ -203,7 +203,7 @@ class AgentCore:
             self._incarnation = above(self._new_incarnation(), sense.attendant)
         in_charge = self.in_charge
         if not (was_in_charge and in_charge):
-            # Also while a claim is pending, since another process may begin a move until then.
+            # Also while a claim is pending, since another process may still begin a move.
             self._take_over(sense)
         return self._act(sense, in_charge=in_charge)
 

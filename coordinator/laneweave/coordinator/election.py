@@ -138,7 +138,7 @@ class Election:
     def _patience_s(self, peer: _Peer) -> float:
         """Return the time until which a leader waits for a higher-ranked new candidate to lead.
 
-        A new candidate must not lead immediately; stepping down earlier would leave no leader.
+        A new candidate does not lead immediately; stepping down earlier would leave no leader.
         """
         return peer.since_s + NEWCOMER_FACTOR * self.election_s
 

@@ -23,11 +23,11 @@ class LogEntry:
 class Operation(Protocol):
     """A leader's tasks for the vehicles on the road.
 
-    `t_s` is road time, `now_s` is the time of the node's clock.
+    `t_s` is road time, `now_s` is node time.
     """
 
     def forget(self) -> None:
-        """Discard all state: this is a new road."""
+        """Discard all state: the road is new."""
 
     def take_over(self) -> None:
         """Reset because this coordinator has begun or stopped leading."""

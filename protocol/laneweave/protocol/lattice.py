@@ -31,8 +31,8 @@ OBLIQUE: tuple[Cell, ...] = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 def displacements(mode: Mode) -> tuple[Cell, ...]:
     """Return the displacements that a vehicle may make in one step, in tie-breaking order.
 
-    Waiting comes first, then straight moves, then oblique ones, so that planners
-    break ties in favour of the simplest path.
+    Waiting comes first, then straight moves, then oblique ones, so that planners break ties in
+    favour of the simplest path.
     """
     return (WAIT, *STRAIGHT) if mode == 1 else (WAIT, *STRAIGHT, *OBLIQUE)
 
@@ -71,8 +71,8 @@ class Lattice:
     """Geometry of the moving lattice and of its blocks of columns.
 
     Block number b has the columns -(b + 1) W + 1 .. -b W for block width W. Neither columns nor
-    block numbers are ever reused. A formation owns one block or several
-    consecutive ones; its number is that of its foremost block.
+    block numbers are ever reused. A formation owns one block or several consecutive ones; its
+    number is that of its foremost block.
     """
 
     pitch_m: float

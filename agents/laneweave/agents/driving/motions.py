@@ -1,6 +1,6 @@
 """Announced motions: moves that other vehicles have published.
 
-A MOTION message contains the cells and the start of a move; the trajectory follows from the
+A MOTION message contains the cells, start and duration of a move; the trajectory follows from the
 scenario. Announced motions are matched with sensed neighbours by position and speed, because
 sensors do not report names and an announcement may be forged or outdated.
 """
@@ -21,11 +21,11 @@ Array = NDArray[np.float64]
 REPEAT_TICKS = 10
 """Interval at which a motion in progress is published again."""
 FRESH_TICKS = 3 * REPEAT_TICKS
-"""Time since it was last sent after which a motion is dropped."""
+"""Time since its last message after which a motion is dropped."""
 NEAR_M = 1.0
 """Maximum distance along the road between a neighbour and a matching motion."""
 NEAR_MPS = 1.0
-"""Maximum difference between their speeds."""
+"""Maximum difference in speed between a neighbour and a matching motion."""
 TURNED_M = 0.4
 """Extra sideways reach of a body that changes lanes, because it lags behind its reference and
 turns."""

@@ -217,7 +217,7 @@ class Tracker:
         return jerk
 
     def _excess(self, state: State, jerk: Array) -> float:
-        """Return the maximum by which the states that jerks (N, 2) lead to exceed a limit."""
+        """Return the maximum excess over a limit of the states that result from jerks (N, 2)."""
         limits, h = self._limits, self._tick_s
         rate = np.cumsum(jerk, axis=0)
         rate *= h

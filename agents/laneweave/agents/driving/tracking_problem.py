@@ -91,7 +91,7 @@ NO_GAPS = Gaps()
 
 @define(eq=False)
 class ErrorBounds:
-    """Bounds for n ticks on the errors from a reference that keep all limits.
+    """Bounds, for n ticks, within which errors from a reference exceed no limit.
 
     Unlike the program's bounds, they have no tolerance near standstill, so that the tracker's fast
     path is exact.

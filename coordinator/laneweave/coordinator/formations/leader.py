@@ -1,4 +1,4 @@
-"""One formation under a leader: its ballots, one after the other (rules L2 to L8).
+"""One formation under a leader: its ballots, one after another (rules L2 to L8).
 
 A leader first observes the formation and adopts a plan that is in force (L2). If there is none, or
 if it stalls or no longer fits, the leader prepares a new ballot. `LEADER_RULES` is the table, shown

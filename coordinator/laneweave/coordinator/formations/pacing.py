@@ -7,7 +7,7 @@ road, and those in S3 may change lanes.
 
 Plans stay in the blocks of their formations, so their footprints never intersect. But two moves
 towards each other across the border between formations (conflict kind `closing`) would trigger the
-emergency brake. Formations are planned one after the other, and the later plan pauses for a slot to
+emergency brake. Formations are planned one after another, and the later plan pauses for a slot to
 avoid such moves.
 """
 

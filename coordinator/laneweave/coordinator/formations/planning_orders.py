@@ -171,7 +171,7 @@ class FormationPlanner:
         nodes = scenario.formation.max_nodes * 2 ** min(leader.failures, MAX_DOUBLINGS)
         # Replaces a request under an earlier ballot, at the end of the queue.
         self._waiting.pop(numbers[0], None)
-        # Invalid promises make the job fail, like any other planning failure.
+        # The job detects invalid promises; they are handled like any planning failure.
         self._waiting[numbers[0]] = (
             ballot,
             partial(sort_lanes, task, nodes, self._make_plan),
@@ -259,7 +259,7 @@ class FormationPlanner:
         return False
 
     def _steps_left_in(self, numbers: Numbers, t_s: float) -> int:
-        """Return the number of steps that remain for vehicles in any cells of some blocks."""
+        """Return the number of steps left for vehicles anywhere in these blocks."""
         cells, scenario = self._block_cells(numbers), self._scenario
         start_s = start_time_s(cells, t_s + START_MARGIN_S, scenario)
         return steps_left(cells, start_s, scenario.cycles_s[0], scenario)
@@ -320,7 +320,7 @@ class FormationPlanner:
         return on_tick(max(begin_s, self._settled_s(cells), t_s + START_MARGIN_S), self._scenario)
 
     def _settled_s(self, cells: Collection[Cell]) -> float:
-        """Return the road time by which vehicles that entered in some cells have settled."""
+        """Return the road time by which vehicles that entered in these cells have settled."""
         formation, lattice = self._scenario.formation, self._scenario.lattice
         rear = min(column for column, _ in cells)
         return lattice.passing_time_s(rear) + formation.entry_spread_s + formation.settle_s

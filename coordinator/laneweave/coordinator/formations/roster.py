@@ -5,8 +5,8 @@ formation is *closed* when no more vehicles can enter its blocks; once a census 
 roster is complete.
 
 **Joined formations** are planned under one ballot. Such a plan may use the blocks of all of them,
-and its roster is all vehicles that entered there. After a plan has used two blocks, a vehicle of
-either may be in the other, so no later plan may use one of them without the vehicles of both:
+and its roster comprises all vehicles that entered there. After a plan has used two blocks, a
+vehicle from either may be in the other, so no later plan may use one without the vehicles of both:
 formations stay joined until their vehicles have left. Every vehicle stores the joined blocks
 (`VehicleState.joined`), so every leader learns them from the promises.
 """
@@ -42,7 +42,7 @@ class Formation:
     closed_s: float = 0.0
     """Road time at which the last of the formations was closed."""
     joined: int = 1
-    """Number of formations that are joined."""
+    """Number of formations; above 1 if joined."""
     deserted: Numbers = ()
     """Blocks of joined formations whose vehicles have all left the road. Plans avoid them, since
     vehicles of formations joined under another leader may be there."""
@@ -86,7 +86,7 @@ class Groups:
 def closed_formations(
     census: Census, t_s: float, scenario: Scenario, groups: Groups
 ) -> dict[int, Formation]:
-    """Return the complete formations on the road by their lowest block number.
+    """Return the closed formations on the road by their lowest block number.
 
     Formations with a block that is not closed in the census are left out, since a member could be
     missing.
@@ -127,7 +127,7 @@ def stage_at(numbers: Numbers, t_s: float, scenario: Scenario) -> int:
     """Return the index of the structure that a formation should plan at a road time.
 
     The first structure is planned at once. Each later structure, and lane sorting after the last
-    one, is planned `STAGE_LEAD_S` before the rear of the formation reaches its position.
+    one, is planned `STAGE_LEAD_S` before the rear of the formation reaches that stage.
     """
     structures = scenario.formation.structures
     later = range(1, len(structures) + 1)
@@ -135,7 +135,7 @@ def stage_at(numbers: Numbers, t_s: float, scenario: Scenario) -> int:
 
 
 def stage_begin_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
-    """Return the road time at which all bodies in some blocks are beyond the start of a stage."""
+    """Return the road time at which all bodies in some blocks have passed the start of a stage."""
     structures, lattice = scenario.formation.structures, scenario.lattice
     sorts = stage == len(structures)
     from_m = scenario.road.sorting_start_m if sorts else structures[stage].from_m

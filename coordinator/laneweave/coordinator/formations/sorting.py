@@ -30,7 +30,7 @@ from laneweave.protocol.wire.messages import Name
 MAX_PLACEMENTS = 6
 """Maximum number of target placements to try if the first one takes too many steps."""
 MIN_DEADLINE_S = 0.05
-"""Minimum deadline of one attempt."""
+"""Minimum deadline for one attempt."""
 
 
 @frozen
@@ -47,11 +47,11 @@ class SortingTask:
     scenario: Scenario
     """Mode, conflict kinds, lattice."""
     deadline_s: float
-    """Deadline of all attempts together [s]."""
+    """Deadline for all attempts together [s]."""
     steps: int = 1_000_000
     """Number of steps that fit on the road; if a plan has more, other targets are tried."""
     deserted: Numbers = ()
-    """Blocks of `numbers` in which only hold cells of members may be used."""
+    """Blocks of `numbers` in which only the members' hold cells may be used."""
     structure: DrivingStructure | None = None
     """Structure to form, with any vehicle in any place; None: sort by lanes."""
 

@@ -1,4 +1,4 @@
-"""States and census that a leader has received, now and one tick ago.
+"""States and census as known to a leader now and one tick ago.
 
 Each plan is made from the states at one road time, so it does not depend on message delays. That
 time is at most one tick ago, so the two newest states of each vehicle suffice.
@@ -25,7 +25,7 @@ class Snapshot:
     states: Mapping[Name, VehicleState]
     """States of the vehicles on the road; vehicles without a state are missing."""
     gone: frozenset[Name]
-    """Vehicles in rosters of pending transfers, if they had left the road by then."""
+    """Departed vehicles that are in rosters of pending transfers."""
 
 
 class ObservedRoad:
@@ -44,7 +44,7 @@ class ObservedRoad:
         self._census_before: Census | None = None
 
     def forget(self) -> None:
-        """Discard everything: this is a new road."""
+        """Discard everything: the road is new."""
         self.states.clear()
         self.take_over()
 
@@ -79,7 +79,7 @@ class ObservedRoad:
 
     @property
     def gone(self) -> frozenset[Name]:
-        """Vehicles in rosters of pending transfers, if they have left the road."""
+        """Departed vehicles that are in rosters of pending transfers."""
         return _gone(self.states.values(), self.census)
 
     def at(self, t_s: float) -> Snapshot:

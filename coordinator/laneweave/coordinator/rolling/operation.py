@@ -1,10 +1,10 @@
 """The rolling operation under a leader: all vehicles on the road are replanned in every slot.
 
-Shortly after a slot begins, every vehicle's hold cell at its end is known. From these cells the
-rolling planner plans complete paths for all vehicles. While the moves of this slot are in progress,
-ballots that include only the vehicles concerned put the moves of the next slot into force
-(`transfer`). No vehicle stops for a new plan: a vehicle that misses one holds, and the
-next plan starts from its cell.
+Shortly after a slot begins, every vehicle's hold cell at the end of the slot is known. From these
+cells the rolling planner plans complete paths for all vehicles. While the moves of this slot are in
+progress, ballots that include only the vehicles concerned put the moves of the next slot into force
+(`transfer`). No vehicle stops for a new plan: a vehicle that misses one holds, and the next plan
+starts from its cell.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class RollingOperation:
         self._last_plan: StreamPlan | None = None
 
     def forget(self) -> None:
-        """Discard everything: this is a new road."""
+        """Discard everything: the road is new."""
         self.take_over()
         self.observed.forget()
         self._last_plan, self._newest_slot = None, -1
@@ -101,7 +101,7 @@ class RollingOperation:
         self._ordered = self._since = None
 
     def on_clock(self, t_s: float, now_s: float) -> None:
-        """Ignore the clock message: plans are due by road time alone."""
+        """Ignore the clock message: only road time determines when plans are due."""
 
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
         """Handle the state of a vehicle; return None if no unfinished ballot depends on it."""

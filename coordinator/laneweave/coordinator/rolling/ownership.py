@@ -21,9 +21,9 @@ def owned_cells(
 ) -> frozenset[Cell] | None:
     """Return the cells that a vehicle owns, from its state and the states of others.
 
-    The gate of its pending transfer is open if a vehicle of the roster reports it open. It never
-    opens if one of these has promised a higher ballot without storing the transfer, or if all have
-    promised higher ballots with closed gates. If one of these can no longer report the gate,
+    The start gate of its pending transfer is open if any member of the roster reports it open. It
+    never opens if any member has promised a higher ballot without storing the transfer, or if all
+    have promised higher ballots with closed gates. If a member can no longer report the gate,
     because it has a newer transfer or has left the road, only cells in both `before` and `after`
     are certain; none are while the queried vehicle moves, since it may still be in another cell.
 

@@ -51,7 +51,7 @@ class CellTransfer(BallotRound):
     """Road time at which the moves begin."""
     slot_s: float
     gone: frozenset[Name] = frozenset()
-    """Vehicles in rosters of pending transfers, if they have left the road."""
+    """Departed vehicles that are in rosters of pending transfers."""
     reason: str = ""
     """Why the ballot was aborted."""
 

@@ -1,7 +1,7 @@
 """The planning service: answers plan requests from clients on the network.
 
 Every coordinator receives every request and accepts those that are assigned to it (`rendezvous`),
-so any number of coordinators share the load without messages between them. A request waits for a
+so any number of coordinators can share the load without exchanging messages. A request waits for a
 free worker until its deadline at the latest, and is planned in the remaining time. A repeated
 request with the same id gets the same answer.
 """
@@ -268,7 +268,7 @@ class PlanningService:
         return Refusal(FAILED, f"planning failed: {error}", "")
 
     def drop_late(self, now_s: float) -> Iterator[Effect]:
-        """Drop requests whose deadlines have passed while waiting."""
+        """Drop requests whose deadlines passed while they waited."""
         late = [entry for entry in self._not_begun() if entry.deadline_s <= now_s]
         for entry in late:
             if entry.job in self._planning:

@@ -3,8 +3,8 @@
 At each tick, the vehicle compares two stopping points: that of the vehicle ahead under full braking
 from now on, and its own under braking from the next tick on. If its own is behind the other, it
 continues for one tick. Otherwise it brakes now, without a jerk limit, because jerk-limited braking
-would be too late. By induction there is no impact (docs/SAFETY.md has the
-derivation, with measurement errors).
+would be too late. By induction there is no impact (docs/SAFETY.md has the derivation, with
+measurement errors).
 
 A body that moves at v with acceleration a and brakes with b through a first-order lag L travels
 
@@ -152,7 +152,7 @@ class EmergencyBrake:
 def min_pitch_m(scenario: Scenario) -> float:
     """Return the minimum column pitch at which vehicles that hold in adjacent cells do not brake.
 
-    It includes measurement errors up to `ERROR_SIGMAS`.
+    The pitch allows for measurement errors up to `ERROR_SIGMAS`.
     """
     speed_mps, pitch_m = scenario.formation.speed_mps, scenario.formation.gap_m
     ahead = Neighbour(0, pitch_m - scenario.vehicle.length_m, speed_mps)

@@ -9,7 +9,7 @@ lag da/dt = u - a. Let c = s + lag v. Then dc/dt = v + lag a and d2c/dt2 = u: th
 without lag, and the body follows it through a low-pass filter, lag ds/dt = c - s. Controlling the
 *commanded state* (c, dc/dt, u) therefore compensates the lag exactly. A low-pass filter averages,
 so the body keeps every limit on speed, acceleration and jerk that the commanded state keeps, and
-two bodies of equal lag keep the distances of their commanded states. All control laws here, the
+two bodies of equal lag keep the distance between their commanded states. All control laws here, the
 tracker and the references use commanded states. The constant lag v_F is left out of c, so a vehicle
 that holds has equal true and commanded states.
 

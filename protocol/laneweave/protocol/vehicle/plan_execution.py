@@ -3,7 +3,7 @@
 A vehicle holds its cell until all conditions of its next move are *known* to be true: it has
 accepted a plan, every member of the roster has reported that it accepted the same plan (start
 gate), and every vehicle with an earlier interfering move has reported completing it. The clock can
-delay moves, but never release one; without messages vehicles hold. `VEHICLE_RULES` is the table;
+delay moves, but never releases one; without messages, vehicles hold. `VEHICLE_RULES` is the table;
 the first lines of its guards and actions are shown in docs/PROTOCOL.md. docs/SAFETY.md has the
 proof.
 
@@ -72,14 +72,14 @@ class PlanExecution:
     hold_cell: Cell
     lattice: Lattice
     joined: tuple[int, ...]
-    """Blocks that plans must have, ascending, as the motion controller has stored them."""
+    """Blocks that plans must have (ascending), as stored by the motion controller."""
     moving: bool = False
     phase: ExecutionPhase = ExecutionPhase.FREE
     promised: Ballot | None = None
     plan: Plan | None = None
     completed: int = 0
     progress: dict[Name, int] = field(factory=dict)
-    """Completed moves of the same plan that each other member has reported; -1: not ready yet."""
+    """Number of moves that each other member reports as completed; -1: not ready yet."""
     wanted_joined: tuple[int, ...] = field(init=False)
     """Blocks that the motion controller should store."""
     moving_in_plan: bool = False
