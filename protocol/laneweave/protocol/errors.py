@@ -18,7 +18,7 @@ class BadInputError(ValueError):
     """
 
     def __init__(self, field: str, value: object, allowed: str) -> None:
-        """Store the three parts; `value` is shortened in the message."""
+        """Store the parts of the message, which shows a shortened `value`."""
         self.field = field
         self.value = value
         self.allowed = allowed

@@ -52,7 +52,7 @@ def key_part(_: object, attribute: attrs.Attribute[Any], value: str) -> None:
 
 
 def key_parts(_: object, attribute: attrs.Attribute[Any], value: Sequence[str]) -> None:
-    """Check that all values are valid as parts of keys, and unique."""
+    """Check that all values are unique and valid as parts of keys."""
     for one in value:
         key_part(None, attribute, one)
         if value.count(one) > 1:

@@ -175,7 +175,7 @@ def structure(data: Mapping[str, Any], kind: type[T]) -> T:
     """Build an instance of the attrs class `kind` from nested maps.
 
     Raises:
-        BadInputError: the first invalid value, with its path.
+        BadInputError: a value is invalid; the error has the path of the first such value.
     """
     try:
         return _CONVERTER.structure(data, kind)

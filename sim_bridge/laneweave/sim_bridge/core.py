@@ -143,7 +143,7 @@ class BridgeCore:
         self._tick_began = 0.0
         self._opened_s = 0.0
         self._until_s = 0.0
-        """Deadline of all phases except ANSWERS."""
+        """Deadline for all phases except ANSWERS."""
 
     # --- core interface -----------------------------------------------------------------------
 

@@ -25,7 +25,7 @@ def run_bridge(
     wrap: CoreWrapper = unwrapped,
     observe: Observe = unobserved,
 ) -> None:
-    """Run the simulated world until all vehicles have left, or until SIGINT or SIGTERM.
+    """Run the simulated world until all vehicles have left, or SIGINT or SIGTERM is received.
 
     Args:
         scenario: complete configuration.

@@ -50,7 +50,7 @@ def check_scenario(scenario: Scenario) -> None:
     """Check the fields against each other.
 
     Raises:
-        BadInputError: the first field that violates a rule.
+        BadInputError: a field violates a rule; the error names the first such field.
     """
     for check in (
         _check_lanes,
@@ -68,7 +68,7 @@ def check_effects(data: Mapping[str, Any], scenario: Scenario) -> None:
     """Check that each value in a file has an effect in the resulting scenario.
 
     Raises:
-        BadInputError: the first field without an effect.
+        BadInputError: a value has no effect; the error names the first such field.
     """
     formation, given = scenario.formation, data.get("formation", {})
     by_vehicles = formation.closes_by_vehicles

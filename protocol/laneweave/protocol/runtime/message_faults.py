@@ -72,7 +72,7 @@ class MessageRule:
     until_s: float | None = field(
         default=None, validator=attrs.validators.optional(within(0.0, 1e6))
     )
-    """Road time at which the rule ends; None: at the end of the run."""
+    """Road time at which the rule ends; None: when the run ends."""
     sender: str | None = field(default=None, validator=attrs.validators.optional(one_of(*SENDERS)))
     """Kind of sender; None: any."""
     receiver: str | None = field(

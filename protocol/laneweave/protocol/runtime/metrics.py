@@ -54,7 +54,7 @@ class SnapshotRequest:
         """Wait for the answer and return it.
 
         Raises:
-            TimeoutError: no answer within `SNAPSHOT_TIMEOUT_S`.
+            TimeoutError: no answer arrives within `SNAPSHOT_TIMEOUT_S`.
         """
         try:
             return self._answers.get(timeout=SNAPSHOT_TIMEOUT_S)

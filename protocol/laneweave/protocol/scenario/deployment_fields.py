@@ -105,7 +105,7 @@ class Service:
     """The planning service of every coordinator."""
 
     workers: int = field(default=0, validator=within(0, 256))
-    """Number of worker processes; 0: one less than the number of cores, at least one."""
+    """Number of worker processes; 0: one less than the number of cores, but at least one."""
     worker_memory_mb: float = field(default=1500.0, validator=within(50.0, 1_000_000.0))
     """Memory limit for the arrays of branch and bound in each worker. When a plan reaches it, the
     other solver completes the plan; without an optimality proof its status is `feasible`."""

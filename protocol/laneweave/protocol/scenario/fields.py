@@ -112,10 +112,10 @@ class DrivingStructure:
     """A geometric structure in which formations drive before they sort (paper, Section 2.2)."""
 
     from_m: float = field(validator=within(0.0, 60_000.0))
-    """Formations change to it after their rear has passed this position."""
+    """Formations change to this structure once their rear has passed this position."""
     structure: str = field(validator=one_of("parallel", "interlaced"))
     lanes: tuple[int, ...] = ()
-    """Lanes that it uses; empty: all lanes."""
+    """Lanes that the structure uses; empty: all lanes."""
 
 
 @frozen
@@ -141,7 +141,7 @@ class FormationSettings:
     speed_mps: float = field(default=15.0, validator=within(1.0, 60.0))
     """v_F, the speed of the lattice."""
     settle_s: float = field(default=10.0, validator=within(1.0, 60.0))
-    """Time from the entry until a vehicle has settled in its cell."""
+    """Time from when a vehicle enters until it has settled in its cell."""
     sort_in_s2: bool = False
     """Rolling operation: settled vehicles also change lanes in S2."""
     reward_drift: bool = False

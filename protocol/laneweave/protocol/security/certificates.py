@@ -1,4 +1,4 @@
-"""Checks of a process's certificate, key and authority before their use.
+"""Checks of a process's certificate, key and authority before they are used.
 
 The process performs a TLS handshake with itself in memory: peers accept what OpenSSL accepts here.
 An error is reported in one line instead of as a failed connection.

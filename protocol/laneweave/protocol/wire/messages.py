@@ -139,13 +139,13 @@ class VehicleState:
     """
 
     vehicle: Name
-    """Vehicle that the state describes; its caretaker sends the state while it has no agent."""
+    """Vehicle that the state describes; a caretaker sends the state while there is no agent."""
     incarnation: int
     """Incarnation of the process in charge of the vehicle [ns]."""
     formation: int
     """Number of the block in which the vehicle entered."""
     joined: tuple[int, ...]
-    """Blocks that its plans must have, ascending, as stored by its motion controller."""
+    """Blocks that the vehicle's plans must cover, ascending, as stored by its motion controller."""
     promised: Ballot | None
     """Highest ballot that the process in charge has promised."""
     accepted: bool
@@ -165,7 +165,7 @@ class VehicleState:
     overdue: bool
     """Whether the next move has been due for 1.5 slots, or for a slot plus 2 s if that is less."""
     attended: bool
-    """Whether an agent drives the vehicle; otherwise its caretaker is in charge, and it holds."""
+    """Whether an agent drives the vehicle; otherwise a caretaker does, and the vehicle holds."""
     s_m: float
     """Position of the front bumper along the road [m], from the start of the road."""
     y_m: float
@@ -229,9 +229,9 @@ class Sense:
     Missing: sent again every `runtime.tick_resend_s` until `runtime.tick_deadline_s`; then the
     vehicle continues its last trajectory. Duplicated: the agent repeats its answer. Older than the
     newest tick of the same bridge, or from an earlier bridge: ignored. From a newer bridge: the
-    agent discards its state of the earlier road and takes a new incarnation. A message with `left`
-    is repeated for 20 ticks or until the agent's token vanishes; when a run ends, each vehicle on
-    the road receives one.
+    agent discards its state from the earlier road and takes a new incarnation. A message with
+    `left` is repeated for 20 ticks or until the agent's token vanishes; when a run ends, each
+    vehicle on the road receives one.
     """
 
     vehicle: Name
@@ -369,8 +369,8 @@ class Announcement:
 class Census:
     """Bridge to coordinators, fleets and observers, on every change and every 10 ticks.
 
-    A change is an entry, a departure, the closing of a formation, or an announcement made or
-    withdrawn. The census is complete: a vehicle is on the road at `t_s` if and only if it is
+    The census changes when a vehicle enters or leaves, a formation closes, or an announcement is
+    made or withdrawn. It is complete: a vehicle is on the road at `t_s` if and only if it is
     listed. In each lane, the number of announced vehicles exceeds the number of free cells that
     pass within `runtime.announce_s` by at most one, so that agents start only for vehicles that can
     enter soon. An agent process with a shard starts an agent for each listed vehicle of its shard,
@@ -388,8 +388,8 @@ class Census:
     announced: tuple[Announcement, ...]
     """Vehicles that wait at the entrance or arrive within `runtime.announce_s`."""
     formations: tuple[ClosedFormation, ...] = ()
-    """Closed formations with a vehicle on the road, foremost first. An entry never changes, and no
-    block belongs to two formations. Empty in the rolling operation."""
+    """Closed formations with a vehicle on the road, foremost first. Listed formations never change,
+    and no block belongs to two of them. Empty in the rolling operation."""
     closed_to: int = -1
     """All blocks up to this number are closed: their vehicles are listed or have left."""
     bridge: int = 0
@@ -408,13 +408,13 @@ class RoadClock:
     t_s: float
     """Road time of the tick [s]."""
     demanded: int
-    """Vehicles that have arrived so far."""
+    """Number of vehicles that have arrived so far."""
     entered: int
-    """Vehicles that have entered so far."""
+    """Number of vehicles that have entered so far."""
     on_road: int
-    """Vehicles on the road."""
+    """Number of vehicles on the road."""
     left: int
-    """Vehicles that have left so far."""
+    """Number of vehicles that have left so far."""
     ended: bool
     """Whether the run is over."""
     bridge: int = 0
@@ -437,15 +437,15 @@ class Report:
     process: Name = Name("unknown")
     """Process of the sender, set by the node; several vehicles may share one."""
     published: int = 0
-    """Messages published by the process since its start, including this one; set by the node."""
+    """Number of messages published by the process, including this one; set by the node."""
     rejected: int = 0
-    """Malformed messages received by the process since its start; set by the node."""
+    """Number of malformed messages received by the process; set by the node."""
     solves: int = 0
     """Number of ticks at which a reference was tracked."""
     unusable: int = 0
-    """Solves without a usable solution."""
+    """Number of solves without a usable solution."""
     osqp_solves: int = 0
-    """Solves with OSQP; in all others the unconstrained optimum satisfied all constraints."""
+    """Number of solves with OSQP; in the rest the unconstrained optimum met all constraints."""
     solve_ms: bytes = b""
     """CPU time of each solve [ms], little-endian float32."""
 

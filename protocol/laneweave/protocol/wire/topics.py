@@ -175,7 +175,7 @@ TOPICS = tuple(each for each in tuple(globals().values()) if isinstance(each, To
 
 @frozen
 class Keys:
-    """Builder and parser of the keys of one realm."""
+    """Builder and parser for the keys of one realm."""
 
     realm: str
 
@@ -206,7 +206,7 @@ class Keys:
 
 
 _MEMO = 1024
-"""Size of the caches of keys."""
+"""Size of the key caches."""
 _MAX_KEY = max(
     len(re.sub(r"{\w+}", "x" * 64, f"{PREFIX}/{{realm}}/{topic.pattern}")) for topic in TOPICS
 )

@@ -80,7 +80,7 @@ class Entrance:
         self._tick_s = scenario.runtime.tick_s
 
     def __len__(self) -> int:
-        """Number of waiting vehicles."""
+        """Return the number of waiting vehicles."""
         return sum(map(len, self._queues))
 
     def queue(self, arrival: Arrival) -> None:

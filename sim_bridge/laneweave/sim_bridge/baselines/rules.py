@@ -171,7 +171,7 @@ class Rules:
         A lane change occupies the gap in the new lane at once.
 
         Returns:
-            The vehicles that slow down, for another vehicle or to reach a gap behind it.
+            The vehicles that slow down, to let another vehicle in or to get in behind it.
         """
         unsorted = sorted(
             {

@@ -90,7 +90,7 @@ class MotionController:
     rung: Rung = Rung.HOLD
     """Rung in the last tick."""
     rung_ticks: dict[Rung, int] = field(init=False)
-    """Number of ticks on each rung."""
+    """Number of ticks spent on each rung."""
     neighbours: Neighbours = NO_NEIGHBOURS
     """Measured neighbours."""
     _measured: State | None = None
@@ -177,7 +177,7 @@ class MotionController:
         self.accepted = None
 
     def store_requests(self, command: Command) -> bool:
-        """Store formations, promise, transfer and acceptance from a command of any tick.
+        """Store formations, promise, transfer and acceptance from a command for any tick.
 
         Commands from processes other than the one in charge are ignored. Returns whether anything
         has changed.

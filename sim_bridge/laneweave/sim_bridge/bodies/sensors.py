@@ -23,7 +23,7 @@ class Sensors:
     """The sensors of one vehicle."""
 
     def __init__(self, scenario: Scenario, vehicle: Name) -> None:
-        """Create the sensors with the seed of the vehicle."""
+        """Create the sensors with a random generator seeded for the vehicle."""
         noise = scenario.sensing
         self._random = np.random.default_rng([scenario.seed, zlib.crc32(vehicle.encode())])
         self._normal: list[float] = []

@@ -126,7 +126,7 @@ class RunRecord:
     def __init__(
         self, folder: Path, scenario: Scenario, method: str, stopwatch: Callable[[], float]
     ) -> None:
-        """Open the files of a run in its folder, which is created if necessary."""
+        """Open the files of a run in its folder; create the folder if necessary."""
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._scenario = scenario
@@ -156,7 +156,7 @@ class RunRecord:
     # --- the road -----------------------------------------------------------------
 
     def event(self, t_s: float, kind: str, /, **data: object) -> None:
-        """Write an event of the bridge."""
+        """Write an event from the bridge."""
         self._write_event(t_s, kind, {"role": "bridge"} | data)
 
     def on_demanded(self, arrival: Arrival) -> None:
@@ -251,7 +251,7 @@ class RunRecord:
     # --- the other roles ----------------------------------------------------------------------
 
     def on_event(self, event: LogEvent) -> None:
-        """Record an event of another role."""
+        """Record an event from another role."""
         # The message's role and name override those in its data.
         data = event.data | {"role": event.role, "name": event.name}
         self._write_event(event.t_s, event.kind, data)

@@ -17,7 +17,7 @@ from laneweave.sim_bridge.recording.trips import Metadata, finite
 ROWS_PER_GROUP = 100_000
 """Number of rows that are written together."""
 EMERGENCY_SHARE = 0.9
-"""Fraction of the braking limit beyond which braking counts as an emergency brake."""
+"""Fraction of the braking limit beyond which braking counts as emergency braking."""
 
 _COLUMNS: list[pa.Field[Any]] = [
     pa.field("t_s", pa.float64(), nullable=False),

@@ -67,7 +67,7 @@ class Caretaker:
         self._execution.on_owned(vehicle.sense(tick, caretaker=True))
 
     def on_message(self, message: Prepare | Plan, tick: int) -> VehicleState | None:
-        """Promise a ballot (V2), or accept a plan without moves of this vehicle (V3).
+        """Promise a ballot (V2), or accept a plan in which this vehicle does not move (V3).
 
         Returns:
             The state to publish at once; None if the message has no effect.
@@ -101,7 +101,7 @@ class Caretaker:
 class Attendance:
     """Agents and caretakers of a road.
 
-    The bridge subscribes to PREPARE and PLAN of a vehicle only while its caretaker is in charge.
+    The bridge subscribes to PREPARE and PLAN for a vehicle only while a caretaker is in charge.
     """
 
     def __init__(self, scenario: Scenario, new_incarnation: Callable[[], int]) -> None:
@@ -170,7 +170,7 @@ class Attendance:
         """Pass a COMMAND to the vehicle's motion controller; a claim removes the caretaker.
 
         Returns:
-            Whether the controller accepts it.
+            Whether the controller accepts the command.
 
         Raises:
             BadInputError: the command is invalid.

@@ -31,7 +31,7 @@ class Arrival:
     vehicle: str
     """Name: `v` and the number in order of arrival over all lanes, from 1."""
     lane: int
-    """Lane of the arrival; 0 is the rightmost."""
+    """Lane in which the vehicle arrives; 0 is the rightmost."""
     preferred_lane: int
     """Lane in which the vehicle wants to leave the road."""
     t_s: float

@@ -115,7 +115,7 @@ class EntryMeter:
         return admissions
 
     def _entry_s(self, lane: int) -> float:
-        """Return when the first vehicle of a queue can enter the next column [s]."""
+        """Return the time [s] at which the first vehicle of a queue can enter the next column."""
         queue = self._queues[lane]
         if not queue:
             return math.inf

@@ -1,4 +1,4 @@
-"""Formation building at the entrance: columns, members and closing of formations.
+"""Formation building at the entrance: which columns and members formations get.
 
 A formation is *closed* when no vehicle can enter its columns any more, so its members are final.
 Each column belongs to at most one closed formation, permanently: plans of different formations rely

@@ -36,7 +36,7 @@ _ROUNDING_S = 1e-6
 
 @define
 class Answers:
-    """Answers of agents to the bridge's ticks."""
+    """Answers from agents to the bridge's ticks."""
 
     runtime: Runtime
     up: set[Name] = field(factory=set)
@@ -160,7 +160,7 @@ class Answers:
         return missed
 
     def always_late(self, name: Name) -> bool:
-        """Return whether an agent has been answering only late for too long."""
+        """Return whether all answers from an agent have been late for too long."""
         return self._too_long(self._late_s.get(name, 0.0) / LATE_SHARE)
 
     def _reset(self, name: Name) -> None:

@@ -60,7 +60,7 @@ class SumoSession:
 
     @property
     def vehicle(self) -> Any:  # noqa: ANN401 - libsumo has no types
-        """Libsumo's functions for vehicles."""
+        """Interface to SUMO's vehicles in libsumo."""
         return self._sumo.vehicle
 
     def step(self) -> None:

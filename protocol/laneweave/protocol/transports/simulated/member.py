@@ -78,7 +78,7 @@ class Member:
 
     @property
     def visible(self) -> bool:
-        """Whether its tokens are visible to others."""
+        """Whether the member's tokens are visible to others."""
         return self.connected and not self.lapsed
 
     # --- input ------------------------------------------------------------------------------

@@ -228,7 +228,7 @@ class SimulatedNetwork(Simulation):
             member.handle(Stopping())
 
     def pause(self, name: str) -> None:
-        """Pause a node, as SIGSTOP does; its tokens vanish after the lease."""
+        """Pause a node, as SIGSTOP does; its tokens vanish when the lease expires."""
         member = self._members[name]
         if member.paused:
             return

@@ -126,7 +126,7 @@ class Simulation:
 class TraceDigest:
     """A trace that computes a hash of all inputs of all nodes, to compare two runs.
 
-    Results of computations, which may be any object, are omitted: they affect later messages.
+    Results of computations, which may be any object, are omitted; later messages reveal them.
     """
 
     def __init__(self) -> None:

@@ -318,7 +318,7 @@ def run_router(
     guard: RouterGuard | None = None,
     observe: Observe = unobserved,
 ) -> None:
-    """Run a Zenoh router until SIGINT or SIGTERM.
+    """Run a Zenoh router until the process receives SIGINT or SIGTERM.
 
     Args:
         listen: endpoints at which to listen; a socket file left by a killed router is replaced.
