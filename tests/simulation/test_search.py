@@ -21,9 +21,9 @@ from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.search import replay_command
 from laneweave.launch.fault_search.setup import SLOT_S
 
-SEEDS = 200
+SEEDS = 140
 BATCH = 20
-DIGESTS = 40
+DIGESTS = 20
 _PRINT_DIGESTS = """
 import json, sys
 from laneweave.launch.fault_search.profiles import PROFILES
