@@ -11,11 +11,15 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from itertools import product
 
 import attrs
 
 from laneweave.coordinator.planning.budget import Budget
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel, conflict_offsets
 from laneweave.coordinator.planning.problem import MoveTable, Problem, Solution, bits
+from laneweave.protocol.lattice import Mode, displacements
 
 State = tuple[int, ...]
 """The cells of all vehicles, team by team, sorted within a team."""
@@ -52,7 +56,7 @@ def explore(
     teams = [sorted(choices[v]) for v in vehicles]
     team = [teams.index(t) for t in teams]
     goals = [frozenset(problem.targets[j] for j in t) for t in teams]
-    one_at_a_time = _can_be_made_one_after_another(problem.table)
+    one_at_a_time = can_be_made_one_after_another(problem.table.mode, problem.table.model)
 
     start, order = _sorted_by_team([problem.starts[v] for v in vehicles], team)
     vehicles = [vehicles[i] for i in order]
@@ -82,21 +86,24 @@ def explore(
     return Reachability(infeasible=True)
 
 
-def _can_be_made_one_after_another(table: MoveTable) -> bool:
-    """Return whether the moves of any step could also be made one after another.
+@lru_cache(maxsize=64)
+def can_be_made_one_after_another(mode: Mode, model: ConflictModel) -> bool:
+    """Return whether the moves of any step can also be made one after another, in any order.
 
-    True if no vehicle moves into a cell that another one is leaving, and if passing a waiting
-    vehicle is forbidden only together with every overlap of footprints. Also true for a computed
-    table that holds for any lateness, because one vehicle may then wait until the other has
-    arrived. With limited lateness, vehicles that cannot move one by one may follow each other.
-    `closing` needs two moving vehicles, so it never blocks a single one.
+    True if of two moves without conflict, each is also possible while the other vehicle waits in
+    its from-cell or in its to-cell.
     """
-    kinds, conflicts = table.model.kinds, table.model.table
-    if "geometric" in kinds:
-        passing = table.mode == 1 or "special-4" not in kinds
-        return conflicts is None or (conflicts.any_lateness and passing)
-    no_following = "node" in kinds and "special-1" in kinds
-    return no_following and (table.mode == 1 or "special-4" not in kinds)
+    if model.vehicles_share_cells:
+        return False
+    conflicts = [frozenset(offsets) for offsets in conflict_offsets(mode, model)]
+    columns, lanes = (range(-reach, reach + 1) for reach in model.reach)
+    for blocked in conflicts:
+        for column, lane, (e, (x, y)) in product(columns, lanes, enumerate(displacements(mode))):
+            if (column, lane) == (0, 0) or (column, lane, e) in blocked:
+                continue
+            if (column, lane, 0) in blocked or (column + x, lane + y, 0) in blocked:
+                return False
+    return True
 
 
 def _single_moves(table: MoveTable, state: State) -> Iterator[tuple[int, ...]]:

@@ -3,8 +3,14 @@
 import pytest
 from hypothesis import given, settings
 
+from laneweave.coordinator.planning import conflict_kinds
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
-from laneweave.coordinator.planning.exact.reachability import Reachability, explore
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
+from laneweave.coordinator.planning.exact.reachability import (
+    Reachability,
+    can_be_made_one_after_another,
+    explore,
+)
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.path_map import RelativePathMap
@@ -12,6 +18,7 @@ from laneweave.coordinator.planning.plan_validator import problems_of_paths, pro
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
+from laneweave.protocol.scenario.fields import CONFLICT_KINDS
 from support.planning_oracles import CountingClock, cheapest_plan, requests
 
 
@@ -104,3 +111,18 @@ def test_passing_without_waiting_is_possible() -> None:
     _, verdict = _explore(request)
     assert verdict.solution is not None
     assert verdict.solution.cost == plan(request).cost == 2
+
+
+def test_a_kind_that_forbids_passing_a_waiting_vehicle_needs_joint_moves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def beside_waiting(a: Move, b: Move) -> bool:
+        longitudinal = a[0] != a[1] and a[0][1] == a[1][1]
+        beside = a[0][0] == b[0][0] and abs(a[0][1] - b[0][1]) == 1
+        return longitudinal and beside and b[0] == b[1]
+
+    monkeypatch.setattr(conflict_kinds, "CONFLICT_KINDS", (*CONFLICT_KINDS, "beside-waiting"))
+    monkeypatch.setitem(conflict_kinds._PREDICATES, "beside-waiting", beside_waiting)
+    assert can_be_made_one_after_another(1, ConflictModel(PUZZLE.conflicts))
+    model = ConflictModel((*PUZZLE.conflicts, "beside-waiting"))
+    assert not can_be_made_one_after_another(1, model)
