@@ -18,6 +18,6 @@ clock that is passed in.
 | parallel and interlaced structure | `formation_structures` |
 
 Additions: improvements to TAPPA (`paper.cbs.Improvements`, `paper.joint_search`), a record of its
-run (`paper.explanation`), branch and bound (`exact`), the planner of the rolling operation
+run (`paper.explanation`), branch and bound (`exact`), the planner for rolling operation
 (`rolling`), and conflicts computed from sizes and motions (`geometry`).
 """

@@ -13,7 +13,7 @@ Clock = Callable[[], float]
 DEFAULT_MEMORY_MB: Final = 1500.0
 
 _RELEASE_S_PER_NODE = 3e-6
-"""Time to free the memory of a node after the search."""
+"""Time to free a node's memory after the search."""
 
 
 class BudgetSpentError(Exception):

@@ -8,7 +8,7 @@ Two kinds go beyond the paper. `geometric` compares footprints, the cells that t
 protocol reserves, or uses a `ConflictTable` computed from sizes and motions (`geometry`).
 `closing` leaves enough distance for emergency braking.
 
-Conflicts depend on the relative position of two vehicles only, so one table of offsets serves all
+Conflicts depend only on the relative position of two vehicles, so one table of offsets serves all
 grids (`conflict_offsets`).
 """
 
@@ -135,7 +135,7 @@ class ConflictModel:
         leaves, enters or stays at a corner of the square of A's cells.
     geometric: without a table, the footprints intersect (`lattice.footprint`). The execution
         protocol reserves footprints, so this holds for any lateness. It contains all kinds above
-        and any `ConflictTable`. With a table, the pair of moves is in the table.
+        and any `ConflictTable`. With a table, it contains exactly the pairs in the table.
     closing: A moves forwards, straight or obliquely, B moves backwards and starts three columns
         ahead of A, and some lane is the from-lane or to-lane of both. No other kind contains it.
     """
@@ -150,7 +150,7 @@ class ConflictModel:
             ValueError: there is a table, but `geometric` is not among the kinds.
         """
         if self.table is not None and "geometric" not in self.kinds:
-            raise ValueError(f"a conflict table, but conflict kinds {self.kinds} without geometric")
+            raise ValueError(f"a conflict table for conflict kinds {self.kinds}, without geometric")
 
     @property
     def reach(self) -> Cell:
@@ -186,7 +186,7 @@ def _difference(cell: Cell, other: Cell) -> Cell:
 
 @lru_cache(maxsize=64)
 def conflict_offsets(mode: Mode, model: ConflictModel) -> tuple[tuple[Offset, ...], ...]:
-    """Return, for each displacement of A, the offsets and displacements of B in conflict."""
+    """Return, for each displacement of A, the offsets and displacements of B that conflict."""
     steps = displacements(mode)
     columns, lanes = (range(-reach, reach + 1) for reach in model.reach)
 

@@ -14,7 +14,7 @@ from laneweave.protocol.lattice import Cell
 
 
 def problems_of_response(request: PlanRequest, response: PlanResponse) -> list[str]:
-    """Return the errors in a response, with or without a plan."""
+    """Return the errors in a response; a valid response has none."""
     if request.structure is not None:
         problems = list(_problems_of_targets(request, response.targets or ()))
         if problems:
@@ -41,7 +41,7 @@ def problems_of_response(request: PlanRequest, response: PlanResponse) -> list[s
 def problems_of_paths(
     request: PlanRequest, assignment: Sequence[int], paths: Sequence[Sequence[Cell]]
 ) -> list[str]:
-    """Return the errors in a path set; it may be issued if there are none."""
+    """Return the errors in a path set; a valid path set has none."""
     problems = list(_problems_of_shape(request, assignment, paths))
     if problems:
         return problems

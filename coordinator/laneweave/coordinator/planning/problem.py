@@ -224,7 +224,7 @@ class Search:
     best: the cheapest path set so far.
     lower_bound: lower bound on the cost of all path sets; infinite: there is none.
     finished: whether it is proven that `best` is optimal or that no path set exists.
-    aborted: whether this solver cannot decide the problem within its limits; another one may.
+    aborted: whether this solver cannot decide the problem within its limits; another might.
     tried: number of assignments that were examined one by one.
     has_fewest_moves: whether it is proven that no path set of the same cost has fewer moves.
     """

@@ -3,7 +3,7 @@
 The paper uses A* in space and time. Here all shortest paths of a vehicle under its constraints are
 computed at once, as sets of moves per step (`Diagram`): a forward pass collects the moves up to the
 earliest final arrival, a backward pass removes those that do not lead to it. `choose_path` selects
-the path with the fewest conflicts with other vehicles, then the fewest moves, then lowest bits.
+the path with the fewest conflicts with other vehicles, then the fewest moves, then the lowest bit.
 """
 
 from __future__ import annotations

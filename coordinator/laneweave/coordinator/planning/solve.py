@@ -33,7 +33,7 @@ MAX_NODES: Final = 500_000
 
 @attrs.frozen
 class _Result:
-    """The result of a solver, without the memory of its search."""
+    """The result of a solver, without the data structures of its search."""
 
     solver: str
     nodes: int
@@ -59,7 +59,7 @@ def plan(
         max_nodes: limit on search nodes, for repeatable results; at most `MAX_NODES`.
         max_memory_mb: limit on the arrays of branch and bound. When it is reached, the other
             solver continues; a path set that is not proven optimal has status `feasible`.
-        weights: weights of the formation relative distance, which must not exceed the steps.
+        weights: weights of the formation relative distance, which must bound steps from below.
         solver: one of `SOLVERS`, overriding the request's; if neither names one, the default.
         fallback: branching continues when TAPPA has spent `TAPPA_SHARE`, and the cheaper path set
             is returned; False: TAPPA may spend the whole budget. A solver that cannot handle the

@@ -229,7 +229,7 @@ def _falling_back(scenario: Scenario, rng: random.Random) -> Episode:
 
 
 def _close_behind(scenario: Scenario, rng: random.Random) -> Episode:
-    """Return a hold slightly above the minimum gap behind a vehicle."""
+    """Return a hold behind a vehicle, at slightly more than the minimum gap."""
     gap_m = scenario.tracking.min_gap_m + rng.uniform(0.1, 2.0)
     rear = _braking(scenario, gap_m, 0.0, 1.0, scenario.lattice.speed_mps)
     reference = Reference.hold(scenario, (0, 1))

@@ -46,7 +46,7 @@ Layer = tuple[list[ExplainedNode], int]
 
 
 def draw_explanation(explanation: Explanation, out: Path) -> None:
-    """Write the figure."""
+    """Write the figure to a file."""
     save(explanation_figure(explanation), out, DPI)
 
 

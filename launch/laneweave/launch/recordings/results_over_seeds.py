@@ -26,7 +26,7 @@ PREFERRED = "preferred_percent"
 
 
 def results_table(runs: Iterable[Run]) -> pa.Table:
-    """Return the table of these runs, in the given order.
+    """Return a table of the runs, in the given order.
 
     Counts are integers, other numbers floats; missing numbers are null.
     """
@@ -50,7 +50,7 @@ def results_table(runs: Iterable[Run]) -> pa.Table:
 
 
 def write_results(runs: Iterable[Run], path: Path) -> None:
-    """Write the table of these runs atomically."""
+    """Write a table of the runs atomically."""
     table = results_table(runs)
     write_atomically(path, lambda part: pq.write_table(table, part, compression="zstd"))
 
@@ -60,7 +60,7 @@ def over_seeds(table: pa.Table, wanted: Iterable[tuple[str, str]]) -> list[dict[
 
     Args:
         table: result of `results_table`.
-        wanted: (column, pyarrow aggregation function) pairs; `stddev` is the sample deviation.
+        wanted: (column, pyarrow function) pairs; `stddev` is the sample standard deviation.
 
     Returns:
         Rows with `KEYS`, `runs` (number of runs), and `COLUMN_FUNCTION` for each pair: None if no

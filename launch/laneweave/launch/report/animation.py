@@ -25,7 +25,7 @@ KINDS: Final = {"s_m": "<u2", "y_m": "<u2", "speed_mps": "u1"}
 """Data types of the columns."""
 STEPS_S: Final = (0.2, 0.5, 1.0)
 MAX_SAMPLES: Final = 600_000
-"""Maximum number of samples (4 MB of text); longer runs are sampled more coarsely, or cut."""
+"""Maximum number of samples (4 MB of text); longer runs are sampled more coarsely or truncated."""
 
 
 def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:

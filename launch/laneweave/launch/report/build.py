@@ -178,7 +178,7 @@ def _sections(
 
 def _snapshots(report: _Report, run: Run, names: Mapping[str, str]) -> list[Picture]:
     name = f"road-{run.label}.png"
-    # A comparison shows the stretch of the paper for all methods, if the road is long enough.
+    # A comparison shows the paper's stretch for all methods, if the road is long enough.
     fits = name not in names and run.scenario.road.length_m >= PAPER_STRETCH_M[1]
     stretch_m = PAPER_STRETCH_M if fits else None
     return report.draw(

@@ -105,7 +105,7 @@ def _map_of(
     last_s = max(changes_s, default=entered_s)
     start_s, slot_s = _driven_slots(run, formation.number, entered_s, changes_s)
     steps = max(0, int(np.ceil((last_s - start_s + 0.5 * tick_s) / slot_s)))
-    # Moves begin with a tick; their target is recorded from that tick on.
+    # Moves begin at a tick; their target is recorded from that tick on.
     times_s = start_s - 0.5 * tick_s + slot_s * np.arange(steps + 1, dtype=np.float64)
     rows = []
     for part in parts:

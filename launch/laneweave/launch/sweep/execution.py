@@ -1,4 +1,4 @@
-"""Execution of points in separate processes, as libsumo supports one simulation and may crash.
+"""Execution of points in processes: libsumo supports one simulation per process and may crash.
 
 A process reads its job from `job.json` in its folder, and writes the files of the run there,
 `result.json` last. If the process exits without a result, the run has failed.

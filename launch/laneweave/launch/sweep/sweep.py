@@ -75,7 +75,7 @@ class _Progress(Progress):
 
 
 def print_results(points: Sequence[Point], folder: SweepFolder, console: Console) -> None:
-    """Print a sweep's means over seeds, and the reasons why runs failed."""
+    """Print a sweep's means over its seeds, and why runs failed."""
     runs = [folder.runs[point.name] for point in points]
     done = [folder.runs[point.name] for point in points if folder.is_finished(point)]
     columns = ("travel_time_s_mean", "throughput_veh_per_lane_h", PREFERRED)

@@ -33,7 +33,7 @@ class MoveArrays(NamedTuple):
 
     lanes: int
     step: Ints
-    """(D,) difference between cell numbers."""
+    """(D,) change in the cell number."""
     valid: Bools
     """(D, X) whether the move stays on free cells."""
     clique: Ints

@@ -68,8 +68,8 @@ _FIRST_WORK, _WORK_FOR_GAP, _STALE = 200, 100, 100
 """Maximum negotiation passes per call until a path set is found; then the passes at a gap of 100 %
 and the number of passes without improvement that halves them."""
 _EXPLORE_NODES, _EXPLORE_MOVES, _MAX_EXPLORE_MOVES, _GROWTH = 16, 5_000, 1_500_000, 4
-"""Nodes after which the joint search is tried if no path set is known, and its initial and maximum
-limit on joint moves; nodes and limit grow by the factor `_GROWTH`."""
+"""Nodes after which the joint search is tried if no path set is known, and the initial and maximum
+limit on its joint moves; nodes and limit grow by the factor `_GROWTH`."""
 _TIE_NODES = 10
 _WARM_UP_WORK = 8
 _BYTES_PER_S = 1_000_000_000
@@ -186,7 +186,7 @@ class Branching(Search):
         return Relaxation(self._arrays, self._teams, steps)
 
     def _longest_path(self) -> int:
-        """Return the steps in the longest path when targets are assigned at minimum cost."""
+        """Return the length of the longest path when targets are assigned at minimum cost."""
         pairs = self._teams.pair[self._teams.team]
         distances = np.where(
             pairs >= 0, self._teams.distance[self._teams.start[:, None], pairs], UNREACHABLE

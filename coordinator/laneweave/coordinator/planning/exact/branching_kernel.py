@@ -25,14 +25,14 @@ STUCK, FULL = 3, 4
 BY_TEAM, BY_CELL = 0, 1
 _ITERATIONS = 10
 _KEPT = 0.8
-"""Fraction of moves kept below which multipliers are improved again before branching."""
+"""If the fraction of moves kept is lower, multipliers are improved again before branching."""
 _ROUNDS = 12
 """Rounds without a choice by mass after which any choice is accepted."""
 _ABOVE_UPPER_BOUND = 0.5
 _MIN_STEP_SIZE = 0.05
 _MIN_MASS = 0.01
 _CELL_WEIGHT = 0.5
-"""Weight of a choice by from-cell relative to one by team."""
+"""Weight of a choice by from-cell relative to a choice by team."""
 _MULTIPLIER_WEIGHT = 10.0
 
 

@@ -32,7 +32,7 @@ def clique_patterns(mode: Mode, model: ConflictModel) -> tuple[Clique, ...]:
     """Return cliques that cover all pairs of moves that conflict under a model.
 
     Raises:
-        ValueError: under this model vehicles may share a cell.
+        ValueError: vehicles may share a cell under this model.
     """
     if model.vehicles_share_cells:
         raise ValueError(f"conflicts {model.kinds}: cliques need vehicles that never share a cell")

@@ -11,7 +11,7 @@ from laneweave.coordinator.planning.random_kernel import random_below
 NOT_IN_TIME = 1_000_000
 """Cost of failing to arrive within the horizon, and of a clique used by a fixed vehicle."""
 _DETOUR = 10.0
-"""Cost of each step that is left to the target at the end of the horizon."""
+"""Cost of each step still needed to reach the target at the end of the horizon."""
 _FIRST_COST, _GROWTH, _MAX_COST = 2.0, 1.01, 50.0
 """Cost of a clique that another vehicle uses: initial value, growth per pass, maximum."""
 _HISTORY = 1.0
@@ -152,7 +152,7 @@ def negotiate(arrays, teams, candidate, number):
 
 @njit(cache=True, nogil=True)
 def improve_paths(arrays, teams, candidate, attempts, max_size):
-    """Remove a few vehicles, let them negotiate, and keep the result if it is not worse.
+    """Remove a few vehicles in each attempt and let them negotiate; undo attempts that are worse.
 
     Returns the number of attempts since the last improvement.
     """

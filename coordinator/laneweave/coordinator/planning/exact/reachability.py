@@ -22,7 +22,7 @@ from laneweave.coordinator.planning.problem import MoveTable, Problem, Solution,
 from laneweave.protocol.lattice import Mode, displacements
 
 State = tuple[int, ...]
-"""The cells of all vehicles, team by team, sorted within a team."""
+"""The cells of all vehicles, team by team, sorted within each team."""
 
 _MOVES_PER_TIME_CHECK = 256
 
@@ -41,7 +41,7 @@ class Reachability:
 
 @attrs.frozen
 class _Step:
-    """The joint move from `state` that first reached another; `order` re-sorts the vehicles."""
+    """The joint move from `state` that first reached a new state; `order` re-sorts the vehicles."""
 
     state: State
     moves: tuple[int, ...]
@@ -90,8 +90,8 @@ def explore(
 def can_be_made_one_after_another(mode: Mode, model: ConflictModel) -> bool:
     """Return whether the moves of any step can also be made one after another, in any order.
 
-    True if of two moves without conflict, each is also possible while the other vehicle waits in
-    its from-cell or in its to-cell.
+    True if, for any two moves that do not conflict, each is also possible while the other vehicle
+    waits in its from-cell or in its to-cell.
     """
     if model.vehicles_share_cells:
         return False

@@ -35,7 +35,7 @@ from laneweave.coordinator.planning.geometry.swept_bodies import (
 from laneweave.protocol.lattice import Cell, displacements
 
 PARTS: Final = 160
-"""Parts into which a move is cut."""
+"""Number of parts into which a move is cut."""
 
 _MAX_SCANNED = MAX_OFFSET + 1
 _ROUNDING_M: Final = 1e-9
@@ -56,7 +56,7 @@ def min_clearances(geometry: BodyGeometry, paths: Mapping[Cell, Floats] | None =
             from the cell, evenly spaced over `geometry.move_s`; None: `geometry.paths()`.
 
     Returns:
-        [m], (7, 7, D, D): columns from A's cell to B's (-3 to 3), lanes (-3 to 3), and A's and B's
+        (7, 7, D, D) [m], by columns and lanes from A's cell to B's (each -3 to 3), and A's and B's
         displacement, in the order of `displacements(2)`; D is 9, or 5 if `paths` are only those
         of mode 1. Negative: bodies overlap along the road. Infinite: bodies are never close
         sideways.

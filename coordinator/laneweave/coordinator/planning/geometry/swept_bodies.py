@@ -98,8 +98,8 @@ class BodyGeometry:
     paper's sizes and times.
 
     A vehicle's tracker needs a gap of at least 3 m to follow its plan (`tracking.min_gap_m`);
-    the default clearance of 5 m leaves 2 m for errors and for braking. Two vehicles that follow
-    each other are 10 m apart when both are on time, 6.4 m when the one ahead is 0.5 s late.
+    the default clearance of 5 m leaves 2 m for errors and for braking. A vehicle that
+    follows another has a gap of 10 m if both are on time, 6.4 m if the one ahead is 0.5 s late.
     Bodies at rest in neighbouring lanes are 1.7 m apart. With unlimited lateness, all values of
     `clearance_across_m` from 0 to 1.4 m give the same table.
     """
@@ -126,7 +126,7 @@ class BodyGeometry:
     lateness_s: float | None = field(
         default=None, validator=attrs.validators.optional(within(0, 60))
     )
-    """Maximum delay of the start of a move. None: a move may begin at any time within its
+    """Maximum delay of a move's start. None: a move may begin at any time within its
     step, and the execution protocol keeps the steps in order."""
 
     def __attrs_post_init__(self) -> None:

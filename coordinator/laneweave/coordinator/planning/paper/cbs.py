@@ -48,7 +48,7 @@ class Improvements:
     The result stays exact with each addition. `benchmarks/planner_switches.py` measures their
     effects; docs/PLANNING.md has the figures.
 
-    cutoff: CBSA of an assignment ends as soon as it cannot find a path set that costs less than
+    cutoff: CBSA ends for an assignment as soon as it cannot find a path set that costs less than
         C'* (`tappa`).
     cardinal: a node gets children for only one of its conflicts, the one that raises their costs
         most, instead of for all conflicts (`constraints`).

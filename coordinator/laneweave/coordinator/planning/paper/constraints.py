@@ -1,6 +1,6 @@
 """Conflicts and constraints of the constraint tree (paper, section `cppm`).
 
-A conflict C^f of two vehicles has an entry for each of them, written {N | (x, y), step, id} or {E |
+A conflict C^f between two vehicles has an entry for each, written {N | (x, y), step, id} or {E |
 (x1, y1), (x2, y2), step, id}; the constraint C^t derived from it is written in the same way and
 forbids that vehicle to enter the node, or to travel along the edge, in that step.
 
@@ -46,7 +46,7 @@ class Conflict(NamedTuple):
 class Constraint(NamedTuple):
     """The constraint that a child adds to its parent's constraints; steps count from 0.
 
-    The paper's constraints forbid a set of moves to one vehicle: `own`. `others` and `arrived`
+    The paper's constraints forbid one vehicle a set of moves, `own`. `others` and `arrived`
     belong to the improvement `bicliques`.
 
     arrived is None: in this step, `vehicle` must not make a move in `own`, and no other vehicle

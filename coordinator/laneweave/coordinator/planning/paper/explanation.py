@@ -1,7 +1,7 @@
 """A record of a run of Algorithms 1 and 2: assignments, constraint trees, stop reason.
 
-Small trees are literally the paper's; if they grow large, the trees of the improved algorithms
-are recorded instead.
+The trees are literally the paper's if those are small, otherwise those of the improved
+algorithms.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Improvement to TAPPA: A* over the cells of all vehicles together.
 
 Where there are few empty cells, most combinations of cheapest paths conflict, and constraint trees
-grow without bound if there is no solution. All vehicles planned together (one meta-agent, in
-the terms of Sharon et al., AIJ 219, 2015, section 7) have a finite state space, which is small in
-these cases. Vehicles with the same eligible targets form a team and are interchangeable, so one
+grow very large; without a solution they never end. All vehicles planned together (one meta-agent,
+in the terms of Sharon et al., AIJ 219, 2015, section 7) have a finite state space, which is small
+in these cases. Vehicles with the same eligible targets form a team and are interchangeable, so one
 search covers all assignments: its lower bound holds for every C'_k, and its path set is optimal.
 
 The search goes backwards from the targets. A vehicle is active in a state if it still has to move;

@@ -1,7 +1,7 @@
 """One window of the lattice as arrays, for the compiled code of the rolling planner.
 
-A window holds the columns that the vehicles on the road can reach, and the slots until the last of
-them has left the road. Indices: slot s from the current one, column c from the window's lowest,
+A window holds the columns that the vehicles on the road can reach, and the slots until the last
+vehicle has left the road. Indices: slot s from the current one, column c from the window's lowest,
 lane, and displacement d as numbered by `displacements`.
 """
 
@@ -149,7 +149,7 @@ def window(
     now_m = (np.arange(columns) + low) * road.pitch_m + slot * road.advance_m
     rearmost_m = now_m[reach]
     slots = max(1, int(np.ceil((road.length_m - rearmost_m) / road.advance_m)) + 1)
-    # More slots for vehicles that fall back.
+    # Add slots for vehicles that fall back.
     slots += int(np.ceil(reach * road.pitch_m / road.advance_m))
     at_m = now_m + np.arange(slots + 1)[:, None] * road.advance_m
     table = _table(road, at_m, low, blocked)

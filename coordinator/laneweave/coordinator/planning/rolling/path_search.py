@@ -2,7 +2,7 @@
 
 The problem is that of the paper's Section 3, without formations: every vehicle on the road gets a
 path from its cell to the end of the road, in one window that moves with the lattice. The
-paths never conflict, so that each plan can be executed. A vehicle whose path misses its lane is
+paths never conflict, so each plan can be executed. A vehicle whose path misses its lane is
 planned again in the next slot.
 
 A path is found by exact dynamic programming over (slot, column, lane) around all others. If a
@@ -45,7 +45,7 @@ def warm_up() -> None:
 
 
 class StreamPlanner:
-    """Plans a stream slot by slot; a plan depends only on the arguments of `plan` and the seed."""
+    """A slot-by-slot stream planner; plans depend only on the seed and the arguments of `plan`."""
 
     def __init__(self, road: StreamRoad, costs: StreamCosts | None = None, seed: int = 0) -> None:
         """Prepare the planner; `seed` determines all random choices."""

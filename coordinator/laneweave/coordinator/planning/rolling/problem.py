@@ -10,7 +10,7 @@ from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.protocol.lattice import Cell, Mode
 
 CellPath = tuple[Cell, ...]
-"""Cells at the beginning of each slot, the current one first, up to the end of the road."""
+"""Cells at the beginning of each slot, from the current slot to the end of the road."""
 
 
 def _one_per_cell(_road: object, _field: Attribute[ConflictModel], model: ConflictModel) -> None:

@@ -27,7 +27,7 @@ def problems_of_plan(
     vehicles: Sequence[StreamVehicle],
     blocked: Collection[Cell] = (),
 ) -> list[str]:
-    """Return the errors in a plan for these vehicles; it may be issued if there are none."""
+    """Return the errors in a plan for these vehicles; a valid plan has none."""
     names = {vehicle.vehicle for vehicle in vehicles}
     if plan.paths.keys() != names:
         return [f"paths of {sorted(plan.paths)} for vehicles {sorted(names)}"]
@@ -88,7 +88,7 @@ def _problems_of_move(
         yield f"{name} moves between {rear_m} m and {front_m} m in slot {slot}"
     entered = {there, (here[0], there[1]), (there[0], here[1])} - {here}
     if not blocked.isdisjoint(entered):
-        yield f"{name} enters {sorted(blocked & entered)}, blocked, in slot {slot}"
+        yield f"{name} enters {sorted(blocked & entered)} (blocked) in slot {slot}"
 
 
 def _conflicts(road: StreamRoad, plan: StreamPlan) -> Iterator[str]:
