@@ -2,6 +2,6 @@
 
 Entry point: `driver.Driver`. `trajectory` plans moves between cells, `reference` gives them
 road times, `tracker` tracks them (`tracking_problem`: the quadratic program, `regulator`: its
-unconstrained solution), `surroundings` predicts neighbours. Only `qp_solver` imports osqp. No I/O;
+unconstrained solution), `surroundings` predicts gaps. Only `qp_solver` imports osqp. No I/O;
 imported by `agents.core`, `agents.process` and launch.
 """

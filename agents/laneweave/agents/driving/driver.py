@@ -1,6 +1,6 @@
-"""The driver: computes jerks for the motion controller from the cell to hold or the move to make.
+"""The driver: computes the jerks with which the motion controller holds a cell or makes a move.
 
-It makes a reference through the lattice points (`reference`) and tracks it (`tracker`). If a
+It plans a reference through the lattice points (`reference`) and tracks it (`tracker`). If a
 solution is unusable, the driver returns no jerks, and the motion controller continues with the last
 usable trajectory and its fallbacks (`sim_bridge.bodies.motion_controller`). The driver is
 independent of the protocol.

@@ -1,4 +1,4 @@
-"""Quadratic programs, solved with OSQP, which only this module imports.
+"""Quadratic programs, solved with OSQP; only this module imports it.
 
     minimise    1/2 x' P x
     subject to  lower <= A x <= upper

@@ -50,7 +50,7 @@ def cost_to_go(weights: Array, h: float) -> Array:
 
 
 def _gain(cost: Array, h: float) -> Array:
-    """Return the gain K (1, 3) for a tick that is followed by a cost to go (3, 3)."""
+    """Return the gain K (1, 3) of a tick, given the cost to go (3, 3) after it."""
     transition, effect = axis_matrices(h)
     gain: Array = effect.T @ cost @ transition / (JERK_WEIGHT + effect.T @ cost @ effect)
     return gain

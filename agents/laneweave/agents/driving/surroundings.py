@@ -1,8 +1,8 @@
 """Surroundings: free positions between the sensed vehicles ahead and behind.
 
-Neighbours in the lanes that the body touches or enters are relevant. They are predicted at constant
-speed for `SENSED_S`. A neighbour that matches an announced motion (`motions`) is also predicted
-along the motion's trajectory, from the sensed position on. At each tick the nearer prediction
+Neighbours in the lanes that the body touches or enters are relevant. They are assumed to keep their
+speed for `SENSED_S`. A neighbour that matches an announced motion (`motions`) is also assumed to
+follow the motion's trajectory from the sensed position on. At each tick the nearer prediction
 counts, so an announcement cannot relax the limits from sensors. All positions are commanded ones
 (`protocol.vehicle.motion`): bodies of equal lag keep the distances between their commanded states.
 """
@@ -25,7 +25,7 @@ from laneweave.protocol.wire.messages import Motion, Neighbour, Sense
 Array = NDArray[np.float64]
 
 SENSED_S = 1.0
-"""Time for which a neighbour is predicted at its sensed speed."""
+"""Time for which neighbours are assumed to keep their speed."""
 
 
 _Sensed = tuple[int, float, float]
@@ -47,7 +47,7 @@ _BEHIND = _Side(-1.0, np.maximum, -np.inf)
 
 
 class Surroundings:
-    """Predicts the neighbours of one vehicle."""
+    """Predicts the gaps around one vehicle."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Take sizes, limits and horizon from a scenario."""
@@ -138,7 +138,7 @@ class Surroundings:
         return relevant, near
 
     def _at_constant_speed(self, others: list[_Sensed], side: _Side) -> Array:
-        """Return the nearest limits (N + 1,) set by neighbours predicted at constant speed."""
+        """Return the nearest limits (N + 1,) set by neighbours at constant speed."""
         positions = np.full(self._times_s.shape, side.free)
         for _, front_m, speed_mps in others:
             positions = side.nearest(positions, front_m + speed_mps * self._times_s)

@@ -131,8 +131,8 @@ class Tracker:
     def rest(self, state: State, goal: State) -> TrackResult | None:
         """Return the jerks that keep a vehicle in its cell while no other vehicle is near.
 
-        `solve` would return the same jerks, but takes longer: this close to the cell, no constraint
-        can bind. None: the commanded state is not close enough to `goal`, rest in the cell.
+        So near the cell no constraint can bind: `solve` returns the same jerks, but is slower.
+        None: the commanded state is not close enough to `goal`, the state at rest in the cell.
         """
         if self._regulator is None:
             return None

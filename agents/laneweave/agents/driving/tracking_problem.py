@@ -315,7 +315,7 @@ def _constraints(n: int, h: float, slip: float) -> Any:  # noqa: ANN401 - scipy.
 
 @cache
 def _cost(n: int, h: float) -> Any:  # noqa: ANN401
-    """Return P."""
+    """Return the matrix P."""
     stage = sparse.block_diag([WEIGHTS, LATERAL_WEIGHTS])
     last = sparse.block_diag([cost_to_go(WEIGHTS, h), cost_to_go(LATERAL_WEIGHTS, h)])
     return sparse.block_diag(

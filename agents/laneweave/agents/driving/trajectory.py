@@ -77,7 +77,7 @@ class InfeasibleTrajectoryError(ValueError):
 
 @frozen(eq=False)
 class Trajectory:
-    """Samples of a motion in the moving frame, which obey the discrete dynamics exactly."""
+    """Samples of a motion in the moving frame; they obey the discrete dynamics exactly."""
 
     states: Array
     """(n + 1, 6): s [m], v [m/s] and a [m/s2] along the road, s and v relative to the lattice;
@@ -87,7 +87,7 @@ class Trajectory:
 
     @property
     def ticks(self) -> int:
-        """Duration n."""
+        """Duration n [ticks]."""
         return len(self.jerks)
 
 

@@ -43,7 +43,7 @@ class FormationsOperation:
             has_watched: returns whether, at a given node time, this leader has handled events
                 without gaps for an election timeout.
             rng: source of random pauses.
-            plan: plans one request.
+            plan: answers a request.
             rules: rules for formation leaders; tests replace some.
         """
         self.leaders: dict[int, FormationLeader] = {}

@@ -53,7 +53,7 @@ def paced(
 
     Args:
         plan: plan with the latest start: when all of its vehicles are in S3.
-        others: plans of neighbouring formations, which are not changed.
+        others: plans of neighbouring formations; not changed.
         not_before_s: earliest start (road time).
         end_s: road time by which the plan should be complete.
         scenario: road, lattice, T_F.
@@ -94,7 +94,7 @@ def with_pauses(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: i
 
     Args:
         plan: the new plan.
-        others: plans of neighbouring formations, which are not changed.
+        others: plans of neighbouring formations; not changed.
         slack_s: difference between the length of a slot and the duration of a move [s].
         max_steps: maximum number of slots. Moves still in conflict then rely on the emergency
             brake, because a delay is better than a wrong lane.

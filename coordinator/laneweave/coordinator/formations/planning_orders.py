@@ -106,7 +106,7 @@ class FormationPlanner:
             groups: joined blocks; new joins are added.
             leaders: leaders of all formations by lowest block number.
             new_job: returns the id of a new computation.
-            plan: plans one request.
+            plan: answers a request.
         """
         self._scenario = scenario
         self._groups = groups

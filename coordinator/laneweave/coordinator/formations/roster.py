@@ -42,7 +42,7 @@ class Formation:
     closed_s: float = 0.0
     """Road time at which the last of the formations was closed."""
     joined: int = 1
-    """Number of formations; above 1 if joined."""
+    """Number of formations it consists of."""
     deserted: Numbers = ()
     """Blocks of joined formations whose vehicles have all left the road. Plans avoid them, since
     vehicles of formations joined under another leader may be there."""

@@ -43,7 +43,7 @@ class SortingTask:
     """Lattice cell of each member, in the order of the result."""
     preferred_lanes: Mapping[Name, int]
     unattended: Collection[Name]
-    """Members without an agent, which only hold."""
+    """Members without an agent; they only hold."""
     scenario: Scenario
     """Mode, conflict kinds, lattice."""
     deadline_s: float
@@ -179,7 +179,7 @@ def sort_lanes(
     Args:
         task: the sorting task.
         max_nodes: maximum number of search nodes per attempt.
-        plan: plans one request.
+        plan: answers a request.
         clock: returns the time for the deadline [s].
     """
     if not task.movers:

@@ -148,7 +148,7 @@ def _place(
 def _filled(
     columns: _Columns, grid: Grid, starts: Sequence[int], preferred: Sequence[int | None]
 ) -> _Placed:
-    """Fill a structure from each possible front; return the nearest one."""
+    """Fill a structure from each front; return that nearest the starts."""
     lanes_of: dict[int, list[int]] = {}
     for lane in sorted(columns):
         for column in columns[lane]:

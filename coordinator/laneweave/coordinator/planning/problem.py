@@ -66,7 +66,7 @@ class MoveTable:
         return free
 
     def bit(self, cell: Cell) -> int:
-        """Return the bit index of a cell, which its wait move shares."""
+        """Return the bit index of a cell and of its wait move."""
         return (cell[0] * self.width + cell[1]) * self.fan
 
     def cell(self, bit: int) -> Cell:
@@ -188,7 +188,7 @@ class Diagram:
     """All minimum-cost paths of a vehicle to a target, as a multi-valued decision diagram.
 
     layers: for each of the `cost` steps, the moves that lie on at least one such path.
-    target: bit index of the target cell, which its wait move shares.
+    target: bit index of the target cell and of its wait move.
     """
 
     layers: tuple[int, ...]

@@ -63,7 +63,7 @@ class PlanRequest:
     """Vehicles, targets and rules of one planning problem.
 
     targets: empty if a structure is given.
-    structure: one of `STRUCTURES`, whose cells are the targets; see `formation_structures`.
+    structure: one of `STRUCTURES` (`formation_structures`); its cells are the targets.
     lanes: lanes of the structure; None: all.
     geometry: defines the conflict kind `geometric`; None: footprints.
     solver: one of `SOLVERS`; None: the planner's default.

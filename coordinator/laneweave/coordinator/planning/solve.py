@@ -1,4 +1,4 @@
-"""Plan one request with the selected solver, and fall back to the other one."""
+"""Answer a request with the selected solver; fall back to the other one."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def plan(
     fallback: bool = True,
     clock: Clock = time.monotonic,
 ) -> PlanResponse:
-    """Plan one request, and check the plan with `plan_validator`.
+    """Answer one request; check the plan with `plan_validator`.
 
     Identical requests get identical plans unless the deadline passes first.
 
@@ -59,7 +59,7 @@ def plan(
         max_nodes: limit on search nodes, for repeatable results; at most `MAX_NODES`.
         max_memory_mb: limit on the arrays of branch and bound. When it is reached, the other
             solver continues; a path set that is not proven optimal has status `feasible`.
-        weights: weights of the formation relative distance, which must bound steps from below.
+        weights: weights that make the formation relative distance a lower bound on steps.
         solver: one of `SOLVERS`, overriding the request's; if neither names one, the default.
         fallback: branching continues when TAPPA has spent `TAPPA_SHARE`, and the cheaper path set
             is returned; False: TAPPA may spend the whole budget. A solver that cannot handle the

@@ -114,7 +114,7 @@ class PlanningService:
             name: name of the coordinator.
             settings: limits.
             workers: number of requests to plan concurrently.
-            plan: plans one request, in a worker process.
+            plan: answers one request, in a worker process.
             solver: solver for requests that name none.
         """
         self._name = name
@@ -323,7 +323,7 @@ def _digest(request: PlanRequest) -> bytes:
 
 
 def plan_in_time(plan: PlanFunction, request: PlanRequest, left_s: float) -> PlanResponse:
-    """Plan a request in the time that remains until its deadline."""
+    """Answer a request in the time left until its deadline."""
     left_s = min(left_s, request.deadline_s)
     response = plan(attrs.evolve(request, deadline_s=left_s))
     waited_ms = round(1e3 * (request.deadline_s - left_s), 3)

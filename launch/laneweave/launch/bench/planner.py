@@ -41,7 +41,7 @@ class Family:
     make: Callable[..., PlanRequest] = formation_request
 
     def request(self, seed: int, vehicles: int, deadline_s: float) -> PlanRequest:
-        """Return an instance.
+        """Return a request.
 
         Raises:
             BadInputError: the vehicles do not fit into a block.

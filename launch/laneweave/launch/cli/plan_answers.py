@@ -1,4 +1,4 @@
-"""`laneweave plan`: read a request, plan or explain it, print and draw the result."""
+"""`laneweave plan`: read a request, make or explain its plan, print and draw it."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def answer_request(
     scenario: Scenario | None = None,
     wait_s: float = 0.0,
 ) -> None:
-    """Read and plan a request, then print and draw the plan; with `access`, a coordinator plans.
+    """Read a request; make, print and draw its plan. With `access`, a coordinator makes it.
 
     `drawing` shows the relative coordinate system, `road_drawing` the road of `scenario`. `wait_s`
     is the time to wait for a coordinator. `deadline_s` and `solver` override the request's values.

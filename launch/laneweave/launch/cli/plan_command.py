@@ -1,4 +1,4 @@
-"""`laneweave plan`: plan one request."""
+"""`laneweave plan`: answer a request."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def plan(
         ),
     ] = False,
 ) -> None:
-    """Plan one request in this process, or have a running coordinator plan it."""
+    """Answer one plan request in this process or by a running coordinator."""
     from laneweave.launch.cli.plan_answers import access_for, answer_request, explain_request
 
     settings = load_scenario(config)

@@ -139,7 +139,7 @@ def issue(
 
 
 def authority_key_path(folder: Path) -> Path:
-    """Return the path of the key of the authority, which roles do not need."""
+    """Return the path of the authority key; roles do not need it."""
     return folder / "ca.key"
 
 

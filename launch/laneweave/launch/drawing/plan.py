@@ -299,7 +299,7 @@ def _rectangle(
 
 
 def short_name(name: str) -> str:
-    """Return a short name: the end of a long name, which usually differs most."""
+    """Shorten a long name to its end, which usually differs most."""
     plain = "".join(char if char.isprintable() else "?" for char in name)
     return plain if len(plain) <= _MAX_LABEL_LENGTH else "…" + plain[1 - _MAX_LABEL_LENGTH :]
 

@@ -217,7 +217,7 @@ def _draw_instant(axes: Axes, picture: _Picture, tick: int) -> None:
 
 
 def _draw_empty_road(axes: Axes, picture: _Picture, *, label_axis: bool) -> None:
-    """Draw the lanes, and if `label_axis`, the label of the axis."""
+    """Draw the lanes and, if `label_axis`, the axis label."""
     width_m = picture.drive.scenario.road.lane_width_m
     axes.set_xlim(*picture.extent_m)
     axes.set_ylim(-0.3, picture.lanes * width_m + 0.3)

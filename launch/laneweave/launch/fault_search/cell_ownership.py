@@ -2,8 +2,8 @@
 
 The checks read the motion controllers. A vehicle with a pending transfer does not know its owned
 cells, but the checker does: the cells after the transfer if any vehicle of its roster has taken
-possession, otherwise the cells before it. So every cell must have at most one owner at any time. If
-an agent opens its gate and exits before its controller is informed, its vehicle has not moved, and
+possession, otherwise the cells before it. Every cell must have at most one owner at any time. If an
+agent opens its gate and exits before its controller is informed, its vehicle has not moved, and
 no cell has been transferred.
 """
 

@@ -66,7 +66,7 @@ class _PlanMotions:
 
 
 class Checker:
-    """Checker of one run, which collects the violations."""
+    """Checker of one run; collects the violations."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""A run of the fault search: real cores, a light road, random faults, and the checker.
+"""A run of the fault search: real cores, a simplified road, random faults, a checker.
 
 During the fault phase, preferred lanes change repeatedly, which requires new plans. Then all faults
 end, and all vehicles must arrive. The same seed gives the same run.

@@ -1,6 +1,6 @@
 """Profiles: kinds and severity of the faults in a search.
 
-A profile defines the ranges and choices from which each seed draws. Shares are probabilities; times
+A profile defines the ranges and choices from which each run draws. Shares are probabilities; times
 are in virtual seconds.
 """
 
@@ -21,7 +21,7 @@ Span = tuple[int, int]
 
 @frozen(kw_only=True)
 class Profile:
-    """The ranges and choices from which the seeds of a search draw."""
+    """The ranges and choices from which the runs of a search draw."""
 
     name: str
     text: str
@@ -37,7 +37,7 @@ class Profile:
     """Share of runs with formations of different lengths."""
     max_joined: Span = (1, 2)
     crowding: float = 0.5
-    """Share of runs in which more vehicles may prefer a lane than their block has cells in it."""
+    """Share of runs in which more of a block's vehicles may prefer a lane than fit in it."""
     leavers: float = 0.15
     """Share of vehicles that leave the road during the fault phase."""
     loss: tuple[float, ...] = (0.0, 0.0, 0.1, 0.3, 0.5, 0.8)

@@ -112,7 +112,7 @@ class Setup:
 
     @property
     def adjoin(self) -> bool:
-        """Whether there are two adjacent formations, which can join."""
+        """Whether there are two adjacent formations that can join."""
         if len(self.formations) != 2:
             return False
         ahead, behind = self.formations
@@ -158,7 +158,7 @@ class Setup:
     def preferences(self, rng: random.Random, *, last: bool) -> dict[Name, int]:
         """Draw the preferred lane of each vehicle.
 
-        The last preferences can be satisfied: in each formation (or two formations that may join),
+        If `last`, all can be satisfied: in each formation (or each pair that may join),
         no lane is preferred by more vehicles than it has cells.
         """
         lanes, lattice = self.scenario.road.lanes, self.scenario.lattice

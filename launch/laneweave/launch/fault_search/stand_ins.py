@@ -94,7 +94,7 @@ class LightBody(Plant):
 
 
 class LightVehicle(RoadVehicle):
-    """Vehicle with a light body, an individual clock, and a variable preferred lane."""
+    """Vehicle with a simplified body, its own clock and a variable preferred lane."""
 
     def __init__(self, visit: Visit, preferred_lane: int, scenario: Scenario) -> None:
         """Start in the cell of a visit."""
@@ -141,7 +141,7 @@ class LightVehicle(RoadVehicle):
 
 
 class LightDriver:
-    """Driver without trajectories, whose commands contain only cells and ticks.
+    """Driver without trajectories; its commands contain only cells and ticks.
 
     Like `TrackingDriver`, it considers a motion complete when its time is over and the body is in
     the target cell.

@@ -66,7 +66,7 @@ class LossMeter:
                 del self._first_tick[name]
 
     def on_clock(self, clock: RoadClock) -> None:
-        """Count a clock message, and close ticks whose grace time is over."""
+        """Count a clock message; close ticks past their grace period."""
         if not self.window_ticks or not clock.tick:
             return
         if self._tick_s == 0.0:

@@ -67,7 +67,7 @@ class Vehicles:
     attended: int
     """Vehicles driven by an agent."""
     unattended: int
-    """Vehicles without an agent, whose states are published by caretakers."""
+    """Vehicles without an agent; caretakers publish their states."""
     unheard: int
     """Vehicles from which no state was received."""
     agents: int

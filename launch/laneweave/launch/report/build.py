@@ -205,7 +205,7 @@ def _add_path_map(report: _Report, driven: DrivenMap | None) -> None:
 
 
 def _add_distributions(report: _Report, comparison: Comparison, example: Run) -> None:
-    """Add the distributions over all runs with trajectories, which are read one by one."""
+    """Add the distributions over all runs with trajectories; read one run at a time."""
     counted: dict[tuple[str, float], distributions.Counts] = {}
     for run in comparison.runs:
         if run.has_trajectories:

@@ -115,9 +115,9 @@ def _break_axis(upper: Axes, lower: Axes, break_s: float) -> None:
 
 
 def _places(labels: int, volumes: int, width: float = 0.8) -> Floats:
-    """Return positions along the axis, shape (labels, volumes), with labels side by side.
+    """Return positions along the axis, shape (labels, volumes), with boxes side by side.
 
-    `width` is the total width of the labels at a volume; the distance between volumes is 1.
+    `width` is the total width of the boxes at a volume; the distance between volumes is 1.
     """
     shifts = (np.arange(labels) - 0.5 * (labels - 1)) * width / max(1, labels)
     return np.asarray(np.arange(volumes) + shifts[:, None])
@@ -189,7 +189,7 @@ def _draw_seeds(
 ) -> None:
     """Draw each run as a dot, and means over seeds with standard deviations as a line.
 
-    The labels are shifted sideways, because several labels may have the same values.
+    The dots of labels are shifted sideways, because labels may have the same values.
     """
     colours, labels, nothing = label_colours(comparison.labels), comparison.labels, True
     for number, label in enumerate(labels):

@@ -51,8 +51,8 @@ def road_snapshots(
     Args:
         folder: folder of the run.
         out: file of the picture; its suffix defines the format.
-        times: road times [s]; empty: the four times at intervals of the shortest T_F at which most
-            vehicles are between two lanes.
+        times: road times [s]; empty: the four times, spaced by the shortest T_F, at which the most
+            vehicles change lanes.
         stretch_m: (from m, to m); None: from 20 m before lane sorting begins to 300 m beyond that
             point.
         dpi: resolution in dots per inch.
@@ -209,7 +209,7 @@ def _shade(colour: str, over_mps: float) -> tuple[float, float, float]:
 
 
 def _instants(tracks: Tracks, scenario: Scenario, stretch_m: tuple[float, float]) -> list[float]:
-    """Return four times at intervals of the shortest T_F at which most vehicles change lanes.
+    """Return four times, spaced by the shortest T_F, at which the most vehicles change lanes.
 
     Fewer are returned if the recording ends earlier. A vehicle on the stretch is weighted by its
     distance from the nearest lane centre, plus a small constant.

@@ -47,7 +47,7 @@ _BY_SOLVER: Final = "planning_by_solver_"
 
 @frozen
 class Table:
-    """A table on a page, which is shown only if it has rows."""
+    """A table on a page; shown only if it has rows."""
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]

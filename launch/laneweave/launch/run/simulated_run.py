@@ -37,7 +37,7 @@ STALL_S = 600.0
 STRIDE_S = 0.02
 """Virtual time between checks of a run without faults.
 
-The network may run for this long after the bridge has ended, which does not affect the results."""
+The network may run for this long after the bridge has ended, without effect on the results."""
 PROGRESS_EVERY_TICKS = 20
 AGENT_PREFIX = "agent-"
 

@@ -35,7 +35,7 @@ END_S = 10.0
 
 @frozen
 class PointResult:
-    """The result of a point, whose files are in `folder`."""
+    """The result of a point; its files are in `folder`."""
 
     point: Point
     folder: Path
@@ -45,7 +45,7 @@ class PointResult:
 
 
 def kept_files(point: Point) -> tuple[str, ...]:
-    """Return the names of the files to keep; `LOG_FILE` is also kept after a failure."""
+    """Return the names of the files to keep; after a failure, add `LOG_FILE`."""
     kept = (SUMMARY_FILE, "trips.parquet", "events.jsonl")
     return (*kept, TRAJECTORIES) if point.keep_trajectories else kept
 

@@ -218,7 +218,7 @@ def _check_timing(scenario: Scenario) -> None:
 
 
 def _in_ticks(scenario: Scenario, time_s: float, min_ticks: int) -> bool:
-    """Return whether a time is a whole number of at least `min_ticks` ticks."""
+    """Return whether a time is a whole number of ticks, at least `min_ticks`."""
     ticks = time_s / scenario.runtime.tick_s
     return ticks >= min_ticks - 1e-6 and abs(ticks - round(ticks)) < 1e-6
 

@@ -33,7 +33,7 @@ class Shard:
 
 
 def parse_shard(text: str, name: str) -> Shard:
-    """Return the shard `I/N`; `name` is the field or option for the error.
+    """Return the shard `I/N`; errors name the field or option `name`.
 
     Raises:
         BadInputError: the text is not a shard.

@@ -131,7 +131,7 @@ class FormationSettings:
     """Formations: `vehicles`: a formation ends at `max_vehicles` vehicles or `max_columns` columns;
     `columns`: each formation has `block_columns` columns, as in the paper."""
     gap_m: float = field(default=15.0, validator=within(1.0, 200.0))
-    """d_F, the column pitch."""
+    """Column pitch d_F."""
     cycle_s: float | None = field(default=None, validator=optional(within(0.5, 60.0)))
     """T_F, the time slot of a step. None: 4 to 7 s in formations, as long as the road allows, and
     by volume in the rolling operation (`Scenario.cycles_s`)."""
@@ -297,8 +297,8 @@ class Braking:
     lead_lag_s: float = field(default=0.2, validator=within(0.0, 2.0))
     """Minimum time constant of the first-order lag of the brakes of the vehicle ahead."""
     reaction_s: float = field(default=0.1, validator=within(0.01, 5.0))
-    """Time from a measurement to the set-point of the brakes: one tick, plus delays of sensors and
-    brakes in whole ticks (none in this plant)."""
+    """Time from a measurement to the brakes' set-point: one tick, plus delays of sensors and brakes
+    in multiples of a tick (none in this plant)."""
     margin_m: float = field(default=0.3, validator=within(0.0, 10.0))
     """Net gap at standstill; measurement errors reduce it."""
 
@@ -310,7 +310,7 @@ class Tracking:
     horizon_ticks: int | None = field(default=None, validator=optional(within(10, 200)))
     """Horizon of the tracker; None: the longest T_F."""
     min_gap_m: float = field(default=3.0, validator=within(0.0, 100.0))
-    """Minimum net gap to the vehicle ahead, which takes precedence over the reference."""
+    """Minimum net gap to the vehicle ahead; takes precedence over the reference."""
     always_solve: bool = False
     """Solve the quadratic program with OSQP in every tick, even if its unconstrained solution
     satisfies all constraints."""
@@ -329,7 +329,7 @@ class RuleSettings:
     gap: str = field(default="front-to-front", validator=one_of("front-to-front", "net"))
     """Definition of d_R: between front bumpers, or bumper to bumper."""
     yielding: str = field(default="unsorted", validator=one_of("unsorted", "all"))
-    """Vehicles that slow down for vehicles with higher priority: those off their lane, or all."""
+    """Vehicles that yield to higher priority: those not in their preferred lane, or all."""
     slow_down_mps2: float = field(default=3.0, validator=within(0.1, 20.0))
     """Deceleration of a vehicle that yields; car following brakes as hard as necessary."""
     lane_change_s: float = field(default=0.0, validator=within(0.0, 20.0))
@@ -360,7 +360,7 @@ class Runtime:
     tick_resend_s: float = field(default=0.05, validator=within(0.005, 10.0))
     """Interval for resending SENSE to agents that have not answered (wall-clock seconds)."""
     tick_deadline_s: float = field(default=0.3, validator=within(0.02, 60.0))
-    """Time after which a tick ends; vehicles without an answer continue their trajectories
+    """Time after which a tick ends; vehicles that did not answer keep their trajectories
     (wall-clock seconds)."""
     agent_silent_s: float = field(default=3.0, validator=within(0.1, 600.0))
     """Time without an answer after which ticks no longer wait for an agent, and its vehicle's

@@ -86,7 +86,7 @@ def spare_error_m(scenario: Scenario, speed_mps: float) -> float:
 
 
 def last_tick_m(brake_mps2: float, tick_s: float) -> float:
-    """Return the maximum extra distance due to braking that ends on a whole tick.
+    """Return the maximum distance added by stopping only at the end of a tick.
 
     In its last tick a body brakes just hard enough to stand still at the end of the tick.
     """

@@ -273,7 +273,7 @@ def _min_accel(share: float, step: float) -> float:
     """Return the minimum rate after this tick with which a speed can stay above its lower bound.
 
     The margin is the speed above that bound [m/s], the rate its derivative [m/s2]. Raising the rate
-    from -x jerk tick_s to zero, in whole ticks at full jerk and a partial one, reduces the margin
+    from -x jerk tick_s to zero, in ticks at full jerk and a partial one, reduces the margin
     by jerk tick_s^2 / 2 times the linear interpolation of m^2 at x; this tick changes it by tick_s
     times the mean of both rates. The minimum rate uses up the margin:
 

@@ -31,7 +31,7 @@ class Quality(Enum):
     ASSURED = "assured"
     """Messages that wait under congestion; the protocol acknowledges and resends them."""
     LOCKSTEP = "lockstep"
-    """Ticks and their answers: as ASSURED, with the highest priority."""
+    """Ticks and answers to them: ASSURED, with the highest priority."""
 
 
 class Exchange(Enum):

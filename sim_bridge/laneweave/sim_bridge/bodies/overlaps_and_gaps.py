@@ -1,4 +1,4 @@
-"""Overlaps between bodies, gaps between them, and exact neighbours of each vehicle.
+"""Overlaps and gaps between bodies; exact states of each vehicle's neighbours.
 
 A vehicle's body is a rectangle of length L and width W. Its pose consists of
 

@@ -38,7 +38,7 @@ s: front bumper; y: centre of the body from the right road edge; column and lane
 
 
 class Trajectories:
-    """Writer of trajectories, which also computes their extreme values."""
+    """Writes trajectories and computes their extreme values."""
 
     def __init__(self, path: Path, metadata: Metadata, min_accel_mps2: float) -> None:
         """Open the file; `min_accel_mps2` is the braking limit."""

@@ -27,7 +27,7 @@ MAX_STRETCH = 8.0
 _STRETCH, _RELAX = 1.5, 0.98
 """Multipliers of that factor after a tick with too many late answers, and after other ticks."""
 _LATE_AGENTS = 0.05
-"""Fraction of agents that may answer late without increasing the deadline."""
+"""Fraction of agents that may be late before the deadline is increased."""
 LATE_SHARE = 2.0
 """Multiple of `agent_silent_s` after which an agent that always answers late is replaced."""
 _ROUNDING_S = 1e-6

@@ -39,7 +39,7 @@ class RoadVehicle:
     def entering(
         cls, admission: Admission, t_s: float, scenario: Scenario, bridge: int = 0
     ) -> RoadVehicle:
-        """Return an admitted vehicle at road time `t_s`, after driving at v_F since its admission.
+        """Return an admitted vehicle at road time `t_s`; it has driven at v_F since admission.
 
         The vehicle settles in its cell within `formation.settle_s`.
         """
@@ -93,7 +93,7 @@ class RoadVehicle:
         return self.controller.rung_ticks
 
     def perceive(self, neighbours: ExactNeighbours) -> None:
-        """Measure the vehicle's own state and its exact neighbours."""
+        """Measure the states of the vehicle and of its neighbours."""
         if self.sensors is not None:
             measured = self.sensors.measure(self.state)
             self.controller.perceive(measured, self.sensors.measure_neighbours(neighbours))

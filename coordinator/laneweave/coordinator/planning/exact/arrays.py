@@ -28,7 +28,7 @@ Bools = NDArray[np.bool_]
 class MoveArrays(NamedTuple):
     """The moves of a grid under a conflict model.
 
-    Shapes: D displacements, X cells, at most M cliques that contain a move.
+    Shapes: D displacements, X cells, at most M cliques per move.
     """
 
     lanes: int

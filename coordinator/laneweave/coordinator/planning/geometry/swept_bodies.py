@@ -31,7 +31,7 @@ _SAMPLES: Final = 128
 
 
 def minimum_jerk_share(time: Floats) -> Floats:
-    """Return the fraction of the distance travelled after a fraction of the time, rest to rest.
+    """Return the fraction of distance travelled after a fraction of time, from rest to rest.
 
     The minimum-jerk quintic (Flash and Hogan, Journal of Neuroscience 5, 1985).
     """
@@ -108,13 +108,13 @@ class BodyGeometry:
     width_m: float = field(default=1.8, validator=within(0.5, 4))
     lane_width_m: float = field(default=3.5, validator=within(2, 10))
     pitch_m: float = field(default=15.0, validator=within(1, 200))
-    """Length of a cell, d_F."""
+    """Cell length d_F."""
     move_s: float = field(default=3.8, validator=within(0.5, 60))
     """Duration of a move."""
     slot_s: float = field(default=4.0, validator=within(0.5, 60))
-    """Time from the start of one step to that of the next, T_F."""
+    """Time T_F from the start of one step to that of the next."""
     speed_mps: float = field(default=15.0, validator=within(1, 60))
-    """Speed of the lattice, v_F; the higher the speed, the less bodies turn."""
+    """Lattice speed v_F; the higher it is, the less bodies turn."""
     clearance_along_m: float = field(default=5.0, validator=within(0, 200))
     clearance_across_m: float = field(default=0.3, validator=within(0, 10))
     profile_error_along_m: float = field(default=0.6, validator=within(0, 50))

@@ -7,7 +7,7 @@ The cost matrix C holds the formation relative distance, FRD (equation `rd`):
 N^{r,o} counts the oblique edges of a shortest path, the smaller of the two coordinate differences;
 N^{r,s} counts its straight edges, the rest of the larger one. The paper sets l^s = l^o = 1, so that
 FRD counts steps in mode 2. In mode 1 an oblique edge takes two steps, hence l^o = 2 there.
-TAPPA stops once the next assignment costs at least as much as the best path set, which is correct
+TAPPA stops once the next assignment costs at least as much as the best path set; this is correct
 only if C is a lower bound on steps; other weights are rejected.
 
 The preference matrix P says which vehicle may be assigned to which target. The paper multiplies

@@ -13,7 +13,7 @@ to the paper's tree (`cbs.Improvements`) use this:
 - Bicliques (Li et al., ICAPS 2019, call them mutex propagation and positive constraints): S_A and
   S_B may be any sets of moves in the same step such that every move of S_A conflicts with every
   move of S_B. Either A makes no move of S_A, or A makes one and no other vehicle makes a move that
-  conflicts with all of S_A, which excludes all of S_B. No solution satisfies both
+  conflicts with all of S_A; this excludes all of S_B. No solution satisfies both
   (`disjoint_constraints`).
 - Likewise, either a vehicle has finally arrived before a step and no other vehicle crosses its
   target from then on, or it has not arrived.

@@ -41,7 +41,7 @@ labels after it: as they are, and with all vehicles active. Moving vehicles are 
 
 
 class JointSearch:
-    """The joint search, which runs in portions.
+    """The joint search; runs in portions.
 
     lower_bound: lower bound on the cost of all path sets; infinite: there is none.
     solution: the optimal path set, once found.
@@ -176,7 +176,7 @@ class JointSearch:
         return found
 
     def _moves_into_cell(self, cell: int) -> list[tuple[int, int, int]]:
-        """Return each move into a cell as a one-bit set, its start, and the moves it excludes."""
+        """Return (one-bit set, start, excluded moves) for each move into a cell."""
         found = self._moves_into.get(cell)
         if found is None:
             table = self._problem.table

@@ -113,7 +113,7 @@ class Scratch(NamedTuple):
     delay: Singles
     """Extra cost of a move in each slot."""
     searches: Ints
-    """Number of path searches; (1)."""
+    """(1,) number of path searches."""
     queue: Ints
     hit: Ints
     chosen: Ints

@@ -1,7 +1,7 @@
 """Compiled code of the rolling planner: paths of single vehicles.
 
-The style is that of `exact.multipliers_kernel`. The table of a window holds, for each slot, cell
-and displacement, the sum of the penalties of all vehicles whose own moves conflict (`load`). Adding
+The style is that of `exact.multipliers_kernel`. The table of a window holds, for each move (slot,
+cell, displacement), the total penalty of all vehicles whose moves conflict with it (`load`). Adding
 a vehicle to the table or removing it changes a few entries; the search for a path only reads them.
 """
 

@@ -24,7 +24,7 @@ class StreamRoad:
 
     lanes: int
     pitch_m: float
-    """Length of a cell, d_F."""
+    """Cell length d_F."""
     advance_m: float
     """Distance that the lattice travels in a slot: v_F T_F."""
     sorting_m: tuple[float, float]

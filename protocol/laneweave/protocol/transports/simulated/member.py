@@ -56,7 +56,7 @@ class Member:
         """None: virtual time."""
         self.connected = True
         self.unplugged = False
-        """Disconnected individually: a restored router does not reconnect it."""
+        """Disconnected on its own: a restored router does not reconnect it."""
         self.connection = 0
         """Id of the current connection; messages sent over earlier connections are dropped."""
         self.paused = False
