@@ -1,4 +1,4 @@
-"""The agent process, over Zenoh, for one or more vehicles."""
+"""The process that runs one or more agents over Zenoh."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The coordinator: election, ballots, both operations, planners and the planning service."""
+"""The coordinator: election, ballots, both operating modes, planners, planning service."""

@@ -1,7 +1,7 @@
 """References: motions in road time, which the tracker follows.
 
-A `Reference` holds a cell, makes one move to a neighbouring cell, or settles in a cell. Where it
-would run into the vehicle ahead, it is replaced by a yielding path (`yield_behind`).
+A `Reference` is a hold, one move to a neighbouring cell, or the settling in a cell. Where it would
+run into the vehicle ahead, it is replaced by a yielding path (`yield_behind`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The tracker: jerks that keep the vehicle on its reference, by model predictive control.
 
 At each tick it solves the quadratic program of `tracking_problem` for the commanded state
-(`protocol.vehicle.motion`), which compensates the lag of the actuators.
+(`protocol.vehicle.motion`), which compensates for actuator lag.
 
 **Fast path.** Without active inequality constraints, the solution is the regulator's,
 w_k = -K e_k. Jerks and values of all constraints are one precomputed matrix times e_0. If they

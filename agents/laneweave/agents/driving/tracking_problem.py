@@ -56,7 +56,7 @@ _STATE_SCALE = 0.3
 FAR_M = 1e4
 """Bound where there is no vehicle: finite, so that OSQP keeps the constraint's type."""
 _MAX_PUSH_M = 1.0
-"""Maximum distance by which vehicles behind push a vehicle ahead of its reference."""
+"""Maximum distance by which vehicles behind can push this one past its reference."""
 _SPEED_TOLERANCE_MPS = 0.3
 _SLIP_TOLERANCE_MPS = 0.1
 """Tolerances by which OSQP's predictions may violate these limits near standstill."""
@@ -176,7 +176,7 @@ class TrackingProgram:
         self._stale = False
 
     def discard_solution(self) -> None:
-        """Make the next solve start without the previous solution."""
+        """Cold-start the next solve."""
         self._stale = True
 
     def solve(self) -> QPResult:

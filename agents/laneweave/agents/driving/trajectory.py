@@ -309,7 +309,7 @@ def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Traject
 
 @lru_cache(maxsize=256)
 def _reach(tick_s: float, ticks: int) -> tuple[Array, Array]:
-    """Return the matrices that map jerks (3, ticks) and initial state (3, 3) to the final state."""
+    """Return matrices (3, ticks) and (3, 3) that map jerks and initial state to the final state."""
     transition, effect = axis_matrices(tick_s)
     power: Array = np.eye(3)
     effects = []

@@ -42,7 +42,7 @@ class BallotPhase(Enum):
     BACKING_OFF = "backing off"
     """L7: pausing because a vehicle has promised a higher ballot."""
     ABORTED = "aborted"
-    """Nothing more is sent; vehicles hold or execute an earlier plan that is in force."""
+    """Nothing more is sent; vehicles hold, or execute an earlier plan in force."""
 
 
 UNFINISHED = (BallotPhase.PREPARING, BallotPhase.PLANNING, BallotPhase.ISSUING)

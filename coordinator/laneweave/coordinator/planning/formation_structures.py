@@ -169,7 +169,7 @@ def _filled(
 def _fill(
     front: int, lanes_of: Mapping[int, Sequence[int]], preferred: Sequence[int | None]
 ) -> list[Cell] | None:
-    """Return the cells from a front to the rear, or None if there are too few."""
+    """Fill cells backwards from column `front`; None: there are too few."""
     per_lane = _vehicles_per_lane(preferred)
     others = len(preferred) - per_lane.total()
     targets: list[Cell] = []

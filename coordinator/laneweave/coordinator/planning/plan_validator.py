@@ -55,7 +55,7 @@ def problems_of_paths(
 
 
 def _problems_of_targets(request: PlanRequest, targets: Sequence[Cell]) -> Iterator[str]:
-    """Yield the differences between the targets and the requested structure."""
+    """Yield the errors in the targets of a requested structure."""
     if len(targets) != len(request.vehicles) or len(set(targets)) != len(targets):
         yield f"{len(set(targets))} targets for {len(request.vehicles)} vehicles"
     for cell in targets:

@@ -237,7 +237,7 @@ def _is_given(attribute: attrs.Attribute[Any], value: object) -> bool:
 
 
 def _check_json(parent: str, value: object) -> None:
-    """Reject nulls, except in a geometry, and keys that do not fit on one printable line."""
+    """Outside a geometry, reject nulls and keys that do not fit on one printable line."""
     items: Any = ()
     if isinstance(value, Mapping):
         prefix = f"{parent}." if parent else ""

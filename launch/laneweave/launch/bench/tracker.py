@@ -47,7 +47,7 @@ class Episode:
     planned: bool = True
     """Whether the motion of the vehicle ahead is known; otherwise it is extrapolated."""
     pushes: tuple[tuple[float, float], ...] = ()
-    """Changes in position [m] and speed [m/s] that are applied to the body every `_PUSH_TICKS`."""
+    """Changes in position [m] and speed [m/s] of the body, one every `_PUSH_TICKS` ticks."""
 
 
 @frozen(eq=False)

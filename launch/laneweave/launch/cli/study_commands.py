@@ -57,7 +57,7 @@ def sweep(
     ] = None,
     no_progress: Annotated[bool, typer.Option("--no-progress", help="Show no progress.")] = False,
 ) -> None:
-    """Run methods x volumes x seeds in parallel, in virtual time; finished runs are kept."""
+    """Run methods x volumes x seeds in parallel, in virtual time; skip finished runs."""
     from laneweave.launch.run_methods import parse_methods
     from laneweave.launch.sweep.execution import run_locally
     from laneweave.launch.sweep.folder import SweepFolder

@@ -92,7 +92,7 @@ HEALTHY = Conditions(lease_s=LEASE_S, compute_s=COMPUTE_S)
 
 
 class Processes(Protocol):
-    """Operations on processes that fault events require."""
+    """Process operations needed by fault events."""
 
     coordinators: tuple[str, ...]
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 JAMMED = 1.25
 """Travel times count as jammed if their upper quartile exceeds the lowest median by this factor."""
 MARGIN = 0.04
-"""Margin below the shortest travel time, as a share of the scale."""
+"""Margin below the shortest travel time, as a share of the range."""
 LOWER_SHARE = 0.66
 """Share of the height below the break of the axis, for methods without jams."""
 BIN_M, BIN_S = 20.0, 5.0

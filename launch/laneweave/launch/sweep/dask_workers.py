@@ -1,7 +1,7 @@
 """The points of a sweep as tasks on an existing Dask cluster.
 
 Workers need laneweave, but no shared disk: tasks return their points' files, and the client writes
-them. Like a local sweep, each task starts a process, because a worker may run several tasks in
+them. As in local sweeps, each task starts a process, because a worker may run several tasks in
 one process, and SUMO may crash.
 """
 

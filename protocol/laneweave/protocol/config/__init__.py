@@ -1,4 +1,4 @@
-"""Loading of scenario files, and checks between their fields.
+"""Loading and cross-field checks of scenario files.
 
 Entry point: `loading.load_scenario`. `cross_checks` checks fields against each other,
 `participants` names all processes. Imported by `security`, `transports` and the other packages.

@@ -128,7 +128,7 @@ class FormationSettings:
     entry: str = field(default="free", validator=one_of("free", "interlaced"))
     """Formations: cells that vehicles may enter, all or only those of the interlaced structure."""
     close: str = field(default="vehicles", validator=one_of("vehicles", "columns"))
-    """Formations: `vehicles`: a formation ends at `max_vehicles` vehicles or `max_columns` columns;
+    """Formations: `vehicles`: each closes at `max_vehicles` vehicles or `max_columns` columns;
     `columns`: each formation has `block_columns` columns, as in the paper."""
     gap_m: float = field(default=15.0, validator=within(1.0, 200.0))
     """Column pitch d_F."""

@@ -42,7 +42,7 @@ class Findings:
 
 
 def check_credentials(credentials: Credentials, identity: str, host: str = "") -> Findings:
-    """Check credentials without the network, and log warnings.
+    """Check credentials offline, and log warnings.
 
     Raises:
         BadInputError: see `examine`.
@@ -60,7 +60,7 @@ def _warn(identity: str, warning: str) -> None:
 
 
 def examine(credentials: Credentials, identity: str, host: str = "") -> Findings:
-    """Check credentials without the network.
+    """Check credentials offline.
 
     Args:
         credentials: credentials of a process.

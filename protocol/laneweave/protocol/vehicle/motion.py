@@ -270,11 +270,11 @@ def _clamp(value: float, low: float, high: float) -> float:
 
 
 def _min_accel(share: float, step: float) -> float:
-    """Return the minimum rate after this tick with which a speed can stay above its lower bound.
+    """Return the minimum rate, after this tick, that lets a speed stay above its lower bound.
 
     The margin is the speed above that bound [m/s], the rate its derivative [m/s2]. Raising the rate
-    from -x jerk tick_s to zero, in ticks at full jerk and a partial one, reduces the margin
-    by jerk tick_s^2 / 2 times the linear interpolation of m^2 at x; this tick changes it by tick_s
+    from -x jerk tick_s to zero, at full jerk except in the last tick, reduces the margin by jerk
+    tick_s^2 / 2 times m^2, interpolated at x between integers m; this tick changes it by tick_s
     times the mean of both rates. The minimum rate uses up the margin:
 
         x + interp(m^2)(x) = 2 (margin + rate tick_s / 2) / (jerk tick_s^2)

@@ -100,8 +100,8 @@ class Plan:
 
     There is one per ballot. Missing: sent again; no vehicle moves until all have accepted (start
     gate). Duplicated or late: ignored. A plan is also ignored (V3) if its ballot is not the
-    promised one, it cannot be executed safely, its blocks are not exactly the joined ones, its
-    territory leaves them, or its cell transfers are invalid. Vehicles derive the dependencies
+    promised one, it cannot be executed safely, its blocks differ from the joined ones or do not
+    cover its territory, or its cell transfers are invalid. Vehicles derive the dependencies
     between moves from this message.
     """
 

@@ -94,7 +94,7 @@ class Lc2013Traffic:
         return vehicle
 
     def _update(self, vehicle: ReferenceVehicle) -> None:
-        """Read a vehicle's position from SUMO."""
+        """Read a vehicle's state from SUMO."""
         s_m, y_m, _, speed_mps = self._poses[vehicle.name]
         vehicle.accel_mps2 = (speed_mps - vehicle.speed_mps) / self._tick_s
         vehicle.s_m, vehicle.y_m, vehicle.speed_mps = s_m, y_m, speed_mps

@@ -135,7 +135,7 @@ class EntryMeter:
         self._columns[lane] = column
 
     def _dequeue(self, cell: Cell, t_s: float) -> Arrival | None:
-        """Remove and return the first vehicle of a queue, unless no formation admits it."""
+        """Remove and return the first vehicle of a queue, unless it needs a later cell."""
         builder, queue = self._builder, self._queues[cell[1]]
         if builder is not None and not builder.try_add(cell, queue[0].preferred_lane, t_s):
             return None

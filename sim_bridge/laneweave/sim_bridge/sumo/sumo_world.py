@@ -69,7 +69,7 @@ class SumoWorld(SumoSession):
         """Advance SUMO by one tick; vehicles without a new state stay in place.
 
         Raises:
-            RuntimeError: SUMO does not have exactly the added vehicles (internal error).
+            RuntimeError: SUMO has a different number of vehicles (internal error).
         """
         if len(self._placed) < len(self._states):
             for vehicle, state in self._states.items():

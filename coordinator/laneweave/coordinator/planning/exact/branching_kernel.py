@@ -21,7 +21,7 @@ from laneweave.coordinator.planning.exact.multipliers_kernel import (
 )
 
 STUCK, FULL = 3, 4
-"""No choice to branch on is left, but the node is undecided; the stack is full."""
+"""STUCK: no choice left to branch on, node undecided; FULL: the stack is full."""
 BY_TEAM, BY_CELL = 0, 1
 _ITERATIONS = 10
 _KEPT = 0.8

@@ -133,7 +133,7 @@ def explain(
 
 
 def entries(table: MoveTable, node: Node, names: Sequence[str]) -> Iterator[str]:
-    """Yield the conflict list of a node: an entry C^f for each vehicle of a conflict."""
+    """Yield a node's conflict list: an entry C^f for each vehicle of each conflict."""
     for conflict in node.conflicts:
         pair = conflict.first, conflict.second
         for vehicle, move in zip(pair, node.moves(conflict), strict=True):

@@ -45,7 +45,7 @@ class Table(NamedTuple):
     move: NDArray[np.int8]
     """Displacement of that vehicle in the slot; same shape."""
     offsets: Ints
-    """Column, lane and displacement of a conflicting move, and its penalty factor;
+    """Relative column and lane, displacement, penalty factor of conflicting moves;
     (conflicts, 4)."""
     first: Ints
     """Index in `offsets` of the first conflict of each displacement; (displacements + 1)."""

@@ -18,7 +18,7 @@ ENTERING = 8
 """Penalty factor of a conflicting move. The factor is 1 for waiting in the cell in which the other
 vehicle waits, so that taking its place is not penalized again in each slot."""
 MAX_EJECTED = 100
-"""Maximum number of vehicles hit by one ejection chain."""
+"""Maximum number of ejections in one ejection chain."""
 _IMPASSABLE = 5e3
 """Cost at which paths are rejected, and factor of forbidden conflicts. Conflict-free paths cost at
 most a hundredth of this; a conflict with a `FIXED` vehicle costs more than this."""

@@ -40,7 +40,7 @@ class StreamRoad:
     rounds: int = 2000
     """Maximum number of rounds of improvement per slot."""
     max_paths: int = 50_000
-    """Maximum number of path searches per slot, of about 5 us each."""
+    """Maximum number of path searches (about 5 us each) per slot."""
 
 
 @frozen

@@ -244,8 +244,8 @@ def _list_costly(paths, off_lane, costly):
 def improve(table, paths, costs, rounds, max_paths, rng, scratch):
     """Improve all paths for some rounds; return the number of rounds.
 
-    While vehicles miss their lanes, ejection chains and reorderings alternate; the slack decreases
-    from several moves to none. Afterwards a few more rounds look for cheaper paths.
+    While vehicles miss their lanes, ejection chains and reorderings alternate; the permitted cost
+    increase falls to zero. Afterwards a few more rounds look for cheaper paths.
     """
     off_lane, costly = scratch.off_lane, scratch.costly
     turn = idle = 0

@@ -4,7 +4,7 @@ Nodes, messages and computations share one event queue; time jumps from event to
 duplication and delay are drawn for each message and receiver from one seeded generator: the same
 seed gives the same run. Nodes can be killed, paused, resumed and disconnected, the router can be
 lost, and clocks can be wrong. Liveliness behaves as measured on Zenoh: a killed process is detected
-at once, a silent one when its lease expires; for a node without a connection all tokens vanish.
+at once, a silent one when its lease expires; a disconnected node sees all tokens vanish.
 
 Messages are sent as bytes and checked on receipt, as on Zenoh. All receivers of the same bytes
 share one decoded message, so cores must not modify it. With `skip_codec`, messages are sent as
