@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
@@ -90,6 +90,10 @@ def _in_child(case: Case, solution: tuple[Path, Path], constraint: Constraint) -
     )
 
 
+MANY_WITHOUT_CONFLICT = [HealthCheck.filter_too_much]
+"""Paths drawn at random often have no conflict."""
+
+
 @st.composite
 def conflicts(draw: st.DrawFn) -> tuple[Case, Conflict, tuple[int, int]]:
     """Draw two vehicles whose paths conflict, their first conflict, and its two moves."""
@@ -103,7 +107,7 @@ def conflicts(draw: st.DrawFn) -> tuple[Case, Conflict, tuple[int, int]]:
 
 
 @pytest.mark.slow
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80, deadline=None, suppress_health_check=MANY_WITHOUT_CONFLICT)
 @given(conflicts())
 def test_children_share_the_solutions_and_none_keeps_the_conflict(
     drawn: tuple[Case, Conflict, tuple[int, int]],
@@ -134,7 +138,7 @@ def _cost_of_child(
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60, deadline=None, suppress_health_check=MANY_WITHOUT_CONFLICT)
 @given(conflicts())
 def test_children_cost_more_as_predicted(drawn: tuple[Case, Conflict, tuple[int, int]]) -> None:
     (table, diagrams, _), conflict, moves = drawn
