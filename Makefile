@@ -1,4 +1,4 @@
-# laneweave: `make demo` and `make test` on a fresh machine need Python >= 3.11 and make.
+# On a fresh machine `make demo` and `make test` need Python >= 3.11 and make.
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
@@ -6,13 +6,15 @@ STAMP  := $(VENV)/.installed
 RUN    ?= runs/demo
 BUDGET ?= 90
 
-# Tests of real processes wait a lot, so three workers use two cores best (9:55 instead of 13:30 minutes).
-# An idle worker takes over half of another worker's remaining tests.
+# Tests of real processes mostly wait, so three workers use two cores better than two (9:55 instead of
+# 13:30 minutes). An idle worker takes over half of another worker's remaining tests.
 PYTEST := $(BIN)/pytest -n 3 --dist worksteal
 
 # One thread for linear algebra: many processes share few cores.
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
+# Keep compiled modules: every process of a run would otherwise compile the project again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test test-unit test-full evaluation evaluation-faults docs check format clean install help
 
@@ -56,7 +58,7 @@ test-full: $(STAMP) ## run all tests, including the long ones
 evaluation: $(STAMP) ## run the evaluation and write the tables of docs/EVALUATION.md (BUDGET=90 minutes on 2 cores)
 	$(BIN)/python benchmarks/evaluate.py --budget $(BUDGET)
 
-evaluation-faults: $(STAMP) ## the same for "Under faults" only; takes an hour and a half more
+evaluation-faults: $(STAMP) ## run the experiments of "Under faults" in docs/EVALUATION.md (an hour and a half)
 	$(BIN)/python benchmarks/evaluate.py --only faults
 
 docs: $(STAMP) ## update the generated parts of the documents
