@@ -29,8 +29,8 @@ from evaluation.evidence import read_evidence
 from evaluation.tables import document_parts
 from laneweave.agents.host import AgentMetrics
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
+from laneweave.coordinator.core import CoordinatorMetrics
 from laneweave.coordinator.formations.leader import LEADER_RULES
-from laneweave.coordinator.metrics import CoordinatorMetrics
 from laneweave.coordinator.planning.paper.explanation import explain
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
@@ -231,7 +231,7 @@ def _planted_bugs() -> str:
     """Return the table of planted bugs."""
     found = json.loads(FOUND.read_text(encoding="utf-8"))
     lines = [
-        "| planted bug | rule | what is broken | failed scenario | it ends with | random search |",
+        "| planted bug | rule | what is broken | failed scenario | outcome | random search |",
         "|---|---|---|---|---|---|",
     ]
     for bug in BUGS:
@@ -254,7 +254,10 @@ def _resilience() -> str:
     """Return the table of the cost of faults, by `benchmarks/resilience.py`."""
     measured = json.loads(MEASURED.read_text(encoding="utf-8"))
     lines = [
-        "| experiment | left | on their lane | overlaps | min. gap | travel time | remarks |",
+        (
+            "| experiment | left the road | in their lane | overlaps | min. gap | travel time "
+            "| remarks |"
+        ),
         "|---|---|---|---|---|---|---|",
     ]
     for name, run in measured.items():
@@ -280,7 +283,7 @@ def _more(name: str, run: dict[str, Any]) -> Iterator[str]:
         yield f"caretakers took over {taken_over} times"
     if taken_over and run["others"]:
         share = run["others_on_lane_percent"]
-        yield f"of {run['others']} that never had one {share:.1f} % on their lane"
+        yield f"of {run['others']} that never had one {share:.1f} % in their lane"
     for key, words in (("leader_recovery_s", "another leader"), ("plan_recovery_s", "next plan")):
         times = run[key]
         if times["count"]:
@@ -369,7 +372,7 @@ def _closing() -> str:
         of = f"of {row['instances']}"
         lines.append(
             f"| {row['conflicts']} | {row['vehicles']} | {row['closing_up']} {of} "
-            f"| {cost[0]}, {cost[1]} | {row['dearer']} {of} "
+            f"| {cost[0]}, {cost[1]} | {row['costlier']} {of} "
             f"| {row['more_steps_p50']:g} / {row['more_steps_mean']:.2f} / {row['more_steps_max']} "
             f"| {p50_ms[0]:.1f}, {p50_ms[1]:.1f} | {mean_ms[0]:.1f}, {mean_ms[1]:.1f} "
             f"| {row['cpu_factor_p50']:.2f} |"
@@ -401,7 +404,7 @@ def _stream() -> str:
 def _metrics() -> str:
     """Return the table of all metrics with their Prometheus names."""
     lines = [
-        "| metric | kind | of | meaning |",
+        "| metric | kind | role | meaning |",
         "|---|---|---|---|",
         f"| `{PROCESS}{{role, name, realm}}` | gauge | every role | {PROCESS_MEANING} |",
     ]
@@ -419,7 +422,7 @@ def _hosts() -> str:
     calm_s = measured["undisturbed"]["travel_time_s"]
     lines = [
         (
-            "| fault at 40 s | left | on their lane | overlaps | min. gap | travel time "
+            "| fault at 40 s | left the road | in their lane | overlaps | min. gap | travel time "
             "| leader changes | caretakers |"
         ),
         "|---|---|---|---|---|---|---|---|",
