@@ -5,7 +5,7 @@ with the real bodies and motion controllers and without disturbances. Each vehic
 and agent host, as in a separate process, and receives bytes as from the transport. CPU time of this
 thread, including garbage collection:
 
-    total      from the bytes of a SENSE to those of the COMMAND and the STATE that answer it
+    total      from the bytes of a SENSE to the bytes of the COMMAND and STATE that answer it
     tracking   `Driver.drive`, a part of the total
     rest       the difference: decode, decide, encode
     states     processing the states of other vehicles; not in the total
@@ -22,7 +22,6 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from itertools import count
 from typing import Any, cast
 
@@ -34,7 +33,6 @@ from laneweave.agents.host import AgentHost
 from laneweave.coordinator.formations.planning_orders import LONGEST_DEADLINE_S
 from laneweave.coordinator.formations.roster import start_time_s, steps_left
 from laneweave.coordinator.formations.sorting import SortingTask, sort_lanes
-from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.lattice import territory
 from laneweave.protocol.runtime.node import Node, Started, read_message
@@ -56,13 +54,12 @@ VEHICLES = 6
 PLAN_TICK = 50
 REPEATS = 5
 KEYS = Keys("bench")
-WEIGHTS = Weights.for_mode(1)
 SHIFT = (1, 2, 0)
-"""Preferred lane of the vehicles of each lane, so that all have to move."""
+"""Preferred lane of the vehicles in each lane, so that all have to move."""
 
 
 @define
-class Clock:
+class CpuTimer:
     """Accumulated CPU time of an activity."""
 
     spent_ns: int = 0
@@ -78,14 +75,14 @@ class Clock:
 class TimedDriver(TrackingDriver):
     """The real driver with measured `drive`."""
 
-    def __init__(self, scenario: Scenario, clock: Clock) -> None:
-        """Create a driver that adds its CPU time to a clock."""
+    def __init__(self, scenario: Scenario, timer: CpuTimer) -> None:
+        """Create a driver that adds its CPU time to a timer."""
         super().__init__(scenario)
-        self._clock = clock
+        self._timer = timer
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         """Track the reference."""
-        drive: Drive = self._clock.call(super().drive, sense, moving=moving)
+        drive: Drive = self._timer.call(super().drive, sense, moving=moving)
         return drive
 
 
@@ -157,7 +154,7 @@ class BodyStore:
 
 
 @define
-class Stand:
+class Rig:
     """A vehicle with the node and the messages of its agent."""
 
     vehicle: RoadVehicle
@@ -175,12 +172,12 @@ class Road:
     """Formations in a closed loop with their agents."""
 
     scenario: Scenario
-    stands: dict[Name, Stand] = field(factory=dict)
+    rigs: dict[Name, Rig] = field(factory=dict)
     tick: int = 0
     world: BodyStore = field(factory=BodyStore)
-    total: Clock = field(factory=Clock)
-    tracking: Clock = field(factory=Clock)
-    states: Clock = field(factory=Clock)
+    total: CpuTimer = field(factory=CpuTimer)
+    tracking: CpuTimer = field(factory=CpuTimer)
+    states: CpuTimer = field(factory=CpuTimer)
     senses: list[tuple[str, bytes]] = field(factory=list)
     answers: list[tuple[str, bytes]] = field(factory=list)
     moving: int = 0
@@ -198,9 +195,9 @@ class Road:
                 name = Name(f"v{next(numbers):04d}")
                 arrival = Arrival(name, cell[1], SHIFT[cell[1]], 0.0)
                 vehicle = RoadVehicle.entering(Admission(arrival, cell, 0.0), 0.0, self.scenario)
-                self.stands[name] = self._stand(vehicle)
+                self.rigs[name] = self._rig(vehicle)
 
-    def _stand(self, vehicle: RoadVehicle) -> Stand:
+    def _rig(self, vehicle: RoadVehicle) -> Rig:
         incarnations, outbox = count(1), Outbox()
         host = AgentHost(
             lambda name: AgentCore(
@@ -213,7 +210,7 @@ class Road:
         )
         node = Node(host, outbox, KEYS, lambda _: None, Name("bench"))
         node.dispatch(Started(), 0.0)
-        return Stand(vehicle, node, outbox)
+        return Rig(vehicle, node, outbox)
 
     def drive(self) -> None:
         """Drive until the first formation leaves the road."""
@@ -224,47 +221,49 @@ class Road:
             if self.tick == PLAN_TICK:
                 for block in range(FORMATIONS):
                     self._sort(block)
-        for name, stand in self.stands.items():
-            cell, preferred = stand.vehicle.controller.hold_cell, stand.vehicle.admission.arrival
-            if cell[1] != preferred.preferred_lane:
+        for name, rig in self.rigs.items():
+            arrival = rig.vehicle.admission.arrival
+            if rig.vehicle.controller.hold_cell[1] != arrival.preferred_lane:
                 raise RuntimeError(f"{name} did not reach its lane")
 
     def _step(self) -> None:
         tick = self.tick
-        for name, stand in self.stands.items():
-            self.senses.append((KEYS.key(SENSE, vehicle=name), self._sensed(stand)))
-        now = self.senses[-len(self.stands) :]
-        nodes = [stand.node for stand in self.stands.values()]
+        for name, rig in self.rigs.items():
+            self.senses.append((KEYS.key(SENSE, vehicle=name), self._sensed(rig)))
+        now = self.senses[-len(self.rigs) :]
+        nodes = [rig.node for rig in self.rigs.values()]
         self.total.call(_deliver, nodes, [Received(*each) for each in now])
-        shown = [sent for stand in self.stands.values() for sent in self._listen_to(stand)]
-        for stand in self.stands.values():
+        published = [sent for rig in self.rigs.values() for sent in self._handle_answers(rig)]
+        for rig in self.rigs.values():
             received = [
-                Received(*each) for each in shown if matches_any(stand.outbox.expressions, each[0])
+                Received(*sent)
+                for sent in published
+                if matches_any(rig.outbox.expressions, sent[0])
             ]
-            self.states.call(_deliver, [stand.node] * len(received), received)
-        for stand in self.stands.values():
-            self.moving += stand.vehicle.controller.motion_end_tick > tick
-            stand.vehicle.step(tick)
+            self.states.call(_deliver, [rig.node] * len(received), received)
+        for rig in self.rigs.values():
+            self.moving += rig.vehicle.controller.motion_end_tick > tick
+            rig.vehicle.step(tick)
         self.tick = tick + 1
         self._update_sensors()
 
-    def _sensed(self, stand: Stand) -> bytes:
-        return encode(stand.vehicle.sense(self.tick, caretaker=False))
+    def _sensed(self, rig: Rig) -> bytes:
+        return encode(rig.vehicle.sense(self.tick, caretaker=False))
 
-    def _listen_to(self, stand: Stand) -> Iterator[tuple[str, bytes]]:
+    def _handle_answers(self, rig: Rig) -> Iterator[tuple[str, bytes]]:
         """Pass the command to the motion controller; yield the state."""
-        for key, payload in stand.take():
+        for key, payload in rig.take():
             self.answers.append((key, payload))
             message = decode(payload)
             if isinstance(message, Command):
-                if not stand.vehicle.controller.accept_command(message):
+                if not rig.vehicle.controller.accept_command(message):
                     raise RuntimeError(f"a command was refused at tick {self.tick}")
             else:
                 yield key, payload
 
     def _update_sensors(self) -> None:
         """Update the sensors of all vehicles."""
-        vehicles = {name: stand.vehicle for name, stand in self.stands.items()}
+        vehicles = {name: rig.vehicle for name, rig in self.rigs.items()}
         record = cast("RunRecord", self.world)
         t_s = self.tick * self.scenario.runtime.tick_s
         show_bodies(self.world, vehicles, self.scenario, record, t_s)
@@ -272,24 +271,22 @@ class Road:
     def _sort(self, block: int) -> None:
         """Send PREPARE and PLAN to a formation, as its leader does."""
         plan = self._plan(block)
-        members = [self.stands[name] for name in plan.roster]
+        members = [self.rigs[name] for name in plan.roster]
         prepare = Prepare(plan.ballot, plan.formations, plan.roster)
         for topic, message in ((PREPARE, prepare), (PLAN, plan)):
-            for stand in members:
-                name = stand.vehicle.name
-                stand.node.deliver(Received(KEYS.key(topic, vehicle=name), encode(message)), 0.0)
-                for _, payload in stand.take():
+            for rig in members:
+                name = rig.vehicle.name
+                rig.node.deliver(Received(KEYS.key(topic, vehicle=name), encode(message)), 0.0)
+                for _, payload in rig.take():
                     answer = decode(payload)
                     if isinstance(answer, Command):
-                        stand.vehicle.controller.store_requests(answer)
+                        rig.vehicle.controller.store_requests(answer)
         # The controllers' confirmations come with the next tick.
 
     def _plan(self, block: int) -> Plan:
         scenario = self.scenario
         members = {
-            name: stand.vehicle
-            for name, stand in self.stands.items()
-            if stand.vehicle.formation == block
+            name: rig.vehicle for name, rig in self.rigs.items() if rig.vehicle.formation == block
         }
         cells = {name: vehicle.controller.hold_cell for name, vehicle in members.items()}
         preferred_lanes = {
@@ -297,7 +294,7 @@ class Road:
         }
         start_s = start_time_s(cells.values(), self.tick * scenario.runtime.tick_s, scenario)
         task = SortingTask((block,), cells, preferred_lanes, (), scenario, LONGEST_DEADLINE_S)
-        moves = sort_lanes(task, scenario.formation.max_nodes, partial(plan, weights=WEIGHTS)).moves
+        moves = sort_lanes(task, scenario.formation.max_nodes, plan).moves
         every = [move for each in moves.values() for move in each]
         slot_s = scenario.cycles_s[0]
         if max(step for step, _, _ in every) >= steps_left(
@@ -334,10 +331,10 @@ def measured() -> dict[str, float]:
     gc.freeze()
     road = Road(Scenario(formation=FormationSettings(entry="interlaced", close="columns")))
     road.drive()
-    reading, writing = Clock(), Clock()
+    reading, writing = CpuTimer(), CpuTimer()
     reading.call(_each, lambda sense: read_message(KEYS, *sense), road.senses)
     writing.call(_each, encode, [decode(payload) for _, payload in road.answers])
-    per_tick = {
+    spent_ns = {
         "total_us": road.total.spent_ns,
         "tracking_us": road.tracking.spent_ns,
         "rest_us": road.total.spent_ns - road.tracking.spent_ns,
@@ -345,10 +342,10 @@ def measured() -> dict[str, float]:
         "encode_us": writing.spent_ns,
         "states_us": road.states.spent_ns,
     }
-    solves = len(road.senses)
-    figures = {name: spent_ns / 1e3 / solves for name, spent_ns in per_tick.items()}
+    ticks = len(road.senses)
+    figures = {name: ns / 1e3 / ticks for name, ns in spent_ns.items()}
     figures["decide_us"] = figures["rest_us"] - figures["decode_us"] - figures["encode_us"]
-    figures["moving_share"] = road.moving / solves
+    figures["moving_share"] = road.moving / ticks
     return figures
 
 
@@ -356,11 +353,12 @@ def main() -> None:
     """Measure and print the medians of several simulations."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--repeats", type=int, default=REPEATS, help="drives")
+    parser.add_argument("--repeats", type=int, default=REPEATS, help="number of simulations")
     options = parser.parse_args()
-    drives = [measured() for _ in range(options.repeats)]
+    simulations = [measured() for _ in range(options.repeats)]
     medians = {
-        name: round(statistics.median(drive[name] for drive in drives), 3) for name in drives[0]
+        name: round(statistics.median(one[name] for one in simulations), 3)
+        for name in simulations[0]
     }
     if options.json:
         sys.stdout.write(json.dumps(medians) + "\n")

@@ -1,6 +1,6 @@
 """Cost of the conflict kind `closing`: `python benchmarks/closing.py [--json FILE]`.
 
-The same formations are planned with and without it. CPU time of one thread.
+The same formations are planned with and without this kind. CPU time of one thread.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def measured(name: str, vehicles: int) -> dict[str, Any]:
         "proven": proven,
         "closing_up": closing_up,
         "cost": cost_of.sum(axis=0).tolist(),
-        "dearer": int((more > 0).sum()),
+        "costlier": int((more > 0).sum()),
         "more_steps_p50": float(np.median(more)),
         "more_steps_mean": round(float(more.mean()), 2),
         "more_steps_max": int(more.max()),
@@ -88,9 +88,9 @@ def rows() -> Iterator[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure, print rows, and write them to a file."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path, default=OUT, help="where to write")
+    parser.add_argument("--json", type=Path, default=OUT, help="output file")
     out: Path = parser.parse_args().json
     warm_up()
     results = []

@@ -26,6 +26,7 @@ from laneweave.coordinator.planning.conflict_kinds import (
     MAX_OFFSET,
     PAPER_KINDS,
     ConflictModel,
+    ConflictTable,
     Pair,
 )
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
@@ -42,6 +43,9 @@ PANELS: Final[dict[str, Cell]] = {
     "A moves to the left": (0, 1),
     "A moves ahead and to the left": (1, 1),
 }
+
+_NEAR: Final = range(-MAX_OFFSET, MAX_OFFSET + 1)
+_OFFSETS: Final = tuple(offset for offset in product(_NEAR, _NEAR) if offset != (0, 0))
 
 
 class Severity(Enum):
@@ -70,9 +74,9 @@ _ARROW, _DOT, _PATH = (0.14, 0.4), 0.045, 0.56
 """Start and end of an arrow, radius of a dot, and end of A's arrow, from the middle of a cell."""
 
 
-def draw_conflicts(out: Path, geometry: BodyGeometry | None = None, dpi: int = 110) -> None:
-    """Draw the table of a geometry in mode 2 and write it to a file."""
-    save(conflict_figure(geometry or BodyGeometry()), out, dpi)
+def draw_conflicts(out: Path, dpi: int = 110) -> None:
+    """Draw the table of the default geometry in mode 2 and write it to a file."""
+    save(conflict_figure(BodyGeometry()), out, dpi)
 
 
 def conflict_figure(geometry: BodyGeometry) -> Figure:
@@ -114,15 +118,15 @@ def conflict_figure(geometry: BodyGeometry) -> Figure:
 class ConflictTables:
     """The conflict tables of one geometry, for three values of lateness."""
 
-    on_time: frozenset[Pair]
-    late: frozenset[Pair]
-    any_delay: frozenset[Pair]
+    on_time: ConflictTable
+    late: ConflictTable
+    any_delay: ConflictTable
 
     @classmethod
     def of(cls, geometry: BodyGeometry) -> ConflictTables:
         """Compute the tables."""
         tables = (
-            conflict_table(attrs.evolve(geometry, lateness_s=late_s)).pairs
+            conflict_table(attrs.evolve(geometry, lateness_s=late_s))
             for late_s in (0.0, LATENESS_S, None)
         )
         return cls(*tables)
@@ -152,15 +156,13 @@ def counts() -> list[tuple[str, int, int]]:
     Only vehicles in different cells count; each pair counts twice, once from either vehicle.
     """
     tables = ConflictTables.of(BodyGeometry())
-    near = range(-MAX_OFFSET, MAX_OFFSET + 1)
-    offsets = [offset for offset in product(near, near) if offset != (0, 0)]
     steps = displacements(2)
-    pairs = list(product(offsets, steps, steps))
+    pairs = list(product(_OFFSETS, steps, steps))
 
     def row(name: str, table: Iterable[Pair]) -> tuple[str, int, int]:
         known = frozenset(table)
         one, two = (
-            len(known.intersection(product(offsets, displacements(mode), displacements(mode))))
+            len(known.intersection(product(_OFFSETS, displacements(mode), displacements(mode))))
             for mode in (1, 2)
         )
         return name, one, two
@@ -179,7 +181,7 @@ def counts() -> list[tuple[str, int, int]]:
 
 
 def _pitch_in() -> tuple[float, float]:
-    """Return the distances between panels."""
+    """Return the horizontal and the vertical distance between panels."""
     across_in = (_WIDTH_IN - _MARGIN_IN) / _ACROSS
     return across_in, (across_in - _MARGIN_IN) * _LANE_HEIGHT + _TITLE_IN
 
@@ -208,11 +210,8 @@ def _draw_panel(axes: Axes, a: Cell, tables: ConflictTables) -> None:
     axes.hlines(
         [line * _LANE_HEIGHT for line in lines], -reach, reach, colors=_BORDER, linewidth=0.6
     )
-    near = range(-MAX_OFFSET, MAX_OFFSET + 1)
-    for offset in product(near, near):
-        if offset == (0, 0):
-            continue
-        # The most severe one is drawn last, on top.
+    for offset in _OFFSETS:
+        # The most severe move is drawn last, on top.
         severities = [(tables.severity((offset, a, b)), b) for b in displacements(2)]
         order = list(Severity)
         for severity, b in sorted(severities, key=lambda item: -order.index(item[0])):

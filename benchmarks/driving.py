@@ -6,8 +6,8 @@
 In closed loop without network and SUMO (`tests/support/driving.py`). `switches`: formation
 switches on the timetable, half in each mode, against lattice points, limits and gaps.
 `emergencies`: the vehicle ahead brakes to a stop while all messages stop; bodies must not touch.
-`--json` prints JSON; `--first N --count 1` repeats one. The exit status is 1 if a goal is
-missed.
+`--json` prints JSON; `--first N --count 1` repeats one simulation. The exit status is 1 if a goal
+is missed.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ COMMANDS = {"switches": (judge_switches, 1000), "emergencies": (judge_emergencie
 
 
 def lines(figures: dict[str, Any], indent: str = "  ") -> list[str]:
-    """Return figures as text, one line for each."""
+    """Return figures as lines of text."""
     text = []
     for name, value in figures.items():
         if isinstance(value, dict):
@@ -86,13 +86,13 @@ def lines(figures: dict[str, Any], indent: str = "  ") -> list[str]:
 
 
 def main() -> int:
-    """Play, print, and return the exit status."""
+    """Simulate, print, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("programme", choices=COMMANDS)
-    parser.add_argument("--count", type=int, help="how many to simulate; 1000 or 2000")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random")
-    parser.add_argument("--first", type=int, default=0, help="number of the first one")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--count", type=int, help="number of simulations; default: 1000 or 2000")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all random draws")
+    parser.add_argument("--first", type=int, default=0, help="number of the first simulation")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="number of processes")
     parser.add_argument("--json", action="store_true", help="print JSON")
     chosen = parser.parse_args()
     judge, count = COMMANDS[chosen.programme]

@@ -1,8 +1,8 @@
 """Entry and formation building without driving: `python benchmarks/entry.py`.
 
 For each volume: the time from the arrival of a vehicle to the moment at which its cell
-passes the start of the road (negative if it takes a cell ahead), and the columns and vehicles of
-formations. If this time grows with the duration, more vehicles arrive than can enter.
+passes the start of the road (negative if the cell passes first), and the columns and
+vehicles of formations. If this time grows with the duration, more vehicles arrive than can enter.
 """
 
 from __future__ import annotations
@@ -80,11 +80,13 @@ def measure(volume: float, seeds: int, duration_s: float, operation: str) -> dic
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--volumes", type=int, nargs="+", default=VOLUMES, help="veh/(lane h)")
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--duration", type=float, default=600.0, help="of arrivals, in s")
+    parser.add_argument(
+        "--duration", type=float, default=600.0, help="duration of the arrivals [s]"
+    )
     parser.add_argument("--operation", choices=("formations", "paper"), default="formations")
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()

@@ -37,7 +37,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PARTS = ("zenoh", "speed", "length", "stability", "sweep", "report", "faults")
 """In the order in which they run: the sweep uses the remaining time."""
-APART = ("faults",)
+ON_REQUEST = ("faults",)
 REPORT_S = 300.0
 """Part of the budget reserved for the report."""
 
@@ -49,7 +49,7 @@ def parse_parts(names: Sequence[str] | None) -> tuple[str, ...]:
         BadInputError: a part does not exist.
     """
     if names is None:
-        return tuple(part for part in PARTS if part not in APART)
+        return tuple(part for part in PARTS if part not in ON_REQUEST)
     for name in names:
         if name not in PARTS:
             raise BadInputError("--only", name, "some of " + ", ".join(PARTS))
@@ -127,19 +127,21 @@ def main() -> int:
     """Run, and return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", nargs="+", metavar="PART", help=", ".join(PARTS))
-    parser.add_argument("--seeds", default=f"{SEEDS[0]}:{SEEDS[-1] + 1}", help="of the sweep")
-    parser.add_argument("--duration", default=f"{DURATION_S:g}", help="s of arrivals at a point")
+    parser.add_argument("--seeds", default=f"{SEEDS[0]}:{SEEDS[-1] + 1}", help="seeds of the sweep")
+    parser.add_argument("--duration", default=f"{DURATION_S:g}", help="duration of arrivals [s]")
     parser.add_argument(
         "--jobs",
         type=int,
         help="parallel processes of the sweep and of trials that share cores; default: all cores",
     )
-    parser.add_argument("--budget", metavar="MINUTES", help="total time; default: no limit")
+    parser.add_argument("--budget", metavar="MINUTES", help="total duration; default: no limit")
     parser.add_argument(
         "--sweeps", nargs="+", type=Path, default=[], metavar="DIR",
         help="report: folders of sweeps instead of OUT/sweep",
     )  # fmt: skip
-    parser.add_argument("--out", default="runs/evaluation", metavar="DIR", help="where runs go")
+    parser.add_argument(
+        "--out", default="runs/evaluation", metavar="DIR", help="folder of the runs"
+    )
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         return 0 if run(parser.parse_args()) else 1
@@ -150,7 +152,7 @@ def main() -> int:
         sys.stderr.write(f"{error}\n")
         return 1
     except KeyboardInterrupt:
-        sys.stderr.write("interrupted; the same command continues\n")
+        sys.stderr.write("interrupted; the same command resumes\n")
         return 1
 
 

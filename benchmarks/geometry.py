@@ -3,7 +3,7 @@
 The same formations are planned in mode 2 with footprints, with the table for any delay, and with
 tables for limited lateness. CPU time of one thread. Also measures the minimum gap between bodies
 whose moves do not conflict, with the paper's kinds and with footprints; `--only nearest` measures
-only this.
+only these gaps.
 """
 
 from __future__ import annotations
@@ -148,11 +148,11 @@ def _gaps_m(pair: Pair, max_late: int) -> NDArray[np.float64]:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure, print rows, and write them to a file."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path, default=OUT, help="where to write")
+    parser.add_argument("--json", type=Path, default=OUT, help="output file")
     parser.add_argument(
-        "--only", choices=["nearest"], help="measure only this; keep the other results"
+        "--only", choices=["nearest"], help="measure only these gaps; keep the other results"
     )
     given = parser.parse_args()
     out: Path = given.json

@@ -4,31 +4,32 @@
                                [--out FOLDER]
 
 Each experiment is one run of the deployment of compose.yaml, as processes on hosts that are network
-namespaces (tests/support/hosts.py): a link is cut, or a service is killed and restarted with the
+namespaces (tests/support/hosts.py). A link is cut, or a service is killed and restarted with the
 same command. Roles start before their router. Figures are read from the run's folder and written to
 FOLDER/hosts.json. Finished experiments are kept, unless `--only` names them. The exit status is 1
-if bodies overlapped or a run did not finish. The script needs permission to create network
-namespaces. `--plain`: without certificates, over TCP. `--short`: vehicles arrive for 20 s instead
-of 90 s.
+if bodies overlapped, a run did not finish, or a process failed. The script needs permission to
+create network namespaces. `--plain`: without certificates, over TCP. `--short`: vehicles arrive for
+20 s instead of 90 s.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import signal
 import statistics
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 from attrs import frozen
 
+from experiments import run_missing
+from laneweave.launch.recordings.formations import read_events
 from laneweave.protocol.wire.events import CARETAKER_TOOK_OVER
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
@@ -125,8 +126,6 @@ def figures(folder: Path) -> dict[str, Any]:
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     trips = pq.read_table(folder / "trips.parquet").to_pylist()
     times = [trip["travel_time_s"] for trip in trips if trip["left_s"] is not None]
-    events = (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()
-    kinds = Counter(json.loads(line)["kind"] for line in events)
     vehicles, safety = summary["vehicles"], summary["safety"]
     return {
         "ending": summary["ending"],
@@ -138,13 +137,13 @@ def figures(folder: Path) -> dict[str, Any]:
         "on_lane_percent": 100.0 * vehicles["on_preferred_lane"] / max(1, vehicles["left"]),
         "travel_time_s": statistics.fmean(times) if times else None,
         "leader_changes": summary["failover"]["leader_changes"],
-        "caretakers": kinds[CARETAKER_TOOK_OVER],
+        "caretakers": len(list(read_events(folder, CARETAKER_TOOK_OVER))),
         "real_time_factor": summary["runtime"]["real_time_factor"],
     }
 
 
 def kept_promises(found: dict[str, Any]) -> bool:
-    """Return whether no vehicles touched and all vehicles arrived."""
+    """Return whether no vehicles touched, all arrived, and all processes ended normally."""
     touched = found["overlaps"] or found["sumo_collisions"]
     complete = found["ending"] == "complete" and found["left"] == found["demanded"] > 0
     return complete and not touched and found["bridge_status"] == 0 and not found["ended_badly"]
@@ -153,32 +152,22 @@ def kept_promises(found: dict[str, Any]) -> bool:
 def main() -> int:
     """Run the requested experiments."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    names = [experiment.name for experiment in EXPERIMENTS]
-    parser.add_argument("--only", nargs="+", choices=names)
-    parser.add_argument("--plain", action="store_true")
-    parser.add_argument("--short", action="store_true")
-    parser.add_argument("--pace", type=float, default=3.0)
-    parser.add_argument("--out", type=Path, default=Path("runs/hosts"))
+    parser.add_argument("--only", nargs="+", choices=[one.name for one in EXPERIMENTS])
+    parser.add_argument("--plain", action="store_true", help="without certificates")
+    parser.add_argument("--short", action="store_true", help="fewer arrivals")
+    parser.add_argument("--pace", type=float, default=3.0, help="road seconds per second")
+    parser.add_argument("--out", type=Path, default=Path("runs/hosts"), help="folder")
     arguments = parser.parse_args()
     # On SIGTERM, exit normally so that all started processes are stopped.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    base: Path = arguments.out
-    base.mkdir(parents=True, exist_ok=True)
-    record = base / "hosts.json"
-    known = json.loads(record.read_text(encoding="utf-8")) if record.exists() else {}
-    chosen = arguments.only or [name for name in names if name not in known]
-    duration_s = SHORT_S if arguments.short else DURATION_S
-    for experiment in EXPERIMENTS:
-        if experiment.name in chosen:
-            folder = base.resolve() / experiment.name
-            shutil.rmtree(folder, ignore_errors=True)
-            known[experiment.name] = run(
-                experiment, folder, duration_s, arguments.pace, secured=not arguments.plain
-            )
-            ordered = {name: known[name] for name in names if name in known}
-            record.write_text(json.dumps(ordered, indent=1) + "\n", encoding="utf-8")
-            print(experiment.name, json.dumps(known[experiment.name]), flush=True)  # noqa: T201
-    return 0 if all(kept_promises(known[name]) for name in chosen) else 1
+    options = {
+        "duration_s": SHORT_S if arguments.short else DURATION_S,
+        "pace": arguments.pace,
+        "secured": not arguments.plain,
+    }
+    runs = {one.name: partial(run, one, **options) for one in EXPERIMENTS}
+    found = run_missing(runs, arguments.only, arguments.out / "hosts.json")
+    return 0 if all(map(kept_promises, found)) else 1
 
 
 if __name__ == "__main__":

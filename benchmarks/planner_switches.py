@@ -1,8 +1,8 @@
 """Effect of each improvement of TAPPA: `python benchmarks/planner_switches.py [--json FILE]`.
 
 Formations of random traffic, and interlaced ones of 2 to 6 vehicles in blocks of four columns, are
-planned with all improvements, without each of them, and by the literal algorithms. CPU time of one
-thread. Each proven cost is compared with that of branching.
+planned with all improvements, with all but one, and by the literal algorithms. CPU time of one
+thread. Each proven cost is compared with the one found by branching.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def switch_settings() -> Iterator[tuple[str, Improvements]]:
 
 
 def planned(request: PlanRequest, improvements: Improvements) -> tuple[float, int | None]:
-    """Return CPU time [ms] and cost; None: not proven within the deadline."""
+    """Return CPU time [ms] and cost; the cost is None if it was not proven before the deadline."""
     began = time.thread_time()
     budget = Budget(deadline=began + DEADLINE_S, max_nodes=MAX_NODES, clock=time.thread_time)
     weights = Weights.for_mode(request.mode)
@@ -66,7 +66,7 @@ def measured(family: str, name: str, improvements: Improvements, instances: int)
     """Return one row.
 
     Raises:
-        RuntimeError: a cost that is reported as optimal differs from that of branching.
+        RuntimeError: a cost that is reported as optimal differs from the one found by branching.
     """
     times_ms, solved = [], 0
     for seed in range(instances):
@@ -89,9 +89,9 @@ def measured(family: str, name: str, improvements: Improvements, instances: int)
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure, print rows, and write them to a file."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path, default=OUT, metavar="FILE")
+    parser.add_argument("--json", type=Path, default=OUT, metavar="FILE", help="output file")
     options = parser.parse_args()
     warm_up()
     rows = []

@@ -4,18 +4,19 @@
 
 Each experiment is one `laneweave run` with a faults file: real processes, or for the rolling
 operation all roles over the simulated network, where results repeat exactly. The figures are read
-from the run's folder and written to FOLDER/resilience.json. Finished experiments are kept, unless
-`--only` names them. The run's own verdict (overlaps, vehicles that did not leave) is included.
+from the run's folder and written to FOLDER/resilience.json; they include the failures that the run
+itself reports (overlaps, vehicles that did not leave). Finished experiments are kept, unless
+`--only` names them.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import subprocess
 import sys
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from attrs import frozen
 
+from experiments import run_missing
 from laneweave.protocol.wire.events import CARETAKER_TOOK_OVER, PLAN_MADE
 
 HERE = Path(__file__).resolve().parent
@@ -150,22 +152,11 @@ def _spread(values: list[float]) -> dict[str, float | int]:
 def main() -> None:
     """Run the requested experiments."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    names = [experiment.name for experiment in EXPERIMENTS]
-    parser.add_argument("--only", nargs="+", choices=names)
-    parser.add_argument("--out", type=Path, default=Path("runs/resilience"))
+    runs = {experiment.name: partial(run, experiment) for experiment in EXPERIMENTS}
+    parser.add_argument("--only", nargs="+", choices=runs)
+    parser.add_argument("--out", type=Path, default=Path("runs/resilience"), help="folder")
     arguments = parser.parse_args()
-    folder: Path = arguments.out
-    folder.mkdir(parents=True, exist_ok=True)
-    record = folder / "resilience.json"
-    known = json.loads(record.read_text(encoding="utf-8")) if record.exists() else {}
-    chosen = arguments.only or [name for name in names if name not in known]
-    for experiment in EXPERIMENTS:
-        if experiment.name in chosen:
-            shutil.rmtree(folder / experiment.name, ignore_errors=True)
-            known[experiment.name] = run(experiment, folder / experiment.name)
-            ordered = {name: known[name] for name in names if name in known}
-            record.write_text(json.dumps(ordered, indent=1), encoding="utf-8")
-            print(experiment.name, json.dumps(known[experiment.name]), flush=True)  # noqa: T201
+    run_missing(runs, arguments.only, arguments.out / "resilience.json")
 
 
 if __name__ == "__main__":

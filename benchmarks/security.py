@@ -3,9 +3,9 @@
     .venv/bin/python benchmarks/security.py
 
 The router runs in a separate process, a vehicle and a coordinator in this one. The vehicle sends
-500 states of 300 B per second, in alternating rounds over TCP, TLS without rules and TLS with
-rules, so that other load on the machine affects all alike. Then routers with rules for 10, 1000
-and 5000 vehicles are started.
+500 states of 300 B per second, in alternating rounds over TCP, TLS without access rules and TLS
+with them, so that other load on the machine affects all three alike. Then routers with rules for
+10, 1000 and 5000 vehicles are started.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def _measure(folder: Path) -> dict[str, object]:
     secured, open_ = _scenario(folder, 27901, "tls"), _scenario(folder, 27902, "tcp")
     unruled = _scenario(folder, 27903, "tls")
     guard = guard_of(secured)
-    assert guard is not None  # noqa: S101 (it is secured)
+    assert guard is not None  # noqa: S101 (the scenario is secured)
     no_rules = attrs.evolve(guard, access_control={"enabled": False}, size_limits=[])
     variants: dict[str, tuple[Scenario, RouterGuard | None]] = {
         "tcp": (open_, None),

@@ -8,15 +8,15 @@ separate process. Requests are formations of 6 to 18 vehicles. Four measurements
 - *alone*: the solver in a process without other work, one request after the other. Its rate is the
   upper bound for a worker.
 - *load*: 200 requests in flight from 20 clients. Each must be answered, and a repetition of the
-  request with the same id must get the same plan. Reported are the rate, compared with that of the
-  solver alone some minutes before, and the share of the workers' time spent solving, which does not
-  depend on other load on the machine.
+  request with the same id must get the same plan. The figures are the rate, also relative to that
+  of the solver alone, measured some minutes earlier, and the share of the workers' time spent
+  solving, which does not depend on other load on the machine.
 - *half*: requests arrive at random, at half the rate that the workers can process. The overhead of
   the service is the latency minus the solver's time and minus the time that the request waited for
-  a busy worker: at half load a queue forms before any single server. Measured with the same
+  a busy worker: even at half load, any single server has a queue. Measured with the same
   formations, and with small ones at hundreds of requests per second.
-- *loss*: three coordinators with one worker each, one of which is killed repeatedly. Counted are
-  the requests that were in flight at such a moment, or arrived within the following second.
+- *loss*: three coordinators with one worker each, of which one after another is killed. The figures
+  count the requests that were in flight when one was killed, or were sent within the next second.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+import numpy as np
 from attrs import define, field, frozen
 
 from laneweave.coordinator.planning.request import PlanRequest
@@ -44,6 +45,7 @@ from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan, warm_up
 from laneweave.coordinator.service.client import AsyncPlanClient, PlanClient, PlanError
 from laneweave.launch.bench.request_families import formation_request
+from laneweave.sim_bridge.recording.trips import percentiles_of
 
 LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
 REQUESTS, CLIENTS = 200, 20
@@ -249,7 +251,7 @@ def half(workers: int, sizes: Sequence[int], count: int) -> dict[str, Any]:
 
 
 def loss() -> dict[str, Any]:
-    """Kill one of three coordinators repeatedly, under load."""
+    """Kill one of three coordinators after another, under load."""
     rng = random.Random(2)  # noqa: S311
     killed_s: list[float] = []
 
@@ -296,19 +298,15 @@ def loss() -> dict[str, Any]:
     }
 
 
-def quantiles(values: list[float]) -> dict[str, float]:
+def quantiles(values: list[float]) -> dict[str, float | None]:
     """Return the percentiles and the maximum of a distribution."""
-    ordered = sorted(values)
-    at = {"p50": 0.5, "p95": 0.95, "p99": 0.99}
-    return {name: ordered[int(share * (len(ordered) - 1))] for name, share in at.items()} | {
-        "max": ordered[-1]
-    }
+    return percentiles_of(np.array(values), 50, 95, 99, largest=True)
 
 
 def main() -> None:
     """Run all measurements, or the selected one."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="output file")
     parser.add_argument("--only", choices=("load", "half", "loss"))
     options = parser.parse_args()
     found: dict[str, Any] = {"cores": len(os.sched_getaffinity(0))}

@@ -2,8 +2,8 @@
 
 One vehicle brakes for 2 s regardless of its commands, in a column that holds its cells and in
 formations that switch, with and without message loss (`tests/support/disturbances.py`). Writes
-peaks and amplification from vehicle to vehicle, a figure, and prints a table. The exit status is 1
-if bodies overlap.
+peaks and amplification from vehicle to vehicle to a file, draws a figure, and prints a table. The
+exit status is 1 if bodies overlap.
 """
 
 from __future__ import annotations
@@ -136,9 +136,9 @@ def draw(runs: Mapping[Case, Sequence[Response]], table: Sequence[dict[str, Any]
 def main() -> int:
     """Simulate, write, print, and return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", type=Path, default=OUT, help="where to write")
-    parser.add_argument("--seeds", type=int, default=SEEDS, help="runs of each case")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--json", type=Path, default=OUT, help="output file")
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="number of runs of each case")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="number of processes")
     chosen = parser.parse_args()
     quiet = structlog.make_filtering_bound_logger(logging.ERROR)
     seeds = range(1, chosen.seeds + 1)

@@ -51,8 +51,8 @@ TICKS = 20
 def cpu_ms(process_id: int) -> float:
     """Return the CPU time of a process in ms.
 
-    Reads the CPU clock of the process, whose id in Linux is this expression; its resolution is 1
-    ns, that of /proc 10 ms.
+    The argument of `clock_gettime` is Linux's id of the process's CPU clock. The resolution of this
+    clock is 1 ns, that of /proc 10 ms.
     """
     return time.clock_gettime((~process_id << 3) | 2) * 1e3
 
@@ -169,10 +169,10 @@ def _median(values: Iterable[float]) -> float:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the figures."""
     parser = argparse.ArgumentParser(description="Cost of one more agent process.")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--agents", type=int, default=AGENTS, help="processes")
+    parser.add_argument("--agents", type=int, default=AGENTS, help="number of agents")
     options = parser.parse_args()
     figures = measured(options.agents)
     if options.json:

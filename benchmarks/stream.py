@@ -1,7 +1,7 @@
 """Results of the stream planner: `python benchmarks/stream.py [--volumes V ...] [--seeds N]`.
 
 A lattice without faults. Arrivals are those of a scenario; each vehicle enters the free column that
-is nearest to its arrival, behind its predecessor on the lane. In each slot all vehicles on the road
+is nearest to its arrival, behind its predecessor in the lane. In each slot all vehicles on the road
 are planned, and the first step of every path is made. CPU time of one thread.
 """
 
@@ -86,7 +86,7 @@ VARIANTS = {
 
 @frozen
 class Traveller:
-    """A vehicle of the demand and the cell at which it enters."""
+    """A vehicle of the demand and the cell in which it enters."""
 
     vehicle: str
     column: int
@@ -248,13 +248,15 @@ _SHOWN = (
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure, print rows, and write them to a file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--volumes", type=int, nargs="+", help="veh/(lane*h); default: all")
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, help="default: all")
-    parser.add_argument("--seeds", type=int, default=5, help="how many; default 5")
-    parser.add_argument("--duration", type=float, default=DURATION_S, help="of arrivals, in s")
-    parser.add_argument("--json", type=Path, default=OUT, help="where to write")
+    parser.add_argument("--seeds", type=int, default=5, help="number of seeds; default 5")
+    parser.add_argument(
+        "--duration", type=float, default=DURATION_S, help="duration of the arrivals [s]"
+    )
+    parser.add_argument("--json", type=Path, default=OUT, help="output file")
     options = parser.parse_args()
     warm_up()
     results = []

@@ -6,7 +6,7 @@ driven with `tracking.always_solve`:
 
     tracker     the whole call of the tracker
     no-shortcut the same with `tracking.always_solve`: OSQP runs at every tick
-    osqp        its program alone: bounds replaced, solved, answer checked
+    osqp        the program alone: bounds replaced, solved, answer checked
     daqp        the same program without its states, by a dual active-set method
     lq          the same program without its inequalities, a matrix times a vector: the lower bound
 
@@ -43,14 +43,15 @@ from laneweave.sim_bridge.recording.trips import percentiles_of
 Array = NDArray[np.float64]
 
 FAMILIES: Final = ("gap-rows", "yielding", "undisturbed")
-"""A gap constraint is active; the reference yields, so that none is active; no vehicle is near.
-Other ticks, which precede these, are recorded as well."""
+"""Ticks with an active gap constraint; with none active, because the reference yields; with no
+vehicle near. Other ticks are recorded as well, because solvers start from the previous solution."""
 GOALS_MS: Final = {"p50": 0.2, "p99": 1.0, "max": 4.0}
-"""CPU time goals of the tracker where gap constraints are active."""
+"""Goals for the tracker's CPU time in ticks with active gap constraints."""
 _REPEATS = 3
 _ROW_TOLERANCE = 2e-2
 """Largest constraint violation of a valid solution."""
-_PRESSING_M = 1e-3
+_BINDING_M = 1e-3
+"""Slack from which a gap constraint counts as active."""
 _EXACT = QPSettings(
     eps_abs=1e-7, max_iter=40_000, check_termination=25, rho=0.3, polishing=True, tolerance=1e-4
 )
@@ -68,7 +69,7 @@ class Parts:
     states: int
     jerks: int
     jerk_rows: NDArray[np.intp]
-    """Rows that bound a jerk alone, in the order of the jerks."""
+    """Rows that bound a single jerk and nothing else, in the order of the jerks."""
 
     @classmethod
     def of(cls, cost: Any, rows: Any) -> Parts:  # noqa: ANN401 - scipy.sparse has no types
@@ -95,7 +96,7 @@ class Parts:
 
 @frozen(eq=False)
 class Problem:
-    """One tick: the tracker's inputs, its program, and the exact solution."""
+    """One tick: the tracker's inputs and answer, the bounds of its program, the exact solution."""
 
     state: State
     window: Window
@@ -106,8 +107,8 @@ class Problem:
     """The tracker's answer (N, 2) [m/s3]."""
     first: Array
     """First jerk (2,) of the exact solution [m/s3]."""
-    pressing: bool
-    """Whether a gap constraint changes the solution: a slack is not zero."""
+    binding: bool
+    """Whether a gap constraint is active, that is, a slack is not zero."""
 
 
 @frozen(eq=False)
@@ -131,7 +132,7 @@ class Recording:
     def _family(self, name: str, problem: Problem) -> str:
         if name == "undisturbed":
             return name
-        if problem.pressing:
+        if problem.binding:
             return "gap-rows"
         # Only a reference that gives way violates the dynamics.
         return "yielding" if problem.lower[6 : self.parts.states].any() else ""
@@ -168,7 +169,7 @@ def record(scenario: Scenario, *, instances: int, seed: int) -> Recording:
                     upper,
                     tick.result.jerk,
                     np.zeros(2),
-                    bool((slack >= _PRESSING_M).any()),
+                    bool((slack >= _BINDING_M).any()),
                 )
                 first = parts.first_jerk(problem, solution.x[parts.states :])
                 problems.append(evolve(problem, first=first))
@@ -184,7 +185,7 @@ def always_solving(scenario: Scenario) -> Scenario:
 
 @frozen(eq=False)
 class Answer:
-    """Answer of a solver to a problem."""
+    """A solver's answer to a problem."""
 
     first: Array
     """First jerk (2,) [m/s3]."""
@@ -228,7 +229,7 @@ class TrackerSolver:
 
 
 class OsqpSolver:
-    """The tracker's program and settings, without the rest of the tracker."""
+    """OSQP with the tracker's program and settings, without the rest of the tracker."""
 
     def __init__(self, parts: Parts) -> None:
         """Set up the program."""
@@ -295,8 +296,8 @@ class Condensed:
 class DaqpSolver:
     """The condensed program, solved by DAQP, always from an empty active set.
 
-    Updating its workspace instead gave one wrong answer in a hundred (0.8.5), and is unnecessary:
-    an identity Hessian needs no factorisation.
+    Updating DAQP's workspace instead gave one wrong answer in a hundred (version 0.8.5), and is
+    unnecessary: an identity Hessian needs no factorisation.
     """
 
     def __init__(self, parts: Parts, condensed: Condensed) -> None:
@@ -370,8 +371,8 @@ def compare(
 
     Args:
         scenario: limits, tick and horizon.
-        instances: episodes per situation.
-        seed: of all episodes.
+        instances: number of episodes per situation.
+        seed: seed of all episodes.
         repeats: number of measurements per problem.
 
     Returns:
@@ -471,7 +472,9 @@ def _summary(measured: _Measured, recording: Recording, family: str) -> dict[str
 def main() -> None:
     """Measure and print JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--instances", type=int, default=20, help="episodes per situation")
+    parser.add_argument(
+        "--instances", type=int, default=20, help="number of episodes per situation"
+    )
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     rows = compare(load_scenario(None), instances=chosen.instances, seed=chosen.seed)

@@ -9,7 +9,7 @@ and observed for some seconds, several times:
     ticks_per_s        ticks of the road, the upper bound of the next two rates
     updates_per_s      received frames
     drawn_per_s        drawn frames
-    server_cpu_share   CPU time of the server of the page, as a share of one core
+    server_cpu_share   CPU time of `laneweave watch`, as a share of one core
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +87,7 @@ class Deployment:
         return done.returncode == 0
 
 
-def wait_until(condition: Any, within_s: float) -> None:  # noqa: ANN401 - any callable
+def wait_until(condition: Callable[[], bool], within_s: float) -> None:
     """Wait until a condition holds.
 
     Raises:
@@ -96,8 +96,7 @@ def wait_until(condition: Any, within_s: float) -> None:  # noqa: ANN401 - any c
     deadline = time.monotonic() + within_s
     while not condition():
         if time.monotonic() > deadline:
-            message = f"the condition did not hold within {within_s:g} s"
-            raise TimeoutError(message)
+            raise TimeoutError(f"the condition did not hold within {within_s:g} s")
         time.sleep(0.1)
 
 
@@ -186,11 +185,11 @@ def _text(driver: webdriver.Chrome, identity: str) -> str:
 
 
 def main() -> None:
-    """Measure and print or write JSON."""
+    """Measure, print JSON, and write it to a file if requested."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--vehicles", type=int, default=90)
-    parser.add_argument("--json", type=Path, help="write the result here")
-    parser.add_argument("--picture", type=Path, help="write a screenshot here")
+    parser.add_argument("--json", type=Path, help="output file")
+    parser.add_argument("--picture", type=Path, help="file for a screenshot")
     options = parser.parse_args()
     text = json.dumps(run(options.vehicles, options.picture), indent=2)
     if options.json is not None:

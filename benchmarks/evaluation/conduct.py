@@ -52,7 +52,7 @@ class Rounds:
     jobs: int
     """Number of parallel processes."""
     end_s: float | None
-    """Time (`time.monotonic`) that no round may exceed, except the first one; None: no limit."""
+    """Latest expected end of a round (`time.monotonic`), except the first one; None: no limit."""
 
     def run(self, out: Path) -> bool:
         """Run the unfinished rounds; return whether formation control kept its guarantees.
@@ -91,7 +91,7 @@ def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:
         part: `zenoh`, `speed` or `length`.
         out: the evaluation's folder.
         root: root folder of the repository.
-        jobs: number of parallel trials, among those that may share the machine.
+        jobs: maximum number of parallel trials; trials that are not `is_shared` run alone.
     """
     stop = threading.Event()
 

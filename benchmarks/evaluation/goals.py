@@ -31,7 +31,7 @@ def _traffic(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
 def _requirements(goal: Goal) -> Iterator[str]:
     at_least = "" if goal.on_lane_percent == 100.0 else "at least "
     yield f"at most {goal.travel_s:g} s"
-    yield f"{at_least}{goal.on_lane_percent:g} % on their lane"
+    yield f"{at_least}{goal.on_lane_percent:g} % in their lane"
     if goal.accel_mps2 is not None:
         yield f"within {goal.accel_mps2:g} m/s2"
     if goal.fallback_percent is not None:
@@ -57,7 +57,7 @@ def _measured(row: PointRow, goal: Goal) -> str:
     off = row.demanded - row.on_preferred_lane
     parts = [
         f"{number(row.travel_s, 2)} s",
-        f"{off} of {row.demanded:,} not on their lane" if off else "100 %",
+        f"{off} of {row.demanded:,} not in their lane" if off else "100 %",
     ]
     if goal.accel_mps2 is not None:
         low, high = number(row.min_accel_mps2, 2), number(row.max_accel_mps2, 2)

@@ -1,14 +1,14 @@
 """Distances between vehicles at the lattice's fixed time points, from a run's trajectories.
 
-At the end of each slot the vehicles that moved in it are at rest in a cell, and two vehicles on a
-lane are at least d_F apart, front to front. Between those points they may be closer by design, for
+At the end of each slot the vehicles that moved in the slot are at rest in a cell, and two vehicles
+in a lane are at least d_F apart, front to front. In between, they may be closer by design, for
 example when one falls back into a cell while another leaves it.
 
-Slots differ between plans. Examined are the ticks before a vehicle begins a move, and one tick per
-shortest T_F. In these ticks vehicles at rest are examined: those on the road for at least
-`formation.settle_s` that are about to begin a move, or have been in the same cell for at least the
-longest time of a move. Lanes and distances are the true ones of the bodies, so that a body outside
-its cell is detected.
+Slots differ between plans. The ticks examined are those before a vehicle begins a move, and one per
+shortest T_F. The vehicles examined in these ticks are at rest: they have been on the road for at
+least `formation.settle_s`, and either are about to begin a move or have been in the same cell for
+at least the longest time of a move. Lanes and distances are the true ones of the bodies, so that a
+body outside its cell is detected.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class LatticeSpacing:
     """Distances at the lattice points of a run."""
 
     least_m: float | None
-    """Minimum distance from front bumper to front bumper; None: no two vehicles on a lane."""
+    """Minimum distance from front bumper to front bumper; None: no two vehicles in a lane."""
     pairs: int
     """Number of distances examined."""
     worst_off_m: float | None
@@ -43,11 +43,11 @@ class LatticeSpacing:
 
 
 def lattice_spacing(tracks: Tracks, scenario: Scenario) -> LatticeSpacing:
-    """Return the distances between vehicles at rest at the ends of slots.
+    """Measure the distances between vehicles at rest at the ends of slots.
 
     Args:
         tracks: the run's trajectories.
-        scenario: of the run.
+        scenario: scenario of the run.
     """
     lattice = scenario.lattice
     ticks = np.rint(tracks.t_s / scenario.runtime.tick_s).astype(np.int64)
@@ -86,7 +86,7 @@ def _settled(tracks: Tracks, ticks: Ints, scenario: Scenario) -> Bools:
 
 
 def _slot_phase(changes: Ints, period: int) -> int:
-    """Return the tick of a period at which slots end: most cells change in the tick after it.
+    """Return the tick of a period at which slots end: most cells change in the next tick.
 
     A vehicle reports its next cell in the first tick of its move.
     """

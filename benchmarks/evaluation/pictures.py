@@ -23,7 +23,7 @@ SHOWN_VOLUME: Final = 1600.0
 
 
 @frozen
-class _Plan:
+class _Figure:
     """A figure, and the labels and volumes of its runs."""
 
     picture: Picture
@@ -31,28 +31,28 @@ class _Plan:
     volumes: tuple[float, ...]
     draw: Callable[[Comparison, Path, int], None]
     traced: bool = False
-    """Whether it needs trajectories."""
+    """Whether the runs need trajectories."""
 
 
 def draw_pictures(runs: Sequence[Run], folder: Path) -> tuple[Picture, ...]:
     """Draw every figure that has runs, and return the drawn figures.
 
     Args:
-        runs: of the sweep; failed ones are excluded.
+        runs: runs of the sweep; failed ones are excluded.
         folder: folder of the figures.
     """
     drawn = []
-    for plan in _PLANS:
+    for figure in _FIGURES:
         chosen = Comparison.of(
             run
             for run in runs
-            if run.label in plan.labels
-            and run.volume_veh_per_lane_h in plan.volumes
-            and (run.has_trajectories or not plan.traced)
+            if run.label in figure.labels
+            and run.volume_veh_per_lane_h in figure.volumes
+            and (run.has_trajectories or not figure.traced)
         )
         if chosen.runs:
-            plan.draw(chosen, folder / plan.picture.name, DPI)
-            drawn.append(plan.picture)
+            figure.draw(chosen, folder / figure.picture.name, DPI)
+            drawn.append(figure.picture)
     return tuple(drawn)
 
 
@@ -69,30 +69,31 @@ def _draw_spacings(comparison: Comparison, out: Path, dpi: int) -> None:
     draw_spacings(counted, comparison.runs[0].scenario, out, dpi)
 
 
-def _snapshots(label: str, description: str) -> _Plan:
+def _snapshots(label: str, description: str) -> _Figure:
     picture = Picture(
         f"evaluation-road-{label}.png",
         f"Four strips of road from 500 to 800 m, {label}",
         f"The road from 500 to 800 m at 1600 veh/(lane h), {description}: four instants, 4 s "
-        "apart. Colours are preferred lanes; the faster, the lighter.",
+        "apart. Colours show preferred lanes; faster vehicles are lighter.",
     )
-    return _Plan(picture, (label,), (SHOWN_VOLUME,), _draw_snapshots, traced=True)
+    return _Figure(picture, (label,), (SHOWN_VOLUME,), _draw_snapshots, traced=True)
 
 
-_PLANS: Final = (
-    _Plan(
+_FIGURES: Final = (
+    _Figure(
         Picture(
             "evaluation-paper.png",
             "Box plots of travel times at the paper's volumes",
-            "Travel times at the paper's volumes: the default formations and the paper's, both of "
-            "at most six, and two interpretations of its rules. Boxes: quartiles over the vehicles "
-            "of all seeds; lines: means. The axis is broken where a method jams.",
+            "Travel times at the paper's volumes: formations of at most six vehicles, with the "
+            "default and with the paper's settings, and two interpretations of the paper's rules. "
+            "Boxes: quartiles over the vehicles of all seeds; lines: means. The axis is broken "
+            "where a method congests.",
         ),
         ("formations", "paper-6", "rule", "rule-net"),
         PAPER_VOLUMES,
         draw_travel_times,
     ),
-    _Plan(
+    _Figure(
         Picture(
             "evaluation-all.png",
             "Box plots of travel times at all volumes",
@@ -102,17 +103,17 @@ _PLANS: Final = (
         VOLUMES,
         draw_travel_times,
     ),
-    _Plan(
+    _Figure(
         Picture(
             "evaluation-flows.png",
-            "Throughput and share on the preferred lane against the demand",
-            "Throughput and share on the preferred lane. Dots are runs, bars standard deviations.",
+            "Throughput and share in the preferred lane against the demand",
+            "Throughput and share in the preferred lane. Dots are runs, bars standard deviations.",
         ),
         LABELS,
         VOLUMES,
         draw_flows,
     ),
-    _Plan(
+    _Figure(
         Picture(
             "evaluation-speeds.png",
             "Heat maps of mean speed over time and position",
@@ -127,7 +128,7 @@ _PLANS: Final = (
     _snapshots("paper-6", "the paper's formations of at most six"),
     _snapshots("rule", "the rules, d_R front to front"),
     _snapshots("rule-net", "the rules, d_R as a net gap"),
-    _Plan(
+    _Figure(
         Picture(
             "evaluation-spacing.png",
             "Distributions of spacing and time headway at 1600",

@@ -9,7 +9,7 @@ import numpy as np
 from attrs import frozen
 
 from evaluation.lattice_points import lattice_spacing
-from laneweave.launch.observe.column_owners import read_events
+from laneweave.launch.recordings.formations import read_events
 from laneweave.launch.recordings.results_over_seeds import results_table
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks
@@ -23,7 +23,7 @@ SLOW_SHARE: Final = 0.5
 """Traffic is congested where its mean speed is below this share of v_F."""
 LIMIT_ERROR: Final = 0.001
 """Rounding error of summaries."""
-SOLVER: Final = {PLAN_MADE: "branching", STREAM_PLANNED: "stream"}
+SOLVER: Final = {PLAN_MADE: "branching", STREAM_PLANNED: "rolling"}
 """The solver of plans whose events do not name it, by kind of event."""
 Key = tuple[str, float]
 """(label, volume in vehicles/(lane h))."""
@@ -35,7 +35,7 @@ class Traced:
 
     runs: int
     lattice_least_m: float | None
-    """Minimum spacing at lattice points; None: no lattice, or no two vehicles on a lane."""
+    """Minimum spacing at lattice points; None: no lattice, or no two vehicles in a lane."""
     lattice_pairs: int
     lattice_worst_off_m: float | None
     """Maximum distance of a vehicle from its cell at lattice points."""
@@ -74,7 +74,7 @@ class PointRow:
     travel_s: float | None
     """Mean over the seeds of the mean travel time from the demanded arrival."""
     travel_sd_s: float | None
-    """Standard deviation of that over the seeds."""
+    """Standard deviation of the seeds' mean travel times."""
     travel_p95_s: float | None
     """Mean over the seeds of the 95th percentile."""
     throughput_veh_per_lane_h: float | None
@@ -102,7 +102,7 @@ class PointRow:
 
     @property
     def on_lane_percent(self) -> float | None:
-        """Share of vehicles that left on their preferred lane, among all that left."""
+        """Share of vehicles that left in their preferred lane, among all that left."""
         return 100.0 * self.on_preferred_lane / self.left if self.left else None
 
 
@@ -197,15 +197,13 @@ def planning_times(runs: Iterable[Run]) -> tuple[PlanningTimes, ...]:
                 solver = str(event.get("solver") or SOLVER[event["kind"]])
                 found.setdefault(solver, []).append(float(solve_ms))
     return tuple(
-        PlanningTimes(solver, len(times_ms), *(round(float(one), 2) for one in _spread(times_ms)))
+        PlanningTimes(
+            solver,
+            len(times_ms),
+            *(round(one, 2) for one in np.percentile(times_ms, [50.0, 95.0, 100.0]).tolist()),
+        )
         for solver, times_ms in sorted(found.items())
     )
-
-
-def _spread(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the median, the 95th percentile and the maximum."""
-    p50, p95 = np.percentile(values, [50.0, 95.0])
-    return float(p50), float(p95), max(values)
 
 
 def within_limits(low: float | None, high: float | None, scenario: Scenario) -> bool:
@@ -214,7 +212,7 @@ def within_limits(low: float | None, high: float | None, scenario: Scenario) -> 
     Args:
         low: minimum acceleration [m/s2]; None: there were no vehicles.
         high: maximum acceleration [m/s2].
-        scenario: of the run.
+        scenario: scenario of the run.
     """
     vehicle = scenario.vehicle
     return (low is None or low >= vehicle.min_accel_mps2 - LIMIT_ERROR) and (
@@ -246,8 +244,8 @@ def trace(tracks: Tracks, scenario: Scenario) -> Traced:
     """Return the figures of the trajectories of one run.
 
     Args:
-        tracks: its trajectories.
-        scenario: of the run.
+        tracks: trajectories of the run.
+        scenario: scenario of the run.
     """
     spacing = lattice_spacing(tracks, scenario)
     slow_m, slowest_mps = slow_stretch(tracks, scenario)

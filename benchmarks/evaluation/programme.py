@@ -91,7 +91,7 @@ class Goal:
     travel_s: float
     """Maximum travel time."""
     on_lane_percent: float = 100.0
-    """Minimum share of vehicles that leave on their preferred lane."""
+    """Minimum share of vehicles that leave in their preferred lane."""
     accel_mps2: float | None = None
     """Maximum acceleration and braking; None: no requirement beyond the vehicles' limits."""
     fallback_percent: float | None = None

@@ -32,7 +32,7 @@ CONGESTED: Final = 1.25
 UNDISTURBED: Final = 0.9
 """Speeds are undisturbed if no stretch of road is below this share of v_F on average."""
 CARRIED: Final = 0.97
-"""Minimum throughput, relative to the volume, at which a volume is carried."""
+"""Minimum ratio of throughput to volume at which the volume is carried."""
 PAPER_STRETCH_M: Final = (500.0, 800.0)
 STRETCH_ERROR_M: Final = 50.0
 """Tolerance: one bin of the road."""
@@ -121,8 +121,8 @@ class _Judge:
         }
         if setting is None:
             return None, None
-        most_s = CONGESTED * setting.free_flow_s
-        first = min((volume for volume, t_s in times.items() if t_s > most_s), default=None)
+        max_s = CONGESTED * setting.free_flow_s
+        first = min((volume for volume, t_s in times.items() if t_s > max_s), default=None)
         below = (volume for volume in times if first is None or volume < first)
         return first, max(below, default=None)
 
@@ -172,8 +172,8 @@ class _Judge:
             return Statement(text, MISSING, "")
         slowest = row.traced.slowest_mps
         measured = (
-            f"`{OWN}` at 1600: no 50 m of road are slower than {slowest:.2f} m/s on average; "
-            "vehicles wait for their cell before they enter"
+            f"`{OWN}` at 1600: the mean speed is at least {slowest:.2f} m/s in every 50 m of road; "
+            "vehicles wait for their cells before they enter"
         )
         return Statement(text, measured, _all([slowest >= UNDISTURBED * setting.speed_mps]))
 
@@ -217,11 +217,11 @@ class _Judge:
         beyond = [
             f"`{label}` carries {found.throughput_veh_per_lane_h:.0f} of {volume:g}"
             for label, volume in (("formations", 2000.0), ("rolling", 2400.0))
-            for found in (self._row(label, volume),)
-            if found is not None and (found.throughput_veh_per_lane_h or 0.0) > bound
+            if (found := self._row(label, volume)) is not None
+            and (found.throughput_veh_per_lane_h or 0.0) > bound
         ]
         if beyond:
-            measured += "; the bound applies to the interlaced entry, not to the lattice: "
+            measured += "; the bound applies to interlaced entry, not to the lattice: "
             measured += ", ".join(beyond)
         return Statement(text, measured, _all([rate >= CARRIED * 1750.0]))
 
@@ -233,7 +233,7 @@ class _Judge:
         off = sum(row.demanded - row.on_preferred_lane for row in rows)
         overlaps = sum(row.overlaps for row in rows)
         vehicles = sum(row.demanded for row in rows)
-        measured = f"{overlaps} overlaps, {off} of {vehicles:,} vehicles not on their lane"
+        measured = f"{overlaps} overlaps, {off} of {vehicles:,} vehicles not in their lane"
         return Statement(text, measured, _all([not overlaps and not off, *missing]))
 
     def _rules_complete(self) -> Statement:
@@ -256,7 +256,8 @@ class _Judge:
             f"`lc2013`: {off} of {sum(row.demanded for row in rows):,} did not reach their lane; "
             f"{number(last.travel_s, 1)} s at {last.volume_veh_per_lane_h:g}"
         )
-        return Statement(text, measured, _provisional("not seen" if not off else HOLDS, missing))
+        verdict = HOLDS if off else "not observed"
+        return Statement(text, measured, _provisional(verdict, missing))
 
     def _six(self) -> Statement:
         text = "Formations have at most six vehicles, for computational reasons"
@@ -281,7 +282,7 @@ def _series(texts: Sequence[str], known: Sequence[float]) -> str:
 
 
 def _all(kept: Sequence[bool | None]) -> str:
-    """Return the verdict of a statement that holds if all findings are true; None: missing."""
+    """Return the verdict of a statement that holds if all findings (None: missing) are true."""
     known = [one for one in kept if one is not None]
     if not known:
         return ""

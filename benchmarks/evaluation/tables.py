@@ -159,7 +159,7 @@ def _agreement(evidence: Evidence) -> str:
         for row in evidence.agreements
     ]
     headings = [
-        "veh/(lane h)", "arrivals", "processes", "vehicles", "in one run only", "on another lane",
+        "veh/(lane h)", "arrivals", "processes", "vehicles", "in one run only", "in another lane",
         "max. difference of travel times", "overlaps", "",
     ]  # fmt: skip
     return markdown(headings, rows)

@@ -32,8 +32,6 @@ ZENOH_VOLUMES: Final = (1000, 1600, 2000)
 TIMEOUT_S: Final = 3600.0
 """Maximum duration of a run."""
 COMMAND_FILE: Final = "command.json"
-
-
 _ROUNDING_S = 1e-6
 
 
@@ -46,7 +44,7 @@ class Agreement:
     missing: int
     """Number that left the road in one run only."""
     other_lane: int
-    """Number that left on different lanes."""
+    """Number whose final lanes differ between the runs."""
     over_a_tick: int
     """Number whose travel times differ by more than a tick."""
     worst_s: float
@@ -71,23 +69,23 @@ def read_trips(folder: Path) -> list[dict[str, Any]]:
 def agreement(
     one: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]], tick_s: float
 ) -> Agreement:
-    """Compare two runs.
+    """Compare two runs of the same demand.
 
     Args:
-        one: trips of a run.
-        other: trips of another run of the same demand.
+        one: trips of one run.
+        other: trips of the other run.
         tick_s: permitted difference of travel times.
     """
     first, second = ({trip["vehicle"]: trip for trip in trips} for trips in (one, other))
-    gone = [
+    left = [
         {name for name, trip in trips.items() if trip["travel_time_s"] is not None}
         for trips in (first, second)
     ]
-    both = sorted(gone[0] & gone[1])
+    both = sorted(left[0] & left[1])
     apart_s = [abs(first[name]["travel_time_s"] - second[name]["travel_time_s"]) for name in both]
     return Agreement(
         vehicles=len(both),
-        missing=len((gone[0] ^ gone[1]) | (first.keys() ^ second.keys())),
+        missing=len((left[0] ^ left[1]) | (first.keys() ^ second.keys())),
         other_lane=sum(first[name]["final_lane"] != second[name]["final_lane"] for name in both),
         over_a_tick=sum(apart > tick_s + _ROUNDING_S for apart in apart_s),
         worst_s=round(max(apart_s, default=0.0), 3),
@@ -105,7 +103,7 @@ class Trial:
     ending: str = "complete"
     """Expected ending in summary.json; a run with another ending has failed."""
     is_shared: bool = False
-    """Whether other trials may run at the same time; its times are not evaluated."""
+    """Whether other trials may run at the same time; the trial's times are not evaluated."""
 
     @property
     def command(self) -> str:

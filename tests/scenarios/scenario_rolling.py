@@ -122,7 +122,7 @@ class RollingRunner(Runner):
         for name, vehicle in self.vehicles.items():
             controller = vehicle.road.controller
             body = frozenset(vehicle.occupied)
-            self._estates.show(0.0, name, controller.owned, controller.transfer, body)
+            self._estates.update(0.0, name, controller.owned, controller.transfer, body)
         if self._wrong:
             wrong, self._wrong = self._wrong, []
             raise CollisionError(f"{command}: {wrong[0]}")

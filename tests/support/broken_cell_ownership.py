@@ -82,11 +82,8 @@ def forget_owned_cells(patch: Patch) -> None:
 def show_owned_cells_at_once(patch: Patch) -> None:
     state = PlanExecution.state
 
-    def mutant(
-        self: PlanExecution, sense: Sense, formation: int, *, attended: bool
-    ) -> VehicleState:
-        noted = evolve(sense, promised=self.promised)
-        return state(self, noted, formation, attended=attended)
+    def mutant(self: PlanExecution, sense: Sense, *, attended: bool) -> VehicleState:
+        return state(self, evolve(sense, promised=self.promised), attended=attended)
 
     patch.setattr(PlanExecution, "state", mutant)
 

@@ -93,7 +93,7 @@ def state(
     if owned is None:
         owned = BEFORE.get(name, ((9, 2),))
     cell = make_plan().start_cells.get(name, owned[0] if owned else (9, 2))
-    shown = vehicle().state(sense(), 0, attended=True)
+    shown = vehicle().state(sense(), attended=True)
     return evolve(
         shown, vehicle=name, hold_cell=cell, promised=promised, transfer=transfer, owned=owned,
         accepted=accepted, ready=accepted, t_s=t_s,

@@ -69,6 +69,20 @@ def test_a_signal_ends_a_run(
     check_files(lab.folder / "out")
 
 
+def test_ctrl_c_ends_a_run_whose_fork_server_is_not_ready(lab: Lab, road: Path) -> None:
+    # With an empty cache the server compiles the planners for a minute.
+    cache = str(lab.folder / "cache")
+    process = lab.start("run", road, *DEMAND, "--out", "out", NUMBA_CACHE_DIR=cache)
+    lab.wait_until(lambda: len(lab.processes()) > 1)
+
+    interrupt(process, signal.SIGINT)
+
+    ended = lab.finish(process, END_S)
+    assert ended.status == 1
+    assert ended.complaints == ["interrupted"]
+    lab.check_nothing_left()
+
+
 @pytest.mark.parametrize("role", ["router", "bridge"])
 def test_ctrl_c_ends_a_run_that_is_starting(lab: Lab, road: Path, role: str) -> None:
     process = lab.start("run", road, *DEMAND, "--coordinators", "1", "--out", "out")

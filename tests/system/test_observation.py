@@ -27,6 +27,18 @@ def status(lab: Lab, config: Path, *options: str) -> Ended:
     return lab.finish(looked, END_S)
 
 
+def wait_for_health(lab: Lab, config: Path, *options: str) -> Ended:
+    """Repeat the command until it finds health: on a busy machine one look may receive nothing."""
+    looks: list[Ended] = []
+
+    def is_healthy() -> bool:
+        looks.append(status(lab, config, *options))
+        return looks[-1].status == 0
+
+    lab.wait_until(is_healthy, END_S)
+    return looks[-1]
+
+
 def seen(config: Path, role: RoleHealth | None = None) -> Status:
     """Return what the command would print, without the start of a process."""
     return listen(load_scenario(config), float(LOOK_S), role)
@@ -55,7 +67,7 @@ def names(found: dict[str, float]) -> set[str]:
 
 def test_status_of_a_deployment(lab: Lab) -> None:
     # Longer than the test takes; and c1 leads until it is killed, even on a busy machine.
-    config = deployment(lab, free_tcp(), "election_s = 1.5\n")
+    config = deployment(lab, free_tcp(), "election_s = 3.0\n")
     text = config.read_text("utf-8").replace("duration_s = 14.0", "duration_s = 900.0")
     config.write_text(text, encoding="utf-8")
     nobody = status(lab, config)
@@ -75,10 +87,12 @@ def test_status_of_a_deployment(lab: Lab) -> None:
     assert ended.complaints == ["not healthy: no coordinator c3 found"]
 
     def flows(found: Status) -> bool:
-        """Tell whether the road advances, with messages of some vehicles, few of them lost."""
+        """Tell whether c1 leads and the road advances, with few messages lost."""
         rates, losses = found.messages_per_s, (found.loss.clock, found.loss.state)
         return (
-            found.vehicles.agents >= found.vehicles.attended > 5
+            (found.leader, found.claims) == ("c1", ("c1",))
+            and {one.coordinator for one in found.candidates} == {"c1", "c2"}
+            and found.vehicles.agents >= found.vehicles.attended > 5
             and found.road is not None
             and found.road.advanced_s > 0.0
             and rates.get("state", 0.0) > rates.get("clock", 0.0) > 0.0
@@ -86,16 +100,13 @@ def test_status_of_a_deployment(lab: Lab) -> None:
         )
 
     lab.wait_until(lambda: flows(seen(config)), END_S)
-    found = seen(config)
-    assert (found.leader, found.claims) == ("c1", ("c1",))
-    assert {one.coordinator for one in found.candidates} == {"c1", "c2"}
-    assert seen(config, RoleHealth(BRIDGE)).healthy
-    table = status(lab, config)
-    assert (table.status, table.complaints) == (0, []), table
+    lab.wait_until(lambda: seen(config, RoleHealth(BRIDGE)).healthy, END_S)
+    table = wait_for_health(lab, config)
+    assert table.complaints == []
     assert re.search(r"^leader +c1, term \d+", table.out, re.MULTILINE)
     assert re.search(r"^road +[\d.]+ s, pace [\d.]+; \d+ on the road", table.out, re.MULTILINE)
-    shard = status(lab, config, "--role", "agent", "--shard", "1/2")
-    assert (shard.status, shard.out, shard.complaints) == (0, "healthy\n", []), shard
+    shard = wait_for_health(lab, config, "--role", "agent", "--shard", "1/2")
+    assert (shard.out, shard.complaints) == ("healthy\n", [])
 
     first.kill()
     lab.finish(first, END_S)

@@ -20,7 +20,7 @@ import pytest
 from attrs import define, field
 from websockets.sync.client import connect
 
-from laneweave.launch.observe.column_owners import read_events
+from laneweave.launch.recordings.formations import read_events
 from laneweave.launch.recordings.trajectories import read_tracks
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport

@@ -112,6 +112,14 @@ def test_base_install_names_the_missing_extra(command: str, begins: str, names: 
     assert not (ROOT / "new-folder").exists()
 
 
+@pytest.mark.slow
+def test_the_live_page_needs_no_packages_for_recordings() -> None:
+    others = "pyarrow libsumo matplotlib psutil jinja2 osqp"
+    missing = f"import sys; sys.modules |= dict.fromkeys({others.split()})"
+    done = python(f"{missing}; import laneweave.launch.watch.process", cwd=ROOT)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_makefile_and_containerfile_import_what_exists() -> None:
     imports = [
         (module, name)

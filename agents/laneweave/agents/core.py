@@ -7,7 +7,7 @@ PLAN and handles the states of other vehicles.
 
 **The claim.** One process at a time acts for a vehicle; the motion controller decides which. An
 agent claims the vehicle with its first COMMAND, and sends nothing to other processes until a SENSE
-reports that it is in charge. While another agent is in charge, it sends nothing at all. If the
+reports that it is in charge. While another one is in charge, it sends nothing at all. If the
 caretaker is in charge (because the agent hung or its messages were lost), the agent takes a new
 incarnation and claims the vehicle again.
 
@@ -90,11 +90,10 @@ class AgentCore:
         self._incarnation = new_incarnation()
         self._driver = make_driver(scenario)
         self._rules = rules
-        self._formation: int | None = None
         self.wanted_motions: tuple[int, ...] = ()
         """Stretches of columns whose motions are needed now; empty while not in charge."""
         self.wanted_states: tuple[int, ...] = ()
-        """Formations whose states are needed now."""
+        """Blocks whose states are needed now."""
         self._move: PlannedMove | None = None
         """Most recently begun move."""
         self._move_ticks = 0
@@ -102,8 +101,6 @@ class AgentCore:
         self._sense: Sense | None = None
         self._command: Command | None = None
         self._own = {"vehicle": vehicle}
-        self._state_parameters: dict[str, object] = {}
-        """Topic parameters of STATE messages."""
 
     @property
     def wakeup_s(self) -> float | None:
@@ -203,7 +200,7 @@ class AgentCore:
             self._incarnation = above(self._new_incarnation(), sense.attendant)
         in_charge = self.in_charge
         if not (was_in_charge and in_charge):
-            # Also while a claim is pending, since another process may still begin a move.
+            # Repeated while a claim is pending, since another process may still begin a move.
             self._take_over(sense)
         return self._act(sense, in_charge=in_charge)
 
@@ -277,8 +274,7 @@ class AgentCore:
 
     def _take_over(self, sense: Sense) -> None:
         """V1: continue the motion controller's current motion."""
-        self._formation, self._move = sense.formation, None
-        self._state_parameters = {"formation": sense.formation, "vehicle": self.vehicle}
+        self._move = None
         self._driver.take_over(sense)
         self.execution = PlanExecution(
             vehicle=self.vehicle,
@@ -311,8 +307,8 @@ class AgentCore:
         execution, sense = self.execution, self._sense
         assert execution is not None  # noqa: S101 (there was a SENSE)
         assert sense is not None  # noqa: S101 (there was a SENSE)
-        state = execution.state(sense, self._formation or 0, attended=True)
-        return Send(STATE, state, self._state_parameters)
+        state = execution.state(sense, attended=True)
+        return Send(STATE, state, {"formation": state.formation, **self._own})
 
     def leave(self) -> list[Effect]:
         """Shut down: the vehicle has left the road."""

@@ -195,10 +195,8 @@ class AgentHost:
 
     def _on_census(self, census: Census, now_s: float) -> list[Effect]:
         effects: list[Effect] = []
-        shard = self._shard
-        if shard is None or census.bridge not in (0, self._bridge):
-            return effects  # from another road
-        if census.t_s < self._census_s:
+        shard, same_road = self._shard, census.bridge in (0, self._bridge)
+        if shard is None or not same_road or census.t_s < self._census_s:
             return effects
         self._census_s = census.t_s
         listed = dict.fromkeys(entry.vehicle for entry in census.announced)
@@ -230,8 +228,8 @@ class AgentHost:
     def _subscribe(self, topic: Topic, numbers: Iterable[Iterable[int]]) -> list[Effect]:
         before, wanted = self._subscribed[topic], {one for each in numbers for one in each}
         self._subscribed[topic] = wanted
-        where = topic.parameters[0]
+        parameter = topic.parameters[0]
         return [
-            *(Unlisten(topic, {where: number}) for number in sorted(before - wanted)),
-            *(Listen(topic, {where: number}) for number in sorted(wanted - before)),
+            *(Unlisten(topic, {parameter: number}) for number in sorted(before - wanted)),
+            *(Listen(topic, {parameter: number}) for number in sorted(wanted - before)),
         ]

@@ -8,6 +8,7 @@ from itertools import product
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.agents.host import AgentHost
+from laneweave.protocol.lattice import displacements
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.scenario.deployment_fields import Shard
@@ -20,12 +21,12 @@ from laneweave.protocol.wire.messages import Name, Sense
 
 
 def warm_up(scenario: Scenario) -> None:
-    """Plan every move and drive one tick, to warm up the caches of forked processes."""
+    """Plan every move and drive one tick, to fill the caches that forked processes inherit."""
     driver = TrackingDriver(scenario)
     column, lane = cell = (0, 1)
-    for (dx, dy), ticks in product(product((-1, 0, 1), repeat=2), scenario.move_durations):
-        if (dx, dy) != (0, 0) and (scenario.formation.mode == 2 or not (dx and dy)):
-            driver.begin((0, cell, (column + dx, lane + dy)), 0, ticks)
+    moves = displacements(scenario.formation.mode)[1:]
+    for (dx, dy), ticks in product(moves, scenario.move_durations):
+        driver.begin((0, cell, (column + dx, lane + dy)), 0, ticks)
     sense = Sense(
         vehicle=Name("warm-up"),
         tick=0,

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import ClassVar
 
 import structlog
+from attrs import frozen
 
 from laneweave.coordinator.election import Election
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.formations.operation import FormationsOperation
-from laneweave.coordinator.metrics import CoordinatorMetrics
 from laneweave.coordinator.operation import LogEntry, Operation
 from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
 from laneweave.coordinator.rolling.operation import RollingOperation
 from laneweave.coordinator.service.server import PlanningService
-from laneweave.protocol.runtime.metrics import MetricsSnapshot
+from laneweave.protocol.runtime.metrics import MetricsSnapshot, metric
 from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
@@ -64,6 +65,21 @@ from laneweave.protocol.wire.topics import (
 log = structlog.get_logger(__name__)
 
 REPORT_S = 2.0
+"""Interval between reports."""
+
+
+@frozen
+class CoordinatorMetrics:
+    """Election and plans as seen by one candidate."""
+
+    ABOUT: ClassVar[str] = "coordinator"
+
+    leading: bool = metric("1 while this candidate leads, else 0")
+    term: int = metric("Highest term seen; the candidate's own term while it leads")
+    candidates: int = metric("Candidates with recent heartbeats, including this one")
+    elections_total: int = metric("Number of times that this process has become leader")
+    plans_in_force: int = metric("Plans in force while leading, for formations or for this slot")
+    road_seconds: float = metric("Newest road time received")
 
 
 class CoordinatorCore:
@@ -78,7 +94,7 @@ class CoordinatorCore:
         make_planner: Callable[[Scenario], Planner] = stream_planner,
         workers: int = 1,
     ) -> None:
-        """Make a candidate that has received nothing yet.
+        """Create a candidate that has received no messages yet.
 
         Args:
             name: name of the candidate; candidates are ranked by name.
@@ -86,7 +102,7 @@ class CoordinatorCore:
             scenario: road, formations, timing.
             rules: rules for formation leaders; tests replace some.
             make_planner: returns the planner of the rolling operation.
-            workers: number of client requests to plan concurrently.
+            workers: number of client requests to answer concurrently.
         """
         self.name = name
         self.scenario = scenario
@@ -97,7 +113,7 @@ class CoordinatorCore:
         self.census: Census | None = None
         self.t_s = 0.0
         self._formation_of: dict[Name, int] = {}
-        """Block in which each vehicle in the census entered."""
+        """Block that each vehicle in the census entered."""
         self._handled_s = self._awake_since_s = 0.0
         """Time of the last event; start of the current gap-free series of events (node clock)."""
         self._incarnation = incarnation
@@ -106,8 +122,8 @@ class CoordinatorCore:
         self._bridge = -1
         """Incarnation of the newest bridge."""
         self._road_changed = True
-        self._heartbeat_s = 0.0
-        self._report_s = 0.0
+        self._next_heartbeat_s = 0.0
+        self._next_report_s = 0.0
         self._wakeup_s: float | None = None
         self.operation = self._make_operation(rules, make_planner)
 
@@ -125,7 +141,7 @@ class CoordinatorCore:
 
     @property
     def metrics(self) -> tuple[MetricsSnapshot, ...]:
-        """Counters of this candidate."""
+        """Metrics of this candidate and of its planning service."""
         election = self.election
         return (
             CoordinatorMetrics(
@@ -160,9 +176,9 @@ class CoordinatorCore:
         if not isinstance(event, Stopping):
             effects += self._on_election(now_s)
             effects += self._lead(now_s)
-            effects += self._heartbeat(now_s)
+            effects += self._periodic_messages(now_s)
             effects += self.service.drop_late(now_s)
-            self._plan_wakeup(now_s)
+            self._set_wakeup(now_s)
         return effects
 
     # --- inputs -------------------------------------------------------------------------------
@@ -174,11 +190,11 @@ class CoordinatorCore:
             case Arrived(_, _, message):
                 self._on_message(message, now_s)
             case PeerUp(topic, parameters) if topic is COORDINATOR_ALIVE:
-                self._meet_candidate(*_identity(parameters), now_s)
+                self._on_candidate(*_identity(parameters), now_s)
             case PeerDown(topic, parameters) if topic is COORDINATOR_ALIVE:
                 self.election.on_token_down(*_identity(parameters))
             case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
-                self._meet_bridge(incarnation_of(parameters))
+                self._on_bridge(incarnation_of(parameters))
             case LinkUp() | LinkDown():
                 self.election.on_link(up=isinstance(event, LinkUp), now_s=now_s)
             case QueryArrived(token, payload, encoding):
@@ -194,7 +210,7 @@ class CoordinatorCore:
                 pass
 
     def _start(self, now_s: float) -> Iterator[Effect]:
-        self.election.started_s = self._heartbeat_s = self._report_s = now_s
+        self.election.started_s = self._next_heartbeat_s = self._next_report_s = now_s
         yield Listen(HEARTBEAT)
         yield Listen(CLOCK)
         yield Listen(CENSUS)
@@ -205,14 +221,14 @@ class CoordinatorCore:
         )
         yield Serve(SERVICE)
 
-    def _meet_candidate(self, name: str, incarnation: int, now_s: float) -> None:
+    def _on_candidate(self, name: str, incarnation: int, now_s: float) -> None:
         if name == self.name and incarnation != self._incarnation:
             # Safe, but both would lead: neither outranks the other.
             log.warning("another coordinator has the same name", coordinator=name)
         self.election.on_token_up(name, incarnation, now_s)
 
-    def _meet_bridge(self, incarnation: int) -> None:
-        """Reset the road state if the bridge is new; its clock starts again at 0."""
+    def _on_bridge(self, incarnation: int) -> None:
+        """Reset the road state if the bridge is new; road time starts again at 0."""
         if incarnation > self._bridge:
             self._bridge = incarnation
             self.census = None
@@ -221,9 +237,9 @@ class CoordinatorCore:
             self.operation.forget()
 
     def _is_of_this_road(self, message: RoadClock | Census) -> bool:
-        """Register a message's bridge; return whether it is the newest bridge."""
+        """Register the bridge that sent a message; return whether it is the newest one."""
         if message.bridge:
-            self._meet_bridge(message.bridge)
+            self._on_bridge(message.bridge)
         return message.bridge in (0, self._bridge)
 
     def _on_message(self, message: object, now_s: float) -> None:
@@ -251,7 +267,7 @@ class CoordinatorCore:
     def _on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
         """Handle the state of a vehicle; return None if nothing depends on it.
 
-        A leader ignores vehicles that its census does not list, for example those that have left.
+        A leader ignores vehicles that its census does not list, for example departed ones.
         """
         if self.election.leading and self._formation_of.get(state.vehicle) == state.formation:
             return self.operation.on_state(state, now_s)
@@ -275,22 +291,22 @@ class CoordinatorCore:
             yield Listen(STATE)
         else:
             yield Unlisten(STATE)
-        self._heartbeat_s = now_s
+        self._next_heartbeat_s = now_s
         kind = LEADER_ELECTED if self.election.leading else LEADER_STEPPED_DOWN
         log.info(kind, coordinator=self.name, term=self.election.term)
         yield self._log(kind, term=self.election.term)
 
-    def _heartbeat(self, now_s: float) -> Iterator[Effect]:
-        if now_s >= self._heartbeat_s:
-            self._heartbeat_s = now_s + self.scenario.network.heartbeat_s
+    def _periodic_messages(self, now_s: float) -> Iterator[Effect]:
+        if now_s >= self._next_heartbeat_s:
+            self._next_heartbeat_s = now_s + self.scenario.network.heartbeat_s
             term, leading = self.election.term, self.election.leading
             yield Send(
                 HEARTBEAT,
                 Heartbeat(self.name, self._incarnation, term, leading, self.operation.in_force),
                 {"coordinator": self.name},
             )
-        if now_s >= self._report_s:
-            self._report_s = now_s + REPORT_S
+        if now_s >= self._next_report_s:
+            self._next_report_s = now_s + REPORT_S
             yield self._report()
 
     # --- leading ------------------------------------------------------------------------------
@@ -335,14 +351,15 @@ class CoordinatorCore:
         message = Report(Name("coordinator"), self.name)
         return Send(REPORT, message, {"role": "coordinator", "name": self.name})
 
-    def _plan_wakeup(self, now_s: float) -> None:
-        times = [self._heartbeat_s, self._report_s, self.election.next_change_s(now_s)]
+    def _set_wakeup(self, now_s: float) -> None:
+        election = self.election
+        times = [self._next_heartbeat_s, self._next_report_s, election.next_change_s(now_s)]
         if (service_s := self.service.wakeup_s) is not None:
             times.append(service_s)
-        if not self.election.leading:
-            times.append(self.election.started_s + self.election.election_s)
-        else:
+        if election.leading:
             times += self.operation.wakeups
+        else:
+            times.append(election.started_s + election.election_s)
         # A time in the past would make the same timer fire forever.
         self._wakeup_s = max(min(time for time in times if time > now_s), now_s + 1e-3)
 

@@ -1,7 +1,7 @@
 """Leader election among coordinator candidates (rule L1).
 
-A candidate leads when it has run for an election timeout (`network.election_s`) and has received
-nothing from a higher-ranked candidate for that long. Candidates are ranked by name. The election
+A candidate leads when it has run for an election timeout (`network.election_s`) and has had no
+contact with a higher-ranked candidate for that long. Candidates are ranked by name. The election
 ensures progress, not safety: two leaders at once are harmless, because vehicles promise one ballot
 at a time.
 """
@@ -16,18 +16,18 @@ from attrs import define, field
 from laneweave.protocol.wire.messages import Heartbeat, Name
 
 NEWCOMER_FACTOR = 1.5
-"""A leader waits this many election timeouts for a higher-ranked new candidate to lead."""
+"""Number of election timeouts that a leader waits for a higher-ranked new candidate to lead."""
 MAX_TERM = 2**62
-"""Higher terms are ignored: 64-bit integers would leave no room for further terms."""
+"""Higher terms are ignored, so that later terms fit in 64-bit integers."""
 
 
 @define
 class _Peer:
     incarnation: int
-    heard_s: float
-    """Time of the last message from this process."""
+    last_contact_s: float
+    """Time of the last heartbeat or token from this process."""
     since_s: float
-    """Time of the first message from this process."""
+    """Time of the first contact, or of the first one after an election timeout of silence."""
     leading: bool = False
 
 
@@ -61,7 +61,8 @@ class Election:
         known = self._peers.get(heartbeat.coordinator)
         if known is not None and known.incarnation > heartbeat.incarnation:
             return
-        self._hear(heartbeat.coordinator, heartbeat.incarnation, now_s).leading = heartbeat.leading
+        peer = self._on_contact(heartbeat.coordinator, heartbeat.incarnation, now_s)
+        peer.leading = heartbeat.leading
 
     def on_token_up(self, coordinator: str, incarnation: int, now_s: float) -> None:
         """Record that a process has connected, or resumed after a pause."""
@@ -70,17 +71,17 @@ class Election:
         self._dead.discard((coordinator, incarnation))
         known = self._peers.get(coordinator)
         if known is None or known.incarnation <= incarnation:
-            self._hear(coordinator, incarnation, now_s)
+            self._on_contact(coordinator, incarnation, now_s)
 
-    def _hear(self, coordinator: str, incarnation: int, now_s: float) -> _Peer:
+    def _on_contact(self, coordinator: str, incarnation: int, now_s: float) -> _Peer:
         peer = self._peers.get(coordinator)
         if (
             peer is None
             or peer.incarnation != incarnation
-            or now_s >= peer.heard_s + self.election_s
+            or now_s >= peer.last_contact_s + self.election_s
         ):
             peer = self._peers[coordinator] = _Peer(incarnation, now_s, now_s)
-        peer.heard_s = now_s
+        peer.last_contact_s = now_s
         return peer
 
     def on_token_down(self, coordinator: str, incarnation: int) -> None:
@@ -105,14 +106,14 @@ class Election:
     def see_term(self, term: int) -> None:
         """Adopt a higher term; a leader continues one term above it."""
         if self.term < term <= MAX_TERM:
-            # A leader that was paused while another led must not continue below that one's term.
+            # A leader that was paused while another led must not continue below the other's term.
             self.term = term + 1 if self.leading else term
 
     def update(self, now_s: float) -> bool:
         """Decide whether to lead; return whether the decision has changed."""
         rival = any(
             name < self.name
-            and now_s < peer.heard_s + self.election_s
+            and now_s < peer.last_contact_s + self.election_s
             and (not self.leading or peer.leading or now_s >= self._patience_s(peer))
             for name, peer in self._peers.items()
         )
@@ -126,13 +127,13 @@ class Election:
         return True
 
     def raise_term(self, above: int) -> None:
-        """Raise the term above that of a ballot reported by a vehicle (L3)."""
+        """Raise the term above the term of a ballot that a vehicle has reported (L3)."""
         self.term = max(self.term, above + 1)
 
     def living(self, now_s: float) -> Iterator[str]:
-        """Yield the other candidates whose last message is within the election timeout."""
+        """Yield the other candidates with a contact within the election timeout."""
         for name, peer in self._peers.items():
-            if now_s < peer.heard_s + self.election_s:
+            if now_s < peer.last_contact_s + self.election_s:
                 yield name
 
     def _patience_s(self, peer: _Peer) -> float:
@@ -143,12 +144,12 @@ class Election:
         return peer.since_s + NEWCOMER_FACTOR * self.election_s
 
     def next_change_s(self, now_s: float) -> float:
-        """Return when the decision may next change after `now_s` if no message arrives."""
+        """Return when the next wait for a higher-ranked candidate ends, or infinity."""
         times = [
             time_s
             for name, peer in self._peers.items()
             if name < self.name
-            for time_s in (peer.heard_s + self.election_s, self._patience_s(peer))
+            for time_s in (peer.last_contact_s + self.election_s, self._patience_s(peer))
             if time_s > now_s
         ]
         return min(times, default=math.inf)

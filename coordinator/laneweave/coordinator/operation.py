@@ -23,7 +23,7 @@ class LogEntry:
 class Operation(Protocol):
     """A leader's tasks for the vehicles on the road.
 
-    `t_s` is road time, `now_s` is node time.
+    `t_s` is road time, `now_s` is the node clock.
     """
 
     def forget(self) -> None:

@@ -14,7 +14,7 @@ class BadInputError(ValueError):
     """A value from a user or a peer is invalid.
 
     The one-line message names the field, the value and the allowed values. The command line prints
-    it and exits with status 2; a running process counts it and continues.
+    the message and exits with status 2; a running process counts the error and continues.
     """
 
     def __init__(self, field: str, value: object, allowed: str) -> None:
@@ -47,7 +47,7 @@ def one_line(text: str, length: int = 500) -> str:
 
 
 class RefusedError(Exception):
-    """Another process rejected the input with this message. Exit status 2."""
+    """Another process rejected the input; the message is its reason. Exit status 2."""
 
 
 class CommandFailedError(RuntimeError):

@@ -28,7 +28,7 @@ STRAIGHT: tuple[Cell, ...] = ((1, 0), (-1, 0), (0, 1), (0, -1))
 OBLIQUE: tuple[Cell, ...] = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
-def displacements(mode: Mode) -> tuple[Cell, ...]:
+def displacements(mode: int) -> tuple[Cell, ...]:
     """Return the displacements that a vehicle may make in one step, in tie-breaking order.
 
     Waiting comes first, then straight moves, then oblique ones, so that planners break ties in
@@ -93,7 +93,7 @@ class Lattice:
         return (lane + 0.5) * self.lane_width_m
 
     def lanes_touched(self, y_m: float, width_m: float) -> tuple[int, int]:
-        """Return the first and the last lane that a body of this width touches around `y_m`."""
+        """Return the first and the last lane that a body of this width touches at `y_m`."""
         half_m, lane_m = 0.5 * width_m, self.lane_width_m
         return int((y_m - half_m) // lane_m), int((y_m + half_m) // lane_m)
 

@@ -89,7 +89,7 @@ def strict_converter(*, detailed: bool) -> Converter:
 
 
 def _origin(kind: Any) -> object:  # noqa: ANN401 (any annotation)
-    return get_origin(kind)
+    return get_origin(kind)  # mypy rejects comparisons with its declared type
 
 
 def _tuple_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a generic alias)
@@ -175,7 +175,7 @@ def structure(data: Mapping[str, Any], kind: type[T]) -> T:
     """Build an instance of the attrs class `kind` from nested maps.
 
     Raises:
-        BadInputError: a value is invalid; the error has the path of the first such value.
+        BadInputError: a value is invalid; the error names the path of the first such value.
     """
     try:
         return _CONVERTER.structure(data, kind)
@@ -191,7 +191,7 @@ def as_lists(_: object, __: object, value: object) -> object:
 
 
 def first_problem(error: Exception, path: str = "") -> BadInputError:
-    """Return the first leaf of a cattrs error group as an error with its path."""
+    """Return the first leaf of a cattrs error group as an error that names the field's path."""
     if isinstance(error, BaseValidationError):
         for inner in error.exceptions:
             return first_problem(inner, path + _step(inner, bool(path)))

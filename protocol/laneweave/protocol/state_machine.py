@@ -1,9 +1,9 @@
 """State machines defined by tables of transitions.
 
-A machine is an object with a `phase`; its `RuleBook` is the table of its transitions, whose guards
-and actions are functions of (machine, message). The first transition whose event, source phase and
-guards match is taken. The tables of docs/PROTOCOL.md are generated from the rule books: the first
-line of a function's docstring is its description there.
+A machine is an object with a `phase`; a `RuleBook` is the table of its transitions. Guards and
+actions are functions of (machine, message). The first transition whose event, source phase and
+guards match is taken. The tables of docs/PROTOCOL.md are generated from the rule books, with the
+first line of each function's docstring as its description.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class RuleBook:
         return {function for row in self.table for function in (*row.guards, *row.actions)}
 
     def take(self, machine: Any, event: str, message: Any) -> Transition | None:  # noqa: ANN401
-        """Take the first transition that matches and return it; None: there is none."""
+        """Take and return the first transition that matches, or return None if there is none."""
         phase = machine.phase
         for row in self._rows.get(event, ()):
             if phase not in row.sources:

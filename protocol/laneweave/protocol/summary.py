@@ -1,7 +1,8 @@
 """`summary.json`: the results of one run.
 
 The bridge writes the file when a run ends; the launcher adds the fields that only it knows.
-Fields with a default are absent in summaries of earlier versions and of runs without these results.
+Fields with a default are absent from summaries of earlier versions, and of runs to which they do
+not apply.
 """
 
 from __future__ import annotations
@@ -188,7 +189,7 @@ class RunSummary:
 
 
 def read_summary(folder: Path) -> RunSummary | None:
-    """Return the summary in a run's folder; None if it is missing or incomplete."""
+    """Return the summary in a run's folder; None if it is missing or invalid."""
     try:
         return RunSummary.from_json(json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8")))
     except (OSError, ValueError):

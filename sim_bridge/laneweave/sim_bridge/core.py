@@ -3,8 +3,8 @@
 In each tick the roadside admits vehicles, every vehicle on the road receives a SENSE, its agent
 answers with a trajectory, all bodies move by one tick, the world displays them, and gaps and
 overlaps are measured. SENSE is repeated to agents that have not answered (`tick_answers`); after
-the deadline their motion controllers continue their trajectories. A vehicle whose agent is absent
-or silent gets a caretaker (`attendance`).
+the deadline their motion controllers continue their trajectories. A vehicle whose agent is absent,
+silent or always late gets a caretaker (`attendance`).
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class BridgeCore:
         record: RunRecord,
         *,
         new_incarnation: Callable[[], int],
-        pace: float | None = None,
+        pace: float | None,
         incarnation: int = 0,
         stopwatch: Callable[[], float] = time.perf_counter,
     ) -> None:
@@ -323,7 +323,7 @@ class BridgeCore:
 
     def _close_formations(self) -> None:
         for closed in self._roadside.close_formations(self.t_s):
-            blocks = range(closed.first_block, closed.last_block + 1)
+            blocks = closed.blocks
             members = [vehicle for vehicle in self.vehicles.values() if vehicle.block in blocks]
             for vehicle in members:
                 vehicle.join(closed)

@@ -20,12 +20,12 @@ from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 def run_bridge(
     scenario: Scenario,
     folder: Path,
-    method: str = "formation",
-    pace: float | None = None,
+    method: str,
+    pace: float | None,
     wrap: CoreWrapper = unwrapped,
     observe: Observe = unobserved,
 ) -> None:
-    """Run the simulated world until all vehicles have left, or SIGINT or SIGTERM is received.
+    """Run the simulated world until all vehicles have left, or until SIGINT or SIGTERM.
 
     Args:
         scenario: complete configuration.

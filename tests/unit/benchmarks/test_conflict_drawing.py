@@ -67,7 +67,7 @@ def test_verdicts() -> None:
 
 def test_counts_are_those_of_the_tables() -> None:
     rows = {name: (one, two) for name, one, two in counts()}
-    different = [pair for pair in conflict_table(BodyGeometry()).pairs if pair[0] != (0, 0)]
+    different = [pair for pair in conflict_table(BodyGeometry()) if pair[0] != (0, 0)]
     assert rows["geometric with `geometry`, any delay"][1] == len(different) == 344
     assert rows["geometric: footprints"] == (48, 360)
     assert rows["node, edge, special-1 to special-4"] == (48, 280)

@@ -159,7 +159,7 @@ def test_two_leaders_that_hear_each_other_stop_outbidding() -> None:
 
 
 def test_a_leader_waits_for_a_newcomer_for_a_limited_time() -> None:
-    """There is always a leader while a better-ranked candidate is too young to lead."""
+    """There is always a leader while a higher-ranked candidate is too young to lead."""
     election = candidate()
     election.update(ELECTION_S)
     patience_s = 1.0 + NEWCOMER_FACTOR * ELECTION_S

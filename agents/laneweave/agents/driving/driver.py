@@ -70,7 +70,7 @@ class Driver(Protocol):
         """Return the motion and the jerks from this tick on."""
 
     def motion(self, tick: int) -> Course | None:
-        """Return the motion to publish at a tick; None: none is due."""
+        """Return the motion to publish at a tick, or None if none is due."""
 
     def on_motion(self, motion: Motion) -> None:
         """Handle another vehicle's announced motion."""

@@ -12,7 +12,7 @@ from attrs import define, frozen
 from numpy.typing import NDArray
 
 from laneweave.agents.driving.trajectory import move_profile
-from laneweave.protocol.lattice import Cell
+from laneweave.protocol.lattice import Cell, displacements
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Motion, Name
 
@@ -36,7 +36,6 @@ class _MoveTable:
     """Trajectory shared by all moves with the same displacement and duration."""
 
     ticks: int
-
     along_m: list[float]
     """Distance covered along the road, relative to the lattice, by tick."""
     speeds_mps: list[float]
@@ -79,9 +78,8 @@ class _Known:
     start_m: float
     """Position of the motion's origin, relative to the lattice."""
     low_m: float
-    """Lowest position at which the vehicle can be sensed, relative to the lattice."""
     high_m: float
-    """Highest such position."""
+    """Range of positions at which the vehicle can be sensed, relative to the lattice."""
 
 
 class Motions:
@@ -92,7 +90,7 @@ class Motions:
         formation = scenario.formation
         self._scenario = scenario
         self._pitch_m = formation.gap_m
-        self._diagonal = formation.mode != 1
+        self._moves = displacements(formation.mode)[1:]
         self._advance_m = formation.speed_mps * scenario.runtime.tick_s
         self._durations = scenario.move_durations
         self._tables: dict[tuple[int, int, int], _MoveTable] = {}
@@ -105,22 +103,20 @@ class Motions:
         """Earliest tick at which a motion becomes outdated."""
 
     def add(self, motion: Motion) -> None:
-        """Add a motion that is a possible move, unless a newer one of its vehicle is known."""
+        """Add a motion, unless the move is impossible or a newer motion of its vehicle is known."""
         known = self.known.get(motion.vehicle)
         if known is not None:
-            newest = known.motion
-            if _content(motion) == _content(newest):
+            content, newest = _content(motion), _content(known.motion)
+            if content == newest:
                 known.tick = max(known.tick, motion.tick)
                 return
-            if _content(motion)[:2] < _content(newest)[:2]:
+            if content[:2] < newest[:2]:
                 return
         (column, lane), (to_column, to_lane) = motion.origin, motion.target
         dx, dy = to_column - column, to_lane - lane
         ticks = motion.ticks
-        if max(abs(dx), abs(dy)) != 1 or (dx and dy and not self._diagonal):
+        if (dx, dy) not in self._moves or ticks not in self._durations:
             return  # not a move of this scenario
-        if ticks not in self._durations:
-            return
         table = self._tables.get((dx, dy, ticks))
         if table is None:
             table = self._tables[dx, dy, ticks] = _MoveTable.of(self._scenario, dx, dy, ticks)

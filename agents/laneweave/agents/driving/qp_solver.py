@@ -3,9 +3,9 @@
     minimise    1/2 x' P x
     subject to  lower <= A x <= upper
 
-P and A are set up once; the bounds change between solves. The module checks every solution, and
-what OSQP 1.1 does not check: it accepts vectors of the wrong length, prints a message and uses old
-data if lower > upper, keeps a NaN in its warm start, and returns a finite x if infeasible.
+P and A are set up once; the bounds change between solves. OSQP 1.1 accepts vectors of the wrong
+length, prints a message and uses old data if lower > upper, keeps a NaN in its warm start, and
+returns a finite x for infeasible programs. The module therefore checks all inputs and solutions.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ class QuadraticProgram:
         scaled: Vector = solver.solution.x
         violation = math.inf
         if status in (SOLVED, SOLVED_INACCURATE, MAX_ITERATIONS):
-            violation = self._row_violation(scaled)
+            violation = self._violation(scaled)
         usable = violation <= self._settings.tolerance
         x = scaled * self._scale.unknowns
         result = QPResult(x, usable, status, int(info.iter), violation)
@@ -186,7 +186,7 @@ class QuadraticProgram:
         if self._settings.adaptive_rho_interval:
             self._solver.update_rho(self._settings.rho)
 
-    def _row_violation(self, scaled: Vector) -> float:
+    def _violation(self, scaled: Vector) -> float:
         values = self._constraints @ scaled
         np.subtract(values, self._upper, out=self._above)
         np.subtract(self._lower, values, out=self._below)

@@ -1,6 +1,6 @@
 """References: motions in road time, which the tracker follows.
 
-A `Reference` is a hold, one move to a neighbouring cell, or the settling in a cell. Where it would
+A `Reference` is a hold, one move to a neighbouring cell, or settling in a cell. Where it would
 run into the vehicle ahead, it is replaced by a yielding path (`yield_behind`).
 """
 
@@ -132,7 +132,7 @@ class Reference:
         s += self._advance_m * tick
         bounds = self._bounds
         if bounds is None:
-            bounds = ErrorBounds.beside(self._states[1:], self._jerks, self._limits)
+            bounds = ErrorBounds.around(self._states[1:], self._jerks, self._limits)
             self._bounds = bounds
         return Window(states, self._jerks[first : first + n], bounds.part(first, first + n))
 

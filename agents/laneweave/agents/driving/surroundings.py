@@ -27,7 +27,6 @@ Array = NDArray[np.float64]
 SENSED_S = 1.0
 """Time for which neighbours are assumed to keep their speed."""
 
-
 _Sensed = tuple[int, float, float]
 """(lane, front-bumper limit [m], speed [m/s]) of a sensed neighbour."""
 
@@ -50,7 +49,7 @@ class Surroundings:
     """Predicts the gaps around one vehicle."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Take sizes, limits and horizon from a scenario."""
+        """Read sizes, limits and horizon from a scenario."""
         limits = scenario.vehicle
         self._motions = Motions(scenario)
         self._lattice = scenario.lattice
@@ -80,10 +79,10 @@ class Surroundings:
         first, last = self._lattice.lanes_touched(sense.state[3], self._width_m)
         touched = first, last, lane
         latest = earliest = None
-        ahead, near = self._relevant(sense, state, sense.ahead, touched, 1.0, self._gain_m)
+        ahead, near = self._relevant(sense, state, sense.ahead, touched, _AHEAD, self._gain_m)
         if near:
             latest = self._at_constant_speed(near, _AHEAD)
-        behind, near = self._relevant(sense, state, sense.behind, touched, -1.0, -self._loss_m)
+        behind, near = self._relevant(sense, state, sense.behind, touched, _BEHIND, -self._loss_m)
         if near:
             earliest = self._at_constant_speed(near, _BEHIND)
         if self._motions.known:
@@ -101,7 +100,7 @@ class Surroundings:
         state: State,
         others: tuple[Neighbour, ...],
         touched: tuple[int, int, int],
-        sign: float,
+        side: _Side,
         change_m: float,
     ) -> tuple[list[_Sensed], list[_Sensed]]:
         """Return neighbours in relevant lanes (if motions are known) and the ones within reach.
@@ -113,12 +112,12 @@ class Surroundings:
             state: commanded state of this vehicle.
             others: the neighbours in one direction.
             touched: the first and the last lane that the body touches; the lane that it enters.
-            sign: 1 ahead, -1 behind.
+            side: the direction.
             change_m: distance by which acceleration can bring the vehicle closer to its neighbours
                 during the prediction; negative behind.
         """
         first, last, lane = touched
-        motions_known, lag_s = self._motions.known, self._lag_s
+        motions_known, lag_s, sign = self._motions.known, self._lag_s, side.sign
         relevant: list[_Sensed] = []
         near: list[_Sensed] = []
         for other in others:

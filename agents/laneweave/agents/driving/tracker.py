@@ -66,7 +66,6 @@ class Tracker:
         self._tick_s = scenario.runtime.tick_s
         self._axis = axis_matrices(self._tick_s)
         limits = self._limits = scenario.vehicle
-        self._jerk_limits = np.array([limits.max_jerk_mps3, limits.max_lateral_jerk_mps3])
         self._shapes = (n + 1, 6), (n, 2)
         self._kept = np.empty(14 * n, dtype=np.bool_)
         """Buffer for comparisons with bounds on the fast path; its blocks follow as views."""
@@ -131,8 +130,8 @@ class Tracker:
     def rest(self, state: State, goal: State) -> TrackResult | None:
         """Return the jerks that keep a vehicle in its cell while no other vehicle is near.
 
-        So near the cell no constraint can bind: `solve` returns the same jerks, but is slower.
-        None: the commanded state is not close enough to `goal`, the state at rest in the cell.
+        Near `goal`, the state at rest in the cell, no constraint can bind, and `solve` would return
+        the same jerks, but more slowly. Returns None if the commanded state is too far from `goal`.
         """
         if self._regulator is None:
             return None
@@ -165,7 +164,7 @@ class Tracker:
         """Return the jerks (N, 2) of the unconstrained solution if all constraints hold."""
         if self._regulator is None or target.defect is not None:
             return None
-        bounds = target.bounds or ErrorBounds.beside(target.states[1:], target.jerks, self._limits)
+        bounds = target.bounds or ErrorBounds.around(target.states[1:], target.jerks, self._limits)
         n = self._n
         values = self._regulator.constraints.dot(error)
         free, free_jerk = values[: 5 * n].reshape(5, n), values[5 * n : 7 * n].reshape(n, 2)
@@ -206,7 +205,8 @@ class Tracker:
 
     def _limited(self, state: State, jerk: Array) -> Array:
         """Return jerks (N, 2) that keep the limits exactly, if the state allows this."""
-        clipped = np.clip(jerk, -self._jerk_limits, self._jerk_limits)
+        max_jerk = self.program.jerk_limits
+        clipped = np.clip(jerk, -max_jerk, max_jerk)
         if self._excess(state, clipped) <= _LIMIT_TOLERANCE:
             return clipped
         now = state

@@ -50,7 +50,7 @@ SETTINGS = QPSettings(
     tolerance=2e-2,
 )
 _GAP_SCALE, _JERK_SCALE = 20.0, 0.4
-"""Scales of these constraints for OSQP, 1 for all others; at 1, active gaps take 300 iterations."""
+"""Scales of gap and jerk constraints, 1 for others; at 1, active gaps take 300 iterations."""
 _STATE_SCALE = 0.3
 """Scale of states and slacks for OSQP; 1 for jerks, because their gradient must vanish."""
 FAR_M = 1e4
@@ -59,7 +59,7 @@ _MAX_PUSH_M = 1.0
 """Maximum distance by which vehicles behind can push this one past its reference."""
 _SPEED_TOLERANCE_MPS = 0.3
 _SLIP_TOLERANCE_MPS = 0.1
-"""Tolerances by which OSQP's predictions may violate these limits near standstill."""
+"""Amounts by which OSQP's predictions may violate speed >= 0 and the slip limit."""
 
 
 @frozen(eq=False)
@@ -106,7 +106,7 @@ class ErrorBounds:
     high_jerk: Array
 
     @classmethod
-    def beside(cls, states: Array, jerks: Array, limits: Vehicle) -> ErrorBounds:
+    def around(cls, states: Array, jerks: Array, limits: Vehicle) -> ErrorBounds:
         """Return the bounds for a reference with states (n, 6) and jerks (n, 2).
 
         The tolerance is added and subtracted to get the same rounding as in the program's bounds.
@@ -163,7 +163,7 @@ class TrackingProgram:
         n = self._n = scenario.horizon_ticks
         self._tick_s = scenario.runtime.tick_s
         self._limits = scenario.vehicle
-        self._jerk_limits = np.array(
+        self.jerk_limits = np.array(
             [self._limits.max_jerk_mps3, self._limits.max_lateral_jerk_mps3]
         )
         self.cost = _cost(n, self._tick_s)
@@ -191,7 +191,7 @@ class TrackingProgram:
         return qp.solve()
 
     def set_up(self) -> QuadraticProgram:
-        """Set up OSQP with initial bounds, so that results do not depend on when this happens."""
+        """Set up OSQP with initial bounds; results then do not depend on the time of the set-up."""
         low, high = _initial_bounds(self._n)
         self._qp = QuadraticProgram(
             self.cost,
@@ -239,8 +239,8 @@ class TrackingProgram:
         np.subtract(margin, slip, out=high.slip_left)
         np.add(margin, slip, out=low.slip_right)
         np.negative(low.slip_right, out=low.slip_right)
-        np.subtract(self._jerk_limits, jerks, out=high.jerk)
-        np.add(self._jerk_limits, jerks, out=low.jerk)
+        np.subtract(self.jerk_limits, jerks, out=high.jerk)
+        np.add(self.jerk_limits, jerks, out=low.jerk)
         np.negative(low.jerk, out=low.jerk)
 
     def write_gaps(self, states: Array, gaps: Gaps) -> None:

@@ -9,7 +9,7 @@ over n ticks of h seconds,
                 speed, acceleration, jerk and slip within a fraction of the vehicle's limits
 
 which each process solves once per kind of move. The jerks are then integrated exactly and the
-result is checked against all limits, independent of the solver's status.
+result is checked against all limits, whatever the solver's status.
 
 States are commanded states (`protocol.vehicle.motion`): the body follows them with the lag of its
 actuators, and is 0.1 m short of its cell at the end of the move, 0.04 m at the end of the slot
@@ -17,7 +17,7 @@ actuators, and is 0.1 m short of its cell at the end of the move, 0.04 m at the 
 stays far enough behind that the emergency brake (`protocol.vehicle.emergency_brake`) does not act,
 with a margin for errors:
 
-    s_k+r + (lag + r h) v_F + (v_F + v_k+r)^2 / (2 b)
+    s_{k+r} + (lag + r h) v_F + (v_F + v_{k+r})^2 / (2 b)
         <=  2 d_F - L + braking distance of the vehicle ahead - margin - errors
 
 for every tick k, with r ticks of reaction time; the square is replaced by its tangents.
@@ -36,6 +36,7 @@ from scipy import sparse
 from laneweave.agents.driving.qp_solver import MAX_ITERATIONS, QPSettings, QuadraticProgram
 from laneweave.agents.driving.regulator import axis_matrices
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import displacements
 from laneweave.protocol.scenario.fields import Scenario, Vehicle
 from laneweave.protocol.vehicle.emergency_brake import (
     ERROR_SIGMAS,
@@ -103,7 +104,7 @@ class Envelope:
 
     @classmethod
     def behind(cls, scenario: Scenario, gap_m: float) -> Envelope:
-        """Return the envelope for a move that starts with a net gap of `gap_m` to that vehicle."""
+        """Return the envelope for a move that starts with a net gap of `gap_m` to the vehicle."""
         speed_mps, braking = scenario.formation.speed_mps, scenario.braking
         ticks = max(round(braking.reaction_s / scenario.runtime.tick_s), 1)
         lost_s = scenario.vehicle.actuator_lag_s + ticks * scenario.runtime.tick_s
@@ -152,9 +153,7 @@ def check_moves(scenario: Scenario) -> None:
         BadInputError: a move cannot be driven.
     """
     for slot_s in scenario.slots_s:
-        for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)):
-            if dx and dy and scenario.formation.mode == 1:
-                continue
+        for dx, dy in displacements(scenario.formation.mode)[1:]:
             try:
                 move_profile(scenario, dx, dy, scenario.move_ticks(slot_s))
             except InfeasibleTrajectoryError as error:
@@ -292,7 +291,7 @@ def _both(limit: float) -> tuple[float, float]:
 def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Trajectory:
     """Return the trajectory of minimum squared jerk from a state to rest at the origin.
 
-    Limits are not checked: an entering vehicle has enough time for 1.5 columns to stay well within
+    Limits are not checked: `config.cross_checks` ensures that an entering vehicle can settle within
     them.
 
     Args:

@@ -53,7 +53,7 @@ PROMISED, PLANNED, FAILED, TOO_LATE = "promised", "planned", "planning failed", 
 
 @define(kw_only=True)
 class BallotRound:
-    """A leader's state for one ballot at a time; subclasses define the roster and take events."""
+    """A leader's state for one ballot at a time; subclasses define the roster and handle events."""
 
     rules: RuleBook
     resend_s: float
@@ -139,7 +139,7 @@ class BallotRound:
 
     @property
     def wakeup_s(self) -> float | None:
-        """Time of the next timer or resend; None: there is none."""
+        """Time of the next timer or resend, or None."""
         if self.phase in _WITHOUT_TIMER:
             return None
         return self.due_s
@@ -241,16 +241,13 @@ def is_older(state: VehicleState, other: VehicleState) -> bool:
     States sent between two ticks have equal times. Their order follows from the promise and the
     acceptance, which are never undone.
     """
-    if state.incarnation == other.incarnation and state.t_s != other.t_s:
-        return state.t_s < other.t_s
-    return _age(state) < _age(other)
+    first, second = (state.incarnation, state.t_s), (other.incarnation, other.t_s)
+    return first < second or (first == second and _progress(state) < _progress(other))
 
 
-def _age(state: VehicleState) -> tuple[object, ...]:
+def _progress(state: VehicleState) -> tuple[object, ...]:
     transfer = state.transfer
     return (
-        state.incarnation,
-        state.t_s,
         state.promised or (),
         bool(state.owned),
         state.accepted,

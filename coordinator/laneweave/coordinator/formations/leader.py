@@ -1,8 +1,8 @@
 """One formation under a leader: its ballots, one after another (rules L2 to L8).
 
-A leader first observes the formation and adopts a plan that is in force (L2). If there is none, or
-if it stalls or no longer fits, the leader prepares a new ballot. `LEADER_RULES` is the table, shown
-in docs/PROTOCOL.md. L1 is `election.Election`.
+A leader first observes the formation and adopts a plan that is in force (L2). If there is no such
+plan, or the plan stalls or no longer fits, the leader prepares a new ballot. `LEADER_RULES` is the
+table, shown in docs/PROTOCOL.md. L1 is `election.Election`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from laneweave.protocol.wire.messages import Ballot, Name, Plan, VehicleState
 OBSERVE_S = 1.0
 """Longest time for which a new leader waits for the states of all members (L2)."""
 BACK_OFF_S = (0.05, 0.3)
-"""Range of the random back-off before a leader outbids another one (L7). It doubles with each
+"""Range of the random back-off before a leader outbids another one (L7). It is doubled for each
 consecutive back-off, so that one of two leaders has time to plan."""
 MAX_BACK_OFFS = 6
 """Maximum number of doublings of the back-off."""
@@ -110,7 +110,7 @@ class FormationLeader(BallotRound):
         self.take(PLANNED, now_s, plan)
 
     def _is_news(self, state: VehicleState) -> bool:
-        """Return whether a state is from a member and not older than its newest state."""
+        """Return whether a state is from a member and not older than the member's newest one."""
         known = self.states.get(state.vehicle)
         return state.vehicle in self.formation.roster and (
             known is None or not is_older(state, known)

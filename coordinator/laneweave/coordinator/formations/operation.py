@@ -6,7 +6,7 @@ import random
 from collections.abc import Callable, Iterator
 
 from laneweave.coordinator.ballots.ballot_round import PROMISED, TIME, BallotPhase
-from laneweave.coordinator.formations.leader import LEADER_RULES, FormationLeader
+from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.planning_orders import FormationPlanner
 from laneweave.coordinator.formations.roster import Formation, Groups, closed_formations, joinable
 from laneweave.coordinator.operation import LogEntry, to_vehicle
@@ -32,7 +32,7 @@ class FormationsOperation:
         has_watched: Callable[[float], bool],
         rng: random.Random,
         plan: PlanFunction,
-        rules: RuleBook = LEADER_RULES,
+        rules: RuleBook,
     ) -> None:
         """Begin without formations.
 
@@ -40,8 +40,8 @@ class FormationsOperation:
             scenario: road, formations, timing.
             new_ballot: returns a new ballot, above the given one, if any.
             new_job: returns the id of a new computation.
-            has_watched: returns whether, at a given node time, this leader has handled events
-                without gaps for an election timeout.
+            has_watched: returns whether, at a given time (node clock), this leader has handled
+                events without gaps for an election timeout.
             rng: source of random pauses.
             plan: answers a request.
             rules: rules for formation leaders; tests replace some.

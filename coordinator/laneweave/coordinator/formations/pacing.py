@@ -1,9 +1,9 @@
 """Timing of a plan: start, slot length, pauses for neighbouring formations.
 
-Lanes are changed in S3 only (paper, Section 5.2.1). If the scenario does not fix T_F, the slots of
-a plan are as long as the road allows, and the plan begins as early as possible without any lane
-change before S3. Before the rear of the formation is in S3, vehicles may already move along the
-road, and those in S3 may change lanes.
+When sorting, vehicles change lanes in S3 only (paper, Section 5.2.1). If the scenario does not fix
+T_F, a plan gets the longest slots with which it ends in time, and begins as early as possible
+without any lane change before S3. Before the rear of the formation is in S3, vehicles may
+already move along the road, and those in S3 may change lanes.
 
 Plans stay in the blocks of their formations, so their footprints never intersect. But two moves
 towards each other across the border between formations (conflict kind `closing`) would trigger the
@@ -47,9 +47,9 @@ def comfortable_steps(start_s: float, end_s: float, scenario: Scenario) -> int:
 def paced(
     plan: Plan, others: Sequence[Plan], not_before_s: float, end_s: float, scenario: Scenario
 ) -> Plan:
-    """Return a plan with the longest slots that let it end in time, else with the shortest.
+    """Return a plan with the longest slots with which it ends in time, otherwise the shortest.
 
-    The plan pauses where its moves and its neighbours' would be in conflict (`closing`).
+    The plan pauses where its moves would have `closing` conflicts with those of its neighbours.
 
     Args:
         plan: plan with the latest start: when all of its vehicles are in S3.
@@ -88,7 +88,7 @@ def _start_s(plan: Plan, slot_s: float, not_before_s: float, scenario: Scenario)
 
 
 def with_pauses(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: int) -> Plan:
-    """Return a plan with pauses, so that no move is in conflict (`closing`) with another plan.
+    """Return a plan with pauses, so that no move has a `closing` conflict with another plan.
 
     All vehicles pause together, so the order of moves does not change.
 
@@ -96,8 +96,8 @@ def with_pauses(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: i
         plan: the new plan.
         others: plans of neighbouring formations; not changed.
         slack_s: difference between the length of a slot and the duration of a move [s].
-        max_steps: maximum number of slots. Moves still in conflict then rely on the emergency
-            brake, because a delay is better than a wrong lane.
+        max_steps: maximum number of slots. Remaining conflicts are left to the emergency brake,
+            because a late vehicle is better than one in a wrong lane.
     """
     theirs = [
         (other.t0_s + step * other.slot_s, other.slot_s - slack_s, (origin, target))

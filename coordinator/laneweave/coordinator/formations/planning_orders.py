@@ -1,4 +1,4 @@
-"""Planning requests for formations, and their results (rule L5).
+"""Plan requests for formations, and their results (rule L5).
 
 The planner runs outside the core (`Compute`), for one formation at a time. This module makes the
 requests. It turns results into plans or failures, or joins formations if one alone lacks room.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
-from typing import Any
 
 from attrs import define, field
 
@@ -20,16 +19,16 @@ from laneweave.coordinator.formations.roster import (
     Formation,
     Groups,
     Numbers,
+    exit_time_s,
     on_tick,
     stage_begin_s,
     start_time_s,
     steps_left,
-    time_left_s,
 )
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
 from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.paper.assignments import Weights
-from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
+from laneweave.coordinator.planning.response import PlanFunction
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.fields import Scenario
@@ -48,7 +47,7 @@ from laneweave.protocol.wire.events import (
 from laneweave.protocol.wire.messages import Ballot, Plan
 
 START_MARGIN_S = 0.5
-"""Minimum road time between the completion of a plan and its start."""
+"""Minimum road time from the end of planning to the start of the plan."""
 ROOM_S = 2.5
 """Maximum time that a formation that lacks room waits for the next one to close (road time)."""
 SHORTEST_DEADLINE_S = 1.0
@@ -60,9 +59,9 @@ MAX_DOUBLINGS = 4
 PACE_WINDOW_S = 2.0
 """Measurement window for the road's pace (node clock)."""
 LOGGED = (
-    *("status", "cost", "lower_bound", "steps", "solve_ms"),
-    *("assignments_tried", "nodes_expanded", "solver", "fallback"),
-)
+    "status", "cost", "lower_bound", "steps", "solve_ms",
+    "assignments_tried", "nodes_expanded", "solver", "fallback",
+)  # fmt: skip
 """Fields of a response that are logged with the plan."""
 MIN_PACE = 0.1
 """Minimum pace; it keeps deadlines finite while the road stands still."""
@@ -140,11 +139,10 @@ class FormationPlanner:
     def order(
         self, leader: FormationLeader, t_s: float, now_s: float
     ) -> Iterator[Compute | LogEntry]:
-        """Request a plan based on a formation's promises; abort if no step can be completed."""
-        numbers, ballot = leader.formation.numbers, leader.ballot
+        """Request a plan from a formation's promises, unless it is too late for any step."""
+        formation, ballot, scenario = leader.formation, leader.ballot, self._scenario
         assert ballot is not None  # noqa: S101 (set before planning begins)
-        formation, scenario = leader.formation, self._scenario
-        block_of = scenario.lattice.block_of
+        numbers, block_of = formation.numbers, scenario.lattice.block_of
         # Hold cells outside the blocks make planning fail later; they do not affect the time left.
         cells = [cell for cell in leader.hold_cells.values() if block_of(cell[0]) in numbers]
         cells = cells or self._block_cells(numbers)
@@ -160,22 +158,19 @@ class FormationPlanner:
         task = SortingTask(
             numbers,
             leader.hold_cells,
-            {member.vehicle: member.preferred_lane for member in leader.formation.members},
+            {member.vehicle: member.preferred_lane for member in formation.members},
             leader.unattended,
             scenario,
-            self._deadline_s(start_s, t_s),
-            comfortable_steps(start_s, end_s, scenario),
-            formation.deserted,
-            None if formation.sorts else scenario.formation.structures[formation.stage],
+            deadline_s=self._deadline_s(start_s, t_s),
+            steps=comfortable_steps(start_s, end_s, scenario),
+            deserted=formation.deserted,
+            structure=None if formation.sorts else scenario.formation.structures[formation.stage],
         )
         nodes = scenario.formation.max_nodes * 2 ** min(leader.failures, MAX_DOUBLINGS)
         # Replaces a request under an earlier ballot, at the end of the queue.
         self._waiting.pop(numbers[0], None)
         # The job detects invalid promises; they are handled like any planning failure.
-        self._waiting[numbers[0]] = (
-            ballot,
-            partial(sort_lanes, task, nodes, self._make_plan),
-        )
+        self._waiting[numbers[0]] = ballot, partial(sort_lanes, task, nodes, self._make_plan)
         yield from self._begin()
 
     def _begin(self) -> Iterator[Compute]:
@@ -199,13 +194,13 @@ class FormationPlanner:
     def _end_s(self, formation: Formation) -> float:
         """Return the road time by which a formation's plan should be complete.
 
-        That is when the formation is planned next, or when its front leaves the road.
+        At this time the formation is planned again or, if it sorts, its front leaves the road.
         """
         if not formation.sorts:
             next_s = stage_begin_s(formation.numbers, formation.stage + 1, self._scenario)
             return next_s - STAGE_LEAD_S
         front = self._scenario.lattice.block_range(formation.numbers[0])[-1]
-        return time_left_s([(front, 0)], 0.0, self._scenario)
+        return exit_time_s([(front, 0)], self._scenario)
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[Compute | LogEntry]:
         """Handle a result, unless it is no longer needed, and start the next request."""
@@ -290,12 +285,12 @@ class FormationPlanner:
         return leader.make_plan(leader.formation.numbers, sorting.moves, t0_s, slot_s)
 
     def _paced(self, plan: Plan, leader: FormationLeader, t_s: float) -> Plan:
-        """Choose a plan's start and slots so that its vehicles have settled before it begins."""
+        """Choose a plan's start and slots so that its vehicles settle before they move."""
         formation, cells = leader.formation, plan.start_cells.values()
         others = self._neighbouring_plans(plan)
         if not formation.sorts:
             return paced(plan, others, plan.t0_s, self._end_s(formation), self._scenario)
-        end_s = time_left_s({*cells, *plan.territory}, 0.0, self._scenario)
+        end_s = exit_time_s({*cells, *plan.territory}, self._scenario)
         not_before_s = max(self._settled_s(cells), t_s + START_MARGIN_S)
         return paced(plan, others, not_before_s, end_s, self._scenario)
 
@@ -333,16 +328,12 @@ def _log_entries(
     if sorting.impossible:
         data = {"formation": number, "stage": formation.stage, "why": sorting.impossible}
         yield LogEntry(STRUCTURE_IMPOSSIBLE, data)
-    if sorting.response is not None:
-        timing = {"t0_s": plan.t0_s, "slot_s": plan.slot_s}
-        yield LogEntry(PLAN_MADE, _log_data(number, sorting.response) | timing)
+    if (response := sorting.response) is not None:
+        data = {"formation": number, "vehicles": len(response.paths)}
+        data |= {name: getattr(response, name) for name in LOGGED}
+        yield LogEntry(PLAN_MADE, data | {"t0_s": plan.t0_s, "slot_s": plan.slot_s})
     if pauses:
         yield LogEntry(NEIGHBOURS_AWAITED, {"formation": number, "slots": pauses})
     if sorting.out_of_reach:
         vehicles = [str(name) for name in sorting.out_of_reach]
         yield LogEntry(LANE_OUT_OF_REACH, {"formation": number, "vehicles": vehicles})
-
-
-def _log_data(number: int, response: PlanResponse) -> dict[str, Any]:
-    facts = {name: getattr(response, name) for name in LOGGED}
-    return {"formation": number, "vehicles": len(response.paths), **facts}

@@ -24,8 +24,8 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name
 
 STAGE_LEAD_S = 5.0
-"""Lead time for planning a change of structure: longer than planning takes. The previous plan is
-complete by then."""
+"""Lead time for planning a change of structure, longer than planning takes. If possible,
+`pacing.paced` makes the previous plan complete by then."""
 
 Numbers = tuple[int, ...]
 """Block numbers, ascending."""
@@ -42,7 +42,7 @@ class Formation:
     closed_s: float = 0.0
     """Road time at which the last of the formations was closed."""
     joined: int = 1
-    """Number of formations it consists of."""
+    """Number of formations that were joined; 1: a single one."""
     deserted: Numbers = ()
     """Blocks of joined formations whose vehicles have all left the road. Plans avoid them, since
     vehicles of formations joined under another leader may be there."""
@@ -108,19 +108,21 @@ def closed_formations(
         first = groups.of(lattice.block_of(entry.cell[0]))[0]
         members.setdefault(first, []).append(entry)
     listed_blocks = {block for closed in census.formations for block in closed.blocks}
-    return {
-        first: Formation(
-            groups.of(first),
-            tuple(sorted(each, key=lambda entry: entry.vehicle)),
-            max(closed_s.get(first, [0.0])),
-            len(closed_s.get(first, [0.0])),
-            tuple(block for block in groups.of(first) if block not in listed_blocks),
-            stage := stage_at(groups.of(first), t_s, scenario),
-            stage == len(scenario.formation.structures),
-        )
-        for first, each in sorted(members.items())
-        if groups.of(first)[-1] <= census.closed_to
-    }
+    formations: dict[int, Formation] = {}
+    for first, each in sorted(members.items()):
+        numbers, times_s = groups.of(first), closed_s.get(first, [0.0])
+        if numbers[-1] <= census.closed_to:
+            stage = stage_at(numbers, t_s, scenario)
+            formations[first] = Formation(
+                numbers,
+                tuple(sorted(each, key=lambda entry: entry.vehicle)),
+                closed_s=max(times_s),
+                joined=len(times_s),
+                deserted=tuple(block for block in numbers if block not in listed_blocks),
+                stage=stage,
+                sorts=stage == len(scenario.formation.structures),
+            )
+    return formations
 
 
 def stage_at(numbers: Numbers, t_s: float, scenario: Scenario) -> int:
@@ -185,12 +187,12 @@ def on_tick(t_s: float, scenario: Scenario) -> float:
     return math.ceil(t_s / tick_s - 1e-6) * tick_s
 
 
-def time_left_s(cells: Collection[Cell], t_s: float, scenario: Scenario) -> float:
-    """Return the time from `t_s` until the foremost cell reaches the end of the road."""
+def exit_time_s(cells: Collection[Cell], scenario: Scenario) -> float:
+    """Return the road time at which the foremost cell reaches the end of the road."""
     front = max(column for column, _ in cells)
-    return scenario.lattice.passing_time_s(front, scenario.road.length_m) - t_s
+    return scenario.lattice.passing_time_s(front, scenario.road.length_m)
 
 
 def steps_left(cells: Collection[Cell], t_s: float, slot_s: float, scenario: Scenario) -> int:
     """Return the number of whole steps until the foremost cell reaches the end of the road."""
-    return max(0, math.floor(time_left_s(cells, t_s, scenario) / slot_s + 1e-6))
+    return max(0, math.floor((exit_time_s(cells, scenario) - t_s) / slot_s + 1e-6))

@@ -1,25 +1,25 @@
 """Lane sorting of one formation, or of joined ones: from promises to moves.
 
 The grid consists of the blocks of the formations. Vehicles without an agent block their cells. If
-complete sorting is infeasible, one vehicle after another is exempted from reaching its lane, so
-that a single blocked vehicle does not prevent all others from sorting. Before sorting, a formation
-may form other structures, in which every vehicle may take any place.
+complete sorting is infeasible, one vehicle is exempted from reaching its lane, so that a single
+blocked vehicle does not prevent all others from sorting; the vehicles are tried one by one. Before
+sorting, a formation may form other structures, in which every vehicle may take any place.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from itertools import islice
-from typing import Any
 
 from attrs import evolve, frozen
 
 from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.planning.budget import Clock
-from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
 from laneweave.coordinator.planning.targets import placements
 from laneweave.protocol.errors import BadInputError
@@ -134,37 +134,32 @@ def plan_requests(task: SortingTask, exempt: Name | None = None) -> Iterator[Pla
         ahead=scenario.formation.closes_by_vehicles,
     ):
         index = {cell: number for number, cell in enumerate(targets.cells)}
-        vehicles: list[dict[str, Any]] = [
-            {"id": name, "cell": list(cell)}
-            | (
-                {"eligible": [index[targets.off_lane[name]]]}
-                if name in targets.off_lane
-                else {"lane": wanted[name]}
-            )
+        vehicles = [
+            VehicleRequest(name, cell, eligible=(index[targets.off_lane[name]],))
+            if name in targets.off_lane
+            else VehicleRequest(name, cell, wanted[name])
             for name, cell in task.movers.items()
         ]
-        yield _plan_request(task, vehicles, {"targets": [list(cell) for cell in targets.cells]})
+        yield _plan_request(task, vehicles, targets.cells)
 
 
 def _plan_request(
-    task: SortingTask, vehicles: list[dict[str, Any]], goal: Mapping[str, Any]
+    task: SortingTask,
+    vehicles: Iterable[VehicleRequest],
+    targets: tuple[Cell, ...] = (),
+    structure: DrivingStructure | None = None,
 ) -> PlanRequest:
-    scenario, formation = task.scenario, task.scenario.formation
-    return PlanRequest.from_dict(
-        {
-            "schema": "laneweave.plan.request/1",
-            "grid": {
-                "columns": len(task.columns),
-                "lanes": scenario.road.lanes,
-                "blocked": [list(cell) for cell in task.blocked],
-            },
-            "mode": formation.mode,
-            "conflicts": list(formation.conflict_kinds),
-            "vehicles": vehicles,
-            **goal,
-            "deadline_s": task.deadline_s,
-            "solver": formation.solver,
-        }
+    formation = task.scenario.formation
+    return PlanRequest(
+        Grid(len(task.columns), task.scenario.road.lanes, task.blocked),
+        1 if formation.mode == 1 else 2,
+        formation.conflict_kinds,
+        tuple(vehicles),
+        targets,
+        task.deadline_s,
+        solver=formation.solver,
+        structure=structure.structure if structure else None,
+        lanes=(structure.lanes or None) if structure else None,
     )
 
 
@@ -206,7 +201,7 @@ def sort_lanes(
 
 
 def _steps(response: PlanResponse) -> float:
-    """Return the number of steps of a plan; infinite: there is no plan."""
+    """Return the number of steps of a plan, or infinity if there is no plan."""
     return math.inf if response.steps is None else response.steps
 
 
@@ -214,10 +209,9 @@ def _form(
     task: SortingTask, structure: DrivingStructure, make_plan: Callable[[PlanRequest], PlanResponse]
 ) -> Sorting:
     """Plan the paths into a structure; if it has too few cells, all members hold."""
-    members = [{"id": name, "cell": list(cell)} for name, cell in task.movers.items()]
-    lanes = {"lanes": list(structure.lanes)} if structure.lanes else {}
+    members = [VehicleRequest(name, cell) for name, cell in task.movers.items()]
     try:
-        request = _plan_request(task, members, {"structure": structure.structure} | lanes)
+        request = _plan_request(task, members, structure=structure)
     except BadInputError as error:
         if error.field != "structure":
             raise

@@ -22,7 +22,7 @@ from typing import Final
 import attrs
 
 from laneweave.protocol.lattice import Cell, Mode, displacements, footprint
-from laneweave.protocol.scenario.fields import BASE_CONFLICTS, CONFLICT_KINDS
+from laneweave.protocol.scenario.fields import CONFLICT_KINDS
 
 Move = tuple[Cell, Cell]
 """From-cell and to-cell of one step; the same cell if the vehicle waits."""
@@ -30,16 +30,16 @@ Pair = tuple[Cell, Cell, Cell]
 """Offset from A's cell to B's, displacement of A, displacement of B."""
 Offset = tuple[int, int, int]
 """Columns and lanes from A's cell to B's, and the index of B's displacement."""
+ConflictTable = frozenset[Pair]
+"""The pairs of moves that bring two bodies too close; see `geometry.conflict_table`."""
 
 PAPER_KINDS: Final = ("node", "edge", "special-1", "special-2", "special-3", "special-4")
-DEFAULT_KINDS: Final[dict[Mode, tuple[str, ...]]] = {1: BASE_CONFLICTS, 2: ("geometric",)}
 
 MAX_OFFSET: Final = 2
 """Maximum column or lane distance between conflicting from-cells; but see `_COLUMNS_OF_KIND`."""
 CLOSING_COLUMNS: Final = 3
 """Column distance of two vehicles with two free columns between them."""
 _COLUMNS_OF_KIND: Final = {"closing": CLOSING_COLUMNS}
-
 
 _WAIT, _LONGITUDINAL, _LATERAL, _OBLIQUE = product((False, True), repeat=2)
 
@@ -81,7 +81,7 @@ def _geometric(a: Move, b: Move) -> bool:
 
 
 def _closing(a: Move, b: Move) -> bool:
-    """Return whether A moves forwards, B backwards from three columns ahead, in a common lane."""
+    """Return whether A moves forwards and B, three columns ahead in a common lane, backwards."""
     return (
         a[1][0] - a[0][0] == 1
         and b[1][0] - b[0][0] == -1
@@ -112,17 +112,6 @@ def _as_kinds(kinds: Iterable[str]) -> tuple[str, ...]:
 
 
 @attrs.frozen
-class ConflictTable:
-    """The pairs of moves that bring two bodies too close; see `geometry.conflict_table`.
-
-    any_lateness: whether the table also holds for moves that begin arbitrarily late.
-    """
-
-    pairs: frozenset[Pair]
-    any_lateness: bool
-
-
-@attrs.frozen
 class ConflictModel:
     """The kinds of conflict that a plan must avoid, in the order of `CONFLICT_KINDS`.
 
@@ -133,9 +122,9 @@ class ConflictModel:
     special-2, special-3, special-4: A moves obliquely; B moves longitudinally, moves laterally or
         stays, respectively. Three of their initial and target cells form a right triangle: B
         leaves, enters or stays at a corner of the square of A's cells.
-    geometric: without a table, the footprints intersect (`lattice.footprint`). The execution
-        protocol reserves footprints, so this holds for any lateness. It contains all kinds above
-        and any `ConflictTable`. With a table, it contains exactly the pairs in the table.
+    geometric: without a table, the footprints intersect (`lattice.footprint`), which the execution
+        protocol reserves, so moves without this conflict are safe at any lateness. It contains
+        all kinds above and any `ConflictTable`. With a table: exactly the pairs in the table.
     closing: A moves forwards, straight or obliquely, B moves backwards and starts three columns
         ahead of A, and some lane is the from-lane or to-lane of both. No other kind contains it.
     """
@@ -171,7 +160,7 @@ class ConflictModel:
         for kind in self.kinds:
             if kind == "geometric" and self.table is not None:
                 pair = _difference(a[0], b[0]), _difference(*a), _difference(*b)
-                if pair in self.table.pairs:
+                if pair in self.table:
                     return kind
                 continue
             predicate = _PREDICATES[kind]

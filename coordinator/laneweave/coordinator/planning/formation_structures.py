@@ -2,7 +2,7 @@
 
 The cells of a structure are free cells in its lanes: all of them if it is parallel; only those with
 even column + lane, or only those with odd column + lane, if it is interlaced. In each lane, a
-structure takes as many neighbouring cells as it has vehicles there, with no gaps but blocked cells:
+structure takes as many neighbouring cells as it has vehicles there; only blocked cells make gaps:
 
 - If every vehicle names a lane, the cells in each lane minimize its vehicles' total distance.
 - Otherwise cells are filled from a common front to the rear, column by column, and in each column
@@ -148,7 +148,7 @@ def _place(
 def _filled(
     columns: _Columns, grid: Grid, starts: Sequence[int], preferred: Sequence[int | None]
 ) -> _Placed:
-    """Fill a structure from each front; return that nearest the starts."""
+    """Fill a structure from each front; return the result nearest to the starts."""
     lanes_of: dict[int, list[int]] = {}
     for lane in sorted(columns):
         for column in columns[lane]:
@@ -169,7 +169,7 @@ def _filled(
 def _fill(
     front: int, lanes_of: Mapping[int, Sequence[int]], preferred: Sequence[int | None]
 ) -> list[Cell] | None:
-    """Fill cells backwards from column `front`; None: there are too few."""
+    """Fill cells backwards from column `front`; return None if there are too few."""
     per_lane = _vehicles_per_lane(preferred)
     others = len(preferred) - per_lane.total()
     targets: list[Cell] = []

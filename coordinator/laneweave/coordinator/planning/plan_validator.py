@@ -1,6 +1,7 @@
 """Check a plan against its request, independently of the search.
 
-Only the definition of a conflict is shared with the planner. `solve.plan` checks every plan.
+Only the definitions of a conflict and of the cost are shared with the planner. `solve.plan` checks
+every plan.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def problems_of_response(request: PlanRequest, response: PlanResponse) -> list[s
     problems = problems_of_paths(request, response.assignment, response.paths)
     if problems:
         return problems
-    cost = sum(_steps_until_final_arrival(path) for path in response.paths)
+    cost = response.path_map(request.ids).cost()
     if response.cost != cost:
         problems.append(f"cost {response.cost}, but the paths cost {cost}")
     if response.steps != len(response.paths[0]) - 1:
@@ -59,7 +60,7 @@ def _problems_of_targets(request: PlanRequest, targets: Sequence[Cell]) -> Itera
     if len(targets) != len(request.vehicles) or len(set(targets)) != len(targets):
         yield f"{len(set(targets))} targets for {len(request.vehicles)} vehicles"
     for cell in targets:
-        if not request.grid.contains(cell) or not request.grid.is_free(cell):
+        if not request.grid.is_free(cell):
             yield f"target {cell} is blocked or outside the grid"
         if cell[1] not in request.structure_lanes:
             yield f"target {cell} is not in a lane of the structure"
@@ -84,8 +85,7 @@ def _problems_of_vehicle(
     if tuple(path[0]) != vehicle.cell:
         yield f"{name} starts at {path[0]} instead of {vehicle.cell}"
     for cell in path:
-        inside = 0 <= cell[0] < grid.columns and 0 <= cell[1] < grid.lanes
-        if not inside or tuple(cell) in grid.blocked:
+        if not grid.is_free(cell):
             yield f"{name} is in {cell}, which is blocked or outside the grid"
     for step in range(len(path) - 1):
         columns = abs(path[step][0] - path[step + 1][0])
@@ -116,8 +116,3 @@ def _conflicts(request: PlanRequest, paths: Sequence[Sequence[Cell]]) -> Iterato
             if kind is not None:
                 ids = f"{request.vehicles[i].id} and {request.vehicles[j].id}"
                 yield f"{kind} conflict of {ids} in step {step}"
-
-
-def _steps_until_final_arrival(path: Sequence[Cell]) -> int:
-    moves = [k for k in range(1, len(path)) if path[k] != path[k - 1]]
-    return moves[-1] if moves else 0

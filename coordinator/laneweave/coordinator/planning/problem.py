@@ -222,7 +222,7 @@ class Search:
     """Base class of the solvers: a search for the cheapest path set.
 
     best: the cheapest path set so far.
-    lower_bound: lower bound on the cost of all path sets; infinite: there is none.
+    lower_bound: lower bound on the cost of all path sets; infinite: no path set exists.
     finished: whether it is proven that `best` is optimal or that no path set exists.
     aborted: whether this solver cannot decide the problem within its limits; another might.
     tried: number of assignments that were examined one by one.

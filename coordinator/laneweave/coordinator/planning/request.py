@@ -1,4 +1,4 @@
-"""A planning request: vehicles, targets and rules, checked on construction.
+"""A plan request: vehicles, targets and rules, checked on construction.
 
 The JSON form is fixed (`laneweave.plan.request/1`). Every error is a `BadInputError` that names the
 field, the value and what is allowed. Unknown keys are errors, too: a misspelt preference must not
@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import attrs
 
-from laneweave.coordinator.planning.conflict_kinds import DEFAULT_KINDS, ConflictModel
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.formation_structures import (
     STRUCTURES,
     shortage,
@@ -26,7 +26,7 @@ from laneweave.coordinator.planning.problem import Problem
 from laneweave.protocol.errors import BadInputError, one_line
 from laneweave.protocol.lattice import Cell, Mode
 from laneweave.protocol.parsing import as_lists, structure
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS, SOLVERS
+from laneweave.protocol.scenario.fields import CONFLICT_KINDS, DEFAULT_CONFLICTS, SOLVERS
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
 DEFAULT_DEADLINE_S: Final = 4.0
@@ -167,7 +167,7 @@ class PlanRequest:
         if document.mode not in (1, 2):
             raise BadInputError("mode", document.mode, "1 or 2")
         mode: Mode = 1 if document.mode == 1 else 2
-        conflicts = DEFAULT_KINDS[mode] if document.conflicts is None else document.conflicts
+        conflicts = DEFAULT_CONFLICTS[mode] if document.conflicts is None else document.conflicts
         fields = attrs.asdict(
             document, recurse=False, filter=lambda field, _: field.name != "schema"
         )
@@ -205,12 +205,13 @@ class _GridDocument:
 
     def grid(self) -> Grid:
         """Return the grid."""
-        _check_grid(Grid(self.columns, self.lanes))
+        grid = Grid(self.columns, self.lanes)
+        _check_grid(grid)
         for i, cell in enumerate(self.blocked):
-            if not Grid(self.columns, self.lanes).contains(cell):
+            if not grid.contains(cell):
                 raise BadInputError(f"grid.blocked[{i}]", cell, "a cell in the grid")
         _check_unique("grid.blocked", self.blocked, "each cell once")
-        return Grid(self.columns, self.lanes, self.blocked)
+        return attrs.evolve(grid, blocked=self.blocked)
 
 
 @attrs.frozen

@@ -27,9 +27,8 @@ _OPTIONAL: Final = ("solver", "targets", "waited_ms")
 class PlanResponse:
     """A plan, or the reason why there is none.
 
-    status: `optimal` is proven without any bound on the number of steps, `feasible` means that the
-        budget was spent first, `infeasible` is proven, `timeout` means that no plan was found in
-        time.
+    status: `optimal`: proven, among plans of any length; `feasible`: the budget was spent before
+        the proof; `infeasible`: proven; `timeout`: no plan was found in time.
     cost, steps: None without a plan. lower_bound: proven lower bound; None if infeasible.
     assignment: per vehicle, the index of its target; empty without a plan.
     paths: per vehicle, its cells at all `steps` + 1 time points; empty without a plan.
@@ -38,7 +37,8 @@ class PlanResponse:
         or nodes, or cannot solve such requests; `paths` is the cheaper of the two path sets.
     targets: targets of the requested structure, to which `assignment` refers; None: the request
         listed its targets.
-    waited_ms: time that the request waited for a service worker; None: it was planned locally.
+    waited_ms: time that the request waited for a service worker; None: answered
+        without a service.
     """
 
     status: Status
@@ -81,7 +81,7 @@ class PlanResponse:
 
 
 PlanFunction = Callable[..., PlanResponse]
-"""Function that plans a `PlanRequest`, with the keyword arguments of `solve.plan`."""
+"""Function that answers a `PlanRequest`; takes the keyword arguments of `solve.plan`."""
 
 
 def _is_given(attribute: attrs.Attribute[Any], value: object) -> bool:

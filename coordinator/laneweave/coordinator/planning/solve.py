@@ -24,8 +24,8 @@ from laneweave.protocol.scenario.fields import DEFAULT_SOLVER
 TAPPA_SHARE: Final = 0.75
 """Share of the deadline, and of the node limit, after which branching replaces TAPPA.
 
-With six to eight vehicles TAPPA needs 3 to 5 s of CPU for 15,000 of the 20,000 nodes of a scenario;
-branching needs 0.1 s for such formations (95th percentile), at most 0.6 s.
+With six to eight vehicles, TAPPA needs 3 to 5 s of CPU for 15,000 nodes, its share of a scenario's
+default limit; branching needs 0.1 s for such formations (95th percentile), at most 0.6 s.
 """
 MAX_NODES: Final = 500_000
 """Node limit that keeps TAPPA's trees below about 1 GB; reaching it takes minutes."""

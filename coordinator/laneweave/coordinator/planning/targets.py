@@ -1,8 +1,8 @@
 """Targets of a formation: the parallel structure after lane sorting (paper, Section 5.2.1).
 
-Each lane provides neighbouring cells, one per vehicle that prefers it, where paths are shortest.
-Vehicles without an agent keep their cells, which are blocked for others. If more vehicles prefer a
-lane than it has free cells, those furthest from it get the nearest other cells.
+Each lane provides neighbouring cells, one per vehicle that prefers the lane, where paths are
+shortest. Vehicles without an agent keep their cells, which are blocked for others. If more vehicles
+prefer a lane than it has free cells, the vehicles furthest from it get the nearest other cells.
 """
 
 from __future__ import annotations

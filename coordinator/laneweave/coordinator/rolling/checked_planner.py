@@ -26,7 +26,7 @@ from that slot on; `StreamPlanner.plan` except in fault searches and tests."""
 
 
 def checked(road: StreamRoad, planner: Planner) -> Planner:
-    """Return a planner that raises `ValueError` for invalid plans; a check takes 0.5 ms."""
+    """Return a planner that raises `ValueError` for invalid plans."""
 
     def plan(
         slot: int,

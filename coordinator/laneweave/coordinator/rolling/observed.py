@@ -112,7 +112,7 @@ class ObservedRoad:
 
 
 def _at(t_s: float, newest: _Message | None, before: _Message | None) -> _Message | None:
-    """Return the message that was the newest at a road time; None: there was none."""
+    """Return the message that was the newest at a road time, or None if there was none."""
     return newest if newest is not None and newest.t_s <= t_s else before
 
 

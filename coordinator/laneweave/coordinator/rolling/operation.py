@@ -16,6 +16,7 @@ from typing import Any
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry, to_vehicle
+from laneweave.coordinator.planning.conflict_kinds import Move
 from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import Planner
 from laneweave.coordinator.rolling.observed import ObservedRoad
@@ -42,7 +43,7 @@ LISTEN_S = 0.5
 """Time for which a new leader only listens (node clock), so that it does not outbid a leader whose
 heartbeats it has missed."""
 MAX_DELAY_S = 1.0
-"""A plan that is ready later than this into its slot is dropped."""
+"""Time into its slot after which a plan that is not in force is dropped."""
 LOOKAHEAD_M = 600.0
 """Distance before the first moves at which planning for a vehicle begins: the length of S3, so that
 all vehicles that can interact there are included in time."""
@@ -209,7 +210,7 @@ class RollingOperation:
         return tuple(vehicles.values()), blocked
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[LogEntry]:
-        """Begin ballots for the first moves of a plan, if it is the one requested last."""
+        """Begin ballots for the first moves of the plan requested last; ignore other results."""
         if self._ordered is None or computed.job != self._ordered[0]:
             return
         slot = self._ordered[1]
@@ -251,7 +252,7 @@ class RollingOperation:
             for name, state in states.items()
             for cell in certain_cells(state, states, gone)
         }
-        moves: dict[Name, tuple[Cell, Cell]] = {}
+        moves: dict[Name, Move] = {}
         rosters: dict[Name, set[Name]] = {}
         for vehicle, path in plan.paths.items():
             if len(path) < 2 or path[0] == path[1]:

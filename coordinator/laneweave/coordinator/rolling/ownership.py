@@ -25,7 +25,7 @@ def owned_cells(
     never opens if any member has promised a higher ballot without storing the transfer, or if all
     have promised higher ballots with closed gates. If a member can no longer report the gate,
     because it has a newer transfer or has left the road, only cells in both `before` and `after`
-    are certain; none are while the queried vehicle moves, since it may still be in another cell.
+    are certain; while the vehicle moves, no cells are, since it may still be in another one.
 
     Args:
         state: state of the vehicle, with owned cells.

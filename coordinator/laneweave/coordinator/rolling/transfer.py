@@ -1,8 +1,8 @@
 """One ballot of the rolling operation: vehicles move, and the cells that they need change owners.
 
 The roster comprises the vehicles that move and the owners of the cells in their footprints. Each
-vehicle makes at most one move, all in one slot. A ballot is aborted if it is outbid, a vehicle
-restarts, or time runs out; its vehicles then hold, and the next slot is planned from there.
+vehicle makes at most one move; all moves are in one slot. A ballot is aborted if it is outbid, a
+vehicle restarts, or time runs out; its vehicles then hold, and the next slot is planned from there.
 `TRANSFER_RULES` is the table, shown in docs/PROTOCOL.md.
 """
 
@@ -29,14 +29,12 @@ from laneweave.coordinator.ballots.ballot_round import (
     is_promise,
     restarted,
 )
+from laneweave.coordinator.planning.conflict_kinds import Move
 from laneweave.coordinator.rolling.ownership import States, owned_cells
 from laneweave.protocol.lattice import Cell, PlannedMove, footprint
 from laneweave.protocol.state_machine import RuleBook, Transition
 from laneweave.protocol.vehicle.plans import ownership_problems, plan_problems
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, VehicleState
-
-Steps = Mapping[Name, tuple[Cell, Cell]]
-"""(from, to) of each vehicle that moves."""
 
 
 @define(kw_only=True)
@@ -46,7 +44,8 @@ class CellTransfer(BallotRound):
     rules: RuleBook = field(factory=lambda: TRANSFER_RULES)
     ballot: Ballot
     roster: tuple[Name, ...]
-    moves: Steps
+    moves: Mapping[Name, Move]
+    """Move of each vehicle that moves."""
     t0_s: float
     """Road time at which the moves begin."""
     slot_s: float
@@ -72,7 +71,7 @@ class CellTransfer(BallotRound):
         self.rules.take(self, MEMBERS, f"{vehicle} has left")
 
     def abort(self, reason: str) -> None:
-        """Abort because it is too late, unless the ballot is in force."""
+        """Abort because time has run out, unless the ballot is in force."""
         self.rules.take(self, TOO_LATE, reason)
 
     def _make_plan(self, states: States) -> Plan | str:

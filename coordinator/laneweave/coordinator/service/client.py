@@ -34,7 +34,6 @@ from laneweave.coordinator.service.format import (
     JSON,
     LATE,
     OVERLOADED,
-    Format,
     Refusal,
     format_of,
 )
@@ -50,18 +49,17 @@ from laneweave.protocol.wire.topics import SERVICE, Keys, Party
 DEFAULT_TIMEOUT_S = 10.0
 LONGEST_ATTEMPT_S = 86_400.0
 """Longest timeout of a query, since Zenoh does not accept arbitrarily long ones."""
-
-
 FIRST_PAUSE_S = 0.02
+"""First pause before a request is sent again; it doubles with each attempt."""
 LONGEST_PAUSE_S = 0.5
 ABSENT_S = 3.0
-"""Time without any answer after which the service counts as absent. A killed coordinator
-is detected at once, a hanging one after `network.lease_s`; a restarted router is found in less than
-a second."""
+"""Time without any answer after which the service counts as absent. A killed coordinator is
+detected at once, a hanging one after `network.lease_s`; a restarted router is found within a
+second."""
 
 
 class PlanError(Exception):
-    """A request was not planned; the message gives the reason in one line."""
+    """There is no plan; the message gives the reason in one line."""
 
 
 class RequestRefusedError(PlanError):
@@ -93,7 +91,7 @@ class PlanningFailedError(PlanError):
 class PendingRequest:
     """One plan request over all attempts: decides what to do after each; pure, without a clock.
 
-    A request may be sent repeatedly: coordinators recognise it by its id, and planning it twice is
+    A request may be sent repeatedly: coordinators recognise it by its id, and answering it twice is
     harmless. It is sent again if there is no answer (its coordinator has exited or is disconnected,
     and the others have not noticed yet), or if its coordinator is overloaded.
     """
@@ -101,7 +99,6 @@ class PendingRequest:
     request: PlanRequest
     timeout_s: float
     begun_s: float
-    form: Format = JSON
     patience_s: float = ABSENT_S
     """Time without any answer after which the service counts as absent [s]."""
     _pause_s: float = FIRST_PAUSE_S
@@ -110,7 +107,7 @@ class PendingRequest:
     @property
     def payload(self) -> bytes:
         """Encoded request; equal bytes are assigned to the same coordinator."""
-        return self.form.write(self.request.to_dict())
+        return JSON.write(self.request.to_dict())
 
     def left_s(self, now_s: float) -> float:
         """Return the remaining time [s]."""
@@ -194,7 +191,7 @@ class _Connection:
         """Connect.
 
         Args:
-            access: access to the network, or only the endpoint of its router.
+            access: access to the network, or just the endpoint of its router.
             patience_s: time without any answer after which the service counts as absent.
 
         Raises:
@@ -215,8 +212,7 @@ class _Connection:
         if self._closed:
             raise ServiceUnavailableError("this client is closed")
         left_s = min(max(0.0, pending.left_s(time.monotonic())), LONGEST_ATTEMPT_S)
-        encoding = pending.form.encoding
-        return self._transport.query(self._key, pending.payload, left_s, encoding)
+        return self._transport.query(self._key, pending.payload, left_s, JSON.encoding)
 
     def _close(self) -> None:
         self._closed = True

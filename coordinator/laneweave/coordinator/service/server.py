@@ -2,7 +2,7 @@
 
 Every coordinator receives every request and accepts those that are assigned to it (`rendezvous`),
 so any number of coordinators can share the load without exchanging messages. A request waits for a
-free worker until its deadline at the latest, and is planned in the remaining time. A repeated
+free worker until its deadline at the latest, and is answered in the remaining time. A repeated
 request with the same id gets the same answer.
 """
 
@@ -52,7 +52,7 @@ class ServiceMetrics:
 
     taken_total: int = metric("Requests assigned to this coordinator", default=0)
     left_total: int = metric("Requests assigned to other coordinators", default=0)
-    answered_total: int = metric("Requests planned and answered", default=0)
+    answered_total: int = metric("Requests answered", default=0)
     repeated_total: int = metric(
         "Repeated requests (same id) that got the earlier answer", default=0
     )
@@ -72,7 +72,7 @@ class ServiceMetrics:
 
 @define(eq=False)
 class _Entry:
-    """A request that is waiting or being planned."""
+    """A request that waits for a worker or is being answered."""
 
     request: PlanRequest
     arrived_s: float
@@ -113,8 +113,8 @@ class PlanningService:
         Args:
             name: name of the coordinator.
             settings: limits.
-            workers: number of requests to plan concurrently.
-            plan: answers one request, in a worker process.
+            workers: number of requests to answer concurrently.
+            plan: answers a request, in a worker process.
             solver: solver for requests that name none.
         """
         self._name = name
@@ -125,7 +125,7 @@ class PlanningService:
         self._waiting: deque[_Entry] = deque()
         self._planning: dict[int, _Entry] = {}
         self._pending: dict[str, _Entry] = {}
-        """Waiting and running requests by id; requests without an id are not included."""
+        """Unanswered requests by id; requests without an id are not included."""
         self._answers: dict[str, _CachedAnswer] = {}
         """Cached answers by request id, oldest first."""
         self._cached_bytes = 0
@@ -142,7 +142,7 @@ class PlanningService:
         return min((entry.deadline_s for entry in self._not_begun()), default=None)
 
     def _not_begun(self) -> Iterator[_Entry]:
-        """Yield the requests that no worker has started; workers take jobs in order."""
+        """Yield the requests on which no worker has begun; workers take jobs in order."""
         ahead = islice(self._planning.values(), self._workers, None)
         yield from (entry for entry in ahead if not entry.dropped)
         yield from self._waiting

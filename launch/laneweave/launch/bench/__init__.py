@@ -1,4 +1,4 @@
 """`laneweave bench planner|tracker|runtime`: seeded benchmarks for users.
 
-Imported by `cli.bench_command`. Benchmarks of this repository's own goals are in benchmarks/.
+Imported by `cli` and by benchmarks/, which checks the goals of this repository.
 """

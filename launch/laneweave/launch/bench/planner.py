@@ -1,7 +1,7 @@
 """`laneweave bench planner`: seeded formations of growing size (`request_families`).
 
 Measures single-thread CPU time with compiled code loaded: median and 95th percentile over the
-instances of a size and family. An instance that reaches the deadline counts as taking that long.
+instances of a size and family, including those that reach the deadline.
 """
 
 from __future__ import annotations
@@ -31,14 +31,12 @@ from laneweave.sim_bridge.recording.trips import percentiles_of
 
 @attrs.frozen
 class Family:
-    """A motion mode, conflict kinds, and a generator of formations.
-
-    make: a function from `request_families`, called with a seed.
-    """
+    """A motion mode, conflict kinds, and a generator of requests."""
 
     mode: Mode
     conflicts: tuple[str, ...]
     make: Callable[..., PlanRequest] = formation_request
+    """Function from `request_families`."""
 
     def request(self, seed: int, vehicles: int, deadline_s: float) -> PlanRequest:
         """Return a request.

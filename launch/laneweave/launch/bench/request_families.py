@@ -15,11 +15,11 @@ from collections.abc import Sequence
 
 import attrs
 
-from laneweave.coordinator.planning.conflict_kinds import DEFAULT_KINDS
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.targets import placements
 from laneweave.protocol.lattice import Cell, Mode
+from laneweave.protocol.scenario.fields import DEFAULT_CONFLICTS
 from laneweave.protocol.wire.messages import Name
 
 _SPARE_COLUMNS = (2, 4)
@@ -29,7 +29,6 @@ TRAFFIC_KINDS = ("node", "edge", "special-1", "closing")
 _TRAFFIC_VOLUMES = (1000, 2000)
 """veh/(lane h)"""
 _MIN_HEADWAY_S = 1.0
-_WARM_UP_FORMATIONS = 2
 _TRAFFIC_LANES, _TRAFFIC_COLUMNS = 3, (3, 7)
 
 
@@ -43,7 +42,7 @@ def block_request(
     conflicts: Sequence[str] | None = None,
     deadline_s: float = 4.0,
 ) -> PlanRequest:
-    """Return a formation in a block without spare columns, that is, with few empty cells."""
+    """Return a request for a block without spare columns, that is, with few empty cells."""
     rng = random.Random(seed)  # noqa: S311
     starts = _checkerboard(vehicles, columns, lanes, first_column=0)
     preferred = _preferred_lanes(rng, vehicles, lanes, columns=columns)
@@ -59,7 +58,7 @@ def formation_request(
     conflicts: Sequence[str] | None = None,
     deadline_s: float = 4.0,
 ) -> PlanRequest:
-    """Return a formation with 2 to 4 spare columns in front of it and behind it."""
+    """Return a request for a formation with 2 to 4 spare columns ahead of it and behind it."""
     rng = random.Random(seed)  # noqa: S311
     behind, ahead = rng.randint(*_SPARE_COLUMNS), rng.randint(*_SPARE_COLUMNS)
     occupied = -(-2 * vehicles // lanes)
@@ -77,16 +76,14 @@ def traffic_request(
     conflicts: Sequence[str] = TRAFFIC_KINDS,
     deadline_s: float = 4.0,
 ) -> PlanRequest:
-    """Return a formation that random traffic forms in three lanes.
+    """Return a request for the second formation of random traffic in three lanes.
 
     The volume is between 1000 and 2000 veh/(lane h). A formation has 3 to 7 columns: it ends with
-    its last vehicle, before a column with too many vehicles, or with its seventh column. The second
-    formation of the stream is returned.
+    its last vehicle, before a column with too many vehicles, or with its seventh column.
     """
     rng = random.Random(seed)  # noqa: S311
     stream = _Arrivals(rng, rng.uniform(*_TRAFFIC_VOLUMES), vehicles)
-    for _ in range(_WARM_UP_FORMATIONS - 1):
-        stream.formation()
+    stream.formation()
     columns, entered = stream.formation()
     cells = {Name(f"v{i + 1}"): cell for i, (cell, _) in enumerate(entered)}
     preferred = {Name(f"v{i + 1}"): lane for i, (_, lane) in enumerate(entered)}
@@ -210,5 +207,5 @@ def _request(
         VehicleRequest(f"v{i + 1}", cell, lane=lane)
         for i, (cell, lane) in enumerate(zip(starts, preferred, strict=True))
     ]
-    kinds = DEFAULT_KINDS[mode] if conflicts is None else tuple(conflicts)
+    kinds = DEFAULT_CONFLICTS[mode] if conflicts is None else tuple(conflicts)
     return PlanRequest(grid, mode, kinds, tuple(vehicles), tuple(targets), deadline_s)

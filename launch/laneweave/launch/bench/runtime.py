@@ -1,6 +1,6 @@
 """`laneweave bench runtime`: CPU time and memory of the processes of a run.
 
-Reports medians, and rates within one run, since other load on the machine varies.
+Reports medians, and rates within one run, because other load on the machine varies.
 """
 
 from __future__ import annotations
@@ -43,8 +43,11 @@ class _Window:
     measured_s: float = 0.0
     began: tuple[float, float] | None = None
     ended: tuple[float, float] | None = None
+    """(road time, wall-clock time) at the end, as `began` at the beginning."""
     cpu_s: dict[str, float] = field(factory=dict)
+    """CPU time by role."""
     memory: dict[str, list[tuple[float, float]]] = field(factory=dict)
+    """(PSS, USS) [MiB] of each process, by role."""
 
     def watch(self, view: RoadView, process_ids: Mapping[str, int]) -> None:
         """Take measurements while the window is open."""
@@ -58,7 +61,7 @@ class _Window:
                 self._measure_cpu(process_ids, count=True)
                 self._measure_memory(process_ids)
             elif now_s >= self.measured_s + CPU_PERIOD_S:
-                # The CPU time of an agent is lost when its vehicle leaves: measure often.
+                # Measure often: the CPU time of a process is unknown once it has exited.
                 self.measured_s = now_s
                 self._measure_cpu(process_ids, count=True)
 
@@ -86,9 +89,8 @@ def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int)
         Real-time factor, tick time, CPU and memory per role, over `seconds` of road time.
     """
     base = load_scenario(None)
-    travel_s = base.road.length_m / base.formation.speed_mps
-    volume = vehicles / (travel_s * base.road.lanes) * 3600.0
-    begin_s = travel_s + WARM_UP_S
+    volume = vehicles / (base.free_flow_s * base.road.lanes) * 3600.0
+    begin_s = base.free_flow_s + WARM_UP_S
     scenario = load_scenario(
         None,
         seed=seed,
@@ -117,7 +119,7 @@ def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int)
 
 
 def machine() -> dict[str, Any]:
-    """Return the properties of the machine on which the figures depend."""
+    """Return the properties of this machine that affect the results."""
     return {
         "cores": os.cpu_count(),
         "python": platform.python_version(),

@@ -1,8 +1,8 @@
 """`laneweave bench tracker`: CPU time of tracking per tick.
 
 Ticks are recorded in seeded closed loops with small measurement errors: situations in which another
-vehicle limits the motion, and undisturbed holds and moves. They are then solved again in order,
-several times; the result is each tick's median CPU time on one thread.
+vehicle limits the motion, and undisturbed holds and moves. The ticks are then solved again in
+order, several times; the result is each tick's median CPU time on one thread.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def tracker_table(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def _predicted(episode: Episode, now_s: float, ahead_s: Array) -> Array | None:
-    """Return the predicted rear bumper positions of the vehicle ahead; None: none is seen."""
+    """Return the predicted rear bumper positions of the vehicle ahead; None if none is seen."""
     if episode.rear_m is None or now_s < episode.seen_s:
         return None
     if episode.planned:

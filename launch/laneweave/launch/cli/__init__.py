@@ -1,5 +1,5 @@
 """The command line `laneweave`: one module per group of commands.
 
 Entry point: `main.main`. Commands import their dependencies when they run. Imported by the
-installed script only.
+installed script; `options` also by benchmarks/.
 """

@@ -85,7 +85,7 @@ def load_deployment(config: Path | None, endpoint: str | None, **overrides: obje
     return settings
 
 
-def parse_seeds(text: str, max_seeds: int = MAX_SEEDS) -> range:
+def parse_seeds(text: str) -> range:
     """Return the range of seeds `A:B`, B excluded.
 
     Raises:
@@ -93,8 +93,8 @@ def parse_seeds(text: str, max_seeds: int = MAX_SEEDS) -> range:
     """
     match = re.fullmatch(r"(\d{1,12}):(\d{1,12})", text)
     seeds = range(int(match[1]), int(match[2])) if match else range(0)
-    if not 0 < len(seeds) <= max_seeds:
-        raise BadInputError("--seeds", text, f"A:B with A < B, at most {max_seeds} seeds")
+    if not 0 < len(seeds) <= MAX_SEEDS:
+        raise BadInputError("--seeds", text, f"A:B with A < B, at most {MAX_SEEDS} seeds")
     return seeds
 
 

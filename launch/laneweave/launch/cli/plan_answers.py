@@ -36,7 +36,7 @@ ANSWER_MARGIN_S = 8.0
 def access_for(
     endpoint: str | None, realm: str | None, config: Path | None, client: str | None
 ) -> Access | None:
-    """Return how to connect to a coordinator; None: plan in this process.
+    """Return how to connect to a coordinator, or None to plan in this process.
 
     Args:
         endpoint: endpoint of the router; overrides the configured one.
@@ -73,7 +73,7 @@ def answer_request(
     scenario: Scenario | None = None,
     wait_s: float = 0.0,
 ) -> None:
-    """Read a request; make, print and draw its plan. With `access`, a coordinator makes it.
+    """Read a request; make, print and draw its plan. With `access`, a coordinator makes the plan.
 
     `drawing` shows the relative coordinate system, `road_drawing` the road of `scenario`. `wait_s`
     is the time to wait for a coordinator. `deadline_s` and `solver` override the request's values.
@@ -156,17 +156,12 @@ def _checked_road_drawer(out: Path, scenario: Scenario, mode: int) -> _Drawer:
     try:
         from laneweave.launch.drawing import plan as plan_drawing
         from laneweave.launch.drawing import plan_on_road as road_drawing
-        from laneweave.launch.drawing.plan_on_road import scenario_in_mode
     except ModuleNotFoundError as error:
         allowed = f"only with laneweave[agent] and laneweave[sim] ({error.name} is not installed)"
         raise BadInputError("--draw-road", str(out), allowed) from error
     plan_drawing.check_drawing(out, "--draw-road")
-    scenario = scenario_in_mode(scenario, mode)
-
-    def draw(request: PlanRequest, response: PlanResponse) -> None:
-        road_drawing.draw_road(request, response, scenario, out)
-
-    return draw, out
+    scenario = road_drawing.scenario_in_mode(scenario, mode)
+    return lambda request, response: road_drawing.draw_road(request, response, scenario, out), out
 
 
 def _table(request: PlanRequest, response: PlanResponse) -> str:

@@ -26,7 +26,8 @@ def plan(
         float | None, typer.Option("--deadline", help="In seconds; overrides the request's.")
     ] = None,
     connect: Annotated[
-        str | None, typer.Option("--connect", metavar="ENDPOINT", help="Ask a coordinator there.")
+        str | None,
+        typer.Option("--connect", metavar="ENDPOINT", help="Ask a coordinator at this router."),
     ] = None,
     realm: Annotated[
         str | None, typer.Option("--realm", help="Realm of the coordinator; default: default.")
@@ -64,18 +65,18 @@ def plan(
         typer.Option(
             "--draw-road",
             metavar="FILE",
-            help="Draw vehicles that drive the plan, as FILE.png or FILE.gif; road: --config.",
+            help="Draw vehicles driving the plan on the road of --config, as FILE.png or FILE.gif.",
         ),
     ] = None,
     explained: Annotated[
         bool,
         typer.Option(
             "--explain",
-            help="Print the steps of TAPPA: assignments and constraint trees (also with --draw).",
+            help="Print the steps of TAPPA (assignments, constraint trees); --draw draws them.",
         ),
     ] = False,
 ) -> None:
-    """Answer one plan request in this process or by a running coordinator."""
+    """Answer one plan request, in this process or with a running coordinator."""
     from laneweave.launch.cli.plan_answers import access_for, answer_request, explain_request
 
     settings = load_scenario(config)

@@ -1,4 +1,4 @@
-"""Commands, each of which runs one role of a deployment.
+"""Commands that run a role of a deployment, check its router, or show its road.
 
 A command imports its dependencies when it runs: an agent starts without SUMO, a coordinator without
 OSQP.
@@ -62,7 +62,7 @@ def router(
 
 
 def ping(config: Config = None, endpoint: Endpoint = None) -> None:
-    """Check that the router of a deployment accepts a session (a health check)."""
+    """Check the health of a router: it must accept a session."""
     from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 
     access = access_of(load_deployment(config, endpoint), "observer.ping")
@@ -105,7 +105,9 @@ def agent(
     ] = None,
     fleet: Annotated[
         str | None,
-        typer.Option("--fleet", metavar="NAME", help="Drive this fleet of security.fleets."),
+        typer.Option(
+            "--fleet", metavar="NAME", help="Drive the vehicles of this fleet in security.fleets."
+        ),
     ] = None,
     metrics: Metrics = None,
     log_format: Log = LogFormat.text,

@@ -74,7 +74,7 @@ def run(
     ] = None,
     transport: Annotated[
         Transport | None,
-        typer.Option("--transport", help="Default: zenoh; simulated: virtual time, repeatable."),
+        typer.Option("--transport", help="Default: zenoh; simulated: virtual time, reproducible."),
     ] = None,
     faults: Annotated[
         str | None,
@@ -155,7 +155,7 @@ def _run_formations(
 
             tune_garbage_collector()
             return SimulatedRun(settings, folder, faults=specification, show_progress=show).run()
-        return LocalRun(settings, folder, FORMATION, specification, show, pace).run()
+        return LocalRun(settings, folder, specification, show, pace).run()
 
 
 def _run_reference(settings: Scenario, out: Path | None, method: Method, *, show: bool) -> Outcome:

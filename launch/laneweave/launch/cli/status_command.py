@@ -81,7 +81,7 @@ def _role_health(role: Role | None, name: str | None, shard: str | None) -> Role
     if shard is not None:
         if role is not Role.agent or name is not None:
             raise BadInputError("--shard", shard, "only with --role agent and without --name")
-        return RoleHealth(AGENT, shard, parse_shard(shard, "--shard").contains, is_shard=True)
+        return RoleHealth(AGENT, shard, parse_shard(shard, "--shard").contains)
     if name is not None and (role in (None, Role.bridge) or not NAME_PATTERN.fullmatch(name)):
         raise BadInputError("--name", name, f"only with --role coordinator or agent: {NAME_RULE}")
     if name is None and role in (Role.coordinator, Role.agent):
@@ -132,7 +132,8 @@ def listen(settings: Scenario, seconds: float, health: RoleHealth | None = None)
     found = status_of(view, began_s, now_s, network.election_s, network.endpoint, network.realm)
     if health is None:
         return found
-    return evolve(found, healthy=problem() is None, problem=problem())
+    reason = problem()
+    return evolve(found, healthy=reason is None, problem=reason)
 
 
 def show(found: Status, console: Console) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -19,6 +18,7 @@ from laneweave.launch.cli.options import (
     check_jobs,
     parse_seeds,
 )
+from laneweave.launch.run.run_folder import timestamped_folder
 from laneweave.launch.run_methods import METHODS, KeepTrajectories
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
@@ -81,8 +81,7 @@ def sweep(
         from laneweave.launch.sweep.dask_workers import run_on_dask
 
         run = partial(run_on_dask, address=dask)
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    with SweepFolder(out or Path("runs") / f"sweep-{stamp}") as folder:
+    with SweepFolder(out or timestamped_folder("sweep")) as folder:
         folder.check_settings(base)
         failed = run_sweep(points, folder, run, show=not no_progress)
         print_results(points, folder, Console())
@@ -126,7 +125,7 @@ def report(
         if len(folders) > 1 or is_sweep(folders[0]):
             if len(folders) == 1:
                 out = folders[0]
-            place = out or Path("runs") / f"report-{time.strftime('%Y%m%d-%H%M%S')}"
+            place = out or timestamped_folder("report")
             title = "laneweave: " + ", ".join(folder.resolve().name for folder in folders)
             page = report_comparison(Comparison.of(runs), place, title, formation=formation)
             Console().print(f"{page}: written", highlight=False, soft_wrap=True)

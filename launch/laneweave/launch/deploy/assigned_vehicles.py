@@ -46,7 +46,8 @@ def assigned_vehicles(
                 list(vehicles),
                 "one vehicle, or several with --fleet, because security.mode is mtls",
             )
-        return AssignedVehicles(_vehicle(vehicles[0]), tuple(vehicles), None)
+        identity = Identity(Party.VEHICLE, vehicles[0])
+        return AssignedVehicles(identity.common_name, tuple(vehicles), None)
     taken = parse_shard(shard or ALL_VEHICLES, "--shard")
     return AssignedVehicles(_fleet(_fleet_of_shard(security, taken)), (), taken)
 
@@ -84,10 +85,6 @@ def _fleet_of_shard(security: Security, shard: Shard) -> str:
 
 def _shard(members: FleetMembers) -> Shard | None:
     return parse_shard(members, "security.fleets") if isinstance(members, str) else None
-
-
-def _vehicle(name: str) -> str:
-    return Identity(Party.VEHICLE, name).common_name
 
 
 def _fleet(name: str) -> str:

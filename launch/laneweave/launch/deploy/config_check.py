@@ -37,7 +37,7 @@ class Report:
 def check_deployment(
     scenario: Scenario, identity: Identity | None, environment: Mapping[str, str] = os.environ
 ) -> Report:
-    """Check what loading a configuration does not; with `identity`, also its certificate files."""
+    """Check what loading does not check; with `identity`, also this role's certificate files."""
     report = Report()
     _check_network(scenario, report)
     _check_moves(scenario, report)
@@ -60,7 +60,7 @@ def _check_network(scenario: Scenario, report: Report) -> None:
         report.warnings.append(
             f"network.endpoint: {network.endpoint} is not reachable by other roles"
         )
-    if scenario.security.mode == "off" and _leaves_the_host(scenario):
+    if scenario.security.mode == "off" and _listens_to_other_hosts(scenario):
         report.warnings.append(
             "security.mode: off, so every process that reaches the router has all rights"
         )
@@ -85,7 +85,7 @@ def _check_moves(scenario: Scenario, report: Report) -> None:
         report.problems.append(str(error))
 
 
-def _leaves_the_host(scenario: Scenario) -> bool:
+def _listens_to_other_hosts(scenario: Scenario) -> bool:
     hosts = [host_of(endpoint) for endpoint in scenario.network.listens_at]
     return any(host and host not in ("127.0.0.1", "::1", "localhost") for host in hosts)
 

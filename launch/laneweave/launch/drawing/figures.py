@@ -1,4 +1,4 @@
-"""Create figures, write text into them, and save them.
+"""Helpers that create figures, write text into them, and save them.
 
 matplotlib is imported when the first figure is drawn, so that the command line starts fast.
 """

@@ -84,10 +84,10 @@ def draw_plan(request: PlanRequest, response: PlanResponse, out: Path) -> None:
     (write_gif if out.suffix.lower() == ".gif" else write_png)(request, response, out)
 
 
-def write_png(request: PlanRequest, response: PlanResponse, out: Path, dpi: int = DPI) -> None:
+def write_png(request: PlanRequest, response: PlanResponse, out: Path) -> None:
     """Write a figure with one panel per time point."""
     figure = plan_figure(request, response)
-    save(figure, out, _limited_dpi(figure, dpi, _MAX_PIXELS))
+    save(figure, out, _limited_dpi(figure, DPI, _MAX_PIXELS))
 
 
 def write_gif(request: PlanRequest, response: PlanResponse, out: Path, dpi: int = 100) -> None:
@@ -299,7 +299,7 @@ def _rectangle(
 
 
 def short_name(name: str) -> str:
-    """Shorten a long name to its end, which usually differs most."""
+    """Shorten a long name to its end, where names usually differ."""
     plain = "".join(char if char.isprintable() else "?" for char in name)
     return plain if len(plain) <= _MAX_LABEL_LENGTH else "…" + plain[1 - _MAX_LABEL_LENGTH :]
 

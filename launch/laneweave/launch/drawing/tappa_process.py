@@ -46,7 +46,7 @@ Layer = tuple[list[ExplainedNode], int]
 
 
 def draw_explanation(explanation: Explanation, out: Path) -> None:
-    """Write the figure to a file."""
+    """Draw an explanation and write the figure to a file."""
     save(explanation_figure(explanation), out, DPI)
 
 
@@ -127,7 +127,7 @@ def _draw_circle(axes: Axes, centre: tuple[float, float], text: str, mfc: str) -
 
 
 def _layers(nodes: Sequence[ExplainedNode]) -> list[Layer]:
-    """Return the first layers of a tree; solutions and their ancestors are always included."""
+    """Return the first layers of a tree; in each, the solution or its ancestor is always shown."""
     parents = {node.number: node.parent for node in nodes}
     ancestor = next((node.number for node in nodes if node.status == "solution"), 0)
     kept = set()
@@ -197,7 +197,7 @@ def _draw_tree(
 
 
 def _chosen_maps(nodes: Sequence[ExplainedNode], layers: Sequence[Layer]) -> list[ExplainedNode]:
-    """Return the root, the solution, and one more node that is drawn."""
+    """Return up to `MAX_MAPS` nodes: the root, the solution, then other drawn nodes."""
     drawn = [node for layer, _ in layers for node in layer]
     solutions = [node for node in nodes if node.status == "solution"]
     others = [node for node in drawn[1:] if node not in solutions]

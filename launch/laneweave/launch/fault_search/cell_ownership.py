@@ -49,7 +49,7 @@ class CellOwnership:
         self._bodies: dict[str, Cells] = {}
         """Cells occupied by each body."""
 
-    def show(
+    def update(
         self,
         t_s: float,
         vehicle: str,
@@ -57,7 +57,7 @@ class CellOwnership:
         transfer: PendingTransfer | None,
         body: Cells | None = None,
     ) -> None:
-        """Update a vehicle's owned cells and newest transfer, and its body cells unless None."""
+        """Update a vehicle's owned cells and newest transfer and, if given, its body's cells."""
         holding = Holding(frozenset(cells), transfer)
         if body is not None:
             self._bodies[vehicle] = body

@@ -117,7 +117,7 @@ class Checker:
     ) -> None:
         """Record a motion controller's owned cells and newest transfer."""
         if self._ownership is not None:
-            self._ownership.show(t_s, vehicle, owned, transfer)
+            self._ownership.update(t_s, vehicle, owned, transfer)
 
     def leave(self, t_s: float, vehicle: str) -> None:
         """Record that a vehicle has left the road."""

@@ -16,7 +16,7 @@ Cells = frozenset[tuple[int, int]]
 
 DONE_ALONG_M = 1.0
 DONE_ACROSS_M = 0.5
-"""Remaining distances at which the checker considers a motion complete: twice the agents'."""
+"""Remaining distances at which the checker considers a motion complete: twice those of agents."""
 
 
 @frozen
@@ -103,7 +103,7 @@ class Body:
 
 
 def overlap_between(mine: Body, other: Body, from_s: float, to_s: float) -> float | None:
-    """Return the first time at which two bodies overlap; None: no overlap.
+    """Return the first time at which two bodies overlap, or None.
 
     No motion may begin between `from_s` and `to_s`, but motions may end. The result is exact:
     while rectangles move in straight lines, they overlap in x during one interval, and in y during

@@ -242,7 +242,6 @@ class FaultRun:
         """Start a process unless it is running."""
         if name in self.network:
             return
-        vehicle = Name(name.removesuffix(TWIN))
         scenario, (vehicle_rules, leader_rules) = self.setup.scenario, self._rules
         core: Core
         if name in COORDINATORS:
@@ -251,6 +250,7 @@ class FaultRun:
                 Name(name), incarnation, scenario, leader_rules, self._make_planner
             )
         else:
+            vehicle = Name(name.removesuffix(TWIN))
             agent = AgentCore(
                 vehicle, self._incarnations.__next__, scenario, LightDriver, vehicle_rules
             )
@@ -280,7 +280,7 @@ class FaultRun:
         return plan
 
     def old_payload(self, rng: random.Random) -> tuple[str, bytes] | None:
-        """Return the key and payload of a random old message; None: there are none."""
+        """Return the key and payload of a random old message, or None."""
         if not self._old_messages:
             return None
         old = rng.choice(self._old_messages)
@@ -337,16 +337,16 @@ class FaultRun:
     # --- outcome ------------------------------------------------------------------------------
 
     def _is_over(self) -> bool:
-        if self.profile.rolling:
-            self._not_arrived()
-            return bool(self.checker.violations)
-        return bool(self.checker.violations) or (self.faults.healed and not self._not_arrived())
+        # In the rolling operation, this call also records which vehicles have moved.
+        not_arrived = self._not_arrived()
+        if self.checker.violations:
+            return True
+        return self.faults.healed and not not_arrived and not self.profile.rolling
 
     @property
     def _patience_s(self) -> float:
-        scenario = self.setup.scenario
-        if scenario.formation.rolling:
-            return HEALTHY_SLOTS * scenario.cycles_s[0]
+        if self.profile.rolling:
+            return HEALTHY_SLOTS * self.setup.scenario.cycles_s[0]
         return PATIENCE_S
 
     def _not_arrived(self) -> list[Name]:
@@ -370,8 +370,7 @@ class FaultRun:
         A vehicle that has moved need not be in its preferred lane, which may be full.
         """
         cell = self.road.vehicles[name].controller.hold_cell
-        moved = self._first_cells.setdefault(name, cell) != cell
-        if moved:
+        if self._first_cells.setdefault(name, cell) != cell:
             self._moved.add(name)
         return name not in self._moved and self._proposed[name] >= MAX_FUTILE_PLANS
 

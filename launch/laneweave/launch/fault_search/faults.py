@@ -42,7 +42,7 @@ CLOCK_DRIFT = 0.05
 
 @frozen
 class FaultMix:
-    """Permanent faults of a run, and the number of its fault events."""
+    """Faults throughout the fault phase of a run, and the number of its fault events."""
 
     conditions: Conditions
     command_loss: float
@@ -72,7 +72,7 @@ class FaultMix:
         )
 
     def kinds(self) -> Counter[str]:
-        """Return the kinds of permanent faults, each with count 1."""
+        """Return the kinds of faults that are present, each with count 1."""
         conditions = self.conditions
         present = {
             "loss": conditions.loss,
@@ -111,7 +111,7 @@ class Processes(Protocol):
         """Start a second process for the vehicle of an agent, and return its name."""
 
     def old_payload(self, rng: random.Random) -> tuple[str, bytes] | None:
-        """Return the key and payload of a random old message; None: there are none."""
+        """Return the key and payload of a random old message, or None."""
 
 
 class RandomFaults:

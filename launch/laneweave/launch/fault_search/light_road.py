@@ -1,4 +1,4 @@
-"""The simplified road: a bridge without SUMO; does not wait for agents.
+"""The simplified road: a bridge without SUMO that does not wait for agents.
 
 Every vehicle gets a SENSE in each tick, COMMANDs are executed on arrival, and bodies move in
 straight lines to the hold cells of their motion controllers. The real `MotionController`,

@@ -37,7 +37,7 @@ class Profile:
     """Share of runs with formations of different lengths."""
     max_joined: Span = (1, 2)
     crowding: float = 0.5
-    """Share of runs in which more of a block's vehicles may prefer a lane than fit in it."""
+    """Share of runs in which more vehicles may prefer a lane than their block has cells there."""
     leavers: float = 0.15
     """Share of vehicles that leave the road during the fault phase."""
     loss: tuple[float, ...] = (0.0, 0.0, 0.1, 0.3, 0.5, 0.8)

@@ -101,7 +101,7 @@ def _batches(
         return
     # A fork would copy locks held by the thread of the progress bar.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(batches)), context, _quiet) as pool:
+    with ProcessPoolExecutor(min(jobs, len(batches)), context, _prepare_worker) as pool:
         waiting = iter(batches)
         running: set[Future[list[SeedResult]]] = set()
         try:
@@ -123,8 +123,8 @@ def _batches(
             raise
 
 
-def _quiet() -> None:
-    """Prepare a worker: ignore Ctrl-C, log critical errors only, and exit with the parent."""
+def _prepare_worker() -> None:
+    """Ignore Ctrl-C, log critical errors only, and exit with the parent."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with_supervisor()
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -48,7 +48,7 @@ MOVE_SHARE = 0.8
 SLOTS_ON_ROAD = 45
 """Length of the road, as the number of slots that a column takes to pass it."""
 MAX_BEHIND = 3
-"""Number of empty cells that the last vehicle in a lane owns behind it."""
+"""Number of empty cells that the last vehicle in a lane owns behind itself."""
 STREAM_PLANNER = 0.05
 """Share of runs with the stream planner, which takes ten times as long as the rest of a run."""
 
@@ -102,7 +102,7 @@ class Setup:
     """Formations, foremost first."""
     visits: tuple[Visit, ...]
     crowded: bool
-    """Whether more vehicles may prefer a lane than their block has cells in it."""
+    """Whether more vehicles may prefer a lane than their block has cells in that lane."""
     grants: tuple[Grant, ...] = ()
     """Assignments of empty cells to owners (rolling operation)."""
     stretch_columns: int = 0
@@ -222,7 +222,7 @@ def _draw_visits(
     mix: FaultMix,
     rng: random.Random,
 ) -> Iterator[Visit]:
-    """Draw the vehicles: at least one per formation, in at most half of its cells."""
+    """Draw the vehicles: in each formation at least one, and at most one for every two cells."""
     lattice = scenario.lattice
     cells = [
         [(column, lane) for column in one.columns(lattice) for lane in range(lattice.lanes)]
@@ -273,8 +273,8 @@ def _grants(
     lattice, spread_s = scenario.lattice, scenario.formation.entry_spread_s
     by_cell = {visit.cell: visit for visit in visits}
     for lane in range(lattice.lanes):
-        on_lane = [visit for visit in visits if visit.cell[1] == lane]
-        owner = max(on_lane or visits, key=lambda visit: visit.cell)
+        in_lane = [visit for visit in visits if visit.cell[1] == lane]
+        owner = max(in_lane or visits, key=lambda visit: visit.cell)
         for column in range(first, first - columns - MAX_BEHIND, -1):
             visit = by_cell.get((column, lane))
             if visit is not None:

@@ -26,18 +26,20 @@ class Failover:
 
     lease_s: float
     recovery_s: list[float] = field(factory=list)
-    """Time to the next leader, for each leader killed, or paused for longer than its lease."""
+    """Time to the next leader, for each leader killed, or paused for longer than the lease."""
     plan_recovery_s: list[float] = field(factory=list)
     """Time to the next plan in force, for each leader killed or paused."""
     _lost: tuple[str | None, int] | None = None
     """Name and incarnation of the failed leader; None: no failover in progress."""
     _lost_s: float = 0.0
     _awake_s: float = math.inf
+    """Time at which the failed leader resumes; infinite: it was killed."""
     _target: str | None = None
     """Target of the newest fault until the next plan; then None."""
     _target_s: float = 0.0
     _killed: bool = False
     _led_again: bool = False
+    """Whether another process has led since the newest fault."""
     _road_s: list[float] = field(factory=list)
     _seen_s: list[float] = field(factory=list)
     """Time at which each road time of `_road_s` was first observed."""
@@ -55,7 +57,7 @@ class Failover:
         view.leader = None
 
     def update(self, view: RoadView, now_s: float) -> None:
-        """Update the leader and the recovery times from the observed state."""
+        """Update the recovery times from the observed state, and clear a failed leader in it."""
         if not self._road_s or view.t_s > self._road_s[-1]:
             self._road_s.append(view.t_s)
             self._seen_s.append(now_s)

@@ -7,7 +7,7 @@ may implement partitions instead.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from typing import Any, Protocol
 
 import structlog
@@ -44,7 +44,7 @@ class RoleControl(Protocol):
         """Names of all coordinators, running or not."""
 
     def agent_of(self, vehicle: str) -> str | None:
-        """Return the role that drives a vehicle; None: not started."""
+        """Return the role that drives a vehicle, or None before it is started."""
 
     def kill(self, name: str) -> None:
         """Kill a role immediately, without clean-up."""
@@ -173,25 +173,23 @@ class FaultInjection:
         running = [name for name in self.roles.running if name not in self._paused]
         target = event.fault.target
         if target in (COORDINATOR, AGENT):
-            candidates = sorted(self._candidates(event, view, running))
+            candidates = sorted(
+                self._names_of(target, view)
+                & set(running) - self._targets.get(event.fault_name, set())
+            )
             return event.draw.choice(candidates) if candidates else None
         name = view.leader if target == LEADER else target
         if name not in running:
             name = self.roles.agent_of(target)
         return name if name in running else None
 
-    def _candidates(
-        self, event: FaultEvent, view: RoadView, running: Collection[str]
-    ) -> Iterator[str]:
-        if event.fault.target == COORDINATOR:
-            yield from (name for name in self.roles.coordinators if name in running)
-            return
-        earlier = self._targets.get(event.fault_name, set())
+    def _names_of(self, target: str, view: RoadView) -> set[str]:
+        """Return the names of all coordinators, or of the agents of vehicles on the road."""
+        if target == COORDINATOR:
+            return set(self.roles.coordinators)
         entries = view.census.on_road if view.census is not None else ()
-        agents = dict.fromkeys(self.roles.agent_of(entry.vehicle) for entry in entries)
-        for name in agents:
-            if name is not None and name in running and name not in earlier:
-                yield name
+        agents = {self.roles.agent_of(entry.vehicle) for entry in entries}
+        return {name for name in agents if name is not None}
 
     def _apply(
         self, event: FaultEvent, name: str, road_s: float, now_s: float, view: RoadView

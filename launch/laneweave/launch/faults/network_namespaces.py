@@ -28,9 +28,12 @@ from attrs import define, field
 from laneweave.launch.faults.specification import NAMESPACES, FaultSpec
 from laneweave.protocol.errors import BadInputError
 
-PORT = 7447
 HUB_ADDRESS = "10.77.255.1"
-"""Address of the hub on every link, so that all groups can share one configuration."""
+"""Address of the hub for all groups, so that they can share one configuration."""
+LISTEN = "tcp/0.0.0.0:7447"
+"""Zenoh endpoint on which the router listens for the groups."""
+ENDPOINT = f"tcp/{HUB_ADDRESS}:7447"
+"""Zenoh endpoint of the router for all groups."""
 ANSWER_S = 10.0
 """Maximum time to create a namespace or to run a command in it."""
 HUB = "hub"
@@ -119,14 +122,14 @@ class _Namespace:
         try:
             self.connection.send([program, *words])
         except OSError as error:
-            raise NamespacesUnavailableError("a namespace has ended") from error
+            raise NamespacesUnavailableError("the process of a namespace has exited") from error
         self.check_answer()
 
     def check_answer(self) -> None:
         try:
             answer = self.connection.recv() if self.connection.poll(ANSWER_S) else "no answer"
         except (EOFError, OSError) as error:
-            raise NamespacesUnavailableError("a namespace has ended") from error
+            raise NamespacesUnavailableError("the process of a namespace has exited") from error
         if answer:
             raise NamespacesUnavailableError(answer)
 
@@ -182,29 +185,17 @@ class GroupNetwork:
         """Return the id of a process in the namespace of a group or the hub."""
         return self._namespaces[name].process_id
 
-    @property
-    def listen(self) -> str:
-        """Zenoh endpoint on which the router listens for the groups."""
-        return f"tcp/0.0.0.0:{PORT}"
-
-    @property
-    def endpoint(self) -> str:
-        """Zenoh endpoint of the router for all groups."""
-        return f"tcp/{HUB_ADDRESS}:{PORT}"
-
-    def cut_off(self, groups: Collection[str]) -> set[str]:
-        """Take the links of these groups down, bring all others up; return the changed groups.
+    def cut_off(self, groups: Collection[str]) -> None:
+        """Take the links of these groups down, and bring all others up.
 
         Raises:
             NamespacesUnavailableError: a command failed.
         """
         wanted = set(groups)
-        changed = wanted ^ self._cut
-        for group in sorted(changed):
+        for group in sorted(wanted ^ self._cut):
             state = "down" if group in wanted else "up"
             self._namespaces[HUB].ip("link", "set", "dev", group, state)
         self._cut = wanted
-        return changed
 
     def close(self) -> None:
         """Release the namespaces; call this after the roles in them have exited."""

@@ -15,7 +15,7 @@ from attrs import define, field, frozen
 from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule
 from laneweave.protocol.runtime.node import Core
 
-WORD = 8
+VALUE_BYTES = 8
 
 
 @define
@@ -32,44 +32,42 @@ class SharedBoard:
     def __init__(self, path: Path) -> None:
         """Create the file with road time 0."""
         self.path = path
-        path.write_bytes(bytes(WORD))
+        path.write_bytes(bytes(VALUE_BYTES))
 
-    def new_word(self) -> int:
+    def new_counter(self) -> int:
         """Create a counter for a process, and return its index."""
         with self.path.open("ab") as file:
-            index = file.tell() // WORD
-            file.write(bytes(WORD))
+            index = file.tell() // VALUE_BYTES
+            file.write(bytes(VALUE_BYTES))
         return index
 
     @property
     def road_s(self) -> float:
         """Road time."""
-        found: float = struct.unpack("=d", self.path.read_bytes()[:WORD])[0]
+        found: float = struct.unpack("=d", self.path.read_bytes()[:VALUE_BYTES])[0]
         return found
 
     @property
     def dropped(self) -> int:
         """Number of messages dropped by faults in all current and past processes."""
-        content = self.path.read_bytes()[WORD:]
-        return sum(struct.unpack(f"={len(content) // WORD}Q", content))
+        content = self.path.read_bytes()[VALUE_BYTES:]
+        return sum(struct.unpack(f"={len(content) // VALUE_BYTES}Q", content))
 
 
 @define
-class BoardWord:
-    """`FaultBoard` of a role process: its counter in the shared file."""
+class ProcessBoard:
+    """`FaultBoard` of a role process, mapped to the shared file."""
 
     path: Path
     index: int
     """Index of this process's counter."""
-    _memory: mmap.mmap = field(init=False)
     _times: memoryview[float] = field(init=False)
     _counters: memoryview[int] = field(init=False)
 
     def __attrs_post_init__(self) -> None:
         """Map the file until the process ends."""
         with self.path.open("r+b") as file:
-            self._memory = mmap.mmap(file.fileno(), 0)
-        whole = memoryview(self._memory)
+            whole = memoryview(mmap.mmap(file.fileno(), 0))
         self._times, self._counters = whole.cast("d"), whole.cast("Q")
 
     @property
@@ -98,12 +96,12 @@ class MessageFaults:
     rules: tuple[MessageRule, ...]
     board: Path
     """File of the run's `SharedBoard`."""
-    word: int
+    counter: int
     """Index of this process's counter."""
     receiver: str
     seed: str
 
     def wrap(self, core: Core) -> Core:
         """Return a core that applies these message faults to `core`."""
-        board = BoardWord(self.board, self.word)
+        board = ProcessBoard(self.board, self.counter)
         return FaultyCore(core, self.rules, board, receiver=self.receiver, seed=self.seed)

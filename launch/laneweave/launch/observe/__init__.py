@@ -2,5 +2,5 @@
 
 Entry points: `observer.Observer` with its `road_view.RoadView`, `status.status_of`,
 `metrics_server.serve_metrics`. An observer publishes nothing. Imported by `faults`, `run`, `watch`,
-`report`, `bench` and `cli`.
+`bench` and `cli`.
 """

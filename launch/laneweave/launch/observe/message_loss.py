@@ -1,9 +1,9 @@
 """Message loss measured by an observer: clocks and states that did not arrive.
 
-In each tick of road time the bridge publishes its clock, and every vehicle on the road its state; a
-census lists the vehicles on the road, so the expected messages of a tick are known. The states of a
-vehicle are expected from its first received state, or from `CONNECT_S` after its entry if that is
-earlier, because its agent may connect late.
+In each tick, the bridge publishes its clock, and every vehicle on the road its state; a census
+lists the vehicles on the road, so the expected messages of a tick are known. The states of a
+vehicle are expected from the first one received, but no later than `CONNECT_S` after its entry,
+because its agent may connect late.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class LossMeter:
             self._first_tick.setdefault(state.vehicle, tick)
 
     def on_census(self, census: Census) -> None:
-        """Process a census newer than all previous ones."""
+        """Process a census that is not older than any previous one."""
         if not self.window_ticks:
             return
         self._censuses.append(census)

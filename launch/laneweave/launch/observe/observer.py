@@ -1,4 +1,4 @@
-"""Observer of a deployment; it publishes nothing."""
+"""The observer of a deployment, which publishes nothing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TOPICS = (CLOCK, CENSUS, HEARTBEAT, EVENT)
 
 @define
 class Observer:
-    """Reader of transport deliveries, which can update a view."""
+    """Receiver of messages and tokens: `receive` yields them, `wait` updates the view."""
 
     keys: Keys
     inbox: queue.SimpleQueue[Delivery] = field(factory=queue.SimpleQueue)

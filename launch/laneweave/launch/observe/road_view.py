@@ -58,6 +58,10 @@ class Coordinator:
     token: bool
     """Whether the process has a liveliness token."""
 
+    def is_active(self, election_s: float) -> bool:
+        """Return whether a heartbeat arrived less than `election_s` ago."""
+        return self.heard_s_ago is not None and self.heard_s_ago < election_s
+
 
 def claims_of(coordinators: Sequence[Coordinator]) -> list[Coordinator]:
     """Return the coordinators that claim to lead; the first one leads.
@@ -162,9 +166,9 @@ class RoadView:
             election_s: time without a heartbeat after which a coordinator no longer leads.
         """
         self.heartbeats = {
-            process: (heartbeat, heard_s)
-            for process, (heartbeat, heard_s) in self.heartbeats.items()
-            if now_s - heard_s <= REMEMBERED_S
+            process: (heartbeat, received_s)
+            for process, (heartbeat, received_s) in self.heartbeats.items()
+            if now_s - received_s <= REMEMBERED_S
         }
         found = []
         for process in sorted(self.coordinator_tokens | (self.heartbeats.keys() - self.departed)):
@@ -173,15 +177,15 @@ class RoadView:
             if process not in self.heartbeats:
                 found.append(Coordinator(name, incarnation, False, None, None, None, token))
                 continue
-            heartbeat, heard_s = self.heartbeats[process]
+            heartbeat, received_s = self.heartbeats[process]
             found.append(
                 Coordinator(
                     name,
                     incarnation,
-                    leading=heartbeat.leading and now_s - heard_s < election_s,
+                    leading=heartbeat.leading and now_s - received_s < election_s,
                     term=heartbeat.term,
                     plans_in_force=heartbeat.formations,
-                    heard_s_ago=round(now_s - heard_s, 3),
+                    heard_s_ago=round(now_s - received_s, 3),
                     token=token,
                 )
             )

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import attrs
-from attrs import field, frozen
+from attrs import frozen
 
 from laneweave.launch.observe.road_view import Coordinator, RoadView, claims_of
 from laneweave.protocol.wire.topics import (
@@ -131,7 +131,7 @@ def status_of(
     candidates = [
         one
         for one in view.coordinators(now_s, election_s)
-        if one.token or (one.heard_s_ago is not None and one.heard_s_ago < election_s)
+        if one.token or one.is_active(election_s)
     ]
     claims = claims_of(candidates)
     leader = claims[0] if claims else None
@@ -166,9 +166,8 @@ class RoleHealth:
     """`COORDINATOR`, `BRIDGE` or `AGENT`."""
     name: str = ""
     """Name of the coordinator, the vehicle or the shard."""
-    takes: Callable[[str], bool] = field(default=lambda _: False)
-    """Returns whether a vehicle belongs to the shard."""
-    is_shard: bool = False
+    in_shard: Callable[[str], bool] | None = None
+    """Returns whether a vehicle belongs to the shard; None: not the check of a shard."""
 
     def problem(
         self, view: RoadView, began_s: float, now_s: float, election_s: float
@@ -182,13 +181,13 @@ class RoleHealth:
             if not view.bridge_tokens:
                 return "no bridge found"
             return _road_problem(view, now_s - began_s)
-        if self.is_shard:
-            return self._shard_problem(view)
+        if self.in_shard is not None:
+            return self._shard_problem(view, self.in_shard)
         return None if self.name in view.agent_tokens else f"no agent of {self.name} found"
 
     def may_end_early(self, view: RoadView) -> bool:
         """Return whether the observed state suffices to conclude that there is no problem."""
-        return not self.is_shard or view.census is not None
+        return self.in_shard is None or view.census is not None
 
     def _coordinator_problem(self, view: RoadView, now_s: float, election_s: float) -> str | None:
         found = [
@@ -198,16 +197,16 @@ class RoleHealth:
         ]
         if not found:
             return f"no coordinator {self.name} found"
-        if any(one.heard_s_ago is not None and one.heard_s_ago < election_s for one in found):
+        if any(one.is_active(election_s) for one in found):
             return None
         return f"no heartbeat of coordinator {self.name} for {election_s:g} s"
 
-    def _shard_problem(self, view: RoadView) -> str | None:
+    def _shard_problem(self, view: RoadView, in_shard: Callable[[str], bool]) -> str | None:
         """Return the problem of a shard; a shard without vehicles on the road is healthy."""
         unattended = [
             entry.vehicle
             for entry in (view.census.on_road if view.census is not None else ())
-            if self.takes(entry.vehicle)
+            if in_shard(entry.vehicle)
             and (
                 entry.vehicle not in view.agent_tokens
                 or (entry.vehicle in view.states and not view.states[entry.vehicle].attended)
@@ -216,7 +215,8 @@ class RoleHealth:
         if not unattended:
             return None
         count = len(unattended)
-        return f"shard {self.name}: {count} vehicles without an agent, such as {unattended[0]}"
+        vehicles = "1 vehicle" if count == 1 else f"{count} vehicles"
+        return f"shard {self.name}: {vehicles} without an agent, such as {unattended[0]}"
 
 
 LINK_LOST = "the connection to the router was lost"
@@ -236,11 +236,7 @@ def _problem(
         found = "one coordinator" if count == 1 else f"{count or 'no'} coordinators"
         return f"there is no leader: {found} found"
     # The token of a killed process may persist, so only processes with heartbeats count.
-    active = Counter(
-        one.coordinator
-        for one in candidates
-        if one.heard_s_ago is not None and one.heard_s_ago < election_s
-    )
+    active = Counter(one.coordinator for one in candidates if one.is_active(election_s))
     for name, processes in active.items():
         if processes > 1:
             return f"{processes} coordinators have the name {name}, which must be unique"
@@ -248,7 +244,7 @@ def _problem(
 
 
 def _road_problem(view: RoadView, listened_s: float) -> str | None:
-    """Return the problem of the road; None: no problem, or no road."""
+    """Return the problem of the road; None if there is no problem or no road."""
     first, newest = view.first_clock, view.clock
     if first is None or newest is None:
         if view.bridge_tokens:

@@ -104,12 +104,12 @@ class Comparison:
         )
 
     def representative(self, label: str, volume_veh_per_lane_h: float) -> Run | None:
-        """Return a label's first run with trajectories at a volume; None: there is none."""
+        """Return a label's first run with trajectories at a volume, or None."""
         runs = self.at(label, volume_veh_per_lane_h)
         return next((run for run in runs if run.has_trajectories), None)
 
     def busiest(self, label: str) -> Run | None:
-        """Return the representative run of a label at its highest volume with trajectories."""
+        """Return a label's `representative` run at the highest volume that has one, or None."""
         found = (self.representative(label, volume) for volume in reversed(self.volumes))
         return next((run for run in found if run is not None), None)
 
@@ -139,10 +139,10 @@ def single_run(folder: Path) -> Run:
         scenario = scenario_of(folder / TRAJECTORIES)
         pq.read_schema(folder / "trips.parquet")
     except (OSError, ValueError) as error:
-        raise _not_a_run(folder, error) from error
+        raise not_a_run(folder, error) from error
     summary = read_summary(folder)
     if summary is None:
-        raise _not_a_run(folder, "its summary.json is missing or incomplete")
+        raise not_a_run(folder, "its summary.json is missing or incomplete")
     return Run(folder, summary.method, summary.method, scenario, summary)
 
 
@@ -201,5 +201,6 @@ def _read_point(path: Path) -> Run:
         raise BadInputError(str(path), "invalid", f"the record of a point ({error})") from error
 
 
-def _not_a_run(folder: Path, why: object) -> BadInputError:
+def not_a_run(folder: Path, why: object) -> BadInputError:
+    """Return the error for a folder that is not that of a finished run."""
     return BadInputError("DIR", str(folder), f"the folder of a finished run ({why})")

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 from attrs import frozen
 from numpy.typing import NDArray
 
-from laneweave.protocol.errors import BadInputError
+from laneweave.launch.recordings.runs import TRAJECTORIES, not_a_run
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -78,10 +78,9 @@ def read_tracks(folder: Path) -> Tracks:
     """
     columns = ["vehicle", "t_s", "s_m", "y_m", "speed_mps", "accel_mps2", "column", "lane"]
     try:
-        table = pq.read_table(folder / "trajectories.parquet", columns=columns)
+        table = pq.read_table(folder / TRAJECTORIES, columns=columns)
     except (OSError, ValueError, KeyError) as error:
-        allowed = f"the folder of a finished run ({error})"
-        raise BadInputError("DIR", str(folder), allowed) from error
+        raise not_a_run(folder, error) from error
     codes = table["vehicle"].combine_chunks().dictionary_encode()
     names = [str(name) for name in codes.dictionary.to_pylist()]
     vehicle = codes.indices.to_numpy(zero_copy_only=False).astype(np.int64)

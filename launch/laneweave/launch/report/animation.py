@@ -1,9 +1,9 @@
 """The animated road: trajectories as compact data for the player (`templates/player.js`).
 
-All vehicles are sampled at common times, `step_s` apart. A sample consists of three little-endian
-integers: longitudinal and lateral position (16 bits each) and speed (8 bits), each with a separate
-unit. Each of these columns is one base64 string with the samples of all vehicles, one vehicle
-after another. The player interpolates between samples.
+All vehicles are sampled at common times, `step_s` apart. A sample has three little-endian integers:
+longitudinal and lateral position (16 bits each) and speed (8 bits). Each of these quantities is one
+column with its own unit: a base64 string with the samples of all vehicles, one vehicle after
+another. The player interpolates between samples.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import numpy as np
 from attrs import frozen
 
 from laneweave.launch.drawing.colours import road_scene
-from laneweave.launch.observe.column_owners import Formations, closed_formations
+from laneweave.launch.formation_columns import Formations
+from laneweave.launch.recordings.formations import closed_formations
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import Floats, Tracks, read_trips
 
@@ -43,7 +44,8 @@ def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
         "title": title,
         "step_s": samples.step_s,
         "end_s": round(samples.end_s, 3),
-        "start_s": round(_busy_s(run, samples.end_s), 3),
+        # When the first vehicle reaches the end of the road.
+        "start_s": round(min(scenario.free_flow_s, 0.5 * samples.end_s), 3),
         **road_scene(scenario),
         "formations": [[one.number, one.rear, one.front] for one in reversed(formations.listed)],
         "vehicles": samples.vehicles,
@@ -99,11 +101,6 @@ def _sample(run: Run, tracks: Tracks, formations: Formations) -> _Samples:
             }
         )
     return _Samples(step_s, end_s, vehicles, columns)
-
-
-def _busy_s(run: Run, end_s: float) -> float:
-    """Return the time at which the first vehicle reaches the road's end, at most half `end_s`."""
-    return min(run.scenario.road.length_m / run.scenario.formation.speed_mps, 0.5 * end_s)
 
 
 def _packed(parts: list[Floats], unit: float, kind: str) -> str:

@@ -49,7 +49,7 @@ SPACING_CAPTION = (
 COMFORT_CAPTION = (
     "Share of the driving time above each value. Dashed: limits of the vehicles. Jerk: difference "
     "quotient of the acceleration; lateral acceleration: second difference quotient of the lateral "
-    "position. Samples of the same time as for spacings."
+    "position. Samples from the same period as for spacings."
 )
 
 
@@ -60,13 +60,15 @@ class _Report:
     figures: Path
     """Folder of the pictures."""
     dpi: int
+    names: Mapping[str, str] = field(factory=dict)
+    """File names of pictures in the report of a single run, by name in a comparison."""
     sections: list[Section] = field(factory=list)
 
     def draw(
         self, name: str, draw: Callable[[Path, int], None], caption: str, alt: str
     ) -> list[Picture]:
         """Draw a picture and return it in a list."""
-        path = self.figures / name
+        path = self.figures / self.names.get(name, name)
         draw(path, self.dpi)
         return [Picture(path, self.dpi, caption, alt)]
 
@@ -101,8 +103,8 @@ def report_run(run: Run, *, formation: int | None = None, dpi: int = DPI) -> Pat
     )
     names = {"travel_times.png": "travel_time.png", "speeds.png": "speed.png"}
     names[f"road-{run.label}.png"] = "road.png"
-    comparison = Comparison((run,), ())
-    sections = _sections(comparison, _Report(run.folder, dpi), names, formation)
+    report = _Report(run.folder, dpi, names)
+    sections = _sections(Comparison((run,), ()), report, formation)
     return write_page(title, lead, sections, run.folder)
 
 
@@ -125,15 +127,13 @@ def report_comparison(
     out.mkdir(parents=True, exist_ok=True)
     runs = len(comparison.runs)
     lead = f"{runs} runs of {', '.join(comparison.labels)}; {len(comparison.failed)} failed."
-    sections = _sections(comparison, _Report(out / "figures", REPORT_DPI), {}, formation)
+    sections = _sections(comparison, _Report(out / "figures", REPORT_DPI), formation)
     return write_page(title, lead, sections, out)
 
 
-def _sections(
-    comparison: Comparison, report: _Report, names: Mapping[str, str], formation: int | None
-) -> list[Section]:
-    """Return all sections; `names` renames pictures (for the report of one run)."""
-    several = not names
+def _sections(comparison: Comparison, report: _Report, formation: int | None) -> list[Section]:
+    """Return all sections."""
+    several = not report.names
     busiest = [run for run in map(comparison.busiest, comparison.labels) if run is not None]
     shown = [(run, read_tracks(run.folder)) for run in busiest]
     # Do this first, because it raises an error for an unknown formation.
@@ -143,10 +143,10 @@ def _sections(
         if not several or _has_formations(run)
     )
     driven = next(maps, None)
-    report.sections.append(Section("Figures", tables=tables_of(comparison)))
+    report.sections.append(Section("Results", tables=tables_of(comparison)))
     report.add(
         "Travel time",
-        names.get("travel_times.png", "travel_times.png"),
+        "travel_times.png",
         partial(figures.draw_travel_times, comparison),
         TRAVEL_CAPTION,
         "Box plots of travel times by method and traffic volume",
@@ -162,12 +162,12 @@ def _sections(
     if busiest:
         report.add(
             "Speed over space and time",
-            names.get("speeds.png", "speeds.png"),
+            "speeds.png",
             partial(figures.draw_speeds, comparison),
             SPEED_CAPTION,
             "Heat maps of mean speed over time and position, one for each method and volume",
         )
-        pictures = [one for run in busiest for one in _snapshots(report, run, names)]
+        pictures = [one for run in busiest for one in _snapshots(report, run)]
         report.sections.append(Section("Snapshots", pictures=pictures))
         _add_path_map(report, driven)
         _add_distributions(report, comparison, busiest[0])
@@ -176,13 +176,12 @@ def _sections(
     return report.sections
 
 
-def _snapshots(report: _Report, run: Run, names: Mapping[str, str]) -> list[Picture]:
-    name = f"road-{run.label}.png"
+def _snapshots(report: _Report, run: Run) -> list[Picture]:
     # A comparison shows the paper's stretch for all methods, if the road is long enough.
-    fits = name not in names and run.scenario.road.length_m >= PAPER_STRETCH_M[1]
+    fits = not report.names and run.scenario.road.length_m >= PAPER_STRETCH_M[1]
     stretch_m = PAPER_STRETCH_M if fits else None
     return report.draw(
-        names.get(name, name),
+        f"road-{run.label}.png",
         lambda path, dpi: road_snapshots(run.folder, path, stretch_m=stretch_m, dpi=dpi),
         f"{_title(run)}. Four times at intervals of the shortest T_F. Colours show the preferred "
         "lanes; faster vehicles are lighter.",
@@ -199,7 +198,7 @@ def _add_path_map(report: _Report, driven: DrivenMap | None) -> None:
         partial(draw_path_map, driven),
         f"Cells (column, lane) of {driven.vehicles} at the ends of slots, as driven. The box "
         "before a name has the colour of the preferred lane; cells have the colour of their lane, "
-        "strong if it is the preferred one; bold: moved in the slot before.",
+        "strong if it is the preferred one; bold: moved in the preceding slot.",
         f"Table of the cells of {driven.name} by vehicle and slot",
     )
 

@@ -31,11 +31,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 JAMMED = 1.25
-"""Travel times count as jammed if their upper quartile exceeds the lowest median by this factor."""
+"""Travel times with an upper quartile above this multiple of the lowest median count as jammed."""
 MARGIN = 0.04
 """Margin below the shortest travel time, as a share of the range."""
 LOWER_SHARE = 0.66
 """Share of the height below the break of the axis, for methods without jams."""
+GROUP_WIDTH = 0.8
+"""Total width of the boxes at a volume; the distance between volumes is 1."""
 BIN_M, BIN_S = 20.0, 5.0
 """Bin sizes for mean speeds."""
 
@@ -59,7 +61,7 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
         for axes in panels.flat:
             _draw_boxes(axes, times)
             axes.grid(visible=False, axis="x")
-        for t_s in sorted({_free_flow_s(run) for run in comparison.runs}):
+        for t_s in sorted({run.scenario.free_flow_s for run in comparison.runs}):
             lower.axhline(t_s, zorder=0, **REFERENCE)
             lower.annotate(
                 f"free flow\n{t_s:.1f} s",
@@ -92,7 +94,7 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
 
 
 def _break(times_s: Iterable[Floats]) -> float | None:
-    """Return the travel time at which to break the axis; None: no jams, or only jams."""
+    """Return the travel time at which to break the axis; None if all methods jam, or none."""
     shapes = [np.percentile(one, [50.0, 75.0, 99.0]) for one in times_s if len(one)]
     limit_s = JAMMED * min((median_s for median_s, _, _ in shapes), default=0.0)
     ends_s = [end_s for _, upper_s, end_s in shapes if upper_s <= limit_s]
@@ -114,12 +116,9 @@ def _break_axis(upper: Axes, lower: Axes, break_s: float) -> None:
     lower.plot([0.0], [1.0], transform=lower.transAxes, clip_on=False, **slash)
 
 
-def _places(labels: int, volumes: int, width: float = 0.8) -> Floats:
-    """Return positions along the axis, shape (labels, volumes), with boxes side by side.
-
-    `width` is the total width of the boxes at a volume; the distance between volumes is 1.
-    """
-    shifts = (np.arange(labels) - 0.5 * (labels - 1)) * width / max(1, labels)
+def _places(labels: int, volumes: int) -> Floats:
+    """Return positions along the axis, shape (labels, volumes), with boxes side by side."""
+    shifts = (np.arange(labels) - 0.5 * (labels - 1)) * GROUP_WIDTH / max(1, labels)
     return np.asarray(np.arange(volumes) + shifts[:, None])
 
 
@@ -132,7 +131,7 @@ def _draw_boxes(axes: Axes, times_s: Mapping[str, Sequence[Floats]]) -> None:
         axes.boxplot(
             times,
             positions=places,
-            widths=0.72 * 0.8 / len(times_s),
+            widths=0.72 * GROUP_WIDTH / len(times_s),
             manage_ticks=False,
             patch_artist=True,
             label=label,
@@ -144,10 +143,6 @@ def _draw_boxes(axes: Axes, times_s: Mapping[str, Sequence[Floats]]) -> None:
         )
         means = [float(np.mean(one)) if len(one) else np.nan for one in times]
         axes.plot(places, means, "o-", color=colour, markersize=3.5, linewidth=1.3, zorder=3)
-
-
-def _free_flow_s(run: Run) -> float:
-    return run.scenario.road.length_m / run.scenario.formation.speed_mps
 
 
 def _travel_times(runs: Iterable[Run]) -> Floats:

@@ -17,12 +17,9 @@ from attrs import frozen
 
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.launch.drawing.colours import lane_colours
-from laneweave.launch.drawing.figures import INK
-from laneweave.launch.observe.column_owners import (
-    FormationColumns,
-    read_events,
-    recorded_formations,
-)
+from laneweave.launch.drawing.figures import INK, write
+from laneweave.launch.formation_columns import FormationColumns
+from laneweave.launch.recordings.formations import read_events, recorded_formations
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks, read_trips
 from laneweave.launch.report.style import SMALL_TEXT, picture
@@ -32,6 +29,7 @@ from laneweave.protocol.wire.events import FORMATIONS_JOINED, PLAN_MADE
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+_SIZE_PT = 8.5
 _MAX_NAME = 9
 _MAX_LISTED = 8
 
@@ -66,7 +64,7 @@ class DrivenMap:
 
 
 def driven_map(run: Run, tracks: Tracks, formation: int | None) -> DrivenMap | None:
-    """Return a formation's path map, by default the one with the most moves; None: there is none.
+    """Return the path map of a formation, by default the one with the most moves, or None.
 
     Raises:
         BadInputError: the run has no such formation.
@@ -187,8 +185,7 @@ def _draw_row(axes: Axes, row: int, driven: DrivenMap) -> None:
     colour = colours[preferred % len(colours)]
     axes.add_patch(FancyBboxPatch((-1.25, row + 0.2), 0.3, 0.6, fc=colour, **style))
     shown = name if len(name) <= _MAX_NAME else name[: _MAX_NAME - 1] + "…"
-    # Names come from files; a dollar sign must not start a formula.
-    axes.text(-0.85, row + 0.5, shown, va="center", fontsize=8.5, parse_math=False)
+    write(axes, (-0.85, row + 0.5), shown, _SIZE_PT)
     for point, (cell, before) in enumerate(zip(cells, (cells[0], *cells), strict=False)):
         colour, alpha = colours[cell[1] % len(colours)], 0.62 if cell[1] == preferred else 0.16
         corner = (point + 0.03, row + 0.06)
@@ -199,4 +196,4 @@ def _draw_row(axes: Axes, row: int, driven: DrivenMap) -> None:
 
 def _write(axes: Axes, point: int, y: float, text: str, **style: Any) -> None:  # noqa: ANN401
     """Write text into the centre of a time point's column."""
-    axes.text(point + 0.5, y, text, ha="center", va="center", **{"fontsize": 8.5} | style)
+    write(axes, (point + 0.5, y), text, _SIZE_PT, ha="center", **style)

@@ -15,7 +15,8 @@ from laneweave.launch.drawing.colours import (
     lane_names,
 )
 from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK
-from laneweave.launch.observe.column_owners import Formations, closed_formations
+from laneweave.launch.formation_columns import Formations
+from laneweave.launch.recordings.formations import closed_formations
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.recordings.trajectories import Floats, Tracks, read_tracks, read_trips
 from laneweave.launch.report.style import picture
@@ -86,7 +87,7 @@ def road_snapshots(
 
 
 def _pose(tracks: Tracks, number: int, t_s: float) -> tuple[float, float, float, float] | None:
-    """Return (s m, y m, heading rad, speed m/s) of a vehicle; None: not on the road."""
+    """Return (s m, y m, heading rad, speed m/s) of a vehicle; None if it is not on the road."""
     times_s, y_m = tracks.t_s[tracks.rows(number)], tracks.y_m[tracks.rows(number)]
     if not times_s[0] - 1e-6 <= t_s <= times_s[-1] + 1e-6:
         return None
@@ -155,7 +156,7 @@ def _draw_vehicle(
     axes: Axes, pose: tuple[float, float, float, float], preferred: int, scenario: Scenario
 ) -> None:
     """Draw the body of a vehicle with a pale windscreen."""
-    from matplotlib.patches import Polygon  # noqa: PLC0415 - lazily, see above
+    from matplotlib.patches import Polygon  # noqa: PLC0415 - lazily
 
     s_m, y_m, heading, speed_mps = pose
     length_m, width_m = scenario.vehicle.length_m, scenario.vehicle.width_m
@@ -177,7 +178,7 @@ def _draw_vehicle(
 
 def _draw_legend(figure: Figure, scenario: Scenario) -> None:
     """Draw the legend of colours above the strips."""
-    from matplotlib.patches import Patch  # noqa: PLC0415 - lazily, see above
+    from matplotlib.patches import Patch  # noqa: PLC0415 - lazily
 
     speed_mps = scenario.formation.speed_mps
     colours = lane_colours(scenario.road.lanes)
@@ -199,7 +200,7 @@ def _draw_legend(figure: Figure, scenario: Scenario) -> None:
 
 def _shade(colour: str, over_mps: float) -> tuple[float, float, float]:
     """Return a colour, darkened below the speed of the lattice and lightened above it."""
-    from matplotlib.colors import to_rgb  # noqa: PLC0415 - lazily, see above
+    from matplotlib.colors import to_rgb  # noqa: PLC0415 - lazily
 
     share = float(np.clip(over_mps / SPEED_SPAN_MPS, -1.0, 1.0))
     end = 1.0 if share > 0.0 else 0.0

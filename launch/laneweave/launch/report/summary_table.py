@@ -40,7 +40,7 @@ def _traffic_rows(summary: RunSummary) -> list[tuple[str, str]]:
 
 
 def _discomfort(safety: Safety) -> str:
-    """Return a remark about uncomfortable accelerations; empty: there were none."""
+    """Return a remark about uncomfortable accelerations; empty if there were none."""
     found = (safety.min_accel_mps2, safety.max_accel_mps2)
     if all(value is None or round(abs(value), 2) <= COMFORT_MPS2 for value in found):
         return ""

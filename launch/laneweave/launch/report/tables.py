@@ -79,7 +79,7 @@ def tables_of(comparison: Comparison) -> list[Table]:
 def run_table(run: Run) -> Table:
     """Return the table of one run."""
     rows = summary_rows(run.summary) if run.summary else []
-    caption = "Results of the run; summary.json has all figures."
+    caption = "Results of the run; all values are in summary.json."
     return Table(("", "value"), [("method", run.label), *rows], caption, 2)
 
 

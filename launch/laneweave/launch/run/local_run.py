@@ -17,18 +17,18 @@ from typing import Any
 import attrs
 from attrs import define, field
 
-from laneweave.coordinator.planning.solve import warm_up
 from laneweave.launch.faults.injection import FaultInjection
-from laneweave.launch.faults.network_namespaces import HUB, open_network
+from laneweave.launch.faults.network_namespaces import ENDPOINT, HUB, LISTEN, open_network
 from laneweave.launch.faults.shared_counters import MessageFaults, SharedBoard
-from laneweave.launch.faults.specification import SENDER_OF_GROUP, FaultSpec
+from laneweave.launch.faults.specification import ROUTER, SENDER_OF_GROUP, FaultSpec
 from laneweave.launch.observe.observer import Observer
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.logs import last_error
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
-from laneweave.launch.run.role_processes import ROUTER, RoleExit, RoleProcesses, RoleStart
+from laneweave.launch.run.role_processes import RoleExit, RoleProcesses, RoleStart
 from laneweave.launch.run.roles import fork_server
+from laneweave.launch.run.run_folder import LOG_FILE
 from laneweave.protocol.config.loading import to_tables
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.errors import BadInputError, CommandFailedError
@@ -45,11 +45,11 @@ MAX_TEMPORARY_BYTES = 70
 """Maximum length of TMPDIR: socket paths are up to 37 bytes longer, and limited to 107 bytes."""
 ROUTER_START_S = 20.0
 STALL_S = 90.0
-"""Time after which a run fails if the road clock does not advance."""
+"""Wall-clock time after which a run fails if the road clock does not advance."""
 MAX_FAILED_AGENTS = 5
 """Maximum number of agents that may exit with an error; one more aborts the run."""
 LEADER_S = 5.0
-"""Maximum wait for a leader, beyond two election timeouts, before the bridge starts."""
+"""Maximum wait for a leader before the bridge starts, in addition to two election timeouts."""
 POLL_S = 0.1
 _GROUP_OF_SENDER = {sender: group for group, sender in SENDER_OF_GROUP.items()}
 
@@ -77,7 +77,6 @@ class LocalRun:
 
     scenario: Scenario
     folder: Path
-    method: str = "formation"
     faults: FaultSpec = field(factory=FaultSpec)
     show_progress: bool = True
     pace: float | None = None
@@ -85,7 +84,7 @@ class LocalRun:
     """Called ten times per second with the observed state and the process ids of the roles."""
     _processes: RoleProcesses = field(init=False)
     _options: dict[str, Any] = field(init=False)
-    """Options of all roles."""
+    """Options that every role receives."""
     _injection: FaultInjection | None = None
     _board: SharedBoard = field(init=False)
     _group_of: dict[str, int] = field(init=False)
@@ -110,7 +109,7 @@ class LocalRun:
             BadInputError: the run is not possible in this environment.
         """
         check_temporary_folder()
-        warm_up()  # compile once, not in every coordinator
+        context = fork_server()
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
             tempfile.TemporaryDirectory(prefix="laneweave-") as temporary,
@@ -127,11 +126,10 @@ class LocalRun:
             self._options = {
                 "folder": str(self.folder),
                 "temporary": temporary,
-                "method": self.method,
                 "pace": self.pace,
             }
             names = coordinator_names(self.scenario)
-            self._processes = RoleProcesses(fork_server(), self._prepare, names)
+            self._processes = RoleProcesses(context, self._prepare, names)
             try:
                 if self.faults:
                     self._board = SharedBoard(Path(temporary) / "board")
@@ -160,7 +158,7 @@ class LocalRun:
 
     def _supervise(self, progress: RunProgress) -> None:
         processes, injection = self._processes, self._injection
-        processes.start("router", ROUTER)
+        processes.start(ROUTER, ROUTER)
         observer = Observer(Keys(self.scenario.network.realm))
         with contextlib.closing(self._connect(observer)) as transport:
             observer.subscribe(transport)
@@ -178,9 +176,10 @@ class LocalRun:
                     processes.start("agent", f"agent-{group[0]}", vehicles=group)
                 road_s = view.t_s
                 if injection is not None:
-                    injection.step(self._board.road_s, now, view)
+                    board_s = self._board.road_s
+                    injection.step(board_s, now, view)
                     # Faults may drop clock messages to the launcher.
-                    road_s = max(road_s, self._board.road_s)
+                    road_s = max(road_s, board_s)
                 if self.watch is not None:
                     self.watch(view, processes.ids)
                 if stall.is_stalled(road_s, now):
@@ -225,7 +224,7 @@ class LocalRun:
         return True
 
     def _record_end(self, subject: str, end: RoleExit) -> None:
-        error = last_error(self.folder / "log.jsonl", end.name)
+        error = last_error(self.folder / LOG_FILE, end.name)
         reason = f": {error}" if error else ""
         self._problems.append(f"{subject} ended with status {end.status}{reason}")
 
@@ -245,7 +244,7 @@ class LocalRun:
 def fault_injection(
     faults: FaultSpec, scenario: Scenario, processes: RoleProcesses
 ) -> FaultInjection:
-    """Return the fault engine for a run; call this before starting its processes.
+    """Return the fault engine of a run; call this before starting the run's processes.
 
     Raises:
         BadInputError: a partition requires network namespaces, which cannot be created.
@@ -265,17 +264,17 @@ def add_faults(
     """Add the message faults and the network namespace of a role to its tables and options."""
     network, sender = injection.network, SENDER_OF_ROLE.get(start.role)
     if network is not None and start.role == ROUTER:
-        options |= {"namespace": network.process_id(HUB), "listen": (network.listen,)}
+        options |= {"namespace": network.process_id(HUB), "listen": (LISTEN,)}
     if sender is None:
         return
     group = _GROUP_OF_SENDER[sender]
     if network is not None and group in network.groups:
         options["namespace"] = network.process_id(group)
-        tables["network"] = tables["network"] | {"endpoint": network.endpoint}
+        tables["network"] = tables["network"] | {"endpoint": ENDPOINT}
     options["faults"] = MessageFaults(
         injection.message_rules(),
         board.path,
-        board.new_word(),
+        board.new_counter(),
         receiver=sender,
         seed=injection.seed_of_start(start.name),
     )

@@ -68,7 +68,7 @@ def log_to_terminal(level: LogLevel = LogLevel.warning) -> None:
 
 
 def last_error(path: Path, name: str) -> str:
-    """Return the last error logged by a process of a run, as one line; empty: none."""
+    """Return the last error logged by a process of a run, as one line; empty if there is none."""
     found = ""
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     for line in lines:

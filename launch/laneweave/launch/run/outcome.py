@@ -40,7 +40,7 @@ def complete_summary(
     dropped: int = 0,
     faults: dict[str, Any] | None = None,
 ) -> Outcome:
-    """Complete the summary of a run with the launcher's data, and judge the run.
+    """Complete the summary of a run with the launcher's data, and return the run's outcome.
 
     Args:
         folder: the run's folder.

@@ -15,7 +15,7 @@ class RunProgress(Progress):
     """Progress bar with road time, vehicles on the road, leader and real-time factor."""
 
     def __init__(self, scenario: Scenario, *, show: bool) -> None:
-        """Create a bar that is full when the last vehicle can have left; hidden unless `show`."""
+        """Create a bar, full when the last vehicle leaves in free flow; hidden unless `show`."""
         super().__init__(
             TextColumn("{task.fields[now]}"),
             BarColumn(bar_width=None),
@@ -27,8 +27,7 @@ class RunProgress(Progress):
             disable=not show,
             transient=True,
         )
-        free_flow_s = scenario.road.length_m / scenario.formation.speed_mps
-        self._total_s = scenario.demand.duration_s + free_flow_s
+        self._total_s = scenario.demand.duration_s + scenario.free_flow_s
         self._task: TaskID = self.add_task(
             "run", total=self._total_s, now="starting", road="", leader="no leader", rate=""
         )

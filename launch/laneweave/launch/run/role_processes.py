@@ -13,13 +13,13 @@ from typing import Any
 import structlog
 from attrs import define, field, frozen
 
+from laneweave.launch.faults.specification import ROUTER
 from laneweave.launch.run.roles import start_role
 
 log = structlog.get_logger(__name__)
 
 STOP_S = 5.0
 """Grace period after SIGTERM before processes are killed."""
-ROUTER = "router"
 
 
 @frozen
@@ -97,7 +97,7 @@ class RoleProcesses:
         return self._running.keys()
 
     def agent_of(self, vehicle: str) -> str | None:
-        """Return the agent process of a vehicle; None: not started."""
+        """Return the agent process of a vehicle, or None before it is started."""
         return self._process_of.get(vehicle)
 
     def kill(self, name: str) -> None:

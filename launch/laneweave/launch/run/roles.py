@@ -1,7 +1,7 @@
-"""Start a role in a new process, and run it there.
+"""Start of a role in a new process, and the role's main function there.
 
-The processes are forked from a server that has imported and prepared what roles need (`preload`),
-which is much cheaper than starting an interpreter.
+Forking a process from a server that has imported and prepared what roles need (`preload`) is much
+cheaper than starting an interpreter.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,8 @@ import structlog
 
 from laneweave.launch.faults.network_namespaces import join_namespace
 from laneweave.launch.run.logs import log_to_file
+from laneweave.launch.run.run_folder import LOG_FILE
+from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
@@ -58,21 +60,31 @@ def tune_garbage_collector() -> None:
 
 
 def fork_server() -> ForkServerContext:
-    """Return a context that forks processes from a prepared server.
+    """Return a context that forks processes from a server, once the server is prepared.
 
+    If the planners must be compiled, this takes a minute; Ctrl-C ends the wait and the server.
     Linear algebra is limited to one thread per process, because many processes share few cores.
+
+    Raises:
+        CommandFailedError: the server has exited.
     """
     for name in THREAD_LIMITS:
         os.environ.setdefault(name, "1")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([PRELOADED])
-    # Ctrl-C reaches the whole process group. Role processes inherit the ignored SIGINT, because
-    # the launcher terminates them in the right order.
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Starting the resource tracker unblocks SIGINT, so it must not start below.
+    resource_tracker.ensure_running()
+    # Ctrl-C reaches the whole process group. Role processes inherit the blocked SIGINT, because
+    # the launcher terminates them in the right order. A Ctrl-C in the meantime is delivered later.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    # Starting it waits for the server; at this point Ctrl-C still raises KeyboardInterrupt.
+    first = context.Process(target=int, name="processes")
+    _start(first)
+    first.join()
     return context
 
 
@@ -90,20 +102,24 @@ def start_role(
         role: `router`, `coordinator`, `bridge` or `agent`.
         name: name for logs and process lists.
         tables: the scenario, as returned by `to_tables`.
-        options: `folder` of the log; `temporary`, folder for temporary files; optionally
-            `namespace`, id of a process whose network namespace the role joins, and `faults`, the
-            `MessageFaults` of the role.
+        options: `folder` of the run; `temporary`, folder for temporary files; the role's own
+            options; optionally `namespace`, id of a process whose network namespace the role joins,
+            and `faults`, the `MessageFaults` of the role.
 
     Raises:
         CommandFailedError: the fork server has exited, or the process cannot be created.
     """
     process = context.Process(target=run_role, args=(role, name, tables, options), name=name)
+    _start(process)
+    return process
+
+
+def _start(process: ForkServerProcess) -> None:
     try:
         process.start()
     except (EOFError, OSError) as error:
         reason = str(error) or "the fork server has ended"
-        raise CommandFailedError(f"cannot start {name}: {reason}") from error
-    return process
+        raise CommandFailedError(f"cannot start {process.name}: {reason}") from error
 
 
 def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
@@ -115,7 +131,7 @@ def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, An
     die_with_supervisor()
     ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
     tempfile.tempdir = options["temporary"]
-    log_to_file(Path(options["folder"]) / "log.jsonl", role, name)
+    log_to_file(Path(options["folder"]) / LOG_FILE, role, name)
     try:
         while not _run_once(role, name, tables, options):
             time.sleep(RECONNECT_S)
@@ -194,7 +210,7 @@ def _bridge(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     run_bridge(
         parse_scenario(tables),
         Path(options["folder"]),
-        options["method"],
+        FORMATION,
         options["pace"],
         _wrap(options),
     )

@@ -1,4 +1,4 @@
-"""The folder of a new run."""
+"""Folders of new runs, and names of new folders."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 
-LOG = "log.jsonl"
+LOG_FILE = "log.jsonl"
 
 
 @contextmanager
@@ -20,24 +20,24 @@ def new_folder(out: Path | None, settings: Scenario, method: str) -> Iterator[Pa
     Raises:
         BadInputError: the folder is not empty, or cannot be created.
     """
-    folder = _free_name(settings, method) if out is None else out
+    volume = f"{settings.demand.volume_veh_per_lane_h:g}"
+    folder = out or timestamped_folder(f"{method}-{volume}-seed{settings.seed}")
     existed = folder.is_dir()
     _claim(folder)
     try:
         yield folder
     except BadInputError:
         files = list(folder.iterdir())
-        if files == [folder / LOG] and not files[0].stat().st_size:
+        if files == [folder / LOG_FILE] and not files[0].stat().st_size:
             files[0].unlink()
             if not existed:
                 folder.rmdir()
         raise
 
 
-def _free_name(settings: Scenario, method: str) -> Path:
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    volume = f"{settings.demand.volume_veh_per_lane_h:g}"
-    base = folder = Path("runs") / f"{method}-{volume}-seed{settings.seed}-{stamp}"
+def timestamped_folder(prefix: str) -> Path:
+    """Return the path of a folder in runs/ that does not exist: the prefix, date and time."""
+    base = folder = Path("runs") / f"{prefix}-{time.strftime('%Y%m%d-%H%M%S')}"
     copies = 1
     while folder.exists():
         copies += 1
@@ -51,7 +51,7 @@ def _claim(folder: Path) -> None:
         if any(folder.iterdir()):
             raise BadInputError("--out", str(folder), "a new or empty folder")
         # If two runs start simultaneously, the second one fails here.
-        (folder / LOG).touch(exist_ok=False)
+        (folder / LOG_FILE).touch(exist_ok=False)
     except FileExistsError as error:
         raise BadInputError("--out", str(folder), "a new or empty folder") from error
     except OSError as error:

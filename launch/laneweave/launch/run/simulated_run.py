@@ -21,6 +21,7 @@ from laneweave.launch.observe.observer import TOPICS
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
+from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.runtime.message_faults import FaultyCore
 from laneweave.protocol.runtime.node import Arrived, Core, Effect, Event, Listen, Started
@@ -80,7 +81,7 @@ class SimulatedRoles:
         return [*(name for name in roles if name in self.network), *router]
 
     def agent_of(self, vehicle: str) -> str | None:
-        """Return the agent of a vehicle; None: not started."""
+        """Return the agent of a vehicle, or None before it is started."""
         return self.agents.get(vehicle)
 
     def kill(self, name: str) -> None:
@@ -115,7 +116,6 @@ class SimulatedRun:
 
     scenario: Scenario
     folder: Path
-    method: str = "formation"
     faults: FaultSpec = field(factory=FaultSpec)
     conditions: Conditions = field(factory=Conditions)
     show_progress: bool = True
@@ -145,7 +145,7 @@ class SimulatedRun:
             self._injection = FaultInjection(
                 self.faults, scenario.seed, self._roles, self.conditions.lease_s
             )
-        record = RunRecord(self.folder, scenario, self.method, time.perf_counter)
+        record = RunRecord(self.folder, scenario, FORMATION, time.perf_counter)
         with (
             tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as sumo_folder,
             SumoWorld(scenario, Path(sumo_folder)) as world,

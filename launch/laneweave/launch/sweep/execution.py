@@ -45,7 +45,7 @@ class PointResult:
 
 
 def kept_files(point: Point) -> tuple[str, ...]:
-    """Return the names of the files to keep; after a failure, add `LOG_FILE`."""
+    """Return the names of the files to keep, besides `LOG_FILE` after a failure."""
     kept = (SUMMARY_FILE, "trips.parquet", "events.jsonl")
     return (*kept, TRAJECTORIES) if point.keep_trajectories else kept
 
@@ -110,7 +110,7 @@ def run_locally(
 
 
 def wait_for_exit(process: subprocess.Popen[bytes], name: str, stopped: Callable[[], bool]) -> None:
-    """Wait for a process of run `name`; stop it if `stopped` returns True or an error is raised.
+    """Wait for the process of run `name`; end it if `stopped` returns True or an error is raised.
 
     Raises:
         StoppedError: the process was stopped.

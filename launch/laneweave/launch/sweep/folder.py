@@ -21,6 +21,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Self
 
+from attrs import evolve
+
 from laneweave.launch.recordings.results_over_seeds import flatten, write_results
 from laneweave.launch.recordings.runs import (
     SWEEP_FILE,
@@ -30,8 +32,8 @@ from laneweave.launch.recordings.runs import (
 )
 from laneweave.launch.run_methods import METHODS, affects
 from laneweave.launch.sweep.execution import LOG_FILE, PointResult, kept_files
-from laneweave.launch.sweep.points import Point
-from laneweave.protocol.config.loading import parse_scenario, to_tables
+from laneweave.launch.sweep.points import Point, with_volume
+from laneweave.protocol.config.loading import to_tables
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import read_summary
@@ -100,10 +102,8 @@ class SweepFolder:
             labelled = METHODS.get(run.label)
             if labelled is None or labelled.method != run.method:
                 raise BadInputError("--out", str(self.out), f"a folder without {run.label}")
-            tables = to_tables(base)
-            tables["seed"] = run.scenario.seed
-            tables["demand"]["volume_veh_per_lane_h"] = run.volume_veh_per_lane_h
-            expected = flatten(to_tables(labelled.settings(parse_scenario(tables))), ".")
+            wanted = evolve(with_volume(base, run.volume_veh_per_lane_h), seed=run.scenario.seed)
+            expected = flatten(to_tables(labelled.settings(wanted)), ".")
             recorded = flatten(to_tables(run.scenario), ".")
             where = f"as recorded in {self.out / name}; other settings require a new folder"
             for field in dict.fromkeys([*recorded, *expected]):

@@ -34,9 +34,13 @@ def main(folder: Path, parent: int) -> None:
     log_to_terminal()
     tune_garbage_collector()
     job = json.loads((folder / JOB_FILE).read_text(encoding="utf-8"))
-    method, run = job["method"], SimulatedRun if job["method"] == FORMATION else ReferenceRun
-    outcome = run(parse_scenario(job["tables"]), folder, method, show_progress=False).run()
-    write_atomically(folder / RESULT_FILE, json.dumps({"problems": outcome.problems}))
+    scenario, method = parse_scenario(job["tables"]), job["method"]
+    run = (
+        SimulatedRun(scenario, folder, show_progress=False)
+        if method == FORMATION
+        else ReferenceRun(scenario, folder, method, show_progress=False)
+    )
+    write_atomically(folder / RESULT_FILE, json.dumps({"problems": run.run().problems}))
 
 
 if __name__ == "__main__":

@@ -53,7 +53,7 @@ def parse_volumes(text: str, base: Scenario) -> tuple[float, ...]:
         except ValueError:
             raise BadInputError("--volumes", entry, "comma-separated numbers") from None
         try:
-            _with_volume(base, volume)
+            with_volume(base, volume)
         except BadInputError as error:
             raise BadInputError("--volumes", entry, error.allowed) from error
         if volume_text(volume) in map(volume_text, volumes):
@@ -81,7 +81,7 @@ def plan_points(
     for label in labels:
         for volume in volumes:
             try:
-                scenario = _with_volume(METHODS[label].settings(base), volume)
+                scenario = with_volume(METHODS[label].settings(base), volume)
                 check_moves(scenario)
             except BadInputError as error:
                 field = f"{error.field} ({label})"
@@ -99,7 +99,12 @@ def plan_points(
     )
 
 
-def _with_volume(scenario: Scenario, volume_veh_per_lane_h: float) -> Scenario:
+def with_volume(scenario: Scenario, volume_veh_per_lane_h: float) -> Scenario:
+    """Return the scenario with another volume.
+
+    Raises:
+        BadInputError: the volume is impossible in this scenario.
+    """
     tables = to_tables(scenario)
     tables["demand"]["volume_veh_per_lane_h"] = volume_veh_per_lane_h
     return parse_scenario(tables)

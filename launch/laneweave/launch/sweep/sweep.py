@@ -44,7 +44,7 @@ def run_sweep(points: Sequence[Point], folder: SweepFolder, run: Runner, *, show
 
 
 class _Progress(Progress):
-    """Progress bar on a terminal; otherwise a line per point."""
+    """A line per completed point and, on a terminal, a progress bar."""
 
     def __init__(self, total: int, finished: int, *, show: bool) -> None:
         console = Console(stderr=True)

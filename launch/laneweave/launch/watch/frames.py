@@ -14,7 +14,7 @@ depend on earlier frames, so any frame may be skipped.
 | `step_s` | time between two frames: wall-clock time if live, road time if recorded |
 | `first`, `last` | numbers of the available frames; `last` < `first`: none |
 | `road`, `body_m`, `lattice`, `shade`, `colours`, `names` | parameters for drawing the road |
-| `rolling` | true: vehicles own cells; false: formations own columns |
+| `rolling` | whether there are no formations: rolling operation or a reference method |
 | `losses` | recorded: message counts of the summary; live: null |
 
 **Frame**: live frames are pushed on changes, at most every `step_s`; recorded frames and earlier
@@ -180,7 +180,7 @@ def _brief(value: object) -> str:
 
 
 def plan_row(t_s: float, kind: str, data: Mapping[str, Any]) -> list[Any] | None:
-    """Return the `plan` field of a frame for an event; None: not a plan event."""
+    """Return the `plan` field of a frame for a plan event; None for other events."""
     if kind not in PLAN_EVENTS:
         return None
     return [

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from laneweave.launch.observe.column_owners import Formations
+from laneweave.launch.formation_columns import Formations
 from laneweave.launch.observe.road_view import RoadView, claims_of
 from laneweave.launch.watch.frames import (
     MOVING,
@@ -216,7 +216,7 @@ class LiveRoad:
         )
 
     def _target_of(self, state: VehicleState) -> Cell | None:
-        """Return the last cell of the plan that a vehicle executes; None: no known plan."""
+        """Return the last cell of the plan that a vehicle executes, or None if it is unknown."""
         if state.promised is None or not state.accepted or state.done:
             return None
         return self._targets.get(state.promised, {}).get(state.vehicle)

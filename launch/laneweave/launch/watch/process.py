@@ -53,7 +53,7 @@ LISTEN_RULE: Final = "HOST:PORT, an address of this machine; port 0: any free po
 
 
 def watch_live(scenario: Scenario, listen: str, ready: Callable[[str], None]) -> None:
-    """Serve the page of a deployment until SIGINT or SIGTERM; call `ready` with its URL.
+    """Serve the page of a deployment until SIGINT or SIGTERM; call `ready` with the page's URL.
 
     Raises:
         BadInputError: there is no router at the endpoint, or the address cannot be used.
@@ -64,7 +64,7 @@ def watch_live(scenario: Scenario, listen: str, ready: Callable[[str], None]) ->
 
 
 def watch_recorded(folder: Path, listen: str, ready: Callable[[str], None]) -> None:
-    """Serve the page of a recorded run until SIGINT or SIGTERM.
+    """Serve the page of a recorded run until SIGINT or SIGTERM; call `ready` with the page's URL.
 
     Raises:
         BadInputError: the folder does not hold a finished run, or the address cannot be used.

@@ -16,11 +16,12 @@ import numpy as np
 from attrs import frozen
 from numpy.typing import NDArray
 
-from laneweave.launch.observe.column_owners import Formations, closed_formations
-from laneweave.launch.recordings.runs import Run, single_run
+from laneweave.launch.formation_columns import Formations
+from laneweave.launch.recordings.formations import closed_formations
+from laneweave.launch.recordings.runs import Run, not_a_run, single_run
 from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks, read_tracks, read_trips
+from laneweave.launch.run_methods import FORMATION
 from laneweave.launch.watch.frames import MOVING, EventFeed, Row, compact, plan_row, scene_of
-from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.events import ENTERED, FORMATIONS_JOINED, LEADER, LEFT
 
@@ -58,13 +59,10 @@ class Recording:
             self._tracks = read_tracks(folder)
             self._trips = read_trips(folder)
             self._moments = list(_moments(folder))
-            formations = closed_formations(folder, run.scenario)
+            self._formations = closed_formations(folder, run.scenario).by_number
         except (OSError, ValueError, KeyError, TypeError) as error:
-            allowed = f"the folder of a finished run ({error})"
-            raise BadInputError("DIR", str(folder), allowed) from error
+            raise not_a_run(folder, error) from error
         self._run = run
-        rolling = run.scenario.formation.rolling or run.label != "formation"
-        self._formations = {} if rolling else formations.by_number
         tick_s = run.scenario.runtime.tick_s
         stride = max(1, round(STEP_S / tick_s))
         self._step_s = stride * tick_s
@@ -72,14 +70,13 @@ class Recording:
         self.first = 0
         # An additional last frame shows no vehicles.
         self.last = int(self._numbers[-1]) + 1 if len(self._numbers) else 0
-        demands_s = [float(trip["demanded_s"]) for trip in self._trips.values()]
-        self._demands_s = np.sort(np.array(demands_s, dtype=np.float64))
+        self._demands_s = np.sort([float(trip["demanded_s"]) for trip in self._trips.values()])
         self._times_s = [moment.t_s for moment in self._moments]
         volume = f"{run.volume_veh_per_lane_h:g} vehicles/(lane h)"
         title = f"{run.label}, {volume}, seed {run.scenario.seed}"
         self.scene = scene_of(run.scenario, "recorded", title, self._step_s) | {
             "losses": _losses(run),
-            "rolling": rolling,
+            "rolling": run.scenario.formation.rolling or run.method != FORMATION,
         }
 
     def frames(self, begin: int, end: int) -> list[str]:

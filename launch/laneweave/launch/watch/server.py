@@ -136,7 +136,7 @@ def same_origin(socket: WebSocket) -> bool:
 
 
 def request_of(text: str | None) -> tuple[int, int] | None:
-    """Return the frame range that a message from the page requests; None: malformed."""
+    """Return the frame range that a message from the page requests; None if it is malformed."""
     if text is None or len(text) > MAX_REQUEST_CHARACTERS:
         return None
     with contextlib.suppress(ValueError, TypeError, KeyError, RecursionError):

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from importlib.resources import files
 
 
-@lru_cache(maxsize=32)
 def text_of(package: str, name: str) -> str:
     """Return the text of a file in a package."""
     return files(package).joinpath(name).read_text(encoding="utf-8")

@@ -7,7 +7,7 @@
 
 const laneweaveRoad = (() => {
   const ACROSS = 1.8; // scale across the road relative to the scale along it
-  const ABOVE_PX = 13; // for names of vehicles on the left lane
+  const ABOVE_PX = 13; // for names of vehicles in the left lane
   const GAP_PX = 30; // below each stretch, for the scale in metres
   const NAMED_FROM = 6; // minimum scale at which names are drawn, in pixels per metre
   const UNKNOWN = "#8a8f96";

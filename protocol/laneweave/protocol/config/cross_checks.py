@@ -10,16 +10,14 @@ from typing import Any
 from laneweave.protocol.config.participants import identities_of, max_vehicles
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import is_tls
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.fields import MAX_HORIZON_TICKS, Scenario
 from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
 from laneweave.protocol.wire.identities import MAX_COMMON_NAME
 
 MIN_GAP_M = 1.0
 """Minimum gap between bumpers in neighbouring cells; covers rotation and tracking errors."""
 MIN_SIDE_GAP_M = 0.5
-"""Minimum lateral gap between bodies side by side; covers the same errors."""
-MAX_TICKS = 200
-"""Maximum horizon of the tracker [ticks]."""
+"""Minimum lateral gap between bodies side by side; covers rotation and tracking errors."""
 MAX_SECURED_VEHICLES = 5000
 """Maximum number of vehicles for which a router holds access rules."""
 
@@ -197,13 +195,14 @@ def _check_timing(scenario: Scenario) -> None:
         scenario.horizon_ticks * runtime.tick_s >= longest_move_s - 1e-6,
         "tracking.horizon_ticks",
         scenario.horizon_ticks,
-        f"long enough to hold a whole move of {longest_move_s:g} s, at most {MAX_TICKS}",
+        f"long enough for a whole move of {longest_move_s:g} s, at most {MAX_HORIZON_TICKS}",
     )
     _require(
-        scenario.horizon_ticks <= MAX_TICKS,
+        scenario.horizon_ticks <= MAX_HORIZON_TICKS,
         "runtime.tick_s",  # an explicit horizon has its own bound
         runtime.tick_s,
-        f"long enough for the longest T_F, {longest_s:g} s, to have at most {MAX_TICKS} ticks",
+        f"long enough for the longest T_F, {longest_s:g} s, to have at most {MAX_HORIZON_TICKS} "
+        "ticks",
     )
     what = "runtime.agent_silent_s, so a lost session is detected before its agent counts as silent"
     deadline_s = runtime.tick_deadline_s
@@ -279,13 +278,13 @@ def _check_security(scenario: Scenario) -> None:
     if not secured:
         return
     _require(bool(security.folder), "security.folder", "", "the folder of the certificates")
-    count = max_vehicles(scenario.demand, scenario.road.lanes)
+    count = max_vehicles(scenario)
     _require(
         count <= MAX_SECURED_VEHICLES,
         "demand.duration_s",
         scenario.demand.duration_s,
-        f"a demand of at most {MAX_SECURED_VEHICLES} vehicles where security.mode is mtls, this "
-        f"one may have {count}: the router has rules for each of them",
+        f"a demand of at most {MAX_SECURED_VEHICLES} vehicles (now up to {count}) where "
+        "security.mode is mtls: the router has rules for each vehicle",
     )
     for identity in identities_of(scenario):
         name = identity.common_name

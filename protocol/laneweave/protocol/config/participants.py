@@ -1,7 +1,7 @@
 """Names of all processes and vehicles of a deployment, derived from its scenario.
 
-The bridge numbers vehicles in order of arrival. The launcher needs the vehicles' names in advance
-to start agents, the router to grant rights.
+The bridge numbers vehicles in order of arrival. The launcher needs their names in advance to start
+agents, and the router to grant rights.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Iterator
 
 from laneweave.protocol.scenario.deployment_fields import FleetMembers, parse_shard
-from laneweave.protocol.scenario.fields import Demand, Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import Party
 
@@ -20,13 +20,14 @@ def vehicle_name(number: int) -> str:
     return f"v{number:04d}"
 
 
-def max_vehicles(demand: Demand, lanes: int) -> int:
+def max_vehicles(scenario: Scenario) -> int:
     """Return an upper bound on the number of arriving vehicles.
 
     The number of arrivals varies less than a Poisson variable with the same mean, so it exceeds the
     mean by more than six standard deviations in fewer than one in 10^8 cases. In addition, each
     lane has at most one arrival per `demand.min_headway_s`.
     """
+    demand, lanes = scenario.demand, scenario.road.lanes
     mean = lanes * demand.volume_veh_per_lane_h * demand.duration_s / 3600.0
     likely = math.ceil(mean + 6.0 * math.sqrt(mean)) + 10
     if demand.min_headway_s <= 0.0:
@@ -36,8 +37,7 @@ def max_vehicles(demand: Demand, lanes: int) -> int:
 
 def demanded_vehicles(scenario: Scenario) -> tuple[str, ...]:
     """Return the names of all vehicles that may arrive in a scenario."""
-    count = max_vehicles(scenario.demand, scenario.road.lanes)
-    return tuple(vehicle_name(number) for number in range(1, count + 1))
+    return tuple(vehicle_name(number) for number in range(1, max_vehicles(scenario) + 1))
 
 
 def members_of(members: FleetMembers, vehicles: Iterable[str]) -> tuple[str, ...]:
@@ -49,7 +49,7 @@ def members_of(members: FleetMembers, vehicles: Iterable[str]) -> tuple[str, ...
 
 
 def coordinator_names(scenario: Scenario) -> tuple[str, ...]:
-    """Return the names of a scenario's coordinator candidates, best-ranked first."""
+    """Return the names of a scenario's coordinator candidates, highest-ranked first."""
     return tuple(f"c{index + 1}" for index in range(scenario.runtime.coordinators))
 
 

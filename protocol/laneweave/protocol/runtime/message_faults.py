@@ -31,9 +31,9 @@ from laneweave.protocol.runtime.node import (
     core_metrics,
 )
 from laneweave.protocol.wire.messages import RoadClock
-from laneweave.protocol.wire.topics import TOPICS
+from laneweave.protocol.wire.topics import ANY_SENDER, ROLES, TOPICS
 
-SENDER_OF_ROLE = {"agent": "vehicle", "coordinator": "coordinator", "bridge": "bridge"}
+SENDER_OF_ROLE = {role: str(party) for party, role in ROLES.items()}
 """Kind of sender in message rules, by role."""
 SENDERS = tuple(SENDER_OF_ROLE.values())
 MESSAGE_TOPICS = tuple(topic.name for topic in TOPICS if topic.kind is not None)
@@ -217,7 +217,7 @@ def unwrapped(core: Core) -> Core:
 
 def _sender(arrived: Arrived) -> str:
     sender = arrived.topic.sender
-    if sender != "any":
+    if sender != ANY_SENDER:
         return sender
     role = arrived.parameters.get("role", "")
     return SENDER_OF_ROLE.get(role, role)

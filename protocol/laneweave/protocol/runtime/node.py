@@ -3,7 +3,7 @@
 A *core* is a state machine without I/O, clock, threads or unseeded randomness: `handle` takes an
 event and the time and returns effects; `wakeup_s` is the time of the next wakeup. A `Node` decodes
 payloads into typed events and executes effects through the transport. It counts and drops malformed
-input, so a core never receives it.
+input, which never reaches a core.
 """
 
 from __future__ import annotations
@@ -225,7 +225,7 @@ class Core(Protocol):
 
     @property
     def wakeup_s(self) -> float | None:
-        """Time of the next `Wakeup`, on the clock of `now_s`; None: no wakeup."""
+        """Time of the next `Wakeup` on the clock of `now_s`, or None."""
 
 
 def core_metrics(core: Core) -> Iterable[MetricsSnapshot]:

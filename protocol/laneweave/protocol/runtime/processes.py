@@ -15,16 +15,25 @@ _PR_SET_PDEATHSIG = 1
 def die_with_parent() -> None:
     """Have the kernel send SIGTERM to this process when its parent dies."""
     parent = os.getppid()
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    _set_death_signal(signal.SIGTERM)
     if os.getppid() != parent:
         sys.exit(1)
+
+
+def outlive_parent() -> None:
+    """Undo `die_with_parent`."""
+    _set_death_signal(0)
+
+
+def _set_death_signal(number: int) -> None:
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, number, 0, 0, 0)
 
 
 @contextlib.contextmanager
 def stop_signals(stop: Callable[[], None]) -> Iterator[None]:
     """Call `stop` on SIGINT and SIGTERM until the block ends.
 
-    `stop` must neither take a lock nor log: it may interrupt code that holds that lock.
+    `stop` must neither take a lock nor log, since the interrupted code may hold the same lock.
     """
 
     def on_signal(_number: int, _frame: object) -> None:

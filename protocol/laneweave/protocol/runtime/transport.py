@@ -108,8 +108,8 @@ class Transport(Protocol):
 
         The node's own tokens are included. For each key, `TokenUp` and `TokenDown` alternate,
         beginning with `TokenUp`. A short-lived token of this node may appear and vanish twice,
-        because the network also reports it. If several nodes declare a token on one key, it
-        vanishes when the last node withdraws it.
+        because the network also reports it. If several nodes declare a token on one key,
+        the token vanishes when the last node withdraws it.
         """
 
     def serve(self, key: str) -> None:

@@ -2,7 +2,7 @@
 
 One thread per worker sends the next job to its process and waits until the result arrives, the
 process dies, or the deadline has been exceeded by `OVERDUE_S`. In the last two cases the process is
-replaced, and only that job fails. (The pools of the standard library and of pebble fail completely
+replaced; no other job is affected. (The pools of the standard library and of pebble fail completely
 when an idle worker is killed.)
 """
 
@@ -183,7 +183,7 @@ class _Worker:
         left_s = max(0.0, job.deadline_s - time.monotonic())
         try:
             connection.send(job)
-            # A new process warms up first; the pipe can hold a job.
+            # A new process warms up first; meanwhile the pipe holds the job.
             if connection.poll(left_s + OVERDUE_S):
                 result, error = connection.recv()
                 return Computed(job.job, result, error)

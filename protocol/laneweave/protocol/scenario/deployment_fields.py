@@ -1,6 +1,6 @@
 """Tables of a scenario file about the deployment of roles: network, security, service, observation.
 
-Every role reads the same file (see `fields.py`).
+Every role reads the same file (see `fields`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Shard:
     count: int
 
     def contains(self, vehicle: str) -> bool:
-        """Return whether a vehicle belongs to this shard; the same in all processes."""
+        """Return whether a vehicle belongs to this shard; all processes agree."""
         return zlib.crc32(vehicle.encode()) % self.count == self.index
 
 
@@ -50,7 +50,7 @@ class Network:
     """Connections between roles; durations are wall-clock time."""
 
     realm: str = field(default="default", validator=key_part)
-    """First variable part of every key; realms do not receive each other's messages."""
+    """First variable part of every key; processes of different realms do not communicate."""
     endpoint: str = ""
     """Zenoh endpoint of the router; empty: a socket in a temporary folder (`laneweave run`)."""
     listen: tuple[str, ...] = ()
@@ -61,8 +61,8 @@ class Network:
     """Time for which a role keeps trying to connect if the router starts later; 0: one attempt."""
     heartbeat_s: float = field(default=0.1, validator=within(0.01, 10.0))
     election_s: float = field(default=0.7, validator=within(0.05, 60.0))
-    """Election timeout: a candidate leads after it has been the best-ranked one for this time. The
-    timeout detects hanging processes; liveliness tokens report dead ones at once."""
+    """Election timeout: a candidate leads after ranking highest for this time. The timeout
+    detects hanging processes; liveliness tokens report dead ones at once."""
     resend_s: float = field(default=0.2, validator=within(0.01, 10.0))
     """Time without an answer after which PREPARE and PLAN are sent again."""
 

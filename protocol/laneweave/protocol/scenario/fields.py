@@ -25,6 +25,10 @@ from laneweave.protocol.wire.events import STREAM_PLANNED
 SCHEMA = "laneweave.scenario/1"
 
 BASE_CONFLICTS = ("node", "edge", "special-1")
+DEFAULT_CONFLICTS: Mapping[int, tuple[str, ...]] = MappingProxyType(
+    {1: BASE_CONFLICTS, 2: ("geometric",)}
+)
+"""Conflict kinds that planners avoid by default, by mode; formations also avoid `closing`."""
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 """Range of T_F if `formation.cycle_s` is not set; the lower end is the paper's value."""
 COMFORT_MPS2 = 3.0
@@ -38,6 +42,8 @@ CYCLE_STEP_S = 0.2
 """Step between values of T_F; few values keep the number of planned trajectories low."""
 SLACK_S = 0.2
 """Part of T_F without motion if `formation.move_s` is not set."""
+MAX_HORIZON_TICKS = 200
+"""Maximum horizon of the tracker."""
 
 PAPERS_FORMATIONS: Mapping[str, object] = MappingProxyType(
     {"entry": "interlaced", "close": "columns", "cycle_s": 4.0}
@@ -126,15 +132,15 @@ class FormationSettings:
     """`formations`: closed formations, each sorted by one plan, as in the paper. `rolling`: no
     formations; the whole stream is replanned in each slot."""
     entry: str = field(default="free", validator=one_of("free", "interlaced"))
-    """Formations: cells that vehicles may enter, all or only those of the interlaced structure."""
+    """Cells that vehicles may enter in formations: all, or those of the interlaced structure."""
     close: str = field(default="vehicles", validator=one_of("vehicles", "columns"))
-    """Formations: `vehicles`: each closes at `max_vehicles` vehicles or `max_columns` columns;
-    `columns`: each formation has `block_columns` columns, as in the paper."""
+    """When a formation closes. `vehicles`: at `max_vehicles` vehicles or `max_columns` columns.
+    `columns`: each has `block_columns` columns, as in the paper."""
     gap_m: float = field(default=15.0, validator=within(1.0, 200.0))
     """Column pitch d_F."""
     cycle_s: float | None = field(default=None, validator=optional(within(0.5, 60.0)))
-    """T_F, the time slot of a step. None: 4 to 7 s in formations, as long as the road allows, and
-    by volume in the rolling operation (`Scenario.cycles_s`)."""
+    """T_F, the time slot of a step. None: in formations the longest from 4 to 7 s for which the
+    road suffices, in the rolling operation a value by volume (`Scenario.cycles_s`)."""
     move_s: float | None = field(default=None, validator=optional(within(0.5, 60.0)))
     """Duration of a move within its slot; the rest is slack for lost messages. None: 0.2 s less
     than T_F."""
@@ -244,7 +250,7 @@ class FormationSettings:
         """Conflict kinds that the planner avoids, defaults included."""
         if self.conflicts:
             return self.conflicts
-        return (*(BASE_CONFLICTS if self.mode == 1 else ("geometric",)), "closing")
+        return (*DEFAULT_CONFLICTS[self.mode], "closing")
 
     @property
     def executable(self) -> bool:
@@ -307,7 +313,9 @@ class Braking:
 class Tracking:
     """The tracking controller of the lower level."""
 
-    horizon_ticks: int | None = field(default=None, validator=optional(within(10, 200)))
+    horizon_ticks: int | None = field(
+        default=None, validator=optional(within(10, MAX_HORIZON_TICKS))
+    )
     """Horizon of the tracker; None: the longest T_F."""
     min_gap_m: float = field(default=3.0, validator=within(0.0, 100.0))
     """Minimum net gap to the vehicle ahead; takes precedence over the reference."""
@@ -329,7 +337,7 @@ class RuleSettings:
     gap: str = field(default="front-to-front", validator=one_of("front-to-front", "net"))
     """Definition of d_R: between front bumpers, or bumper to bumper."""
     yielding: str = field(default="unsorted", validator=one_of("unsorted", "all"))
-    """Vehicles that yield to higher priority: those not in their preferred lane, or all."""
+    """Vehicles that yield to any of higher priority: those off their preferred lane, or all."""
     slow_down_mps2: float = field(default=3.0, validator=within(0.1, 20.0))
     """Deceleration of a vehicle that yields; car following brakes as hard as necessary."""
     lane_change_s: float = field(default=0.0, validator=within(0.0, 20.0))
@@ -368,7 +376,7 @@ class Runtime:
     agent_start_s: float = field(default=15.0, validator=within(0.1, 120.0))
     """Maximum wait at the entrance for a vehicle's agent (wall-clock seconds)."""
     announce_s: float = field(default=6.0, validator=within(0.0, 600.0))
-    """Lead time of announcements before arrivals, so that agents can start (road seconds)."""
+    """Time by which announcements precede arrivals, so that agents can start (road seconds)."""
     max_pace: float = field(default=10.0, validator=within(0.01, 1000.0))
     """Maximum road seconds per wall-clock second. Network and planning take wall-clock time, which
     must be short compared with the time between a plan and its start."""
@@ -447,6 +455,11 @@ class Scenario:
         return round(self.cycles_s[1] / self.runtime.tick_s) if ticks is None else ticks
 
     @property
+    def free_flow_s(self) -> float:
+        """Time [s] in which a vehicle passes the whole road at v_F."""
+        return self.road.length_m / self.formation.speed_mps
+
+    @property
     def move_s(self) -> float:
         """Duration of a move in the shortest T_F [s]."""
         return self.cycles_s[0] - self.formation.slack_s
@@ -462,7 +475,7 @@ class Scenario:
 
     @property
     def moves_from_m(self) -> float:
-        """Position [m] from which vehicles may move between cells: the start of S3, or in S2."""
+        """Position [m] from which vehicles may move between cells: in S2, or the start of S3."""
         start_m, formation = self.road.sorting_start_m, self.formation
         if not (formation.rolling and formation.sort_in_s2):
             return start_m

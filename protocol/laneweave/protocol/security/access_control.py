@@ -29,7 +29,7 @@ from laneweave.protocol.security.connection import (
 )
 from laneweave.protocol.wire.codec import MAX_BYTES
 from laneweave.protocol.wire.identities import Identity, parse_identity
-from laneweave.protocol.wire.topics import ANY_SENDER, TOPICS, Exchange, Keys, Party, Topic
+from laneweave.protocol.wire.topics import ANY_SENDER, ROLES, TOPICS, Exchange, Keys, Party, Topic
 
 CA_FILE = "LANEWEAVE_CA_FILE"
 CERTIFICATE_FILE = "LANEWEAVE_CERTIFICATE_FILE"
@@ -72,8 +72,6 @@ READING: dict[Exchange, tuple[tuple[Flow, str], ...]] = {
     Exchange.QUERIES: ((Flow.IN, "declare_queryable"), (Flow.IN, "reply"), (Flow.OUT, "query")),
 }
 """Rights of a topic's readers."""
-_REPORTING = {Party.VEHICLE: "agent", Party.COORDINATOR: "coordinator", Party.BRIDGE: "bridge"}
-"""Role in the keys of topics with `ANY_SENDER`."""
 
 
 @frozen
@@ -112,7 +110,7 @@ def rights_on(
     """Yield the rights that a topic grants, with the parameters of the keys."""
     own = _own(topic, party, name)
     sending, reading = SENDING[topic.exchange], READING[topic.exchange]
-    if party == topic.sender or (topic.sender == ANY_SENDER and party in _REPORTING):
+    if party == topic.sender or (topic.sender == ANY_SENDER and party in ROLES):
         yield from ((right, own) for right in sending)
     if party == topic.deputy:
         yield from ((right, {}) for right in sending)
@@ -125,8 +123,8 @@ def rights_on(
 def _own(topic: Topic, party: Party, name: str) -> dict[str, str]:
     """Return the parameters of keys that contain the name of this process."""
     own = {str(party): name}
-    if party in _REPORTING:
-        own |= {"role": _REPORTING[party], "name": name or str(party)}
+    if party in ROLES:
+        own |= {"role": ROLES[party], "name": name or str(party)}
     return {key: value for key, value in own.items() if key in topic.parameters}
 
 
@@ -158,7 +156,7 @@ def access_of(
 
 
 def credentials_of(
-    scenario: Scenario, identity: str, environment: Mapping[str, str] = os.environ
+    scenario: Scenario, identity: str, environment: Mapping[str, str]
 ) -> Credentials | None:
     """Return the credentials of a process; None if the network is not secured.
 
@@ -168,7 +166,7 @@ def credentials_of(
     if scenario.security.mode == "off":
         return None
     known = parse_identity(identity)
-    if known not in set(identities_of(scenario)):
+    if known not in identities_of(scenario):
         raise BadInputError("identity", identity, KNOWN_RULE)
     name = known.common_name
     folder = Path(scenario.security.folder)

@@ -10,9 +10,9 @@ A body that moves at v with acceleration a and brakes with b through a first-ord
 
     (v + L (a + b))^2 / (2 b)  -  L^2 (a + b)
 
-until it stands still. The lag acts like an additional speed of L (a + b). This bounds the reaction
-time for which cells of length d_F and moves of duration T_F are possible (`config.cross_checks`,
-and `check_moves` of the agents).
+until it stands still: the lag acts like an additional speed of L (a + b). Cells of length d_F and
+moves of duration T_F are possible only up to some reaction time, which `config.cross_checks` and
+`check_moves` of the agents check.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ def stopping_distance_m(
     change = accel_mps2 + brake_mps2
     gained = speed_mps + lag_s * change
     travelled = gained * gained / (2.0 * brake_mps2) - lag_s * lag_s * change
-    # Near standstill the body stops before the lag has decayed; this is a lower bound.
+    # Near standstill the body stops before the lag has decayed; the second term is a lower bound.
     return max(travelled, speed_mps * speed_mps / (2.0 * brake_mps2))
 
 
 def own_braking_mps2(scenario: Scenario) -> float:
     """Return the deceleration a vehicle assumes for itself: at most that of the vehicle ahead.
 
-    If it braked harder, the gap could be smallest before both have stopped.
+    With harder braking, the gap could reach its minimum before both vehicles have stopped.
     """
     return min(-scenario.vehicle.min_accel_mps2, scenario.braking.lead_brake_mps2)
 
@@ -61,7 +61,7 @@ def lead_lag_s(scenario: Scenario) -> float:
 
 def lead_path_m(speed_mps: float, accel_mps2: float, brake_mps2: float, lag_s: float) -> float:
     """Return the minimum distance that a vehicle ahead travels if it brakes from now on."""
-    # It may stop accelerating at once. Braking harder than assumed is taken to continue.
+    # It may stop accelerating at once. Harder braking than assumed counts as the assumed braking.
     accel = min(max(accel_mps2, -brake_mps2), 0.0)
     return stopping_distance_m(max(speed_mps, 0.0), accel, brake_mps2, lag_s)
 
@@ -97,7 +97,7 @@ class EmergencyBrake:
     """Decides when a vehicle must brake, independently of its commands."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Take the tick and the assumptions in the tables `braking` and `vehicle`."""
+        """Read the tick and the assumptions (tables `braking` and `vehicle`) from a scenario."""
         limits, assumed = scenario.vehicle, scenario.braking
         self._brake_mps2 = own_braking_mps2(scenario)
         self._lag_s = limits.actuator_lag_s
@@ -116,7 +116,7 @@ class EmergencyBrake:
             state: measured state of the body.
             setpoint_mps2: set-point of its acceleration along the road.
             jerk: jerk until the next tick, within the limits; only the part along the road matters.
-            others: vehicles ahead that it must not hit.
+            others: vehicles ahead that the body must not hit.
 
         Returns:
             Negative: the vehicle must brake now. Infinite: there is no vehicle ahead.
@@ -136,8 +136,8 @@ class EmergencyBrake:
         """Return the distance that the vehicle travels if it brakes after its reaction time."""
         _, v, a, _, _, _ = state
         lag_s, tick_s, later_s = self._lag_s, self._tick_s, self._later_s
-        # The commanded state has no lag and the same stopping point. It is integrated as in
-        # `integrate`, for a tick and for the rest of the reaction time.
+        # The commanded state has no lag, and the same stopping point as the body. It is integrated
+        # as in `integrate`, for a tick and for the rest of the reaction time.
         speed, half = v + lag_s * a, tick_s * tick_s / 2.0
         ahead_m = (
             lag_s * v + speed * tick_s + setpoint_mps2 * half + jerk_mps3 * (half * tick_s / 3.0)

@@ -10,8 +10,8 @@ without lag, and the body follows it through a low-pass filter, lag ds/dt = c - 
 *commanded state* (c, dc/dt, u) therefore compensates the lag exactly. A low-pass filter averages,
 so the body keeps every limit on speed, acceleration and jerk that the commanded state keeps, and
 two bodies of equal lag keep the distance between their commanded states. All control laws here, the
-tracker and the references use commanded states. The constant lag v_F is left out of c, so a vehicle
-that holds has equal true and commanded states.
+tracker and the references use commanded states. The constant term lag v_F is left out of c, so that
+a vehicle that holds has equal true and commanded states.
 
 All functions are pure functions of floats. The agent plans with them, the motion controller drives
 with them when the agent's commands run out, and the plant integrates with them, so the results of
@@ -228,8 +228,8 @@ def keep_gap(
         v T + v^2 / (2 b)  <=  gap - min_gap + v_other^2 / (2 b).
 
     b is also the maximum braking of the hold law, so a queue of vehicles that all use these laws is
-    safe. T is the time in which limited jerk reaches b, plus the time until the vehicle stops
-    accelerating; the speed that it gains until then is added, too.
+    safe. T is half the time in which limited jerk reaches b, plus two ticks, plus the time until
+    the vehicle stops accelerating; the speed that the vehicle gains until then is added to v.
 
     There are two exceptions. A vehicle at least `min_gap_m` behind may always be as fast as the one
     ahead, so a queue at equal speed keeps its gaps; if these are below v T, the queue relies on
@@ -274,8 +274,8 @@ def _min_accel(share: float, step: float) -> float:
 
     The margin is the speed above that bound [m/s], the rate its derivative [m/s2]. Raising the rate
     from -x jerk tick_s to zero, at full jerk except in the last tick, reduces the margin by jerk
-    tick_s^2 / 2 times m^2, interpolated at x between integers m; this tick changes it by tick_s
-    times the mean of both rates. The minimum rate uses up the margin:
+    tick_s^2 / 2 times m^2, interpolated at x between integers m; this tick changes the margin by
+    tick_s times the mean of the rates before and after. The minimum rate uses up the margin:
 
         x + interp(m^2)(x) = 2 (margin + rate tick_s / 2) / (jerk tick_s^2)
 

@@ -52,9 +52,6 @@ class ExecutionPhase(Enum):
     """The start gate is open."""
 
 
-ACCEPTED = (ExecutionPhase.GATED, ExecutionPhase.GOING)
-"""Phases in which a plan is accepted."""
-
 PREPARE, PLAN, STORED, STATE = "PREPARE", "PLAN", "SENSE", "STATE"
 GATE, TICK, REST = "tick (gate)", "tick (move)", "motion ends"
 
@@ -63,8 +60,8 @@ GATE, TICK, REST = "tick (gate)", "tick (move)", "motion ends"
 class PlanExecution:
     """State machine of one vehicle: handles messages and ticks, and decides when moves begin.
 
-    It begins without a promise or a plan (V1). `hold_cell`, `moving`, `joined`, `owned` and
-    `stored_transfer` mirror the motion controller, which outlives this object.
+    The machine begins without a promise or a plan (V1). `hold_cell`, `moving`, `joined`, `owned`
+    and `stored_transfer` mirror the motion controller, which outlives this object.
     """
 
     vehicle: Name
@@ -115,17 +112,17 @@ class PlanExecution:
         return self.rules.take(self, PLAN, plan) is not None
 
     def on_stored(self, ballot: Ballot | None) -> bool:
-        """V3: handle the accepted plan that the controller reports; return whether it is new."""
+        """V3: accept the taken plan once it is stored; return whether it was accepted now."""
         return self.rules.take(self, STORED, ballot) is not None
 
-    def on_joined(self, formations: tuple[int, ...]) -> bool:
+    def on_joined(self, blocks: tuple[int, ...]) -> bool:
         """Add the blocks that the controller reports as joined; return whether any is new.
 
         Joined blocks are never removed, so an old report has no effect.
         """
-        if formations == self.joined or set(formations) <= set(self.joined):
+        if blocks == self.joined or set(blocks) <= set(self.joined):
             return False
-        self.joined = tuple(sorted({*self.joined, *formations}))
+        self.joined = tuple(sorted({*self.joined, *blocks}))
         self.wanted_joined = tuple(sorted({*self.joined, *self.wanted_joined}))
         return True
 
@@ -192,18 +189,17 @@ class PlanExecution:
             return False
         return self.is_due(t_s - min(OVERDUE_SLOTS * plan.slot_s, plan.slot_s + OVERDUE_S))
 
-    def state(self, sense: Sense, formation: int, *, attended: bool) -> VehicleState:
+    def state(self, sense: Sense, *, attended: bool) -> VehicleState:
         """Return the state to publish.
 
         Args:
             sense: the newest measurements.
-            formation: block in which the vehicle entered.
-            attended: whether an agent drives it.
+            attended: whether an agent drives the vehicle.
         """
         return VehicleState(
             vehicle=self.vehicle,
             incarnation=self.incarnation,
-            formation=formation,
+            formation=sense.formation,
             joined=self.joined,
             promised=self.promised,
             accepted=self.accepted,
@@ -227,21 +223,17 @@ class PlanExecution:
         """Return whether the states of other vehicles are needed now.
 
         They are needed until the gate opens, and from `LISTEN_S` before the next move is due until
-        it is released. States are repeated, so missing some in between is harmless.
+        the move is released. States are repeated, so missing some in between is harmless.
         """
-        plan = self.plan
-        if plan is None:
+        if self.plan is None:
             return False
         if self.phase is not ExecutionPhase.GOING:
             return True
-        if self.next_move is None or not self.is_due(t_s + LISTEN_S):
-            return False
-        needs = self.needs[self.completed]
-        return any(self.progress.get(other, -1) < count for other, count in needs.items())
+        return self.is_due(t_s + LISTEN_S) and not is_released(self, None)
 
     @property
     def next_move(self) -> PlannedMove | None:
-        """First move of the plan not yet completed; None: there is none."""
+        """First uncompleted move of the plan, or None."""
         if self.plan is None or self.completed >= len(self.plan.moves[self.vehicle]):
             return None
         return self.plan.moves[self.vehicle][self.completed]
@@ -249,17 +241,14 @@ class PlanExecution:
     @property
     def accepted(self) -> bool:
         """Whether a plan is accepted: the motion controller has stored it."""
-        return self.phase in ACCEPTED
+        return self.phase in (ExecutionPhase.GATED, ExecutionPhase.GOING)
 
     def is_due(self, t_s: float) -> bool:
-        """Return whether the next move is due at a road time."""
-        plan = self.plan
-        if plan is None:
+        """Return whether there is a next move that is due at a road time."""
+        plan, move = self.plan, self.next_move
+        if plan is None or move is None:
             return False
-        moves, completed = plan.moves[self.vehicle], self.completed
-        if completed >= len(moves):
-            return False
-        return t_s + TIME_TOLERANCE_S >= plan.t0_s + moves[completed][0] * plan.slot_s
+        return t_s + TIME_TOLERANCE_S >= plan.t0_s + move[0] * plan.slot_s
 
 
 # --- guards and actions ---------------------------------------------------------------------------
@@ -297,6 +286,7 @@ def forget_progress(execution: PlanExecution, _: object) -> None:
 
 def publish_state(execution: PlanExecution, _: object) -> None:
     """Publish the state."""
+    # Left to the caller: `on_prepare` and `on_stored` return whether the state must be published.
 
 
 def is_promised_ballot(execution: PlanExecution, plan: Plan) -> bool:

@@ -19,8 +19,8 @@ Needs = dict[Name, int]
 def dependencies(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
     """Return, for each move of a vehicle, how many moves others must complete first.
 
-    For a move in step s and another vehicle A, this is 1 + the index of A's last move before step s
-    whose footprint intersects that of the move. Vehicles without such a move are left out.
+    For a move in step s and another vehicle A, this number is 1 + the index of A's last move before
+    step s whose footprint intersects that of the move. Vehicles without such a move are left out.
     """
 
     def needs(step: int, cells: frozenset[Cell]) -> Needs:
@@ -37,7 +37,7 @@ def dependencies(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
 
 
 def plan_problems(plan: Plan) -> list[str]:
-    """Return the reasons why a plan cannot be executed safely; empty: it can.
+    """Return the reasons why a plan cannot be executed safely; empty if it can.
 
     The maps must cover the roster, and slots must have a positive length. The moves of each vehicle
     must form a chain of neighbouring cells from its start cell, with ascending steps. The cells
@@ -62,7 +62,7 @@ def plan_problems(plan: Plan) -> list[str]:
 
 
 def ownership_problems(plan: Plan) -> list[str]:
-    """Return the reasons why the cell transfers of a plan are invalid; empty: they are valid.
+    """Return the reasons why the cell transfers of a plan are invalid; empty if they are valid.
 
     The maps must cover the roster. No cell may have two owners, before or after the plan. No
     vehicle may receive a cell that no member owned. Afterwards every vehicle must own the cells

@@ -20,13 +20,14 @@ from laneweave.protocol.field_validators import NAME_PATTERN
 from laneweave.protocol.wire.topics import Party
 
 MAX_COMMON_NAME = 64
-"""Maximum number of characters according to X.520."""
+"""Maximum number of characters of a common name (X.520)."""
 IDENTITY_RULE = (
     "router, bridge, or coordinator, vehicle, fleet, client or observer with a dot and a name, "
     f"at most {MAX_COMMON_NAME} characters"
 )
 _PROCESS_BITS = 22
-"""Number of bits of a Linux process id; the bits above them count steps of 4 ms."""
+"""Number of low bits of an incarnation that contain the Linux process id; the bits above them count
+steps of 4 ms."""
 _STEP = 1 << _PROCESS_BITS
 
 

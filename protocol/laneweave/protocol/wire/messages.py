@@ -1,4 +1,4 @@
-"""All messages: sender, receivers, rate, units, and how receivers handle unexpected ones.
+"""All messages: senders, receivers, rates, units, and the effect of loss, delay and duplication.
 
 Messages are frozen attrs classes; `codec` encodes them as MessagePack and checks field types when
 decoding, so a core never receives a malformed message. `t_s` is road time [s], the clock that moves
@@ -30,7 +30,7 @@ class Ballot(NamedTuple):
     """Term of the leader; each election raises it above every term that the leader has seen."""
     coordinator: Name
     incarnation: int
-    """Start time of the coordinator process [ns]."""
+    """Incarnation of the coordinator process [ns]."""
     seq: int
     """Sequence number of the ballot in its process."""
 
@@ -98,10 +98,10 @@ class Prepare:
 class Plan:
     """Leader to each vehicle of the roster that has not accepted, every `network.resend_s`.
 
-    There is one per ballot. Missing: sent again; no vehicle moves until all have accepted (start
+    Each ballot has one plan. Missing: sent again; no vehicle moves until all have accepted (start
     gate). Duplicated or late: ignored. A plan is also ignored (V3) if its ballot is not the
-    promised one, it cannot be executed safely, its blocks differ from the joined ones or do not
-    cover its territory, or its cell transfers are invalid. Vehicles derive the dependencies
+    promised one, if it cannot be executed safely, if its blocks differ from the joined ones or do
+    not cover its territory, or if its cell transfers are invalid. Vehicles derive the dependencies
     between moves from this message.
     """
 
@@ -132,9 +132,9 @@ class Plan:
 class VehicleState:
     """Vehicle to its formation and the coordinators, every tick and at once on every change.
 
-    It serves as promise, acceptance and progress report. Missing: vehicles that wait for it hold.
-    Late or duplicated: harmless to vehicles, since "completed k moves of ballot b" stays true;
-    leaders drop states older than that vehicle's newest. With a ballot other than that of the
+    The state serves as promise, acceptance and progress report. Missing: vehicles that wait for it
+    hold. Late or duplicated: harmless to vehicles, since "completed k moves of ballot b" stays
+    true; leaders drop states older than that vehicle's newest. With a ballot other than that of the
     receiver's plan: not used for this plan.
     """
 
@@ -252,7 +252,7 @@ class Sense:
     ahead: tuple[Neighbour, ...]
     """Neighbours ahead: at most one per lane that the body touches or is next to."""
     behind: tuple[Neighbour, ...] = ()
-    """Neighbours behind, selected in the same way."""
+    """Neighbours behind: at most one per lane that the body touches or is next to."""
     setpoint: tuple[float, float] = (0.0, 0.0)
     """Accelerations last commanded to the actuators, along and across the road [m/s2]."""
     formation: int = 0
@@ -283,12 +283,13 @@ class Sense:
 class Command:
     """Agent to the motion controller of its vehicle (in the bridge), in answer to each `Sense`.
 
-    It contains the complete remaining trajectory. Missing: the controller executes its stored
-    trajectory, then holds. Duplicated: no effect. Only an answer to the current tick that arrives
-    in time is executed; a late answer only ends the agent's silence. From an older incarnation than
-    the one in charge: refused. From a newer one: that process takes charge. `joined`, `accepted`,
-    `promised` and `transfer` are stored for any tick, and confirmed in the next SENSE. With jerks
-    that are not pairs of finite numbers, or cells outside the road's lanes: refused and logged.
+    A command contains the complete remaining trajectory. Missing: the controller executes its
+    stored trajectory, then holds. Duplicated: no effect. Only an answer to the current tick that
+    arrives in time is executed; a late answer only ends the agent's silence. From an older
+    incarnation than the one in charge: refused. From a newer one: that process takes charge.
+    `joined`, `accepted`, `promised` and `transfer` are stored for any tick, and confirmed in the
+    next SENSE. With jerks that are not pairs of finite numbers, or cells outside the road's lanes:
+    refused and logged.
     """
 
     vehicle: Name
@@ -370,8 +371,8 @@ class Census:
     """Bridge to coordinators, fleets and observers, on every change and every 10 ticks.
 
     The census changes when a vehicle enters or leaves, a formation closes, or an announcement is
-    made or withdrawn. It is complete: a vehicle is on the road at `t_s` if and only if it is
-    listed. In each lane, the number of announced vehicles exceeds the number of free cells that
+    made or withdrawn. The census is complete: a vehicle is on the road at `t_s` if and only if it
+    is listed. In each lane, the number of announced vehicles exceeds the number of free cells that
     pass within `runtime.announce_s` by at most one, so that agents start only for vehicles that can
     enter soon. An agent process with a shard starts an agent for each listed vehicle of its shard,
     and stops the agents of vehicles that are no longer listed.
@@ -423,13 +424,13 @@ class RoadClock:
 
 @frozen
 class Report:
-    """Any role to the recorder: its counters.
+    """Any role to the recorder: the sender's counters.
 
     Sent by agents when their vehicle has left or they are stopped, by the bridge when its run ends,
     and by coordinators every 2 s and when they are stopped. Missing: not included in the
     summary; when a run ends, the bridge waits up to 2 s for the reports from all agents. Late: not
-    recorded. Duplicated: the newest report from a sender counts. The summary takes the maximum of a
-    process's counters over its senders, and the sum of all other counters.
+    recorded. Duplicated: the newest report from a sender counts. The summary takes the maximum of
+    `published` and of `rejected` over the senders of a process, and sums all other counters.
     """
 
     role: Name

@@ -46,7 +46,7 @@ class Exchange(Enum):
 
 
 class Party(StrEnum):
-    """Kinds of processes with different rights."""
+    """Kind of process; it determines the rights of the process."""
 
     ROUTER = "router"
     """Forwards all messages."""
@@ -66,6 +66,8 @@ class Party(StrEnum):
 
 ANY_SENDER = "any"
 """Vehicles, coordinators and the bridge, whose {role} and {name} are in the key."""
+ROLES = {Party.VEHICLE: "agent", Party.COORDINATOR: "coordinator", Party.BRIDGE: "bridge"}
+"""Role of each party in the keys of topics with `ANY_SENDER`."""
 
 
 @frozen
@@ -121,12 +123,12 @@ COMMAND = Topic(
 STATE = Topic(
     "state", "state/{formation}/{vehicle}", messages.VehicleState, Party.VEHICLE, Quality.LATEST,
     readers=(Party.COORDINATOR, Party.VEHICLE, Party.OBSERVER), deputy=Party.BRIDGE,
-    remark="coordinators: only the leader; vehicles: only waiting ones of the formation",
+    remark="coordinators: only the leader; vehicles: only while waiting for the formation",
 )  # fmt: skip
 MOTION = Topic(
     "motion", "motion/{stretch}/{vehicle}", messages.Motion, Party.VEHICLE, Quality.LATEST,
     readers=(Party.VEHICLE, Party.OBSERVER),
-    remark="vehicles in this stretch of columns and in both adjacent ones",
+    remark="only vehicles in this stretch of columns and in both adjacent ones",
 )  # fmt: skip
 PREPARE = Topic(
     "prepare", "prepare/{vehicle}", messages.Prepare, Party.COORDINATOR, Quality.ASSURED,
@@ -170,7 +172,7 @@ SERVICE = Topic(
     remark="a query",
 )  # fmt: skip
 
-TOPICS = tuple(each for each in tuple(globals().values()) if isinstance(each, Topic))
+TOPICS = tuple(each for each in globals().values() if isinstance(each, Topic))
 
 
 @frozen

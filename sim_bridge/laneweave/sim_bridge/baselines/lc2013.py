@@ -25,8 +25,8 @@ class Lc2013Traffic:
         self._vehicles: dict[str, ReferenceVehicle] = {}
         self._offered: dict[str, int] = {}
         """Lane of each vehicle that waits for SUMO to insert it, at most one per lane."""
-        self._kept_on_lane: set[ReferenceVehicle] = set()
-        """Vehicles that may not change lanes yet."""
+        self._kept_in_lane: set[ReferenceVehicle] = set()
+        """Vehicles that must not change lanes yet."""
         self._poses: dict[str, Pose] = {}
         self._road = scenario.road
         self._everywhere = scenario.lc2013.lane_changes == "everywhere"
@@ -46,9 +46,9 @@ class Lc2013Traffic:
         new_vehicles = [self._entered(name, t_s, entrance) for name in sorted(entered)]
         for vehicle in self._vehicles.values():
             self._update(vehicle)
-        for vehicle in list(self._kept_on_lane):
+        for vehicle in list(self._kept_in_lane):
             if vehicle.s_m >= self._road.sorting_start_m:
-                self._kept_on_lane.remove(vehicle)
+                self._kept_in_lane.remove(vehicle)
                 self._sumo.allow_lane_changes(vehicle.name, allowed=True)
         return new_vehicles
 
@@ -63,13 +63,13 @@ class Lc2013Traffic:
     def remove(self, vehicle: ReferenceVehicle) -> None:
         """Remove a vehicle from the road."""
         del self._vehicles[vehicle.name]
-        self._kept_on_lane.discard(vehicle)
+        self._kept_in_lane.discard(vehicle)
         self._sumo.remove(vehicle.name)
 
     def _offer(self, t_s: float, entrance: Entrance) -> None:
         """Queue the next vehicle of each lane in SUMO, which inserts it when there is room."""
         for lane in range(self._road.lanes):
-            arrival = entrance.next_on(lane)
+            arrival = entrance.next_in(lane)
             if arrival is not None and arrival.vehicle not in self._offered:
                 s_m = entrance.max_entry_m(arrival, t_s)
                 self._sumo.offer(arrival.vehicle, arrival.lane, arrival.preferred_lane, s_m)
@@ -90,7 +90,7 @@ class Lc2013Traffic:
         )
         self._vehicles[name] = vehicle
         if not self._everywhere:
-            self._kept_on_lane.add(vehicle)
+            self._kept_in_lane.add(vehicle)
         return vehicle
 
     def _update(self, vehicle: ReferenceVehicle) -> None:

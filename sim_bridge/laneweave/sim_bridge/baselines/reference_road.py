@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from typing import Protocol
 
 from attrs import define
@@ -15,7 +15,7 @@ from laneweave.protocol.wire.messages import RoadClock
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
-from laneweave.sim_bridge.road.demand import Arrival, arrivals
+from laneweave.sim_bridge.road.demand import Arrival, arrivals, count_until
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S
 
 
@@ -87,7 +87,7 @@ class Entrance:
         """Add a vehicle to the queue of its lane."""
         self._queues[arrival.lane].append(arrival)
 
-    def next_on(self, lane: int) -> Arrival | None:
+    def next_in(self, lane: int) -> Arrival | None:
         """Return the next vehicle in the queue of a lane, if any."""
         return self._queues[lane][0] if self._queues[lane] else None
 
@@ -126,19 +126,12 @@ class Traffic(Protocol):
 class ReferenceRoad:
     """The road of a reference method; call `advance` until `ending` is set."""
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        traffic: Traffic,
-        record: RunRecord,
-        stopwatch: Callable[[], float] = time.perf_counter,
-    ) -> None:
-        """Create the road before the first tick; `stopwatch` measures the duration of ticks [s]."""
+    def __init__(self, scenario: Scenario, traffic: Traffic, record: RunRecord) -> None:
+        """Create the road before the first tick."""
         self.tick = 0
         self._scenario = scenario
         self._traffic = traffic
         self._record = record
-        self._stopwatch = stopwatch
         self._arrivals = arrivals(scenario)
         self._demanded = 0
         self._left = 0
@@ -174,24 +167,22 @@ class ReferenceRoad:
 
     def advance(self) -> None:
         """Advance by one tick."""
-        start_s = self._stopwatch()
+        start_s = time.perf_counter()
         self.tick += 1
         self._queue_arrivals()
         for vehicle in self._traffic.step(self.t_s, self._entrance):
             self._record.on_entered(vehicle)
         self._measure()
         self._remove_departed()
-        self._record.on_tick(self.t_s, len(self._traffic.vehicles), self._stopwatch() - start_s)
+        self._record.on_tick(self.t_s, len(self._traffic.vehicles), time.perf_counter() - start_s)
 
     def _queue_arrivals(self) -> None:
         """Queue the vehicles that arrived since the last tick."""
-        while self._demanded < len(self._arrivals):
-            arrival = self._arrivals[self._demanded]
-            if arrival.t_s > self.t_s + TIME_TOLERANCE_S:
-                return
+        first = self._demanded
+        self._demanded = count_until(self._arrivals, self.t_s + TIME_TOLERANCE_S)
+        for arrival in self._arrivals[first : self._demanded]:
             self._record.on_demanded(arrival)
             self._entrance.queue(arrival)
-            self._demanded += 1
 
     def _measure(self) -> None:
         """Record positions, overlaps and gaps."""

@@ -31,6 +31,7 @@ class RuleTraffic:
         self._limits = scenario.vehicle
         self._rule = scenario.rule
         self._road = scenario.road
+        self._centre_m = scenario.lattice.cell_y_m
         self._speed_mps = scenario.formation.speed_mps
         self._tick_s = scenario.runtime.tick_s
 
@@ -109,7 +110,7 @@ class RuleTraffic:
     def _admit(self, t_s: float, entrance: Entrance) -> list[ReferenceVehicle]:
         entered = []
         for lane in range(self._road.lanes):
-            while (arrival := entrance.next_on(lane)) is not None:
+            while (arrival := entrance.next_in(lane)) is not None:
                 s_m = self._room_m(lane, entrance.max_entry_m(arrival, t_s))
                 if s_m is None:
                     break
@@ -138,9 +139,6 @@ class RuleTraffic:
         if s_m < 0.0 or not following.is_safe(s_m, speed_mps, ahead.s_m, ahead.speed_mps):
             return None
         return s_m
-
-    def _centre_m(self, lane: int) -> float:
-        return (lane + 0.5) * self._road.lane_width_m
 
 
 def check_rule(scenario: Scenario) -> None:

@@ -38,7 +38,7 @@ class Following:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        """Take the parameters from the tables `rule` and `vehicle`."""
+        """Read the parameters from the tables `rule` and `vehicle`."""
         rule, vehicle = scenario.rule, scenario.vehicle
         self._standstill_m = rule.standstill_gap_m
         if rule.gap == "net":
@@ -55,7 +55,7 @@ class Following:
     def is_safe(
         self, s_m: float, speed_mps: float, ahead_s_m: float, ahead_speed_mps: float
     ) -> bool:
-        """Return whether a vehicle may start to follow: at least d_R away, with room to brake.
+        """Return whether a vehicle may start following another: at least d_R behind, able to stop.
 
         Behind a much slower vehicle d_R alone is not sufficient.
         """
@@ -70,7 +70,7 @@ class Following:
     ) -> float:
         """Return the highest safe speed of a follower at the end of a tick.
 
-        It is the lower of two speeds v', reached over the distance (v + v') / 2 dt:
+        The result is the lower of two speeds v', reached over the distance (v + v') / 2 dt:
 
         - the speed at which the gap is d_R at the end of the tick. If all vehicles keep d_R, speeds
           follow the speed ahead with a first-order lag of time constant tau;
@@ -154,7 +154,7 @@ class Rules:
     """Lane changes and speeds by rules 1 to 3."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Take the parameters from the tables `rule`, `road`, `formation` and `vehicle`."""
+        """Read the parameters from the tables `rule`, `road`, `formation` and `vehicle`."""
         self.following = Following(scenario)
         rule, road = scenario.rule, scenario.road
         self._sorting_start_m = road.sorting_start_m
@@ -174,14 +174,14 @@ class Rules:
             The vehicles that slow down, to let another vehicle in or to get in behind it.
         """
         unsorted = sorted(
-            {
+            (
                 vehicle
                 for lane in lanes
                 for vehicle in lane
                 if vehicle.lane != vehicle.preferred_lane
                 and vehicle.previous_lane is None
                 and vehicle.s_m >= self._sorting_start_m
-            },
+            ),
             key=priority,
         )
         slowing: set[ReferenceVehicle] = set()

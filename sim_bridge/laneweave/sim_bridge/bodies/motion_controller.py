@@ -7,12 +7,12 @@ It drives on one of the rungs of a fallback ladder (`Rung`):
     give way    as hold, but brakes comfortably behind a vehicle ahead
     emergency   brakes as hard as possible while `EmergencyBrake` requires it
 
-Without an agent or new commands, it executes the trajectory to its end. A trajectory that has ended
-or was interrupted by an emergency is not resumed: only a new command leads back to `execute`. The
-emergency brake acts on every rung and uses only local sensing.
+Without an agent or new commands, the controller executes its trajectory to the end. A trajectory
+that has ended or was interrupted by an emergency is not resumed: only a new command leads back to
+`execute`. The emergency brake acts on every rung and uses only local sensing.
 
 The controller also stores the data that must survive the agent: the process in charge, the joined
-formations, the newest accepted plan, and in the rolling operation the highest promise and the owned
+blocks, the newest accepted plan, and in the rolling operation the highest promise and the owned
 cells. Only the process in charge can change the hold cell and the trajectory.
 """
 
@@ -45,14 +45,14 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, Neighbo
 from laneweave.sim_bridge.bodies.plant import Plant
 
 MAX_COLUMN = 2**31 - 1
-"""Maximum column: columns are recorded as 32-bit integers. Formation numbers are smaller."""
+"""Maximum column: columns are recorded as 32-bit integers. Block numbers are no larger."""
 RELEASE_M = 1.0
 """Spare distance, beyond the distance driven in a tick, at which an emergency ends. Without it,
-favourable measurement errors would release the brake repeatedly, and accumulate."""
+favourable measurement errors would release the brake repeatedly, and lost distance add up."""
 
 
 class Rung(IntEnum):
-    """Rung of the fallback ladder; see the module."""
+    """Rung of the fallback ladder; see the module docstring."""
 
     EXECUTE = 0
     HOLD = 1
@@ -70,7 +70,7 @@ class MotionController:
     attendant: int = 0
     """Incarnation of the process in charge; 0: none."""
     joined: tuple[int, ...] = field(init=False)
-    """Formations whose blocks the vehicle's plans may use, ascending; never shrinks."""
+    """Blocks that the vehicle's plans must cover, ascending; never shrinks."""
     accepted: Ballot | None = None
     """Newest plan that the process in charge has accepted."""
     promised: Ballot | None = None
@@ -103,7 +103,7 @@ class MotionController:
     _brake: EmergencyBrake = field(init=False)
 
     def __attrs_post_init__(self) -> None:
-        """Begin without a trajectory, in the formation of the cell."""
+        """Begin without a trajectory, in the block of the cell."""
         self.lattice = self._scenario.lattice
         self.tick_s = self._scenario.runtime.tick_s
         # The other blocks of the formation are not known until it is closed.
@@ -128,7 +128,7 @@ class MotionController:
         self._measured, self.neighbours = measured, neighbours
 
     def accept_command(self, command: Command) -> bool:
-        """Accept a command from the process in charge, or from one that takes charge with it.
+        """Accept a command from the process in charge, or from a newer one, which takes charge.
 
         A command is rejected if its incarnation is older than that of the process in charge, if its
         tick is not later than that of the last command, or if the vehicle does not own its hold
@@ -148,13 +148,13 @@ class MotionController:
         if command.incarnation < self.attendant or command.tick <= self.command_tick:
             return False
         jerks = self._checked_jerks(command)
-        if command.incarnation > self.attendant and command.hold_cell != self.hold_cell:
-            return False
+        leaves = command.hold_cell != self.hold_cell
         if command.incarnation > self.attendant:
+            if leaves:
+                return False
             self.put_in_charge(command.incarnation)
         self.command_tick = command.tick
         self.store_requests(command)
-        leaves = command.hold_cell != self.hold_cell
         if self.rolling and leaves and command.hold_cell not in self.owned:
             return False
         if len(jerks) > 0 or leaves:
@@ -177,7 +177,7 @@ class MotionController:
         self.accepted = None
 
     def store_requests(self, command: Command) -> bool:
-        """Store formations, promise, transfer and acceptance from a command for any tick.
+        """Store joined blocks, promise, transfer and acceptance from a command for any tick.
 
         Commands from processes other than the one in charge are ignored. Returns whether anything
         has changed.
@@ -237,9 +237,9 @@ class MotionController:
         if self.transfer is not None and not self.transfer.open:
             self.transfer = _with_cells(self.transfer, {cell})
 
-    def join(self, formations: Iterable[int]) -> None:
-        """Add joined formations."""
-        self.joined = tuple(sorted({*self.joined, *formations}))
+    def join(self, blocks: Iterable[int]) -> None:
+        """Add joined blocks."""
+        self.joined = tuple(sorted({*self.joined, *blocks}))
 
     def moving(self, tick: int) -> bool:
         """Return whether a motion is still in progress at `tick`.
@@ -334,5 +334,5 @@ def _with_cells(transfer: PendingTransfer, cells: Iterable[Cell]) -> PendingTran
     )
 
 
-def _in_range(formations: Iterable[int]) -> bool:
-    return max(map(abs, formations), default=0) <= MAX_COLUMN
+def _in_range(blocks: Iterable[int]) -> bool:
+    return max(map(abs, blocks), default=0) <= MAX_COLUMN

@@ -7,8 +7,8 @@ A vehicle's body is a rectangle of length L and width W. Its pose consists of
     heading  angle of its body, atan2(v_y, v): a body points in its direction of motion.
 
 The body's centre is (s - L/2 cos heading, y). The overlap test is exact for these rectangles and
-determines the safety of a run. SUMO's collision list, which misses overlaps between two lanes, is
-also recorded.
+decides whether a run counts as safe. SUMO's collision list, which misses overlaps between two
+lanes, is also recorded.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Pose = tuple[float, float, float, float]
 _Point = tuple[float, float]
 
 _TOUCH_M = 1e-9
-"""Tolerance: touching bodies do not overlap; a body that touches a lane's border stays inside."""
+"""Tolerance: touching bodies do not overlap; a body that touches a lane's border is inside."""
 
 
 class MinGaps(NamedTuple):
@@ -167,8 +167,8 @@ class Bodies:
     ) -> dict[str, ExactNeighbours]:
         """Return the neighbours of each vehicle without measurement errors.
 
-        They are the nearest vehicle ahead and behind in each lane that the vehicle's body touches
-        and in the adjacent lanes. A vehicle that straddles two lanes is in both. The
+        Neighbours are the nearest vehicles ahead and behind in each lane that the body touches and
+        in the adjacent lanes. A vehicle that straddles two lanes is in both. The
         bumper-to-bumper gap ignores rotation and is negative for vehicles side by side. The vehicle
         whose front is farther ahead counts as ahead; ties go to the vehicle with the later name.
 
@@ -249,8 +249,6 @@ def _gap_m(behind: Pose, ahead: Pose, length_m: float, width_m: float) -> float:
     As functions of y, rear boundaries are convex and front boundaries are concave, with kinks at
     corners, so their minimum difference is at a corner or at an end of the common range of y.
     """
-    if behind[2] == 0.0 and ahead[2] == 0.0:
-        return ahead[0] - length_m - behind[0]
     one, other = corners(behind, length_m, width_m), corners(ahead, length_m, width_m)
     low = max(min(y for _, y in one), min(y for _, y in other))
     high = min(max(y for _, y in one), max(y for _, y in other))
@@ -269,7 +267,9 @@ def _crossings(shape: Sequence[_Point], level_y: float) -> list[float]:
     for index, (x, y) in enumerate(shape):
         other_x, other_y = shape[index - 1]
         if min(y, other_y) <= level_y <= max(y, other_y):
-            share = (level_y - y) / (other_y - y) if other_y != y else 0.0
-            found += [x + share * (other_x - x)] if other_y != y else [x, other_x]
+            if y == other_y:
+                found += [x, other_x]
+            else:
+                found.append(x + (level_y - y) / (other_y - y) * (other_x - x))
     # Due to rounding, the level may be just outside the polygon.
     return found or [min(shape, key=lambda point: abs(point[1] - level_y))[0]]

@@ -192,7 +192,7 @@ class RunRecord:
     def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
         """Record a vehicle that has passed the end of the road since the last tick.
 
-        `attended`: its agent was in charge, not a caretaker.
+        `attended`: whether the vehicle's agent was in charge, not a caretaker.
         """
         s_m, v_mps, _, y_m, _, _ = vehicle.state
         beyond_m = s_m - self._scenario.road.length_m
@@ -405,7 +405,7 @@ def _sample(vehicle: RecordedVehicle) -> Sample:
 
 
 def _per_process(reports: Iterable[Report], counter: str) -> int:
-    """Return the sum of a counter over processes; one may report it for several vehicles."""
+    """Return the sum of a counter over processes, each of which may report for several vehicles."""
     newest: dict[Name, int] = {}
     for report in reports:
         newest[report.process] = max(newest.get(report.process, 0), getattr(report, counter))

@@ -94,7 +94,7 @@ def travel_time(trips: pa.Table) -> TravelTime:
 def throughput(trips: pa.Table, lanes: int) -> float | None:
     """Return the flow at the end of the road [vehicles/(lane h)]; None if undefined.
 
-    It is measured from the time the first counted vehicle leaves until the last one leaves.
+    The flow is measured between the departures of the first and the last counted vehicle.
     """
     counted_s = trips.filter(pc.field("counted"))["left_s"].to_numpy()
     if not len(counted_s) or counted_s.max() <= counted_s.min():

@@ -1,7 +1,7 @@
 """Attendance: the process in charge of each vehicle, its agent or a caretaker.
 
-Rules for when an agent is present or silent, when a caretaker takes charge and is replaced, and how
-agents are notified that their vehicles have left. The bridge and the fault search share them.
+Rules, shared by the bridge and the fault search, for when an agent is present or silent, when a
+caretaker takes charge and is replaced, and how agents are notified that their vehicles have left.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ class Absence(StrEnum):
 class Caretaker:
     """Substitute for a vehicle's agent that is absent, silent or always late.
 
-    It runs the same plan execution as an agent and publishes the same states, but it never starts a
-    move, and accepts only plans in which its vehicle does not move. The vehicle promises to stay in
-    its cell, and the leader plans around it.
+    A caretaker runs the same plan execution as an agent and publishes the same states, but never
+    starts a move, and accepts only plans in which its vehicle does not move. The vehicle promises
+    to stay in its cell, and the leader plans around it.
 
     The motion controller finishes its trajectory and holds. The caretaker is removed when an agent
     claims the vehicle with a COMMAND.
@@ -94,8 +94,7 @@ class Caretaker:
         vehicle, execution = self._vehicle, self._execution
         if execution.moving and not vehicle.controller.moving(tick):
             execution.end_motion()
-        sense = vehicle.sense(tick, caretaker=True)
-        return execution.state(sense, vehicle.block, attended=False)
+        return execution.state(vehicle.sense(tick, caretaker=True), attended=False)
 
 
 class Attendance:
@@ -158,8 +157,8 @@ class Attendance:
         Returns:
             Whether the controller has stored a change that the agent waits for.
         """
-        # Late answers also show that an agent is present, but a replaced agent says nothing about
-        # its successor.
+        # Late answers also show that an agent is present, but those of a replaced agent say nothing
+        # about its successor.
         if command.incarnation >= vehicle.controller.attendant or vehicle.name in self:
             self.answers.on_message(vehicle.name)
         return vehicle.controller.store_requests(command)
@@ -187,7 +186,7 @@ class Attendance:
         return True
 
     def leave(self, vehicle: RoadVehicle) -> Iterator[Effect]:
-        """Remove a vehicle from the road, and notify its agent from now on."""
+        """Remove a vehicle from the road; later ticks notify its agent."""
         self.answers.remove(vehicle.name)
         self.departed[vehicle.name] = (vehicle, LEFT_REPEATS)
         yield from self._end_caretaker(vehicle.name)

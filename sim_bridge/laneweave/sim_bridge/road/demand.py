@@ -12,6 +12,8 @@ only appends arrivals, without changing the names of earlier ones.
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Sequence
 from itertools import accumulate
 
 import numpy as np
@@ -43,7 +45,7 @@ def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
     drawn = sorted(
         (t_s, lane, preferred)
         for lane in range(scenario.road.lanes)
-        for t_s, preferred in _arrivals_on(lane, scenario)
+        for t_s, preferred in _arrivals_in(lane, scenario)
     )
     return tuple(
         Arrival(vehicle_name(number), lane, preferred, t_s)
@@ -51,7 +53,12 @@ def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
     )
 
 
-def _arrivals_on(lane: int, scenario: Scenario) -> list[tuple[float, int]]:
+def count_until(stream: Sequence[Arrival], t_s: float) -> int:
+    """Return the number of sorted arrivals up to a road time."""
+    return bisect_right(stream, t_s, key=lambda arrival: arrival.t_s)
+
+
+def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int]]:
     """Return (time [s], preferred lane) of each arrival in one lane."""
     demand = scenario.demand
     mean_excess_s = max(0.0, 3600.0 / demand.volume_veh_per_lane_h - demand.min_headway_s)

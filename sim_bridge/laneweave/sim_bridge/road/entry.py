@@ -1,14 +1,14 @@
 """Entry metering at the start of the road.
 
-A vehicle enters at s = 0 with the lattice speed v_F. It gets the first free cell of its lane behind
-its predecessor that passes s = 0 at most `spread_s` before or after the vehicle, and settles in
-this cell. With interlaced entry only every other cell may be entered, as in the paper's driving
-structure. Vehicles of a lane enter in order of arrival, at least one column's time apart.
+A vehicle enters at s = 0 with the lattice speed v_F. Of the free cells of its lane behind its
+predecessor, it gets the first that passes s = 0 at most `spread_s` before or after the vehicle, and
+settles in this cell. With interlaced entry only every other cell may be entered, as in the paper's
+driving structure. Vehicles of a lane enter in order of arrival, at least one column's time apart.
 
 With formations, `formation_building` decides whether a formation admits a vehicle.
 
-Decisions do not depend on later arrivals: they are made in order of time; at the same time, from
-the right lane to the left.
+Decisions do not depend on later arrivals: they are made in order of time and, at equal times, from
+the rightmost lane to the leftmost.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class EntryMeter:
     def __init__(
         self,
         lattice: Lattice,
-        spread_s: float = 0.0,
+        spread_s: float,
         builder: FormationBuilder | None = None,
         *,
         interlaced: bool = False,
@@ -74,11 +74,11 @@ class EntryMeter:
         return tuple(arrival for queue in self._queues for arrival in queue)
 
     def closed_column(self, lane: int) -> int:
-        """Return the last column of a lane that vehicles can no longer enter."""
+        """Return the rearmost column of a lane that vehicles can no longer enter."""
         return self._columns[lane] + 1
 
     def demand(self, arrival: Arrival) -> None:
-        """Queue a vehicle for its lane in order of arrival; its arrival time may lie ahead.
+        """Queue a vehicle for its lane in order of arrival; its arrival may be in the future.
 
         Raises:
             ValueError: a lane does not exist, or the vehicle is already queued.

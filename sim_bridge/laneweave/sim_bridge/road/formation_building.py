@@ -5,14 +5,14 @@ Each column belongs to at most one closed formation, permanently: plans of diffe
 on this.
 
 - `ColumnBlocks`, as in the paper: all formations have the same number of columns.
-- `GrowingFormations`, the default: the length depends on the traffic. A formation begins with the
-  column of its first vehicle. It ends at its maximum number of vehicles, at its maximum length, or
-  before a vehicle that would need more places in a lane than the shortest formation has. Behind the
+- `GrowingFormations`, the default: the length depends on the traffic. A formation begins near the
+  column of its first vehicle. It closes at its maximum number of vehicles, at its maximum length,
+  or before more vehicles prefer a lane than the shortest full formation has columns. Behind the
   last vehicle it gets the columns that sorting needs: at least as many free cells as lanes, and as
   many columns as there are vehicles that prefer the same lane.
 
-Both close a formation before it needs more places in a lane than it has, unlike the paper, which
-groups vehicles regardless of their preferences.
+In both, the number of vehicles that prefer the same lane is at most the number of columns, unlike
+in the paper, which groups vehicles regardless of their preferences.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class GrowingFormations:
 
     @property
     def shortest_length(self) -> int:
-        """Number of columns of a full formation without additional cells."""
+        """Minimum number of columns of a full formation."""
         return self._length_for(self.max_vehicles)
 
     def try_add(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
@@ -154,7 +154,10 @@ class GrowingFormations:
         self._preferring.clear()
 
     def _length_for(self, vehicles: int) -> int:
-        """Return the number of columns for some vehicles plus as many free cells as lanes."""
+        """Return the minimum number of columns.
+
+        With several lanes, at least as many cells as there are lanes stay free.
+        """
         lanes = self.lattice.lanes
         return math.ceil((vehicles + lanes) / lanes) if lanes > 1 else vehicles
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from itertools import chain, takewhile
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect, Send
@@ -21,7 +20,7 @@ from laneweave.protocol.wire.messages import (
     RoadClock,
 )
 from laneweave.protocol.wire.topics import CENSUS, CLOCK
-from laneweave.sim_bridge.road.demand import Arrival, arrivals
+from laneweave.sim_bridge.road.demand import Arrival, arrivals, count_until
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter
 from laneweave.sim_bridge.road.formation_building import formation_builder
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -78,22 +77,15 @@ class Roadside:
     def newly_demanded(self, t_s: float) -> tuple[Arrival, ...]:
         """Return the arrivals since the last call."""
         first = self._demanded
-        while (
-            self._demanded < len(self._arrivals)
-            and self._arrivals[self._demanded].t_s <= t_s + TIME_TOLERANCE_S
-        ):
-            self._demanded += 1
+        self._demanded = count_until(self._arrivals, t_s + TIME_TOLERANCE_S)
         return self._arrivals[first : self._demanded]
 
     def admit(self, t_s: float) -> list[Admission]:
         """Return the vehicles that have entered since the last call."""
         # Also queue vehicles that arrive before the next tick, since cells pass between ticks.
-        while (
-            self._queued < len(self._arrivals)
-            and self._arrivals[self._queued].t_s <= t_s + self._tick_s
-        ):
-            self._meter.demand(self._arrivals[self._queued])
-            self._queued += 1
+        first, self._queued = self._queued, count_until(self._arrivals, t_s + self._tick_s)
+        for arrival in self._arrivals[first : self._queued]:
+            self._meter.demand(arrival)
         admissions = self._meter.admit(t_s)
         for admission in admissions:
             column, lane = admission.cell
@@ -119,7 +111,7 @@ class Roadside:
     def assign_empty_cells(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
         """Assign empty cells at the entrance to vehicles near them (rolling operation).
 
-        A cell is assigned once no vehicle can enter in it any more. A cell without a vehicle nearby
+        A cell is assigned once no vehicle can enter it any more. A cell without a vehicle nearby
         waits for the next vehicles; if it is too far ahead of them, it remains without an owner.
         """
         if not self._rolling:
@@ -138,7 +130,7 @@ class Roadside:
                 self._assign(cell, vehicles)
 
     def _assign(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
-        """Assign an empty cell to a nearby vehicle, preferably one ahead in the same lane."""
+        """Assign an empty cell to a nearby vehicle, preferably one ahead of it in its lane."""
         column, lane = cell
         first, last = column - self._max_empty, column + self._max_empty
         near = [
@@ -152,7 +144,7 @@ class Roadside:
             self._unassigned.append(cell)
 
     def _store_recent(self, column: int, lane: int, name: Name) -> None:
-        """Store an entered vehicle, and remove vehicles far ahead of it."""
+        """Add an entered vehicle to the recent ones, and drop those far ahead of it."""
         far = column + 2 * self._max_empty
         self._recent = [one for one in self._recent if one[0] <= far]
         self._recent.append((column, lane, name))
@@ -227,10 +219,8 @@ class Roadside:
         """Return the vehicles that may enter within `announce_s`."""
         room = [self._announced_per_lane] * self._lanes
         coming = []
-        until_s = t_s + self._announce_s
-        later = map(self._arrivals.__getitem__, range(self._queued, len(self._arrivals)))
-        upcoming = takewhile(lambda one: one.t_s <= until_s, later)
-        for arrival in chain(self._meter.waiting, upcoming):
+        until = count_until(self._arrivals, t_s + self._announce_s)
+        for arrival in (*self._meter.waiting, *self._arrivals[self._queued : until]):
             if room[arrival.lane] > 0:
                 room[arrival.lane] -= 1
                 coming.append(arrival)

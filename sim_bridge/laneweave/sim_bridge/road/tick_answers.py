@@ -2,7 +2,7 @@
 
 A tick waits until its deadline for every agent with a token. If messages are lost, the next tick
 waits for the agent again. An agent that has not answered for `agent_silent_s` is *silent*: ticks no
-longer wait for it. If no agent has answered for this time, ticks do not wait for new agents either.
+longer wait for it. If no agent has answered for that long, ticks do not wait for new agents either.
 
 Answers after the deadline indicate a slow machine rather than lost messages. Ticks then get more
 time, and SENSE is repeated less often, so that the road slows down and agents keep up. When answers
@@ -25,7 +25,7 @@ from laneweave.protocol.wire.messages import Name
 MAX_STRETCH = 8.0
 """Maximum factor of `tick_deadline_s`."""
 _STRETCH, _RELAX = 1.5, 0.98
-"""Multipliers of that factor after a tick with too many late answers, and after other ticks."""
+"""Multipliers of the deadline's factor after ticks with too many late answers, and after others."""
 _LATE_AGENTS = 0.05
 """Fraction of agents that may be late before the deadline is increased."""
 LATE_SHARE = 2.0
@@ -77,8 +77,7 @@ class Answers:
     def agent_down(self, name: Name) -> None:
         """Remove an agent whose token has vanished."""
         self.up.discard(name)
-        self.awaited.discard(name)
-        self._reset(name)
+        self.remove(name)
 
     def remove(self, name: Name) -> None:
         """Remove a vehicle that has left the road; its agent may still be present."""

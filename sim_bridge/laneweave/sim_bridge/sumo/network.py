@@ -25,7 +25,7 @@ MIN_MARGIN_M = 30.0
 def margin_m(scenario: Scenario) -> float:
     """Return the length by which SUMO's edge exceeds the road at each end [m].
 
-    When a vehicle is removed, it is up to one tick's travel beyond the end.
+    Vehicles are removed up to one tick's travel beyond the end of the road.
     """
     vehicle = scenario.vehicle
     tick_m = vehicle.max_speed_mps * scenario.runtime.tick_s
@@ -37,7 +37,7 @@ def exit_route(lane: int) -> str:
     return f"{ROUTE}-{lane}"
 
 
-def write_network(scenario: Scenario, folder: Path, *, exits: bool = False) -> tuple[str, ...]:
+def write_network(scenario: Scenario, folder: Path, *, exits: bool) -> tuple[str, ...]:
     """Write network and route files; return SUMO's command line, program name included.
 
     Args:
@@ -73,7 +73,7 @@ def _network(scenario: Scenario, *, exits: bool) -> Iterator[str]:
     speed_mps = scenario.formation.speed_mps if exits else scenario.vehicle.max_speed_mps
 
     def lane_of(edge: str, index: int, lane: int, from_m: float, to_m: float) -> str:
-        centre_m = (lane + 0.5) * lane_m
+        centre_m = scenario.lattice.cell_y_m(lane)
         return (
             f'<lane id="{edge}_{index}" index="{index}" speed="{speed_mps:.6f}"'
             f' length="{to_m - from_m:.6f}" width="{lane_m:.6f}"'

@@ -1,7 +1,7 @@
 """The road in SUMO, with bodies that SUMO displays but does not drive.
 
 SUMO displays every vehicle with the position, lateral position, heading and speed of its plant,
-also between lanes. The calls in each tick are
+even between lanes. The calls in each tick are
 
     place() every vehicle  ->  step()  ->  positions(), collisions()
 

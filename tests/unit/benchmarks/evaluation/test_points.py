@@ -162,7 +162,7 @@ def test_planning_times_are_those_of_each_solver(tmp_path: Path) -> None:
     assert (row.plans, row.fallbacks) == (10, 2)
     assert row.planning == (
         PlanningTimes("branching", 2, 6.0, 6.9, 7.0),
-        PlanningTimes("stream", 1, 3.5, 3.5, 3.5),
+        PlanningTimes("rolling", 1, 3.5, 3.5, 3.5),
         PlanningTimes("tappa", 3, 2.0, 8.3, 9.0),
     )
 

@@ -119,10 +119,10 @@ def test_a_point_whose_runs_all_failed() -> None:
 def test_goals() -> None:
     table = goals_table(full())
     assert cells(table, "`rolling`, 2400")[1:] == [
-        "at most 67 s, at least 99.9 % on their lane", "66.50 s, 100 %", "holds",
+        "at most 67 s, at least 99.9 % in their lane", "66.50 s, 100 %", "holds",
     ]  # fmt: skip
     assert cells(table, "`formations`, 1600")[1:] == [
-        "at most 66.9 s, 100 % on their lane, within 3.5 m/s2, at most 1 % fallbacks",
+        "at most 66.9 s, 100 % in their lane, within 3.5 m/s2, at most 1 % fallbacks",
         "66.60 s, 100 %, -6.80 to 4.80 m/s2, 9 of 1,000 plans",
         "**missed**",
     ]

@@ -11,9 +11,9 @@ from laneweave.coordinator.formations.roster import (
     Formation,
     Groups,
     closed_formations,
+    exit_time_s,
     start_time_s,
     steps_left,
-    time_left_s,
 )
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Road, Scenario
@@ -157,7 +157,7 @@ def test_longer_slots_are_fewer(slot_s: float, left_s: float) -> None:
     """The last one ends before the foremost cell is at the end of the road."""
     cells: list[Cell] = [(-3, 0), (-1, 2)]
     t_s = GROWING.lattice.passing_time_s(-1, GROWING.road.length_m) - left_s
-    assert time_left_s(cells, t_s, GROWING) == pytest.approx(left_s)
+    assert exit_time_s(cells, GROWING) - t_s == pytest.approx(left_s)
     steps = steps_left(cells, t_s, slot_s, GROWING)
     assert steps * slot_s <= max(left_s, 0.0) + 1e-3
     assert (steps + 1) * slot_s > left_s

@@ -7,7 +7,7 @@ from attrs import evolve
 
 from laneweave.coordinator.formations import pacing
 from laneweave.coordinator.formations.pacing import MIN_RESERVE_S, RESERVE_S, steps_of, with_pauses
-from laneweave.coordinator.formations.roster import start_time_s, time_left_s
+from laneweave.coordinator.formations.roster import exit_time_s, start_time_s
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import FormationSettings, Scenario
 from laneweave.protocol.wire.messages import Plan
@@ -32,7 +32,7 @@ def paced(plan: Plan, scenario: Scenario = SCENARIO) -> Plan:
 
 
 def left_s(plan: Plan) -> float:
-    return time_left_s(plan.territory, plan.t0_s, SCENARIO)
+    return exit_time_s(plan.territory, SCENARIO) - plan.t0_s
 
 
 @pytest.mark.parametrize("late_s", [0.0, 7.0, 14.0, 16.1])
@@ -70,7 +70,7 @@ def test_a_plan_begins_before_its_rear_is_in_s3_unless_a_lane_change_does() -> N
         t0_s=start_time_s([(-3, 0)], 0.0, SCENARIO),
         territory=((-3, 0), (-2, 0), (-2, 1)),
     )
-    end_s = time_left_s(plan.territory, 0.0, SCENARIO)
+    end_s = exit_time_s(plan.territory, SCENARIO)
     early = pacing.paced(plan, [], 0.0, end_s, SCENARIO)
     changes_s = early.t0_s + early.slot_s
     assert early.t0_s < plan.t0_s

@@ -200,7 +200,7 @@ def test_formations_keep_the_clearance_when_agents_drive_them(lateness_s: float)
     """Eight vehicles in mode 2 follow a timetable with delays."""
     least_m = []
     for seed in range(6):
-        document = formation_request(seed, vehicles=8, mode=2).to_dict()
+        document = formation_request(seed, vehicles=8, mode=2, deadline_s=60.0).to_dict()
         document["geometry"] = {"lateness_s": lateness_s}
         response = plan(PlanRequest.from_dict(document), max_nodes=300)
         paths = [list(path) for path in response.paths]

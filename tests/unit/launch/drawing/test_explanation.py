@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import attrs
 import pytest
 from matplotlib.image import imread
 
@@ -39,7 +40,7 @@ def test_large_trees_are_the_improved_ones_and_are_cut_short() -> None:
         for request in map(traffic_request, range(1000))
         if request.grid.columns == 3 and len(request.vehicles) == 6
     )
-    told = explain(request)
+    told = explain(attrs.evolve(request, deadline_s=60.0))
     text = explanation_text(told)
     assert IMPROVED in text
     assert "more nodes" in text

@@ -27,7 +27,7 @@ class Watched:
         self.kinds.append(kind)
 
     def show(self, vehicle: str, *owned: Cell, transfer: PendingTransfer | None = None) -> None:
-        self.ownership.show(0.0, vehicle, owned, transfer)
+        self.ownership.update(0.0, vehicle, owned, transfer)
 
     def stand(self, vehicle: str, *cells: Cell) -> None:
         self.ownership.occupy(0.0, vehicle, frozenset(cells))

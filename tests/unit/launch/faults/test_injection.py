@@ -101,14 +101,17 @@ def test_targets_are_found_by_name() -> None:
     assert roles.done == [("kill", "c3"), ("kill", "router"), ("kill", "agent-v2")]
 
 
-def test_each_agent_on_the_road_is_chosen_at_most_once() -> None:
+@pytest.mark.parametrize(
+    ("target", "names"),
+    [("agent", ["agent-v1", "agent-v3", "agent-v4"]), ("coordinator", ["c1", "c2", "c3"])],
+)
+def test_each_target_is_chosen_at_most_once(target: str, names: list[str]) -> None:
     roles, view = FakeRoles(), on_road("v1", "v3", "v4")
-    faults = injection(roles, kill=(Kill(at_s=1.0, target="agent", count=4, restart_after_s=0.5),))
+    faults = injection(roles, kill=(Kill(at_s=1.0, target=target, count=4, restart_after_s=0.5),))
     for step in range(10):
         faults.step(1.0 + step, float(step), view)
-    killed = [name for verb, name in roles.done if verb == "kill"]
-    assert sorted(killed) == ["agent-v1", "agent-v3", "agent-v4"]
-    assert sorted(name for verb, name in roles.done if verb == "start") == sorted(killed)
+    assert sorted(name for verb, name in roles.done if verb == "kill") == names
+    assert sorted(name for verb, name in roles.done if verb == "start") == names
 
 
 def test_the_choice_among_agents_is_drawn_from_the_seed() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from laneweave.launch.faults.shared_counters import (
-    BoardWord,
     LocalBoard,
     MessageFaults,
+    ProcessBoard,
     SharedBoard,
 )
 from laneweave.protocol.runtime.message_faults import FaultBoard, FaultyCore, MessageRule, unwrapped
@@ -16,21 +16,21 @@ from laneweave.protocol.runtime.message_faults import FaultBoard, FaultyCore, Me
 def test_road_time_passes_from_one_process_to_all(tmp_path: Path) -> None:
     board = SharedBoard(tmp_path / "board")
     assert board.road_s == 0.0
-    bridge, early = (BoardWord(board.path, board.new_word()) for _ in range(2))
+    bridge, early = (ProcessBoard(board.path, board.new_counter()) for _ in range(2))
     bridge.road_s = 12.5
-    late = BoardWord(board.path, board.new_word())
+    late = ProcessBoard(board.path, board.new_counter())
     assert (board.road_s, early.road_s, late.road_s) == (12.5, 12.5, 12.5)
 
 
 def test_counters_add_up_when_processes_start_later(tmp_path: Path) -> None:
     board = SharedBoard(tmp_path / "board")
     assert board.dropped == 0
-    words: list[FaultBoard] = []
+    boards: list[FaultBoard] = []
     for count in (3, 5, 7):
-        words.append(BoardWord(board.path, board.new_word()))
-        words[-1].dropped += count
-    assert [word.dropped for word in words] == [3, 5, 7]
-    words[0].dropped += 1
+        boards.append(ProcessBoard(board.path, board.new_counter()))
+        boards[-1].dropped += count
+    assert [each.dropped for each in boards] == [3, 5, 7]
+    boards[0].dropped += 1
     assert board.dropped == 16
 
 
@@ -52,7 +52,7 @@ def test_a_role_process_puts_message_faults_before_its_core(tmp_path: Path) -> N
     faults = MessageFaults(
         rules=(MessageRule(loss=1.0),),
         board=board.path,
-        word=board.new_word(),
+        counter=board.new_counter(),
         receiver="vehicle",
         seed="1/agent-v1/1",
     )

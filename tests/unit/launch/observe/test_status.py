@@ -282,7 +282,7 @@ def test_health_of_a_bridge(listener: Listener) -> None:
 def test_health_of_agents(listener: Listener) -> None:
     alone = RoleHealth(AGENT, "a")
     assert problem(listener, alone) == "no agent of a found"
-    shard = RoleHealth(AGENT, "0/2", lambda vehicle: vehicle in "ab", is_shard=True)
+    shard = RoleHealth(AGENT, "0/2", lambda vehicle: vehicle in "ab")
     assert problem(listener, shard) is None
     assert not shard.may_end_early(listener.view)
     listener.census(10, a=0.0, b=0.0, c=0.0)
@@ -293,4 +293,4 @@ def test_health_of_agents(listener: Listener) -> None:
     assert problem(listener, alone) is None
     assert problem(listener, shard) is None
     listener.states("b", [10], attended=False)
-    assert problem(listener, shard) == "shard 0/2: 1 vehicles without an agent, such as b"
+    assert problem(listener, shard) == "shard 0/2: 1 vehicle without an agent, such as b"

@@ -14,7 +14,7 @@ import pytest
 from attrs import evolve
 from numpy.typing import ArrayLike
 
-from laneweave.launch.observe.column_owners import read_events
+from laneweave.launch.recordings.formations import read_events
 from laneweave.launch.recordings.runs import Run, single_run
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.launch.report.distributions import (
@@ -93,6 +93,7 @@ def test_counts_add_up() -> None:
     np.testing.assert_array_equal(both.exceedance(DECELERATION), one.exceedance(DECELERATION))
 
 
+@pytest.mark.slow
 def test_path_maps_are_those_of_the_driven_plans(swept: Path) -> None:
     run = single_run(swept / "formation-1600-1")
     driven_tracks = read_tracks(run.folder)
@@ -187,6 +188,7 @@ def test_path_maps_of_formations_of_different_lengths(tmp_path: Path) -> None:
         driven_map(run, driven_tracks, 2)
 
 
+@pytest.mark.slow
 def test_the_path_map_of_an_older_recording(swept: Path, tmp_path: Path) -> None:
     newer = single_run(swept / "formation-1600-1")
     older = single_run(older_recording(newer.folder, tmp_path / "run"))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
+from multiprocessing import forkserver
 from typing import NoReturn
 
 import pytest
 
-from laneweave.launch.run.roles import PRELOADED, THREAD_LIMITS, start_role
+from laneweave.launch.run.roles import PRELOADED, THREAD_LIMITS, fork_server, start_role
 from laneweave.protocol.errors import CommandFailedError
 from support.commands import python
 
@@ -18,7 +20,8 @@ class _DeadServer:
     def __init__(self, error: Exception) -> None:
         self._error = error
 
-    def Process(self, **_: object) -> _DeadServer:  # noqa: N802 (the context's name)
+    def Process(self, *, name: str, **_: object) -> _DeadServer:  # noqa: N802 (the context's name)
+        self.name = name
         return self
 
     def start(self) -> NoReturn:
@@ -35,6 +38,13 @@ class _DeadServer:
 def test_a_dead_fork_server_is_a_failure_with_words(error: Exception, reason: str) -> None:
     with pytest.raises(CommandFailedError, match=rf"cannot start agent-v1: .*{reason}"):
         start_role(_DeadServer(error), "agent", "agent-v1", {}, {})  # type: ignore[arg-type]
+
+
+def test_ctrl_c_while_the_fork_server_starts_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(forkserver, "ensure_running", lambda: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        fork_server()
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 LOOK_AROUND = """

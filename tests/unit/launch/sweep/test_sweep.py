@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from laneweave.launch.run_methods import affects
+from support.sharing import made_once
 from support.sweeping import command, results, short_road, sweep
 
 pytestmark = pytest.mark.slow
@@ -26,13 +27,15 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of an undisturbed sweep with two processes."""
-    out = tmp_path_factory.mktemp("whole") / "sweep"
-    done = sweep(scenario, out, *LISTS, "--jobs", 2)
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of an undisturbed sweep with two processes. It is to be left as it is."""
+    return made_once(tmp_path_factory, "whole-sweep", _sweep)
+
+
+def _sweep(out: Path) -> None:
+    done = sweep(short_road(out.parent), out, *LISTS, "--jobs", 2)
     assert done.returncode == 0, done.stderr
     assert len(done.stderr.splitlines()) == 4
-    return out
 
 
 def test_the_files_of_a_sweep(whole: Path) -> None:

@@ -121,4 +121,4 @@ def test_numbers_beside_the_road() -> None:
     ]
     data = {"scene": {"road": {"lane_width_m": 3.5}}, "bodies": bodies}
     found = in_node("return laneweaveFrames.facts(data.scene, data.bodies);", data)
-    assert found == {"onLane": 1, "knownLane": 2, "speed": 15.0}
+    assert found == {"inLane": 1, "knownLane": 2, "speed": 15.0}

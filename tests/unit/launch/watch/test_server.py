@@ -241,6 +241,7 @@ def test_the_end_does_not_wait_for_browsers() -> None:
             receive(browser)
 
 
+@pytest.mark.slow
 def test_a_recorded_run_over_the_websocket(recorded: Path) -> None:
     recording = Recording(recorded)
     with Site(recording).running() as site, site.browser() as browser:

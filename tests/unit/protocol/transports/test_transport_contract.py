@@ -728,7 +728,8 @@ def test_a_core_runs_over_zenoh_until_it_ends(router: Router) -> None:
     client.transport.watch(TOKENS)
 
     def ask_at_last() -> None:
-        watcher.until(lambda: any(isinstance(event, node.Computed) for event in core.events))
+        done = {node.Computed, node.Arrived}
+        watcher.until(lambda: done <= {type(event) for event in core.events})
         assert isinstance(client.transport, ZenohTransport)
         answers.append(client.transport.query(PLAN_SERVICE, b"?", WAIT_S).result(WAIT_S))
 

@@ -117,14 +117,14 @@ def test_neither_blocks_nor_joined_formations_matter() -> None:
 def test_a_promise_shows_owned_cells_only_when_the_controller_has_noted_it() -> None:
     execution = vehicle()
     old = sense(transfer=pending(A, LOW))
-    assert execution.state(old, 0, attended=True).owned == BEFORE[A]
+    assert execution.state(old, attended=True).owned == BEFORE[A]
     execution.on_prepare(PREPARE)
     assert execution.wanted_promised == MID
     assert not execution.on_owned(old)
-    assert execution.state(old, 0, attended=True).owned == ()
+    assert execution.state(old, attended=True).owned == ()
     noted = sense(promised=MID)
     assert execution.on_owned(noted)
-    assert execution.state(noted, 0, attended=True).owned == BEFORE[A]
+    assert execution.state(noted, attended=True).owned == BEFORE[A]
     assert not execution.on_owned(noted)  # nothing new
 
 

@@ -405,21 +405,22 @@ def test_how_long_a_move_may_be_due_follows_the_slots_of_its_plan(
 @pytest.mark.parametrize("attended", [True, False])
 def test_the_state_says_what_the_vehicle_knows_and_senses(*, attended: bool) -> None:
     sense = Sense(
-        A, 1001, 100.1, (7.0, 14.0, 0.5, 2.0, 0.1, 0.0), (-4, 1), 1038, (-4, 0), 2, (), joined=(0,)
-    )
+        A, 1001, 100.1, (7.0, 14.0, 0.5, 2.0, 0.1, 0.0), (-4, 1), 1038, (-4, 0), 2, (),
+        formation=3, joined=(0,),
+    )  # fmt: skip
     execution = going()
     assert execution.tick(T0_S) is not None
     expected = holding(
         A, MID, (-4, 1), incarnation=7, formation=3, accepted=True, ready=True, moving=True,
         go=True, attended=attended, s_m=7.0, y_m=2.0, speed_mps=14.0, t_s=100.1,
     )  # fmt: skip
-    assert execution.state(sense, 3, attended=attended) == expected
+    assert execution.state(sense, attended=attended) == expected
     execution.end_motion()
-    assert execution.state(sense, 3, attended=attended) == evolve(
+    assert execution.state(sense, attended=attended) == evolve(
         expected, moving=False, done=True, completed=1
     )
     late = evolve(sense, t_s=T0_S + OVERDUE_S)
-    assert accepted().state(late, 3, attended=attended).overdue
+    assert accepted().state(late, attended=attended).overdue
 
 
 # --- the table as a whole ---------------------------------------------------------------------

@@ -14,7 +14,7 @@ The first cost with a solution is the minimum. Moves have a small cost, so the s
 about half as many nodes again, to find a solution that costs the same but has fewer moves.
 
 The gap between the cost and the lower bound is small, so few moves remain, and most nodes are
-decided quickly. Unlike in conflict trees, interchangeable vehicles do not multiply the nodes.
+fathomed quickly. Unlike in conflict trees, interchangeable vehicles do not multiply the nodes.
 
 Every few nodes, negotiation (`negotiation`) looks for path sets, so that a plan exists if the
 deadline passes first; if it fails, a joint search (`reachability`) looks for a path set or proves
@@ -54,9 +54,10 @@ from laneweave.coordinator.planning.shortest_paths import without_needless_moves
 
 _SPARE_STEPS, _MORE_STEPS = 8, 6
 """Steps with multipliers beyond the longest path; steps added when a solution may need more."""
-_ITERATIONS, _FEW_ITERATIONS, _BATCH = 40, 10, 10
-"""Iterations at the root with many and with few vehicles; iterations between checks."""
 _FEW_VEHICLES = 11
+_ITERATIONS, _FEW_ITERATIONS, _BATCH = 40, 10, 10
+"""Iterations at the root with more than `_FEW_VEHICLES` vehicles and with fewer; iterations between
+checks."""
 _FIRST_STACK = 16
 _CHUNK_S = 0.005
 """Approximate time between clock readings."""
@@ -65,8 +66,8 @@ _NODES_BETWEEN = 8
 _MANY_VEHICLES = 20
 """Formation size from which a path set is sought first, since the search takes long."""
 _FIRST_WORK, _WORK_FOR_GAP, _STALE = 200, 100, 100
-"""Maximum negotiation passes per call until a path set is found; then the passes at a gap of 100 %
-and the number of passes without improvement that halves them."""
+"""Maximum number of negotiation passes per call until a path set is found; afterwards, their number
+at a gap of 100 %, and the passes without improvement after which that number is halved."""
 _EXPLORE_NODES, _EXPLORE_MOVES, _MAX_EXPLORE_MOVES, _GROWTH = 16, 5_000, 1_500_000, 4
 """Nodes after which the joint search is tried if no path set is known, and the initial and maximum
 limit on its joint moves; nodes and limit grow by the factor `_GROWTH`."""
@@ -212,7 +213,7 @@ class Branching(Search):
                 root, nodes, depth, upper_bound, 1 if first else None
             )
             if first and depth > 1:
-                root.set_multipliers(nodes.multipliers[0])
+                root.multipliers = nodes.multipliers[0].copy()
             first = False
             if outcome == OPEN:
                 self._run_heuristics(root, nodes.multipliers[depth - 1])

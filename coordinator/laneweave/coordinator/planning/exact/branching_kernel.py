@@ -1,6 +1,6 @@
 """Compiled code of `branching`: the search over the open nodes, depth first.
 
-A node is decided by its lower bound or by a relaxed solution without conflicts; otherwise it is
+A node is fathomed by its lower bound or by a relaxed solution without conflicts; otherwise it is
 split at a conflict clique. See `multipliers_kernel` for the style.
 """
 
@@ -21,18 +21,18 @@ from laneweave.coordinator.planning.exact.multipliers_kernel import (
 )
 
 STUCK, FULL = 3, 4
-"""STUCK: no choice left to branch on, node undecided; FULL: the stack is full."""
+"""STUCK: no choice left to branch on, node not fathomed; FULL: the stack is full."""
 BY_TEAM, BY_CELL = 0, 1
 _ITERATIONS = 10
 _KEPT = 0.8
 """If the fraction of moves kept is lower, multipliers are improved again before branching."""
 _ROUNDS = 12
-"""Rounds without a choice by mass after which any choice is accepted."""
+"""Attempts to choose by mass (`_choose`) before all moves count equally."""
 _ABOVE_UPPER_BOUND = 0.5
 _MIN_STEP_SIZE = 0.05
 _MIN_MASS = 0.01
 _CELL_WEIGHT = 0.5
-"""Weight of a choice by from-cell relative to a choice by team."""
+"""Weight of branching on a from-cell relative to branching on a team."""
 _MULTIPLIER_WEIGHT = 10.0
 
 
@@ -71,7 +71,7 @@ def search(arrays, teams, stack, depth, scratch, state, upper_bound, nodes):
 
 @njit(cache=True)
 def _examine(arrays, teams, allowed, earliest, multipliers, scratch, state, upper_bound, choice):
-    """Decide a node, or choose what to branch on.
+    """Fathom a node, or choose what to branch on.
 
     Multipliers are improved and moves fixed by reduced cost as long as that removes many moves.
     """

@@ -15,13 +15,8 @@ from collections.abc import Iterator
 from functools import lru_cache
 from itertools import product
 
-from laneweave.coordinator.planning.conflict_kinds import (
-    ConflictModel,
-    Move,
-    Offset,
-    conflict_offsets,
-)
-from laneweave.protocol.lattice import Mode, displacements
+from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Offset, conflict_offsets
+from laneweave.protocol.lattice import Mode
 
 Clique = tuple[Offset, ...]
 """Columns and lanes from the anchor to each move's from-cell, and the displacement index."""
@@ -52,22 +47,15 @@ class _Relation:
     """The conflict relation around the origin; a move is an `Offset` from the anchor (0, 0)."""
 
     def __init__(self, mode: Mode, model: ConflictModel) -> None:
-        self.steps = displacements(mode)
-        self._mode = mode
-        self._model = model
+        self._conflicts = [frozenset(offsets) for offsets in conflict_offsets(mode, model)]
         columns, lanes = (range(-reach, reach + 1) for reach in model.reach)
-        self._moves = list(product(columns, lanes, range(len(self.steps))))
-
-    def move(self, member: Offset) -> Move:
-        column, lane, d = member
-        step = self.steps[d]
-        return (column, lane), (column + step[0], lane + step[1])
+        self._moves = list(product(columns, lanes, range(len(self._conflicts))))
 
     def pairs(self) -> set[tuple[Offset, Offset]]:
         """Return all conflicting pairs, unique up to translation."""
         return {
             _normal_pair((0, 0, d), other)
-            for d, offsets in enumerate(conflict_offsets(self._mode, self._model))
+            for d, offsets in enumerate(self._conflicts)
             for other in offsets
             if other[:2] != (0, 0)
         }
@@ -75,7 +63,7 @@ class _Relation:
     def maximal_cliques(self) -> set[Clique]:
         """Return all maximal cliques, unique up to translation."""
         found: set[Clique] = set()
-        for d in range(len(self.steps)):
+        for d in range(len(self._conflicts)):
             origin = (0, 0, d)
             near = [b for b in self._moves if b != origin and self._exclude(origin, b)]
             near_of = {a: {b for b in near if b != a and self._exclude(a, b)} for a in near}
@@ -85,7 +73,8 @@ class _Relation:
 
     def _exclude(self, a: Offset, b: Offset) -> bool:
         """Return whether two moves exclude each other; vehicles never share a cell."""
-        return a[:2] == b[:2] or self._model.kind(self.move(a), self.move(b)) is not None
+        column, lane, d = b[0] - a[0], b[1] - a[1], b[2]
+        return (column, lane) == (0, 0) or (column, lane, d) in self._conflicts[a[2]]
 
 
 def _cliques(

@@ -7,9 +7,9 @@ sum of all multipliers is a lower bound on every solution's cost, whatever its l
 last step with multipliers, vehicles ignore each other. Good multipliers are found by a subgradient
 method (Held, Wolfe and Crowder, Mathematical Programming 6, 1974) with momentum.
 
-At given multipliers, each move of a team has a reduced cost, a lower bound on what it adds to every
-solution that contains it. So for a given upper bound, moves whose reduced cost is too high are
-forbidden (reduced-cost fixing), which shrinks the problem and raises its lower bound.
+At given multipliers, each move of a team has a reduced cost, a lower bound on the extra cost of
+every solution that contains the move. So for a given upper bound, moves whose reduced cost is too
+high are forbidden (reduced-cost fixing), which shrinks the problem and raises its lower bound.
 
 Costs are the steps until final arrival plus `PER_MOVE` for each move that is not a wait.
 """
@@ -179,7 +179,7 @@ class Relaxation:
 
     @property
     def min_cost(self) -> float:
-        """Lower bound on the cost of every solution, in steps; infinite: there is none."""
+        """Lower bound on the cost of every solution, in steps; infinite: no solution exists."""
         bound = float(self.state[BOUND])
         if bound >= UNREACHABLE:
             return math.inf
@@ -241,10 +241,6 @@ class Relaxation:
         ):
             return None
         return True
-
-    def set_multipliers(self, multipliers: Floats) -> None:
-        """Continue from these multipliers."""
-        self.multipliers = multipliers.copy()
 
     def lengthen(self, steps: int) -> None:
         """Add multipliers for more steps; this discards the best relaxed solution so far."""

@@ -14,7 +14,7 @@ UNREACHABLE = 1e9
 PER_MOVE = 1e-5
 """Cost of each move that is not a wait, so that ties go to the fewest moves."""
 PARKED = -1
-"""In a path: the vehicle has finally arrived."""
+"""In a path: the vehicle has arrived for good."""
 REFUTED, FOUND, OPEN = 0, 1, 2
 """No solution below the upper bound exists; one has been found; undecided."""
 BOUND, STEP_SIZE, STALE, WEIGHT, WEIGHTS, BEST = range(6)

@@ -123,7 +123,8 @@ def _shuffle(items, random):
 def negotiate(arrays, teams, candidate, number):
     """Run pass `number` (from 0) of a negotiation; return whether a path set was found.
 
-    All vehicles that are late or on contested cliques are rerouted, one after another.
+    Pass 0 routes all vehicles, one after another; later passes reroute those that are late or on
+    contested cliques.
     """
     use, history, weight = candidate.use, candidate.history, candidate.weight
     steps, cliques = use.shape
@@ -152,7 +153,7 @@ def negotiate(arrays, teams, candidate, number):
 
 @njit(cache=True, nogil=True)
 def improve_paths(arrays, teams, candidate, attempts, max_size):
-    """Remove a few vehicles in each attempt and let them negotiate; undo attempts that are worse.
+    """In each attempt, let a few vehicles negotiate new paths; undo it if the result is worse.
 
     Returns the number of attempts since the last improvement.
     """
@@ -201,7 +202,7 @@ def improve_paths(arrays, teams, candidate, attempts, max_size):
 
 @njit(cache=True)
 def _negotiate_among(arrays, teams, candidate, chosen, max_cost):
-    """Negotiate among removed vehicles around all others; return whether that succeeded."""
+    """Negotiate paths for removed vehicles around fixed others; return whether it succeeded."""
     use, own, history, weight = candidate.use, candidate.own, candidate.history, candidate.weight
     path, start, cost = candidate.path, teams.start, candidate.cost
     steps, cliques = use.shape

@@ -1,6 +1,6 @@
 """The conflict table computed from geometry: pairs of moves that bring two bodies too close.
 
-Two vehicles make one move each in the same step, from cells that lie an offset apart. Their
+Two vehicles make one move each in the same step, from cells at a given offset. Their
 clearance is the smallest gap between bumpers while the bodies are less than `clearance_across_m`
 apart sideways. The minimum is taken over
 
@@ -23,7 +23,7 @@ from typing import Final
 
 import numpy as np
 
-from laneweave.coordinator.planning.conflict_kinds import MAX_OFFSET, ConflictTable, Pair
+from laneweave.coordinator.planning.conflict_kinds import MAX_OFFSET, ConflictTable
 from laneweave.coordinator.planning.geometry.swept_bodies import (
     FRONT,
     LEFT,
@@ -44,7 +44,7 @@ _ROUNDING_M: Final = 1e-9
 @lru_cache(maxsize=32)
 def conflict_table(geometry: BodyGeometry) -> ConflictTable:
     """Return the conflict table of a geometry, with the default profile; cached."""
-    return ConflictTable(pairs_closer_than(geometry), geometry.lateness_s is None)
+    return pairs_closer_than(geometry)
 
 
 def min_clearances(geometry: BodyGeometry, paths: Mapping[Cell, Floats] | None = None) -> Floats:
@@ -76,7 +76,7 @@ def min_clearances(geometry: BodyGeometry, paths: Mapping[Cell, Floats] | None =
 
 def pairs_closer_than(
     geometry: BodyGeometry, paths: Mapping[Cell, Floats] | None = None
-) -> frozenset[Pair]:
+) -> ConflictTable:
     """Return the pairs of moves that come closer than the clearances of the geometry.
 
     Raises:
@@ -103,7 +103,7 @@ def _parts_late(geometry: BodyGeometry) -> int:
 
 
 def _boxes(geometry: BodyGeometry, path: Floats) -> Floats:
-    """Return the edges (4, PARTS) of the box that contains a body during each part of a move."""
+    """Return the box (edges, as (4, PARTS)) that contains a body during each part of a move."""
     outline = geometry.outline(path)
     sampled, ends = np.linspace(0.0, 1.0, len(outline)), np.linspace(0.0, 1.0, PARTS + 1)
     times = np.union1d(sampled, ends)
@@ -119,7 +119,7 @@ def _boxes(geometry: BodyGeometry, path: Floats) -> Floats:
 
 
 def _fill(found: Floats, a: Floats, b: Floats, geometry: BodyGeometry) -> None:
-    """Fill in the clearances (7, 7) of two moves from their edges (4, K) in simultaneous parts."""
+    """Fill in the clearances (7, 7) of two moves from their boxes (4, K) in simultaneous parts."""
     behind, ahead = b[REAR] - a[FRONT], a[REAR] - b[FRONT]
     right, left = b[RIGHT] - a[LEFT], a[RIGHT] - b[LEFT]
     min_m = geometry.clearance_across_m + geometry.profile_error_across_m - _ROUNDING_M

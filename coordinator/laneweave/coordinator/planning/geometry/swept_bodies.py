@@ -226,9 +226,9 @@ class BodyGeometry:
     def _max_lateness_s(self, along_m: float, across_m: float) -> float:
         """Return the maximum lateness at which moves keep clear of those of the next step.
 
-        A late move overlaps the next step's moves in time. Its remaining distance plus the distance
-        they have covered is at most what a move covers in the overlap from rest, since the covered
-        fraction is convex in time in the first half of a move.
+        A late move overlaps a move of the next step in time. The remaining distance of the former
+        plus the covered distance of the latter is at most the distance that a move covers from rest
+        within the overlap, since that distance is convex in time in the first half of a move.
         """
         share = min(
             (along_m - self.clearance_along_m) / self.pitch_m,

@@ -130,7 +130,7 @@ class Assignment:
 class _Matching:
     """A minimum-cost matching with the dual variables that prove its optimality.
 
-    Idle rows of cost 0 make the matrix square; they take the remaining targets.
+    Dummy rows of cost 0 make the matrix square; they take the remaining targets.
 
     rows: target of each row.
     columns: row of each target.

@@ -133,7 +133,7 @@ class ConstraintTree:
 
     @property
     def lower_bound(self) -> float:
-        """Return the lowest L_i in T; infinite: T is empty."""
+        """Return the lowest L_i in T, or infinity if T is empty."""
         return self._open[0][0] if self._open else math.inf
 
     def search(self, limit: Limit) -> Node | None:
@@ -173,7 +173,7 @@ class ConstraintTree:
             self.nodes.append(node)
 
     def _root(self) -> Node | None:
-        """Return N_1; None: a target cannot be reached."""
+        """Return N_1, or None if a target cannot be reached."""
         problem, table = self._problem, self._problem.table
         diagrams = []
         for vehicle, target in enumerate(self.assignment):
@@ -220,7 +220,7 @@ class ConstraintTree:
         return best
 
     def _child(self, node: Node, added: Constraint) -> Node | None:
-        """Return the child with one more constraint, by SPPA; None: a vehicle has no path."""
+        """Return the child with one more constraint (SPPA), or None if a vehicle has no path."""
         problem, table = self._problem, self._problem.table
         constraints = (*node.constraints, added)
         diagrams, paths = list(node.diagrams), list(node.paths)

@@ -15,8 +15,8 @@ to the paper's tree (`cbs.Improvements`) use this:
   move of S_B. Either A makes no move of S_A, or A makes one and no other vehicle makes a move that
   conflicts with all of S_A; this excludes all of S_B. No solution satisfies both
   (`disjoint_constraints`).
-- Likewise, either a vehicle has finally arrived before a step and no other vehicle crosses its
-  target from then on, or it has not arrived.
+- Likewise, either a vehicle has arrived for good before a step and no other vehicle crosses its
+  target from then on, or it has not.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ class Constraint(NamedTuple):
 
     arrived is None: in this step, `vehicle` must not make a move in `own`, and no other vehicle
         may make a move in `others`.
-    arrived is True: `vehicle` has finally arrived at its target before this step, and from this
+    arrived is True: `vehicle` has arrived for good at its target before this step, and from this
         step on, no other vehicle makes a move in `others`.
-    arrived is False: `vehicle` has not finally arrived before this step. It may wait at its target
-        in this step and leave it later.
+    arrived is False: `vehicle` has not arrived for good before this step. It may wait at its
+        target in this step and leave it later.
     """
 
     vehicle: int
@@ -80,8 +80,8 @@ class Constraint(NamedTuple):
         """Return the paper's notation, extended for the constraints of the improvements.
 
         Steps count from 1, cells as in requests from 0. {S | edges, step, id}: none of these
-        edges; {U | edges, step, id}: one of these; {A | step, id}: finally arrived before this
-        step; {B | step, id}: not finally arrived before it.
+        edges; {U | edges, step, id}: one of these; {A | step, id}: arrived for good before
+        this step; {B | step, id}: not arrived for good before it.
         """
         end = f"{self.step + 1}, {name}}}"
         if self.arrived is not None:
@@ -209,7 +209,7 @@ def _side_to_branch_on(sets: tuple[int, int], layers: tuple[int, int]) -> int:
 def _exclusive_sets(
     table: MoveTable, moves: tuple[int, int], layers: tuple[int, int]
 ) -> tuple[int, int]:
-    """Return large sets S_A and S_B around two conflicting moves."""
+    """Return large sets S_A and S_B that contain one of two conflicting moves each."""
     a, b = 1 << moves[0], 1 << moves[1]
     excluded_by_first = table.common_conflicts(layers[0])
     if excluded_by_first & b:

@@ -1,7 +1,6 @@
 """A record of a run of Algorithms 1 and 2: assignments, constraint trees, stop reason.
 
-The trees are literally the paper's if those are small, otherwise those of the improved
-algorithms.
+The trees are exactly the paper's if these are small, otherwise those of the improved algorithms.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import Final, Literal
 
 import attrs
 
-from laneweave.coordinator.planning.budget import Budget, Clock
+from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvements, Node
 from laneweave.coordinator.planning.paper.constraints import entry
@@ -104,22 +103,26 @@ class Explanation:
         return f"there is no further assignment, C'* = {best}"
 
 
-def explain(
-    request: PlanRequest, weights: Weights | None = None, clock: Clock = time.monotonic
-) -> Explanation:
+def explain(request: PlanRequest) -> Explanation:
     """Run Algorithm 1 on a request and return the record of the run."""
-    deadline = clock() + request.deadline_s
-    run = _run(request, Improvements.none(), deadline, MAX_LITERAL_NODES, weights, clock)
+    deadline, weights = time.monotonic() + request.deadline_s, Weights.for_mode(request.mode)
+    problem = request.problem()
+
+    def recorded(improvements: Improvements, max_nodes: int) -> Tappa:
+        budget = Budget(deadline=deadline, max_nodes=max_nodes)
+        tappa = Tappa(request, problem, weights, budget, improvements, record=True)
+        tappa.run()
+        return tappa
+
+    run = recorded(Improvements.none(), MAX_LITERAL_NODES)
     literal = run.finished
     if not literal:
-        run = _run(request, Improvements(), deadline, MAX_NODES, weights, clock)
-    names = [vehicle.id for vehicle in request.vehicles]
-    problem = request.problem()
+        run = recorded(Improvements(), MAX_NODES)
     best = math.inf
     found = []
     for attempt in run.attempts or ():
         best = min(best, math.inf if attempt.best_cost is None else attempt.best_cost)
-        found.append(_assignment(problem, names, attempt, best))
+        found.append(_assignment(problem, request.ids, attempt, best))
     found_by_tree = best == run.best_cost
     return Explanation(
         literal=literal,
@@ -139,22 +142,6 @@ def entries(table: MoveTable, node: Node, names: Sequence[str]) -> Iterator[str]
         for vehicle, move in zip(pair, node.moves(conflict), strict=True):
             at_node = not conflict.on_edge
             yield entry(table, move, names[vehicle], conflict.step, at_node=at_node)
-
-
-def _run(
-    request: PlanRequest,
-    improvements: Improvements,
-    deadline: float,
-    max_nodes: int,
-    weights: Weights | None,
-    clock: Clock,
-) -> Tappa:
-    budget = Budget(deadline=deadline, max_nodes=max_nodes, clock=clock)
-    weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
-    problem = request.problem()
-    run = Tappa(request, problem, weights, budget, improvements, record=True)
-    run.run()
-    return run
 
 
 def _assignment(

@@ -32,18 +32,17 @@ State = tuple[Cells, Labels]
 
 _MAX_GOALS = 2_000
 _MAX_MOVES = 2_000_000
-"""Limits on memory, about 1 GB."""
-
+"""Limits that keep memory below about 1 GB."""
 
 JointMove = tuple[Cells, Callable[[Labels], Labels]]
-"""The sorted cells before the move, and a function that picks their labels from two copies of the
-labels after it: as they are, and with all vehicles active. Moving vehicles are active before it."""
+"""The sorted cells before the move, and a function that returns their labels, given the labels
+after the move followed by the same labels with all vehicles active (for vehicles that move)."""
 
 
 class JointSearch:
     """The joint search; runs in portions.
 
-    lower_bound: lower bound on the cost of all path sets; infinite: there is none.
+    lower_bound: lower bound on the cost of all path sets; infinite: no path set exists.
     solution: the optimal path set, once found.
     ended: whether the search is complete or has reached its limits.
     """

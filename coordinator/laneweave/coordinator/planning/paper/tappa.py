@@ -32,7 +32,7 @@ _JOINT_AFTER = 32
 _MAX_JOINT_MOVES_PER_NODE = 150
 """Upper bound on the joint moves made at a node; node n makes min(n, bound) of them. The joint
 search then takes up to about two thirds of the time. In crowded blocks it finishes first; in
-others the trees do."""
+other blocks the trees do."""
 
 
 @attrs.frozen
@@ -119,12 +119,10 @@ class Tappa(Search):
             self._update_best(self._cbsa(assignment))  # lines 5 to 8, and 16 to 19 for the last one
             assignment = next(self._assignments, None)  # line 9
             self.next_cost = None if assignment is None else assignment.cost
-            if self.next_cost is not None and self.best_cost <= self._bound(self.next_cost):
-                return  # lines 10 to 13
-
-    def _bound(self, cost: float) -> float:
-        """Return a lower bound on the path sets of assignments that cost at least `cost`."""
-        return max(cost, self.joint_bound)
+            if self.next_cost is not None:
+                min_cost = max(self.next_cost, self.joint_bound)  # of all further path sets
+                if self.best_cost <= min_cost:
+                    return  # lines 10 to 13
 
     def _update_best(self, solution: Solution | None) -> None:
         """Set P* and C'* if a path set is better (lines 6 to 8)."""

@@ -26,7 +26,7 @@ from laneweave.protocol.lattice import Cell, Mode, displacements
 
 _SAVED = MAX_EJECTED + 32
 """Maximum number of paths saved during a chain or a reordering."""
-ROUNDING_M = 1e-6
+_ROUNDING_M = 1e-6
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -45,7 +45,7 @@ class Table(NamedTuple):
     move: NDArray[np.int8]
     """Displacement of that vehicle in the slot; same shape."""
     offsets: Ints
-    """Relative column and lane, displacement, penalty factor of conflicting moves;
+    """Relative column and lane, displacement and penalty factor of each conflicting move;
     (conflicts, 4)."""
     first: Ints
     """Index in `offsets` of the first conflict of each displacement; (displacements + 1)."""
@@ -174,7 +174,7 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
     load = np.zeros((slots, len(steps), road.lanes, columns), dtype=np.float32)
     may_move = _may_move(road, at_m, is_blocked)
     load[:, 1:][~may_move] = FIXED * ENTERING
-    may_leave: NDArray[np.bool_] = np.asarray(may_move.any(axis=(1, 2)), dtype=np.bool_)
+    may_leave: Bools = np.asarray(may_move.any(axis=(1, 2)))
     moving_columns = np.stack(
         [may_leave.argmax(axis=1), columns - 1 - may_leave[:, ::-1].argmax(axis=1)]
     )
@@ -187,7 +187,7 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
         first,
         np.array(steps, dtype=np.int64),
         np.ascontiguousarray(moving_columns.T),
-        (at_m <= road.length_m + ROUNDING_M).sum(axis=1),
+        (at_m <= road.length_m + _ROUNDING_M).sum(axis=1),
     )
 
 
@@ -198,8 +198,8 @@ def _may_move(road: StreamRoad, at_m: Floats, is_blocked: Bools) -> Bools:
     (slots, displacements without the first, lanes, columns).
     """
     start_m, end_m = road.sorting_m
-    rear = at_m[:-1] - road.body_m >= start_m - ROUNDING_M
-    front = at_m[1:] <= end_m + ROUNDING_M
+    rear = at_m[:-1] - road.body_m >= start_m - _ROUNDING_M
+    front = at_m[1:] <= end_m + _ROUNDING_M
     lanes, columns = is_blocked.shape
     steps = displacements(road.mode)[1:]
     allowed = np.zeros((len(rear), len(steps), lanes, columns), dtype=np.bool_)

@@ -34,7 +34,7 @@ _FIRST_SLACK, _COOLED_AFTER = 16.0, 0.67
 _REORDER_EVERY = 8
 _MAX_REORDERED = 13
 _IDLE_ROUNDS = 200
-"""Maximum rounds of improvement in which no vehicle misses a reachable lane."""
+"""Maximum number of rounds spent only on cheaper paths, when no reachable lane is missed."""
 _IDLE_SOFTNESS = 3.0
 _ROUNDING = 1e-4
 

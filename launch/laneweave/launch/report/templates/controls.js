@@ -12,12 +12,12 @@ class Player {
     this.pace = 2;
     const canvas = box.querySelector("canvas");
     this.painter = new laneweaveRoad.Painter(canvas, run);
-    this.wire(box);
+    this.addListeners(box);
     new ResizeObserver(() => this.draw()).observe(canvas);
     this.draw();
   }
 
-  wire(box) {
+  addListeners(box) {
     const part = (name) => box.querySelector(`[data-part=${name}]`);
     this.button = part("play");
     this.slider = part("time");

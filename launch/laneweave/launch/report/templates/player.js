@@ -61,8 +61,8 @@ const laneweave = (() => {
   /** Return the position of the centre of a formation, which may be off the road. */
   function formationCentre(run, formation, t) {
     const [, rear, front] = run.formations.find(([number]) => number === formation);
-    const column = (rear + front) / 2;
-    return run.lattice.speed_mps * t + column * run.lattice.pitch_m - run.body_m[0] / 2;
+    const [from, to] = laneweaveRoad.columnsAt(run, rear, front, t);
+    return (from + to) / 2;
   }
 
   /** Return the stretches [from, to] of the road to draw; `follow` null: the whole road. */

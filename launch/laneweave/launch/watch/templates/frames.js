@@ -124,14 +124,14 @@ const laneweaveFrames = (() => {
     return { t: mix(one.t, next.t), bodies };
   }
 
-  /** Return the figures shown above the road: {onLane, knownLane, speed}. */
+  /** Return the figures shown above the road: {inLane, knownLane, speed}. */
   function facts(scene, bodies) {
     const width = scene.road.lane_width_m;
     const known = bodies.filter((one) => one.lane >= 0);
     const there = known.filter((one) => Math.floor(one.y / width) === one.lane);
     const seen = bodies.filter((one) => !one.faint);
     const speed = seen.reduce((sum, one) => sum + one.v, 0) / (seen.length || 1);
-    return { onLane: there.length, knownLane: known.length, speed: seen.length ? speed : null };
+    return { inLane: there.length, knownLane: known.length, speed: seen.length ? speed : null };
   }
 
   return { FrameStore, between, facts, MOVING, UNATTENDED, UNHEARD, OVERDUE };

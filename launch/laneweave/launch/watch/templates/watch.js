@@ -29,9 +29,9 @@ class Watch {
     this.arrived = 0;
     this.stats = { frames: 0, shown: 0, paints: 0, firstFrameMs: null };
     this.lastShown = null;
-    this.wire();
+    this.addListeners();
     this.connect();
-    requestAnimationFrame((now) => this.turn(now));
+    requestAnimationFrame((now) => this.animate(now));
   }
 
   get live() {
@@ -96,7 +96,7 @@ class Watch {
     this.showButton();
   }
 
-  wire() {
+  addListeners() {
     part("pause").addEventListener("click", () => this.toggle());
     part("slider").addEventListener("input", (event) => {
       this.place = Number(event.target.value);
@@ -108,19 +108,19 @@ class Watch {
     for (const one of PACES) pace.add(new Option(`${one}x`, one, one === 1, one === 1));
     pace.addEventListener("change", () => (this.pace = Number(pace.value)));
     const view = part("view");
-    for (const event of ["pointerdown", "focus"]) view.addEventListener(event, () => this.offer());
-    view.addEventListener("change", () => this.look(view.value));
+    for (const event of ["pointerdown", "focus"]) view.addEventListener(event, () => this.listViews());
+    view.addEventListener("change", () => this.setFollowed(view.value));
     for (const box of ["cells", "targets"]) {
       part(box).addEventListener("change", () => (this.stale = true));
     }
-    part("road").addEventListener("click", (event) => this.pick(event));
+    part("road").addEventListener("click", (event) => this.followAt(event));
     document.addEventListener("keydown", (event) => {
       const typing = event.target.closest?.("button, select, input[type=checkbox]");
       if (event.key === " " && !typing) {
         event.preventDefault();
         this.toggle();
       } else if (event.key === "Escape") {
-        this.look("");
+        this.setFollowed("");
       }
     });
     new ResizeObserver(() => (this.stale = true)).observe(part("road"));
@@ -151,7 +151,7 @@ class Watch {
   }
 
   /** List the formations and vehicles that can be followed as options of the view. */
-  offer() {
+  listViews() {
     const { bodies } = this.picture ?? { bodies: [] };
     const shown = laneweaveLayers.groups(this.current?.formations ?? [], []);
     const formations = shown.map(({ numbers }) => `formation ${numbers[0]}`);
@@ -164,14 +164,14 @@ class Watch {
     view.value = chosen;
   }
 
-  look(name) {
+  setFollowed(name) {
     const formation = /^formation (\d+)$/.exec(name);
     this.follow = formation ? { formation: Number(formation[1]) } : name ? { vehicle: name } : null;
     this.columns = null; // of the followed formation, once it was seen
     const view = part("view");
     view.value = name;
     if (view.value !== name) {
-      this.offer();
+      this.listViews();
       view.add(new Option(`follow ${name}`, name));
       view.value = name;
     }
@@ -179,14 +179,14 @@ class Watch {
   }
 
   /** Follow the vehicle under the pointer. */
-  pick(event) {
+  followAt(event) {
     const place = this.painter?.placeAt(event.offsetX, event.offsetY);
     if (!place || !this.picture) return;
     const [length, width] = this.store.scene.body_m;
     const hit = this.picture.bodies.find(
       (body) => Math.abs(place.s - body.s + length / 2) < length && Math.abs(place.y - body.y) < width,
     );
-    if (hit) this.look(hit.name);
+    if (hit) this.setFollowed(hit.name);
   }
 
   // --- the picture ------------------------------------------------------------------------------
@@ -205,8 +205,8 @@ class Watch {
     return frame ? [frame, store.get(from + 1), this.place - from] : null;
   }
 
-  turn(now) {
-    requestAnimationFrame((next) => this.turn(next));
+  animate(now) {
+    requestAnimationFrame((next) => this.animate(next));
     if (!this.painter || now - this.painted < PAINT_MS) return;
     if (this.playing) this.advance((now - this.painted) / 1000);
     this.painted = now;
@@ -285,7 +285,7 @@ class Watch {
   showNumbers(frame) {
     const { store } = this;
     const { scene } = store;
-    const { onLane, knownLane, speed } = laneweaveFrames.facts(scene, this.picture.bodies);
+    const { inLane, knownLane, speed } = laneweaveFrames.facts(scene, this.picture.bodies);
     const setText = (id, text) => {
       const element = part(id);
       if (element.textContent !== text) element.textContent = text;
@@ -295,8 +295,8 @@ class Watch {
     const [demanded, entered, , left] = frame.counts ?? [0, 0, 0, 0];
     setText("count", frame.counts ? `${this.picture.bodies.length}` : "–");
     setText("counts", frame.counts ? `${entered} of ${demanded} entered, ${left} left` : "");
-    setText("sorted", knownLane ? `${Math.round((100 * onLane) / knownLane)} %` : "–");
-    setText("speed", speed === null ? "" : `${onLane} of ${knownLane}; mean ${speed.toFixed(1)} m/s`);
+    setText("sorted", knownLane ? `${Math.round((100 * inLane) / knownLane)} %` : "–");
+    setText("speed", speed === null ? "" : `${inLane} of ${knownLane}; mean ${speed.toFixed(1)} m/s`);
     setText("leader", frame.leader ? `${frame.leader[0]}, term ${frame.leader[1]}` : "none");
     part("leader").classList.toggle("bad", !frame.leader);
     this.showCandidates(frame.candidates);
@@ -340,11 +340,11 @@ class Watch {
     const key = JSON.stringify(news);
     if (key === this.newsKey) return;
     this.newsKey = key;
-    const items = [...news].reverse().map(([t, who, what, details]) => {
+    const items = [...news].reverse().map(([t, process, kind, details]) => {
       const item = document.createElement("li");
       const when = document.createElement("b");
       when.textContent = `${t.toFixed(1)} s`;
-      item.append(when, ` ${who}: ${what.replaceAll("-", " ")}${details ? ` (${details})` : ""}`);
+      item.append(when, ` ${process}: ${kind.replaceAll("-", " ")}${details ? ` (${details})` : ""}`);
       return item;
     });
     part("news").replaceChildren(...items);

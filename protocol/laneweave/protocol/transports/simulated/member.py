@@ -190,7 +190,7 @@ class Member:
 class Tokens:
     """Liveliness tokens: notifies members when tokens that they watch appear or vanish.
 
-    If several nodes declare a token on one key, it appears when the first declares it and vanishes
+    A token that several nodes declare on one key appears when the first declares it, and vanishes
     when the last withdraws it. Notifications are never lost and stay in order, as on Zenoh.
     """
 

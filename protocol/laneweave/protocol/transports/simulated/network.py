@@ -287,7 +287,7 @@ class SimulatedNetwork(Simulation):
         if self._router_up:
             self._router_up = False
             self._outages += 1
-            self._break_links(list(self._members.values()))
+            self._break_links(self._members.values())
 
     def restore_router(self) -> None:
         """Restore the router; each node reconnects after a random time in `REJOIN_S`."""

@@ -34,7 +34,7 @@ _TIME = and_(ge(0.0), lt(math.inf))
 
 @frozen
 class Conditions:
-    """Message faults, and computation times."""
+    """Message faults, lease, and computation times."""
 
     delay_s: float = field(default=0.002, validator=_TIME)
     jitter_s: float = field(default=0.003, validator=_TIME)
@@ -57,8 +57,8 @@ class Conditions:
 class Clock:
     """A machine's clock, which reads `offset_s + rate * t` at virtual time t."""
 
-    offset_s: float = field(default=0.0, validator=and_(gt(-math.inf), lt(math.inf)))
-    rate: float = field(default=1.0, validator=and_(gt(0.0), lt(math.inf)))
+    offset_s: float = field(validator=and_(gt(-math.inf), lt(math.inf)))
+    rate: float = field(validator=and_(gt(0.0), lt(math.inf)))
 
     def local_s(self, virtual_s: float) -> float:
         """Return the reading of the clock at a virtual time."""
@@ -78,7 +78,7 @@ class Clock:
 class Simulation:
     """Virtual clock, queue of future events, and random generator."""
 
-    def __init__(self, seed: int, conditions: Conditions | None = None) -> None:
+    def __init__(self, seed: int, conditions: Conditions | None) -> None:
         """Start at time 0 with an empty queue."""
         self.now_s = 0.0
         self.conditions = conditions or Conditions()

@@ -22,7 +22,7 @@ def client_settings(access: Access) -> Iterator[Setting]:
     """Yield the settings of a client."""
     yield from _common_settings("client", access.lease_s)
     yield "connect/endpoints", [access.endpoint]
-    # Zenoh does not accept the parts individually.
+    # Zenoh accepts these values only together.
     yield (
         "connect/retry",
         {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5},

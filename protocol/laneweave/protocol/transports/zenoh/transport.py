@@ -206,8 +206,8 @@ class ZenohTransport:
         """Query the servers of a key.
 
         Returns:
-            A future for the first answer. None: the key has no server, or all have declined, exited
-            or disconnected. The future raises `TimeoutError` if no server answers in time.
+            A future for the first answer. Its result is None if the key has no server, or if all
+            have declined, exited or disconnected. It raises `TimeoutError` if none answers in time.
         """
         first: Future[Answer | None] = Future()
         first.set_running_or_notify_cancel()

@@ -34,7 +34,9 @@ def solved(request: PlanRequest, max_nodes: int | None = None) -> PlanResponse:
 def test_both_solvers_agree_on_formations(
     seed: int, size: int, mode: Mode, conflicts: tuple[str, ...] | None
 ) -> None:
-    request = formation_request(seed, vehicles=size, mode=mode, conflicts=conflicts)
+    request = formation_request(
+        seed, vehicles=size, mode=mode, conflicts=conflicts, deadline_s=60.0
+    )
     branching = solved(request)
     tappa = plan(request, solver="tappa", max_nodes=300, fallback=False)
     assert branching.status == "optimal"
@@ -47,7 +49,7 @@ def test_both_solvers_agree_on_formations(
 
 
 def test_equal_requests_get_equal_plans() -> None:
-    request = formation_request(5, vehicles=9)
+    request = formation_request(5, vehicles=9, deadline_s=60.0)
     first, second = solved(request), solved(request)
     assert (first.paths, first.assignment) == (second.paths, second.assignment)
 
@@ -154,7 +156,7 @@ def test_requests_that_branching_cannot_handle_go_to_tappa() -> None:
 
 
 def test_an_unfinished_search_returns_its_bound() -> None:
-    request = formation_request(3, vehicles=12)
+    request = formation_request(3, vehicles=12, deadline_s=60.0)
     response = solved(request, max_nodes=30)
     assert response.status in ("timeout", "feasible")
     assert response.lower_bound is not None

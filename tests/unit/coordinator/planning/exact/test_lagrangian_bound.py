@@ -18,8 +18,8 @@ CASES: list[tuple[int, int, Mode]] = [(0, 6, 1), (3, 9, 1), (1, 6, 2), (3, 8, 2)
 def test_bounds_rise_and_never_exceed_the_minimum_cost(
     seed: int, vehicles: int, mode: Mode
 ) -> None:
-    request = formation_request(seed, vehicles=vehicles, mode=mode)
-    cost = plan(request).cost
+    request = formation_request(seed, vehicles=vehicles, mode=mode, deadline_s=60.0)
+    cost = plan(request, solver="branching").cost
     assert cost is not None
     whole = Relaxation(*arrays_of(request), 16)
     bounds = []
@@ -35,8 +35,8 @@ def test_bounds_rise_and_never_exceed_the_minimum_cost(
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "vehicles", "mode"), CASES)
 def test_moves_of_an_optimal_plan_are_never_fixed(seed: int, vehicles: int, mode: Mode) -> None:
-    request = formation_request(seed, vehicles=vehicles, mode=mode)
-    response = plan(request)
+    request = formation_request(seed, vehicles=vehicles, mode=mode, deadline_s=60.0)
+    response = plan(request, solver="branching")
     assert response.cost is not None
     arrays, grouped = arrays_of(request)
     whole = Relaxation(arrays, grouped, 16)

@@ -99,37 +99,35 @@ def test_at_any_delay_it_contains_the_kinds_of_the_paper(mode: Mode, kind: str) 
     model = ConflictModel([kind])
     named = {pair for pair in every_pair(mode) if model.kind(*moves(pair)) is not None}
     assert named or (mode == 1 and kind in ("special-2", "special-3", "special-4"))
-    assert named <= conflict_table(ANY_DELAY).pairs
+    assert named <= conflict_table(ANY_DELAY)
 
 
 def test_the_kinds_of_the_paper_overlook_pairs_of_oblique_moves_only() -> None:
     """All other pairs that the table forbids at any delay are also conflicts of the paper."""
     model = ConflictModel(PAPER_KINDS)
     named = {pair for pair in every_pair() if model.kind(*moves(pair)) is not None}
-    overlooked = conflict_table(ANY_DELAY).pairs & set(every_pair()) - named
+    overlooked = conflict_table(ANY_DELAY) & set(every_pair()) - named
     assert (len(named), len(overlooked)) == (280, 64)
     steps = [(b[0] - a[0], b[1] - a[1]) for pair in overlooked for a, b in moves(pair)]
     assert all(column and lane for column, lane in steps)
-    assert ((-1, -2), (-1, -1), (1, 1)) in overlooked & conflict_table(
-        BodyGeometry(lateness_s=0.0)
-    ).pairs
+    assert ((-1, -2), (-1, -1), (1, 1)) in overlooked & conflict_table(BodyGeometry(lateness_s=0.0))
 
 
 def test_at_any_delay_it_is_footprints_except_obliques_that_share_a_corner() -> None:
     meeting = {pair for pair in every_pair() if footprints_meet(pair)}
-    allowed = meeting - conflict_table(ANY_DELAY).pairs
+    allowed = meeting - conflict_table(ANY_DELAY)
     assert len(meeting) == 360
     assert len(allowed) == 16
     for pair in allowed:
         a, b = moves(pair)
         (shared,) = footprint(*a) & footprint(*b)
         assert shared not in (*a, *b), "a corner of both"
-    assert not {pair for pair in conflict_table(ANY_DELAY).pairs if pair[0] != (0, 0)} - meeting
+    assert not {pair for pair in conflict_table(ANY_DELAY) if pair[0] != (0, 0)} - meeting
 
 
 def test_in_mode_1_it_is_footprints() -> None:
     meeting = {pair for pair in every_pair(1) if footprints_meet(pair)}
-    assert conflict_table(ANY_DELAY).pairs & set(every_pair(1)) == meeting
+    assert conflict_table(ANY_DELAY) & set(every_pair(1)) == meeting
 
 
 # ----------------------------------------------------------------------------------- lateness
@@ -138,16 +136,16 @@ def test_in_mode_1_it_is_footprints() -> None:
 @pytest.mark.parametrize("along", [-1, 1])
 def test_trains_are_allowed_with_limited_lateness(along: int) -> None:
     train: Pair = ((1, 0), (along, 0), (along, 0))
-    assert train not in conflict_table(HALF_A_SECOND).pairs
-    assert train in conflict_table(BodyGeometry(lateness_s=0.8)).pairs
-    assert train in conflict_table(attrs.evolve(HALF_A_SECOND, clearance_along_m=6.0)).pairs
-    assert train in conflict_table(ANY_DELAY).pairs
+    assert train not in conflict_table(HALF_A_SECOND)
+    assert train in conflict_table(BodyGeometry(lateness_s=0.8))
+    assert train in conflict_table(attrs.evolve(HALF_A_SECOND, clearance_along_m=6.0))
+    assert train in conflict_table(ANY_DELAY)
 
 
 @pytest.mark.parametrize("lateness_s", [0.0, 0.5])
 @pytest.mark.parametrize("mode", [1, 2])
 def test_waiting_in_a_crossed_cell_is_a_conflict(mode: Mode, lateness_s: float) -> None:
-    table = conflict_table(BodyGeometry(lateness_s=lateness_s)).pairs
+    table = conflict_table(BodyGeometry(lateness_s=lateness_s))
     node = ConflictModel(["node", "edge"])
     assert {pair for pair in every_pair(mode) if node.kind(*moves(pair))} <= table
     same_cell = {((0, 0), a, b) for a, b in product(displacements(mode), repeat=2)}
@@ -162,7 +160,7 @@ def test_waiting_in_a_crossed_cell_is_a_conflict(mode: Mode, lateness_s: float) 
 @given(geometries())
 def test_disjoint_footprints_are_never_too_close(geometry: BodyGeometry) -> None:
     """They are separated by a column or by a lane, so the table forbids none of them."""
-    table = conflict_table(geometry).pairs
+    table = conflict_table(geometry)
     for pair in table:
         assert footprints_meet(pair), pair
 
@@ -173,7 +171,7 @@ def test_disjoint_footprints_are_never_too_close(geometry: BodyGeometry) -> None
 def test_the_table_is_symmetric(
     geometry: BodyGeometry,
 ) -> None:
-    table = conflict_table(geometry).pairs
+    table = conflict_table(geometry)
     for (column, lane), a, b in table:
         assert ((-column, -lane), b, a) in table
         assert ((column, -lane), (a[0], -a[1]), (b[0], -b[1])) in table
@@ -182,7 +180,7 @@ def test_the_table_is_symmetric(
 @pytest.mark.parametrize("geometry", [ANY_DELAY, HALF_A_SECOND, BodyGeometry(lateness_s=0.0)])
 def test_backwards_it_forbids_the_same_or_more(geometry: BodyGeometry) -> None:
     """Bodies turn more if they fall back while they change lanes."""
-    table = conflict_table(geometry).pairs
+    table = conflict_table(geometry)
     mirrored = {((-c, lane), (-a[0], a[1]), (-b[0], b[1])) for (c, lane), a, b in table}
     assert {pair for pair in mirrored if pair[1][0] <= 0 and pair[2][0] <= 0} <= table
     assert (table == mirrored) == (geometry != HALF_A_SECOND)
@@ -204,11 +202,8 @@ def test_more_clearance_or_more_lateness_removes_nothing(
         )
     except BadInputError:
         stricter = attrs.evolve(geometry, lateness_s=None)
-    assert conflict_table(geometry).pairs <= conflict_table(stricter).pairs
-    assert (
-        conflict_table(geometry).pairs
-        <= conflict_table(attrs.evolve(geometry, lateness_s=None)).pairs
-    )
+    assert conflict_table(geometry) <= conflict_table(stricter)
+    assert conflict_table(geometry) <= conflict_table(attrs.evolve(geometry, lateness_s=None))
 
 
 # -------------------------------------------------------------------------- against simulation
@@ -220,7 +215,7 @@ def test_more_clearance_or_more_lateness_removes_nothing(
 def test_it_contains_what_simulated_bodies_do(geometry: BodyGeometry, seed: int) -> None:
     """Forbidden pairs are too close with slightly larger clearances."""
     bodies = Bodies(**attrs.asdict(geometry))
-    table = conflict_table(geometry).pairs
+    table = conflict_table(geometry)
     slack_m = 0.1 + 2.0 * 1.875 * geometry.pitch_m / geometry.move_s * geometry.move_s / 100
     for pair in Random(seed).sample(every_pair(), 300):
         if least_gap_m(bodies, *pair) < geometry.clearance_along_m:
@@ -257,9 +252,9 @@ def test_the_table_contains_that_of_driven_motions_and_little_more(
     exact = attrs.evolve(geometry, profile_error_along_m=0.0, profile_error_across_m=0.0)
     driven = pairs_closer_than(exact, actual_paths())
     assert (min_clearances(exact, actual_paths()) >= min_clearances(geometry)).all()
-    assert driven <= conflict_table(exact).pairs & conflict_table(geometry).pairs
-    assert len(conflict_table(exact).pairs - driven) == more
-    assert len(conflict_table(geometry).pairs - driven) == more_with_errors
+    assert driven <= conflict_table(exact) & conflict_table(geometry)
+    assert len(conflict_table(exact) - driven) == more
+    assert len(conflict_table(geometry) - driven) == more_with_errors
     of_mode_1 = {step: path for step, path in actual_paths().items() if 0 in step}
     straight = pairs_closer_than(exact, of_mode_1)
     assert straight == {pair for pair in driven if 0 in pair[1] and 0 in pair[2]}
@@ -315,9 +310,7 @@ def test_a_model_with_a_table_needs_geometric() -> None:
 def test_a_model_with_a_table_uses_it() -> None:
     model = ConflictModel(["geometric"], conflict_table(HALF_A_SECOND))
     for pair in every_pair():
-        assert (model.kind(*moves(pair)) == "geometric") == (
-            pair in conflict_table(HALF_A_SECOND).pairs
-        )
+        assert (model.kind(*moves(pair)) == "geometric") == (pair in conflict_table(HALF_A_SECOND))
     train = moves(((1, 0), (1, 0), (1, 0)))
     assert model.kind(*train) is None
     assert (

@@ -1,0 +1,60 @@
+"""Events and formations of a recorded run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+
+from laneweave.launch.formation_columns import FormationColumns, Formations
+from laneweave.protocol.lattice import Lattice
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.wire.events import FORMATION_CLOSED
+
+
+def read_events(folder: Path, *kinds: str) -> Iterator[Mapping[str, Any]]:
+    """Yield the recorded events of the given kinds, in the order in which they were written.
+
+    Raises:
+        OSError, ValueError, KeyError, TypeError: the events cannot be read.
+    """
+    path = folder / "events.jsonl"
+    if not path.is_file():
+        return
+    for line in path.read_text(encoding="utf-8").splitlines():
+        event = json.loads(line)
+        if event["kind"] in kinds:
+            yield event
+
+
+def closed_formations(folder: Path, scenario: Scenario) -> Formations:
+    """Return the formations of a recorded run; none in the rolling operation."""
+    if scenario.formation.rolling:
+        return Formations()
+    return recorded_formations(folder, scenario.lattice)
+
+
+def recorded_formations(folder: Path, lattice: Lattice) -> Formations:
+    """Return the formations of a recorded run that contained vehicles.
+
+    In the rolling operation, and in recordings without `formation-closed` events, each block of the
+    lattice counts as a formation.
+
+    Raises:
+        OSError, ValueError, KeyError, TypeError: a file of the run cannot be read.
+    """
+    found: dict[int, FormationColumns] = {}
+    for event in read_events(folder, FORMATION_CLOSED):
+        if event.get("role") == "bridge":
+            rear, front = event["columns"]
+            number = int(event["formation"])
+            found[number] = FormationColumns(number, int(rear), int(front), float(event["t_s"]))
+    trips = pq.read_table(folder / "trips.parquet", columns=["formation"])
+    numbers: set[int] = set(trips["formation"].drop_null().to_pylist())  # type: ignore[arg-type]
+    for number in numbers:
+        columns = lattice.block_range(number)
+        found.setdefault(number, FormationColumns(number, columns[0], columns[-1]))
+    return Formations(found.values())
