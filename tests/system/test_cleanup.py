@@ -71,8 +71,8 @@ def test_a_signal_ends_a_run(
 
 def test_ctrl_c_ends_a_run_whose_fork_server_is_not_ready(lab: Lab, road: Path) -> None:
     # With an empty cache the server compiles the planners for a minute.
-    cache = str(lab.folder / "cache")
-    process = lab.start("run", road, *DEMAND, "--out", "out", NUMBA_CACHE_DIR=cache)
+    cache = lab.folder / "cache"
+    process = lab.start("run", road, *DEMAND, "--out", "out", NUMBA_CACHE_DIR=str(cache))
     lab.wait_until(lambda: len(lab.processes()) > 1)
 
     interrupt(process, signal.SIGINT)
@@ -81,6 +81,8 @@ def test_ctrl_c_ends_a_run_whose_fork_server_is_not_ready(lab: Lab, road: Path) 
     assert ended.status == 1
     assert ended.complaints == ["interrupted"]
     lab.check_nothing_left()
+    # It died with its launcher; `solve.warm_up` compiles more than 40 functions.
+    assert len(list(cache.rglob("*.nbi"))) < 20
 
 
 @pytest.mark.parametrize("role", ["router", "bridge"])

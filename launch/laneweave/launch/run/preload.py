@@ -9,17 +9,19 @@ process would copy all of them.
 
 from __future__ import annotations
 
+import os
+
 import laneweave.coordinator.process  # noqa: F401
 from laneweave.agents import process as agents
 from laneweave.coordinator.planning import solve
-from laneweave.launch.run.roles import tune_garbage_collector
+from laneweave.launch.run.roles import LAUNCHER, tune_garbage_collector
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.runtime.processes import die_with_parent, outlive_parent
 from laneweave.protocol.wire import codec
 
 # The fork server itself notices the end of its launcher only after this preparation; from then on
 # it must outlive the launcher until its last child has exited.
-die_with_parent()
+die_with_parent(int(os.environ.pop(LAUNCHER)))
 codec.warm_up()
 agents.warm_up(parse_scenario({}))
 solve.warm_up()

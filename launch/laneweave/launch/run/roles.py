@@ -37,6 +37,8 @@ from laneweave.protocol.security.access_control import access_of
 log = structlog.get_logger(__name__)
 
 PRELOADED = "laneweave.launch.run.preload"
+LAUNCHER = "LANEWEAVE_LAUNCHER"
+"""Environment variable of the fork server with the process ID of its launcher."""
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that limit the threads of linear algebra libraries."""
 AGENT_NICENESS = 5
@@ -77,9 +79,11 @@ def fork_server() -> ForkServerContext:
     # Ctrl-C reaches the whole process group. Role processes inherit the blocked SIGINT, because
     # the launcher terminates them in the right order. A Ctrl-C in the meantime is delivered later.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    os.environ[LAUNCHER] = str(os.getpid())
     try:
         forkserver.ensure_running()
     finally:
+        del os.environ[LAUNCHER]
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     # Starting it waits for the server; at this point Ctrl-C still raises KeyboardInterrupt.
     first = context.Process(target=int, name="processes")

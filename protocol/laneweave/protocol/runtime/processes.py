@@ -12,9 +12,13 @@ from collections.abc import Callable, Iterator
 _PR_SET_PDEATHSIG = 1
 
 
-def die_with_parent() -> None:
-    """Have the kernel send SIGTERM to this process when its parent dies."""
-    parent = os.getppid()
+def die_with_parent(parent: int | None = None) -> None:
+    """Have the kernel send SIGTERM to this process when its parent dies.
+
+    Args:
+        parent: process ID of the parent, which may already have died; None: the current parent.
+    """
+    parent = parent or os.getppid()
     _set_death_signal(signal.SIGTERM)
     if os.getppid() != parent:
         sys.exit(1)

@@ -9,7 +9,7 @@ from typing import NoReturn
 
 import pytest
 
-from laneweave.launch.run.roles import PRELOADED, THREAD_LIMITS, fork_server, start_role
+from laneweave.launch.run.roles import LAUNCHER, PRELOADED, THREAD_LIMITS, fork_server, start_role
 from laneweave.protocol.errors import CommandFailedError
 from support.commands import python
 
@@ -59,5 +59,6 @@ print(gc.get_count()[2], gc.get_freeze_count() > len(gc.get_objects()))
 
 @pytest.mark.slow
 def test_the_fork_server_has_one_thread_and_nothing_open_and_leaves_nothing_to_collect() -> None:
-    done = python(LOOK_AROUND, PRELOADED, env=os.environ | dict.fromkeys(THREAD_LIMITS, "1"))
+    set_by_launcher = dict.fromkeys(THREAD_LIMITS, "1") | {LAUNCHER: str(os.getpid())}
+    done = python(LOOK_AROUND, PRELOADED, env=os.environ | set_by_launcher)
     assert done.stdout.split() == ["1", "0", "0", "True"], done.stderr
