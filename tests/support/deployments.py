@@ -42,7 +42,7 @@ endpoint = "{endpoint}"
 
 def ping(lab: Lab, config: Path) -> Ended:
     """Run `laneweave ping`."""
-    return lab.finish(lab.start("ping", "--config", config), END_S)
+    return lab.run_forked("ping", "--config", config, alone=False)
 
 
 def start_router(lab: Lab, config: Path) -> subprocess.Popen[str]:
@@ -55,7 +55,7 @@ def start_router(lab: Lab, config: Path) -> subprocess.Popen[str]:
 def ask(lab: Lab, config: Path, request: dict[str, Any], *options: str) -> Ended:
     """Run `laneweave plan` with the planning service of a deployment."""
     path = lab.path("request.json", json.dumps(request))
-    return lab.finish(lab.start("plan", path, "--config", config, *options), RUN_S)
+    return lab.run_forked("plan", path, "--config", config, *options, within_s=RUN_S, alone=False)
 
 
 def stop(lab: Lab, *processes: subprocess.Popen[str]) -> None:

@@ -143,7 +143,7 @@ def test_a_run_ends_with_its_bridge_and_its_router(
 
 def test_vehicles_arrive_though_an_agent_is_killed(lab: Lab) -> None:
     road = lab.path("short.toml", SHORT_ROAD)
-    process = start_and_wait(lab, road, "--duration", "14")
+    process = start_and_wait(lab, road, "--duration", "14", "--coordinators", "1")
     agent = next(name for name in sorted(lab.roles()) if name.startswith("agent-"))
 
     os.kill(lab.roles()[agent], signal.SIGKILL)

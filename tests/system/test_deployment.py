@@ -26,9 +26,7 @@ def test_roles_by_hand(finished_run: FinishedRun, lab: Lab) -> None:
     # The other tests here use TCP.
     config = deployment(lab, "unixsock-stream/router.sock")
     router = start_router(lab, config)
-    coordinators = [
-        lab.start("coordinator", "--config", config, "--name", name) for name in ("c1", "c2")
-    ]
+    coordinator = lab.start("coordinator", "--config", config)
     agents = [lab.start("agent", "--config", config, "--shard", f"{i}/2") for i in range(2)]
     # Somebody must lead before vehicles come: the answer to a question shows it.
     lab.wait_until(lambda: ask(lab, config, REQUEST).status == 0, END_S)
@@ -37,7 +35,7 @@ def test_roles_by_hand(finished_run: FinishedRun, lab: Lab) -> None:
     ended = lab.finish(bridge, RUN_S)
 
     assert (ended.status, ended.complaints) == (0, []), ended
-    stop(lab, *agents, *coordinators)
+    stop(lab, *agents, coordinator)
     assert ping(lab, config).status == 0
     stop(lab, router)
     check_safe_and_complete(lab.folder / "out")

@@ -23,8 +23,7 @@ LOOK_S = "0.6"
 
 
 def status(lab: Lab, config: Path, *options: str) -> Ended:
-    looked = lab.start("status", "--config", config, "--seconds", LOOK_S, *options)
-    return lab.finish(looked, END_S)
+    return lab.run_forked("status", "--config", config, "--seconds", LOOK_S, *options, alone=False)
 
 
 def wait_for_health(lab: Lab, config: Path, *options: str) -> Ended:

@@ -11,5 +11,5 @@ from support.commands import Here
 @pytest.fixture
 def laneweave(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Here:
     """Runs commands; logs are not bound to a stream that ends with the test."""
-    monkeypatch.setattr(logs, "log_to_terminal", lambda: None)
+    monkeypatch.setattr(logs, "log_to_terminal", lambda *_: None)
     return Here(capsys)
