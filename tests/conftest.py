@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 
 import pytest
@@ -23,6 +24,13 @@ def pytest_configure() -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run tests that wait for processes first, beside tests that compute."""
     items.sort(key=_rank)
+
+
+def pytest_collection_finish() -> None:
+    """Exclude the collected tests from garbage collection, which would take 7 % of the time."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

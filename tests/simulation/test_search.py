@@ -22,7 +22,7 @@ from laneweave.launch.fault_search.search import replay_command
 from laneweave.launch.fault_search.setup import SLOT_S
 
 BATCH = 20
-SEEDS = 100
+SEEDS = 80
 DIGESTS = range(1000, 1010)
 _PRINT_DIGESTS = """
 import json, sys
@@ -72,7 +72,7 @@ def test_no_rule_is_broken_and_all_vehicles_arrive_long(
 
 @pytest.mark.parametrize("profile", [name for name in PROFILES if name != "mixed"])
 def test_profile(profile: str) -> None:
-    search(profile, range({"rolling-dense": 4}.get(profile, 8)))
+    search(profile, range({"rolling-dense": 4}.get(profile, 6)))
 
 
 @pytest.mark.full

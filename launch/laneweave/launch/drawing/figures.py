@@ -30,6 +30,11 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 def save(figure: Figure, out: Path, dpi: float) -> None:
     """Save a figure to a file."""
     out.parent.mkdir(parents=True, exist_ok=True)
+    # `savefig` would draw the figure twice: first for its layout only.
+    figure.set_dpi(dpi)
+    if (layout := figure.get_layout_engine()) is not None:
+        layout.execute(figure)
+        figure.set_layout_engine("none")
     figure.savefig(out, dpi=dpi)
 
 
