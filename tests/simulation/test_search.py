@@ -22,7 +22,7 @@ from laneweave.launch.fault_search.search import replay_command
 from laneweave.launch.fault_search.setup import SLOT_S
 
 BATCH = 20
-SEEDS = 80
+SEEDS = 60
 DIGESTS = range(1000, 1010)
 _PRINT_DIGESTS = """
 import json, sys

@@ -122,8 +122,15 @@ def test_a_run_ends_when_the_fork_server_is_killed(lab: Lab, road: Path) -> None
     lab.wait_until(lambda: not lab.processes(), END_S)
 
 
-@pytest.mark.parametrize("role", ["bridge", "router"])
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("role", "number"),
+    [
+        ("bridge", signal.SIGKILL),
+        ("bridge", signal.SIGTERM),
+        ("router", signal.SIGKILL),
+        pytest.param("router", signal.SIGTERM, marks=pytest.mark.full),
+    ],
+)
 def test_a_run_ends_with_its_bridge_and_its_router(
     lab: Lab, road: Path, role: str, number: signal.Signals
 ) -> None:

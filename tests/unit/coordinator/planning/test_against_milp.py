@@ -31,7 +31,7 @@ from oracles.path_rules import check_paths
 from oracles.proven import Oracle, by_oracle
 from support.planning_oracles import assert_agreement
 
-INSTANCES = 120
+INSTANCES = 200
 MORE_INSTANCES = 1_600
 FORMATION_INSTANCES = 100
 LARGE_INSTANCES = 100
