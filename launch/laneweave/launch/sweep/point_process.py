@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import sys
 from pathlib import Path
@@ -28,9 +27,7 @@ def main(folder: Path, parent: int) -> None:
     """
     # Handle SIGTERM like Ctrl-C, to complete files and remove temporary folders.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    die_with_parent()
-    if os.getppid() != parent:
-        sys.exit("the sweep has exited")
+    die_with_parent(parent)
     log_to_terminal()
     tune_garbage_collector()
     job = json.loads((folder / JOB_FILE).read_text(encoding="utf-8"))
