@@ -22,7 +22,7 @@ from laneweave.protocol.wire.topics import SERVICE, Keys
 
 IN_FLIGHT = 48
 """Below the limit of a service, which stays out of this."""
-ANSWER_S = 30.0
+ANSWER_S = 120.0
 
 Tree = dict[str, Any]
 

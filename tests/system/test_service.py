@@ -168,7 +168,7 @@ config.insert_json5("scouting/multicast/enabled", "false")
 with zenoh.open(config) as session:
     for selector in ("laneweave/default/service/plan", "laneweave/*/service/*", "laneweave/**"):
         for request in sys.argv[2:]:
-            (reply,) = session.get(selector, payload=request, timeout=20.0)
+            (reply,) = session.get(selector, payload=request, timeout=120.0)
             answer = reply.ok or reply.err
             print(bool(reply.ok), answer.encoding, answer.payload.to_string())
 """

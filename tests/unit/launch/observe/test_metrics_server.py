@@ -38,7 +38,7 @@ def free_address() -> str:
 
 
 def scrape(address: str) -> dict[tuple[str, ...], float]:
-    with urllib.request.urlopen(f"http://{address}/metrics", timeout=10) as answer:
+    with urllib.request.urlopen(f"http://{address}/metrics", timeout=60) as answer:
         assert answer.headers["Content-Type"].startswith("text/plain")
         text = answer.read().decode()
     return {
