@@ -44,6 +44,7 @@ volume_veh_per_lane_h = 1600.0
 duration_s = 8.0
 [network]
 realm = "test"
+election_s = 3.0
 endpoint = "unixsock-stream/router.sock"
 """
 FIRST_PAINT = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime"

@@ -43,7 +43,11 @@ def main() -> None:
         # Threads and processes that start later inherit the mask.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         threading.Thread(target=_forward_interrupts, name="interrupts", daemon=True).start()
-    sys.exit(_status(sys.argv[1:]))
+    status = _status(sys.argv[1:])
+    # A second Ctrl-C must not interrupt the end of this process, which would print a traceback.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    sys.exit(status)
 
 
 def _forward_interrupts() -> None:

@@ -198,7 +198,8 @@ def _add_path_map(report: _Report, driven: DrivenMap | None) -> None:
         partial(draw_path_map, driven),
         f"Cells (column, lane) of {driven.vehicles} at the ends of slots, as driven. The box "
         "before a name has the colour of the preferred lane; cells have the colour of their lane, "
-        "strong if it is the preferred one; bold: moved in the preceding slot.",
+        "strong if it is the preferred one; bold: moved in the preceding slot. Cost: the sum "
+        "over the vehicles of the slot in which they arrive.",
         f"Table of the cells of {driven.name} by vehicle and slot",
     )
 

@@ -169,8 +169,7 @@ def draw_path_map(driven: DrivenMap, out: Path, dpi: int) -> None:
         for row in range(rows):
             _draw_row(axes, row, driven)
         axes.set_title(
-            f"{driven.name}: {rows} vehicles, {path_map.cost()} steps in all "
-            f"within {path_map.steps} slots",
+            f"{driven.name}: {rows} vehicles, {path_map.steps} slots, cost {path_map.cost()}",
             fontsize=9.5,
         )
 

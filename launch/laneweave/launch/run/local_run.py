@@ -112,8 +112,8 @@ class LocalRun:
         context = fork_server()
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
-            tempfile.TemporaryDirectory(prefix="laneweave-") as temporary,
             stop_signals(self._request_stop),
+            tempfile.TemporaryDirectory(prefix="laneweave-") as temporary,
             RunProgress(self.scenario, show=self.show_progress) as progress,
         ):
             network = attrs.evolve(

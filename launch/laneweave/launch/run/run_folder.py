@@ -15,7 +15,7 @@ LOG_FILE = "log.jsonl"
 
 @contextmanager
 def new_folder(out: Path | None, settings: Scenario, method: str) -> Iterator[Path]:
-    """Yield a new or empty folder; remove a new one if the run is rejected before it begins.
+    """Yield a new or empty folder; remove a new one if the run ends before it begins.
 
     Raises:
         BadInputError: the folder is not empty, or cannot be created.
@@ -26,7 +26,7 @@ def new_folder(out: Path | None, settings: Scenario, method: str) -> Iterator[Pa
     _claim(folder)
     try:
         yield folder
-    except BadInputError:
+    except (BadInputError, KeyboardInterrupt):
         files = list(folder.iterdir())
         if files == [folder / LOG_FILE] and not files[0].stat().st_size:
             files[0].unlink()
