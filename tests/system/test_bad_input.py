@@ -7,20 +7,13 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from support.harness import END_S, Ended, Lab
+from support.service_lab import request
 
 NOBODY = "unixsock-stream/nobody.sock"
-
-REQUEST: dict[str, Any] = {
-    "schema": "laneweave.plan.request/1",
-    "grid": {"columns": 4, "lanes": 2},
-    "vehicles": [{"id": "a", "cell": [0, 0], "lane": 1}],
-    "targets": [[1, 0], [1, 1]],
-}
 
 
 def refused(lab: Lab, *arguments: object) -> str:
@@ -63,9 +56,9 @@ def test_endpoints_that_cannot_be(lab: Lab, endpoint: str) -> None:
 
 @pytest.mark.parametrize("role", ["coordinator", "agent", "bridge", "ping", "plan"])
 def test_an_endpoint_without_a_router_is_refused(lab: Lab, role: str) -> None:
-    request = lab.path("request.json", json.dumps(REQUEST))
+    file = lab.path("request.json", json.dumps(request()))
     options: dict[str, list[object]] = {
-        "plan": [request, "--connect", NOBODY],
+        "plan": [file, "--connect", NOBODY],
         "bridge": ["--endpoint", NOBODY, "--out", "out"],
     }
     line = refused_afresh(lab, role, *options.get(role, ["--endpoint", NOBODY]))
