@@ -212,7 +212,8 @@ def _start(warm_up: Callable[[], None] | None) -> tuple[SpawnProcess, Connection
 
 def _work(connection: Connection, warm_up: Callable[[], None] | None) -> None:
     """Run jobs until the parent closes its connection; main function of a worker process."""
-    die_with_parent()
+    parent = multiprocessing.parent_process()
+    die_with_parent(None if parent is None else parent.pid)
     # Ctrl-C reaches the whole process group, but the parent stops its workers itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
