@@ -16,7 +16,7 @@ from simulation.search_bugs import SEEDS, bug_named, first_catch
 EVIDENCE = Path(__file__).parents[2] / "docs" / "evidence" / "planted-bugs-found.json"
 SOON = {
     "lower-ballot-promised": ("mixed", "monotone"),
-    "no-gate": ("mixed", "interleaved"),
+    "no-gate": ("partitions", "interleaved"),
     "old-motion-counts": ("mixed", "cell"),
     "second-plan-under-one-ballot": ("mixed", "two-plans"),
     "promise-keeps-plan": ("mixed", "motion"),

@@ -29,6 +29,7 @@ from attrs import define, field, frozen
 from laneweave.launch import cli
 from laneweave.launch.cli.main import main
 from support.commands import LANEWEAVE
+from support.waiting import wait_until
 
 MARK = "LANEWEAVE_TEST_MARK"
 LOADED = (
@@ -191,13 +192,8 @@ class Lab:
         return found
 
     def wait_until(self, condition: Callable[[], bool], within_s: float = RUN_S) -> None:
-        """Wait for something to happen; at most half of the time is spent on looking for it."""
-        began_s = looked_s = time.monotonic()
-        while not condition():
-            now_s = time.monotonic()
-            assert now_s < began_s + within_s, f"not within {within_s:g} s"
-            time.sleep(max(0.02, now_s - looked_s))
-            looked_s = time.monotonic()
+        """Wait for something to happen."""
+        wait_until(condition, within_s)
 
     def check_nothing_left(self) -> None:
         """Check that no process of this test runs any more, and no temporary file is there."""

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,6 +32,7 @@ from laneweave.launch.faults.network_namespaces import (
 )
 from laneweave.launch.run.roles import fork_server
 from support.commands import LANEWEAVE
+from support.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 CERTIFICATES = "/certs"
@@ -128,7 +129,7 @@ class Hosts:
         """Wait until services are healthy."""
 
         def wait(name: str) -> None:
-            self.wait_until(lambda: self.healthy(name), READY_S)
+            wait_until(lambda: self.healthy(name), READY_S)
 
         # At the same time: most of a check is the start of an interpreter.
         with ThreadPoolExecutor() as pool:
@@ -190,15 +191,7 @@ class Hosts:
 
     def wait_road(self, t_s: float, within_s: float = 120.0) -> None:
         """Wait for a road time."""
-        self.wait_until(lambda: self.road_s >= t_s, within_s)
-
-    def wait_until(self, condition: Callable[[], bool], within_s: float) -> None:
-        """Wait for something to happen."""
-        give_up = time.monotonic() + within_s
-        while not condition():
-            if time.monotonic() >= give_up:
-                raise TimeoutError(f"not within {within_s:g} s")
-            time.sleep(0.1)
+        wait_until(lambda: self.road_s >= t_s, within_s)
 
 
 @contextmanager

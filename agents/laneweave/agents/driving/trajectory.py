@@ -229,6 +229,34 @@ def _trajectory_program(
     envelope: Envelope | None,
 ) -> QuadraticProgram:
     """Return the program in units of `unit_s`: x = (z_s [3n], z_y [3n], j_s [n], j_y [n])."""
+    constraints = _constraints(limits, speed_mps, h, unit_s, n, envelope)
+    lower, upper = constraints.lower.copy(), constraints.upper.copy()
+    lower[constraints.ends] = upper[constraints.ends] = [end_m[0], 0.0, 0.0, end_m[1], 0.0, 0.0]
+    cost = sparse.diags([np.concatenate([np.zeros(6 * n), np.ones(2 * n)])], [0])
+    return QuadraticProgram(cost, constraints.matrix, lower, upper, settings=_SETTINGS)
+
+
+@frozen(eq=False)
+class _Constraints:
+    """lower <= matrix x <= upper."""
+
+    matrix: Any
+    lower: Array
+    upper: Array
+    ends: slice
+    """Rows of z_n, whose bounds are 0."""
+
+
+@lru_cache(maxsize=32)
+def _constraints(
+    limits: Vehicle,
+    speed_mps: float,
+    h: float,
+    unit_s: float,
+    n: int,
+    envelope: Envelope | None,
+) -> _Constraints:
+    """Return the constraints that all motions of the same duration share; cached."""
     transition, effect = axis_matrices(h)
     eye = sparse.eye(n)
     shift = sparse.diags([np.ones(n - 1)], [-1], shape=(n, n)) if n > 1 else sparse.eye(1) * 0.0
@@ -243,7 +271,7 @@ def _trajectory_program(
 
     slip = limits.max_slip_ratio * LIMIT_SHARE
     v_unit, a_unit, j_unit = unit_s * LIMIT_SHARE, unit_s**2 * LIMIT_SHARE, unit_s**3 * LIMIT_SHARE
-    infinite, ends = np.inf, np.array([[d, 0.0, 0.0] for d in end_m])
+    infinite = np.inf
     # Columns of x, lower bound, upper bound.
     rows: list[tuple[list[Any], Any, Any]] = [
         ([step, None, drive, None], 0.0, 0.0),
@@ -263,9 +291,10 @@ def _trajectory_program(
         ([slip * pick(1), pick(1), None, None], -slip * speed_mps * unit_s, infinite),
         ([None, None, eye, None], *_both(j_unit * limits.max_jerk_mps3)),
         ([None, None, None, eye], *_both(j_unit * limits.max_lateral_jerk_mps3)),
-        ([last, None, None, None], ends[0], ends[0]),
-        ([None, last, None, None], ends[1], ends[1]),
+        ([last, None, None, None], 0.0, 0.0),
+        ([None, last, None, None], 0.0, 0.0),
     ]
+    ends_after = len(rows)
     if envelope is not None:
         brake, later = envelope.brake_mps2, eye.tocsr()[envelope.ticks - 1 :]
         for share in np.linspace(0.0, _CLOSING_SPEEDUP, _TANGENTS):
@@ -275,12 +304,12 @@ def _trajectory_program(
             max_m = envelope.max_m - speed * (2.0 * speed_mps - speed) / (2.0 * brake)
             rows.append(([row, None, None, None], -infinite, max_m))
     heights = [next(m for m in blocks if m is not None).shape[0] for blocks, _, _ in rows]
-    return QuadraticProgram(
-        sparse.diags([np.concatenate([np.zeros(6 * n), np.ones(2 * n)])], [0]),
+    end = sum(heights[:ends_after])
+    return _Constraints(
         sparse.bmat([blocks for blocks, _, _ in rows]),
         np.concatenate([np.full(m, low) for m, (_, low, _) in zip(heights, rows, strict=True)]),
         np.concatenate([np.full(m, high) for m, (_, _, high) in zip(heights, rows, strict=True)]),
-        settings=_SETTINGS,
+        slice(end - 6, end),
     )
 
 

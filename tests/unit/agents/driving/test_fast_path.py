@@ -131,7 +131,7 @@ def test_the_fast_path_gives_the_programs_solution_where_no_row_binds(
             assert result.usable
             assert slack >= -1e-6
             np.testing.assert_allclose(result.jerk, free.jerk, atol=1e-4)
-            if taken % 3:
+            if taken % 6:
                 continue  # tight tolerances take their time
             expected = exact.solve(problem.state, problem.window, problem.gaps)
             assert expected.usable

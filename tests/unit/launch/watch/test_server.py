@@ -11,7 +11,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from laneweave.launch.watch.process import open_socket
 from laneweave.launch.watch.recorded_run import Recording
 from laneweave.launch.watch.server import Browser, Browsers, make_app, request_of
 from laneweave.protocol.errors import BadInputError
+from support.waiting import wait_until
 
 WAIT_S = 60.0
 BIG = "x" * 100_000
@@ -61,7 +62,7 @@ class Site:
 
     def offer(self, frame: str) -> None:
         """Offer a frame to all browsers, from another thread than the server's."""
-        wait_until(lambda: self._loop is not None)
+        wait_until(lambda: self._loop is not None, WAIT_S)
         assert self._loop is not None
         self._loop.call_soon_threadsafe(self.browsers.offer, frame)
 
@@ -83,13 +84,6 @@ class Site:
             f"ws://{self.host}/stream", open_timeout=WAIT_S, **options
         )
         return browser
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    give_up = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < give_up
-        time.sleep(0.01)
 
 
 def receive(browser: ClientConnection) -> dict[str, Any]:
@@ -114,7 +108,7 @@ def shared_site() -> Iterator[Site]:
 def site(shared_site: Site) -> Site:
     """Return a healthy server without browsers."""
     shared_site.healthy = True
-    wait_until(lambda: not shared_site.browsers.connected)
+    wait_until(lambda: not shared_site.browsers.connected, WAIT_S)
     return shared_site
 
 
@@ -149,26 +143,26 @@ def test_a_browser_gets_the_scene_and_new_frames_and_those_that_it_requests(site
 def test_several_browsers_come_and_go(site: Site) -> None:
     with site.browser() as one, site.browser() as other:
         receive(one), receive(other)
-        wait_until(lambda: len(site.browsers.connected) == 2)
+        wait_until(lambda: len(site.browsers.connected) == 2, WAIT_S)
         # One disconnects without closing the websocket.
         one.socket.shutdown(socket.SHUT_RDWR)
-        wait_until(lambda: len(site.browsers.connected) == 1)
+        wait_until(lambda: len(site.browsers.connected) == 1, WAIT_S)
         site.offer('{"n":5}')
         assert receive(other) == {"n": 5}
-    wait_until(lambda: not site.browsers.connected)
+    wait_until(lambda: not site.browsers.connected, WAIT_S)
 
 
 def test_a_slow_browser_gets_fewer_frames_and_delays_no_other(site: Site) -> None:
     with contextlib.closing(deaf_socket(site)), site.browser(max_size=None) as fast:
         receive(fast)
-        wait_until(lambda: len(site.browsers.connected) == 2)
+        wait_until(lambda: len(site.browsers.connected) == 2, WAIT_S)
         for number in range(120):
             site.offer(compact({"n": number, "filling": BIG}))
             # The fast one reads every frame, the slow one none.
             assert receive(fast)["n"] == number
         assert max(browser.skipped for browser in site.browsers.connected) > 20
     # It is disconnected at last, with frames still unsent.
-    wait_until(lambda: not site.browsers.connected)
+    wait_until(lambda: not site.browsers.connected, WAIT_S)
 
 
 def deaf_socket(site: Site) -> socket.socket:

@@ -22,6 +22,7 @@ from laneweave.protocol.runtime import worker_pool
 from laneweave.protocol.runtime.node import Computed, Delegate
 from laneweave.protocol.runtime.worker_pool import WorkerPool
 from support import worker_jobs as jobs
+from support.waiting import wait_until
 
 pytestmark = pytest.mark.slow
 
@@ -72,13 +73,6 @@ def two() -> Iterator[Bench]:
     bench = Bench(2)
     with contextlib.closing(bench.pool):
         yield bench
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    give_up = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < give_up
-        time.sleep(0.005)
 
 
 def is_gone(process_id: int) -> bool:
@@ -163,7 +157,7 @@ def test_an_idle_worker_that_is_killed_is_replaced(one: Bench, *, with_a_job: bo
     before = one.process_id()
     os.kill(before, signal.SIGKILL)
     if not with_a_job:
-        wait_until(lambda: one.pool.process_ids not in ([before], []))
+        wait_until(lambda: one.pool.process_ids not in ([before], []), WAIT_S)
     assert one.process_id() not in (before, os.getpid())
     assert one.pool.process_ids == [one.process_id()]
 
@@ -171,7 +165,7 @@ def test_an_idle_worker_that_is_killed_is_replaced(one: Bench, *, with_a_job: bo
 def test_the_job_of_a_worker_that_is_killed_is_done_by_another(two: Bench, tmp_path: Path) -> None:
     file = tmp_path / "begun"
     job = two.order(partial(jobs.hang_at_first, file))
-    wait_until(lambda: len(jobs.noted(file)) == 1)
+    wait_until(lambda: len(jobs.noted(file)) == 1, WAIT_S)
     (killed,) = jobs.noted(file)
     # The other worker is not disturbed.
     assert two.do(jobs.process_id).result != killed
@@ -197,7 +191,7 @@ def test_a_worker_that_goes_on_too_long_is_killed(
     one.order(partial(jobs.sleep, 1000.0), within_s=0.1)
     os.kill(before, number)
     assert one.done.get(timeout=WAIT_S).error == "the worker was killed: it exceeded its deadline"
-    wait_until(lambda: is_gone(before))
+    wait_until(lambda: is_gone(before), WAIT_S)
     monkeypatch.undo()
     assert one.process_id() != before
 
@@ -229,7 +223,7 @@ def test_closing_waits_for_no_job(tmp_path: Path) -> None:
     bench = Bench(2)
     for _ in range(5):
         bench.order(partial(jobs.hang_at_first, tmp_path / "begun"))
-    wait_until(lambda: len(jobs.noted(tmp_path / "begun")) >= 1)
+    wait_until(lambda: len(jobs.noted(tmp_path / "begun")) >= 1, WAIT_S)
     processes = bench.pool.process_ids
 
     begun_s = time.monotonic()
@@ -281,4 +275,4 @@ def test_workers_die_with_the_process_that_has_the_pool(tmp_path: Path) -> None:
         finally:
             owner.kill()
     assert len(workers) == 2
-    wait_until(lambda: all(is_gone(worker) for worker in workers))
+    wait_until(lambda: all(is_gone(worker) for worker in workers), WAIT_S)
