@@ -32,6 +32,8 @@ from oracles.proven import Oracle, by_oracle
 from support.planning_oracles import assert_agreement
 
 INSTANCES = 200
+QUICK_INSTANCES = 120
+"""The first so many are for `make test`, the others for the long programme."""
 LONG_INSTANCES = (27,)
 """Those of the first instances on which `tappa` takes about 8 s; the others take 0.1 s."""
 MORE_INSTANCES = 1_600
@@ -45,7 +47,10 @@ CHUNK = 10
 def chunks(instances: int, first: int = 0) -> pytest.MarkDecorator:
     """Run a test with `CHUNK` seeds at a time."""
     every = range(first, first + instances, CHUNK)
-    return pytest.mark.parametrize("seeds", [range(k, k + CHUNK) for k in every], ids=str)
+    marks = {k: () if k < QUICK_INSTANCES else pytest.mark.full for k in every}
+    return pytest.mark.parametrize(
+        "seeds", [pytest.param(range(k, k + CHUNK), marks=marks[k]) for k in every], ids=str
+    )
 
 
 @pytest.mark.slow

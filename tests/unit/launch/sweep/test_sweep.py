@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from laneweave.launch.run_methods import affects
+from support.commands import Here
 from support.sharing import made_once
 from support.sweeping import command, results, short_road, sweep
 
@@ -135,10 +136,8 @@ def test_a_run_that_breaks_a_promise_is_a_failed_row_with_its_numbers(tmp_path: 
     assert (tmp_path / "sweep" / "formation-1600-1" / "log.txt").is_file()
 
 
-def test_other_settings_are_refused(whole: Path, scenario: Path) -> None:
-    refused = sweep(scenario, whole, *LISTS, "--duration", 7)
-    assert refused.returncode == 2
-    (line,) = refused.stderr.splitlines()
+def test_other_settings_are_refused(laneweave: Here, whole: Path, scenario: Path) -> None:
+    line = laneweave.refused(*command(scenario, whole, *LISTS, "--duration", 7)[1:])
     assert line.startswith("demand.duration_s: got 7.0; allowed: 8.0, as recorded in ")
 
 
@@ -170,9 +169,8 @@ def test_which_settings_affect_a_method(field: str, method: str, matters: bool) 
     assert affects(field, method) is matters
 
 
-def test_other_folders_are_refused(scenario: Path, tmp_path: Path) -> None:
+def test_other_folders_are_refused(laneweave: Here, scenario: Path, tmp_path: Path) -> None:
     (tmp_path / "letter.txt").touch()
-    refused = sweep(scenario, tmp_path)
-    assert refused.returncode == 2
-    assert "allowed: a new or empty folder, or that of a sweep" in refused.stderr
+    line = laneweave.refused(*command(scenario, tmp_path)[1:])
+    assert "allowed: a new or empty folder, or that of a sweep" in line
     assert {path.name for path in tmp_path.iterdir()} == {"letter.txt"}
