@@ -33,7 +33,7 @@ def run_coordinator(
     wrap: CoreWrapper = unwrapped,
     observe: Observe = unobserved,
     *,
-    workers_at_once: bool = False,
+    fork_workers: bool = False,
 ) -> None:
     """Run a coordinator candidate until SIGINT or SIGTERM.
 
@@ -44,8 +44,8 @@ def run_coordinator(
         name: name of the candidate; candidates are ranked by name.
         wrap: wraps the core, to inject faults.
         observe: registers the metrics source.
-        workers_at_once: whether the planning service starts its worker processes now rather than at
-            its first request.
+        fork_workers: whether the planning service forks its worker processes now, which spares them
+            the loading, rather than starting them at its first request.
 
     Raises:
         BadInputError: no router answers at the scenario's endpoint.
@@ -55,8 +55,8 @@ def run_coordinator(
     workers = scenario.service.workers or max(1, len(os.sched_getaffinity(0)) - 1)
     core = CoordinatorCore(Name(name), Incarnations()(), scenario, workers=workers)
     with contextlib.closing(WorkerPool(workers, warm_up)) as pool:
-        if workers_at_once:
-            pool.start()
+        if fork_workers:
+            pool.fork()
         run_core(wrap(core), access_of(scenario, f"coordinator.{name}"), pool, observe)
 
 

@@ -90,7 +90,7 @@ def coordinator(
         config, endpoint, observation__metrics=metrics, formation__solver=solver
     )
     with _as_role("coordinator", name, settings, log_format, log_level) as observe:
-        run_coordinator(settings, name, observe=observe, workers_at_once=True)
+        run_coordinator(settings, name, observe=observe, fork_workers=True)
 
 
 def agent(

@@ -17,7 +17,8 @@ import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
+from multiprocessing.context import ForkContext, SpawnContext
+from multiprocessing.process import BaseProcess
 
 import structlog
 
@@ -36,8 +37,8 @@ PAUSE_S = 0.5
 """Delay before replacing a process that died within this time of its start, so that repeated
 failures do not load the machine."""
 
-# A fork would inherit the sockets and locked state of Zenoh.
-_CONTEXT = multiprocessing.get_context("spawn")
+_SPAWN = multiprocessing.get_context("spawn")
+_FORK = multiprocessing.get_context("fork")
 _Job = tuple[Delegate, Callable[[Computed], None]]
 
 
@@ -45,11 +46,11 @@ class WorkerPool:
     """Pool of worker processes, which die with their parent."""
 
     def __init__(self, workers: int, warm_up: Callable[[], None] | None = None) -> None:
-        """Create the pool; processes start at the first call of `submit` or `start`.
+        """Create the pool; processes start at the first call of `submit` or `fork`.
 
         Args:
             workers: maximum number of concurrent jobs.
-            warm_up: picklable function that each worker calls when it starts.
+            warm_up: picklable function that each worker calls when it starts, unless it is a fork.
         """
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._workers = [_Worker(self._jobs, warm_up) for _ in range(workers)]
@@ -60,8 +61,17 @@ class WorkerPool:
         """Process ids of the running workers."""
         return [worker.process_id for worker in self._workers if worker.process_id]
 
-    def start(self) -> None:
-        """Start the workers without waiting for them."""
+    def fork(self) -> None:
+        """Start the workers as forks of this process, which has called `warm_up` itself.
+
+        Must be called before this process opens Zenoh, and before `submit`: a fork would inherit
+        the sockets and locked state of Zenoh. Workers that replace others are not forks.
+        """
+        for worker in self._workers:
+            worker.start_process(_FORK)
+        self._start()
+
+    def _start(self) -> None:
         if not self._started:
             self._started = True
             for worker in self._workers:
@@ -69,7 +79,7 @@ class WorkerPool:
 
     def submit(self, job: Delegate, done: Callable[[Computed], None]) -> None:
         """Queue a job; `done` is called from a worker's thread."""
-        self.start()
+        self._start()
         self._jobs.put((job, done))
 
     def close(self) -> None:
@@ -93,7 +103,7 @@ class _Worker:
         self._warm_up = warm_up
         self._lock = threading.Lock()
         self._ending = threading.Event()
-        self._process: SpawnProcess | None = None
+        self._process: BaseProcess | None = None
         self._connection: Connection | None = None
         self._started_s = -math.inf
         self.thread = threading.Thread(target=self._run_jobs, name="worker", daemon=True)
@@ -113,13 +123,14 @@ class _Worker:
                 process.kill()
 
     def _run_jobs(self) -> None:
-        self._start_process()
+        if self._process is None:
+            self.start_process()
         while not self._ending.is_set():
             try:
                 order = self._jobs.get(timeout=CHECK_S)
             except queue.Empty:
                 if self._process is None or not self._process.is_alive():
-                    self._start_process()
+                    self.start_process()
                 continue
             if order is None:
                 break
@@ -134,10 +145,10 @@ class _Worker:
             if not self._ending.is_set():
                 done(result)
                 if self._connection is None:
-                    self._start_process()
+                    self.start_process()
         self._discard_process()
 
-    def _start_process(self) -> Connection | None:
+    def start_process(self, context: SpawnContext | ForkContext = _SPAWN) -> Connection | None:
         """Start a process, replacing the previous one.
 
         Returns:
@@ -151,7 +162,8 @@ class _Worker:
                 return None
             self._started_s = time.monotonic()
             try:
-                self._process, self._connection = _start(self._warm_up)
+                warm_up = self._warm_up if context is _SPAWN else None
+                self._process, self._connection = _start(context, warm_up)
             except OSError as error:
                 log.warning("a worker cannot be started", reason=str(error))
             return self._connection
@@ -169,7 +181,7 @@ class _Worker:
     def _run(self, job: Delegate) -> Computed:
         """Run a job; retry once in a new process if the worker dies."""
         for _ in range(2):
-            connection = self._connection or self._start_process()
+            connection = self._connection or self.start_process()
             done = None if connection is None else self._try_once(connection, job)
             if done is not None:
                 return done
@@ -198,10 +210,12 @@ class _Worker:
         return Computed(job.job, None, "the worker was killed: it exceeded its deadline")
 
 
-def _start(warm_up: Callable[[], None] | None) -> tuple[SpawnProcess, Connection]:
-    ours, theirs = _CONTEXT.Pipe()
+def _start(
+    context: SpawnContext | ForkContext, warm_up: Callable[[], None] | None
+) -> tuple[BaseProcess, Connection]:
+    ours, theirs = context.Pipe()
     with theirs:
-        process = _CONTEXT.Process(target=_work, args=(theirs, warm_up), name="worker", daemon=True)
+        process = context.Process(target=_work, args=(theirs, warm_up), name="worker", daemon=True)
         try:
             process.start()
         except OSError:
@@ -212,11 +226,11 @@ def _start(warm_up: Callable[[], None] | None) -> tuple[SpawnProcess, Connection
 
 def _work(connection: Connection, warm_up: Callable[[], None] | None) -> None:
     """Run jobs until the parent closes its connection; main function of a worker process."""
-    parent = multiprocessing.parent_process()
-    die_with_parent(None if parent is None else parent.pid)
     # Ctrl-C reaches the whole process group, but the parent stops its workers itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    parent = multiprocessing.parent_process()
+    die_with_parent(None if parent is None else parent.pid)
     if warm_up is not None:
         warm_up()
     with contextlib.suppress(EOFError, OSError):

@@ -211,7 +211,7 @@ def test_a_machine_that_gives_no_process_is_an_error_of_the_job(
     bench = Bench(1)
     with contextlib.closing(bench.pool):
         with monkeypatch.context() as patch:
-            patch.setattr(worker_pool._CONTEXT.Process, "start", refuse)
+            patch.setattr(worker_pool._SPAWN.Process, "start", refuse)
             assert bench.do(jobs.process_id).error == "the worker died"
         assert bench.process_id() in bench.pool.process_ids
 
@@ -246,9 +246,12 @@ from laneweave.protocol.runtime.worker_pool import WorkerPool
 from support import worker_jobs as jobs
 
 if __name__ == "__main__":
-    pool = WorkerPool(2)
+    folder, fork = Path(sys.argv[1]), sys.argv[2] == "True"
+    pool = WorkerPool(2, partial(jobs.note, folder / "warm", 0.0))
+    if fork:
+        pool.fork()
     met = []
-    meet = partial(jobs.meet, Path(sys.argv[1]))
+    meet = partial(jobs.meet, folder / "met")
     for number in range(2):
         pool.submit(Delegate(number, meet, time.monotonic() + 60), met.append)
     while len(met) < 2:
@@ -259,12 +262,13 @@ if __name__ == "__main__":
 """
 
 
-def test_workers_die_with_the_process_that_has_the_pool(tmp_path: Path) -> None:
+@pytest.mark.parametrize("fork", [False, True])
+def test_workers_die_with_the_process_that_has_the_pool(tmp_path: Path, *, fork: bool) -> None:
     script = tmp_path / "owner.py"
     script.write_text(OWNER, encoding="utf-8")
     environment = dict(os.environ) | {"PYTHONPATH": os.pathsep.join(sys.path)}
     with subprocess.Popen(
-        [sys.executable, str(script), str(tmp_path / "met")],
+        [sys.executable, str(script), str(tmp_path), str(fork)],
         stdout=subprocess.PIPE,
         text=True,
         env=environment,
@@ -272,7 +276,14 @@ def test_workers_die_with_the_process_that_has_the_pool(tmp_path: Path) -> None:
         try:
             assert owner.stdout is not None
             workers = [int(word) for word in owner.stdout.readline().split()]
+            # Forks are warm already; a worker that replaces one is not.
+            assert len(set(workers)) == 2
+            assert sorted(jobs.noted(tmp_path / "warm")) == ([] if fork else sorted(workers))
+            if fork:
+                os.kill(workers[0], signal.SIGKILL)
+                wait_until(lambda: len(jobs.noted(tmp_path / "warm")) == 1, WAIT_S)
+                workers += jobs.noted(tmp_path / "warm")
         finally:
             owner.kill()
-    assert len(workers) == 2
+    assert len(set(workers)) == (3 if fork else 2)
     wait_until(lambda: all(is_gone(worker) for worker in workers), WAIT_S)
