@@ -176,7 +176,11 @@ workers = 1
     def workers(self, name: str) -> list[int]:
         """Return the ids of a coordinator's workers."""
         children = psutil.Process(self.coordinators[name].pid).children()
-        return [child.pid for child in children if any("spawn_main" in w for w in child.cmdline())]
+        return [
+            child.pid
+            for child in children
+            if all("resource_tracker" not in w for w in child.cmdline())
+        ]
 
     def rss_mb(self, name: str) -> float:
         """Return the memory of a coordinator's own process."""
