@@ -164,7 +164,7 @@ class PendingRequest:
 
 
 def _parse(answer: Answer) -> dict[str, object]:
-    return format_of(answer.payload, answer.encoding).read(answer.payload)
+    return format_of(answer.payload, answer.encoding).read(answer.payload, "response")
 
 
 def client_access(config: Path, name: str = "plan", endpoint: str | None = None) -> Access:

@@ -57,8 +57,12 @@ class Format:
     write: Callable[[dict[str, Any]], bytes]
     parse: Callable[[bytes], object]
 
-    def read(self, payload: bytes) -> dict[str, Any]:
+    def read(self, payload: bytes, name: str = "request") -> dict[str, Any]:
         """Return the map in a payload.
+
+        Args:
+            payload: bytes of a message.
+            name: what the payload is, for errors.
 
         Raises:
             BadInputError: the payload is not a map in this encoding.
@@ -67,9 +71,9 @@ class Format:
             data = self.parse(payload)
         except Exception as error:
             # Parsers raise many kinds of errors: not text, too deep, too many digits, truncated.
-            raise BadInputError("request", payload[:16], f"a map in {self.encoding}") from error
+            raise BadInputError(name, payload[:16], f"a map in {self.encoding}") from error
         if not isinstance(data, dict):
-            raise BadInputError("request", type(data).__name__, f"a map in {self.encoding}")
+            raise BadInputError(name, type(data).__name__, f"a map in {self.encoding}")
         return data
 
     def reply(self, token: int, answer: PlanResponse | Refusal) -> Reply:
