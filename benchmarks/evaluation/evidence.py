@@ -14,7 +14,7 @@ from evaluation.programme import FORMATIONS
 from evaluation.trials import AgreementRow, CostRow, FactorRow
 from laneweave.launch.recordings.runs import Run
 from laneweave.protocol.files import write_atomically
-from laneweave.protocol.parsing import structure
+from laneweave.protocol.structuring import structure
 
 SCHEMA: Final = "laneweave.evaluation/1"
 

@@ -25,8 +25,8 @@ from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.protocol.errors import BadInputError, one_line
 from laneweave.protocol.lattice import Cell, Mode
-from laneweave.protocol.parsing import as_lists, structure
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS, DEFAULT_CONFLICTS, SOLVERS
+from laneweave.protocol.structuring import as_lists, structure
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
 DEFAULT_DEADLINE_S: Final = 4.0

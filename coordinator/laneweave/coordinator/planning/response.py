@@ -12,7 +12,7 @@ from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import within
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.parsing import as_lists, structure
+from laneweave.protocol.structuring import as_lists, structure
 
 RESPONSE_SCHEMA: Final = "laneweave.plan.response/1"
 

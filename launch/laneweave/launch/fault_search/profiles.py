@@ -13,7 +13,7 @@ from importlib.resources import files
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.parsing import structure
+from laneweave.protocol.structuring import structure
 
 Span = tuple[int, int]
 """Minimum and maximum, both included."""

@@ -21,8 +21,8 @@ from attrs.validators import optional
 from laneweave.protocol.config.loading import read_toml
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import one_of, within
-from laneweave.protocol.parsing import NumberOrRange, structure
 from laneweave.protocol.runtime.message_faults import SENDERS, MessageRule
+from laneweave.protocol.structuring import NumberOrRange, structure
 
 LEADER, COORDINATOR, ROUTER, AGENT = "leader", "coordinator", "router", "agent"
 SENDER_OF_GROUP = dict(zip(("vehicles", "coordinators", "bridge"), SENDERS, strict=True))

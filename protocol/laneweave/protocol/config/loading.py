@@ -11,9 +11,9 @@ import attrs
 
 from laneweave.protocol.config.cross_checks import check_effects, check_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.parsing import structure
 from laneweave.protocol.scenario.deployment_fields import Security
 from laneweave.protocol.scenario.fields import PAPERS_FORMATIONS, Scenario
+from laneweave.protocol.structuring import structure
 
 
 def load_scenario(path: Path | None, **overrides: object) -> Scenario:

@@ -13,7 +13,7 @@ import msgpack
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
-from laneweave.protocol.parsing import first_problem, strict_converter
+from laneweave.protocol.structuring import first_problem, strict_converter
 from laneweave.protocol.wire.messages import Ballot, Name
 from laneweave.protocol.wire.topics import TOPICS
 

@@ -10,9 +10,9 @@ import pytest
 from attrs import define, field
 
 from laneweave.protocol.config.loading import load_scenario, parse_scenario
-from laneweave.protocol.parsing import structure
 from laneweave.protocol.runtime.node import Send
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.structuring import structure
 from laneweave.protocol.wire.messages import Census, ClosedFormation, Name, RoadClock
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.roadside import Roadside

@@ -10,7 +10,7 @@ from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import within
-from laneweave.protocol.parsing import NumberOrRange, structure
+from laneweave.protocol.structuring import NumberOrRange, structure
 from support.refusals import refusal
 
 
