@@ -145,6 +145,22 @@ def test_a_move_ends_in_its_cell_on_time(target: Cell) -> None:
     assert rig.off(target) < 0.02
 
 
+def test_a_move_whose_first_commands_are_lost_begins_when_one_arrives() -> None:
+    """Else its trajectory would be ahead of the body by the time that was lost."""
+    rig = up_and_running()
+    target = (0, 1)
+    rig.accept((0, HOME, target))
+    lost = 8
+    for _ in range(lost):
+        (command,) = sent(rig.hand(topics.SENSE, rig.sense()), Command)
+        assert (command.hold_cell, command.motion_end_tick) == (target, rig.tick + MOVE_TICKS)
+        rig.coast(1)
+    rig.run()
+    assert rig.controller.motion_end_tick == rig.tick - 1 + MOVE_TICKS
+    assert rig.run(MOVE_TICKS).done
+    assert rig.off(target) < 0.12
+
+
 def test_v7_only_when_the_body_is_there() -> None:
     """A vehicle ahead keeps it back: time is over, but the move is not."""
     rig = kept_back()

@@ -346,7 +346,7 @@ def test_a_result_that_no_leader_waits_for_is_dropped(news: object) -> None:
     assert messages(effects, Plan) == messages(effects, LogEvent) == []
 
 
-@pytest.mark.parametrize("spoil", ["error", "nothing found", "unsafe paths"])
+@pytest.mark.parametrize("spoil", ["error", "nothing found", "unsafe paths", "one unsafe path"])
 def test_failed_planning_is_logged_and_tried_again_under_the_same_ballot(spoil: str) -> None:
     desk = Desk()
     cells: Cells = {A: (0, 0), B: (-1, 1)}
@@ -363,13 +363,15 @@ def test_failed_planning_is_logged_and_tried_again_under_the_same_ballot(spoil: 
             nothing = evolve(sorting.response, status="timeout", paths=())
             result = evolve(result, result=evolve(sorting, response=nothing))
         case _:
-            swapped: dict[Name, tuple[PlannedMove, ...]] = {
-                A: ((0, (0, 0), (-1, 1)),),
-                B: ((0, (-1, 1), (0, 0)),),
-            }
-            result = evolve(result, result=evolve(sorting, moves=swapped))
+            moves: dict[Name, tuple[PlannedMove, ...]] = {A: ((0, (0, 0), (-1, 1)),), B: ()}
+            if spoil == "unsafe paths":
+                moves[B] = ((0, (-1, 1), (0, 0)),)
+            result = evolve(result, result=evolve(sorting, moves=moves))
     effects = desk.give(result)
     assert logged(effects) == ["planning-failed"]
+    if spoil == "one unsafe path":
+        (failure,) = messages(effects, LogEvent)
+        assert failure.message.data["error"].count(";") == 0  # one problem is enough
     assert messages(effects, Plan) == []
     assert jobs(desk.wait(0.9)) == []
     (job,) = jobs(desk.wait(0.1))

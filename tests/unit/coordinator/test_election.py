@@ -89,6 +89,13 @@ def test_the_next_process_of_that_name_counts() -> None:
     assert election.update(0.6 + ELECTION_S)
 
 
+def test_a_heartbeat_of_an_earlier_process_does_not_count() -> None:
+    election = candidate()
+    election.on_heartbeat(beat("a", incarnation=2), 0.1)
+    election.on_heartbeat(beat("a", incarnation=1), 0.1 + ELECTION_S / 2)  # delayed
+    assert election.update(0.1 + ELECTION_S)
+
+
 def test_a_stopped_process_that_resumes_counts_again() -> None:
     election = candidate()
     election.on_heartbeat(beat("a"), 0.1)

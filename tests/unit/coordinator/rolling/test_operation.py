@@ -87,6 +87,7 @@ class Bench:
     """A rolling operation with a planner that returns the paths of the test."""
 
     ways: dict[str, tuple[Cell, ...]] = field(factory=dict)
+    missed: tuple[str, ...] = ()
     calls: list[Call] = field(factory=list)
     seq: Iterable[int] = field(factory=lambda: count(1))
     jobs: Iterable[int] = field(factory=lambda: count(100))
@@ -110,7 +111,7 @@ class Bench:
     ) -> StreamPlan:
         asked = {vehicle.vehicle: vehicle for vehicle in vehicles}
         self.calls.append(Call(slot, asked, before, frozenset(blocked)))
-        return StreamPlan(slot, self.ways, ())
+        return StreamPlan(slot, self.ways, self.missed)
 
     def new_job(self) -> int:
         return next(iter(self.jobs))
@@ -595,7 +596,7 @@ def test_the_real_planner_accepts_its_input() -> None:
 
 def test_a_wrong_plan_is_not_issued() -> None:
     """The planner is not trusted: a path that ends on the road is not issued."""
-    bench = Bench(ways={A: (HOMES[A], HOMES[A])})
+    bench = Bench(ways={A: (HOMES[A], HOMES[A])}, missed=(A,))
     planner = checked(stream_road(ROLLING), bench.plan)
     bench.control = RollingOperation(ROLLING, bench.new_ballot, bench.new_job, planner)
     bench.control.on_census(census(A))
@@ -603,7 +604,8 @@ def test_a_wrong_plan_is_not_issued() -> None:
     assert bench.order(BEGUN_S - 2.0) is None
     compute = bench.order()
     assert compute is not None
-    with pytest.raises(ValueError, match=f"the plan of slot {SLOT + 1} is invalid: .* on the road"):
+    one = rf"the plan of slot {SLOT + 1} is invalid: [^;]* on the road$"
+    with pytest.raises(ValueError, match=one):
         compute.work()
     (note,) = bench.control.finish(Computed(compute.job, None, "wrong"), LOOK_S, 0.0)
     assert note == LogEntry("planning-failed", {"slot": SLOT + 1, "error": "wrong"})

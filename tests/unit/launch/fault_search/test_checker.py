@@ -38,9 +38,9 @@ def sense(attendant: int, joined: tuple[int, ...] = (0,)) -> Sense:
 class Scene:
     """A road with vehicles whose agents execute plans."""
 
-    def __init__(self, *plans: Paths) -> None:
+    def __init__(self, *plans: Paths, rolling: bool = False) -> None:
         """Put vehicles in the first cells of their paths, and send the plans."""
-        self.checker = Checker(GEOMETRY)
+        self.checker = Checker(GEOMETRY, rolling=rolling)
         self.cells: dict[Name, Cell] = {}
         for paths in plans:
             self.cells = {name: path[0] for name, path in paths.items()} | self.cells
@@ -127,6 +127,29 @@ def test_an_overlap_is_reported_with_the_time_of_contact() -> None:
     overlap = scene.checker.violations[-1]
     assert overlap.kind == "overlap"
     assert overlap.t_s == pytest.approx(2.0)  # 10 m of net gap at 10 m/s
+
+
+def test_an_overlap_of_two_that_both_move_is_reported_once() -> None:
+    scene = Scene({A: ((0, 0), (1, 0)), B: ((1, 0), (0, 0))})
+    scene.move(1.0, A, 1, (1, 0), lasts_s=1.5)
+    scene.move(1.0, B, 1, (0, 0), lasts_s=1.5)
+    scene.checker.advance(4.0)
+    (overlap,) = (each for each in scene.checker.violations if each.kind == "overlap")
+    assert set(overlap.vehicles) == {A, B}
+    assert overlap.t_s == pytest.approx(1.5)  # 10 m of net gap at twice 10 m/s
+
+
+@pytest.mark.parametrize(("first", "second"), [(1, 2), (2, 1)])
+def test_a_motion_during_one_of_an_earlier_plan_of_a_member_is_reported(
+    first: int, second: int
+) -> None:
+    """In the rolling operation, only the earlier plan of a member must have ended."""
+    both: Paths = {A: ((0, 0), (0, 1)), B: ((4, 0), (4, 1))}
+    scene = Scene(both, both, rolling=True)
+    scene.move(1.0, B, first, (4, 1))
+    scene.move(1.2, A, second, (0, 1))
+    found = [each.vehicles for each in scene.checker.violations if each.kind == "interleaved"]
+    assert found == ([(A, B)] if first < second else [])
 
 
 def test_a_vehicle_that_has_left_frees_its_cell() -> None:

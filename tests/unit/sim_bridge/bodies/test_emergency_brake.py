@@ -117,6 +117,36 @@ def test_no_vehicle_hits_one_that_brakes_as_hard_as_it_can(
     assert other.state[1] == pytest.approx(0.0, abs=0.05)
 
 
+@pytest.mark.parametrize("lead_lag_s", [0.0, 0.2, 0.6])
+@pytest.mark.parametrize("lead_brake_mps2", [3.0, 5.0, 8.0, 12.0])
+@pytest.mark.parametrize(("v_mps", "other_mps"), [(15.0, 15.0), (25.0, 15.0), (8.0, 20.0)])
+def test_no_vehicle_hits_one_with_other_brakes_than_its_own(
+    v_mps: float, other_mps: float, lead_brake_mps2: float, lead_lag_s: float
+) -> None:
+    """The gap may be least before both stand: where one's own brakes are better than assumed."""
+    braking = attrs.evolve(SCENARIO.braking, lead_brake_mps2=lead_brake_mps2, lead_lag_s=lead_lag_s)
+    brake = EmergencyBrake(attrs.evolve(SCENARIO, braking=braking))
+    limits = attrs.evolve(LIMITS, min_accel_mps2=-lead_brake_mps2, actuator_lag_s=lead_lag_s)
+
+    def other_at(gap_m: float) -> Plant:
+        front_m = LIMITS.length_m + gap_m
+        return Plant((front_m, other_mps, 0.0, 1.75, 0.0, 0.0), limits, TICK_S)
+
+    def to_spare_m(other: Plant) -> float:
+        return brake.spare_m(own.state, own.setpoint[0], (0.0, 0.0), [seen(own, other)])
+
+    own = plant_at(0.0, v_mps)
+    other = other_at(max(-to_spare_m(other_at(0.0)), MARGIN_M))
+    assert to_spare_m(other) >= -1e-9
+    while own.state[1] > 1e-6:
+        if to_spare_m(other) < -1e-9:
+            own.brake(0.0)
+        else:
+            own.step(0.0, 0.0)
+        other.brake(0.0)
+        assert seen(own, other).gap_m >= 0.3 * MARGIN_M
+
+
 def drive_behind(
     scenario: Scenario, number: int, gap_m: float, *, braking_tick: int
 ) -> tuple[float, MotionController]:
