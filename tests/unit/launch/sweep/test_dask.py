@@ -18,7 +18,7 @@ def test_a_cluster_has_the_same_results(tmp_path: Path) -> None:
     scenario = short_road(tmp_path)
     lists = ("--volumes", "1600", "--seeds", "3:5")
     with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, host="127.0.0.1", dashboard_address=None
+        n_workers=1, threads_per_worker=2, host="127.0.0.1", dashboard_address="127.0.0.1:0"
     ) as cluster:
         done = sweep(scenario, tmp_path / "cluster", *lists, "--dask", cluster.scheduler_address)
     assert done.returncode == 0, done.stderr
