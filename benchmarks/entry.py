@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import ClosedFormation
 from laneweave.sim_bridge.road.demand import arrivals

@@ -24,7 +24,7 @@ from pathlib import Path
 import attrs
 
 from laneweave.launch.deploy.certificate_authority import issue, make_authority
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.runtime.transport import Delivery, Received
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of, guard_of

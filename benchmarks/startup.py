@@ -30,7 +30,7 @@ import psutil
 from attrs import define, evolve, field
 
 from laneweave.launch.run.roles import fork_server, start_role
-from laneweave.protocol.config.loading import to_tables
+from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.transport import Delivery, Received, TokenUp
 from laneweave.protocol.scenario.fields import Scenario

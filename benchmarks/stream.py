@@ -32,7 +32,7 @@ from laneweave.coordinator.planning.rolling.problem import (
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
 from laneweave.coordinator.planning.solve import warm_up
 from laneweave.coordinator.rolling.checked_planner import REWARD, stream_road
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.road.demand import arrivals
 

@@ -35,7 +35,7 @@ from laneweave.agents.driving.tracker import Tracker
 from laneweave.agents.driving.tracking_problem import SETTINGS, Gaps, program_scale
 from laneweave.launch.bench.runtime import machine
 from laneweave.launch.bench.tracker import SITUATIONS, drive
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.sim_bridge.recording.trips import percentiles_of

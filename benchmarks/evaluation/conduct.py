@@ -29,7 +29,7 @@ from laneweave.launch.recordings.runs import is_sweep, runs_of
 from laneweave.launch.sweep.execution import StoppedError, run_locally
 from laneweave.launch.sweep.folder import SweepFolder
 from laneweave.launch.sweep.sweep import run_sweep
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 
 SWEEP_FOLDER = "sweep"

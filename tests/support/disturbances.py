@@ -23,7 +23,7 @@ from attrs import define, field, frozen
 from numpy.typing import NDArray
 
 from laneweave.agents.driving.reference import Reference
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario, Vehicle
 from laneweave.protocol.transports.simulated.virtual_time import Conditions

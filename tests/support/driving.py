@@ -16,7 +16,7 @@ from attrs import define, field, frozen
 from numpy.typing import NDArray
 
 from laneweave.agents.driving.driver import TrackingDriver
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.lattice import Cell, PlannedMove, stretch_of
 from laneweave.protocol.scenario.fields import Scenario, Vehicle
 from laneweave.protocol.vehicle.motion import State, cell_state

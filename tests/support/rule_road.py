@@ -8,7 +8,7 @@ from typing import Any
 
 from attrs import define, field
 
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
 from laneweave.sim_bridge.baselines.rule_based import RuleTraffic

@@ -13,7 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from laneweave.launch.cli.status_command import listen
 from laneweave.launch.observe.status import BRIDGE, COORDINATOR, RoleHealth, Status
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from support.deployments import deployment, free_tcp, ping, start_router, stop
 from support.harness import END_S, Ended, Lab
 

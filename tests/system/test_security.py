@@ -17,7 +17,7 @@ import pytest
 import zenoh
 
 from laneweave.launch.deploy.certificate_authority import issue, load_authority, make_authority
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import REQUEST_MARGIN

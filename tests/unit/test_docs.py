@@ -34,7 +34,7 @@ from laneweave.launch.faults.specification import (
     preset_names,
 )
 from laneweave.launch.observe.status import SCHEMA, Status
-from laneweave.protocol.config.loading import load_scenario, parse_scenario
+from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
 from laneweave.protocol.field_validators import HOST_PORT_RULE, NAME_RULE
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.runtime.message_faults import MessageRule

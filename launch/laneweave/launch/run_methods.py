@@ -8,7 +8,7 @@ from typing import Final
 
 from attrs import field, frozen
 
-from laneweave.protocol.config.loading import parse_scenario, to_tables
+from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import PAPERS_FORMATIONS, FormationSettings, Scenario
 

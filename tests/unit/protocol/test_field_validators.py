@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import check_endpoint, host_and_port, host_of, is_tls
 from support.refusals import refusal

@@ -37,7 +37,7 @@ from laneweave.coordinator.service.format import (
     Refusal,
     format_of,
 )
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.transport import Answer
 from laneweave.protocol.security.access_control import access_of

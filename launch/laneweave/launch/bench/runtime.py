@@ -22,7 +22,7 @@ from rich.table import Table
 
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.local_run import LocalRun
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.recording.trips import percentiles_of
 

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 from laneweave.launch.cli.options import SOLVER_NAMES
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 
 

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.config.participants import coordinator_names
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import host_of
 from laneweave.protocol.scenario.fields import Scenario

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from laneweave.launch.deploy.config_check import check_deployment
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.wire.identities import Identity, parse_identity
 from laneweave.protocol.wire.topics import Party

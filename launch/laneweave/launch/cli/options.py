@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from laneweave.launch.run.logs import LogFormat, LogLevel
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import SOLVERS, Scenario
 

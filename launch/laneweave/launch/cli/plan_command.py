@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from laneweave.launch.cli.options import SOLVER_NAMES
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 
 

@@ -136,7 +136,7 @@ def bridge(
     log_level: Level = None,
 ) -> None:
     """Run the simulated world of a deployment."""
-    from laneweave.launch.report.build import draw_report
+    from laneweave.launch.report.report import draw_report
     from laneweave.launch.run.outcome import complete_summary, print_outcome
     from laneweave.sim_bridge.process import run_bridge
 

@@ -21,7 +21,7 @@ from laneweave.launch.cli.options import (
 )
 from laneweave.launch.run.run_folder import new_folder
 from laneweave.launch.run_methods import FORMATION, LC2013, RULE
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def run(
 
     print_outcome(outcome, Console())
     if outcome.summary is not None:
-        from laneweave.launch.report.build import draw_report
+        from laneweave.launch.report.report import draw_report
 
         draw_report(outcome.folder)
     raise typer.Exit(outcome.exit_status)

@@ -20,7 +20,7 @@ from laneweave.launch.cli.options import (
 )
 from laneweave.launch.run.run_folder import timestamped_folder
 from laneweave.launch.run_methods import METHODS, KeepTrajectories
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 
 VOLUMES = "1000,1150,1300,1450,1600"
@@ -112,7 +112,7 @@ def report(
 ) -> None:
     """Write figures and a page for each finished run, and for a sweep or several runs together."""
     from laneweave.launch.recordings.runs import Comparison, is_sweep, runs_of, single_run
-    from laneweave.launch.report.build import REPORT_DPI, report_comparison, report_run
+    from laneweave.launch.report.report import REPORT_DPI, report_comparison, report_run
 
     if out is not None and len(folders) == 1:
         raise BadInputError("--out", str(out), "only with several folders")

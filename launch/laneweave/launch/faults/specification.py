@@ -18,7 +18,7 @@ import attrs
 from attrs import field, frozen
 from attrs.validators import optional
 
-from laneweave.protocol.config.loading import read_toml
+from laneweave.protocol.config.scenario_files import read_toml
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import one_of, within
 from laneweave.protocol.runtime.message_faults import SENDERS, MessageRule

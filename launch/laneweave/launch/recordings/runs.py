@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 from attrs import evolve, frozen
 
 from laneweave.launch.run_methods import rank
-from laneweave.protocol.config.loading import parse_scenario, to_tables
+from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import RunSummary, read_summary

@@ -29,8 +29,8 @@ from laneweave.launch.run.progress import RunProgress
 from laneweave.launch.run.role_processes import RoleExit, RoleProcesses, RoleStart
 from laneweave.launch.run.roles import fork_server
 from laneweave.launch.run.run_folder import LOG_FILE
-from laneweave.protocol.config.loading import to_tables
 from laneweave.protocol.config.participants import coordinator_names
+from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.runtime.message_faults import SENDER_OF_ROLE
 from laneweave.protocol.runtime.processes import stop_signals

@@ -15,7 +15,7 @@ import laneweave.coordinator.process  # noqa: F401
 from laneweave.agents import process as agents
 from laneweave.coordinator.planning import solve
 from laneweave.launch.run.roles import LAUNCHER, tune_garbage_collector
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.runtime.processes import die_with_parent, outlive_parent
 from laneweave.protocol.wire import codec
 

@@ -28,7 +28,7 @@ from laneweave.launch.faults.network_namespaces import join_namespace
 from laneweave.launch.run.logs import log_to_file
 from laneweave.launch.run.run_folder import LOG_FILE
 from laneweave.launch.run_methods import FORMATION
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.processes import die_with_parent

@@ -22,7 +22,7 @@ from attrs import frozen
 from laneweave.launch.recordings.runs import TRAJECTORIES
 from laneweave.launch.run.roles import THREAD_LIMITS
 from laneweave.launch.sweep.points import Point
-from laneweave.protocol.config.loading import to_tables
+from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.summary import SUMMARY_FILE
 
 JOB_FILE, RESULT_FILE, LOG_FILE = "job.json", "result.json", "log.txt"

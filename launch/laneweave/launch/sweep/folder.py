@@ -33,7 +33,7 @@ from laneweave.launch.recordings.runs import (
 from laneweave.launch.run_methods import METHODS, affects
 from laneweave.launch.sweep.execution import LOG_FILE, PointResult, kept_files
 from laneweave.launch.sweep.points import Point, with_volume
-from laneweave.protocol.config.loading import to_tables
+from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import read_summary

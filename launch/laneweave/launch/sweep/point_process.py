@@ -13,7 +13,7 @@ from laneweave.launch.run.roles import tune_garbage_collector
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.launch.run_methods import FORMATION
 from laneweave.launch.sweep.execution import JOB_FILE, RESULT_FILE
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.runtime.processes import die_with_parent
 

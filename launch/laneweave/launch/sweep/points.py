@@ -8,7 +8,7 @@ from attrs import evolve, frozen
 
 from laneweave.agents.driving.trajectory import check_moves
 from laneweave.launch.run_methods import METHODS, KeepTrajectories
-from laneweave.protocol.config.loading import parse_scenario, to_tables
+from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from attrs import define
 from numpy.typing import NDArray
 
-from laneweave.protocol.config.loading import to_tables
+from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import TravelTime
 from laneweave.sim_bridge.road.demand import Arrival

@@ -9,7 +9,7 @@ from laneweave.agents.driving.trajectory import (
     check_moves,
     move_profile,
 )
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario

@@ -16,7 +16,7 @@ from laneweave.agents.driving.trajectory import (
     move_profile,
     plan_trajectory,
 )
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state, integrate
 

@@ -11,7 +11,7 @@ from evaluation.evidence import Evidence, setting_of
 from evaluation.points import PointRow, Traced
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.run_methods import METHODS
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import RunSummary
 from support.summaries import make_summary

@@ -9,7 +9,7 @@ from attrs import evolve
 from evaluation.lattice_points import TOLERANCE_M, lattice_spacing
 from evaluation.points import slow_stretch, within_limits
 from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from support.tracks import make_tracks
 
 SCENARIO = load_scenario(None)

@@ -21,7 +21,7 @@ from evaluation.programme import (
 )
 from evaluation.trials import TRIALS, agreement, agreement_rows, is_finished
 from laneweave.launch.run_methods import METHODS
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from unit.benchmarks.evaluation.recorded import BASE, run, summary
 

@@ -24,7 +24,7 @@ from laneweave.coordinator.rolling.operation import (
     _clusters,
 )
 from laneweave.coordinator.rolling.transfer import CellTransfer
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.wire.messages import (

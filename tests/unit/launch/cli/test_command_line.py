@@ -11,8 +11,8 @@ from laneweave.launch.cli.options import check_pace
 from laneweave.launch.run import run_folder
 from laneweave.launch.run.local_run import MAX_TEMPORARY_BYTES, check_temporary_folder
 from laneweave.launch.run.logs import last_error
-from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.config.participants import coordinator_names
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 

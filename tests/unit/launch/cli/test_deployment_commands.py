@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from laneweave.launch.deploy.config_check import Report, check_deployment
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.wire.identities import parse_identity
 from support.commands import Here
 

@@ -12,7 +12,7 @@ import yaml
 from typer.main import get_command
 
 from laneweave.launch.cli.main import command_line
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
 
 ROOT = Path(__file__).resolve().parents[4]

@@ -27,7 +27,7 @@ from laneweave.launch.drawing.plan_on_road import (
     drive_plan,
     road_figure,
 )
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import cell_state

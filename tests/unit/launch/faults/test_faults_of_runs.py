@@ -18,7 +18,7 @@ from laneweave.launch.run.outcome import Outcome
 from laneweave.launch.run.role_processes import RoleProcesses, RoleStart
 from laneweave.launch.run.roles import fork_server
 from laneweave.launch.run.simulated_run import SimulatedRun
-from laneweave.protocol.config.loading import load_scenario, to_tables
+from laneweave.protocol.config.scenario_files import load_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.message_faults import MessageRule
 from laneweave.protocol.scenario.fields import Scenario

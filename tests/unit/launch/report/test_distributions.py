@@ -30,7 +30,7 @@ from laneweave.launch.report.distributions import (
 from laneweave.launch.report.figures import _break
 from laneweave.launch.report.path_maps import driven_map
 from laneweave.launch.report.style import label_colours, spread_evenly
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from support.older_recordings import older_recording
 from support.tracks import make_tracks

@@ -13,7 +13,7 @@ from laneweave.launch.drawing.colours import lane_colours
 from laneweave.launch.recordings.runs import Comparison, Run, scenario_of
 from laneweave.launch.report.figures import draw_speeds, draw_travel_times
 from laneweave.launch.report.snapshots import road_snapshots
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import Trip, metadata_of, trips_table

@@ -183,7 +183,7 @@ def test_an_error_of_the_report_is_not_reported_as_bad_input(
     def fail(*_: object, **__: object) -> None:
         raise KeyError("a bug")
 
-    monkeypatch.setattr("laneweave.launch.report.build.report_run", fail)
+    monkeypatch.setattr("laneweave.launch.report.report.report_run", fail)
     with pytest.raises(KeyError, match="a bug"):
         laneweave("report", swept / "formation-1000-1")
 

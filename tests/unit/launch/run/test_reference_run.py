@@ -11,7 +11,7 @@ import pytest
 from laneweave.launch.run.outcome import Outcome
 from laneweave.launch.run.reference_run import ReferenceRun, check_reference
 from laneweave.launch.run_methods import LC2013, RULE
-from laneweave.protocol.config.loading import parse_scenario, to_tables
+from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines import reference_road as road
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies

@@ -8,7 +8,7 @@ import pytest
 
 from laneweave.launch.run_methods import METHODS, KeepTrajectories, parse_methods, rank
 from laneweave.launch.sweep.points import parse_volumes, plan_points
-from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from support.commands import Here

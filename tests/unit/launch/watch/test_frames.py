@@ -13,7 +13,7 @@ from laneweave.launch.watch.frames import (
     opening,
     scene_of,
 )
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 
 
 def buffer(count: int, max_frames: int = 10, max_characters: int = 10**6) -> FrameBuffer:

@@ -10,7 +10,7 @@ from attrs import evolve
 
 from laneweave.launch.watch.frames import UNATTENDED, UNHEARD, compact
 from laneweave.launch.watch.live_road import STILL_S, LiveRoad
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.codec import decode, encode

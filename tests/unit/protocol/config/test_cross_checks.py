@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from laneweave.protocol.config.loading import load_scenario, parse_scenario, to_tables
+from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario, to_tables
 from support.refusals import refusal
 
 # --- fields that do not fit together ----------------------------------------------------------

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.config.participants import demanded_vehicles, identities_of, members_of
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.deployment_fields import Shard, parse_shard
 from laneweave.sim_bridge.road.demand import arrivals
 from support.refusals import refusal

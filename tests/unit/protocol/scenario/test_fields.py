@@ -10,7 +10,7 @@ from typing import Any
 import attrs
 import pytest
 
-from laneweave.protocol.config.loading import load_scenario, parse_scenario
+from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
 from laneweave.protocol.scenario.fields import FormationSettings, Scenario
 from support.refusals import refusal
 

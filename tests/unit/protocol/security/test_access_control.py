@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from laneweave.protocol.config.loading import load_scenario, parse_scenario, to_tables
 from laneweave.protocol.config.participants import identities_of
+from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario, to_tables
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import (
     Flow,

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from attrs import asdict
 
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.core import TickPhase

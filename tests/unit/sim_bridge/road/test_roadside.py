@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from attrs import define, field
 
-from laneweave.protocol.config.loading import load_scenario, parse_scenario
+from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
 from laneweave.protocol.runtime.node import Send
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.structuring import structure

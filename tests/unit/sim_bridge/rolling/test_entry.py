@@ -7,7 +7,7 @@ from attrs import define, field
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell, Lattice
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Name

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import pose_of

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.lc2013 import check_lc2013

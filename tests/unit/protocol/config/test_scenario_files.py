@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.protocol.config.loading import load_scenario, parse_scenario, to_tables
+from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario, to_tables
 from laneweave.protocol.scenario.fields import FormationSettings, Scenario
 from support.refusals import refusal
 
