@@ -192,7 +192,7 @@ class Lab:
         return found
 
     def wait_until(self, condition: Callable[[], bool], within_s: float = RUN_S) -> None:
-        """Wait for something to happen."""
+        """Wait for a condition."""
         wait_until(condition, within_s)
 
     def check_nothing_left(self) -> None:

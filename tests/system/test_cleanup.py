@@ -82,7 +82,7 @@ def test_ctrl_c_ends_a_run_whose_fork_server_is_not_ready(lab: Lab, road: Path) 
     assert ended.complaints == ["interrupted"]
     lab.check_nothing_left()
     assert not (lab.folder / "out").exists()
-    # The server died with its launcher; `solve.warm_up` compiles more than 40 functions.
+    # The fork server ended with its launcher; `solve.warm_up` compiles more than 40 functions.
     assert len(list(cache.rglob("*.nbi"))) < 20
 
 

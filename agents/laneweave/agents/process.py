@@ -25,7 +25,7 @@ def warm_up(scenario: Scenario) -> None:
     driver = TrackingDriver(scenario)
     column, lane = cell = (0, 1)
     moves = displacements(scenario.formation.mode)[1:]
-    for (dx, dy), ticks in product(moves, scenario.move_durations):
+    for ticks, (dx, dy) in product(scenario.move_durations, moves):
         driver.begin((0, cell, (column + dx, lane + dy)), 0, ticks)
     sense = Sense(
         vehicle=Name("warm-up"),

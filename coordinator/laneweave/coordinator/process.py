@@ -44,8 +44,8 @@ def run_coordinator(
         name: name of the candidate; candidates are ranked by name.
         wrap: wraps the core, to inject faults.
         observe: registers the metrics source.
-        fork_workers: whether the planning service forks its worker processes now, which spares them
-            the loading, rather than starting them at its first request.
+        fork_workers: whether the planning service forks its worker processes now, with the planner
+            loaded, instead of starting new ones at its first request.
 
     Raises:
         BadInputError: no router answers at the scenario's endpoint.

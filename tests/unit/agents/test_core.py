@@ -146,7 +146,7 @@ def test_a_move_ends_in_its_cell_on_time(target: Cell) -> None:
 
 
 def test_a_move_whose_first_commands_are_lost_begins_when_one_arrives() -> None:
-    """Else its trajectory would be ahead of the body by the time that was lost."""
+    """Otherwise the trajectory would be ahead of the body."""
     rig = up_and_running()
     target = (0, 1)
     rig.accept((0, HOME, target))

@@ -238,7 +238,7 @@ def _trajectory_program(
 
 @frozen(eq=False)
 class _Constraints:
-    """lower <= matrix x <= upper."""
+    """Linear constraints lower <= matrix x <= upper."""
 
     matrix: Any
     lower: Array
@@ -247,7 +247,7 @@ class _Constraints:
     """Rows of z_n, whose bounds are 0."""
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=2)  # with and without an envelope, for one duration after another
 def _constraints(
     limits: Vehicle,
     speed_mps: float,
@@ -256,7 +256,7 @@ def _constraints(
     n: int,
     envelope: Envelope | None,
 ) -> _Constraints:
-    """Return the constraints that all motions of the same duration share; cached."""
+    """Return the constraints that all trajectories of one duration share; cached."""
     transition, effect = axis_matrices(h)
     eye = sparse.eye(n)
     shift = sparse.diags([np.ones(n - 1)], [-1], shape=(n, n)) if n > 1 else sparse.eye(1) * 0.0

@@ -15,7 +15,7 @@ LOG_FILE = "log.jsonl"
 
 @contextmanager
 def new_folder(out: Path | None, settings: Scenario, method: str) -> Iterator[Path]:
-    """Yield a new or empty folder; remove a new one if the run ends before it begins.
+    """Yield a new or empty folder; remove a new one if the run is rejected or interrupted early.
 
     Raises:
         BadInputError: the folder is not empty, or cannot be created.

@@ -62,16 +62,16 @@ class WorkerPool:
         return [worker.process_id for worker in self._workers if worker.process_id]
 
     def fork(self) -> None:
-        """Start the workers as forks of this process, which has called `warm_up` itself.
+        """Start the workers as forks of this process, which must have called `warm_up`.
 
         Must be called before this process opens Zenoh, and before `submit`: a fork would inherit
         the sockets and locked state of Zenoh. Workers that replace others are not forks.
         """
         for worker in self._workers:
             worker.start_process(_FORK)
-        self._start()
+        self._start_threads()
 
-    def _start(self) -> None:
+    def _start_threads(self) -> None:
         if not self._started:
             self._started = True
             for worker in self._workers:
@@ -79,7 +79,7 @@ class WorkerPool:
 
     def submit(self, job: Delegate, done: Callable[[Computed], None]) -> None:
         """Queue a job; `done` is called from a worker's thread."""
-        self._start()
+        self._start_threads()
         self._jobs.put((job, done))
 
     def close(self) -> None:

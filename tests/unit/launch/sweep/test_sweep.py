@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import psutil
@@ -16,6 +15,7 @@ from laneweave.launch.run_methods import affects
 from support.commands import Here
 from support.sharing import made_once
 from support.sweeping import command, results, short_road, sweep
+from support.waiting import wait_until
 
 pytestmark = pytest.mark.slow
 
@@ -97,13 +97,7 @@ def test_an_interrupted_sweep_is_continued(whole: Path, scenario: Path, tmp_path
 
 def running_points(sweep_pid: int) -> list[psutil.Process]:
     """Return the processes of a sweep's points, once there are some."""
-    deadline = time.monotonic() + 120.0
-    while time.monotonic() < deadline:
-        children = psutil.Process(sweep_pid).children()
-        if children:
-            return children
-        time.sleep(0.02)
-    raise AssertionError("no point was started")
+    return wait_until(psutil.Process(sweep_pid).children, 120.0)
 
 
 def test_a_run_whose_process_dies_is_a_failed_row_and_tried_again(

@@ -276,7 +276,7 @@ def test_workers_die_with_the_process_that_has_the_pool(tmp_path: Path, *, fork:
         try:
             assert owner.stdout is not None
             workers = [int(word) for word in owner.stdout.readline().split()]
-            # Forks are warm already; a worker that replaces one is not.
+            # A fork inherits what is loaded; a worker that replaces it must load it.
             assert len(set(workers)) == 2
             assert sorted(jobs.noted(tmp_path / "warm")) == ([] if fork else sorted(workers))
             if fork:

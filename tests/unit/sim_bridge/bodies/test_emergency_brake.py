@@ -123,7 +123,7 @@ def test_no_vehicle_hits_one_that_brakes_as_hard_as_it_can(
 def test_no_vehicle_hits_one_with_other_brakes_than_its_own(
     v_mps: float, other_mps: float, lead_brake_mps2: float, lead_lag_s: float
 ) -> None:
-    """The gap may be least before both stand: where one's own brakes are better than assumed."""
+    """Behind a vehicle that brakes less hard, the gap is smallest before both have stopped."""
     braking = attrs.evolve(SCENARIO.braking, lead_brake_mps2=lead_brake_mps2, lead_lag_s=lead_lag_s)
     brake = EmergencyBrake(attrs.evolve(SCENARIO, braking=braking))
     limits = attrs.evolve(LIMITS, min_accel_mps2=-lead_brake_mps2, actuator_lag_s=lead_lag_s)
