@@ -39,9 +39,13 @@ COME_S = 60.0
 """Longest wait for what must come."""
 
 
-def secured_deployment(lab: Lab, port: int) -> Path:
+LINKS = ("tls/127.0.0.1:{}", "quic/127.0.0.1:{}?mixed_rel=1")
+"""Encrypted endpoints with a port to fill in."""
+
+
+def secured_deployment(lab: Lab, endpoint: str) -> Path:
     """Write a secured deployment's configuration."""
-    return deployment(lab, f"tls/127.0.0.1:{port}", SECURITY)
+    return deployment(lab, endpoint, SECURITY)
 
 
 @define

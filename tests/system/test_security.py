@@ -18,6 +18,7 @@ import zenoh
 
 from laneweave.launch.deploy.certificate_authority import issue, load_authority, make_authority
 from laneweave.protocol.config.scenario_files import load_scenario
+from laneweave.protocol.field_validators import link_of
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import REQUEST_MARGIN
@@ -45,6 +46,7 @@ from support.deployments import ask, free_port, start_router, stop
 from support.harness import END_S, RUN_S, Lab, check_safe_and_complete, laboratory, trips
 from support.secured import (
     KEYS,
+    LINKS,
     QUIET_S,
     Member,
     Network,
@@ -66,12 +68,14 @@ MEMBERS = ("bridge", "coordinator.c1", "coordinator.c3", f"vehicle.{A}", f"vehic
            *STRANGERS)  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def secured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Scenario]]:
-    """Run one router for the whole module; give its folder of certificates, and the scenario."""
+@pytest.fixture(scope="module", params=LINKS)
+def secured(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Path, Scenario]]:
+    """Run one router per kind of link; give its folder of certificates, and the scenario."""
     folder = tmp_path_factory.mktemp("secured")
     with laboratory(folder) as lab:
-        config = secured_deployment(lab, free_port())
+        config = secured_deployment(lab, request.param.format(free_port()))
         init = ("certs", "init", "certs", "--config", config)
         vehicles = ("--vehicle", A, "--vehicle", B, "--vehicle", "stranger")
         assert lab.run(*init, *vehicles, "--client", "stranger").status == 0
@@ -285,7 +289,9 @@ def test_outsiders_do_not_get_in(network: Network, tmp_path: Path) -> None:
 
     assert connects(endpoint, **ca, **shown_by(ours, name))
     assert not connects(endpoint, **ca), "no certificate"
-    assert not connects(endpoint.replace("tls/", "tcp/")), "plain tcp"
+    host = endpoint.partition("/")[2].partition("?")[0]
+    for plain in (f"tcp/{host}", f"udp/{host}", f"udp/{host}?rel=1;mixed_rel=1"):
+        assert not connects(plain), plain
     assert not connects(endpoint, **ca, **shown_by(theirs, name)), "wrong authority"
     assert not connects(endpoint, **ca, **shown_by(expired, name)), "expired"
     assert not connects(endpoint, **ca, **shown_by(ours, "router")), "not for clients"
@@ -297,7 +303,8 @@ def test_outsiders_do_not_get_in(network: Network, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["router", "vehicle.v0001", "bridge", "coordinator.c1"])
 def test_nobody_else_passes_for_the_router(network: Network, name: str) -> None:
-    endpoint = f"tls/127.0.0.1:{free_port()}"
+    current = network.scenario.network.endpoint
+    endpoint = next(one for one in LINKS if link_of(one) == link_of(current)).format(free_port())
     config = zenoh.Config()
     folder = network.folder
     settings: dict[str, Any] = {
@@ -319,7 +326,7 @@ def test_nobody_else_passes_for_the_router(network: Network, name: str) -> None:
 def test_a_role_says_in_one_line_what_is_wrong_with_its_certificate(
     network: Network, lab: Lab
 ) -> None:
-    config = secured_deployment(lab, int(network.scenario.network.endpoint.rpartition(":")[2]))
+    config = secured_deployment(lab, network.scenario.network.endpoint)
     ours, theirs = network.folder, lab.folder / "theirs"
     name = "observer.ping"
     issue(make_authority(theirs), theirs, parse_identity(name), days=30.0)
@@ -354,8 +361,9 @@ def test_a_role_says_in_one_line_what_is_wrong_with_its_certificate(
 # --- a whole deployment ---------------------------------------------------------------------------
 
 
-def test_a_secured_deployment_runs_to_its_end(lab: Lab) -> None:
-    config = secured_deployment(lab, free_port())
+@pytest.mark.parametrize("link", LINKS)
+def test_a_secured_deployment_runs_to_its_end(lab: Lab, link: str) -> None:
+    config = secured_deployment(lab, link.format(free_port()))
     assert lab.run("certs", "init", "certs", "--config", config).status == 0
     network = Network(lab.folder / "certs", load_scenario(config))
     router = start_router(lab, config)

@@ -16,9 +16,19 @@ from laneweave.protocol.errors import BadInputError
 NAME_PATTERN = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 NAME_RULE = "letters, digits, `_`, `-`, `.`; at least 1, at most 64"
 HOST_PORT_RULE = "HOST:PORT with a port from 1 to 65535, or nothing"
-ENDPOINT_RULE = "unixsock-stream/PATH, tcp/HOST:PORT or tls/HOST:PORT"
-_NETWORK = re.compile(r"(?:tcp|tls)/(?P<host>\[[0-9A-Fa-f:.%]+\]|[^\s/:?#\[\]]+):(?P<port>\d{1,5})")
-# Zenoh reads session settings, including those of TLS, after `?` and `#`.
+LINK_OPTIONS = ("?rel=0", "?mixed_rel=1", "?rel=1;mixed_rel=1")
+"""Zenoh's options for links over datagrams: all messages unreliable; unreliable and reliable
+messages; the same, where links are not reliable by default (`udp/`)."""
+ENDPOINT_RULE = (
+    "unixsock-stream/PATH, tcp/HOST:PORT, tls/HOST:PORT, or udp/HOST:PORT or quic/HOST:PORT with "
+    f"one of {', '.join(LINK_OPTIONS)} or nothing"
+)
+# Zenoh reads session settings, including those of TLS, after `?` and `#`: allow only known ones.
+_NETWORK = re.compile(
+    r"(?:tcp|tls|(?P<datagrams>udp|quic))/"
+    r"(?P<host>\[[0-9A-Fa-f:.%]+\]|[^\s/:?#\[\]]+):(?P<port>\d{1,5})"
+    rf"(?P<options>{'|'.join(map(re.escape, LINK_OPTIONS))})?"
+)
 _SOCKET = re.compile(r"unixsock-stream/[^?#]+")
 Validator = Callable[[Any, "attrs.Attribute[Any]", Any], None]
 
@@ -86,14 +96,27 @@ def check_endpoint(endpoint: str, name: str = "network.endpoint") -> str:
         BadInputError: the endpoint is malformed, or the Zenoh wheel lacks its protocol.
     """
     found = _NETWORK.fullmatch(endpoint)
-    if not _SOCKET.fullmatch(endpoint) and (found is None or int(found["port"]) > 65535):
+    if found is None:
+        valid = _SOCKET.fullmatch(endpoint) is not None
+    else:
+        valid = int(found["port"]) <= 65535 and bool(found["datagrams"] or not found["options"])
+    if not valid:
         raise BadInputError(name, endpoint, ENDPOINT_RULE)
     return endpoint
 
 
-def is_tls(endpoint: str) -> bool:
+def is_encrypted(endpoint: str) -> bool:
     """Return whether traffic through an endpoint is encrypted."""
-    return endpoint.startswith("tls/")
+    return link_of(endpoint).startswith(("tls", "quic"))
+
+
+def link_of(endpoint: str) -> str:
+    """Return the protocol of an endpoint with its options, such as `quic?rel=0`.
+
+    Only endpoints of the same link can be connected.
+    """
+    address, question_mark, options = endpoint.partition("?")
+    return address.partition("/")[0] + question_mark + options
 
 
 def host_of(endpoint: str) -> str:

@@ -11,7 +11,7 @@ from attrs import define, field
 
 from laneweave.protocol.config.participants import demanded_vehicles, identities_of, members_of
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.field_validators import check_endpoint, host_of
+from laneweave.protocol.field_validators import check_endpoint, host_of, link_of
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import (
     EVERYWHERE,
@@ -56,6 +56,9 @@ def _check_network(scenario: Scenario, report: Report) -> None:
             check_endpoint(endpoint, name)
         except BadInputError as error:
             report.problems.append(str(error))
+    if link_of(network.endpoint) not in map(link_of, network.listens_at):
+        allowed = f"an endpoint with the protocol and the options of {network.endpoint}, too"
+        report.problems.append(str(BadInputError("network.listen", network.listen, allowed)))
     if network.listen and host_of(network.endpoint) in EVERYWHERE:
         report.warnings.append(
             f"network.endpoint: {network.endpoint} is not reachable by other roles"

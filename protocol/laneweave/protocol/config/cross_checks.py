@@ -9,7 +9,7 @@ from typing import Any
 
 from laneweave.protocol.config.participants import identities_of, max_vehicles
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.field_validators import is_tls
+from laneweave.protocol.field_validators import is_encrypted
 from laneweave.protocol.scenario.fields import MAX_HORIZON_TICKS, Scenario
 from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
 from laneweave.protocol.wire.identities import MAX_COMMON_NAME
@@ -270,11 +270,11 @@ def _check_security(scenario: Scenario) -> None:
     endpoints += [("network.listen", endpoint) for endpoint in network.listen]
     for name, endpoint in endpoints:
         if secured:
-            _require(
-                is_tls(endpoint), name, endpoint, "tls/HOST:PORT only, as security.mode is mtls"
-            )
+            allowed = "tls/HOST:PORT or quic/HOST:PORT, as security.mode is mtls"
+            _require(is_encrypted(endpoint), name, endpoint, allowed)
         else:
-            _require(not is_tls(endpoint), "security.mode", "off", f"mtls, as {name} is {endpoint}")
+            allowed = f"mtls, as {name} is {endpoint}"
+            _require(not is_encrypted(endpoint), "security.mode", "off", allowed)
     if not secured:
         return
     _require(bool(security.folder), "security.folder", "", "the folder of the certificates")

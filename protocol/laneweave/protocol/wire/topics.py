@@ -96,6 +96,11 @@ class Topic:
     """Remark for the table of docs/PROTOCOL.md."""
 
     @property
+    def reliable(self) -> bool:
+        """Whether a link that can lose messages must deliver this topic's messages, in order."""
+        return self.quality is not Quality.LATEST
+
+    @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters, in order."""
         return tuple(re.findall(r"{(\w+)}", self.pattern))

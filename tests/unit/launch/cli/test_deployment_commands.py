@@ -122,11 +122,27 @@ def checked(text: str, identity: str | None, folder: Path) -> Report:
 
 def test_all_problems_are_reported_at_once(laneweave: Here, tmp_path: Path) -> None:
     path = tmp_path / "deployment.toml"
-    path.write_text('[network]\nendpoint = "tcp/x"\nlisten = ["udp/y:1", "tcp/z:1"]\n')
+    path.write_text('[network]\nendpoint = "tcp/x"\nlisten = ["ws/y:1", "tcp/z:1"]\n')
     status, out, errors = laneweave("config", "check", path)
     assert (status, out) == (2, "")
     problems = [line for line in errors if not line.startswith("warning: ")]
     assert [line.partition(":")[0] for line in problems] == ["network.endpoint", "network.listen"]
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "listen", "fits"),
+    [
+        ("udp/127.0.0.1:1?rel=0", "udp/127.0.0.1:1?rel=0", True),
+        ("udp/127.0.0.1:1?rel=0", "udp/127.0.0.1:1", False),
+        ("udp/127.0.0.1:1", "tcp/127.0.0.1:1", False),
+    ],
+)
+def test_both_ends_of_a_link_have_its_protocol_and_options(
+    tmp_path: Path, endpoint: str, listen: str, *, fits: bool
+) -> None:
+    text = f'network.endpoint = "{endpoint}"\nnetwork.listen = ["{listen}"]'
+    problems = checked(text, None, tmp_path).problems
+    assert [problem.partition(":")[0] for problem in problems] == [] if fits else ["network.listen"]
 
 
 def test_a_file_that_does_not_load(laneweave: Here, tmp_path: Path) -> None:

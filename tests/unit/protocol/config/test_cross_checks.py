@@ -76,6 +76,8 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
     ),
     ("network.endpoint", MTLS | {"network": {"endpoint": "tcp/r:7447"}}),
     ("network.endpoint", MTLS | {"network": {"endpoint": "unixsock-stream/r"}}),
+    ("network.endpoint", MTLS | {"network": {"endpoint": "udp/r:1?rel=1;mixed_rel=1"}}),
+    ("security.mode", {"network": {"endpoint": "quic/r:7447?mixed_rel=1"}}),
     ("network.listen", MTLS | {"network": {"listen": ["tls/r:1", "tcp/r:2"]}}),
     ("security.mode", {"network": {"endpoint": "tls/r:7447"}}),
     ("security.mode", {"network": {"listen": ["tls/r:7447"]}}),

@@ -671,8 +671,8 @@ def test_after_close_nothing_of_the_closed_session_is_used(router: Router) -> No
 
 @pytest.mark.parametrize(
     "endpoint",
-    ["", "udp/127.0.0.1:1", "unixsock-stream", "tcp/", "tcp/nonsense", "tls/127.0.0.1",
-     "unixsock-stream/no-router-here"],
+    ["", "ws/127.0.0.1:1", "udp/127.0.0.1:1", "unixsock-stream", "tcp/", "tcp/nonsense",
+     "tls/127.0.0.1", "unixsock-stream/no-router-here"],
 )  # fmt: skip
 def test_an_endpoint_that_is_malformed_or_without_a_router_is_refused(endpoint: str) -> None:
     error = refusal(ZenohTransport, Access(endpoint, lease_s=LEASE_S), lambda _: None)

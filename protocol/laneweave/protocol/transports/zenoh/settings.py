@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from laneweave.protocol.security.connection import Access, Credentials, RouterGuard
+from laneweave.protocol.wire.topics import TOPICS, Keys
 
 DROP_AFTER_US = 50
 OPEN_MS = 2000
@@ -26,6 +27,13 @@ def client_settings(access: Access) -> Iterator[Setting]:
     yield (
         "connect/retry",
         {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5},
+    )
+    # Matters on links that carry reliable and unreliable messages (`?mixed_rel=1`). `Session.put`
+    # has no such argument.
+    unreliable = [Keys(access.realm).all_of(topic) for topic in TOPICS if not topic.reliable]
+    yield (
+        "qos/publication",
+        [{"key_exprs": unreliable, "config": {"reliability": "best_effort"}}],
     )
     if access.credentials is not None:
         yield from _tls_settings(access.credentials, "connect")
@@ -71,5 +79,5 @@ def _tls_settings(credentials: Credentials, side: str) -> Iterator[Setting]:
     yield f"{tls}/enable_mtls", True
     yield f"{tls}/verify_name_on_connect", True
     yield f"{tls}/close_link_on_expiration", True
-    # Allow only TLS, for any endpoint.
-    yield "transport/link/protocols", ["tls"]
+    # Allow only encrypted links, for any endpoint.
+    yield "transport/link/protocols", ["tls", "quic"]
