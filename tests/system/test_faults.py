@@ -241,3 +241,17 @@ def _is_stopped(process: psutil.Process) -> bool:
         return process.status() == psutil.STATUS_STOPPED
     except psutil.Error:
         return False
+
+
+def test_links_lose_packets(lab: Lab, short: Path) -> None:
+    faults = lab.path("faults.toml", "[[link]]\nloss = 0.02\nfrom_s = 5\nuntil_s = 15\n")
+    folder = lab.folder / "out"
+    ended = lab.run("run", short, *DEMAND, "--faults", faults, "--out", folder,
+                    "--pace", "4", "--vehicles-per-process", "8")  # fmt: skip
+    if "link[0]: " in ended.err:
+        pytest.skip(f"there can be no links that lose packets here: {ended.err}")
+    assert ended.status == 0, ended
+    check_safe_and_complete(folder)
+    found = summary(folder)
+    assert injected(found, "link") == ["began", "ended"]
+    assert found["messages"]["dropped_by_faults"] == 0

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from laneweave.launch.faults.network_namespaces import NamespacesUnavailableError
+from laneweave.launch.faults.network_namespaces import Link, NamespacesUnavailableError
 from support.harness import Lab, check_safe_and_complete, events, final_lanes, summary, trips
 from support.hosts import LINKS, Hosts, lasts, open_hosts
 
@@ -29,12 +29,13 @@ def make_hosts(lab: Lab) -> Iterator[MakeHosts]:
     """Make hosts on which nothing runs yet; whatever runs on them at last is ended."""
     with ExitStack() as stack:
 
-        def make(pace: float = 6.0) -> Hosts:
+        def make(pace: float = 6.0, link: str = "tls") -> Hosts:
             try:
                 return stack.enter_context(
                     open_hosts(
                         lab.folder,
                         pace=pace,
+                        link=link,
                         environment=lab.environment,
                         road=SHORT,
                         demand=DEMAND,
@@ -74,6 +75,13 @@ def test_a_link_is_cut_and_the_router_killed(make_hosts: MakeHosts) -> None:
     lanes = final_lanes(folder)
     wanted = {name: trip["preferred_lane"] for name, trip in trips(folder).items()}
     assert sum(lanes[name] == wanted[name] for name in lanes) >= 0.8 * len(lanes)
+
+
+def test_links_lose_packets(make_hosts: MakeHosts) -> None:
+    hosts = make_hosts(pace=3.0, link="quic?mixed_rel=1")
+    hosts.start_all(Link(loss=0.1))
+    folder = finish(hosts)
+    assert summary(folder)["failover"]["leader_changes"] <= 1
 
 
 @pytest.mark.full

@@ -28,6 +28,7 @@ from laneweave.launch.cli.plan_answers import answer_request
 from laneweave.launch.faults.specification import (
     GROUPS,
     Kill,
+    LinkFault,
     Partition,
     Pause,
     load_faults,
@@ -227,6 +228,7 @@ def test_rules_between_fields_name_existing_fields() -> None:
         ("## Kills: `[[kill]]`", Kill),
         ("## Pauses: `[[pause]]`", Pause),
         ("## Partitions: `[[partition]]`", Partition),
+        ("## Lost packets: `[[link]]`", LinkFault),
     ],
 )
 def test_tables_of_faults(heading: str, kind: type) -> None:
@@ -243,8 +245,9 @@ def test_tables_of_faults(heading: str, kind: type) -> None:
 def test_presets_and_groups_of_faults() -> None:
     presets = rows(section(read("FAULTS.md"), "## Presets"))
     assert tuple(sorted(code(cells[0]) for cells in presets)) == preset_names()
-    part = section(read("FAULTS.md"), "## Partitions: `[[partition]]`")
-    assert all(f"`{group}`" in part for group in GROUPS)
+    for heading in ("## Partitions: `[[partition]]`", "## Lost packets: `[[link]]`"):
+        part = section(read("FAULTS.md"), heading)
+        assert all(f"`{group}`" in part for group in GROUPS), heading
 
 
 def test_endings_of_runs() -> None:
@@ -443,7 +446,7 @@ def test_commands_exist(path: Path) -> None:
 def test_toml_in_documents_loads(path: Path, tmp_path: Path) -> None:
     for body in fences(path.read_text(encoding="utf-8"), "toml"):
         data = tomllib.loads(body)
-        if not data.keys().isdisjoint({"messages", "kill", "pause", "partition"}):
+        if not data.keys().isdisjoint({"messages", "kill", "pause", "partition", "link"}):
             file = tmp_path / "faults.toml"
             file.write_text(body)
             load_faults(file, COORDINATORS)

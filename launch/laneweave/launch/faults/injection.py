@@ -2,7 +2,7 @@
 
 Kills and pauses affect roles through `RoleControl`, which both kinds of runs implement. Message
 faults and partitions are rules that roles receive at start-up; in local runs, network namespaces
-may implement partitions instead.
+may implement partitions instead, and implement faults of links.
 """
 
 from __future__ import annotations
@@ -14,7 +14,11 @@ import structlog
 from attrs import define, field
 
 from laneweave.launch.faults.failover import Failover
-from laneweave.launch.faults.network_namespaces import GroupNetwork, NamespacesUnavailableError
+from laneweave.launch.faults.network_namespaces import (
+    GroupNetwork,
+    Link,
+    NamespacesUnavailableError,
+)
 from laneweave.launch.faults.schedule import FaultEvent, FaultSchedule
 from laneweave.launch.faults.specification import (
     AGENT,
@@ -23,6 +27,7 @@ from laneweave.launch.faults.specification import (
     MESSAGES,
     NAMESPACES,
     FaultSpec,
+    LinkFault,
     Partition,
 )
 from laneweave.launch.observe.road_view import RoadView
@@ -86,7 +91,7 @@ class FaultInjection:
     """Targets of each fault; a fault affects each agent at most once."""
     _paused: set[str] = field(factory=set)
     _in_force: set[str] = field(factory=set)
-    """Names of the partitions in force."""
+    """Names of the partitions and the faults of links in force."""
 
     def __attrs_post_init__(self) -> None:
         """Draw the schedule of the faults."""
@@ -135,7 +140,7 @@ class FaultInjection:
                 self._waiting.append(event)
             else:
                 self._apply(event, name, road_s, now_s, view)
-        self._partition(road_s)
+        self._change_links(road_s)
 
     def unused_faults(self) -> list[str]:
         """Return a line for each fault that had no effect."""
@@ -212,25 +217,34 @@ class FaultInjection:
         self.injected.append({"t_s": round(road_s, 3), "fault": fault, verb: target})
         log.warning(verb, target=target, t_s=road_s, fault=fault)
 
-    # --- partitions ---------------------------------------------------------------------------
+    # --- links --------------------------------------------------------------------------------
 
     def _uses_links(self, partition: Partition) -> bool:
         return self.network is not None and partition.may_use_links
 
-    def _partition(self, road_s: float) -> None:
-        in_force = {
-            name: partition
-            for name, partition in self.specification.partitions()
-            if partition.holds(road_s)
-        }
+    def _change_links(self, road_s: float) -> None:
+        """Begin and end partitions and faults of links."""
+        specification = self.specification
+        faults: list[tuple[str, Partition | LinkFault]] = [
+            *specification.partitions(),
+            *specification.links(),
+        ]
+        in_force = {name: fault for name, fault in faults if fault.holds(road_s)}
         if in_force.keys() == self._in_force:
             return
         if self.network is not None:
-            cut = {part.between[0] for part in in_force.values() if self._uses_links(part)}
+            links: dict[str, Link] = {}
+            for fault in in_force.values():
+                if isinstance(fault, LinkFault):
+                    state = Link(loss=fault.loss, burst=fault.burst)
+                    links = dict.fromkeys(fault.groups, state) | links
+                elif self._uses_links(fault):
+                    links[fault.between[0]] = Link(up=False)
             try:
-                self.network.cut_off(cut)
+                self.network.set_links(links)
             except NamespacesUnavailableError as error:
                 raise CommandFailedError(f"cannot change a link: {error}") from error
         for name in sorted(in_force.keys() ^ self._in_force):
-            self._record(road_s, name, "partition", "began" if name in in_force else "ended")
+            kind = name.partition("[")[0]
+            self._record(road_s, name, kind, "began" if name in in_force else "ended")
         self._in_force = set(in_force)

@@ -1,14 +1,15 @@
-"""Network namespaces for groups of processes, so that partitions affect real connections.
+"""Network namespaces for groups of processes, so that faults of links affect real connections.
 
 The namespaces form a star. The router runs in the hub, which has the same address for all groups. A
-pair of virtual Ethernet devices (veth) connects each group to the hub; taking the hub's end down
-disconnects the group: packets are lost, connections end when their leases expire, and the group
-loses the liveliness tokens of all others. The launcher reaches the router through a Unix socket,
-which is independent of namespaces.
+pair of virtual Ethernet devices (veth) connects each group to the hub. Packet filters at both ends
+of a pair drop a share of the received packets. Taking the hub's end down disconnects the group: all
+packets are lost, connections end when their leases expire, and the group loses the liveliness
+tokens of all others. The launcher reaches the router through a Unix socket, which is independent of
+namespaces.
 
 The namespaces have no names; each is held by a process of the run. The kernel removes a namespace
 with its devices and addresses when its last process exits, so nothing remains after a run. This
-requires CAP_SYS_ADMIN and the program `ip`.
+requires CAP_SYS_ADMIN and the program `ip`, and `nft` for links that lose packets.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Collection
+from collections.abc import Iterable, Mapping
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
 
-from attrs import define, field
+from attrs import define, field, frozen
 
 from laneweave.launch.faults.specification import NAMESPACES, FaultSpec
 from laneweave.protocol.errors import BadInputError
@@ -41,6 +42,20 @@ _CLONE_NEWNET = 0x40000000
 _PATH = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"))
 _UPLINK = "uplink"
 """A group's end of its device pair; the hub's end is named after the group."""
+
+
+@frozen
+class Link:
+    """State of the link between a group and the hub."""
+
+    up: bool = True
+    loss: float = 0.0
+    """Share of packets lost in each direction, in [0, 1]."""
+    burst: int = 1
+    """Number of successive packets lost together; 1: packets are lost independently."""
+
+
+PERFECT = Link()
 
 
 class NamespacesUnavailableError(RuntimeError):
@@ -114,11 +129,11 @@ class _Namespace:
     def process_id(self) -> int:
         return self.process.pid or 0
 
-    def ip(self, *words: str) -> None:
-        """Run `ip` in this namespace."""
-        program = shutil.which("ip", path=_PATH)
+    def run(self, name: str, *words: str) -> None:
+        """Run a program in this namespace."""
+        program = shutil.which(name, path=_PATH)
         if program is None:
-            raise NamespacesUnavailableError("the program `ip` is not installed")
+            raise NamespacesUnavailableError(f"the program `{name}` is not installed")
         try:
             self.connection.send([program, *words])
         except OSError as error:
@@ -148,7 +163,7 @@ class GroupNetwork:
     context: ForkServerContext
     groups: tuple[str, ...]
     _namespaces: dict[str, _Namespace] = field(factory=dict)
-    _cut: set[str] = field(factory=set)
+    _links: dict[str, Link] = field(factory=dict)
 
     def open(self) -> None:
         """Create the namespaces and their links.
@@ -160,8 +175,8 @@ class GroupNetwork:
             for name in (HUB, *self.groups):
                 namespace = self._namespaces[name] = _Namespace.make(self.context, name)
                 namespace.check_answer()
-                namespace.ip("link", "set", "lo", "up")
-            self._namespaces[HUB].ip("addr", "add", f"{HUB_ADDRESS}/32", "dev", "lo")
+                namespace.run("ip", "link", "set", "lo", "up")
+            self._namespaces[HUB].run("ip", "addr", "add", f"{HUB_ADDRESS}/32", "dev", "lo")
             for group in self.groups:
                 self._link(group)
         except NamespacesUnavailableError:
@@ -171,11 +186,11 @@ class GroupNetwork:
     def _link(self, group: str) -> None:
         hub, leaf = self._namespaces[HUB], self._namespaces[group]
         ends = ("link", "add", "name", group, "type", "veth", "peer", "name", _UPLINK)
-        hub.ip(*ends, "netns", str(leaf.process_id))
+        hub.run("ip", *ends, "netns", str(leaf.process_id))
         for namespace, device, last in ((hub, group, 1), (leaf, _UPLINK, 2)):
-            namespace.ip("addr", "add", f"{self._network(group)}.{last}/30", "dev", device)
-            namespace.ip("link", "set", "dev", device, "up")
-        leaf.ip("route", "add", "default", "via", f"{self._network(group)}.1")
+            namespace.run("ip", "addr", "add", f"{self._network(group)}.{last}/30", "dev", device)
+            namespace.run("ip", "link", "set", "dev", device, "up")
+        leaf.run("ip", "route", "add", "default", "via", f"{self._network(group)}.1")
 
     def _network(self, group: str) -> str:
         """Return the first three bytes of the addresses on the link of a group."""
@@ -185,17 +200,25 @@ class GroupNetwork:
         """Return the id of a process in the namespace of a group or the hub."""
         return self._namespaces[name].process_id
 
-    def cut_off(self, groups: Collection[str]) -> None:
-        """Take the links of these groups down, and bring all others up.
+    def set_links(self, links: Mapping[str, Link]) -> None:
+        """Change the links of groups; all other links become perfect.
 
         Raises:
             NamespacesUnavailableError: a command failed.
         """
-        wanted = set(groups)
-        for group in sorted(wanted ^ self._cut):
-            state = "down" if group in wanted else "up"
-            self._namespaces[HUB].ip("link", "set", "dev", group, state)
-        self._cut = wanted
+        for group in self.groups:
+            wanted, current = links.get(group, PERFECT), self._links.get(group, PERFECT)
+            self._links[group] = wanted
+            if wanted.up != current.up:
+                state = "up" if wanted.up else "down"
+                self._namespaces[HUB].run("ip", "link", "set", "dev", group, state)
+            if (wanted.loss, wanted.burst) != (current.loss, current.burst):
+                self._filter(group, [(_UPLINK, wanted)])
+                self._filter(HUB, self._links.items())
+
+    def _filter(self, namespace: str, links: Iterable[tuple[str, Link]]) -> None:
+        """Drop packets received in a namespace, by device."""
+        self._namespaces[namespace].run("nft", filter_rules(links))
 
     def close(self) -> None:
         """Release the namespaces; call this after the roles in them have exited."""
@@ -204,25 +227,55 @@ class GroupNetwork:
         self._namespaces.clear()
 
 
+def filter_rules(links: Iterable[tuple[str, Link]]) -> str:
+    """Return commands for `nft` that replace the packet filter of a namespace.
+
+    Filters are at the receiving end, because the kernel reports a packet that is dropped at the
+    sending end as an error to the sender, which then closes the connection.
+    """
+    rules = []
+    for device, link in links:
+        if link.loss > 0.0:
+            # Either each packet with this probability, or the first ones of each group of packets.
+            draw, period = ("inc", link.burst / link.loss) if link.burst > 1 else ("random", 1e4)
+            lost = max(1, round(link.loss * period))
+            condition = f"numgen {draw} mod {round(period)} < {lost}"
+            match = f'iifname "{device}" meta l4proto {{ tcp, udp }} {condition} drop'
+            rules.append(f"add rule inet laneweave received {match}")
+    chain = "{ type filter hook input priority 0 ; }"
+    return "; ".join(
+        [
+            "flush ruleset",
+            "add table inet laneweave",
+            f"add chain inet laneweave received {chain}",
+            *rules,
+        ]
+    )
+
+
 def open_network(
     specification: FaultSpec, context: ForkServerContext
 ) -> tuple[GroupNetwork | None, str]:
     """Create the namespaces that partitions use.
 
     Returns:
-        (namespaces, ""), or (None, reason); the reason is empty if no partition needs namespaces.
+        (namespaces, ""), or (None, reason); the reason is empty if no fault needs namespaces.
 
     Raises:
-        BadInputError: a partition requires namespaces, which cannot be created.
+        BadInputError: a fault requires namespaces, which cannot be created.
     """
-    partitions = specification.partition
-    groups = dict.fromkeys(part.between[0] for part in partitions if part.may_use_links)
+    parts = [part for part in specification.partition if part.may_use_links]
+    groups = dict.fromkeys(part.between[0] for part in parts)
+    groups |= dict.fromkeys(group for fault in specification.link for group in fault.groups)
     if not groups:
         return None, ""
     network = GroupNetwork(context, tuple(groups))
     try:
         network.open()
     except NamespacesUnavailableError as error:
+        for name, fault in specification.links():
+            allowed = f"nothing, because namespaces cannot be created ({error})"
+            raise BadInputError(name, fault.of, allowed) from error
         for name, partition in specification.partitions():
             if partition.method == NAMESPACES:
                 allowed = f"messages, because namespaces cannot be created ({error})"

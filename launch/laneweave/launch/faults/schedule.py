@@ -17,9 +17,9 @@ from attrs import field, frozen
 from laneweave.launch.faults.specification import (
     FaultSpec,
     Kill,
-    Partition,
     Pause,
     RoleFault,
+    TimedFault,
 )
 from laneweave.protocol.runtime.message_faults import MessageRule
 
@@ -72,9 +72,10 @@ class FaultSchedule:
             for name, fault in self._specification.role_faults()
             if name not in applied
         ]
-        windows: list[tuple[str, MessageRule | Partition]] = [
+        windows: list[tuple[str, MessageRule | TimedFault]] = [
             *((f"messages[{i}]", rule) for i, rule in enumerate(self._specification.messages)),
             *self._specification.partitions(),
+            *self._specification.links(),
         ]
         lines += [
             f"the run ended before {name} came into force at {window.from_s:g} s"

@@ -1,8 +1,8 @@
 """The fault specification of a run: the format of fault files (reference: docs/FAULTS.md).
 
-A file has any number of tables `[[messages]]`, `[[kill]]`, `[[pause]]` and `[[partition]]`. Faults
-begin at a road time; durations are in wall-clock time. The package contains preset files, which are
-selected by name.
+A file has any number of tables `[[messages]]`, `[[kill]]`, `[[pause]]`, `[[partition]]` and
+`[[link]]`. Faults begin at a road time; durations are in wall-clock time. The package contains
+preset files, which are selected by name.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ SENDER_OF_GROUP = dict(zip(("vehicles", "coordinators", "bridge"), SENDERS, stri
 """Groups that a partition may separate, with their sender names in message rules."""
 GROUPS = tuple(SENDER_OF_GROUP)
 OTHERS = "others"
+ALL = "all"
 AUTO, NAMESPACES, MESSAGES = "auto", "namespaces", "messages"
 MAX_S = 1e6
 MAX_TIMES = 10_000
@@ -125,8 +126,30 @@ class Pause(RoleFault):
 
 
 @frozen(kw_only=True)
-class Partition:
-    """Separate one group from all others, or two groups from each other, for a period of road time.
+class TimedFault:
+    """Fields of faults that are in force for a period of road time.
+
+    Raises:
+        BadInputError: a value is not allowed, or values contradict each other.
+    """
+
+    from_s: float = field(default=0.0, validator=within(0.0, MAX_S))
+    until_s: float | None = field(default=None, validator=optional(within(0.0, MAX_S)))
+    """End (road time); None: the end of the run."""
+
+    def __attrs_post_init__(self) -> None:
+        """Check that the fields do not contradict each other."""
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise BadInputError("until_s", self.until_s, f"more than from_s, {self.from_s:g}")
+
+    def holds(self, road_s: float) -> bool:
+        """Return whether the fault is in force at a road time."""
+        return self.from_s <= road_s and (self.until_s is None or road_s < self.until_s)
+
+
+@frozen(kw_only=True)
+class Partition(TimedFault):
+    """Separate one group from all others, or two groups from each other.
 
     Raises:
         BadInputError: a value is not allowed, or values contradict each other.
@@ -134,9 +157,6 @@ class Partition:
 
     between: tuple[str, str]
     """Two groups, or a group and `others` (all processes outside the group)."""
-    from_s: float = field(default=0.0, validator=within(0.0, MAX_S))
-    until_s: float | None = field(default=None, validator=optional(within(0.0, MAX_S)))
-    """End (road time); None: the end of the run."""
     method: str = field(default=AUTO, validator=one_of(AUTO, NAMESPACES, MESSAGES))
 
     def __attrs_post_init__(self) -> None:
@@ -145,15 +165,10 @@ class Partition:
         if first == second or first not in GROUPS or second not in (*GROUPS, OTHERS):
             allowed = f"two of {', '.join(GROUPS)}, or one of them and {OTHERS}"
             raise BadInputError("between", list(self.between), allowed)
-        if self.until_s is not None and self.until_s <= self.from_s:
-            raise BadInputError("until_s", self.until_s, f"more than from_s, {self.from_s:g}")
+        super().__attrs_post_init__()
         if self.method == NAMESPACES and second != OTHERS:
             # All messages pass through one router, so a link separates a group from all others.
             raise BadInputError("method", NAMESPACES, f"{MESSAGES}, or {OTHERS} in between")
-
-    def holds(self, road_s: float) -> bool:
-        """Return whether the partition is in force at a road time."""
-        return self.from_s <= road_s and (self.until_s is None or road_s < self.until_s)
 
     @property
     def may_use_links(self) -> bool:
@@ -177,6 +192,23 @@ class Partition:
 
 
 @frozen(kw_only=True)
+class LinkFault(TimedFault):
+    """Lose packets on links between groups and the router."""
+
+    of: str = field(default=ALL, validator=one_of(*GROUPS, ALL))
+    """Group whose link loses packets, in both directions; `all`: every group's."""
+    loss: float = field(validator=within(0.0, 1.0))
+    """Share of packets that are lost in each direction."""
+    burst: int = field(default=1, validator=within(1, 1000))
+    """Number of successive packets lost together; 1: each packet is lost independently."""
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Groups whose links lose packets."""
+        return GROUPS if self.of == ALL else (self.of,)
+
+
+@frozen(kw_only=True)
 class FaultSpec:
     """All faults of a run."""
 
@@ -186,10 +218,11 @@ class FaultSpec:
     kill: tuple[Kill, ...] = ()
     pause: tuple[Pause, ...] = ()
     partition: tuple[Partition, ...] = ()
+    link: tuple[LinkFault, ...] = ()
 
     def __bool__(self) -> bool:
         """Return whether there are any faults."""
-        return bool(self.messages or self.kill or self.pause or self.partition)
+        return bool(self.messages or self.kill or self.pause or self.partition or self.link)
 
     def role_faults(self) -> Iterator[tuple[str, RoleFault]]:
         """Yield kills and pauses with their names, such as `kill[0]`."""
@@ -201,6 +234,11 @@ class FaultSpec:
         """Yield partitions with their names."""
         for index, partition in enumerate(self.partition):
             yield f"partition[{index}]", partition
+
+    def links(self) -> Iterator[tuple[str, LinkFault]]:
+        """Yield the faults of links with their names."""
+        for index, fault in enumerate(self.link):
+            yield f"link[{index}]", fault
 
     def check_simulated(self) -> None:
         """Check that the simulated network supports these faults.
@@ -215,6 +253,9 @@ class FaultSpec:
         for name, partition in self.partitions():
             if partition.method == NAMESPACES:
                 raise BadInputError(f"{name}.method", NAMESPACES, f"{MESSAGES} {where}")
+        if self.link:
+            allowed = f"nothing {where}, which has no packets; messages can lose messages"
+            raise BadInputError("link", "a table", allowed)
 
 
 def preset_names() -> tuple[str, ...]:

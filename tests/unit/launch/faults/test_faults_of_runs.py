@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,22 @@ import pyarrow.parquet as pq
 import pytest
 
 from laneweave.launch.faults.injection import FaultInjection
-from laneweave.launch.faults.network_namespaces import GroupNetwork, NamespacesUnavailableError
+from laneweave.launch.faults.network_namespaces import (
+    GroupNetwork,
+    Link,
+    NamespacesUnavailableError,
+)
 from laneweave.launch.faults.shared_counters import MessageFaults, SharedBoard
-from laneweave.launch.faults.specification import FaultSpec, Kill, Partition, Pause, load_faults
+from laneweave.launch.faults.specification import (
+    GROUPS,
+    FaultSpec,
+    Kill,
+    LinkFault,
+    Partition,
+    Pause,
+    load_faults,
+)
+from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.local_run import add_faults, fault_injection
 from laneweave.launch.run.outcome import Outcome
 from laneweave.launch.run.role_processes import RoleProcesses, RoleStart
@@ -104,14 +117,47 @@ def test_a_partition_that_requires_namespaces_is_refused_without_them(
         injection_of(FaultSpec(partition=(CUT, required)))
 
 
+def test_lost_packets_are_refused_without_namespaces(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_namespaces(monkeypatch)
+    with pytest.raises(BadInputError, match=r"link\[0\]: .*not permitted"):
+        injection_of(FaultSpec(link=(LinkFault(of="bridge", loss=0.1),)))
+
+
 class _FakeNetwork(GroupNetwork):
     """Namespaces that are only names."""
 
     def process_id(self, name: str) -> int:
         return {"hub": 11, "coordinators": 12}[name]
 
-    def cut_off(self, groups: Any) -> None:  # noqa: ANN401 (any collection)
-        self._cut = set(groups)
+    def set_links(self, links: Mapping[str, Link]) -> None:
+        self._links = dict(links)
+
+
+def test_links_follow_the_faults_in_force(board: SharedBoard) -> None:
+    del board
+    lossy = LinkFault(loss=0.1, from_s=1.0, until_s=4.0)
+    bursts = LinkFault(of="coordinators", loss=0.2, burst=5, from_s=2.0)
+    cut = Partition(between=("coordinators", "others"), from_s=3.0, until_s=5.0)
+    specification = FaultSpec(link=(lossy, bursts), partition=(cut,))
+    network = _FakeNetwork(processes().context, GROUPS)
+    injection = FaultInjection(specification, 1, processes(), 1.0, network)
+    found = []
+    for road_s in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0):
+        injection.step(road_s, road_s, RoadView())
+        found.append([network._links.get(group) for group in ("bridge", "coordinators")])
+    some, many, down = Link(loss=0.1), Link(loss=0.2, burst=5), Link(up=False)
+    # The first table counts, and a cut before any loss.
+    assert found == [
+        [None, None],
+        [some, some],
+        [some, some],
+        [some, down],
+        [None, down],
+        [None, many],
+    ]
+    assert [entry.get("link") for entry in injection.injected] == [
+        "began", "began", None, "ended", None,
+    ]  # fmt: skip
 
 
 def test_with_namespaces_groups_reach_the_router_over_their_link(board: SharedBoard) -> None:

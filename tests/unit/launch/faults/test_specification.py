@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 from laneweave.launch.faults.specification import (
+    GROUPS,
     FaultSpec,
     Kill,
+    LinkFault,
     Partition,
     Pause,
     load_faults,
@@ -68,6 +70,14 @@ def test_a_file_may_have_every_field(tmp_path: Path) -> None:
         between = ["coordinators", "others"]
         from_s = 5
         until_s = 6
+        [[link]]
+        loss = 0.1
+        [[link]]
+        of = "bridge"
+        loss = 0.05
+        burst = 20
+        from_s = 7
+        until_s = 8
         """,
     )
     assert found == FaultSpec(
@@ -90,7 +100,12 @@ def test_a_file_may_have_every_field(tmp_path: Path) -> None:
         ),
         pause=(Pause(target="c2", at_s=1.5, for_s=2.0), Pause(at_s=1.5, for_s=(0.1, 15.0))),
         partition=(Partition(between=("coordinators", "others"), from_s=5.0, until_s=6.0),),
+        link=(
+            LinkFault(loss=0.1),
+            LinkFault(of="bridge", loss=0.05, burst=20, from_s=7.0, until_s=8.0),
+        ),
     )
+    assert [fault.groups for fault in found.link] == [GROUPS, ("bridge",)]
     assert found
 
 
@@ -127,6 +142,11 @@ def test_a_file_may_have_every_field(tmp_path: Path) -> None:
         ('[[messages]]\ntopics = ["service"]', "messages[0].topics"),
         ("[[messages]]\nfrom_s = 3\nuntil_s = 3", "messages[0].until_s"),
         ('[[partition]]\nbetween = ["bridge"]', "partition[0].between"),
+        ("[[link]]", "link[0].loss"),
+        ("[[link]]\nloss = 1.5", "link[0].loss"),
+        ("[[link]]\nloss = 0.1\nburst = 0", "link[0].burst"),
+        ('[[link]]\nloss = 0.1\nof = "others"', "link[0].of"),
+        ("[[link]]\nloss = 0.1\nfrom_s = 2\nuntil_s = 1", "link[0].until_s"),
         ('[[partition]]\nbetween = ["bridge", "bridge"]', "partition[0].between"),
         ('[[partition]]\nbetween = ["others", "bridge"]', "partition[0].between"),
         ('[[partition]]\nbetween = ["router", "others"]', "partition[0].between"),
@@ -178,6 +198,11 @@ def test_a_partition_has_a_window() -> None:
     partition = Partition(between=("bridge", "others"), from_s=5.0, until_s=8.0)
     assert [partition.holds(t_s) for t_s in (4.9, 5.0, 7.9, 8.0)] == [False, True, True, False]
     assert Partition(between=("bridge", "others")).holds(1e6)
+
+
+def test_a_simulated_network_loses_no_packets() -> None:
+    with pytest.raises(BadInputError, match=r"link: .*no packets"):
+        FaultSpec(link=(LinkFault(loss=0.1),)).check_simulated()
 
 
 # --- presets --------------------------------------------------------------------------------------
