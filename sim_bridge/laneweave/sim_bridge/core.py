@@ -62,6 +62,8 @@ from laneweave.sim_bridge.world_interface import World, show_bodies
 log = structlog.get_logger(__name__)
 
 BRIDGE = Name("bridge")
+CATCH_UP_S = 1.0
+"""Maximum delay of the road that later, shorter ticks make up for [s, on the node's clock]."""
 SHUT_DOWN_S = 2.0
 """Maximum wait for final reports after a run has ended."""
 
@@ -118,7 +120,8 @@ class BridgeCore:
             world: an empty world.
             record: receives the measurements.
             new_incarnation: returns an unused incarnation, for caretakers.
-            pace: maximum road seconds per second of the node's clock; None: the scenario's.
+            pace: road seconds per second of the node's clock, if answers arrive in time; None: the
+                scenario's `max_pace`.
             incarnation: distinguishes this road from earlier roads of the same deployment.
             stopwatch: clock [s] that measures how long ticks take.
         """
@@ -129,7 +132,9 @@ class BridgeCore:
         self._world = world
         self._record = record
         self._roadside = Roadside(scenario, incarnation)
-        self._tick_duration_s = scenario.runtime.tick_s / (pace or scenario.runtime.max_pace)
+        tick_s, max_pace = scenario.runtime.tick_s, scenario.runtime.max_pace
+        self._tick_duration_s = tick_s / (pace or max_pace)
+        self._min_tick_duration_s = min(self._tick_duration_s, tick_s / max_pace)
         self._incarnation = incarnation
         self._stopwatch = stopwatch
         self._attendance = Attendance(scenario, new_incarnation)
@@ -142,6 +147,8 @@ class BridgeCore:
         self._ending = Ending.COMPLETE
         self._tick_began = 0.0
         self._opened_s = 0.0
+        self._due_s = 0.0
+        """Time at which the current tick was due."""
         self._until_s = 0.0
         """Deadline for all phases except ANSWERS."""
 
@@ -198,6 +205,7 @@ class BridgeCore:
                     yield Listen(subscribed)
                 yield Watch(VEHICLE_ALIVE)
                 yield Announce(BRIDGE_ALIVE, {"incarnation": self._incarnation})
+                self._due_s = now_s
                 self._open_tick(now_s)
             case Arrived(_, parameters, message):
                 yield from self._on_message(message, parameters, now_s)
@@ -355,12 +363,21 @@ class BridgeCore:
         if self._is_over():
             yield from self._shut_down(now_s)
             return
-        min_s = self._tick_duration_s
+        self._until_s = self._next_tick_s(now_s)
+        self.phase = TickPhase.PACE
+
+    def _next_tick_s(self, now_s: float) -> float:
+        """Return when the next tick opens.
+
+        The road keeps `pace` on average: after long ticks it is faster, up to the scenario's
+        `max_pace`. On a link that loses packets, few ticks are long.
+        """
         if self._answers.all_silent or not self._attendance.link_up:
             # No agent can answer: run no faster than real time during a network failure.
-            min_s = max(min_s, self.scenario.runtime.tick_s)
-        self._until_s = max(now_s, self._opened_s + min_s)
-        self.phase = TickPhase.PACE
+            self._due_s = self._opened_s + max(self._tick_duration_s, self.scenario.runtime.tick_s)
+        else:
+            self._due_s = max(self._due_s + self._tick_duration_s, now_s - CATCH_UP_S)
+        return max(now_s, self._due_s, self._opened_s + self._min_tick_duration_s)
 
     def _remove_departed(self) -> Iterator[Effect]:
         length_m = self.scenario.road.length_m

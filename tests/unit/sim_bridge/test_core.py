@@ -23,7 +23,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.messages import Census, Name, Report, RoadClock, Sense
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import pose_of
-from laneweave.sim_bridge.core import SHUT_DOWN_S, TickPhase
+from laneweave.sim_bridge.core import CATCH_UP_S, SHUT_DOWN_S, TickPhase
 from laneweave.sim_bridge.road.attendance import LEFT_REPEATS
 from support.bridge_bench import (
     TWO,
@@ -110,18 +110,31 @@ def test_the_answers_are_played_from_this_tick_on(desk: Desk) -> None:
     assert plants[B].setpoint[0] == before[B][0]
 
 
-def test_ticks_keep_the_pace_and_do_not_make_up_for_lost_time(desk: Desk) -> None:
+def test_ticks_keep_the_pace_on_average_and_never_exceed_the_maximum(desk: Desk) -> None:
     opened_s = desk.now_s
     desk.drive_to(desk.core.tick + 1)
     assert desk.now_s == pytest.approx(opened_s + TICK_S)
     desk.now_s += 2.3 * TICK_S
     desk.answer(A)
     desk.answer(B)
-    assert desk.core.wakeup_s == desk.now_s  # late: at once, but
+    assert desk.core.wakeup_s == desk.now_s  # late: at once
     desk.wake()
+    desk.drive_to(desk.core.tick + 1)  # at the maximum pace, the scenario's
+    assert desk.now_s == pytest.approx(
+        opened_s + 3.3 * TICK_S + TICK_S / desk.scenario.runtime.max_pace
+    )
+    desk.drive_to(desk.core.tick + 1)  # nothing is left to make up for
+    assert desk.now_s == pytest.approx(opened_s + 4 * TICK_S)
+
+
+def test_ticks_do_not_make_up_for_a_long_delay(desk: Desk) -> None:
+    desk.now_s += 5 * CATCH_UP_S
+    desk.answer(A)
+    desk.answer(B)
     late_s = desk.now_s
-    desk.drive_to(desk.core.tick + 1)
-    assert desk.now_s == pytest.approx(late_s + TICK_S)  # only one
+    desk.wake()
+    desk.drive_to(desk.core.tick + 30)
+    assert desk.now_s == pytest.approx(late_s + 30 * TICK_S - CATCH_UP_S)
 
 
 def test_measurement_errors_are_the_same_in_repeated_senses(tmp_path: Path) -> None:
@@ -184,7 +197,7 @@ def test_an_agent_without_answers_is_awaited_to_each_deadline_until_it_is_silent
     began_s, tick = desk.now_s, desk.core.tick
     desk.effects.clear()
     desk.drive_to(tick + 6, B)
-    assert desk.now_s == pytest.approx(began_s + 6 * TICK_S)
+    assert desk.now_s < began_s + 6 * TICK_S
     assert asked(desk.effects).count(B) == asked(desk.effects).count(A) == 6
     assert len(read_events(desk.folder, "agent-silent")) == 1
     desk.give(Stopping())
