@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -23,10 +24,11 @@ def run_missing(
     known = json.loads(record.read_text(encoding="utf-8")) if record.exists() else {}
     chosen = [name for name in runs if (name in only if only else name not in known)]
     for name in chosen:
-        folder = record.parent.resolve() / name
+        folder = record.parent.resolve() / re.sub(r"[^\w-]+", "-", name)
         shutil.rmtree(folder, ignore_errors=True)
         known[name] = runs[name](folder)
-        ordered = {name: known[name] for name in runs if name in known}
+        others = {name: known[name] for name in known if name not in runs}
+        ordered = {name: known[name] for name in runs if name in known} | others
         record.write_text(json.dumps(ordered, indent=1) + "\n", encoding="utf-8")
         print(name, json.dumps(known[name]), flush=True)  # noqa: T201
     return [known[name] for name in chosen]

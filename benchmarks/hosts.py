@@ -1,21 +1,23 @@
-"""Faults in a deployment on several hosts: the table of docs/FAULTS.md, "On several hosts".
+"""Faults in a deployment on several hosts: tables of docs/FAULTS.md and docs/DEPLOYMENT.md.
 
-    python benchmarks/hosts.py [--only NAME ...] [--plain] [--short] [--pace P]
+    python benchmarks/hosts.py [--only NAME ...] [--losses] [--link LINK] [--short] [--pace P]
                                [--out FOLDER]
 
 Each experiment is one run of the deployment of compose.yaml, as processes on hosts that are network
 namespaces (tests/support/hosts.py). A link is cut, or a service is killed and restarted with the
-same command. Roles start before their router. Figures are read from the run's folder and written to
-FOLDER/hosts.json. Finished experiments are kept, unless `--only` names them. The exit status is 1
-if bodies overlapped, a run did not finish, or a process failed. The script needs permission to
-create network namespaces. `--plain`: without certificates, over TCP. `--short`: vehicles arrive for
-20 s instead of 90 s.
+same command; with `--losses`, all links lose packets. Roles start before their router. Figures are
+read from the run's folder and written to FOLDER/hosts.json, or FOLDER/links.json. Finished
+experiments are kept, unless `--only` names them. The exit status is 1 if bodies overlapped, a run
+did not finish, or a process failed. The script needs permission to create network namespaces.
+`--link`: protocol and options of endpoints, such as `quic?mixed_rel=1`; `tcp` and `udp` are without
+certificates. `--short`: vehicles arrive for 20 s instead of 90 s.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import resource
 import signal
 import statistics
 import sys
@@ -33,6 +35,7 @@ from laneweave.launch.recordings.formations import read_events
 from laneweave.protocol.wire.events import CARETAKER_TOOK_OVER
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from laneweave.launch.faults.network_namespaces import PERFECT, Link
 from support.hosts import Hosts, compose, lasts, open_hosts
 
 LONGEST_S = 600.0
@@ -54,6 +57,8 @@ class Experiment:
     text: str
     """Description of the fault, for the table."""
     disturb: Callable[[Hosts], None]
+    loss: Link = PERFECT
+    """Of all links during the whole run."""
 
 
 def nothing(_: Hosts) -> None:
@@ -84,8 +89,9 @@ def killed(name: str) -> Experiment:
     )
 
 
-EXPERIMENTS = (
-    Experiment("undisturbed", "nothing", nothing),
+UNDISTURBED = Experiment("undisturbed", "nothing", nothing)
+FAULTS = (
+    UNDISTURBED,
     *(
         cut(host, for_s)
         for for_s in (5.0, 30.0)
@@ -93,17 +99,28 @@ EXPERIMENTS = (
     ),
     *(killed(name) for name in SERVICES),
 )
+LOSSES = (
+    UNDISTURBED,
+    *(
+        Experiment(f"loss-{percent}", f"{percent} %", nothing, Link(loss=percent / 100))
+        for percent in (2, 10, 25)
+    ),
+    Experiment(
+        "bursts-10", "10 %, 20 successive packets each time", nothing, Link(loss=0.1, burst=20)
+    ),
+)
 
 
 def run(
-    experiment: Experiment, folder: Path, duration_s: float, pace: float, *, secured: bool
+    experiment: Experiment, folder: Path, duration_s: float, pace: float, link: str
 ) -> dict[str, Any]:
     """Run an experiment and return its figures."""
     folder.mkdir(parents=True)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     demand = {"duration_s": duration_s}
-    with open_hosts(folder, pace=pace, secured=secured, demand=demand) as hosts:
-        hosts.start_all()
-        hosts.wait_road(BEGIN_S)
+    with open_hosts(folder, pace=pace, link=link, demand=demand) as hosts:
+        hosts.start_all(experiment.loss)
+        hosts.wait_road(BEGIN_S, LONGEST_S)
         began = time.monotonic()
         experiment.disturb(hosts)
         lasted_s = time.monotonic() - began
@@ -111,10 +128,12 @@ def run(
         # Services that still run exit on request; a negative status means that the process died.
         statuses = hosts.stop(*[name for name in hosts.running if name != "router"], "router")
         (*_, last) = hosts.runs
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
     found = figures(last)
     return {
         "text": experiment.text,
-        "secured": secured,
+        "link": link,
+        "cpu_s": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
         "bridge_status": bridge,
         "ended_badly": sorted(name for name, status in statuses.items() if status != 0),
         "disturbed_s": round(lasted_s, 1),
@@ -139,6 +158,9 @@ def figures(folder: Path) -> dict[str, Any]:
         "leader_changes": summary["failover"]["leader_changes"],
         "caretakers": len(list(read_events(folder, CARETAKER_TOOK_OVER))),
         "real_time_factor": summary["runtime"]["real_time_factor"],
+        "tick_ms_p50": summary["runtime"]["tick_ms"]["p50"],
+        "tick_ms_p99": summary["runtime"]["tick_ms"]["p99"],
+        "missed_ticks": summary["tracking"]["missed_ticks"],
     }
 
 
@@ -152,21 +174,31 @@ def kept_promises(found: dict[str, Any]) -> bool:
 def main() -> int:
     """Run the requested experiments."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--only", nargs="+", choices=[one.name for one in EXPERIMENTS])
-    parser.add_argument("--plain", action="store_true", help="without certificates")
+    names = [one.name for one in (*FAULTS, *LOSSES[1:])]
+    parser.add_argument("--only", nargs="+", choices=names)
+    parser.add_argument("--losses", action="store_true", help="lossy links instead of faults")
+    parser.add_argument("--link", default="tls", help="protocol and options of endpoints")
     parser.add_argument("--short", action="store_true", help="fewer arrivals")
-    parser.add_argument("--pace", type=float, default=3.0, help="road seconds per second")
+    parser.add_argument("--pace", type=float, help="road seconds per second")
     parser.add_argument("--out", type=Path, default=Path("runs/hosts"), help="folder")
     arguments = parser.parse_args()
     # On SIGTERM, exit normally so that all started processes are stopped.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     options = {
         "duration_s": SHORT_S if arguments.short else DURATION_S,
-        "pace": arguments.pace,
-        "secured": not arguments.plain,
+        "pace": arguments.pace or (1.0 if arguments.losses else 3.0),
+        "link": arguments.link,
     }
-    runs = {one.name: partial(run, one, **options) for one in EXPERIMENTS}
-    found = run_missing(runs, arguments.only, arguments.out / "hosts.json")
+    if arguments.losses:
+        runs = {f"{arguments.link} {one.name}": partial(run, one, **options) for one in LOSSES}
+        record = arguments.out / "links.json"
+    else:
+        runs = {one.name: partial(run, one, **options) for one in FAULTS}
+        record = arguments.out / "hosts.json"
+    only = arguments.only
+    if only and arguments.losses:
+        only = [f"{arguments.link} {name}" for name in only]
+    found = run_missing(runs, only, record)
     return 0 if all(map(kept_promises, found)) else 1
 
 

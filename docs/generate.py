@@ -69,6 +69,7 @@ CLOSING = DOCS / "evidence" / "closing.json"
 STREAM = DOCS / "evidence" / "stream.json"
 """Output of `benchmarks/stream.py`."""
 HOSTS = DOCS / "evidence" / "hosts.json"
+LINKS = DOCS / "evidence" / "links.json"
 """Output of `benchmarks/hosts.py`."""
 SERVICE = DOCS / "evidence" / "service.json"
 """Output of `benchmarks/service.py`."""
@@ -178,8 +179,8 @@ def _node(phase: Enum) -> str:
 def _topics() -> str:
     """Return the table of topics, keys and readers."""
     lines = [
-        "| Topic | Key | Message | Sender | Quality | Readers | Remark |",
-        "|---|---|---|---|---|---|---|",
+        "| Topic | Key | Message | Sender | Quality | Reliable | Readers | Remark |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for topic in TOPICS:
         message = "none" if topic.kind is None else f"`{topic.kind.__name__}`"
@@ -187,7 +188,8 @@ def _topics() -> str:
         own = [f"own {topic.addressee}"] if topic.addressee else []
         lines.append(
             f"| `{topic.name}` | `{topic.pattern}` | {message} | {sender} "
-            f"| `{topic.quality.name}` | {', '.join([*own, *topic.readers])} | {topic.remark} |"
+            f"| `{topic.quality.name}` | {'yes' if topic.reliable else 'no'} "
+            f"| {', '.join([*own, *topic.readers])} | {topic.remark} |"
         )
     return "\n".join(lines)
 
@@ -439,6 +441,28 @@ def _hosts() -> str:
     return "\n".join(lines)
 
 
+def _links() -> str:
+    """Return the table of links that lose packets, by `benchmarks/hosts.py --losses`."""
+    measured = json.loads(LINKS.read_text(encoding="utf-8"))
+    calm_s = min(run["travel_time_s"] for run in measured.values())
+    lines = [
+        (
+            "| endpoint | packets lost per link | pace | tick p50 / p99 | leader changes "
+            "| in their lane | overlaps | travel time |"
+        ),
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| `{run['link'].partition('?')[0]}/...{''.join(run['link'].partition('?')[1:])}` "
+        f"| {'0 %' if run['text'] == 'nothing' else run['text']} | {run['real_time_factor']:.3f} "
+        f"| {run['tick_ms_p50']:.0f} / {run['tick_ms_p99']:.0f} ms | {run['leader_changes']} "
+        f"| {run['on_lane_percent']:.1f} % of {run['demanded']} | {run['overlaps']} "
+        f"| {run['travel_time_s'] / calm_s:.3f}x |"
+        for run in measured.values()
+    ]
+    return "\n".join(lines)
+
+
 def _service() -> str:
     """Return the tables of the planning service, by `benchmarks/service.py`."""
     measured = json.loads(SERVICE.read_text(encoding="utf-8"))
@@ -541,6 +565,7 @@ def parts() -> dict[str, str]:
         "metrics": _metrics(),
         "rights": rights_table(),
         "hosts": _hosts(),
+        "links": _links(),
         **document_parts(read_evidence(EVALUATED)),
     }
 

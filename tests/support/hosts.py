@@ -27,10 +27,13 @@ from attrs import define, field
 from laneweave.launch.faults.network_namespaces import (
     HUB,
     HUB_ADDRESS,
+    PERFECT,
     GroupNetwork,
+    Link,
     NamespacesUnavailableError,
 )
 from laneweave.launch.run.roles import fork_server
+from laneweave.protocol.field_validators import is_encrypted
 from support.commands import LANEWEAVE
 from support.waiting import wait_until
 
@@ -103,12 +106,17 @@ class Hosts:
                     start_new_session=True,
                 )
 
-    def start_all(self) -> None:
-        """Start everything, the router after those who need it, the bridge when all is well."""
+    def start_all(self, loss: Link = PERFECT) -> None:
+        """Start everything, the router after those who need it, the bridge when all is well.
+
+        Args:
+            loss: of all links from the bridge's start on.
+        """
         names = [name for name, service in self.services.items() if lasts(service)]
         self.start(*(name for name in names if name not in ("router", "bridge")))
         self.start("router")
         self.wait_healthy(*self.services["bridge"]["depends_on"])
+        self.network.set_links(dict.fromkeys(LINKS, loss))
         self.start("bridge")
 
     def healthy(self, name: str) -> bool:
@@ -168,9 +176,9 @@ class Hosts:
 
     def partition(self, host: str, for_s: float) -> None:
         """Cut a host off for some time."""
-        self.network.cut_off({host})
+        self.network.set_links({host: Link(up=False)})
         time.sleep(for_s)
-        self.network.cut_off(())
+        self.network.set_links({})
 
     # --- the run ------------------------------------------------------------------------------
 
@@ -199,7 +207,7 @@ def open_hosts(
     folder: Path,
     *,
     pace: float,
-    secured: bool = True,
+    link: str = "tls",
     environment: Mapping[str, str] | None = None,
     **tables: Mapping[str, object],
 ) -> Iterator[Hosts]:
@@ -208,7 +216,8 @@ def open_hosts(
     Args:
         folder: a new one.
         pace: road seconds per second.
-        secured: with certificates, as compose.yaml does; else anybody may do anything.
+        link: protocol and options of endpoints, such as `quic?mixed_rel=1`; without encryption
+            (`tcp`, `udp`) anybody may do anything.
         environment: of the services; none: this process's.
         **tables: entries of scenarios/compose.toml that are to be different, by table.
 
@@ -218,7 +227,7 @@ def open_hosts(
     for program in ("nsenter", "unshare", "mount"):
         if shutil.which(program) is None:
             raise NamespacesUnavailableError(f"there is no program `{program}`")
-    text = _configuration(_security(folder, secured=secured) | tables)
+    text = _configuration(_network(folder, link) | tables)
     (folder / "deployment.toml").write_text(text, encoding="utf-8")
     (folder / "hosts").write_text(f"127.0.0.1 localhost\n{HUB_ADDRESS} router\n", encoding="utf-8")
     network = GroupNetwork(fork_server(), LINKS)
@@ -226,7 +235,8 @@ def open_hosts(
     services = compose()["services"]
     hosts = Hosts(folder, network, services, pace, environment or os.environ)
     try:
-        for name in [name for name in services if secured and not lasts(services[name])]:
+        once = [name for name, service in services.items() if not lasts(service)]
+        for name in once if is_encrypted(link) else []:
             hosts.start(name)
             if hosts.finish(name, END_S) != 0:
                 raise RuntimeError((folder / f"{name}.log").read_text(encoding="utf-8"))
@@ -238,11 +248,12 @@ def open_hosts(
         network.close()
 
 
-def _security(folder: Path, *, secured: bool) -> dict[str, Mapping[str, object]]:
-    if secured:
-        return {"security": {"folder": str(folder / "certs")}}
-    addresses = {"endpoint": "tcp/router:7447", "listen": ["tcp/0.0.0.0:7447"]}
-    return {"security": {"mode": "off"}, "network": addresses}
+def _network(folder: Path, link: str) -> dict[str, Mapping[str, object]]:
+    protocol, question_mark, options = link.partition("?")
+    end = f":7447{question_mark}{options}"
+    security = {"folder": str(folder / "certs")} if is_encrypted(link) else {"mode": "off"}
+    addresses = {"endpoint": f"{protocol}/router{end}", "listen": [f"{protocol}/0.0.0.0{end}"]}
+    return {"security": security, "network": addresses}
 
 
 def _configuration(changes: Mapping[str, Mapping[str, object]]) -> str:
