@@ -28,6 +28,10 @@ Hosts = Annotated[
 ]
 Days = Annotated[float, typer.Option("--days", metavar="N", help="Validity in days.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+Separate = Annotated[
+    bool,
+    typer.Option("--separate", help="Give each identity a sub-folder, which also has ca.pem."),
+]
 
 
 @app.command()
@@ -50,6 +54,7 @@ def init(
     keep: Annotated[
         bool, typer.Option("--keep", help="Keep existing files and make only missing ones.")
     ] = False,
+    separate: Separate = False,
 ) -> None:
     """Make a test authority and a certificate for each process of a deployment."""
     from laneweave.launch.deploy.certificate_authority import (
@@ -80,7 +85,7 @@ def init(
     else:
         authority = make_authority(folder, days=max(CA_DAYS, days), replace=force)
     for identity in identities:
-        issue(authority, folder, identity, days=days, hosts=hosts, replace=force)
+        issue(authority, folder, identity, days=days, hosts=hosts, replace=force, separate=separate)
     typer.echo(f"{folder}: a test authority and {len(identities)} certificates:")
     for identity in identities:
         typer.echo(f"  {identity.common_name}")
@@ -96,6 +101,7 @@ def add(
     host: Hosts = None,
     days: Days = DEFAULT_DAYS,
     force: Force = False,
+    separate: Separate = False,
 ) -> None:
     """Issue another certificate from the existing authority."""
     from laneweave.launch.deploy.certificate_authority import issue, load_authority
@@ -104,7 +110,8 @@ def add(
     wanted = parse_identity(identity, "IDENTITY")
     if host and wanted.party is not Party.ROUTER:
         raise BadInputError("--host", host[0], "only for the router")
-    issue(load_authority(folder), folder, wanted, days=days, hosts=host or (), replace=force)
+    authority = load_authority(folder)
+    issue(authority, folder, wanted, days=days, hosts=host or (), replace=force, separate=separate)
     typer.echo(f"{folder}: a certificate for {wanted.common_name}")
 
 

@@ -20,7 +20,12 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.security.connection import ca_path, certificate_path, key_path
+from laneweave.protocol.security.connection import (
+    ca_path,
+    certificate_path,
+    identity_folder,
+    key_path,
+)
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import Party
 
@@ -61,11 +66,9 @@ def make_authority(folder: Path, *, days: float = CA_DAYS, replace: bool = False
         .sign(key, hashes.SHA256())
     )
     authority = Authority(certificate, key)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInputError("DIR", str(folder), f"a folder ({error.strerror})") from error
-    _write(ca_path(folder), certificate, authority_key_path(folder), key)
+    _make_folder(folder)
+    _write_key(authority_key_path(folder), key)
+    _write_certificate(ca_path(folder), certificate)
     return authority
 
 
@@ -99,8 +102,12 @@ def issue(
     days: float,
     hosts: Sequence[str] = (),
     replace: bool = False,
+    separate: bool = False,
 ) -> None:
     """Create a certificate and its key, and write their files.
+
+    If `folder` has a sub-folder with the identity's name, the files are written there, with the
+    authority's certificate beside them.
 
     Args:
         authority: authority that signs the certificate.
@@ -109,11 +116,14 @@ def issue(
         days: validity in days.
         hosts: names and addresses of the router; ignored for other processes.
         replace: whether to replace an existing certificate.
+        separate: whether to create the identity's sub-folder if it is missing.
 
     Raises:
         BadInputError: a certificate exists, or the files cannot be written.
     """
     name = identity.common_name
+    if separate:
+        _make_folder(folder / name)
     path = certificate_path(folder, name)
     if path.exists() and not replace:
         raise BadInputError(
@@ -135,7 +145,12 @@ def issue(
     )
     if serves:
         builder = builder.add_extension(host_names((*hosts, *LOCAL_HOSTS)), critical=False)
-    _write(path, builder.sign(authority.key, hashes.SHA256()), key_path(folder, name), key)
+    own = identity_folder(folder, name)
+    if own != folder:
+        _write_certificate(ca_path(own), authority.certificate)
+    _write_key(key_path(folder, name), key)
+    # Last: a certificate shows that all files of its identity exist.
+    _write_certificate(path, builder.sign(authority.key, hashes.SHA256()))
 
 
 def authority_key_path(folder: Path) -> Path:
@@ -198,26 +213,34 @@ def _general_name(host: str) -> x509.GeneralName:
         raise BadInputError("--host", host, "a host's name or address") from error
 
 
-def _write(
-    certificate_file: Path,
-    certificate: x509.Certificate,
-    key_file: Path,
-    key: ec.EllipticCurvePrivateKey,
-) -> None:
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInputError("DIR", str(folder), f"a folder ({error.strerror})") from error
+
+
+def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
     secret = key.private_bytes(
         serialization.Encoding.PEM,
         serialization.PrivateFormat.PKCS8,
         serialization.NoEncryption(),
     )
-    public = certificate.public_bytes(serialization.Encoding.PEM)
+    _write(path, secret, 0o600)
+
+
+def _write_certificate(path: Path, certificate: x509.Certificate) -> None:
+    _write(path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+
+
+def _write(path: Path, content: bytes, mode: int) -> None:
     try:
-        for path, content, mode in ((key_file, secret, 0o600), (certificate_file, public, 0o644)):
-            # An existing file may have other permissions.
-            path.unlink(missing_ok=True)
-            number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-            with os.fdopen(number, "wb") as file:
-                file.write(content)
+        # An existing file may have other permissions.
+        path.unlink(missing_ok=True)
+        number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        with os.fdopen(number, "wb") as file:
+            file.write(content)
     except OSError as error:
         raise BadInputError(
-            "DIR", str(certificate_file.parent), f"a writable folder ({error.strerror})"
+            "DIR", str(path.parent), f"a writable folder ({error.strerror})"
         ) from error

@@ -25,6 +25,7 @@ from laneweave.protocol.security.connection import (
     RouterGuard,
     ca_path,
     certificate_path,
+    identity_folder,
     key_path,
 )
 from laneweave.protocol.wire.codec import MAX_BYTES
@@ -174,7 +175,7 @@ def credentials_of(
     if key_pem and key_file:
         raise BadInputError(PRIVATE_KEY_FILE, key_file, f"nothing, as {PRIVATE_KEY} is set")
     return Credentials(
-        ca=environment.get(CA_FILE) or str(ca_path(folder)),
+        ca=environment.get(CA_FILE) or str(ca_path(identity_folder(folder, name))),
         certificate=environment.get(CERTIFICATE_FILE) or str(certificate_path(folder, name)),
         private_key="" if key_pem else key_file or str(key_path(folder, name)),
         private_key_pem=key_pem,

@@ -55,6 +55,15 @@ class RouterGuard:
     """Zenoh's `low_pass_filter`."""
 
 
+def identity_folder(folder: Path, identity: str) -> Path:
+    """Return the folder of an identity's files: its sub-folder if there is one, else `folder`."""
+    own = folder / identity
+    try:
+        return own if own.is_dir() else folder
+    except OSError:  # not readable
+        return folder
+
+
 def ca_path(folder: Path) -> Path:
     """Return the path of the authority's certificate."""
     return folder / "ca.pem"
@@ -62,9 +71,9 @@ def ca_path(folder: Path) -> Path:
 
 def certificate_path(folder: Path, identity: str) -> Path:
     """Return the path of an identity's certificate."""
-    return folder / f"{identity}.pem"
+    return identity_folder(folder, identity) / f"{identity}.pem"
 
 
 def key_path(folder: Path, identity: str) -> Path:
     """Return the path of an identity's private key."""
-    return folder / f"{identity}.key"
+    return identity_folder(folder, identity) / f"{identity}.key"

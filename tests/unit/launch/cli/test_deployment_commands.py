@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import stat
 from pathlib import Path
 
@@ -77,6 +78,28 @@ def test_what_is_missing_is_made_and_what_is_there_kept(laneweave: Here, config:
     status, _, errors = laneweave("config", "check", config, "--role", "bridge")
     assert (status, errors) == (0, [])
     assert laneweave(*init, "--keep", "--force")[0] == 2
+
+
+def test_each_identity_has_a_folder_that_is_enough_for_it(laneweave: Here, config: Path) -> None:
+    folder, elsewhere = config.parent / "authority", config.parent / "certs"
+    init = ("certs", "init", folder, "--config", config, "--separate")
+    assert laneweave(*init)[0] == 0
+    assert laneweave("certs", "add", folder, "client.ops", "--separate")[0] == 0
+    assert {path.name for path in folder.iterdir() if path.is_file()} == {"ca.pem", "ca.key"}
+    for own in filter(Path.is_dir, folder.iterdir()):
+        made = {path.name for path in own.iterdir()}
+        assert made == {"ca.pem", f"{own.name}.pem", f"{own.name}.key"}
+    shutil.copytree(folder / "coordinator.c2", elsewhere / "coordinator.c2")
+    check = ("config", "check", config, "--role", "coordinator", "--name")
+    assert laneweave(*check, "c2")[0] == 0
+    assert laneweave(*check, "c1")[0] == 2
+
+    shutil.rmtree(folder / "bridge")
+    (folder / "bridge").mkdir()  # as a new volume
+    status, out, errors = laneweave(*init, "--keep")
+    assert (status, errors) == (0, [])
+    assert "1 certificates" in out
+    assert (folder / "bridge" / "ca.pem").read_bytes() == (folder / "ca.pem").read_bytes()
 
 
 def test_one_more_certificate(laneweave: Here, tmp_path: Path) -> None:
