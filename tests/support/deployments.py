@@ -45,9 +45,9 @@ def ping(lab: Lab, config: Path) -> Ended:
     return lab.run_forked("ping", "--config", config, alone=False)
 
 
-def start_router(lab: Lab, config: Path) -> subprocess.Popen[str]:
+def start_router(lab: Lab, config: Path, **environment: str) -> subprocess.Popen[str]:
     """Start a router and wait until clients can connect."""
-    router = lab.start("router", "--config", config)
+    router = lab.start("router", "--config", config, **environment)
     lab.wait_until(lambda: ping(lab, config).status == 0, END_S)
     return router
 

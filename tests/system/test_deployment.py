@@ -15,6 +15,7 @@ from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import BRIDGE_ALIVE, Keys
 from support.deployments import REALM, ask, deployment, free_tcp, ping, start_router, stop
+from support.extras import only_for
 from support.harness import END_S, RUN_S, Lab, check_safe_and_complete, events, final_lanes, summary
 from support.service_lab import request, slow_request
 from system.conftest import FinishedRun
@@ -23,18 +24,22 @@ REQUEST = request()
 
 
 def test_roles_by_hand(finished_run: FinishedRun, lab: Lab) -> None:
-    # The other tests here use TCP.
+    # The other tests here use TCP. Each role has only the packages of its image.
     config = deployment(lab, "unixsock-stream/router.sock")
-    router = start_router(lab, config)
-    coordinator = lab.start("coordinator", "--config", config)
-    agents = [lab.start("agent", "--config", config, "--shard", f"{i}/2") for i in range(2)]
+    router = start_router(lab, config, **only_for("router"))
+    coordinator = lab.start("coordinator", "--config", config, **only_for("coordinator"))
+    agents = [
+        lab.start("agent", "--config", config, "--shard", f"{i}/2", **only_for("agent"))
+        for i in range(2)
+    ]
     # Somebody must lead before vehicles come: the answer to a question shows it.
     lab.wait_until(lambda: ask(lab, config, REQUEST).status == 0, END_S)
 
-    bridge = lab.start("bridge", "--config", config, "--pace", "20", "--out", "out")
-    ended = lab.finish(bridge, RUN_S)
+    bridge = ("bridge", "--config", config, "--pace", "20", "--out", "out")
+    ended = lab.finish(lab.start(*bridge, **only_for("bridge")), RUN_S)
 
     assert (ended.status, ended.complaints) == (0, []), ended
+    assert (lab.folder / "out" / "report.html").stat().st_size > 0
     stop(lab, *agents, coordinator)
     assert ping(lab, config).status == 0
     stop(lab, router)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import subprocess
 import tomllib
@@ -12,14 +13,11 @@ from pathlib import Path
 import grimp
 import pytest
 
-from support.commands import python
+from support.commands import LANEWEAVE, python, run
+from support.extras import normal, only_extras, only_for
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOTS = ("agents", "coordinator", "protocol", "sim_bridge", "launch")
-
-
-def _normal(name: str) -> str:
-    return re.sub(r"[-_.]+", "-", name).lower()
 
 
 @pytest.mark.parametrize("root", ROOTS)
@@ -51,40 +49,52 @@ def test_every_dependency_is_pinned_by_name_and_version_only() -> None:
     pinned = set()
     for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines():
         assert re.fullmatch(r"[A-Za-z0-9._-]+==[0-9][A-Za-z0-9.]*", line), line
-        pinned.add(_normal(line.partition("==")[0]))
+        pinned.add(normal(line.partition("==")[0]))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"].values()
     wanted = [*project["dependencies"], *(one for extra in extras for one in extra)]
-    assert {_normal(re.split(r"[\[<>=]", one)[0]) for one in wanted} - {"laneweave"} <= pinned
+    assert {normal(re.split(r"[\[<>=]", one)[0]) for one in wanted} - {"laneweave"} <= pinned
 
 
 CASE_STUDY = "docs/examples/case-study.json"
 ROUTER = "router --endpoint tcp/127.0.0.1:1"
-BASE_INSTALL = """
-import sys
-extras = "osqp libsumo pyarrow matplotlib psutil distributed prometheus_client cryptography"
-extras += " starlette uvicorn websockets"
-for missing in extras.split():
-    sys.modules[missing] = None
-import laneweave.coordinator.process
-from laneweave.launch.cli.main import main
-sys.argv = ["laneweave", *sys.argv[1:]]
-main()
-"""
 
 
-def run_base_install(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return python(BASE_INSTALL, *arguments, cwd=ROOT)
+def run_with(extras: str, command: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | only_extras(*extras.split())
+    return run(LANEWEAVE, *command.split(), cwd=ROOT, env=environment)
 
 
 @pytest.mark.slow
-def test_base_install_plans_and_checks_a_configuration() -> None:
-    done = run_base_install("plan", CASE_STUDY, "--format", "table")
+def test_packages_of_other_extras_are_hidden() -> None:
+    # As the bridge did that drew its report with modules of the agents.
+    environment = os.environ | only_for("bridge")
+    done = python("import matplotlib, osqp", cwd=ROOT, env=environment)
+    assert "No module named 'osqp'" in done.stderr
+    done = python("import osqp", cwd=ROOT, env=os.environ | only_for("agent"))
     assert (done.returncode, done.stderr) == (0, "")
-    assert "cost 7" in done.stdout
-    done = run_base_install("config", "check", "scenarios/compose.toml")
-    assert done.returncode == 0
-    assert "tls/router:7447" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("extras", "command", "says"),
+    [
+        ("", "config check scenarios/compose.toml", "tls/router:7447"),
+        ("plan", f"plan {CASE_STUDY} --format table", "cost 7"),
+        ("certs", "certs init {folder}/certs --separate", "coordinator.c3"),
+        # Nothing is at the endpoint: these commands fail last, with all that they import.
+        ("", "ping --endpoint tcp/127.0.0.1:1", "tcp/127.0.0.1:1"),
+        ("", "status --endpoint tcp/127.0.0.1:1", "tcp/127.0.0.1:1"),
+        ("watch", "watch --endpoint tcp/127.0.0.1:1 --listen 127.0.0.1:0", "tcp/127.0.0.1:1"),
+    ],
+)
+def test_commands_need_only_their_extra(
+    extras: str, command: str, says: str, tmp_path: Path
+) -> None:
+    # `test_roles_by_hand` runs all other roles like this.
+    done = run_with(extras, command.format(folder=tmp_path))
+    assert "not installed" not in done.stderr
+    assert says in done.stdout + done.stderr
 
 
 @pytest.mark.slow
@@ -92,24 +102,41 @@ def test_base_install_plans_and_checks_a_configuration() -> None:
     ("command", "begins", "names"),
     [
         ("run --duration 5", "", "not installed"),
+        (f"plan {CASE_STUDY} --solver branching", "", "[plan]"),
+        ("coordinator --endpoint tcp/127.0.0.1:1", "", "[plan]"),
+        ("agent --endpoint tcp/127.0.0.1:1", "", "[agent]"),
+        ("bridge --endpoint tcp/127.0.0.1:1", "", "[sim]"),
         (f"{ROUTER} --metrics 127.0.0.1:1", "prometheus_client: not installed", "[metrics]"),
+        ("certs init new-folder", "", "laneweave[certs]"),
+        ("watch --endpoint tcp/127.0.0.1:1", "", "laneweave[watch]"),
+    ],
+)
+def test_base_install_names_the_missing_extra(command: str, begins: str, names: str) -> None:
+    assert_refused(run_with("", command), begins, names)
+    assert not (ROOT / "new-folder").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "begins", "names"),
+    [
         (f"plan {CASE_STUDY} --draw plan.png", "", "not installed"),
         (
             f"plan {CASE_STUDY} --draw-road road.png",
             "--draw-road: got 'road.png'",
             "laneweave[agent] and laneweave[sim]",
         ),
-        ("certs init new-folder", "", "laneweave[certs]"),
-        ("watch --endpoint tcp/127.0.0.1:1", "", "laneweave[watch]"),
     ],
 )
-def test_base_install_names_the_missing_extra(command: str, begins: str, names: str) -> None:
-    done = run_base_install(*command.split())
+def test_drawing_a_plan_names_the_missing_extra(command: str, begins: str, names: str) -> None:
+    assert_refused(run_with("plan", command), begins, names)
+
+
+def assert_refused(done: subprocess.CompletedProcess[str], begins: str, names: str) -> None:
     assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith(begins)
     assert names in line
-    assert not (ROOT / "new-folder").exists()
 
 
 @pytest.mark.slow

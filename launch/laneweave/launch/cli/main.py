@@ -26,6 +26,8 @@ SIM_HINT = "the simulation packages: install laneweave[sim]"
 WATCH_HINT = "the web server: install laneweave[watch]"
 INSTALL_HINTS = {
     "distributed": "Dask: install laneweave[dask]",
+    "numba": "the planner: install laneweave[plan]",
+    "scipy": "the numerical routines: install laneweave[plan], for agents laneweave[agent]",
     "osqp": "the quadratic-program solver: install laneweave[agent]",
     "cryptography": "the package for certificates: install laneweave[certs]",
     "prometheus_client": "the package for metrics: install laneweave[metrics]",

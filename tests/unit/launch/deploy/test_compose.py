@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +11,23 @@ import yaml
 from typer.main import get_command
 
 from laneweave.launch.cli.main import command_line
+from laneweave.protocol.config.participants import identities_of
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
+from support.extras import EXTRA_OF_ROLE, PROJECT
 
 ROOT = Path(__file__).resolve().parents[4]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 CONTAINERFILE = (ROOT / "Containerfile").read_text(encoding="utf-8")
-NEEDS = {"agent": "agent", "bridge": "sim", "certs": "certs", "watch": "watch"}
-"""The extra that a role does not run without."""
+STAGES = {
+    name: (parent, text)
+    for parent, name, text in re.findall(
+        r"^FROM (\S+) AS (\S+)\n(.*?)(?=^FROM |\Z)", CONTAINERFILE, re.MULTILINE | re.DOTALL
+    )
+}
+"""The stage below each stage, and its instructions."""
+LARGE = {"plan", "sim"}
 WRITABLE = re.compile(r"^[\w.-]+:(?P<target>/[\w/.-]+)$")
 """A named volume that may be written to."""
 
@@ -32,9 +39,38 @@ def role(service: str) -> str:
     return name
 
 
-def extras(service: str) -> list[str]:
-    text: str = SERVICES[service]["build"]["args"]["EXTRAS"]
-    return text.split(",") if text else []
+def instructions(service: str) -> str:
+    """Return the instructions for a service's image, the lowest stage first."""
+    text, stage = "", SERVICES[service]["build"]["target"]
+    while stage in STAGES:
+        stage, above = STAGES[stage]
+        text = above + text
+    assert stage == "$BASE"
+    return text
+
+
+def extras(service: str) -> set[str]:
+    """Return the extras whose packages a service's image contains."""
+    installed = r"^RUN python \S+/install_extras\.py \S+(.*)$"
+    found = re.findall(installed, instructions(service), re.MULTILINE)
+    return {extra for extras in found for extra in extras.split()}
+
+
+def identity(service: str) -> str:
+    """Return the common name of a service's certificate."""
+    given = parameters(SERVICES[service]["command"])
+    names = {
+        "coordinator": f"coordinator.{given.get('name')}",
+        "agent": f"fleet.{given.get('fleet')}",
+        "watch": "observer.watch",
+    }
+    return names.get(role(service), role(service))
+
+
+def certificates(service: str) -> dict[str, str]:
+    """Return the volumes of certificates that a service mounts, with their places."""
+    mounted = (volume.partition(":") for volume in SERVICES[service]["volumes"])
+    return {name: place for name, _, place in mounted if name.startswith("certs")}
 
 
 def port_of(service: str) -> str:
@@ -92,14 +128,20 @@ def test_permanent_services_have_health_checks_and_restart(service: str) -> None
 
 
 @each_service
-def test_images_have_what_their_role_needs_and_no_more(service: str) -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    known = set(project["optional-dependencies"])
-    needed = {NEEDS[role(service)]} if role(service) in NEEDS else set()
-    assert needed <= set(extras(service)) <= known - {"all", "dev", "dask"}
-    assert "sim" not in set(extras(service)) - needed
-    same = [other for other in SERVICES if SERVICES[other]["image"] == SERVICES[service]["image"]]
-    assert {tuple(extras(other)) for other in same} == {tuple(extras(service))}
+def test_images_have_what_their_role_needs_and_nothing_large_beside_it(service: str) -> None:
+    known = set(PROJECT["optional-dependencies"])
+    needed = {extra} if (extra := EXTRA_OF_ROLE.get(role(service))) else set()
+    assert needed <= extras(service) <= known - {"all", "dev", "dask"}
+    assert not extras(service) & (LARGE - needed)
+    assert SERVICES[service]["image"] == f"laneweave-{SERVICES[service]['build']['target']}"
+    compiles = "warm_up()" in instructions(service)
+    assert compiles == (role(service) == "coordinator")
+
+
+def test_the_base_image_is_an_argument() -> None:
+    (default,) = re.findall(r"^ARG BASE=(\S+)$", CONTAINERFILE, re.MULTILINE)
+    for service in SERVICES.values():
+        assert service["build"]["args"]["BASE"] == f"${{LANEWEAVE_BASE_IMAGE:-{default}}}"
 
 
 @each_service
@@ -110,7 +152,7 @@ def test_containers_have_no_rights_to_misuse(service: str) -> None:
     assert found["cap_drop"] == ["ALL"]
     assert found["security_opt"] == ["no-new-privileges:true"]
     assert "/tmp" in found["tmpfs"]  # noqa: S108 (in the container)
-    users = re.findall(r"^USER (\S+)$", CONTAINERFILE, re.MULTILINE)
+    users = re.findall(r"^USER (\S+)$", instructions(service), re.MULTILINE)
     assert users == ["laneweave"]
 
 
@@ -126,7 +168,9 @@ def test_dependencies_are_services_that_can_be_waited_for(service: str) -> None:
 
 @each_service
 def test_what_a_volume_covers_is_in_the_image_and_belongs_to_the_user(service: str) -> None:
-    made = set(" ".join(re.findall(r"mkdir -p ([^&\\]+)", CONTAINERFILE)).split())
+    made = set(" ".join(re.findall(r"mkdir -p ([^&\\]+)", instructions(service))).split())
+    named = SERVICES[service]["build"]["args"]["IDENTITIES"].split()
+    made |= {f"/certs/{identity}" for identity in named}
     for volume in SERVICES[service]["volumes"]:
         if not volume.startswith("./"):
             assert volume.partition(":")[0] in COMPOSE["volumes"]
@@ -176,18 +220,36 @@ def test_every_coordinator_has_one_container_that_looks_at_its_own_health() -> N
     assert names == [f"c{number + 1}" for number in range(configuration().runtime.coordinators)]
 
 
-def test_certificates_are_made_by_one_and_read_by_all() -> None:
+def test_only_the_service_that_makes_certificates_mounts_the_key_of_the_authority() -> None:
     security = configuration().security
     assert security.mode == "mtls"
-    for name, service in SERVICES.items():
-        (volume,) = [one for one in service["volumes"] if one.startswith("certs:")]
-        rest = "" if role(name) == "certs" else ":ro"
-        assert volume == f"certs:{security.folder}{rest}"
+    for service in SERVICES:
+        assert ("certs" in certificates(service)) == (role(service) == "certs")
+    names = [identity.common_name for identity in identities_of(configuration())]
+    places = {f"certs-{name}": f"{security.folder}/{name}" for name in names if not vehicle(name)}
+    assert certificates("certs") == {"certs": security.folder} | places
+    assert SERVICES["certs"]["build"]["args"]["IDENTITIES"].split() == [
+        name for name in names if not vehicle(name)
+    ]
+
+
+def vehicle(name: str) -> bool:
+    return name.startswith("vehicle.")
+
+
+@each_service
+def test_a_role_mounts_its_own_certificate_and_that_of_its_health_check(service: str) -> None:
+    if role(service) == "certs":
+        return
+    names = {identity(service)} | {f"observer.{word}" for word in check(service)[:1]}
+    folder = configuration().security.folder
+    assert certificates(service) == {f"certs-{name}": f"{folder}/{name}:ro" for name in names}
 
 
 def test_the_image_is_made_of_files_that_exist() -> None:
-    for source in re.findall(r"^COPY (?!--from)(\S+) ", CONTAINERFILE, re.MULTILINE):
-        assert (ROOT / source).exists()
+    for sources in re.findall(r"^COPY (?!--from)(.+) \S+$", CONTAINERFILE, re.MULTILINE):
+        assert all((ROOT / source).exists() for source in sources.split())
     needed = re.findall(r"lib\w+[\d-]*\d", (ROOT / "README.md").read_text(encoding="utf-8"))
     (debian,) = re.findall(r"--no-install-recommends \\\n\s+([^\\]+) \\", CONTAINERFILE)
-    assert set(debian.split()) <= set(needed)
+    (unpacked,) = re.findall(r"apt-get download (\S+)", CONTAINERFILE)
+    assert {*debian.split(), unpacked} == set(needed)
