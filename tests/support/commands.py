@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from attrs import frozen
+from typer.main import get_command
 
 from laneweave.launch.cli import main as cli
 
@@ -40,6 +41,17 @@ def loads(module: str, other: str) -> bool:
     done = python(program)
     assert done.returncode == 0, done.stderr
     return done.stdout == "True\n"
+
+
+def parameters(words: list[str]) -> dict[str, Any]:
+    """Parse a command line as the command itself does, and return its options."""
+    group: Any = get_command(cli.command_line())
+    command = group.commands[words[0]]
+    words = words[1:]
+    while hasattr(command, "commands"):
+        command, words = command.commands[words[0]], words[1:]
+    found: dict[str, Any] = command.make_context("laneweave", list(words)).params
+    return found
 
 
 @frozen

@@ -8,12 +8,11 @@ from typing import Any
 
 import pytest
 import yaml
-from typer.main import get_command
 
-from laneweave.launch.cli.main import command_line
 from laneweave.protocol.config.participants import identities_of
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
+from support.commands import parameters
 from support.extras import EXTRA_OF_ROLE, PROJECT
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -51,7 +50,7 @@ def instructions(service: str) -> str:
 
 def extras(service: str) -> set[str]:
     """Return the extras whose packages a service's image contains."""
-    installed = r"^RUN python \S+/install_extras\.py \S+(.*)$"
+    installed = r"^RUN python \S+/install_extras\.py \S+([\w ]*)"
     found = re.findall(installed, instructions(service), re.MULTILINE)
     return {extra for extras in found for extra in extras.split()}
 
@@ -90,17 +89,6 @@ def check(service: str) -> list[str]:
     kind, program, *words = SERVICES[service].get("healthcheck", {"test": ["CMD", "none"]})["test"]
     assert kind == "CMD"
     return words if program == "laneweave" else []
-
-
-def parameters(words: list[str]) -> dict[str, Any]:
-    """Parse a command line as the command itself does."""
-    group: Any = get_command(command_line())
-    command = group.commands[words[0]]
-    words = words[1:]
-    while hasattr(command, "commands"):
-        command, words = command.commands[words[0]], words[1:]
-    found: dict[str, Any] = command.make_context("laneweave", list(words)).params
-    return found
 
 
 def configuration() -> Scenario:
