@@ -16,7 +16,7 @@ export OPENBLAS_NUM_THREADS := 1
 # Keep compiled modules: every process of a run would otherwise compile the project again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-unit test-full evaluation evaluation-faults docs check format clean install help
+.PHONY: demo test test-unit test-full containers evaluation evaluation-faults docs check format clean install help
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 19
@@ -54,6 +54,9 @@ test: $(STAMP) ## run the tests that CI runs
 
 test-full: $(STAMP) ## run all tests, including the long ones
 	$(PYTEST)
+
+containers: $(STAMP) ## build the images of compose.yaml and run the deployment in containers (needs podman or docker)
+	$(BIN)/pytest -m full tests/system/test_containers.py
 
 evaluation: $(STAMP) ## run the evaluation and write the tables of docs/EVALUATION.md (BUDGET=90 minutes on 2 cores)
 	$(BIN)/python benchmarks/evaluate.py --budget $(BUDGET)

@@ -1,0 +1,150 @@
+"""The deployment of compose.yaml in containers: `make containers`."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from support.engine import (
+    Containers,
+    Engine,
+    EngineUnavailableError,
+    find_engine,
+    open_containers,
+    substituted,
+)
+from support.hosts import compose, lasts
+
+RUN_S = 600.0
+"""Three times the duration of the run."""
+MB = 1_000_000
+SIZES_MB = {"base": 200, "agent": 330, "coordinator": 530, "sim": 900}
+"""Largest size of each image, without the base image."""
+TOGETHER = 1.25
+"""Largest size of all images together, as a multiple of the largest one, over any base image: 1.18
+over one of 300 MB, 1.21 over one of 130 MB."""
+PARENT = {
+    "base": "base-packages",
+    "agent": "agent-packages",
+    "coordinator": "agent-packages",
+    "sim": "agent-packages",
+}
+"""The highest stage of Containerfile that each target shares with another one."""
+PICTURES = {"comfort", "path_map", "road", "spacing", "speed", "travel_time"}
+
+pytestmark = [pytest.mark.full, pytest.mark.timeout(3600)]
+
+
+@pytest.fixture
+def engine() -> Engine:
+    try:
+        return find_engine()
+    except EngineUnavailableError as error:
+        pytest.skip(f"there is no container engine here: {error}")
+
+
+@pytest.fixture
+def containers(engine: Engine) -> Iterator[Containers]:
+    with open_containers(engine) as opened:
+        yield opened
+    assert opened.left("ps", "--all") == opened.left("volume", "ls") == []
+
+
+def test_the_deployment_runs_in_containers(
+    containers: Containers, capsys: pytest.CaptureFixture[str]
+) -> None:
+    began_s = time.monotonic()
+    figures = build(containers.engine)
+    figures.append(f"all images built within {time.monotonic() - began_s:.0f} s")
+
+    containers.up()
+    assert containers.wait_ended("certs", 60.0) == 0
+    roles = [name for name, service in containers.services.items() if lasts(service)]
+    containers.wait_healthy(*roles)
+    check_secrets(containers)
+
+    leader = status(containers)["leader"]
+    for service in (f"coordinator-{leader.removeprefix('c')}", "router", "agents-1"):
+        containers.kill(service)
+        containers.wait_healthy(*roles)
+        assert status(containers)["healthy"]
+
+    assert containers.wait_ended("bridge", RUN_S) == 0
+    assert status(containers)["healthy"]
+    check_run(containers)
+    containers.down()
+    figures.append(f"everything done within {time.monotonic() - began_s:.0f} s")
+    with capsys.disabled():
+        print("", *figures, sep="\n")  # noqa: T201
+
+
+def build(engine: Engine) -> list[str]:
+    """Build all images, check their sizes, and return the sizes as text."""
+    builds = {service["image"]: service["build"] for service in compose()["services"].values()}
+    images = {how["target"]: image for image, how in builds.items()}
+    assert images.keys() == SIZES_MB.keys()
+    for image, how in builds.items():
+        engine.build(how["target"], image, how["args"])
+    arguments = next(iter(builds.values()))["args"]
+    shared = {stage: f"laneweave-test-{stage}" for stage in PARENT.values()}
+    for stage, tag in shared.items():
+        engine.build(stage, tag, arguments)
+    base_size = engine.size(substituted(arguments["BASE"]))
+
+    sizes = {target: engine.size(image) for target, image in images.items()}
+    own = {}
+    for target, image in images.items():
+        below = shared[PARENT[target]]
+        layers = engine.layers(below)
+        assert engine.layers(image)[: len(layers)] == layers
+        own[target] = sizes[target] - engine.size(below)
+    largest = max(sizes.values())
+    together = engine.size(shared["agent-packages"]) + sum(own.values())
+    for tag in shared.values():
+        engine("image", "rm", tag)
+
+    lines = [f"{target}: {size / MB:.0f} MB" for target, size in sizes.items()]
+    lines.append(f"base image: {base_size / MB:.0f} MB")
+    lines.append(f"together: {together / MB:.0f} MB, {together / largest:.2f} times the largest")
+    for target, size in sizes.items():
+        assert (size - base_size) / MB <= SIZES_MB[target], lines
+    assert together <= TOGETHER * largest, lines
+    return lines
+
+
+def check_secrets(containers: Containers) -> None:
+    """Check that every volume and every service has only the keys that it should have."""
+    assert containers.files("certs") == {"./ca.pem", "./ca.key"}
+    for service, how in containers.services.items():
+        mounted = [volume.split(":") for volume in how["volumes"]]
+        names = {name.removeprefix("certs-") for name, *_ in mounted if name.startswith("certs-")}
+        for name in names:
+            files = {"./ca.pem", f"./{name}.pem", f"./{name}.key"}
+            assert containers.files(f"certs-{name}") == files
+        if lasts(how):
+            found = containers.execute(service, "find", "/certs", "-name", "*.key").split()
+            assert set(found) == {f"/certs/{name}/{name}.key" for name in names}
+            assert containers.execute(service, "id", "-u").strip() == "10001"
+
+
+def status(containers: Containers) -> dict[str, Any]:
+    """Return what `laneweave status` reports."""
+    words = ["laneweave", "status", "--config", "/scenarios/compose.toml", "--json"]
+    found: dict[str, Any] = json.loads(containers.execute("agents-2", *words))
+    return found
+
+
+def check_run(containers: Containers) -> None:
+    """Check the files of the run in the volume `runs`: one run, which is complete."""
+    (folder,) = containers.in_volume("runs", "ls").split()
+    summary = json.loads(containers.in_volume("runs", "cat", f"{folder}/summary.json"))
+    vehicles = summary["vehicles"]
+    assert summary["ending"] == "complete"
+    assert vehicles["left"] == vehicles["entered"] == vehicles["demanded"] > 0
+    assert summary["safety"]["overlaps"] == 0
+    pictures = {f"./{folder}/{name}.png" for name in PICTURES}
+    assert pictures | {f"./{folder}/report.html"} <= containers.files("runs")
