@@ -6,6 +6,7 @@ Environment variables: `CONTAINER_BUILD_OPTIONS` has more options for the engine
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -112,7 +113,8 @@ class Containers:
 
     def down(self) -> None:
         """Remove all containers and volumes, also those of a project that did not start fully."""
-        self._compose("down", "--volumes", within_s=UP_S, check=False)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._compose("down", "--volumes", within_s=UP_S, check=False)
         for name in self.left("ps", "--all"):
             self.engine("rm", "--force", name, check=False)
         for name in self.left("volume", "ls"):
