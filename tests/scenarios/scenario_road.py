@@ -29,7 +29,7 @@ from laneweave.protocol.wire.messages import (
     Sense,
     VehicleState,
 )
-from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, STATE
+from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, STATE, Topic
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.attendance import Attendance
 from laneweave.sim_bridge.road.demand import Arrival
@@ -166,13 +166,13 @@ class Agent:
     def sense(self, tick: int) -> None:
         """Get the SENSE of a tick; `command` is the answer, or none."""
         self.tick, self.command = tick, None
-        self._note(self._core.handle(self._arrived(SENSE, self.vehicle.sense(tick)), 0.0))
+        self._handle(SENSE, self.vehicle.sense(tick))
 
     def get(self, message: Prepare | Plan, tick: int, *, noted: bool = True) -> None:
         del tick
         topic = PLAN if isinstance(message, Plan) else PREPARE
         before = self.command
-        self._note(self._core.handle(self._arrived(topic, message), 0.0))
+        self._handle(topic, message)
         asked = self.command
         # What is to be noted goes to the controller at once, and back: within one vehicle.
         if not noted:
@@ -183,13 +183,16 @@ class Agent:
             and self.vehicle.road.controller.store_requests(asked)
         ):
             sense = self.vehicle.sense(self.tick)
-            self._note(self._core.handle(self._arrived(SENSE, sense), 0.0))
+            self._handle(SENSE, sense)
 
     def hear(self, state: VehicleState) -> None:
-        self._note(self._core.handle(self._arrived(STATE, state), 0.0))
+        self._handle(STATE, state)
 
-    def _arrived(self, topic: object, message: object) -> Arrived:
-        return Arrived(topic, {"vehicle": self.vehicle.name}, message)  # type: ignore[arg-type]
+    def _handle(self, topic: Topic, message: object) -> None:
+        """Let it handle a message; its clock is the road's."""
+        now_s = max(self.tick, 0) * self.vehicle.scenario.runtime.tick_s
+        arrived = Arrived(topic, {"vehicle": self.vehicle.name}, message)
+        self._note(self._core.handle(arrived, now_s))
 
     def _note(self, effects: Iterable[Effect]) -> None:
         for effect in effects:

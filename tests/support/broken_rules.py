@@ -201,7 +201,7 @@ def any_has_promised(me: FormationLeader, _: object) -> bool:
 
 def take_old_states(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(
-        FormationLeader, "_is_news", lambda me, state: state.vehicle in me.formation.roster
+        FormationLeader, "_is_news", lambda me, state, _: state.vehicle in me.formation.roster
     )
 
 
@@ -351,9 +351,9 @@ def note_by_itself(patch: pytest.MonkeyPatch) -> None:
 def keep_incarnation(patch: pytest.MonkeyPatch) -> None:
     sense = AgentCore._on_sense
 
-    def mutant(self: AgentCore, message: Any) -> Any:  # noqa: ANN401
+    def mutant(self: AgentCore, message: Any, now_s: float) -> Any:  # noqa: ANN401
         # As if there had been no caretaker: earlier promises still count.
-        return sense(self, evolve(message, attendant=self._incarnation))
+        return sense(self, evolve(message, attendant=self._incarnation), now_s)
 
     patch.setattr(AgentCore, "_on_sense", mutant)
 

@@ -12,7 +12,9 @@ caretaker is in charge (because the agent hung or its messages were lost), the a
 incarnation and claims the vehicle again.
 
 **The road.** A SENSE names its bridge. A newer bridge has another road and begins at tick 0: the
-agent discards its state, takes a new incarnation, and ignores late messages from the old bridge.
+agent discards its state, takes a new incarnation, and ignores late messages from the old bridge. It
+does the same if only lower ticks, or only an older bridge, are shown for a while: then what seemed
+to be newer was wrong.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from collections.abc import Callable
 from attrs import evolve
 
 from laneweave.agents.driving.driver import Driver, SolverStats, TrackingDriver
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import PlannedMove, stretch_of
 from laneweave.protocol.runtime.node import (
     Announce,
@@ -29,6 +32,7 @@ from laneweave.protocol.runtime.node import (
     Effect,
     Event,
     Listen,
+    Refuse,
     Send,
     Started,
     Stopping,
@@ -38,6 +42,7 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
+from laneweave.protocol.wire.bounds import Bounds, check_ballot
 from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import (
     Command,
@@ -49,6 +54,7 @@ from laneweave.protocol.wire.messages import (
     Sense,
     VehicleState,
 )
+from laneweave.protocol.wire.newest import NewestRoad
 from laneweave.protocol.wire.topics import (
     COMMAND,
     MOTION,
@@ -88,6 +94,11 @@ class AgentCore:
         self._scenario = scenario
         self._new_incarnation = new_incarnation
         self._incarnation = new_incarnation()
+        self._raised = False
+        """Whether the incarnation is above the clock because that of a process in charge was."""
+        runtime = scenario.runtime
+        self._bounds = Bounds(self._incarnation, runtime.tick_s, runtime.max_road_s)
+        self._road = NewestRoad(runtime.max_pace)
         self._driver = make_driver(scenario)
         self._rules = rules
         self.wanted_motions: tuple[int, ...] = ()
@@ -125,11 +136,13 @@ class AgentCore:
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Handle an event; see `Core`."""
-        del now_s
         if isinstance(event, Arrived):
             message = event.message
             if isinstance(message, Sense):
-                effects = self._on_sense(message)
+                try:
+                    effects = self._on_sense(message, now_s)
+                except BadInputError as error:
+                    return [Refuse(error)]
             elif self.in_charge:
                 effects = self._on_message(message)
             else:
@@ -167,6 +180,10 @@ class AgentCore:
             case VehicleState():
                 execution.on_state(message)
             case Prepare():
+                try:
+                    check_ballot(message.ballot, self._road.t_s)
+                except BadInputError as error:
+                    return [Refuse(error)]
                 if execution.on_prepare(message):
                     return [*self._request_storage(execution), self._state()]
             case Plan():
@@ -178,12 +195,17 @@ class AgentCore:
 
     # --- the tick -----------------------------------------------------------------------------
 
-    def _on_sense(self, sense: Sense) -> list[Effect]:
+    def _on_sense(self, sense: Sense, now_s: float) -> list[Effect]:
         if sense.vehicle != self.vehicle:
             return []
-        if self._sense is not None and sense.bridge != self._sense.bridge:
-            if sense.bridge < self._sense.bridge:
-                return []
+        road = self._road
+        self._bounds.check(sense, road.latest_s(now_s), now_s)
+        number = road.number
+        if (not sense.bridge and road.bridge > 0) or not road.on_message(
+            sense.bridge, sense.t_s, now_s
+        ):
+            return []
+        if road.number != number and self._sense is not None:
             self._forget_road()
         if sense.left:
             return self.leave()
@@ -197,7 +219,10 @@ class AgentCore:
             self._command, self.wanted_motions = None, ()
             if not sense.caretaker:
                 return []  # another agent is in charge
-            self._incarnation = above(self._new_incarnation(), sense.attendant)
+            self._claim_above(sense.attendant)
+        elif sense.attendant < self._incarnation and self._raised:
+            # The attendant of an earlier SENSE may have been wrong, and the claim too high.
+            self._claim_above(sense.attendant)
         in_charge = self.in_charge
         if not (was_in_charge and in_charge):
             # Repeated while a claim is pending, since another process may still begin a move.
@@ -268,9 +293,15 @@ class AgentCore:
 
     def _forget_road(self) -> None:
         """Discard the state of an earlier bridge's vehicle, as after a restart (V1)."""
-        self._incarnation = self._new_incarnation()
+        self._incarnation, self._raised = self._new_incarnation(), False
         self._sense = self._command = self._move = self.execution = None
         self.wanted_motions, self.wanted_states = (), ()
+
+    def _claim_above(self, attendant: int) -> None:
+        """Take a new incarnation, above that of the process in charge."""
+        number = self._new_incarnation()
+        self._incarnation = above(number, attendant)
+        self._raised = self._incarnation != number
 
     def _take_over(self, sense: Sense) -> None:
         """V1: continue the motion controller's current motion."""

@@ -8,6 +8,7 @@ from typing import ClassVar
 from attrs import frozen
 
 from laneweave.agents.core import AgentCore
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import MetricsSnapshot, metric
 from laneweave.protocol.runtime.node import (
     Arrived,
@@ -17,6 +18,7 @@ from laneweave.protocol.runtime.node import (
     Listen,
     PeerDown,
     PeerUp,
+    Refuse,
     Started,
     Stopping,
     Unlisten,
@@ -24,7 +26,9 @@ from laneweave.protocol.runtime.node import (
     Watch,
 )
 from laneweave.protocol.scenario.deployment_fields import Shard
+from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.messages import Census, Motion, Name, VehicleState
+from laneweave.protocol.wire.newest import NewestRoad
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,
@@ -58,8 +62,16 @@ class AgentHost:
         make_agent: Callable[[Name], AgentCore],
         vehicles: Iterable[Name] = (),
         shard: Shard | None = None,
+        bounds: Bounds | None = None,
     ) -> None:
-        """Host the named vehicles, or all announced vehicles of a shard."""
+        """Host the named vehicles, or all announced vehicles of a shard.
+
+        Args:
+            make_agent: returns the agent of a vehicle.
+            vehicles: names of the vehicles; empty with a shard.
+            shard: share of the announced vehicles.
+            bounds: limits of received numbers; None: none.
+        """
         self._make_agent = make_agent
         self._shard = shard
         self._agents: dict[Name, AgentCore] = {name: make_agent(name) for name in vehicles}
@@ -70,9 +82,8 @@ class AgentHost:
         """Stretches whose motions each vehicle needed at the last update."""
         self._states: list[tuple[int, ...]] = []
         """Blocks whose states each vehicle needed at the last update."""
-        self._census_s = 0.0
-        self._bridge = -1
-        """Incarnation of the newest bridge."""
+        self._bounds = bounds
+        self._road = NewestRoad()
         self._no_bridge_since_s: float | None = 0.0
         """Time at which the bridge was lost; None: a bridge is up."""
         self._solves = self._unusable = 0
@@ -108,11 +119,14 @@ class AgentHost:
                     agent.on_motion(motion)
             return []
         hosted = bool(self._agents)
-        if isinstance(event, Arrived):
-            effects = self._on_message(event, now_s)
-        else:
-            effects = self._on_event(event, now_s)
-            self._update_subscriptions(effects)
+        try:
+            if isinstance(event, Arrived):
+                effects = self._on_message(event, now_s)
+            else:
+                effects = self._on_event(event, now_s)
+                self._update_subscriptions(effects)
+        except BadInputError as error:
+            return [Refuse(error)]
         if hosted and not self._agents and self._shard is None:
             effects.append(End())  # last, since the node then disconnects
         return effects
@@ -126,10 +140,12 @@ class AgentHost:
                     effects.append(Listen(CENSUS))
                 return effects + self._dispatch_to_all(event, now_s)
             case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
-                return self._on_bridge(incarnation_of(parameters))
+                incarnation = incarnation_of(parameters)
+                if self._bounds is not None:
+                    self._bounds.check_incarnation(incarnation, now_s)
+                return self._on_bridge(incarnation, now_s) if incarnation >= 0 else []
             case PeerDown(topic, parameters) if topic is BRIDGE_ALIVE:
-                if incarnation_of(parameters) == self._bridge:
-                    self._no_bridge_since_s = now_s
+                return self._on_bridge_down(incarnation_of(parameters), now_s)
             case Wakeup() if self.wakeup_s is not None and now_s >= self.wakeup_s:
                 return [End()]
             case Stopping():
@@ -160,18 +176,30 @@ class AgentHost:
             effects += agent.handle(event, now_s)
         return effects
 
-    def _on_bridge(self, incarnation: int) -> list[Effect]:
+    def _on_bridge(self, incarnation: int, now_s: float) -> list[Effect]:
         """Handle a bridge's token; agents of named vehicles detect a new bridge by its SENSE."""
+        known = self._road.bridge
+        self._road.on_token_up(incarnation, now_s)
+        if self._road.bridge == incarnation:
+            self._no_bridge_since_s = None
+        return [] if self._road.bridge == known or known < 0 else self._leave_road()
+
+    def _on_bridge_down(self, incarnation: int, now_s: float) -> list[Effect]:
+        known = self._road.bridge
+        self._road.on_token_down(incarnation, now_s)
+        if self._road.bridge != known:
+            return self._leave_road()  # an earlier bridge still has its token
+        if incarnation == known:
+            self._no_bridge_since_s = now_s
+        return []
+
+    def _leave_road(self) -> list[Effect]:
+        """End all agents of a shard, because its road is another one."""
         effects: list[Effect] = []
-        if incarnation < max(self._bridge, 0):
-            return effects  # from an earlier run, or not a bridge
-        self._no_bridge_since_s = None
-        if self._shard is not None and self._bridge not in (-1, incarnation):
+        if self._shard is not None:
             for name in list(self._agents):
                 effects += self._remove(name).leave()
             self._seen.clear()
-            self._census_s = 0.0
-        self._bridge = incarnation
         return effects
 
     def _remove(self, name: Name) -> AgentCore:
@@ -195,10 +223,14 @@ class AgentHost:
 
     def _on_census(self, census: Census, now_s: float) -> list[Effect]:
         effects: list[Effect] = []
-        shard, same_road = self._shard, census.bridge in (0, self._bridge)
-        if shard is None or not same_road or census.t_s < self._census_s:
+        shard, road = self._shard, self._road
+        if shard is None or census.bridge not in (0, road.bridge):
             return effects
-        self._census_s = census.t_s
+        if self._bounds is not None:
+            self._bounds.check(census, road.latest_s(now_s), now_s)
+        road.on_message(census.bridge, census.t_s, now_s)
+        if census.t_s < road.t_s:
+            return effects  # late
         listed = dict.fromkeys(entry.vehicle for entry in census.announced)
         listed |= dict.fromkeys(entry.vehicle for entry in census.on_road)
         for name in listed:

@@ -16,6 +16,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.messages import Name, Sense
 
@@ -62,10 +63,11 @@ def run_agents(
     Raises:
         BadInputError: no router answers at the endpoint.
     """
-    incarnations = Incarnations()
+    incarnations, runtime = Incarnations(), scenario.runtime
     host = AgentHost(
         lambda vehicle: AgentCore(vehicle, incarnations, scenario),
         [Name(vehicle) for vehicle in vehicles],
         shard,
+        Bounds(incarnations(), runtime.tick_s, runtime.max_road_s),
     )
     run_core(wrap(host), access, observe=observe)

@@ -17,6 +17,7 @@ from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
 from laneweave.coordinator.rolling.operation import RollingOperation
 from laneweave.coordinator.service.server import PlanningService
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import MetricsSnapshot, metric
 from laneweave.protocol.runtime.node import (
     Announce,
@@ -28,6 +29,7 @@ from laneweave.protocol.runtime.node import (
     PeerDown,
     PeerUp,
     QueryArrived,
+    Refuse,
     Send,
     Serve,
     Started,
@@ -38,6 +40,7 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.wire.bounds import Bounds, max_election_term
 from laneweave.protocol.wire.events import LEADER_ELECTED, LEADER_STEPPED_DOWN
 from laneweave.protocol.wire.messages import (
     Ballot,
@@ -49,6 +52,7 @@ from laneweave.protocol.wire.messages import (
     RoadClock,
     VehicleState,
 )
+from laneweave.protocol.wire.newest import NewestRoad
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,
@@ -110,8 +114,12 @@ class CoordinatorCore:
         self.service = PlanningService(
             name, scenario.service, workers, plan, scenario.formation.solver
         )
+        runtime = scenario.runtime
+        self._bounds = Bounds(incarnation, runtime.tick_s, runtime.max_road_s)
+        self._road = NewestRoad(runtime.max_pace)
+        self._road_number = 0
+        """Number of the road that the census and the operation are about."""
         self.census: Census | None = None
-        self.t_s = 0.0
         self._formation_of: dict[Name, int] = {}
         """Block that each vehicle in the census entered."""
         self._handled_s = self._awake_since_s = 0.0
@@ -119,8 +127,8 @@ class CoordinatorCore:
         self._incarnation = incarnation
         self._seq = 0
         self._last_job = 0
-        self._bridge = -1
-        """Incarnation of the newest bridge."""
+        self._of_this_road = True
+        """Whether the newest clock or census is of the newest road."""
         self._road_changed = True
         self._next_heartbeat_s = 0.0
         self._next_report_s = 0.0
@@ -156,6 +164,11 @@ class CoordinatorCore:
         )
 
     @property
+    def t_s(self) -> float:
+        """Road time."""
+        return self._road.t_s
+
+    @property
     def wakeup_s(self) -> float | None:
         """Time of the next heartbeat, report, election timeout or other timer."""
         return self._wakeup_s
@@ -166,6 +179,10 @@ class CoordinatorCore:
             # After a pause, a leader knows no more than a newly elected one.
             self._awake_since_s = now_s
         self._handled_s = now_s
+        try:
+            self._check(event, now_s)
+        except BadInputError as error:
+            return [Refuse(error)]
         if isinstance(event, Arrived) and isinstance(event.message, VehicleState):
             outcomes = self._on_state(event.message, now_s)
             if outcomes is None and self._wakeup_s is not None and now_s < self._wakeup_s:
@@ -183,6 +200,37 @@ class CoordinatorCore:
 
     # --- inputs -------------------------------------------------------------------------------
 
+    def _check(self, event: Event, now_s: float) -> None:
+        """Check the numbers of an event, and register the road that it shows.
+
+        Raises:
+            BadInputError: a number is out of bounds.
+        """
+        road = self._road
+        match event:
+            case Arrived(_, _, message):
+                self._bounds.check(message, road.latest_s(now_s), now_s)
+                if isinstance(message, (RoadClock, Census)):
+                    self._of_this_road = road.on_message(message.bridge, message.t_s, now_s)
+            case PeerUp(_, {"incarnation": _} as parameters):
+                incarnation = incarnation_of(parameters)
+                self._bounds.check_incarnation(incarnation, now_s)
+                if event.topic is BRIDGE_ALIVE:
+                    road.on_token_up(incarnation, now_s)
+            case PeerDown(topic, parameters) if topic is BRIDGE_ALIVE and self.election.link_up:
+                road.on_token_down(incarnation_of(parameters), now_s)
+            case _:
+                pass
+        if road.number != self._road_number:
+            self._forget_road()
+
+    def _forget_road(self) -> None:
+        """Discard everything about another road, or about a road time that was wrong."""
+        self._road_number = self._road.number
+        self.census = None
+        self._formation_of = {}
+        self.operation.forget()
+
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
         match event:
             case Started():
@@ -193,8 +241,6 @@ class CoordinatorCore:
                 self._on_candidate(*_identity(parameters), now_s)
             case PeerDown(topic, parameters) if topic is COORDINATOR_ALIVE:
                 self.election.on_token_down(*_identity(parameters))
-            case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
-                self._on_bridge(incarnation_of(parameters))
             case LinkUp() | LinkDown():
                 self.election.on_link(up=isinstance(event, LinkUp), now_s=now_s)
             case QueryArrived(token, payload, encoding):
@@ -227,29 +273,14 @@ class CoordinatorCore:
             log.warning("another coordinator has the same name", coordinator=name)
         self.election.on_token_up(name, incarnation, now_s)
 
-    def _on_bridge(self, incarnation: int) -> None:
-        """Reset the road state if the bridge is new; road time starts again at 0."""
-        if incarnation > self._bridge:
-            self._bridge = incarnation
-            self.census = None
-            self._formation_of = {}
-            self.t_s = 0.0
-            self.operation.forget()
-
-    def _is_of_this_road(self, message: RoadClock | Census) -> bool:
-        """Register the bridge that sent a message; return whether it is the newest one."""
-        if message.bridge:
-            self._on_bridge(message.bridge)
-        return message.bridge in (0, self._bridge)
-
     def _on_message(self, message: object, now_s: float) -> None:
         match message:
             case Heartbeat():
                 self.election.on_heartbeat(message, now_s)
-            case RoadClock() | Census() if not self._is_of_this_road(message):
+            case RoadClock() | Census() if not self._of_this_road:
                 pass
             case RoadClock():
-                self.t_s = max(self.t_s, message.t_s)
+                self.election.limit_term(max_election_term(self.t_s))
                 self.operation.on_clock(self.t_s, now_s)
                 self._road_changed = True
             case Census():
@@ -259,7 +290,6 @@ class CoordinatorCore:
                     self._formation_of = {
                         entry.vehicle: block_of(entry.cell[0]) for entry in message.on_road
                     }
-                    self.t_s = max(self.t_s, message.t_s)
                     self._road_changed = True
             case _:
                 pass
@@ -326,9 +356,9 @@ class CoordinatorCore:
         self._seq += 1
         ballot = Ballot(self.election.term, self.name, self._incarnation, self._seq)
         if above is not None and ballot < above:
-            # Terms can be equal if two candidates did not receive each other's heartbeats.
-            self.election.raise_term(above.term)
-            ballot = ballot._replace(term=self.election.term)
+            # Terms can be equal if two candidates did not receive each other's heartbeats. The term
+            # of the election stays, since a vehicle may report any term.
+            ballot = ballot._replace(term=above.term + 1)
         return ballot
 
     def _effects(self, outcomes: Iterable[Effect | LogEntry]) -> Iterator[Effect]:

@@ -13,12 +13,11 @@ from collections.abc import Iterator
 
 from attrs import define, field
 
+from laneweave.protocol.wire.bounds import max_election_term
 from laneweave.protocol.wire.messages import Heartbeat, Name
 
 NEWCOMER_FACTOR = 1.5
 """Number of election timeouts that a leader waits for a higher-ranked new candidate to lead."""
-MAX_TERM = 2**62
-"""Higher terms are ignored, so that later terms fit in 64-bit integers."""
 
 
 @define
@@ -41,6 +40,8 @@ class Election:
     started_s: float
     term: int = 0
     """Highest term seen; the candidate's own term while it leads."""
+    max_term: int = max_election_term(0.0)
+    """Higher terms are not adopted; grows with road time."""
     leading: bool = False
     link_up: bool = True
     won: int = 0
@@ -59,7 +60,11 @@ class Election:
         if (heartbeat.coordinator, heartbeat.incarnation) in self._dead:
             return
         known = self._peers.get(heartbeat.coordinator)
-        if known is not None and known.incarnation > heartbeat.incarnation:
+        if (
+            known is not None
+            and known.incarnation > heartbeat.incarnation
+            and now_s < known.last_contact_s + self.election_s
+        ):
             return
         peer = self._on_contact(heartbeat.coordinator, heartbeat.incarnation, now_s)
         peer.leading = heartbeat.leading
@@ -105,9 +110,14 @@ class Election:
 
     def see_term(self, term: int) -> None:
         """Adopt a higher term; a leader continues one term above it."""
-        if self.term < term <= MAX_TERM:
+        if self.term < term <= self.max_term:
             # A leader that was paused while another led must not continue below the other's term.
             self.term = term + 1 if self.leading else term
+
+    def limit_term(self, max_term: int) -> None:
+        """Set the maximum term, and continue with it after a term that is no longer possible."""
+        self.max_term = max_term
+        self.term = min(self.term, max_term)
 
     def update(self, now_s: float) -> bool:
         """Decide whether to lead; return whether the decision has changed."""
@@ -125,10 +135,6 @@ class Election:
             self.term += 1
             self.won += 1
         return True
-
-    def raise_term(self, above: int) -> None:
-        """Raise the term above the term of a ballot that a vehicle has reported (L3)."""
-        self.term = max(self.term, above + 1)
 
     def living(self, now_s: float) -> Iterator[str]:
         """Yield the other candidates with a contact within the election timeout."""

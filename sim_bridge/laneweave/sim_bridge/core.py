@@ -27,6 +27,7 @@ from laneweave.protocol.runtime.node import (
     Event,
     Listen,
     PeerUp,
+    Refuse,
     Send,
     Started,
     Stopping,
@@ -34,6 +35,7 @@ from laneweave.protocol.runtime.node import (
     Watch,
 )
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.wire.bounds import Bounds, check_ballot
 from laneweave.protocol.wire.events import AGENT_MISSING, AGENT_SILENT
 from laneweave.protocol.wire.messages import (
     Command,
@@ -137,6 +139,8 @@ class BridgeCore:
         self._min_tick_duration_s = min(self._tick_duration_s, tick_s / max_pace)
         self._incarnation = incarnation
         self._stopwatch = stopwatch
+        runtime = scenario.runtime
+        self._bounds = Bounds(incarnation, runtime.tick_s, runtime.max_road_s)
         self._attendance = Attendance(scenario, new_incarnation)
         self._answers = self._attendance.answers
         self._at_entrance: list[RoadVehicle] = []
@@ -189,10 +193,13 @@ class BridgeCore:
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Handle an event; see `Core`."""
-        if isinstance(event, Arrived) and isinstance(event.message, Command):
-            effects = self._on_command(event.message)  # most events
-        else:
-            effects = list(self._on_event(event, now_s))
+        try:
+            if isinstance(event, Arrived) and isinstance(event.message, Command):
+                effects = self._on_command(event.message, now_s)  # most events
+            else:
+                effects = list(self._on_event(event, now_s))
+        except BadInputError as error:
+            effects = [Refuse(error)]
         if self.phase is not TickPhase.ANSWERS or self._answers.complete(now_s):
             effects += self._proceed(now_s)
         return effects
@@ -229,23 +236,27 @@ class BridgeCore:
         match message:
             case Prepare() | Plan():
                 vehicle = Name(parameters["vehicle"])
+                check_ballot(message.ballot, self.t_s)
                 yield from self._attendance.on_message(vehicle, message, self.tick)
             case Report():
                 self._on_report(message)
             case LogEvent():
                 self._record.on_event(message)
             case Heartbeat():
+                self._bounds.check(message, self.t_s, now_s)
                 self._record.on_heartbeat(message, self.t_s, now_s)
             case _:
                 pass
 
-    def _on_command(self, command: Command) -> list[Effect]:
+    def _on_command(self, command: Command, now_s: float) -> list[Effect]:
         effects: list[Effect] = []
         name = command.vehicle
         vehicle = self.vehicles.get(name)
         if vehicle is None:
             return effects
         attendant = vehicle.controller.attendant
+        self._bounds.check(command, self.t_s, now_s)
+        self._bounds.check_claim(command.incarnation, attendant, now_s)
         had_caretaker = name in self._attendance
         if self._attendance.register_command(vehicle, command):
             effects.append(self._sense_of(vehicle))

@@ -236,8 +236,7 @@ def test_it_ends_with_its_vehicle_whatever_process_is_in_charge() -> None:
     seat = Seat()
     seat.take_charge()
     seat.feel(9)
-    seat.tick += 1
-    effects = seat.rig.hand(SENSE, evolve(seat.last, tick=seat.tick, left=True))
+    effects = seat.feel(9, left=True)
     assert kinds(effects) == [Report]
     assert seat.agent.ended
 

@@ -75,7 +75,7 @@ def test_answers_each_tick_once_and_repeats_are_the_same_bytes() -> None:
     assert (command.tick, command.hold_cell, command.motion_end_tick) == (2, HOME, 0)
     assert (command.incarnation, command.joined) == (1, (0,))
     for _ in range(3):
-        assert rig.hand(topics.SENSE, attrs.evolve(sense, t_s=99.0)) == [
+        assert rig.hand(topics.SENSE, attrs.evolve(sense, setpoint=(9.0, 9.0))) == [
             node.Send(topics.COMMAND, command, {"vehicle": ME})
         ]
 
@@ -93,7 +93,8 @@ def test_an_agent_starts_anew_on_the_road_of_a_newer_bridge() -> None:
     rig = up_and_running()
     rig.accept((0, HOME, (-1, 2)))
     rig.run(20)
-    old = attrs.evolve(rig.sense(), tick=rig.tick + 50)
+    late = rig.tick + 50
+    old = attrs.evolve(rig.sense(), tick=late, t_s=late * TICK_S)
     first = Rig().sense()  # of the next road: tick 0, and no process is in charge yet
     (claim,) = sent(rig.hand(topics.SENSE, attrs.evolve(first, bridge=7)), Command)
     assert (claim.tick, claim.incarnation, claim.hold_cell) == (0, 2, HOME)

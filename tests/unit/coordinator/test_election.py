@@ -126,9 +126,8 @@ def test_losing_the_own_link_changes_nothing_known_of_others() -> None:
 
 def test_terms_only_rise() -> None:
     election = candidate()
-    election.raise_term(4)
+    election.see_term(5)
     assert election.term == 5
-    election.raise_term(2)
     election.see_term(3)
     assert election.term == 5
     election.update(ELECTION_S)
@@ -154,7 +153,7 @@ def test_two_leaders_that_hear_each_other_stop_outbidding() -> None:
     first, second = candidate("a"), candidate("b")
     for election in (first, second):
         election.update(ELECTION_S)
-    second.raise_term(6)
+    second.see_term(6)
     now_s = 1.0
     for _ in range(20):
         for one, other in ((first, second), (second, first)):

@@ -235,19 +235,16 @@ PLAN_RULES = (
 """Transitions from the last promise to a plan in force (L5, L6)."""
 
 
-def is_older(state: VehicleState, other: VehicleState) -> bool:
-    """Return whether a state was sent before another state of the same vehicle.
+def age(state: VehicleState) -> tuple[object, ...]:
+    """Return a value that orders the states of a vehicle by the time at which they were sent.
 
     States sent between two ticks have equal times. Their order follows from the promise and the
     acceptance, which are never undone.
     """
-    first, second = (state.incarnation, state.t_s), (other.incarnation, other.t_s)
-    return first < second or (first == second and _progress(state) < _progress(other))
-
-
-def _progress(state: VehicleState) -> tuple[object, ...]:
     transfer = state.transfer
     return (
+        state.incarnation,
+        state.t_s,
         state.promised or (),
         bool(state.owned),
         state.accepted,

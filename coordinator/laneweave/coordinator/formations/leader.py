@@ -23,24 +23,26 @@ from laneweave.coordinator.ballots.ballot_round import (
     UNFINISHED,
     BallotPhase,
     BallotRound,
+    age,
     count_promise,
     had_promised,
     has_higher_promise,
-    is_older,
     is_promise,
     restarted,
 )
 from laneweave.coordinator.formations.roster import Formation
 from laneweave.protocol.state_machine import RuleBook, Transition
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, VehicleState
+from laneweave.protocol.wire.newest import Newest
 
 OBSERVE_S = 1.0
 """Longest time for which a new leader waits for the states of all members (L2)."""
 BACK_OFF_S = (0.05, 0.3)
 """Range of the random back-off before a leader outbids another one (L7). It is doubled for each
 consecutive back-off, so that one of two leaders has time to plan."""
-MAX_BACK_OFFS = 6
-"""Maximum number of doublings of the back-off."""
+MAX_BACK_OFFS = 2
+"""Maximum number of doublings of the back-off, so that planning goes on within 2 s of the last
+promise that outbids the leader."""
 RETRY_S = 1.0
 """First pause after failed planning; it doubles with each failure (L5)."""
 LONGEST_RETRY_S = 8.0
@@ -60,6 +62,8 @@ class FormationLeader(BallotRound):
     """Members that cannot reach their lanes with the plan in force."""
     states: dict[Name, VehicleState] = field(factory=dict)
     """Newest state of each member."""
+    ages: dict[Name, Newest] = field(factory=dict)
+    """`age` of each of these states."""
     highest: Ballot | None = None
     """Highest ballot that a member has reported; members promise only higher ones."""
 
@@ -93,12 +97,13 @@ class FormationLeader(BallotRound):
             return
         for vehicle in set(self.formation.roster) - set(formation.roster):
             self.states.pop(vehicle, None)
+            self.ages.pop(vehicle, None)
         self.take(MEMBERS, now_s, formation)
         self.formation = formation
 
     def on_state(self, state: VehicleState, now_s: float) -> None:
         """Handle the state of a member (L2, L4, L6, L7, L8)."""
-        if self._is_news(state):
+        if self._is_news(state, now_s):
             self.states[state.vehicle] = state
             if state.promised is not None:
                 self.highest = max(self.highest or state.promised, state.promised)
@@ -109,11 +114,11 @@ class FormationLeader(BallotRound):
         self.out_of_reach = frozenset(out_of_reach)
         self.take(PLANNED, now_s, plan)
 
-    def _is_news(self, state: VehicleState) -> bool:
+    def _is_news(self, state: VehicleState, now_s: float) -> bool:
         """Return whether a state is from a member and not older than the member's newest one."""
-        known = self.states.get(state.vehicle)
-        return state.vehicle in self.formation.roster and (
-            known is None or not is_older(state, known)
+        name = state.vehicle
+        return name in self.formation.roster and (
+            self.ages.setdefault(name, Newest()).take(age(state), now_s)
         )
 
 
@@ -123,6 +128,7 @@ class FormationLeader(BallotRound):
 def observe_members(leader: FormationLeader, _: object) -> None:
     """Observe all members."""
     leader.states.clear()
+    leader.ages.clear()
     leader.promises = {}
     leader.until_s = leader.due_s = leader.now_s + OBSERVE_S
 

@@ -11,8 +11,9 @@ from typing import TypeVar
 
 from attrs import frozen
 
-from laneweave.coordinator.ballots.ballot_round import is_older
+from laneweave.coordinator.ballots.ballot_round import age
 from laneweave.protocol.wire.messages import Census, Name, VehicleState
+from laneweave.protocol.wire.newest import Newest
 
 _Message = TypeVar("_Message", Census, VehicleState)
 
@@ -35,6 +36,8 @@ class ObservedRoad:
         """Begin without states or census."""
         self.states: dict[Name, VehicleState] = {}
         """The newest state of each vehicle on the road."""
+        self._ages: dict[Name, Newest] = {}
+        """`age` of each of these states."""
         self.census: Census | None = None
         """The newest census."""
         self._before: dict[Name, VehicleState] = {}
@@ -46,6 +49,7 @@ class ObservedRoad:
     def forget(self) -> None:
         """Discard everything: the road is new."""
         self.states.clear()
+        self._ages.clear()
         self.take_over()
 
     def take_over(self) -> None:
@@ -63,18 +67,22 @@ class ObservedRoad:
         gone = [name for name in self.states if name not in listed]
         for name in gone:
             self._left[name] = self.states.pop(name)
+            del self._ages[name]
         return gone
 
-    def on_state(self, state: VehicleState) -> bool:
+    def on_state(self, state: VehicleState, now_s: float) -> bool:
         """Handle the state of a vehicle; return whether it is the newest."""
-        known = self.states.get(state.vehicle)
-        if known is not None and is_older(state, known):
-            if state.t_s < known.t_s:
+        name = state.vehicle
+        known = self.states.get(name)
+        if not self._ages.setdefault(name, Newest()).take(age(state), now_s):
+            if known is not None and state.t_s < known.t_s:
                 self._keep_before(state)
             return False
-        if known is not None and state.t_s > known.t_s:
+        if known is not None and age(state) < age(known):
+            self._before.pop(name, None)  # no longer shown either
+        elif known is not None and state.t_s > known.t_s:
             self._keep_before(known)
-        self.states[state.vehicle] = state
+        self.states[name] = state
         return True
 
     @property
@@ -107,7 +115,7 @@ class ObservedRoad:
 
     def _keep_before(self, state: VehicleState) -> None:
         before = self._before.get(state.vehicle)
-        if before is None or is_older(before, state):
+        if before is None or age(before) < age(state):
             self._before[state.vehicle] = state
 
 

@@ -106,7 +106,7 @@ class RollingOperation:
 
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
         """Handle the state of a vehicle; return None if no unfinished ballot depends on it."""
-        if not self.observed.on_state(state):
+        if not self.observed.on_state(state, now_s):
             return None
         if state.promised is not None:
             self._highest = max(self._highest or state.promised, state.promised)

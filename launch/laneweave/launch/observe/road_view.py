@@ -1,7 +1,7 @@
 """Observed state of a deployment: newest road, coordinators, processes.
 
 Each bridge process has an incarnation number. A clock or census from a newer bridge starts a new
-road; those from older bridges are ignored.
+road; those from older bridges are ignored. Road times within the bounds of `wire.newest` count.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 from attrs import define, field, frozen
 
 from laneweave.launch.observe.message_loss import LossMeter
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import Arrived, PeerDown, PeerUp
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.wire.messages import (
@@ -23,6 +24,7 @@ from laneweave.protocol.wire.messages import (
     RoadClock,
     VehicleState,
 )
+from laneweave.protocol.wire.newest import NewestRoad
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     COORDINATOR_ALIVE,
@@ -91,8 +93,8 @@ class RoadView:
     states: dict[Name, VehicleState] = field(factory=dict)
     """Newest state of each vehicle."""
     loss: LossMeter = field(init=False)
-    bridge: int = -1
-    """Incarnation of the newest bridge."""
+    road: NewestRoad = field(factory=NewestRoad)
+    """The newest road."""
     roads: int = 0
     """Number of roads observed so far."""
     clock_received_s: float = 0.0
@@ -136,9 +138,11 @@ class RoadView:
                 self.update(message, now_s)
             case VehicleState():
                 self._on_state(event)
-            case RoadClock() if self._is_of_newest_road(event.bridge):
+            case RoadClock() | Census() if not self._is_of_newest_road(event, now_s):
+                pass
+            case RoadClock():
                 self._on_clock(event, now_s)
-            case Census() if self._is_of_newest_road(event.bridge):
+            case Census():
                 if self.census is None or event.t_s >= self.census.t_s:
                     self.census = event
                     self.loss.on_census(event)
@@ -191,15 +195,24 @@ class RoadView:
             )
         return found
 
-    def _is_of_newest_road(self, bridge: int) -> bool:
+    @property
+    def bridge(self) -> int:
+        """Incarnation of the newest bridge; -1: unknown."""
+        return self.road.bridge
+
+    def _is_of_newest_road(self, message: RoadClock | Census, now_s: float) -> bool:
         """Return whether a message belongs to the newest road; start a new road if necessary."""
-        if bridge > self.bridge:
+        number = self.road.number
+        try:
+            is_newest = self.road.on_message(message.bridge, message.t_s, now_s)
+        except BadInputError:
+            return False
+        if self.roads == 0 or self.road.number != number:
             if self.roads:
                 self.clock = self.first_clock = self.census = None
                 self.states, self.loss = {}, self._new_meter()
-            self.bridge = bridge
             self.roads += 1
-        return bridge == self.bridge
+        return is_newest
 
     def _on_clock(self, clock: RoadClock, now_s: float) -> None:
         if self.clock is None:

@@ -194,6 +194,13 @@ class Delegate:
 
 
 @frozen
+class Refuse:
+    """Count the event as rejected input: a number in it is out of bounds (`wire.bounds`)."""
+
+    error: BadInputError
+
+
+@frozen
 class End:
     """Leave the network; the core has finished."""
 
@@ -210,6 +217,7 @@ Effect = (
     | Decline
     | Compute
     | Delegate
+    | Refuse
     | End
 )
 
@@ -288,7 +296,7 @@ class Node:
             else:
                 event = self._other_event(delivery)
         except BadInputError as error:
-            self._reject(delivery, str(error))
+            self._reject(getattr(delivery, "key", ""), error)
             return
         self.dispatch(event, now_s)
 
@@ -300,6 +308,8 @@ class Node:
         for effect in self.core.handle(event, now_s):
             if isinstance(effect, Send):
                 self._send(effect)
+            elif isinstance(effect, Refuse):
+                self._reject(_key_of(self._keys, event), effect.error)
             else:
                 self._execute(effect)
 
@@ -318,12 +328,11 @@ class Node:
         known = known_key(self._keys, delivery.key)
         return PeerUp(*known) if isinstance(delivery, TokenUp) else PeerDown(*known)
 
-    def _reject(self, delivery: Delivery, reason: str) -> None:
+    def _reject(self, key: str, error: BadInputError) -> None:
         self.rejected += 1
         # Log only the 1st, 10th, 100th, ...: a flood must not fill the log.
         if self.rejected == 10 ** (len(str(self.rejected)) - 1):
-            key = getattr(delivery, "key", "")
-            log.warning("message ignored", key=key, reason=reason, ignored=self.rejected)
+            log.warning("message ignored", key=key, reason=str(error), ignored=self.rejected)
 
     def _send(self, effect: Send) -> None:
         message, topic = effect.message, effect.topic
@@ -381,6 +390,13 @@ def read_message(
     if topic.kind is None:
         raise BadInputError("key", key, "a topic that carries messages")
     return Arrived(topic, parameters, decode(payload, topic.kind))
+
+
+def _key_of(keys: Keys, event: Event) -> str:
+    """Return the key of a message or token; empty for other events."""
+    if isinstance(event, (Arrived, PeerUp, PeerDown)):
+        return keys.key(event.topic, **event.parameters)
+    return ""
 
 
 def known_key(keys: Keys, key: str) -> tuple[Topic, Mapping[str, str]]:

@@ -1,0 +1,168 @@
+"""Bounds of received numbers: terms, incarnations, road times and ticks.
+
+Malformed messages are refused by the codec. A well-formed message may still contain a number that
+no correct sender has, such as a term of 2^63 - 1, above which no leader can go. Each role refuses
+such a message before it uses any of the fields. Values within the bounds that their sender does not
+repeat are forgotten (`newest`). Safety depends on neither: a refused message is a lost one
+(decision 32).
+"""
+
+from __future__ import annotations
+
+from attrs import define
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Census,
+    Command,
+    Heartbeat,
+    RoadClock,
+    Sense,
+    VehicleState,
+)
+
+MAX_TERM_AT_START = 200_000
+"""Maximum term of a ballot at road time 0."""
+TERMS_PER_S = 1_000
+"""Growth of the maximum term per second of road time.
+
+The maximum is a function of time only, so that all vehicles accept the same ballots, whatever each
+has received before. It grows, so that a leader can soon go above any promise."""
+ELECTION_MARGIN = 100_000
+"""Difference between the maximum terms of ballots and of elections. A leader uses a term above that
+of its election only if a vehicle has promised a ballot of a higher term."""
+DAY_NS = 86_400 * 10**9
+CLAIM_AHEAD_NS = DAY_NS
+"""Maximum lead of the incarnation in a COMMAND over the bridge's clock."""
+AHEAD_NS = 2 * DAY_NS
+"""Maximum lead of all other incarnations; more than `CLAIM_AHEAD_NS`, because every process must
+accept what the bridge has accepted."""
+SUCCESSION_NS = 10**9
+"""Maximum lead of a claim over the process in charge, if the latter is itself near the limit."""
+
+
+def max_term(road_s: float) -> int:
+    """Return the maximum term of a ballot at a road time."""
+    return MAX_TERM_AT_START + int(TERMS_PER_S * road_s)
+
+
+def max_election_term(road_s: float) -> int:
+    """Return the maximum term that a coordinator adopts from another one at a road time."""
+    return max_term(road_s) - ELECTION_MARGIN
+
+
+@define
+class Bounds:
+    """Limits of one receiver; `check` refuses messages outside them.
+
+    Incarnations are bounded by the receiver's own: a start time to which the time since is added,
+    so no wall clock is needed. Counters, which simulations use, are far below this limit.
+    """
+
+    incarnation: int
+    """Incarnation of the receiver [ns]."""
+    tick_s: float
+    max_road_s: float
+    """Road time at which every run ends [s]."""
+    _since_s: float | None = None
+    """Node clock at the first check."""
+
+    def max_incarnation(self, now_s: float, ahead_ns: int = AHEAD_NS) -> int:
+        """Return the maximum incarnation at a time on the node's clock."""
+        if self._since_s is None:
+            self._since_s = now_s
+        return self.incarnation + ahead_ns + int((now_s - self._since_s) * 1e9)
+
+    def check_incarnation(self, incarnation: int, now_s: float) -> None:
+        """Check the incarnation of a process.
+
+        Raises:
+            BadInputError: it is out of bounds.
+        """
+        limit = self.max_incarnation(now_s)
+        if not 0 <= incarnation <= limit:
+            raise BadInputError("incarnation", incarnation, f"0 to {limit}")
+
+    def check(self, message: object, road_s: float, now_s: float) -> None:
+        """Check a message.
+
+        Args:
+            message: received message of any kind.
+            road_s: latest possible road time at the receiver [s].
+            now_s: the node's clock.
+
+        Raises:
+            BadInputError: a number is out of bounds.
+        """
+        road_s = min(road_s, self.max_road_s)
+        match message:
+            case VehicleState():
+                self._check_time(message.t_s, road_s)
+                self.check_incarnation(message.incarnation, now_s)
+                _check_ballots(message, road_s)
+            case Sense():
+                self._check_tick(message.tick, message.t_s, road_s)
+                self.check_incarnation(message.attendant, now_s)
+                self.check_incarnation(message.bridge, now_s)
+                _check_ballots(message, road_s)
+            case Command():
+                self.check_incarnation(message.incarnation, now_s)
+                _check_ballots(message, road_s)
+            case RoadClock():
+                self._check_tick(message.tick, message.t_s, road_s)
+                self.check_incarnation(message.bridge, now_s)
+            case Census():
+                self._check_time(message.t_s, road_s)
+                self.check_incarnation(message.bridge, now_s)
+            case Heartbeat():
+                self.check_incarnation(message.incarnation, now_s)
+                _check_term(message.term, road_s)
+            case _:
+                pass
+
+    def check_claim(self, incarnation: int, attendant: int, now_s: float) -> None:
+        """Check the incarnation in a COMMAND for a vehicle with a process in charge.
+
+        Raises:
+            BadInputError: the incarnation is out of bounds.
+        """
+        limit = max(
+            self.max_incarnation(now_s, CLAIM_AHEAD_NS),
+            min(attendant + SUCCESSION_NS, self.max_incarnation(now_s)),
+        )
+        if not 0 <= incarnation <= limit:
+            raise BadInputError("incarnation", incarnation, f"0 to {limit}")
+
+    def _check_time(self, t_s: float, road_s: float) -> None:
+        limit_s = road_s + self.tick_s
+        if not 0.0 <= t_s <= limit_s:
+            raise BadInputError("t_s", t_s, f"0 to {limit_s:g}")
+
+    def _check_tick(self, tick: int, t_s: float, road_s: float) -> None:
+        self._check_time(t_s, road_s)
+        if abs(tick - t_s / self.tick_s) > 0.5:
+            raise BadInputError("tick", tick, f"{t_s / self.tick_s:.0f}, by t_s")
+
+
+def _check_ballots(message: VehicleState | Sense | Command, road_s: float) -> None:
+    if message.promised is not None:
+        check_ballot(message.promised, road_s)
+    if not isinstance(message, VehicleState) and message.accepted is not None:
+        check_ballot(message.accepted, road_s)
+    if message.transfer is not None:
+        check_ballot(message.transfer.ballot, road_s)
+
+
+def check_ballot(ballot: Ballot, road_s: float) -> None:
+    """Check the term of a ballot.
+
+    Raises:
+        BadInputError: it is out of bounds.
+    """
+    _check_term(ballot.term, road_s)
+
+
+def _check_term(term: int, road_s: float) -> None:
+    if not 0 <= term <= max_term(road_s):
+        raise BadInputError("term", term, f"0 to {max_term(road_s)}")
