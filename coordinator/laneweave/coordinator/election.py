@@ -69,6 +69,15 @@ class Election:
         peer = self._on_contact(heartbeat.coordinator, heartbeat.incarnation, now_s)
         peer.leading = heartbeat.leading
 
+    def on_heartbeats_dropped(self, coordinator: str, now_s: float) -> None:
+        """Record that silence of a candidate proves nothing: its heartbeats may be dropped here.
+
+        A candidate whose token has vanished stays removed.
+        """
+        peer = self._peers.get(coordinator)
+        if peer is not None:
+            peer.last_contact_s = now_s
+
     def on_token_up(self, coordinator: str, incarnation: int, now_s: float) -> None:
         """Record that a process has connected, or resumed after a pause."""
         if coordinator == self.name:

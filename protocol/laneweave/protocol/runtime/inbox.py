@@ -1,19 +1,27 @@
-"""Input queue of a node, with fair scheduling of queries."""
+"""Input queue of a node, with fair scheduling of queries and bounded waiting of messages."""
 
 from __future__ import annotations
 
 import contextlib
 import queue
+import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator
 
 from laneweave.protocol.runtime.metrics import SnapshotRequest
 from laneweave.protocol.runtime.node import Computed, Stopping
-from laneweave.protocol.runtime.transport import Delivery, Query
+from laneweave.protocol.runtime.transport import Delivery, Overflow, Query, Received
 
 MAX_QUERY_WAIT_S = 0.02
 """Longest time a query waits while other work is queued, unless `QUERY_SHARE` requires more."""
+MAX_WAITING = 100
+"""Maximum number of waiting messages of one key; further ones are dropped.
+
+A flood on some keys then delays messages on other keys only briefly. Every message may be lost, and
+a correct sender has at most a few messages under way."""
+OVERFLOW_S = 0.1
+"""Interval at which the node is notified of dropped messages."""
 QUERY_SHARE = 0.1
 """Maximum fraction of time spent on queries while other work is queued."""
 
@@ -25,13 +33,21 @@ class Inbox:
     """Input queue of a node.
 
     Queries yield to other work for at most `MAX_QUERY_WAIT_S`. `QUERY_SHARE` keeps a flood of
-    queries from blocking a leader.
+    queries from blocking a leader, and `MAX_WAITING` a flood of messages.
     """
 
     def __init__(self) -> None:
         """Create an empty queue."""
         self._items: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self._queries: deque[Query] = deque()
+        self._waiting: Counter[str] = Counter()
+        """Number of waiting messages by key."""
+        self._lock = threading.Lock()
+        """Guards `_waiting`; never needed in a signal handler."""
+        self._overflowed: dict[str, None] = {}
+        """Keys of messages dropped since the last `Overflow`."""
+        self._next_overflow_s = 0.0
+        """Earliest time of the next `Overflow`."""
         self._next_query_s = 0.0
         """Time from which a query is taken even if other work is queued."""
 
@@ -40,17 +56,41 @@ class Inbox:
         if isinstance(item, Query):
             self._queries.append(item)
             self._items.put(None)  # wake up `take`
+        elif isinstance(item, Received) and not self._admit(item.key):
+            self._overflowed[item.key] = None
         else:
             self._items.put(item)
 
     def take(self, timeout_s: float) -> Iterator[Item]:
-        """Wait for an input until a timeout; yield at most one query and one other input."""
+        """Wait for an input until a timeout; yield at most one query and one other input.
+
+        The keys of dropped messages come in addition.
+        """
         with contextlib.suppress(queue.Empty):
             item = self._items.get(timeout=0.0 if self._queries else timeout_s)
+            if isinstance(item, Received):
+                self._release(item.key)
             if item is not None:
                 yield item
         now_s = time.monotonic()
+        if self._overflowed and now_s >= self._next_overflow_s:
+            self._next_overflow_s = now_s + OVERFLOW_S
+            overflowed, self._overflowed = self._overflowed, {}
+            yield from map(Overflow, overflowed)
         if self._queries and (self._items.empty() or now_s > self._next_query_s):
             yield self._queries.popleft()
             took_s = time.monotonic() - now_s
             self._next_query_s = now_s + max(MAX_QUERY_WAIT_S, took_s / QUERY_SHARE)
+
+    def _admit(self, key: str) -> bool:
+        with self._lock:
+            if self._waiting[key] >= MAX_WAITING:
+                return False
+            self._waiting[key] += 1
+            return True
+
+    def _release(self, key: str) -> None:
+        with self._lock:
+            self._waiting[key] -= 1
+            if not self._waiting[key]:
+                del self._waiting[key]

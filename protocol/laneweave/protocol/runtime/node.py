@@ -22,6 +22,7 @@ from laneweave.protocol.runtime.transport import (
     Delivery,
     LinkDown,
     LinkUp,
+    Overflow,
     Query,
     Received,
     TokenDown,
@@ -71,6 +72,11 @@ class PeerDown(_OnTopic):
 
 
 @frozen
+class MessagesDropped(_OnTopic):
+    """Messages were dropped on arrival, since too many of the same key were waiting."""
+
+
+@frozen
 class Wakeup:
     """The core's `wakeup_s` has been reached."""
 
@@ -104,6 +110,7 @@ Event = (
     | Arrived
     | PeerUp
     | PeerDown
+    | MessagesDropped
     | LinkUp
     | LinkDown
     | Wakeup
@@ -320,12 +327,16 @@ class Node:
         )
         return [own, *core_metrics(self.core)]
 
-    def _other_event(self, delivery: LinkUp | LinkDown | Query | TokenUp | TokenDown) -> Event:
+    def _other_event(
+        self, delivery: LinkUp | LinkDown | Query | TokenUp | TokenDown | Overflow
+    ) -> Event:
         if isinstance(delivery, (LinkUp, LinkDown)):
             return delivery
         if isinstance(delivery, Query):
             return QueryArrived(delivery.token, delivery.payload, delivery.encoding)
         known = known_key(self._keys, delivery.key)
+        if isinstance(delivery, Overflow):
+            return MessagesDropped(*known)
         return PeerUp(*known) if isinstance(delivery, TokenUp) else PeerDown(*known)
 
     def _reject(self, key: str, error: BadInputError) -> None:

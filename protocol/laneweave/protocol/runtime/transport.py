@@ -24,6 +24,13 @@ class Received:
 
 
 @frozen
+class Overflow:
+    """Messages of a key were dropped, since too many of them waited for this node."""
+
+    key: str
+
+
+@frozen
 class TokenUp:
     """A liveliness token appeared: its process is connected."""
 
@@ -81,7 +88,7 @@ def update_tokens(tokens: dict[str, None], event: TokenUp | TokenDown) -> bool:
     return known
 
 
-Delivery = Received | TokenUp | TokenDown | LinkUp | LinkDown | Query
+Delivery = Received | Overflow | TokenUp | TokenDown | LinkUp | LinkDown | Query
 Deliver = Callable[[Delivery], None]
 
 
