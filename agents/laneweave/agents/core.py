@@ -201,9 +201,10 @@ class AgentCore:
         road = self._road
         self._bounds.check(sense, road.latest_s(now_s), now_s)
         number = road.number
-        if (not sense.bridge and road.bridge > 0) or not road.on_message(
-            sense.bridge, sense.t_s, now_s
-        ):
+        t_s = sense.tick * self._scenario.runtime.tick_s
+        if not sense.bridge and road.bridge > 0:
+            return []
+        if not road.on_message(sense.bridge, t_s, now_s):
             return []
         if road.number != number and self._sense is not None:
             self._forget_road()

@@ -242,8 +242,8 @@ class CoordinatorCore:
                 self._on_candidate(*_identity(parameters), now_s)
             case PeerDown(topic, parameters) if topic is COORDINATOR_ALIVE:
                 self.election.on_token_down(*_identity(parameters))
-            case MessagesDropped(topic, parameters) if topic is HEARTBEAT:
-                self.election.on_heartbeats_dropped(parameters["coordinator"], now_s)
+            case MessagesDropped():
+                self.election.on_messages_dropped(now_s)
             case LinkUp() | LinkDown():
                 self.election.on_link(up=isinstance(event, LinkUp), now_s=now_s)
             case QueryArrived(token, payload, encoding):

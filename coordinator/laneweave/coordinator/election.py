@@ -69,14 +69,13 @@ class Election:
         peer = self._on_contact(heartbeat.coordinator, heartbeat.incarnation, now_s)
         peer.leading = heartbeat.leading
 
-    def on_heartbeats_dropped(self, coordinator: str, now_s: float) -> None:
-        """Record that silence of a candidate proves nothing: its heartbeats may be dropped here.
+    def on_messages_dropped(self, now_s: float) -> None:
+        """Record that silence of candidates proves nothing: messages are dropped on their way.
 
-        A candidate whose token has vanished stays removed.
+        A candidate whose token has vanished, or that was silent before, stays removed.
         """
-        peer = self._peers.get(coordinator)
-        if peer is not None:
-            peer.last_contact_s = now_s
+        for name in list(self.living(now_s)):
+            self._peers[name].last_contact_s = now_s
 
     def on_token_up(self, coordinator: str, incarnation: int, now_s: float) -> None:
         """Record that a process has connected, or resumed after a pause."""

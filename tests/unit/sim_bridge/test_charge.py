@@ -4,14 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from attrs import evolve
 
-from laneweave.protocol.runtime.node import Arrived, Effect, Listen, Send, Stopping, Unlisten
+from laneweave.protocol.runtime.node import (
+    Arrived,
+    Effect,
+    Listen,
+    Refuse,
+    Send,
+    Stopping,
+    Unlisten,
+)
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.wire.identities import above
-from laneweave.protocol.wire.messages import Name, Plan, Prepare, Sense, VehicleState
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Name,
+    PendingTransfer,
+    Plan,
+    Prepare,
+    Sense,
+    VehicleState,
+)
 from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, STATE
 from laneweave.sim_bridge.core import TickPhase
 from laneweave.sim_bridge.road.tick_answers import LATE_SHARE
@@ -395,3 +412,53 @@ def test_vehicles_that_leave_off_their_lane_are_reported(tmp_path: Path) -> None
     vehicles = read_summary(tmp_path)["vehicles"]
     assert (vehicles["left"], vehicles["on_preferred_lane"]) == (3, 1)
     assert (vehicles["left_off_lane"], vehicles["left_unattended"]) == (2, 1)
+
+
+# --- numbers that no correct sender has -------------------------------------------------------
+
+HUGE = 2**63 - 1
+DAY_NS = 86_400 * 10**9
+HIGH = Ballot(HUGE, Name("zz"), HUGE, HUGE)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"incarnation": HUGE},
+        {"incarnation": 2 * DAY_NS},
+        {"incarnation": -1},
+        {"promised": HIGH},
+        {"accepted": HIGH},
+        {"transfer": PendingTransfer(HIGH)},
+    ],
+)
+def test_a_command_with_an_impossible_number_is_refused(
+    attended: Desk, changes: dict[str, Any]
+) -> None:
+    before = attended.known(B)
+    effects = attended.answer(B, **({"incarnation": AGENT} | changes))
+    assert [type(effect) for effect in effects] == [Refuse]
+    assert attended.known(B) == before
+    assert B in attended.core._answers.awaited
+    attended.answer(B, incarnation=AGENT)
+    assert B not in attended.core._answers.awaited
+
+
+def test_a_claim_near_the_limit_leaves_room_for_successors(attended: Desk) -> None:
+    """A forged claim that is possible takes charge; the caretaker and the agent follow it."""
+    limit = DAY_NS
+    attended.answer(B, incarnation=limit)
+    assert attended.core.vehicles[B].controller.attendant == limit
+    attended.drive(lambda: B in attended.core._attendance, B)
+    caretaker = attended.core.vehicles[B].controller.attendant
+    assert caretaker > limit
+    attended.drive_to(attended.core.tick + 1, B)
+    attended.answer(B, incarnation=above(5, caretaker))
+    assert B not in attended.core._attendance
+
+
+def test_a_caretaker_promises_no_ballot_of_an_impossible_term(cared_for: Desk) -> None:
+    for ballot, promised in ((HIGH, False), (BALLOT, True)):
+        prepare = Prepare(ballot, (0,), (B,))
+        effects = cared_for.give(Arrived(PREPARE, {"vehicle": B}, prepare))
+        assert [state.promised for state in sent(effects, VehicleState)] == [ballot] * promised

@@ -21,6 +21,7 @@ from laneweave.protocol.wire.messages import (
     Sense,
     VehicleState,
 )
+from laneweave.protocol.wire.newest import AHEAD_S
 
 MAX_TERM_AT_START = 200_000
 """Maximum term of a ballot at road time 0."""
@@ -141,8 +142,9 @@ class Bounds:
 
     def _check_tick(self, tick: int, t_s: float, road_s: float) -> None:
         self._check_time(t_s, road_s)
-        if abs(tick - t_s / self.tick_s) > 0.5:
-            raise BadInputError("tick", tick, f"{t_s / self.tick_s:.0f}, by t_s")
+        tick_s = tick * self.tick_s
+        if not 0 <= tick_s <= road_s + self.tick_s or abs(tick_s - t_s) > AHEAD_S:
+            raise BadInputError("tick", tick, f"about {t_s / self.tick_s:.0f}, by t_s")
 
 
 def _check_ballots(message: VehicleState | Sense | Command, road_s: float) -> None:

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import time
 
-from laneweave.protocol.runtime.inbox import MAX_QUERY_WAIT_S, QUERY_SHARE, Inbox
+from laneweave.protocol.runtime.inbox import (
+    MAX_QUERY_WAIT_S,
+    MAX_WAITING,
+    OVERFLOW_S,
+    QUERY_SHARE,
+    Inbox,
+)
 from laneweave.protocol.runtime.node import Stopping
-from laneweave.protocol.runtime.transport import Query, Received
+from laneweave.protocol.runtime.transport import Overflow, Query, Received
 
 MESSAGE = Received("k", b"")
 QUESTION = Query("k", b"", 1)
@@ -61,3 +67,35 @@ def test_questions_that_take_long_get_a_small_part_of_the_time() -> None:
     assert long_s / QUERY_SHARE > MAX_QUERY_WAIT_S
     for begin_s, end_s, next_s in zip(begun_s, ended_s, begun_s[1:], strict=False):
         assert next_s - begin_s >= (end_s - begin_s) / QUERY_SHARE
+
+
+def test_a_flood_on_one_key_delays_other_keys_only_briefly() -> None:
+    inbox, other = Inbox(), Received("other", b"")
+    for _ in range(50 * MAX_WAITING):
+        inbox.put(MESSAGE)
+    inbox.put(other)
+    taken = [item for _ in range(MAX_WAITING + 1) for item in inbox.take(0.0)]
+    assert [item for item in taken if isinstance(item, Received)] == MAX_WAITING * [MESSAGE] + [
+        other
+    ]
+
+
+def test_messages_are_taken_again_when_those_before_have_been_handled() -> None:
+    inbox = Inbox()
+    for _ in range(3):
+        for _ in range(MAX_WAITING):
+            inbox.put(MESSAGE)
+        taken = [item for _ in range(MAX_WAITING) for item in inbox.take(0.0)]
+        assert taken == MAX_WAITING * [MESSAGE]
+    assert not inbox._waiting
+
+
+def test_the_keys_of_dropped_messages_are_told_at_intervals() -> None:
+    inbox = Inbox()
+    told = 0
+    until_s = time.monotonic() + 3.5 * OVERFLOW_S
+    while time.monotonic() < until_s:
+        for _ in range(2 * MAX_WAITING):
+            inbox.put(MESSAGE)
+        told += sum(item == Overflow("k") for item in inbox.take(0.0))
+    assert 1 <= told <= 4

@@ -9,6 +9,7 @@ import msgpack
 import pytest
 from attrs import define, evolve, field
 
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import NodeMetrics
 from laneweave.protocol.runtime.node import (
     Announce,
@@ -21,10 +22,12 @@ from laneweave.protocol.runtime.node import (
     End,
     Event,
     Listen,
+    MessagesDropped,
     Node,
     PeerDown,
     PeerUp,
     QueryArrived,
+    Refuse,
     Reply,
     Send,
     Serve,
@@ -39,6 +42,7 @@ from laneweave.protocol.runtime.transport import (
     Delivery,
     LinkDown,
     LinkUp,
+    Overflow,
     Query,
     Received,
     TokenDown,
@@ -87,6 +91,7 @@ def bench() -> Bench:
     ("delivery", "event"),
     [
         (Received(BEAT_KEY, encode(BEAT)), Arrived(topics.HEARTBEAT, {"coordinator": "c1"}, BEAT)),
+        (Overflow(BEAT_KEY), MessagesDropped(topics.HEARTBEAT, {"coordinator": "c1"})),
         (LinkUp(), LinkUp()),
         (LinkDown(), LinkDown()),
         (Query("any/key", b"q", 4), QueryArrived(4, b"q")),
@@ -103,6 +108,19 @@ def bench() -> Bench:
 def test_deliveries_become_events(bench: Bench, delivery: Delivery, event: Event) -> None:
     bench.node.deliver(delivery, 1.0)
     assert bench.core.events == [(1.0, event)]
+
+
+def test_a_core_may_refuse_what_it_receives(bench: Bench) -> None:
+    refuse = Refuse(BadInputError("term", 2**63 - 1, "less"))
+    bench.core.on_event = lambda *_: [refuse]
+    for delivery in (
+        Received(BEAT_KEY, encode(BEAT)),
+        TokenUp("laneweave/r/alive/bridge/17"),
+        LinkUp(),
+    ):
+        bench.node.deliver(delivery, 1.0)
+    assert bench.node.rejected == 3
+    assert bench.transport.mock_calls == []
 
 
 def deep_field(depth: int) -> bytes:

@@ -19,6 +19,7 @@ from laneweave.protocol.runtime.transport import (
     Delivery,
     LinkDown,
     LinkUp,
+    Overflow,
     Query,
     Received,
     TokenDown,
@@ -33,7 +34,7 @@ WAKE_AGAIN_S = 0.001
 """Delay of a wakeup requested for a past time, so that virtual time advances."""
 INJECTED_FAILURE = "injected failure"
 """Error of a computation that `Conditions.compute_failure` makes fail."""
-_DELIVERIES = (Received, TokenUp, TokenDown, LinkUp, LinkDown, Query)
+_DELIVERIES = (Received, Overflow, TokenUp, TokenDown, LinkUp, LinkDown, Query)
 
 
 class Member:
