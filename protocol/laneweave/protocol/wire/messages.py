@@ -27,7 +27,8 @@ class Ballot(NamedTuple):
     """
 
     term: int
-    """Term of the leader; each election raises it above every term that the leader has seen."""
+    """Term of the leader; each election raises it above every term that other candidates have
+    shown. At most `bounds.max_term`."""
     coordinator: Name
     incarnation: int
     """Incarnation of the coordinator process [ns]."""
@@ -42,8 +43,8 @@ class Heartbeat:
     Also sent at once when a coordinator begins or stops leading. Missing for `network.election_s`:
     the sender no longer counts as a candidate. Late or duplicated: harmless. From a process whose
     token has vanished, or that a newer process of the same name has replaced: only the term is
-    used. A higher term than the receiver's: a candidate adopts it, a leader continues one term
-    above it. With the receiver's own name: ignored.
+    used. A higher term than the receiver's, up to `bounds.max_election_term`: a candidate adopts
+    it, a leader continues one term above it. With the receiver's own name: ignored.
     """
 
     coordinator: Name
@@ -83,7 +84,8 @@ class Prepare:
     """Leader to each vehicle of the roster that has not promised, every `network.resend_s`.
 
     Missing: sent again. Duplicated, late, or with a lower ballot than the promised one: no effect,
-    but the vehicle answers with its state, which contains the promised ballot.
+    but the vehicle answers with its state, which contains the promised ballot. With a term above
+    `bounds.max_term`: refused.
     """
 
     ballot: Ballot
@@ -134,7 +136,8 @@ class VehicleState:
 
     The state serves as promise, acceptance and progress report. Missing: vehicles that wait for it
     hold. Late or duplicated: harmless to vehicles, since "completed k moves of ballot b" stays
-    true; leaders drop states older than that vehicle's newest. With a ballot other than that of the
+    true; leaders drop states older than that vehicle's newest, unless only older ones arrive for
+    0.5 s. With a ballot other than that of the
     receiver's plan: not used for this plan.
     """
 
@@ -228,8 +231,9 @@ class Sense:
 
     Missing: sent again every `runtime.tick_resend_s` until `runtime.tick_deadline_s`; then the
     vehicle continues its last trajectory. Duplicated: the agent repeats its answer. Older than the
-    newest tick of the same bridge, or from an earlier bridge: ignored. From a newer bridge: the
-    agent discards its state from the earlier road and takes a new incarnation. A message with
+    newest tick of the same bridge, or from an earlier bridge: ignored. From a newer bridge, or if
+    only older ones arrive for 0.5 s: the agent discards its state and takes a new incarnation. A
+    message with
     `left` is repeated for 20 ticks or until the agent's token vanishes; when a run ends, each
     vehicle on the road receives one.
     """
@@ -286,7 +290,8 @@ class Command:
     A command contains the complete remaining trajectory. Missing: the controller executes its
     stored trajectory, then holds. Duplicated: no effect. Only an answer to the current tick that
     arrives in time is executed; a late answer only ends the agent's silence. From an older
-    incarnation than the one in charge: refused. From a newer one: that process takes charge.
+    incarnation than the one in charge: refused. From a newer one: that process takes charge, unless
+    its incarnation is more than a day ahead of the bridge's clock.
     `joined`, `accepted`, `promised` and `transfer` are stored for any tick, and confirmed in the
     next SENSE. With jerks that are not pairs of finite numbers, or cells outside the road's lanes:
     refused and logged.
@@ -379,7 +384,7 @@ class Census:
 
     Missing: the receiver uses the older census, and plans nothing for formations closed since then.
     Duplicated or older than the newest: ignored. A coordinator's road time is the newest `t_s` from
-    the census and the clock.
+    the census and the clock; more than 10 s ahead of it: refused.
     """
 
     t_s: float
@@ -402,7 +407,9 @@ class RoadClock:
     """Bridge to coordinators and observers, each tick: road time and progress.
 
     Missing: the coordinator's road time stops until the next clock or census, so the coordinator
-    begins nothing new. Late or duplicated: ignored. Agents take road time from `Sense`.
+    begins nothing new. Late or duplicated: ignored, unless only earlier ones arrive for 0.5 s: then
+    the newest one was wrong. More than 10 s ahead of the receiver's road time: refused. Agents take
+    road time from `Sense`.
     """
 
     tick: int

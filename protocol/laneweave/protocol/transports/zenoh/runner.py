@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import queue
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -35,6 +36,11 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger(__name__)
 
+SWITCH_S = 1e-4
+"""Longest time for which Zenoh's thread waits for this one to yield (Python's default is 5 ms).
+
+With the default, a flood of messages that are refused lets hardly any others in."""
+
 
 def run_core(
     core: Core,
@@ -51,6 +57,7 @@ def run_core(
         BadInputError: the realm is malformed, or no router answers at the endpoint within
             `connect_timeout_s`.
     """
+    sys.setswitchinterval(SWITCH_S)
     keys = Keys(access.realm)
     inbox = Inbox()
     worker = _Worker(inbox.put)
