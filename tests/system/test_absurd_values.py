@@ -277,27 +277,6 @@ def test_planning_goes_on_within_two_seconds_of_many_absurd_messages(lab: Lab, r
     assert leader_changes(folder) <= 1
 
 
-@pytest.mark.full
-def test_planning_goes_on_within_two_seconds_of_a_minute_of_everything(
-    lab: Lab, road: Path
-) -> None:
-    """All impossible values at once stop nothing, and the possible ones only while they arrive."""
-    with running(lab, road, "--duration", "150", "--pace", 1.0) as (forger, folder):
-        began_s, until_s = forger.t_s, time.monotonic() + 60.0
-        while time.monotonic() < until_s:
-            forger.choose()
-            for row, forge in ROWS.items():
-                if row != "token":
-                    forge(forger)
-            time.sleep(0.05)
-        ended_s = forger.t_s
-
-    assert recovery_s(folder, began_s, ended_s) <= RECOVERY_S
-    late = {name for name, trip in trips(folder).items() if trip["entered_s"] > ended_s}
-    assert late
-    assert not off_lane(folder) & late
-
-
 @pytest.mark.slow
 def test_a_flood_changes_the_leader_at_most_once(lab: Lab, road: Path) -> None:
     """Of messages that are costly to refuse, on the keys that all coordinators read."""
