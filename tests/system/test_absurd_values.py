@@ -277,7 +277,7 @@ def test_planning_goes_on_within_two_seconds_of_many_absurd_messages(lab: Lab, r
     assert leader_changes(folder) <= 1
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_flood_changes_the_leader_at_most_once(lab: Lab, road: Path) -> None:
     """Of messages that are costly to refuse, on the keys that all coordinators read."""
     floods = [

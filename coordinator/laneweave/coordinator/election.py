@@ -4,6 +4,10 @@ A candidate leads when it has run for an election timeout (`network.election_s`)
 contact with a higher-ranked candidate for that long. Candidates are ranked by name. The election
 ensures progress, not safety: two leaders at once are harmless, because vehicles promise one ballot
 at a time.
+
+On a link that loses packets, heartbeats are delayed. A candidate whose heartbeats came late counts
+as present for longer, up to twice the election timeout, so that such delays do not change the
+leader again and again.
 """
 
 from __future__ import annotations
@@ -18,6 +22,12 @@ from laneweave.protocol.wire.messages import Heartbeat, Name
 
 NEWCOMER_FACTOR = 1.5
 """Number of election timeouts that a leader waits for a higher-ranked new candidate to lead."""
+MAX_SILENCE_FACTOR = 2.0
+"""Maximum number of election timeouts for which a silent candidate counts as present."""
+SILENCE_MARGIN = 1.5
+"""Ratio of the silence after which a candidate counts as absent to its longest recent one."""
+SILENCE_DECAY = 0.99
+"""Factor by which each contact reduces the remembered silence."""
 
 
 @define
@@ -28,6 +38,8 @@ class _Peer:
     since_s: float
     """Time of the first contact, or of the first one after an election timeout of silence."""
     leading: bool = False
+    longest_silence_s: float = 0.0
+    """Longest recent time between two contacts."""
 
 
 @define
@@ -63,7 +75,7 @@ class Election:
         if (
             known is not None
             and known.incarnation > heartbeat.incarnation
-            and now_s < known.last_contact_s + self.election_s
+            and now_s < self._present_until_s(known)
         ):
             return
         peer = self._on_contact(heartbeat.coordinator, heartbeat.incarnation, now_s)
@@ -88,14 +100,21 @@ class Election:
 
     def _on_contact(self, coordinator: str, incarnation: int, now_s: float) -> _Peer:
         peer = self._peers.get(coordinator)
-        if (
-            peer is None
-            or peer.incarnation != incarnation
-            or now_s >= peer.last_contact_s + self.election_s
-        ):
+        silence_s = 0.0
+        if peer is not None and peer.incarnation == incarnation:
+            limit_s = MAX_SILENCE_FACTOR / SILENCE_MARGIN * self.election_s
+            silence_s = min(
+                max(now_s - peer.last_contact_s, SILENCE_DECAY * peer.longest_silence_s), limit_s
+            )
+        if peer is None or peer.incarnation != incarnation or now_s >= self._present_until_s(peer):
             peer = self._peers[coordinator] = _Peer(incarnation, now_s, now_s)
         peer.last_contact_s = now_s
+        peer.longest_silence_s = silence_s
         return peer
+
+    def _present_until_s(self, peer: _Peer) -> float:
+        """Return the time until which a candidate counts as present without another contact."""
+        return peer.last_contact_s + max(self.election_s, SILENCE_MARGIN * peer.longest_silence_s)
 
     def on_token_down(self, coordinator: str, incarnation: int) -> None:
         """Remove a process that has exited.
@@ -131,7 +150,7 @@ class Election:
         """Decide whether to lead; return whether the decision has changed."""
         rival = any(
             name < self.name
-            and now_s < peer.last_contact_s + self.election_s
+            and now_s < self._present_until_s(peer)
             and (not self.leading or peer.leading or now_s >= self._patience_s(peer))
             for name, peer in self._peers.items()
         )
@@ -145,9 +164,9 @@ class Election:
         return True
 
     def living(self, now_s: float) -> Iterator[str]:
-        """Yield the other candidates with a contact within the election timeout."""
+        """Yield the other candidates that count as present."""
         for name, peer in self._peers.items():
-            if now_s < peer.last_contact_s + self.election_s:
+            if now_s < self._present_until_s(peer):
                 yield name
 
     def _patience_s(self, peer: _Peer) -> float:
@@ -163,7 +182,7 @@ class Election:
             time_s
             for name, peer in self._peers.items()
             if name < self.name
-            for time_s in (peer.last_contact_s + self.election_s, self._patience_s(peer))
+            for time_s in (self._present_until_s(peer), self._patience_s(peer))
             if time_s > now_s
         ]
         return min(times, default=math.inf)

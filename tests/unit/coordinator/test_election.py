@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from itertools import count
 
 import pytest
 
-from laneweave.coordinator.election import NEWCOMER_FACTOR, Election
+from laneweave.coordinator.election import (
+    MAX_SILENCE_FACTOR,
+    NEWCOMER_FACTOR,
+    SILENCE_MARGIN,
+    Election,
+)
 from laneweave.protocol.wire.messages import Heartbeat, Name
 
 ELECTION_S = 0.4
@@ -42,6 +49,41 @@ def test_a_better_ranked_candidate_keeps_it_from_leading() -> None:
     assert not election.update(0.3 + ELECTION_S - 0.01)
     assert election.next_change_s(0.3) == 0.3 + ELECTION_S
     assert election.update(0.3 + ELECTION_S)
+
+
+def heard_until(election: Election, contacts_s: Iterable[float]) -> float:
+    """Let heartbeats of `a` arrive, and return how long it counts as present without another."""
+    for now_s in contacts_s:
+        election.on_heartbeat(beat("a"), now_s)
+    return next(ms / 1e3 for ms in count() if "a" not in election.living(now_s + ms / 1e3))
+
+
+def test_late_heartbeats_extend_the_timeout_for_a_while() -> None:
+    election = candidate()
+    late = (0.0, 0.1, 0.1 + 0.9 * ELECTION_S)
+    assert heard_until(election, late) == pytest.approx(SILENCE_MARGIN * 0.9 * ELECTION_S, abs=2e-3)
+    began_s = late[-1]
+    punctual = [began_s + 0.1 * number for number in range(1, 200)]
+    assert heard_until(election, punctual[:5]) > 1.2 * ELECTION_S
+    assert heard_until(election, punctual[5:]) == pytest.approx(ELECTION_S, abs=2e-3)
+
+
+def test_a_long_silence_extends_the_timeout_to_a_limit() -> None:
+    election = candidate()
+    silent = heard_until(election, (0.0, 100.0))
+    assert silent == pytest.approx(MAX_SILENCE_FACTOR * ELECTION_S, abs=2e-3)
+    # A new process has not been silent.
+    election.on_heartbeat(beat("a", incarnation=2), 100.1)
+    assert "a" not in election.living(100.1 + 1.01 * ELECTION_S)
+
+
+def test_terms_above_the_maximum_end_with_it() -> None:
+    election = candidate()
+    election.see_term(election.max_term)
+    assert election.term == election.max_term
+    election.limit_term(7)
+    election.see_term(8)
+    assert election.term == 7
 
 
 def test_worse_ranked_candidates_and_its_own_earlier_process_are_no_rivals() -> None:

@@ -137,8 +137,7 @@ class VehicleState:
     The state serves as promise, acceptance and progress report. Missing: vehicles that wait for it
     hold. Late or duplicated: harmless to vehicles, since "completed k moves of ballot b" stays
     true; leaders drop states older than that vehicle's newest, unless only older ones arrive for
-    0.5 s. With a ballot other than that of the
-    receiver's plan: not used for this plan.
+    0.5 s. With a ballot other than that of the receiver's plan: not used for this plan.
     """
 
     vehicle: Name
@@ -233,9 +232,8 @@ class Sense:
     vehicle continues its last trajectory. Duplicated: the agent repeats its answer. Older than the
     newest tick of the same bridge, or from an earlier bridge: ignored. From a newer bridge, or if
     only older ones arrive for 0.5 s: the agent discards its state and takes a new incarnation. A
-    message with
-    `left` is repeated for 20 ticks or until the agent's token vanishes; when a run ends, each
-    vehicle on the road receives one.
+    message with `left` is repeated for 20 ticks or until the agent's token vanishes; when a run
+    ends, each vehicle on the road receives one.
     """
 
     vehicle: Name
