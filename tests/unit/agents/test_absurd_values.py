@@ -136,6 +136,16 @@ def test_what_the_road_does_not_show_is_forgotten(changes: dict[str, Any]) -> No
     assert execution.promised is None or execution.incarnation == before
 
 
+def test_a_claim_above_a_wrong_attendant_is_taken_back() -> None:
+    seat = Seat()
+    seat.tick += 1
+    seat.feel(attendant=DAY_NS // 2, caretaker=True)
+    assert seat.agent._incarnation > DAY_NS // 2
+    seat.drive(3)
+    assert seat.agent.in_charge
+    assert seat.agent._incarnation == seat.given < DAY_NS // 2
+
+
 def test_it_takes_charge_of_a_vehicle_whose_attendant_is_nearly_a_day_ahead() -> None:
     """Such as after a forged COMMAND, from which the caretaker took over."""
     seat = Seat()
