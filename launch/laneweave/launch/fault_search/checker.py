@@ -179,6 +179,10 @@ class Checker:
         """Record that a vehicle has not arrived long after all faults have ended."""
         self._report("stuck", t_s, [vehicle], text)
 
+    def crashed(self, t_s: float, process: str, error: str) -> None:
+        """Record that a computation of a process has failed, which the process itself retries."""
+        self._report("crash", t_s, [process], error)
+
     def _end_motion(self, vehicle: str) -> None:
         if vehicle in self._moving:
             _, cell, ballot = self._moving.pop(vehicle)

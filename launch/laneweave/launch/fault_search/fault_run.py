@@ -208,6 +208,8 @@ class FaultRun:
         end_s = fault_s + self._patience_s
         while network.now_s < end_s and not self._is_over():
             network.run(network.now_s + CHECK_S)
+            while network.failed_jobs:
+                self.checker.crashed(*network.failed_jobs.pop())
         self.checker.advance(network.now_s)
         for name in self._not_arrived():
             vehicle = self.road.vehicles[name]

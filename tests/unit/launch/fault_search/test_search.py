@@ -14,7 +14,7 @@ from attrs import evolve
 from laneweave.launch.cli.options import check_jobs, parse_seeds
 from laneweave.launch.fault_search import search as search_module
 from laneweave.launch.fault_search.checker import Violation
-from laneweave.launch.fault_search.fault_run import SeedResult, Totals
+from laneweave.launch.fault_search.fault_run import FaultRun, SeedResult, Totals
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.search import (
     SearchResult,
@@ -82,6 +82,14 @@ def test_failures_are_described_with_the_command_that_replays_them() -> None:
 
 
 @pytest.mark.slow
+def test_a_crash_in_a_computation_is_a_violation() -> None:
+    run = FaultRun(0, CALM)
+    run.network.at(1.0, run.network.failed_jobs.append, (1.0, "c1", "ValueError: no"))
+    (violation,) = run.run().violations
+    found = violation.kind, violation.vehicles, violation.text
+    assert found == ("crash", ("c1",), "ValueError: no")
+
+
 def test_timeline_of_a_run() -> None:
     lines = list(timeline_of(1, CALM))
     assert lines[0] == "seed 1, profile calm:"

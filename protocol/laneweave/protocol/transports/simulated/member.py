@@ -176,16 +176,24 @@ class Member:
         duration_s = conditions.compute_s
         if conditions.compute_jitter_s:
             duration_s += conditions.compute_jitter_s * draw()
-        if conditions.compute_failure and draw() < conditions.compute_failure:
-            computed = Computed(job.job, None, INJECTED_FAILURE)
-        else:
-            computed = (
-                run_job(job) if isinstance(job, Compute) else run_delegated(job, self._local_s)
-            )
         # As with one thread and one worker, jobs of a kind end in the order in which they start.
         end_s = max(self._computed_s[type(job)], simulation.now_s + duration_s)
         self._computed_s[type(job)] = end_s
-        simulation.at(end_s, self.handle, computed)
+        if conditions.compute_failure and draw() < conditions.compute_failure:
+            simulation.at(end_s, self.handle, Computed(job.job, None, INJECTED_FAILURE))
+        elif isinstance(job, Delegate):
+            simulation.at(end_s, self.handle, run_delegated(job, self._local_s))
+        else:
+            simulation.at(end_s, self._run, job)
+
+    def _run(self, job: Compute) -> None:
+        """Run a computation at its end, since a thread may read what has changed meanwhile."""
+        if self.closed:
+            return
+        computed = run_job(job)
+        if computed.error:
+            self._simulation.failed_jobs.append((self._simulation.now_s, self.name, computed.error))
+        self.handle(computed)
 
 
 class Tokens:

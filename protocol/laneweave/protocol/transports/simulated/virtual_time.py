@@ -89,6 +89,8 @@ class Simulation:
         """Number of lost messages, counted per receiver."""
         self.delivered = 0
         """Number of deliveries to nodes."""
+        self.failed_jobs: list[tuple[float, str, str]] = []
+        """Time, node and error of each computation that failed by itself, not by injection."""
         self.random = random.Random(seed)  # noqa: S311 (simulation, not secrets)
         self.queue: list[tuple[float, int, Action, tuple[Any, ...]]] = []
         """(time, tie-breaker, action, arguments) of each future event."""

@@ -224,6 +224,29 @@ def test_a_computation_takes_its_time() -> None:
     assert core.times(Computed) == [0.25, 0.25]
 
 
+def test_a_computation_sees_what_has_changed_since_it_was_ordered() -> None:
+    """As in a thread: a job that reads what its core changes is not pure."""
+    state = [1]
+    core = Recorder(at_start(Compute(1, lambda: sum(state))))
+    network = SimulatedNetwork(3, Conditions(compute_s=0.25))
+    network.add("a", core, REALM)
+    network.at(0.1, state.append, 10)
+    network.run(1.0)
+    assert core.of(Computed) == [Computed(1, 11)]
+    assert network.failed_jobs == []
+
+
+def test_failed_computations_are_reported_unless_injected() -> None:
+    def fail() -> None:
+        raise ValueError("no")
+
+    for share, failed in ((0.0, [(0.25, "a", "ValueError: no")]), (1.0, [])):
+        network = SimulatedNetwork(3, Conditions(compute_s=0.25, compute_failure=share))
+        network.add("a", Recorder(at_start(Compute(1, fail))), REALM)
+        network.run(1.0)
+        assert network.failed_jobs == failed
+
+
 def test_computations_take_their_own_time_each_and_end_in_order() -> None:
     conditions = Conditions(compute_s=0.25, compute_jitter_s=2.0)
     core = computing(conditions, *(Compute(number, lambda: 7) for number in range(40)))
