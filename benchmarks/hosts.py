@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import resource
 import signal
 import statistics
@@ -32,11 +33,11 @@ from attrs import frozen
 
 from experiments import run_missing
 from laneweave.launch.recordings.formations import read_events
-from laneweave.protocol.wire.events import CARETAKER_TOOK_OVER
+from laneweave.protocol.wire.events import AGENT_TOOK_OVER, CARETAKER_TOOK_OVER, LEFT
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from laneweave.launch.faults.network_namespaces import PERFECT, Link
-from support.hosts import Hosts, compose, lasts, open_hosts
+from support.hosts import APART, Hosts, compose, lasts, open_hosts
 
 LONGEST_S = 600.0
 """Upper bound on the duration of a run, in wall-clock seconds."""
@@ -44,6 +45,10 @@ DURATION_S, SHORT_S = 90.0, 20.0
 """Duration of the arrivals."""
 BEGIN_S = 40.0
 """Road time of the fault: vehicles enter and change lanes, and none has left yet."""
+OUTAGES, OUTAGE_S, BETWEEN_S = 20, 5.0, 1.0
+"""Number of outages of one link, duration of each, and time after each recovery [s]."""
+MAX_BACK_S = 20.0
+"""Upper bound on the time until agents are back."""
 AWAY_S = 3.0
 """Wall-clock time until a killed service is restarted."""
 SERVICES = tuple(name for name, service in compose()["services"].items() if lasts(service))
@@ -56,20 +61,25 @@ class Experiment:
     name: str
     text: str
     """Description of the fault, for the table."""
-    disturb: Callable[[Hosts], None]
+    disturb: Callable[[Hosts], list[float]]
+    """Disturb a run; return how long each disturbance lasted beyond its end [s], if measured."""
     loss: Link = PERFECT
     """Of all links during the whole run."""
+    apart: bool = False
+    """Whether the second agents process has a link of its own."""
 
 
-def nothing(_: Hosts) -> None:
+def nothing(_: Hosts) -> list[float]:
     """Do not disturb the deployment."""
+    return []
 
 
 def cut(host: str, for_s: float) -> Experiment:
     """Return an experiment that cuts a host's link."""
 
-    def disturb(hosts: Hosts) -> None:
+    def disturb(hosts: Hosts) -> list[float]:
         hosts.partition(host, for_s)
+        return []
 
     return Experiment(
         f"{host}-cut-{for_s:g}-s", f"link of the {host} host cut for {for_s:g} s", disturb
@@ -79,14 +89,39 @@ def cut(host: str, for_s: float) -> Experiment:
 def killed(name: str) -> Experiment:
     """Return an experiment that kills a service and restarts it."""
 
-    def disturb(hosts: Hosts) -> None:
+    def disturb(hosts: Hosts) -> list[float]:
         hosts.kill(name)
         time.sleep(AWAY_S)
         hosts.start(name)
+        return []
 
     return Experiment(
         f"{name}-killed", f"{name} killed, and started again after {AWAY_S:g} s", disturb
     )
+
+
+def outages(hosts: Hosts) -> list[float]:
+    """Cut one agents process off again and again; return the times until its agents are back."""
+    back_s = []
+    for _ in range(OUTAGES):
+        hosts.partition(APART, OUTAGE_S)
+        began_s = time.monotonic()
+        while (unattended := _unattended(hosts)) and time.monotonic() < began_s + MAX_BACK_S:
+            time.sleep(0.02)
+        back_s.append(math.inf if unattended else time.monotonic() - began_s)
+        time.sleep(BETWEEN_S)
+    return back_s
+
+
+def _unattended(hosts: Hosts) -> set[str]:
+    """Return the vehicles on the road with a caretaker in charge."""
+    unattended: set[str] = set()
+    for event in read_events(hosts.runs[-1], CARETAKER_TOOK_OVER, AGENT_TOOK_OVER, LEFT):
+        if event["kind"] == CARETAKER_TOOK_OVER:
+            unattended.add(event["vehicle"])
+        elif event["kind"] in (AGENT_TOOK_OVER, LEFT):
+            unattended.discard(event["vehicle"])
+    return unattended
 
 
 UNDISTURBED = Experiment("undisturbed", "nothing", nothing)
@@ -98,6 +133,12 @@ FAULTS = (
         for host in ("vehicles", "coordinators", "simulation")
     ),
     *(killed(name) for name in SERVICES),
+    Experiment(
+        "outages",
+        f"link of agents-2 cut for {OUTAGE_S:g} s, {OUTAGES} times",
+        outages,
+        apart=True,
+    ),
 )
 LOSSES = (
     UNDISTURBED,
@@ -118,11 +159,12 @@ def run(
     folder.mkdir(parents=True)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     demand = {"duration_s": duration_s}
-    with open_hosts(folder, pace=pace, link=link, demand=demand) as hosts:
+    options: dict[str, Any] = {"pace": pace, "link": link, "apart": experiment.apart}
+    with open_hosts(folder, **options, demand=demand) as hosts:
         hosts.start_all(experiment.loss)
         hosts.wait_road(BEGIN_S, LONGEST_S)
         began = time.monotonic()
-        experiment.disturb(hosts)
+        back_s = experiment.disturb(hosts)
         lasted_s = time.monotonic() - began
         bridge = hosts.finish("bridge", LONGEST_S)
         # Services that still run exit on request; a negative status means that the process died.
@@ -137,6 +179,7 @@ def run(
         "bridge_status": bridge,
         "ended_badly": sorted(name for name, status in statuses.items() if status != 0),
         "disturbed_s": round(lasted_s, 1),
+        "back_s": [round(each, 2) for each in back_s],
     } | found
 
 

@@ -47,6 +47,8 @@ END_S = 90.0
 """How long a process that was told to end may take, and a health check."""
 READY_S = 90.0
 """How long services may take to be healthy; numba's code may have to be compiled."""
+APART = "vehicles-2"
+"""Host of the second agents process, if that is to have a link of its own."""
 _HOST_OF = {
     "certs": HUB,
     "router": HUB,
@@ -70,11 +72,6 @@ def lasts(service: Mapping[str, Any]) -> bool:
     return service.get("restart") != "no"
 
 
-def host_of(service: str) -> str:
-    """Return the host of a service."""
-    return _HOST_OF[service.partition("-")[0]]
-
-
 @define
 class Hosts:
     """Hosts with services on them; see `open_hosts`."""
@@ -85,6 +82,8 @@ class Hosts:
     services: Mapping[str, Mapping[str, Any]]
     pace: float
     environment: Mapping[str, str]
+    apart: bool = False
+    """Whether the second agents process has a host of its own."""
     running: dict[str, subprocess.Popen[bytes]] = field(factory=dict)
 
     # --- services -----------------------------------------------------------------------------
@@ -116,7 +115,7 @@ class Hosts:
         self.start(*(name for name in names if name not in ("router", "bridge")))
         self.start("router")
         self.wait_healthy(*self.services["bridge"]["depends_on"])
-        self.network.set_links(dict.fromkeys(LINKS, loss))
+        self.network.set_links(dict.fromkeys(self.network.groups, loss))
         self.start("bridge")
 
     def healthy(self, name: str) -> bool:
@@ -163,7 +162,10 @@ class Hosts:
         return status
 
     def _words(self, service: str, words: Iterable[str]) -> list[str]:
-        namespace = f"/proc/{self.network.process_id(host_of(service))}/ns/net"
+        host = (
+            APART if self.apart and service == "agents-2" else _HOST_OF[service.partition("-")[0]]
+        )
+        namespace = f"/proc/{self.network.process_id(host)}/ns/net"
         enter = ["nsenter", f"--net={namespace}", "--", "unshare", "--mount", "--"]
         inside = (self._path(word) for word in words)
         return [*enter, "sh", "-c", _ENTER, str(self.folder / "hosts"), *inside]
@@ -208,6 +210,7 @@ def open_hosts(
     *,
     pace: float,
     link: str = "tls",
+    apart: bool = False,
     environment: Mapping[str, str] | None = None,
     **tables: Mapping[str, object],
 ) -> Iterator[Hosts]:
@@ -218,6 +221,7 @@ def open_hosts(
         pace: road seconds per second.
         link: protocol and options of endpoints, such as `quic?mixed_rel=1`; without encryption
             (`tcp`, `udp`) anybody may do anything.
+        apart: whether the second agents process has a host of its own.
         environment: of the services; none: this process's.
         **tables: entries of scenarios/compose.toml that are to be different, by table.
 
@@ -230,10 +234,10 @@ def open_hosts(
     text = _configuration(_network(folder, link) | tables)
     (folder / "deployment.toml").write_text(text, encoding="utf-8")
     (folder / "hosts").write_text(f"127.0.0.1 localhost\n{HUB_ADDRESS} router\n", encoding="utf-8")
-    network = GroupNetwork(fork_server(), LINKS)
+    network = GroupNetwork(fork_server(), (*LINKS, APART) if apart else LINKS)
     network.open()
     services = compose()["services"]
-    hosts = Hosts(folder, network, services, pace, environment or os.environ)
+    hosts = Hosts(folder, network, services, pace, environment or os.environ, apart)
     try:
         once = [name for name, service in services.items() if not lasts(service)]
         for name in once if is_encrypted(link) else []:
