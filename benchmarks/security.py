@@ -37,12 +37,14 @@ ROUNDS, SAMPLES, PERIOD_S, PAYLOAD_BYTES = 6, 500, 0.002, 300
 START_S = 120.0
 
 
-def _scenario(folder: Path, port: int, kind: str, vehicles: int = 10) -> Scenario:
+def _scenario(
+    folder: Path, port: int, kind: str, vehicles: int = 10, options: str = ""
+) -> Scenario:
     return parse_scenario(
         {
-            "network": {"endpoint": f"{kind}/127.0.0.1:{port}"},
+            "network": {"endpoint": f"{kind}/127.0.0.1:{port}{options}"},
             "security": {
-                "mode": "mtls" if kind == "tls" else "off",
+                "mode": "off" if kind == "tcp" else "mtls",
                 "folder": str(folder),
                 "vehicles": [f"v{number:04d}" for number in range(1, vehicles + 1)],
             },
@@ -105,6 +107,11 @@ def _measure(folder: Path) -> dict[str, object]:
         "tcp": (open_, None),
         "tls": (unruled, no_rules),
         "tls with rules": (secured, guard),
+        "quic with rules": (_scenario(folder, 27904, "quic"), guard),
+        "quic?mixed_rel=1 with rules": (
+            _scenario(folder, 27905, "quic", options="?mixed_rel=1"),
+            guard,
+        ),
     }
     found: dict[str, list[float]] = {name: [] for name in variants}
     for _ in range(ROUNDS):
@@ -121,6 +128,7 @@ def _measure(folder: Path) -> dict[str, object]:
             "samples": len(times),
             "put_to_callback_us_p50": round(percent[49]),
             "put_to_callback_us_p99": round(percent[98]),
+            "lost": ROUNDS * SAMPLES - len(times),
         }
     return report
 
