@@ -134,12 +134,11 @@ class BridgeCore:
         self._world = world
         self._record = record
         self._roadside = Roadside(scenario, incarnation)
-        tick_s, max_pace = scenario.runtime.tick_s, scenario.runtime.max_pace
-        self._tick_duration_s = tick_s / (pace or max_pace)
-        self._min_tick_duration_s = min(self._tick_duration_s, tick_s / max_pace)
+        runtime = scenario.runtime
+        self._tick_duration_s = runtime.tick_s / (pace or runtime.max_pace)
+        self._min_tick_duration_s = min(self._tick_duration_s, runtime.tick_s / runtime.max_pace)
         self._incarnation = incarnation
         self._stopwatch = stopwatch
-        runtime = scenario.runtime
         self._bounds = Bounds(incarnation, runtime.tick_s, runtime.max_road_s)
         self._attendance = Attendance(scenario, new_incarnation)
         self._answers = self._attendance.answers
