@@ -38,7 +38,7 @@ def the_line(ended: Ended) -> str:
     "endpoint",
     [
         "nonsense",
-        "udp/127.0.0.1:7447",
+        "ws/127.0.0.1:7447",
         "tcp/",
         "tcp/127.0.0.1",
         "tcp/127.0.0.1:port",

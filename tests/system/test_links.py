@@ -81,6 +81,7 @@ def test_a_link_loses_a_share_of_its_packets(network: GroupNetwork) -> None:
     missing = lost(network, "one")
     assert 0.06 < len(missing) / PACKETS < 0.14
     assert lost(network, "other") == set()
+    network.set_links({"one": Link(loss=1.0)})
     network.set_links({})
     assert lost(network, "one") == set()
 

@@ -218,6 +218,8 @@ class CoordinatorCore:
                 self._bounds.check_incarnation(incarnation, now_s)
                 if event.topic is BRIDGE_ALIVE:
                     road.on_token_up(incarnation, now_s)
+            case LinkDown():
+                road.on_link_down()
             case PeerDown(topic, parameters) if topic is BRIDGE_ALIVE and self.election.link_up:
                 road.on_token_down(incarnation_of(parameters), now_s)
             case _:

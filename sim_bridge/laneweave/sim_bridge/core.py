@@ -373,11 +373,11 @@ class BridgeCore:
         if self._is_over():
             yield from self._shut_down(now_s)
             return
-        self._until_s = self._next_tick_s(now_s)
+        self._until_s = self._schedule_tick(now_s)
         self.phase = TickPhase.PACE
 
-    def _next_tick_s(self, now_s: float) -> float:
-        """Return when the next tick opens.
+    def _schedule_tick(self, now_s: float) -> float:
+        """Schedule the next tick, and return when it opens.
 
         The road keeps `pace` on average: after long ticks it is faster, up to the scenario's
         `max_pace`. On a link that loses packets, few ticks are long.

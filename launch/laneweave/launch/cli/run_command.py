@@ -83,7 +83,7 @@ def run(
     out: RunFolder = None,
     pace: Annotated[
         float | None,
-        typer.Option("--pace", help="Maximum road seconds per second; default: runtime.max_pace."),
+        typer.Option("--pace", help="Mean road seconds per second; default: runtime.max_pace."),
     ] = None,
     no_progress: NoProgress = False,
 ) -> None:

@@ -58,7 +58,7 @@ def _check_network(scenario: Scenario, report: Report) -> None:
             report.problems.append(str(error))
     if link_of(network.endpoint) not in map(link_of, network.listens_at):
         allowed = f"an endpoint with the protocol and the options of {network.endpoint}, too"
-        report.problems.append(str(BadInputError("network.listen", network.listen, allowed)))
+        report.problems.append(str(BadInputError("network.listen", list(network.listen), allowed)))
     if network.listen and host_of(network.endpoint) in EVERYWHERE:
         report.warnings.append(
             f"network.endpoint: {network.endpoint} is not reachable by other roles"

@@ -40,6 +40,8 @@ ANSWER_S = 10.0
 HUB = "hub"
 _CLONE_NEWNET = 0x40000000
 _PATH = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"))
+_PARTS = 10_000
+"""Denominator of shares of lost packets."""
 _UPLINK = "uplink"
 """A group's end of its device pair; the hub's end is named after the group."""
 
@@ -216,6 +218,18 @@ class GroupNetwork:
                 self._filter(group, [(_UPLINK, wanted)])
                 self._filter(HUB, self._links.items())
 
+    def check_filters(self) -> None:
+        """Check that links can lose packets.
+
+        Raises:
+            NamespacesUnavailableError: they cannot; nothing remains.
+        """
+        try:
+            self._filter(HUB, ())
+        except NamespacesUnavailableError:
+            self.close()
+            raise
+
     def _filter(self, namespace: str, links: Iterable[tuple[str, Link]]) -> None:
         """Drop packets received in a namespace, by device."""
         self._namespaces[namespace].run("nft", filter_rules(links))
@@ -236,11 +250,7 @@ def filter_rules(links: Iterable[tuple[str, Link]]) -> str:
     rules = []
     for device, link in links:
         if link.loss > 0.0:
-            # Either each packet with this probability, or the first ones of each group of packets.
-            draw, period = ("inc", link.burst / link.loss) if link.burst > 1 else ("random", 1e4)
-            lost = max(1, round(link.loss * period))
-            condition = f"numgen {draw} mod {round(period)} < {lost}"
-            match = f'iifname "{device}" meta l4proto {{ tcp, udp }} {condition} drop'
+            match = f'iifname "{device}" meta l4proto {{ tcp, udp }} {_condition(link)} drop'
             rules.append(f"add rule inet laneweave received {match}")
     chain = "{ type filter hook input priority 0 ; }"
     return "; ".join(
@@ -253,10 +263,20 @@ def filter_rules(links: Iterable[tuple[str, Link]]) -> str:
     )
 
 
+def _condition(link: Link) -> str:
+    """Return the condition of `nft` for losing a packet."""
+    if link.loss >= 1.0:
+        return ""
+    if link.burst > 1:
+        # The first ones of each group of packets.
+        return f"numgen inc mod {round(link.burst / link.loss)} < {link.burst}"
+    return f"numgen random mod {_PARTS} < {min(round(link.loss * _PARTS), _PARTS - 1)}"
+
+
 def open_network(
     specification: FaultSpec, context: ForkServerContext
 ) -> tuple[GroupNetwork | None, str]:
-    """Create the namespaces that partitions use.
+    """Create the namespaces that partitions and faults of links use.
 
     Returns:
         (namespaces, ""), or (None, reason); the reason is empty if no fault needs namespaces.
@@ -272,10 +292,12 @@ def open_network(
     network = GroupNetwork(context, tuple(groups))
     try:
         network.open()
+        if specification.link:
+            network.check_filters()
     except NamespacesUnavailableError as error:
-        for name, fault in specification.links():
-            allowed = f"nothing, because namespaces cannot be created ({error})"
-            raise BadInputError(name, fault.of, allowed) from error
+        if specification.link:
+            allowed = f"nothing, because links cannot lose packets here ({error})"
+            raise BadInputError("link[0]", "a table", allowed) from error
         for name, partition in specification.partitions():
             if partition.method == NAMESPACES:
                 allowed = f"messages, because namespaces cannot be created ({error})"

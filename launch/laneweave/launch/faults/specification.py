@@ -31,6 +31,7 @@ GROUPS = tuple(SENDER_OF_GROUP)
 OTHERS = "others"
 ALL = "all"
 AUTO, NAMESPACES, MESSAGES = "auto", "namespaces", "messages"
+MAX_BURST_LOSS = 0.5
 MAX_S = 1e6
 MAX_TIMES = 10_000
 MIN_EVERY_S = 0.1
@@ -197,10 +198,16 @@ class LinkFault(TimedFault):
 
     of: str = field(default=ALL, validator=one_of(*GROUPS, ALL))
     """Group whose link loses packets, in both directions; `all`: every group's."""
-    loss: float = field(validator=within(0.0, 1.0))
-    """Share of packets that are lost in each direction."""
+    loss: float = field(validator=within(0.001, 1.0))
+    """Share of packets that are lost in each direction; at most 0.5 with bursts."""
     burst: int = field(default=1, validator=within(1, 1000))
     """Number of successive packets lost together; 1: each packet is lost independently."""
+
+    def __attrs_post_init__(self) -> None:
+        """Check that the fields do not contradict each other."""
+        super().__attrs_post_init__()
+        if self.burst > 1 and self.loss > MAX_BURST_LOSS:
+            raise BadInputError("burst", self.burst, f"1 if loss is above {MAX_BURST_LOSS:g}")
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -254,7 +261,7 @@ class FaultSpec:
             if partition.method == NAMESPACES:
                 raise BadInputError(f"{name}.method", NAMESPACES, f"{MESSAGES} {where}")
         if self.link:
-            allowed = f"nothing {where}, which has no packets; messages can lose messages"
+            allowed = f"nothing {where}, which has no packets; use [[messages]] to lose messages"
             raise BadInputError("link", "a table", allowed)
 
 

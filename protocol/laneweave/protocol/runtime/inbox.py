@@ -16,9 +16,10 @@ from laneweave.protocol.runtime.transport import Delivery, Overflow, Query, Rece
 MAX_QUERY_WAIT_S = 0.02
 """Longest time a query waits while other work is queued, unless `QUERY_SHARE` requires more."""
 MAX_WAITING = 100
-"""Maximum number of waiting messages of one key; further ones are dropped.
+"""Maximum number of waiting messages of one sender or receiver; further ones are dropped.
 
-A flood on some keys then delays messages on other keys only briefly. Every message may be lost, and
+It is the last part of a key, so that other parts, which a sender may choose, do not matter. A flood
+from one sender then delays messages of others only briefly. Every message may be lost, and
 a correct sender has at most a few messages under way."""
 OVERFLOW_S = 0.1
 """Interval at which the node is notified of dropped messages."""
@@ -41,7 +42,7 @@ class Inbox:
         self._items: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self._queries: deque[Query] = deque()
         self._waiting: Counter[str] = Counter()
-        """Number of waiting messages by key."""
+        """Number of waiting messages by the last part of their keys."""
         self._lock = threading.Lock()
         """Guards `_waiting`; never needed in a signal handler."""
         self._overflowed: dict[str, None] = {}
@@ -83,14 +84,16 @@ class Inbox:
             self._next_query_s = now_s + max(MAX_QUERY_WAIT_S, took_s / QUERY_SHARE)
 
     def _admit(self, key: str) -> bool:
+        name = key.rpartition("/")[2]
         with self._lock:
-            if self._waiting[key] >= MAX_WAITING:
+            if self._waiting[name] >= MAX_WAITING:
                 return False
-            self._waiting[key] += 1
+            self._waiting[name] += 1
             return True
 
     def _release(self, key: str) -> None:
+        name = key.rpartition("/")[2]
         with self._lock:
-            self._waiting[key] -= 1
-            if not self._waiting[key]:
-                del self._waiting[key]
+            self._waiting[name] -= 1
+            if not self._waiting[name]:
+                del self._waiting[name]

@@ -57,8 +57,8 @@ def max_election_term(road_s: float) -> int:
 class Bounds:
     """Limits of one receiver; `check` refuses messages outside them.
 
-    Incarnations are bounded by the receiver's own: a start time to which the time since is added,
-    so no wall clock is needed. Counters, which simulations use, are far below this limit.
+    Incarnations are bounded by the receiver's own: its start time plus the time since then, so no
+    wall clock is needed. Counters, which simulations use, are far below this limit.
     """
 
     incarnation: int

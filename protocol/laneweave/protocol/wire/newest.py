@@ -87,6 +87,10 @@ class NewestRoad:
             self._bridge = Newest()
             self._take_bridge(max(self._tokens), now_s)
 
+    def on_link_down(self) -> None:
+        """Forget all tokens: they are shown again when the connection is restored."""
+        self._tokens.clear()
+
     def on_message(self, bridge: int, t_s: float, now_s: float) -> bool:
         """Register a message of a bridge; return whether it is of the newest road.
 

@@ -92,13 +92,18 @@ class Topic:
     deputy: Party | None = None
     """Party that may send on behalf of any sender."""
     exchange: Exchange = Exchange.MESSAGES
+    long: bool = False
+    """Whether a message may take many packets."""
     remark: str = ""
     """Remark for the table of docs/PROTOCOL.md."""
 
     @property
     def reliable(self) -> bool:
-        """Whether a link that can lose messages must deliver this topic's messages, in order."""
-        return self.quality is not Quality.LATEST
+        """Whether a link that can lose messages must deliver this topic's messages, in order.
+
+        A long message sent as datagrams would rarely arrive complete.
+        """
+        return self.quality is not Quality.LATEST or self.long
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -112,7 +117,7 @@ CLOCK = Topic(
 )  # fmt: skip
 CENSUS = Topic(
     "census", "census", messages.Census, Party.BRIDGE, Quality.LATEST,
-    readers=(Party.COORDINATOR, Party.FLEET, Party.OBSERVER),
+    readers=(Party.COORDINATOR, Party.FLEET, Party.OBSERVER), long=True,
     remark="fleets: only those with a shard",
 )  # fmt: skip
 SENSE = Topic(

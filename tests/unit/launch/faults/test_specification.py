@@ -145,6 +145,8 @@ def test_a_file_may_have_every_field(tmp_path: Path) -> None:
         ("[[link]]", "link[0].loss"),
         ("[[link]]\nloss = 1.5", "link[0].loss"),
         ("[[link]]\nloss = 0.1\nburst = 0", "link[0].burst"),
+        ("[[link]]\nloss = 0.6\nburst = 2", "link[0].burst"),
+        ("[[link]]\nloss = 0.0001", "link[0].loss"),
         ('[[link]]\nloss = 0.1\nof = "others"', "link[0].of"),
         ("[[link]]\nloss = 0.1\nfrom_s = 2\nuntil_s = 1", "link[0].until_s"),
         ('[[partition]]\nbetween = ["bridge", "bridge"]', "partition[0].between"),

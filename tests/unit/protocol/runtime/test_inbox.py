@@ -80,6 +80,14 @@ def test_a_flood_on_one_key_delays_other_keys_only_briefly() -> None:
     ]
 
 
+def test_a_sender_that_varies_other_parts_of_its_keys_is_limited_too() -> None:
+    inbox = Inbox()
+    for number in range(50 * MAX_WAITING):
+        inbox.put(Received(f"state/{number}/v0001", b""))
+    taken = [item for _ in range(50 * MAX_WAITING) for item in inbox.take(0.0)]
+    assert sum(isinstance(item, Received) for item in taken) == MAX_WAITING
+
+
 def test_messages_are_taken_again_when_those_before_have_been_handled() -> None:
     inbox = Inbox()
     for _ in range(3):

@@ -69,6 +69,15 @@ def test_when_its_token_vanishes_the_newest_bridge_that_has_one_counts() -> None
     assert road.bridge == 7
 
 
+def test_tokens_from_before_a_lost_connection_do_not_count() -> None:
+    road = NewestRoad(PACE)
+    road.on_token_up(7, 0.0)
+    road.on_link_down()
+    road.on_token_up(8, 1.0)  # 7 exited meanwhile
+    road.on_token_down(8, 2.0)
+    assert road.bridge == 8
+
+
 def test_a_bridge_that_shows_nothing_is_forgotten_while_another_one_does() -> None:
     road = NewestRoad(PACE)
     road.on_message(7, 30.0, 0.0)

@@ -65,6 +65,11 @@ def test_topics_are_distinct() -> None:
         assert [other for other in keys if topics.matches(KEYS.all_of(topic), other)] == [key]
 
 
+def test_only_short_messages_that_the_next_one_replaces_may_be_lost_by_a_link() -> None:
+    unreliable = {topic.name for topic in topics.TOPICS if not topic.reliable}
+    assert unreliable == {"clock", "state", "motion", "heartbeat"}
+
+
 def test_every_message_kind_has_one_topic() -> None:
     carried = [topic.kind for topic in topics.TOPICS if topic.kind is not None]
     assert sorted(kind.__name__ for kind in carried) == sorted(KINDS)

@@ -119,7 +119,9 @@ class ZenohTransport:
             self._session = _open(client_settings(access), CLIENT_RUNTIME)
         except zenoh.ZError as error:
             raise BadInputError(
-                "network.endpoint", endpoint, f"the endpoint of a running router{authority}"
+                "network.endpoint",
+                endpoint,
+                f"the endpoint of a running router, with its options{authority}",
             ) from error
         self._deliver = deliver
         self._subscriptions: dict[str, Any] = {}
