@@ -79,7 +79,10 @@ def test_a_link_is_cut_and_the_router_killed(make_hosts: MakeHosts) -> None:
 
 def test_links_lose_packets(make_hosts: MakeHosts) -> None:
     hosts = make_hosts(pace=3.0, link="quic?mixed_rel=1")
-    hosts.start_all(Link(loss=0.1))
+    try:
+        hosts.start_all(Link(loss=0.1))
+    except NamespacesUnavailableError as error:
+        pytest.skip(f"there can be no links that lose packets here: {error}")
     folder = finish(hosts)
     assert summary(folder)["failover"]["leader_changes"] <= 1
 
