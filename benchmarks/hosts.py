@@ -32,11 +32,11 @@ import pyarrow.parquet as pq
 from attrs import frozen
 
 from experiments import run_missing
+from laneweave.launch.faults.network_namespaces import PERFECT, Link
 from laneweave.launch.recordings.formations import read_events
 from laneweave.protocol.wire.events import AGENT_TOOK_OVER, CARETAKER_TOOK_OVER, LEFT
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from laneweave.launch.faults.network_namespaces import PERFECT, Link
 from support.hosts import APART, Hosts, compose, lasts, open_hosts
 
 LONGEST_S = 600.0
@@ -61,7 +61,7 @@ class Experiment:
     name: str
     text: str
     """Description of the fault, for the table."""
-    disturb: Callable[[Hosts], list[float]]
+    disturb: Callable[[Hosts], list[float] | None]
     """Disturb a run; return how long each disturbance lasted beyond its end [s], if measured."""
     loss: Link = PERFECT
     """Of all links during the whole run."""
@@ -69,17 +69,15 @@ class Experiment:
     """Whether the second agents process has a link of its own."""
 
 
-def nothing(_: Hosts) -> list[float]:
+def nothing(_: Hosts) -> None:
     """Do not disturb the deployment."""
-    return []
 
 
 def cut(host: str, for_s: float) -> Experiment:
     """Return an experiment that cuts a host's link."""
 
-    def disturb(hosts: Hosts) -> list[float]:
+    def disturb(hosts: Hosts) -> None:
         hosts.partition(host, for_s)
-        return []
 
     return Experiment(
         f"{host}-cut-{for_s:g}-s", f"link of the {host} host cut for {for_s:g} s", disturb
@@ -89,11 +87,10 @@ def cut(host: str, for_s: float) -> Experiment:
 def killed(name: str) -> Experiment:
     """Return an experiment that kills a service and restarts it."""
 
-    def disturb(hosts: Hosts) -> list[float]:
+    def disturb(hosts: Hosts) -> None:
         hosts.kill(name)
         time.sleep(AWAY_S)
         hosts.start(name)
-        return []
 
     return Experiment(
         f"{name}-killed", f"{name} killed, and started again after {AWAY_S:g} s", disturb
@@ -164,7 +161,7 @@ def run(
         hosts.start_all(experiment.loss)
         hosts.wait_road(BEGIN_S, LONGEST_S)
         began = time.monotonic()
-        back_s = experiment.disturb(hosts)
+        back_s = experiment.disturb(hosts) or []
         lasted_s = time.monotonic() - began
         bridge = hosts.finish("bridge", LONGEST_S)
         # Services that still run exit on request; a negative status means that the process died.

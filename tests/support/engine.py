@@ -13,7 +13,6 @@ import re
 import shlex
 import shutil
 import subprocess
-import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -176,11 +175,8 @@ class Containers:
 
     def wait_ended(self, service: str, within_s: float) -> int:
         """Wait until a service has ended by itself, and return its exit status."""
-        give_up = time.monotonic() + within_s
-        while (state := self.state(service))["Status"] != "exited":
-            assert time.monotonic() < give_up, f"{service} runs longer than {within_s:g} s"
-            time.sleep(1.0)
-        status: int = state["ExitCode"]
+        wait_until(lambda: self.state(service)["Status"] == "exited", within_s)
+        status: int = self.state(service)["ExitCode"]
         return status
 
     def in_volume(self, volume: str, *words: str) -> str:

@@ -49,7 +49,7 @@ def installed_by(*extras: str) -> set[str]:
     waiting = [Requirement(one) for group in groups for one in group]
     while waiting:
         wanted = waiting.pop()
-        # The same distribution may be wanted with other extras of its own.
+        # A distribution may be required again, with other extras.
         if str(wanted) not in found:
             found |= {str(wanted), normal(wanted.name)}
             waiting += _requirements(wanted.name, wanted.extras or {""})

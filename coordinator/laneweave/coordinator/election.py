@@ -100,16 +100,14 @@ class Election:
 
     def _on_contact(self, coordinator: str, incarnation: int, now_s: float) -> _Peer:
         peer = self._peers.get(coordinator)
-        silence_s = 0.0
-        if peer is not None and peer.incarnation == incarnation:
-            limit_s = MAX_SILENCE_FACTOR / SILENCE_MARGIN * self.election_s
-            silence_s = min(
-                max(now_s - peer.last_contact_s, SILENCE_DECAY * peer.longest_silence_s), limit_s
-            )
-        if peer is None or peer.incarnation != incarnation or now_s >= self._present_until_s(peer):
+        if peer is None or peer.incarnation != incarnation:
             peer = self._peers[coordinator] = _Peer(incarnation, now_s, now_s)
+        elif now_s >= self._present_until_s(peer):
+            peer.since_s, peer.leading = now_s, False
+        silence_s = max(now_s - peer.last_contact_s, SILENCE_DECAY * peer.longest_silence_s)
+        limit_s = MAX_SILENCE_FACTOR / SILENCE_MARGIN * self.election_s
+        peer.longest_silence_s = min(silence_s, limit_s)
         peer.last_contact_s = now_s
-        peer.longest_silence_s = silence_s
         return peer
 
     def _present_until_s(self, peer: _Peer) -> float:

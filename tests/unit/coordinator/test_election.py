@@ -52,7 +52,7 @@ def test_a_better_ranked_candidate_keeps_it_from_leading() -> None:
 
 
 def heard_until(election: Election, contacts_s: Iterable[float]) -> float:
-    """Let heartbeats of `a` arrive, and return how long it counts as present without another."""
+    """Let heartbeats of `a` arrive; return how long it counts as present after the last one."""
     for now_s in contacts_s:
         election.on_heartbeat(beat("a"), now_s)
     return next(ms / 1e3 for ms in count() if "a" not in election.living(now_s + ms / 1e3))

@@ -224,11 +224,7 @@ class FaultInjection:
 
     def _change_links(self, road_s: float) -> None:
         """Begin and end partitions and faults of links."""
-        specification = self.specification
-        faults: list[tuple[str, Partition | LinkFault]] = [
-            *specification.partitions(),
-            *specification.links(),
-        ]
+        faults = self.specification.timed_faults()
         in_force = {name: fault for name, fault in faults if fault.holds(road_s)}
         if in_force.keys() == self._in_force:
             return

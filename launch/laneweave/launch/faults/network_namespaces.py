@@ -208,6 +208,7 @@ class GroupNetwork:
         Raises:
             NamespacesUnavailableError: a command failed.
         """
+        hub = filter_rules(self._links.items())
         for group in self.groups:
             wanted, current = links.get(group, PERFECT), self._links.get(group, PERFECT)
             self._links[group] = wanted
@@ -216,7 +217,8 @@ class GroupNetwork:
                 self._namespaces[HUB].run("ip", "link", "set", "dev", group, state)
             if (wanted.loss, wanted.burst) != (current.loss, current.burst):
                 self._filter(group, [(_UPLINK, wanted)])
-                self._filter(HUB, self._links.items())
+        if filter_rules(self._links.items()) != hub:
+            self._filter(HUB, self._links.items())
 
     def check_filters(self) -> None:
         """Check that links can lose packets.

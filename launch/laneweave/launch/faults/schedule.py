@@ -74,8 +74,7 @@ class FaultSchedule:
         ]
         windows: list[tuple[str, MessageRule | TimedFault]] = [
             *((f"messages[{i}]", rule) for i, rule in enumerate(self._specification.messages)),
-            *self._specification.partitions(),
-            *self._specification.links(),
+            *self._specification.timed_faults(),
         ]
         lines += [
             f"the run ended before {name} came into force at {window.from_s:g} s"

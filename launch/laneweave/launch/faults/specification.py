@@ -242,8 +242,9 @@ class FaultSpec:
         for index, partition in enumerate(self.partition):
             yield f"partition[{index}]", partition
 
-    def links(self) -> Iterator[tuple[str, LinkFault]]:
-        """Yield the faults of links with their names."""
+    def timed_faults(self) -> Iterator[tuple[str, Partition | LinkFault]]:
+        """Yield partitions and faults of links with their names."""
+        yield from self.partitions()
         for index, fault in enumerate(self.link):
             yield f"link[{index}]", fault
 

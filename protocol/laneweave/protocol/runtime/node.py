@@ -73,7 +73,7 @@ class PeerDown(_OnTopic):
 
 @frozen
 class MessagesDropped(_OnTopic):
-    """Messages were dropped on arrival, since too many of the same key were waiting."""
+    """Messages were dropped on arrival, since too many of the same sender were waiting."""
 
 
 @frozen

@@ -25,7 +25,7 @@ class Received:
 
 @frozen
 class Overflow:
-    """Messages of a key were dropped, since too many of them waited for this node."""
+    """Messages of a key were dropped, since too many of the same sender waited for this node."""
 
     key: str
 

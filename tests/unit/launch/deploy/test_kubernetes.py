@@ -64,7 +64,7 @@ def container(workload: str) -> dict[str, Any]:
 
 
 def words(text: list[str], workload: str, ordinal: int) -> list[str]:
-    """Return the words of a command as the pod with an ordinal executes them."""
+    """Return the command that the pod with this ordinal executes, as words."""
     values = {"ORDINAL": str(ordinal), "POD": f"{workload.partition('/')[2]}-{ordinal}"}
     if text[:2] == ["sh", "-c"]:
         script = re.sub(

@@ -134,5 +134,5 @@ def test_a_leader_can_soon_go_above_every_promise() -> None:
 
 
 def test_what_a_coordinator_adopts_is_acceptable_to_all_vehicles() -> None:
-    """Even to those whose road time is 60 s behind, and after many elections."""
+    """Vehicles accept the term of an election, also if their road time is 60 s behind."""
     check_ballot(Ballot(max_election_term(100.0) + 1000, Name("c"), 1, 1), 40.0)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 log = structlog.get_logger(__name__)
 
 SWITCH_S = 1e-4
-"""Longest time for which Zenoh's thread waits for this one to yield (Python's default is 5 ms).
+"""Maximum time [s] for which Zenoh's thread waits for the interpreter lock; Python's own is 5 ms.
 
 With the default, a flood of messages that are refused lets hardly any others in."""
 
