@@ -16,20 +16,20 @@ from collections.abc import Iterator
 
 import pytest
 
-from laneweave.launch.fault_search.fault_run import FaultRun, SeedResult, Totals
+from laneweave.launch.fault_search.fault_run import SeedResult, Totals
 from laneweave.launch.fault_search.profiles import PROFILES
-from laneweave.launch.fault_search.search import replay_command
+from laneweave.launch.fault_search.search import replay_command, run_story, run_tasks
 from laneweave.launch.fault_search.setup import SLOT_S
+from laneweave.launch.fault_search.story import Story
 
 BATCH = 20
 SEEDS = 40
 DIGESTS = range(1000, 1006)
 _PRINT_DIGESTS = """
 import json, sys
-from laneweave.launch.fault_search.profiles import PROFILES
-from laneweave.launch.fault_search.search import silence_logs, run_seeds
+from laneweave.launch.fault_search.search import silence_logs, run_tasks
 silence_logs()
-outcomes = run_seeds(range(*map(int, sys.argv[1:])), PROFILES["mixed"], digest=True)
+outcomes = run_tasks([(seed, "mixed") for seed in range(*map(int, sys.argv[1:]))], digest=True)
 print(json.dumps([outcome.digest for outcome in outcomes]))
 """
 
@@ -42,9 +42,9 @@ def search(profile: str, seeds: range) -> Totals:
 def outcomes(profile: str, seeds: range, *, digest: bool = False) -> Iterator[SeedResult]:
     """Run seeds, in each of which no rule must be broken."""
     for seed in seeds:
-        outcome = FaultRun(seed, PROFILES[profile], digest=digest).run()
+        outcome = run_story(Story.drawn(seed, PROFILES[profile]), digest=digest)
         violations = "\n".join(map(str, outcome.violations))
-        assert not violations, f"{violations}\n{replay_command(seed, PROFILES[profile])}"
+        assert not violations, f"{violations}\n{replay_command(seed, profile)}"
         yield outcome
 
 
@@ -96,6 +96,7 @@ def test_every_kind_of_fault_happens() -> None:
         "late-planning",
         "failing-planning",
         "lost-commands",
+        "late-commands",
         "slow-moves",
         "wrong-clocks",
     }
@@ -105,7 +106,7 @@ def test_every_kind_of_fault_happens() -> None:
 
 @pytest.mark.parametrize("seed", range(10))
 def test_without_faults_the_last_plan_is_not_late(seed: int) -> None:
-    outcome = FaultRun(seed, PROFILES["calm"]).run()
+    (outcome,) = run_tasks([(seed, "calm")])
     assert not outcome.violations
     # The last preferences change at most 1 s before the end of the phase; then follow one census,
     # the margin of a plan, and the steps: one of the current plan, at most eight of the last one.

@@ -15,6 +15,7 @@ from attrs import field, frozen
 from laneweave.coordinator.ballots import ballot_round as ballot
 from laneweave.coordinator.formations import leader
 from laneweave.coordinator.rolling import transfer
+from laneweave.launch.fault_search.coverage import Rules
 from laneweave.protocol.state_machine import Function, RuleBook, Transition
 from laneweave.protocol.vehicle import plan_execution as vehicle
 from support import broken_cell_ownership as rolling
@@ -47,8 +48,8 @@ class Bug:
     """Of docs/PROTOCOL.md, or one of `ROWS_OF_OTHERS`."""
     text: str
     """What is broken."""
-    scenario: str
-    """A scenario of tests/scenarios that it makes fail."""
+    scenario: str = ""
+    """A scenario of tests/scenarios that it makes fail; empty: none is written for it."""
     collides: bool = True
     """That scenario ends with two vehicles in one cell (in the rolling operation also: with two
     owners of one, or with a body in a cell that is not its own)."""
@@ -69,6 +70,11 @@ class Bug:
     def leader_rules(self) -> RuleBook:
         """A leader's rules with this bug."""
         return self._broken(leader.LEADER_RULES)
+
+    @property
+    def rules(self) -> Rules:
+        """All rule books with this bug, for the fault search."""
+        return Rules(self.vehicle_rules, self.leader_rules, self._broken(transfer.TRANSFER_RULES))
 
     def _broken(self, book: RuleBook) -> RuleBook:
         used = book.functions

@@ -16,6 +16,7 @@ from laneweave.coordinator.operation import LogEntry, Operation
 from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
 from laneweave.coordinator.rolling.operation import RollingOperation
+from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.coordinator.service.server import PlanningService
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import MetricsSnapshot, metric
@@ -98,6 +99,7 @@ class CoordinatorCore:
         rules: RuleBook = LEADER_RULES,
         make_planner: Callable[[Scenario], Planner] = stream_planner,
         workers: int = 1,
+        transfer_rules: RuleBook = TRANSFER_RULES,
     ) -> None:
         """Create a candidate that has received no messages yet.
 
@@ -108,6 +110,7 @@ class CoordinatorCore:
             rules: rules for formation leaders; tests replace some.
             make_planner: returns the planner of the rolling operation.
             workers: number of client requests to answer concurrently.
+            transfer_rules: rules for cell transfers; tests replace some.
         """
         self.name = name
         self.scenario = scenario
@@ -134,15 +137,20 @@ class CoordinatorCore:
         self._next_heartbeat_s = 0.0
         self._next_report_s = 0.0
         self._wakeup_s: float | None = None
-        self.operation = self._make_operation(rules, make_planner)
+        self.operation = self._make_operation(rules, transfer_rules, make_planner)
 
     def _make_operation(
-        self, rules: RuleBook, make_planner: Callable[[Scenario], Planner]
+        self,
+        rules: RuleBook,
+        transfer_rules: RuleBook,
+        make_planner: Callable[[Scenario], Planner],
     ) -> Operation:
         scenario = self.scenario
         if scenario.formation.rolling:
             planner = make_planner(scenario)
-            return RollingOperation(scenario, self._new_ballot, self._new_job, planner)
+            return RollingOperation(
+                scenario, self._new_ballot, self._new_job, planner, transfer_rules
+            )
         rng = random.Random(f"{scenario.seed}/{self.name}/{self._incarnation}")  # noqa: S311
         return FormationsOperation(
             scenario, self._new_ballot, self._new_job, self._has_watched, rng, plan, rules

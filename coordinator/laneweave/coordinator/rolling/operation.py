@@ -21,10 +21,11 @@ from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVeh
 from laneweave.coordinator.rolling.checked_planner import Planner
 from laneweave.coordinator.rolling.observed import ObservedRoad
 from laneweave.coordinator.rolling.ownership import certain_cells, partners
-from laneweave.coordinator.rolling.transfer import CellTransfer
+from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.wire.events import (
     PLAN_IN_FORCE,
     PLANNING_FAILED,
@@ -60,6 +61,7 @@ class RollingOperation:
         new_ballot: Callable[[Ballot | None], Ballot],
         new_job: Callable[[], int],
         planner: Planner,
+        rules: RuleBook = TRANSFER_RULES,
     ) -> None:
         """Begin without vehicles.
 
@@ -68,7 +70,9 @@ class RollingOperation:
             new_ballot: returns a new ballot, above the given one, if any.
             new_job: returns the id of a new computation.
             planner: plans all vehicles.
+            rules: rules of cell transfers; tests replace some.
         """
+        self._rules = rules
         self._scenario = scenario
         self._new_ballot = new_ballot
         self._new_job = new_job
@@ -275,6 +279,7 @@ class RollingOperation:
                 resend_s=self._scenario.network.resend_s,
                 due_s=now_s,
                 gone=gone,
+                rules=self._rules,
             )
 
     def _with_partners(self, names: set[Name]) -> set[Name]:

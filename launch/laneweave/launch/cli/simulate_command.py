@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -14,6 +15,10 @@ from laneweave.launch.cli.options import (
     parse_seeds,
     shows_progress,
 )
+from laneweave.protocol.files import write_atomically
+
+if TYPE_CHECKING:
+    from laneweave.launch.fault_search.story import Story
 
 
 def simulate(
@@ -21,9 +26,12 @@ def simulate(
     profile: Annotated[
         str,
         typer.Option(
-            "--profile", metavar="NAME", help="Kinds of faults; an unknown name lists all profiles."
+            "--profile",
+            metavar="NAME",
+            help="Kinds of faults; guided: those that reach rarely reached rules. An unknown name "
+            "lists all profiles.",
         ),
-    ] = "mixed",
+    ] = "guided",
     jobs: Jobs = None,
     digest: Annotated[
         bool, typer.Option("--digest", help="Print a digest of all delivered messages.")
@@ -32,22 +40,55 @@ def simulate(
         bool,
         typer.Option("--verbose", help="Print the timeline of the first failed, or only, seed."),
     ] = False,
+    shrink: Annotated[
+        Path | None,
+        typer.Option(
+            "--shrink",
+            metavar="FILE",
+            help="Shrink the run of the first failed seed, and write its story.",
+        ),
+    ] = None,
+    story: Annotated[
+        Path | None,
+        typer.Option("--story", metavar="FILE", help="Run a story instead of seeds."),
+    ] = None,
     no_progress: NoProgress = False,
 ) -> None:
     """Simulate and check runs with far more faults than occur in practice."""
     from laneweave.launch.fault_search import profiles, search
+    from laneweave.launch.fault_search.story import Story
 
-    chosen = profiles.profile_named(profile)
-    numbers, count = parse_seeds(seeds), check_jobs(jobs)
     search.silence_logs()
+    if story is not None:
+        _run_story(Story.read(story), verbose=verbose)
+    chosen = profiles.profiles_named(profile)
+    numbers, count = parse_seeds(seeds), check_jobs(jobs)
     show = shows_progress(no_progress)
     result = search.search(numbers, chosen, count, digest=digest, show=show)
-    if verbose and (result.failed or len(numbers) == 1):
-        seed = result.failed[0].seed if result.failed else numbers[0]
-        for line in search.timeline_of(seed, chosen):
+    first = next(iter(result.failed), None)
+    if verbose and (first is not None or len(numbers) == 1):
+        seed, name = (numbers[0], chosen[0].name) if first is None else (first.seed, first.profile)
+        for line in search.timeline_of(Story.drawn(seed, profiles.PROFILES[name])):
             typer.echo(line)
+    if shrink is not None and first is not None:
+        smaller = search.shrunk_story(first.seed, profiles.PROFILES[first.profile])
+        write_atomically(shrink, smaller.text())
+        typer.echo(f"story of seed {first.seed}: {shrink}")
     if digest:
         typer.echo(f"digest {result.digest}")
-    for line in search.describe(result, chosen):
+    for line in search.describe(result):
         typer.echo(line)
     raise typer.Exit(1 if result.failed else 0)
+
+
+def _run_story(story: Story, *, verbose: bool) -> NoReturn:
+    """Run one story, and exit."""
+    from laneweave.launch.fault_search.search import run_story, timeline_of
+
+    for line in timeline_of(story) if verbose else ():
+        typer.echo(line)
+    violations = run_story(story).violations
+    for violation in violations:
+        typer.echo(str(violation))
+    typer.echo("failed" if violations else "passed")
+    raise typer.Exit(1 if violations else 0)

@@ -8,35 +8,46 @@ machines of the processes, and shares no code with them.
 | `overlap` | two bodies (rectangles) overlap |
 | `cell` | two vehicles occupy one cell: a hold cell, or any cell in the bounding box of a motion |
 | `motion` | a body begins a motion that is not the next move in the published plan of its agent |
+| `order` | a motion begins before an earlier interfering move of the plan has ended |
+| `early` | a motion begins before its time on the clock of its vehicle |
 | `interleaved` | two plans that share a vehicle have motions at the same time |
 | `owner` | a cell has two owners (rolling operation, see `cell_ownership`) |
 | `trespass` | a body is in a cell that its vehicle does not own (rolling operation) |
 | `gate` | a motion begins before any vehicle of the plan has taken possession (rolling operation) |
 | `monotone` | a process revokes a promise, an acceptance, progress, a join, or a takeover |
-| `two-plans` | two different plans are sent under one ballot |
+| `leader` | a coordinator without a connection leads, or there is not one leader at the end |
+| `busy` | a process starts computations without a pause |
+| `crash` | a process fails |
 | `stuck` | a vehicle is not in its preferred lane long after all faults have ended |
+
+`claims` checks what messages claim.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 
 from attrs import define, frozen
 
 from laneweave.launch.fault_search.cell_ownership import CellOwnership
 from laneweave.launch.fault_search.checker_geometry import Body, Geometry, overlap_between
+from laneweave.launch.fault_search.claims import Claims, Stored, required_before, short
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import (
     Ballot,
     Name,
-    PendingTransfer,
     Plan,
+    Prepare,
     Sense,
     VehicleState,
 )
 
 MAX_VIOLATIONS = 20
 """Maximum number of violations recorded per run."""
+CLOCK_TOLERANCE_S = 0.01
+MAX_COMPUTATIONS = 15
+"""Maximum number of computations that a process starts in a second."""
 
 
 @frozen
@@ -87,6 +98,7 @@ class Checker:
         self.motions = 0
         self.plans: dict[Ballot, Plan] = {}
         """All plans sent so far."""
+        self.claims = Claims(self._report, self.plans)
         self._geometry = geometry
         self._on_event = on_event
         self._bodies: dict[str, Body] = {}
@@ -102,22 +114,36 @@ class Checker:
         self._motions_of: dict[Ballot, _PlanMotions] = {}
         self._charge: dict[str, tuple[int, frozenset[int]]] = {}
         """Process in charge and reported joined formations of each motion controller."""
+        self._computations: dict[str, list[float]] = {}
+        """Start times of the newest computations of each process."""
 
     # --- the road -----------------------------------------------------------------------------
 
-    def enter(self, t_s: float, vehicle: str, cell: Cell) -> None:
-        """Record that a vehicle has entered the road."""
+    def begin_road(self, t_s: float) -> None:
+        """Record that another road begins, without vehicles."""
+        self._log(t_s, "another road begins")
+        self.claims.begin_road()
+        for state in (self._bodies, self._moving, self._states, self._begun, self._done):
+            state.clear()
+        self._motions_of.clear()
+        self._charge.clear()
+        if self._ownership is not None:
+            self._ownership = CellOwnership(self._report)
+
+    def enter(self, t_s: float, vehicle: str, cell: Cell, block: int) -> None:
+        """Record that a vehicle has entered the road in a cell of a block."""
         self._log(t_s, f"{vehicle} enters in {cell}")
         self.advance(t_s)
         self._bodies[vehicle] = Body.standing(self._geometry, cell, t_s)
         self._check_cells(t_s, vehicle)
+        if self._ownership is None:
+            self.claims.enter(t_s, vehicle, block)
 
-    def own(
-        self, t_s: float, vehicle: str, owned: tuple[Cell, ...], transfer: PendingTransfer | None
-    ) -> None:
-        """Record a motion controller's owned cells and newest transfer."""
+    def store(self, t_s: float, vehicle: str, stored: Stored) -> None:
+        """Record what a motion controller has stored."""
+        self.claims.store(vehicle, stored)
         if self._ownership is not None:
-            self._ownership.update(t_s, vehicle, owned, transfer)
+            self._ownership.update(t_s, vehicle, stored.owned, stored.transfer)
 
     def leave(self, t_s: float, vehicle: str) -> None:
         """Record that a vehicle has left the road."""
@@ -125,13 +151,29 @@ class Checker:
         self.advance(t_s)
         self._end_motion(vehicle)
         del self._bodies[vehicle]
+        self.claims.leave(vehicle)
         if self._ownership is not None:
             self._ownership.leave(vehicle)
 
     def begin(
-        self, t_s: float, vehicle: str, incarnation: int, move: tuple[Cell, Cell], lasts_s: float
+        self,
+        t_s: float,
+        vehicle: str,
+        incarnation: int,
+        move: tuple[Cell, Cell],
+        lasts_s: float,
+        clock_s: float = math.inf,
     ) -> None:
-        """Record that process `incarnation` begins a motion from `move[0]` to `move[1]`."""
+        """Record that process `incarnation` begins a motion from `move[0]` to `move[1]`.
+
+        Args:
+            t_s: virtual time.
+            vehicle: name of the vehicle.
+            incarnation: process that has sent the command.
+            move: origin and target.
+            lasts_s: duration of the motion.
+            clock_s: latest road time that the vehicle's clock has shown.
+        """
         self._log(t_s, f"{vehicle} moves from {move[0]} to {move[1]} in {lasts_s:.2f} s")
         self.advance(t_s)
         self.motions += 1
@@ -150,7 +192,7 @@ class Checker:
                 "motion", t_s, [vehicle], f"moves from {move[0]} to {move[1]} without a plan"
             )
             return
-        self._check_order(t_s, vehicle, ballot, move)
+        self._check_order(t_s, vehicle, ballot, move, clock_s)
         if self._ownership is None:
             self._check_serial(t_s, vehicle, ballot)
         else:
@@ -202,14 +244,28 @@ class Checker:
                 self._report("cell", t_s, [vehicle, other], f"both occupy {shared}")
 
     def _check_order(
-        self, t_s: float, vehicle: str, ballot: Ballot, move: tuple[Cell, Cell]
+        self, t_s: float, vehicle: str, ballot: Ballot, move: tuple[Cell, Cell], clock_s: float
     ) -> None:
-        index = self._done.get((ballot, vehicle), 0)
+        index, plan = self._done.get((ballot, vehicle), 0), self.plans[ballot]
         self._done[ballot, vehicle] = index + 1
-        moves = self.plans[ballot].moves.get(Name(vehicle), ())
+        moves = plan.moves.get(Name(vehicle), ())
         if index >= len(moves) or moves[index][1:] != move:
             text = f"{move[0]} to {move[1]} is not move {index} of its plan {short(ballot)}"
             self._report("motion", t_s, [vehicle], text)
+            return
+        for other, moves_before in required_before(plan, vehicle, index):
+            if other in self._bodies and self._finished(t_s, other, ballot) < moves_before:
+                text = f"move {index} begins before move {moves_before - 1} of {other} has ended"
+                self._report("order", t_s, [vehicle, other], text)
+        due_s = plan.t0_s + moves[index][0] * plan.slot_s
+        if clock_s < due_s - CLOCK_TOLERANCE_S:
+            text = f"move {index} is due at {due_s:.1f} s, its clock showed {clock_s:.1f} s"
+            self._report("early", t_s, [vehicle], text)
+
+    def _finished(self, t_s: float, vehicle: str, ballot: Ballot) -> int:
+        """Return how many motions a body has completed under a ballot."""
+        end_s, _, under = self._moving.get(vehicle, (t_s, None, None))
+        return self._done.get((ballot, vehicle), 0) - (under == ballot and end_s > t_s)
 
     def _check_serial(self, t_s: float, vehicle: str, ballot: Ballot) -> None:
         motions = self._motions_of.get(ballot)
@@ -239,6 +295,8 @@ class Checker:
         match message:
             case VehicleState():
                 self._on_state(t_s, message)
+            case Prepare():
+                self.claims.on_prepare(t_s, message)
             case Plan():
                 self._on_plan(t_s, message)
             case Sense():
@@ -246,7 +304,9 @@ class Checker:
 
     def _on_plan(self, t_s: float, plan: Plan) -> None:
         known = self.plans.setdefault(plan.ballot, plan)
-        if known is not plan and known != plan:
+        if known is plan:
+            self.claims.on_plan(t_s, plan)
+        elif known != plan:
             self._report("two-plans", t_s, plan.roster, f"under ballot {short(plan.ballot)}")
 
     def _on_sense(self, t_s: float, sense: Sense) -> None:
@@ -261,6 +321,9 @@ class Checker:
             self._charge[sense.vehicle] = sense.attendant, frozenset(sense.joined)
 
     def _on_state(self, t_s: float, state: VehicleState) -> None:
+        self._check_claims(t_s, state)
+        if self.claims.is_earlier(state.vehicle, state.incarnation):
+            return
         states = self._states.setdefault(state.vehicle, {})
         before = states.get(state.incarnation)
         states[state.incarnation] = state
@@ -280,6 +343,32 @@ class Checker:
                 self._begun[key] = state.promised if state.accepted else None
         for text in texts:
             self._report("monotone", t_s, [state.vehicle], text)
+
+    def _check_claims(self, t_s: float, state: VehicleState) -> None:
+        name = state.vehicle
+        self.claims.on_promise(state)
+        if name not in self._bodies:
+            return
+        end_s, cell, _ = self._moving.get(name, (t_s, None, None))
+        if end_s > t_s:
+            cell = None
+        elif cell is None:
+            (cell,) = self._bodies[name].cells
+        finished = 0 if state.promised is None else self._finished(t_s, name, state.promised)
+        self.claims.on_state(t_s, state, finished, cell)
+
+    def computes(self, t_s: float, process: str) -> None:
+        """Record that a process starts a computation."""
+        times = self._computations.setdefault(process, [])
+        times.append(t_s)
+        del times[:-MAX_COMPUTATIONS]
+        if len(times) == MAX_COMPUTATIONS and times[0] > t_s - 1.0:
+            text = f"{MAX_COMPUTATIONS} computations in {t_s - times[0]:.2f} s"
+            self._report("busy", t_s, [process], text)
+
+    def leads(self, t_s: float, process: str, text: str) -> None:
+        """Record that a coordinator leads, or does not, against the rules."""
+        self._report("leader", t_s, [process], text)
 
     def _log(self, t_s: float, event: str) -> None:
         if self._on_event is not None:
@@ -303,8 +392,3 @@ def _revoked(before: VehicleState, state: VehicleState) -> Iterator[str]:
             yield f"it has completed {state.completed} moves after {before.completed}"
         if before.go and not state.go:
             yield f"its gate for {short(state.promised)} closed again"
-
-
-def short(ballot: Ballot | None) -> str:
-    """Return a ballot as text."""
-    return "nothing" if ballot is None else ".".join(str(part) for part in ballot)

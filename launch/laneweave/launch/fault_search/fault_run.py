@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import random
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Collection, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import count
 
 import attrs
@@ -18,48 +18,44 @@ from attrs import field, frozen
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
-from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
 from laneweave.launch.fault_search.checker import Checker, Violation
 from laneweave.launch.fault_search.checker_geometry import Geometry
-from laneweave.launch.fault_search.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, ROAD, RandomFaults
-from laneweave.launch.fault_search.light_road import LightRoad
-from laneweave.launch.fault_search.profiles import Profile
-from laneweave.launch.fault_search.setup import Setup
+from laneweave.launch.fault_search.coverage import Rules
+from laneweave.launch.fault_search.fault_context import ROAD
+from laneweave.launch.fault_search.faults import RandomFaults
+from laneweave.launch.fault_search.lasting_faults import CLOCK_DRIFT, CLOCK_OFFSET_S
+from laneweave.launch.fault_search.light_road import LightRoad, Reception
 from laneweave.launch.fault_search.stand_ins import LightDriver, LightPlanner
+from laneweave.launch.fault_search.story import Story
 from laneweave.launch.fault_search.timeline import Timeline
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.runtime.node import Core, Effect, Event, Send
+from laneweave.protocol.runtime.node import Compute, Core, Effect, Event, Send
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import TraceDigest
-from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
-from laneweave.protocol.wire.codec import encode
-from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare, Sense, VehicleState
-from laneweave.protocol.wire.topics import Keys
+from laneweave.protocol.wire.bounds import Bounds
+from laneweave.protocol.wire.messages import Name
 
+RULES = Rules()
 TWIN = ".2"
 """Suffix of the name of the second process of a vehicle."""
 COORDINATORS = ("c1", "c2", "c3")
 MAX_MOTION_SLOTS = 3.0
 """Maximum duration of a slow motion, in slots."""
-NEW_PREFERENCES_S = (0.8, 3.0)
-"""Range of intervals at which the preferred lanes change during the fault phase."""
 PATIENCE_S = 90.0
 """Time limit for all vehicles to arrive after the fault phase."""
 MAX_FUTILE_PLANS = 5
 """Number of plans after which a vehicle that has not moved counts as stuck."""
 HEALTHY_SLOTS = 8
 """Number of slots after the fault phase (rolling operation)."""
+NOTICE_S = 0.1
+"""Time after which a candidate must have noticed that it is disconnected."""
+ELECTED_S = 5.0
+"""Time after all faults have ended after which there must be one leader."""
 CHECK_S = 0.5
 """Virtual time between checks of whether a run is over."""
-MAX_OLD_MESSAGES = 400
-"""Maximum number of old messages kept for replay or corruption."""
-KEEP_EVERY = 7
-"""One in this many sent messages is kept."""
-_REPLAYABLE = (Prepare, Plan, VehicleState, Command, Sense)
 
 
 @frozen
@@ -97,15 +93,26 @@ class SeedResult:
     totals: Totals
     digest: str = ""
     """Digest of all delivered messages, if requested."""
+    profile: str = ""
+    """Profile from which the run was drawn."""
+    features: frozenset[str] = frozenset()
+    """Rules and guards that the run has reached (`coverage`)."""
 
 
 class _ListenedCore:
-    """Core that passes its sent messages to a listener."""
+    """Core that passes its sent messages through a listener, which may change them."""
 
-    def __init__(self, core: Core, name: str, listener: Callable[[str, Send], None]) -> None:
+    def __init__(
+        self,
+        core: Core,
+        name: str,
+        listener: Callable[[str, Send], Send],
+        on_compute: Callable[[str], None],
+    ) -> None:
         self.core = core
         self._name = name
         self._listener = listener
+        self._on_compute = on_compute
 
     @property
     def wakeup_s(self) -> float | None:
@@ -113,43 +120,40 @@ class _ListenedCore:
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         effects = list(self.core.handle(event, now_s))
-        for effect in effects:
+        for index, effect in enumerate(effects):
             if type(effect) is Send:
-                self._listener(self._name, effect)
+                effects[index] = self._listener(self._name, effect)
+            elif type(effect) is Compute:
+                self._on_compute(self._name)
         return effects
 
 
 class FaultRun:
-    """A run of one seed; call `run` once."""
+    """A run of one story; call `run` once."""
 
     coordinators: tuple[str, ...] = COORDINATORS
 
     def __init__(
         self,
-        seed: int,
-        profile: Profile,
-        vehicle_rules: RuleBook = VEHICLE_RULES,
-        leader_rules: RuleBook = LEADER_RULES,
+        story: Story,
+        rules: Rules = RULES,
         timeline: Timeline | None = None,
         *,
         digest: bool = False,
     ) -> None:
-        """Draw the setup and start all processes.
+        """Start all processes.
 
         Args:
-            seed: determines all draws, together with the profile name.
-            profile: profile from which the setup is drawn.
-            vehicle_rules: rules of plan execution, which tests replace with faulty ones.
-            leader_rules: rules of leaders, which tests replace with faulty ones.
+            story: what happens in the run.
+            rules: rules of vehicles and leaders, which tests replace with faulty ones.
             timeline: timeline to which events are added.
             digest: whether to compute a digest of all delivered messages.
         """
-        self.seed = seed
-        self.profile = profile
-        self._rng = random.Random(f"{profile.name}/{seed}")  # noqa: S311 (simulation, no secrets)
-        self.setup = Setup.drawn(profile, self._rng)
-        scenario, mix = self.setup.scenario, self.setup.mix
-        self.network = SimulatedNetwork(seed, mix.conditions)
+        self.story = story
+        self.setup = story.setup
+        self._rng = random.Random(story.seed)  # noqa: S311 (simulation, no secrets)
+        scenario, lasting = self.setup.scenario, self.setup.lasting
+        self.network = SimulatedNetwork(story.seed, lasting.conditions)
         self._trace = TraceDigest() if digest else None
         self.network.trace = self._trace
         size = scenario.vehicle
@@ -158,16 +162,20 @@ class FaultRun:
                 scenario.formation.gap_m, scenario.road.lane_width_m, size.length_m, size.width_m
             ),
             timeline.add if timeline is not None else None,
-            rolling=profile.rolling,
+            rolling=self._rolling,
         )
-        self._rules = vehicle_rules, leader_rules
+        self._features: set[str] = set()
+        """Rules and guards reached so far."""
+        self._rules = rules.observed(self._features)
         self._timeline = timeline
-        self._keys = Keys(scenario.network.realm)
         self._incarnations = count(1)
-        self._old_messages: deque[Send] = deque(maxlen=MAX_OLD_MESSAGES)
-        self._sent = 0
         self.faults = RandomFaults(
-            self.network, self, mix, self._rng, scenario.network.realm, self._log
+            self.network,
+            self,
+            lasting,
+            scenario.network.realm,
+            self.checker.claims.harmful,
+            self._log,
         )
         self._proposed: Counter[str] = Counter()
         """Number of plans after the fault phase that move or hold each vehicle."""
@@ -175,41 +183,31 @@ class FaultRun:
         """First cell of each vehicle after the fault phase (rolling operation)."""
         self._moved: set[Name] = set()
         """Vehicles that have moved since the fault phase."""
-        self._preferences = self.setup.preferences(self._rng, last=False)
-        self.road = LightRoad(
-            scenario,
-            self.setup.visits,
-            self._preferences,
-            self.checker,
-            self._incarnations.__next__,
-            self._move_lasts_s,
-            self._loses_command,
-            self.setup.formations,
-            self.setup.grants,
-        )
+        self._preferences = story.preferences[0].lanes
+        self._clocks: dict[str, tuple[float, float]] = {}
+        """Offset and rate of the clock of each machine."""
+        self._takeovers = 0
+        """Number of takeovers by caretakers on earlier roads."""
+        self.road = self._make_road()
         self._set_clocks()
-        self.network.add(
-            ROAD, _ListenedCore(self.road, ROAD, self._on_message), scenario.network.realm
-        )
+        self._add(ROAD, self.road)
         for name in (*COORDINATORS, *self.agents):
             self.start(name)
 
     def run(self) -> SeedResult:
         """Run the fault phase, then wait until all vehicles have arrived; stop at a violation."""
         began_s = time.process_time()
-        network, fault_s = self.network, self.setup.mix.fault_s
-        self.faults.plan(self.profile.event_kinds)
-        change_s, last = 0.0, False
-        while not last:
-            change_s += self._rng.uniform(*NEW_PREFERENCES_S)
-            last = change_s + NEW_PREFERENCES_S[1] > fault_s
-            network.at(change_s, self._change_preferences, last)
-        network.at(fault_s, self.faults.heal)
-        end_s = fault_s + self._patience_s
+        network, story = self.network, self.story
+        self.faults.plan(story.events)
+        for change in story.preferences[1:]:
+            network.at(change.t_s, self._change_preferences, change.lanes)
+        network.at(story.fault_s, self.faults.heal)
+        end_s = story.fault_s + self._patience_s
         while network.now_s < end_s and not self._is_over():
             network.run(network.now_s + CHECK_S)
             while network.failed_jobs:
                 self.checker.crashed(*network.failed_jobs.pop())
+            self._check_leaders()
         self.checker.advance(network.now_s)
         for name in self._not_arrived():
             vehicle = self.road.vehicles[name]
@@ -222,11 +220,11 @@ class FaultRun:
     @property
     def agents(self) -> tuple[str, ...]:
         """Agents of the vehicles that have not left the road."""
-        now_s = self.network.now_s
+        road_s = self.network.now_s - self.road.began_s
         return tuple(
             visit.vehicle
             for visit in self.setup.visits
-            if visit.leaves_s is None or now_s < visit.leaves_s
+            if visit.leaves_s is None or road_s < visit.leaves_s
         )
 
     @property
@@ -241,27 +239,57 @@ class FaultRun:
         return twin
 
     def start(self, name: str) -> None:
-        """Start a process unless it is running."""
+        """Start a process unless it is running; the road begins anew."""
         if name in self.network:
             return
-        scenario, (vehicle_rules, leader_rules) = self.setup.scenario, self._rules
+        scenario, rules = self.setup.scenario, self._rules
+        incarnation = self._incarnations.__next__
         core: Core
-        if name in COORDINATORS:
-            incarnation = next(self._incarnations)
+        if name == ROAD:
+            self._takeovers += self.road.takeovers
+            core = self.road = self._make_road()
+            self.checker.begin_road(self.network.now_s)
+        elif name in COORDINATORS:
             core = CoordinatorCore(
-                Name(name), incarnation, scenario, leader_rules, self._make_planner
+                Name(name),
+                incarnation(),
+                scenario,
+                rules.leader,
+                self._make_planner,
+                transfer_rules=rules.transfer,
             )
         else:
             vehicle = Name(name.removesuffix(TWIN))
-            agent = AgentCore(
-                vehicle, self._incarnations.__next__, scenario, LightDriver, vehicle_rules
-            )
-            core = AgentHost(lambda _: agent, [vehicle])
-        self.network.add(name, _ListenedCore(core, name, self._on_message), scenario.network.realm)
+            agent = AgentCore(vehicle, incarnation, scenario, LightDriver, rules.vehicle)
+            runtime = scenario.runtime
+            bounds = Bounds(incarnation(), runtime.tick_s, runtime.max_road_s)
+            core = AgentHost(lambda _: agent, [vehicle], bounds=bounds)
+        self._add(name, core)
+
+    def _add(self, name: str, core: Core) -> None:
+        listened = _ListenedCore(core, name, self._on_message, self._on_compute)
+        self.network.add(name, listened, self.setup.scenario.network.realm)
+
+    def _make_road(self) -> LightRoad:
+        """Return a road without vehicles, which begins now."""
+        bridge = next(self._incarnations)
+        road = LightRoad(
+            self.setup.scenario,
+            self.setup.make_entrance(self.story.preferences[0].lanes, bridge),
+            {visit.vehicle: visit for visit in self.setup.visits},
+            self.checker,
+            self._incarnations.__next__,
+            self._move_lasts_s,
+            self._reception,
+            bridge=bridge,
+            began_s=self.network.now_s,
+        )
+        road.prefer(self._preferences)
+        return road
 
     def _make_planner(self, scenario: Scenario) -> Planner:
         """Return a planner that, after the fault phase, counts its plans for each vehicle."""
-        exact = self.setup.uses_stream_planner
+        exact = self.setup.road.stream_planner
         planner = stream_planner(scenario) if exact else LightPlanner(scenario).plan
 
         def plan(
@@ -281,13 +309,6 @@ class FaultRun:
 
         return plan
 
-    def old_payload(self, rng: random.Random) -> tuple[str, bytes] | None:
-        """Return the key and payload of a random old message, or None."""
-        if not self._old_messages:
-            return None
-        old = rng.choice(self._old_messages)
-        return self._keys.key(old.topic, **old.parameters), encode(old.message)
-
     def _leads(self, name: str) -> bool:
         if name not in self.network:
             return False
@@ -295,42 +316,78 @@ class FaultRun:
         core = core.core if isinstance(core, _ListenedCore) else core
         return isinstance(core, CoordinatorCore) and core.election.leading
 
+    def _check_leaders(self) -> None:
+        """Check that disconnected candidates do not lead, and that one leads without faults."""
+        now_s = self.network.now_s
+        for name in self.leaders:
+            if self.network.offline_s(name) > NOTICE_S:
+                self.checker.leads(now_s, name, "leads without a connection")
+        if now_s > self.story.fault_s + ELECTED_S and len(self.leaders) != 1:
+            self.checker.leads(now_s, " ".join(self.leaders), "there is not one leader")
+
+    # --- clocks -------------------------------------------------------------------------------
+
     def _set_clocks(self) -> None:
-        if not self.setup.mix.wrong_clocks:
+        if not self.setup.lasting.wrong_clocks:
             return
         for name in (*COORDINATORS, *(visit.vehicle for visit in self.setup.visits)):
             offset_s = self._rng.uniform(-CLOCK_OFFSET_S, CLOCK_OFFSET_S)
             rate = 1.0 + self._rng.uniform(-CLOCK_DRIFT, CLOCK_DRIFT)
+            self._clocks[name] = offset_s, rate
             self.network.set_clock(name, offset_s, rate)
+
+    def jump_clock(self, name: str, jump_s: float) -> None:
+        """Change the clock of a vehicle or coordinator; 0: end its error by jumps.
+
+        The clock of a process cannot be set back, so only a vehicle's road time jumps back.
+        """
+        vehicle = self.road.vehicles.get(Name(name))
+        if vehicle is not None:
+            vehicle.clock_jump_s = jump_s
+        elif name in COORDINATORS and jump_s:
+            offset_s, rate = self._clocks.get(name, (0.0, 1.0))
+            self._clocks[name] = offset_s + abs(jump_s), rate
+            self.network.set_clock(name, *self._clocks[name])
 
     # --- draws for the road -------------------------------------------------------------------
 
     def _move_lasts_s(self) -> float:
         rng = self._rng
-        if not self.faults.healed and rng.random() < self.setup.mix.slow_moves:
+        if not self.faults.healed and rng.random() < self.setup.lasting.slow_moves:
             slot_s = self.setup.scenario.cycles_s[0]
             return rng.uniform(slot_s, MAX_MOTION_SLOTS * slot_s)
         return self.setup.scenario.move_s
 
-    def _loses_command(self) -> bool:
-        share = self.setup.mix.command_loss
-        return share > 0.0 and not self.faults.healed and self._rng.random() < share
+    def _reception(self, vehicle: Name) -> Reception:
+        lasting = self.setup.lasting
+        if self.faults.healed:
+            return Reception.IN_TIME
+        if lasting.command_loss and self._rng.random() < lasting.command_loss:
+            return Reception.LOST
+        if vehicle in self.faults.processes.refused:
+            return Reception.LATE
+        if lasting.late_commands and self._rng.random() < lasting.late_commands:
+            return Reception.LATE
+        return Reception.IN_TIME
 
-    def _change_preferences(self, last: bool) -> None:
-        self._preferences = self.setup.preferences(self._rng, last=last)
-        self.road.prefer(self._preferences)
-        self._log(f"new preferred lanes: {self._preferences}")
+    def _change_preferences(self, lanes: Mapping[Name, int]) -> None:
+        self._preferences = lanes
+        self.road.prefer(lanes)
+        self._log(f"new preferred lanes: {dict(lanes)}")
 
     # --- messages -----------------------------------------------------------------------------
 
-    def _on_message(self, sender: str, effect: Send) -> None:
+    def _on_message(self, sender: str, effect: Send) -> Send:
         now_s = self.network.now_s
+        effect = self.faults.messages.changed(effect)
+        self.faults.on_sent(sender, effect)
         self.checker.sent(now_s, effect.message)
-        self._sent += 1
-        if self._sent % KEEP_EVERY == 0 and isinstance(effect.message, _REPLAYABLE):
-            self._old_messages.append(effect)
         if self._timeline is not None:
             self._timeline.add_message(now_s, sender, effect)
+        return effect
+
+    def _on_compute(self, name: str) -> None:
+        self.checker.computes(self.network.now_s, name)
 
     def _log(self, text: str) -> None:
         if self._timeline is not None:
@@ -339,42 +396,51 @@ class FaultRun:
     # --- outcome ------------------------------------------------------------------------------
 
     def _is_over(self) -> bool:
-        # In the rolling operation, this call also records which vehicles have moved.
-        not_arrived = self._not_arrived()
+        self._record_moves()
         if self.checker.violations:
             return True
-        return self.faults.healed and not not_arrived and not self.profile.rolling
+        return self.faults.healed and not self._rolling and not self._not_arrived()
+
+    @property
+    def _rolling(self) -> bool:
+        return self.setup.road.rolling
 
     @property
     def _patience_s(self) -> float:
-        if self.profile.rolling:
+        if self._rolling:
             return HEALTHY_SLOTS * self.setup.scenario.cycles_s[0]
         return PATIENCE_S
 
+    def _record_moves(self) -> None:
+        """Record which vehicles have moved since the fault phase (rolling operation)."""
+        if self._rolling and self.faults.healed:
+            for name, vehicle in self.road.vehicles.items():
+                cell = vehicle.controller.hold_cell
+                if self._first_cells.setdefault(name, cell) != cell:
+                    self._moved.add(name)
+
     def _not_arrived(self) -> list[Name]:
-        """Return the vehicles that should be at rest in their preferred lanes, but are not."""
+        """Return the vehicles that should be at rest in their preferred lanes, but are not.
+
+        In the rolling operation, these are vehicles that have not moved although plans move them:
+        one that has moved need not be in its preferred lane, which may be full.
+        """
         if self.checker.violations or not self.faults.healed:
             return []
-        now_s = self.network.now_s
+        road_s = self.network.now_s - self.road.began_s
         not_arrived = [
             name
             for name, vehicle in self.road.vehicles.items()
             if vehicle.controller.hold_cell[1] != vehicle.preferred_lane
-            or not vehicle.body.has_arrived(now_s)
+            or not vehicle.body.has_arrived(road_s)
         ]
-        if not self.profile.rolling:
+        if not self._rolling:
             return not_arrived
-        return [name for name in not_arrived if self._is_stuck(name)]
-
-    def _is_stuck(self, name: Name) -> bool:
-        """Return whether a vehicle has not moved although plans move it (rolling operation).
-
-        A vehicle that has moved need not be in its preferred lane, which may be full.
-        """
-        cell = self.road.vehicles[name].controller.hold_cell
-        if self._first_cells.setdefault(name, cell) != cell:
-            self._moved.add(name)
-        return name not in self._moved and self._proposed[name] >= MAX_FUTILE_PLANS
+        return [
+            name
+            for name in not_arrived
+            if name not in self._moved and self._proposed[name] >= MAX_FUTILE_PLANS
+        ]
 
     def _result(self, cpu_s: float) -> SeedResult:
         network, checker = self.network, self.checker
@@ -387,11 +453,17 @@ class FaultRun:
             motions=checker.motions,
             plans=len(plans),
             joint_plans=sum(len(plan.formations) > 1 for plan in plans),
-            takeovers=self.road.takeovers,
+            takeovers=self._takeovers + self.road.takeovers,
             delivered=network.delivered,
             dropped=network.dropped,
-            longest_recovery_s=network.now_s - self.setup.mix.fault_s,
+            longest_recovery_s=network.now_s - self.story.fault_s,
             faults=self.faults.counts,
         )
         digest = self._trace.hexdigest() if self._trace is not None else ""
-        return SeedResult(self.seed, tuple(checker.violations), totals, digest)
+        return SeedResult(
+            self.story.seed,
+            tuple(checker.violations),
+            totals,
+            digest,
+            features=frozenset(self._features),
+        )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator
 from importlib.resources import files
+from typing import Any
 
 from attrs import frozen
 
@@ -28,6 +29,8 @@ class Profile:
     """Description in one line."""
     rolling: bool = False
     """Whether to use the rolling operation, in which vehicles own cells."""
+    roadside: bool = False
+    """Whether vehicles enter one after another at the real roadside."""
     density: tuple[float, float] = (0.3, 0.7)
     """Occupied share of the cells in which vehicles may enter (rolling operation)."""
     vehicles: Span = (2, 16)
@@ -47,6 +50,8 @@ class Profile:
     """Maximum additional delay of a message; the minimum delay is 2 ms."""
     command_loss: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
     """Additional loss of SENSE and COMMAND messages."""
+    late_commands: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
+    """Share of commands whose motion is refused, as if they came too late for their tick."""
     slow_moves: tuple[float, ...] = (0.0, 0.2, 0.5)
     """Share of motions that last up to three slots."""
     compute_failure: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
@@ -63,23 +68,33 @@ class Profile:
 
 
 def _load() -> Iterator[Profile]:
-    """Yield the profiles of `profiles.toml`, completed with values from their base profiles."""
+    """Yield the profiles of `profiles.toml`, completed with values from their base profiles.
+
+    A base comes before the profiles that are derived from it.
+    """
     text = files("laneweave.launch.fault_search").joinpath("profiles.toml").read_text("utf-8")
-    tables = tomllib.loads(text)
-    for name, table in tables.items():
+    tables: dict[str, dict[str, Any]] = {}
+    for name, table in tomllib.loads(text).items():
         base = tables.get(table.pop("base", ""), {})
-        yield structure(base | table | {"name": name}, Profile)
+        tables[name] = base | table | {"name": name}
+        yield structure(tables[name], Profile)
 
 
 PROFILES = {profile.name: profile for profile in _load()}
 
 
-def profile_named(name: str) -> Profile:
-    """Return a profile by name.
+GUIDED = "guided"
+"""Name of the choice of all profiles with faults."""
+
+
+def profiles_named(name: str) -> tuple[Profile, ...]:
+    """Return the profile of a name; for `guided`, all profiles with fault events.
 
     Raises:
         BadInputError: there is no such profile.
     """
+    if name == GUIDED:
+        return tuple(profile for profile in PROFILES.values() if profile.event_kinds)
     if name not in PROFILES:
-        raise BadInputError("--profile", name, ", ".join(PROFILES))
-    return PROFILES[name]
+        raise BadInputError("--profile", name, ", ".join((GUIDED, *PROFILES)))
+    return (PROFILES[name],)

@@ -1,28 +1,41 @@
-"""Setup of a run, drawn from its seed: road, vehicles, faults, and preferred lanes.
+"""Setup of a run: road, vehicles, lasting faults, and preferred lanes.
 
-In the rolling operation the road is short, because plans extend to its end. Some vehicles are
-in S3 at the start, the others enter behind them, and all leave at the end of the road.
+In the rolling operation the road is short, because plans extend to its end. On a drawn entrance,
+some vehicles are in S3 at the start, and the others enter behind them. At the real roadside, all
+vehicles enter one after another.
 """
 
 from __future__ import annotations
 
 import math
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 
 from attrs import evolve, frozen
 
-from laneweave.launch.fault_search.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, LEASE_S, FaultMix
+from laneweave.launch.fault_search.drawn_entrance import DrawnEntrance, Entrance, Grant
+from laneweave.launch.fault_search.lasting_faults import (
+    CLOCK_DRIFT,
+    CLOCK_OFFSET_S,
+    LEASE_S,
+    LastingFaults,
+)
 from laneweave.launch.fault_search.profiles import Profile
-from laneweave.launch.fault_search.stand_ins import Grant, Visit
+from laneweave.launch.fault_search.stand_ins import Visit
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.deployment_fields import Network
 from laneweave.protocol.scenario.fields import FormationSettings, Road, Runtime, Scenario
 from laneweave.protocol.wire.messages import ClosedFormation, Name
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.roadside import Roadside
 
 TICK_S = 0.1
 LEAVES_S = (2.0, 9.0)
 """Range of times that vehicles spend on the road if they leave during the fault phase."""
+
+MEAN_HEADWAYS_S = (0.3, 3.0)
+"""Range of the mean headway, beyond the minimum of 1 s, between arrivals at the real roadside."""
 
 # Operation in formations
 SLOT_S, MOVE_S = 1.0, 0.8
@@ -49,66 +62,88 @@ SLOTS_ON_ROAD = 45
 """Length of the road, as the number of slots that a column takes to pass it."""
 MAX_BEHIND = 3
 """Number of empty cells that the last vehicle in a lane owns behind itself."""
+BEFORE_COLUMNS = (3, 4, 6)
+"""Lengths of the road before S3 to draw from at the real roadside, in columns."""
 STREAM_PLANNER = 0.05
 """Share of runs with the stream planner, which takes ten times as long as the rest of a run."""
 
 
-def make_scenario(lanes: int, max_joined: int, *, growing: bool = False) -> Scenario:
-    """Return a scenario with formations (of different lengths if `growing`) on a long road."""
-    formation = FormationSettings(
-        operation="formations",
-        close="vehicles" if growing else "columns",
-        block_columns=BLOCK_COLUMNS,
-        cycle_s=SLOT_S,
-        move_s=MOVE_S,
-        max_joined=max_joined,
-        # Limit planning by the number of nodes: a deadline would make plans depend on the machine.
-        planning_deadline_s=3600.0,
-        max_nodes=500,
-    )
-    return _scenario(Road(lanes=lanes, s1_m=0.0, s2_m=0.0, s3_m=20_000.0), formation)
+@frozen(kw_only=True)
+class RoadSetup:
+    """Road and operation of a run."""
 
+    lanes: int
+    rolling: bool = False
+    roadside: bool = False
+    """Whether vehicles enter at the real roadside."""
+    growing: bool = False
+    """Whether formations have different lengths."""
+    max_joined: int = 1
+    max_vehicles: int = MAX_SIZE
+    """Maximum number of vehicles in a formation at the real roadside."""
+    slot_s: float = SLOT_S
+    move_s: float = MOVE_S
+    mode: int = 1
+    before_m: float = 0.0
+    """Length of the road before S3."""
+    seed: int = 0
+    stream_planner: bool = False
+    """Whether the stream planner replaces `LightPlanner` (rolling operation)."""
 
-def make_rolling_scenario(lanes: int, rng: random.Random) -> Scenario:
-    """Return a scenario of the rolling operation."""
-    slot_s = rng.choice(SLOTS_S)
-    formation = FormationSettings(
-        operation="rolling",
-        cycle_s=slot_s,
-        move_s=round(MOVE_SHARE * slot_s / TICK_S) * TICK_S,
-        mode=rng.choice(MODES),
-    )
-    length_m = SLOTS_ON_ROAD * slot_s * formation.speed_mps
-    scenario = _scenario(Road(lanes=lanes, s1_m=0.0, s2_m=0.0, s3_m=length_m), formation)
-    return evolve(scenario, seed=rng.randrange(2**31))
-
-
-def _scenario(road: Road, formation: FormationSettings) -> Scenario:
-    return Scenario(
-        road=road,
-        formation=formation,
-        network=Network(heartbeat_s=0.2, election_s=0.6, lease_s=LEASE_S),
-        runtime=Runtime(tick_s=TICK_S, agent_silent_s=1.5),
-    )
+    def make_scenario(self) -> Scenario:
+        """Return the scenario of the road."""
+        if self.rolling:
+            formation = FormationSettings(
+                operation="rolling",
+                cycle_s=self.slot_s,
+                move_s=self.move_s,
+                mode=self.mode,
+                sort_in_s2=False,
+            )
+            s3_m = SLOTS_ON_ROAD * self.slot_s * formation.speed_mps
+        else:
+            formation = FormationSettings(
+                operation="formations",
+                close="vehicles" if self.growing else "columns",
+                block_columns=BLOCK_COLUMNS,
+                max_vehicles=self.max_vehicles,
+                cycle_s=self.slot_s,
+                move_s=self.move_s,
+                max_joined=self.max_joined,
+                # Limit planning by nodes: a deadline would make plans depend on the machine.
+                planning_deadline_s=3600.0,
+                max_nodes=500,
+            )
+            s3_m = 20_000.0
+        return Scenario(
+            road=Road(lanes=self.lanes, s1_m=0.0, s2_m=self.before_m, s3_m=s3_m),
+            formation=formation,
+            network=Network(heartbeat_s=0.2, election_s=0.6, lease_s=LEASE_S),
+            runtime=Runtime(tick_s=TICK_S, agent_silent_s=1.5),
+            seed=self.seed,
+        )
 
 
 @frozen
 class Setup:
     """Setup of a run."""
 
-    scenario: Scenario
-    mix: FaultMix
-    formations: tuple[ClosedFormation, ...]
-    """Formations, foremost first."""
+    road: RoadSetup
+    lasting: LastingFaults
     visits: tuple[Visit, ...]
-    crowded: bool
+    formations: tuple[ClosedFormation, ...] = ()
+    """Formations on a drawn entrance, foremost first."""
+    crowded: bool = False
     """Whether more vehicles may prefer a lane than their block has cells in that lane."""
     grants: tuple[Grant, ...] = ()
-    """Assignments of empty cells to owners (rolling operation)."""
+    """Assignments of empty cells to owners on a drawn entrance (rolling operation)."""
     stretch_columns: int = 0
     """Number of columns in which vehicles enter (rolling operation)."""
-    uses_stream_planner: bool = False
-    """Whether the stream planner replaces `LightPlanner` (rolling operation)."""
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """Scenario of the road."""
+        return self.road.make_scenario()
 
     @property
     def adjoin(self) -> bool:
@@ -122,53 +157,92 @@ class Setup:
     def drawn(cls, profile: Profile, rng: random.Random) -> Setup:
         """Draw a setup from a profile."""
         lanes = rng.randint(*profile.lanes)
+        if profile.roadside:
+            return cls._drawn_at_roadside(profile, lanes, rng)
         if profile.rolling:
             return cls._drawn_rolling(profile, lanes, rng)
         growing = rng.random() < profile.growing
-        scenario = make_scenario(lanes, rng.randint(*profile.max_joined), growing=growing)
+        road = RoadSetup(lanes=lanes, max_joined=rng.randint(*profile.max_joined), growing=growing)
+        scenario = road.make_scenario()
         formations = tuple(_draw_formations(profile, scenario, rng))
-        mix = FaultMix.drawn(profile, rng)
-        visits = tuple(_draw_visits(profile, scenario, formations, mix, rng))
-        return cls(scenario, mix, formations, visits, rng.random() < profile.crowding)
+        lasting = LastingFaults.drawn(profile, rng)
+        visits = tuple(_draw_visits(profile, scenario, formations, lasting, rng))
+        return cls(road, lasting, visits, formations, rng.random() < profile.crowding)
 
     @classmethod
     def _drawn_rolling(cls, profile: Profile, lanes: int, rng: random.Random) -> Setup:
-        scenario = make_rolling_scenario(lanes, rng)
-        mix = FaultMix.drawn(profile, rng)
+        road = _draw_rolling_road(lanes, rng)
+        scenario = road.make_scenario()
+        lasting = LastingFaults.drawn(profile, rng)
         # At least the foremost column is in S3 at the start.
         count = rng.randint(*profile.vehicles)
         columns = max(2, math.ceil(count / (lanes * rng.uniform(*profile.density))))
         first = rng.randint(1, columns + 1)
         cells = [(first - index, lane) for index in range(columns) for lane in range(lanes)]
         visits = tuple(
-            _visit(Name(f"v{number:02}"), cell, rng.random() < profile.leavers, scenario, mix, rng)
+            _visit(number, cell, rng.random() < profile.leavers, scenario, lasting, rng)
             for number, cell in enumerate(sorted(rng.sample(cells, count), reverse=True), start=1)
         )
         return cls(
-            scenario,
-            mix,
-            (),
+            road,
+            lasting,
             visits,
-            rng.random() < profile.crowding,
-            tuple(_grants(scenario, first, columns, visits)),
-            columns,
-            rng.random() < STREAM_PLANNER,
+            crowded=rng.random() < profile.crowding,
+            grants=tuple(_grants(scenario, first, columns, visits)),
+            stretch_columns=columns,
         )
+
+    @classmethod
+    def _drawn_at_roadside(cls, profile: Profile, lanes: int, rng: random.Random) -> Setup:
+        if profile.rolling:
+            road = _draw_rolling_road(lanes, rng, before_columns=rng.choice(BEFORE_COLUMNS))
+        else:
+            road = RoadSetup(
+                lanes=lanes,
+                roadside=True,
+                max_joined=rng.randint(*profile.max_joined),
+                growing=rng.random() < profile.growing,
+                max_vehicles=rng.randint(2, MAX_SIZE),
+            )
+        scenario = road.make_scenario()
+        lasting = LastingFaults.drawn(profile, rng)
+        mean_s = rng.uniform(*MEAN_HEADWAYS_S)
+        next_s = [rng.uniform(0.0, mean_s) for _ in range(lanes)]
+        visits = []
+        for number in range(1, rng.randint(*profile.vehicles) + 1):
+            arrival_s, lane = min((t_s, lane) for lane, t_s in enumerate(next_s))
+            next_s[lane] += 1.0 + rng.expovariate(1.0 / mean_s)
+            leaves = number > 1 and rng.random() < profile.leavers
+            visit = _visit(number, (0, lane), leaves, scenario, lasting, rng)
+            visits.append(evolve(visit, enters_s=arrival_s))
+        crowded = rng.random() < profile.crowding
+        return cls(road, lasting, tuple(visits), crowded=crowded, stretch_columns=len(visits))
+
+    def make_entrance(self, preferred_lanes: Mapping[Name, int], bridge: int) -> Entrance:
+        """Return the entrance of a road with preferred lanes and the incarnation of its bridge."""
+        if not self.road.roadside:
+            return DrawnEntrance(self.visits, preferred_lanes, self.formations, self.grants, bridge)
+        stream = tuple(
+            Arrival(visit.vehicle, visit.cell[1], preferred_lanes[visit.vehicle], visit.enters_s)
+            for visit in sorted(self.visits, key=lambda visit: visit.enters_s)
+        )
+        return Roadside(self.scenario, bridge, stream)
 
     def preferences(self, rng: random.Random, *, last: bool) -> dict[Name, int]:
         """Draw the preferred lane of each vehicle.
 
         If `last`, all can be satisfied: in each formation (or each pair that may join),
-        no lane is preferred by more vehicles than it has cells.
+        no lane is preferred by more vehicles than it has cells. At the real roadside, formations
+        form by the preferred lanes at entry, so only these can all be satisfied.
         """
         lanes, lattice = self.scenario.road.lanes, self.scenario.lattice
         columns = [len(one.columns(lattice)) for one in self.formations]
-        if self.scenario.formation.rolling:
+        if self.road.rolling or self.road.roadside:
             room = [self.stretch_columns] * lanes
             weights = [6.0 if self.crowded and lane == 0 else 1.0 for lane in range(lanes)]
             vehicles = [visit.vehicle for visit in self.visits]
             return _draw_lanes(vehicles, room, weights, rng)
-        may_join = self.adjoin and self.scenario.formation.max_joined >= 2
+        may_join = self.adjoin and self.road.max_joined >= 2
         if self.crowded and (may_join or not last):
             # One lane is preferred more often than the others.
             room = [sum(columns)] * lanes if last else [99] * lanes
@@ -184,6 +258,21 @@ class Setup:
             ]
             preferences |= _draw_lanes(members, [length] * lanes, [1.0] * lanes, rng)
         return preferences
+
+
+def _draw_rolling_road(lanes: int, rng: random.Random, before_columns: int = 0) -> RoadSetup:
+    slot_s = rng.choice(SLOTS_S)
+    road = RoadSetup(
+        lanes=lanes,
+        rolling=True,
+        roadside=before_columns > 0,
+        slot_s=slot_s,
+        move_s=round(MOVE_SHARE * slot_s / TICK_S) * TICK_S,
+        mode=rng.choice(MODES),
+        seed=rng.randrange(2**31),
+        stream_planner=rng.random() < STREAM_PLANNER,
+    )
+    return evolve(road, before_m=before_columns * road.make_scenario().lattice.pitch_m)
 
 
 def _draw_lanes(
@@ -219,7 +308,7 @@ def _draw_visits(
     profile: Profile,
     scenario: Scenario,
     formations: tuple[ClosedFormation, ...],
-    mix: FaultMix,
+    lasting: LastingFaults,
     rng: random.Random,
 ) -> Iterator[Visit]:
     """Draw the vehicles: in each formation at least one, and at most one for every two cells."""
@@ -244,16 +333,21 @@ def _draw_visits(
             number += 1
             # The first vehicle stays, because formations are never empty.
             leaves = index > 0 and rng.random() < profile.leavers
-            yield _visit(Name(f"v{number:02}"), cell, leaves, scenario, mix, rng)
+            yield _visit(number, cell, leaves, scenario, lasting, rng)
 
 
 def _visit(
-    name: Name, cell: Cell, leaves: bool, scenario: Scenario, mix: FaultMix, rng: random.Random
+    number: int,
+    cell: Cell,
+    leaves: bool,
+    scenario: Scenario,
+    lasting: LastingFaults,
+    rng: random.Random,
 ) -> Visit:
     enters_s = max(0.0, scenario.lattice.passing_time_s(cell[0]))
-    wrong = 1.0 if mix.wrong_clocks else 0.0
+    wrong = 1.0 if lasting.wrong_clocks else 0.0
     return Visit(
-        vehicle=name,
+        vehicle=Name(f"v{number:02}"),
         cell=cell,
         enters_s=enters_s,
         leaves_s=enters_s + rng.uniform(*LEAVES_S) if leaves else None,

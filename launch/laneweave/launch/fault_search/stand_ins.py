@@ -20,7 +20,6 @@ from laneweave.protocol.vehicle.motion import State, at_rest_in_cell
 from laneweave.protocol.wire.messages import Motion, Name, Sense
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.bodies.plant import Plant
-from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
@@ -36,22 +35,14 @@ class Visit:
 
     vehicle: Name
     cell: Cell
-    """Cell in which the vehicle enters."""
+    """Cell in which the vehicle enters; at the real roadside, only its lane counts."""
     enters_s: float
+    """Time of entry, or of arrival at the real roadside."""
     leaves_s: float | None
     """Exit time; None: the vehicle stays until the end of the road."""
     clock_offset_s: float = 0.0
     clock_drift: float = 0.0
     """Error of the clock rate: seconds gained per second."""
-
-
-@frozen
-class Grant:
-    """Assignment of an empty cell to an owner (rolling operation)."""
-
-    t_s: float
-    owner: Name
-    cell: Cell
 
 
 class LightBody(Plant):
@@ -96,17 +87,25 @@ class LightBody(Plant):
 class LightVehicle(RoadVehicle):
     """Vehicle with a simplified body, its own clock and a variable preferred lane."""
 
-    def __init__(self, visit: Visit, preferred_lane: int, scenario: Scenario) -> None:
-        """Start in the cell of a visit."""
-        self.body = LightBody(scenario, visit.cell)
-        arrival = Arrival(visit.vehicle, visit.cell[1], preferred_lane, visit.enters_s)
+    def __init__(
+        self, visit: Visit, admission: Admission, scenario: Scenario, bridge: int = 0
+    ) -> None:
+        """Start at rest in the cell of the admission."""
+        self.body = LightBody(scenario, admission.cell)
         super().__init__(
             visit.vehicle,
-            Admission(arrival, visit.cell, visit.enters_s),
-            MotionController(self.body, scenario, visit.cell),
+            admission,
+            MotionController(self.body, scenario, admission.cell),
+            bridge=bridge,
         )
         if scenario.formation.rolling:
-            self.controller.assign_cell(visit.cell)
+            self.controller.assign_cell(admission.cell)
+        if not scenario.formation.closes_by_vehicles:
+            self.formation = self.controller.joined[0]
+        self.clock_jump_s = 0.0
+        """Error of the vehicle's clock by jumps, in addition to that of the visit."""
+        self.latest_s = 0.0
+        """Latest road time that the vehicle's clock has shown."""
         self._visit = visit
         self._speed_mps = scenario.lattice.speed_mps
 
@@ -132,7 +131,9 @@ class LightVehicle(RoadVehicle):
         """
         sense = super().sense(tick, caretaker=caretaker, left=left)
         visit = self._visit
-        ahead_s = visit.clock_offset_s + visit.clock_drift * (sense.t_s % SYNC_S)
+        drifted_s = visit.clock_offset_s + visit.clock_drift * (sense.t_s % SYNC_S)
+        ahead_s = max(drifted_s + self.clock_jump_s, -sense.t_s)
+        self.latest_s = max(self.latest_s, sense.t_s + ahead_s)
         if ahead_s == 0.0:
             return sense
         s, v, a, y, v_y, a_y = sense.state

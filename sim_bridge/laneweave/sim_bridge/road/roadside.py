@@ -34,8 +34,16 @@ begin near the entrance, since all cells must be assigned before a plan can tran
 class Roadside:
     """Demand, entry metering and census."""
 
-    def __init__(self, scenario: Scenario, bridge: int = 0) -> None:
-        """Draw the arrivals of a scenario; `bridge` is the incarnation of the bridge."""
+    def __init__(
+        self, scenario: Scenario, bridge: int = 0, stream: tuple[Arrival, ...] | None = None
+    ) -> None:
+        """Begin without vehicles.
+
+        Args:
+            scenario: road, demand, formations.
+            bridge: incarnation of the bridge.
+            stream: the arrivals, by time; None: drawn from the scenario's seed.
+        """
         self._bridge = bridge
         self._announce_s = scenario.runtime.announce_s
         self._tick_s = scenario.runtime.tick_s
@@ -64,7 +72,7 @@ class Roadside:
         """Last column of each lane whose cells have been processed."""
         columns = int(scenario.moves_from_m / lattice.pitch_m)
         self._max_empty = max(0, min(MAX_EMPTY, columns - 2))
-        self._arrivals = arrivals(scenario)
+        self._arrivals = arrivals(scenario) if stream is None else stream
         self._demanded = 0
         self._queued = 0
         self._entered = 0

@@ -15,6 +15,8 @@ from support.states import holding, make_plan
 GEOMETRY = Geometry(pitch_m=15.0, lane_width_m=3.5, length_m=5.0, width_m=1.8)
 A, B, C = Name("a"), Name("b"), Name("c")
 MOVE_S = 0.8
+OTHER_BLOCK = 99
+"""A block that is in no plan."""
 
 Paths = dict[Name, tuple[Cell, ...]]
 Motion = tuple[float, Name, int, Cell]
@@ -45,7 +47,7 @@ class Scene:
         for paths in plans:
             self.cells = {name: path[0] for name, path in paths.items()} | self.cells
         for name, cell in self.cells.items():
-            self.checker.enter(0.0, name, cell)
+            self.checker.enter(0.0, name, cell, OTHER_BLOCK)
             self.checker.sent(0.0, state(name, None, cell))
         for seq, paths in enumerate(plans, start=1):
             self.issue(seq, paths)
@@ -56,6 +58,8 @@ class Scene:
             for name, path in paths.items()
         }
         cells = {name: path[0] for name, path in paths.items()}
+        for name, cell in cells.items():
+            self.checker.claims.on_promise(state(name, seq, cell))
         self.checker.sent(0.0, make_plan(cells, moves, ballot=ballot(seq)))
 
     def move(self, t_s: float, name: Name, seq: int, target: Cell, lasts_s: float = MOVE_S) -> None:
@@ -114,7 +118,7 @@ def test_motions(kind: str | None, plans: list[Paths], motions: list[Motion]) ->
 
 def test_an_entry_into_an_occupied_cell_is_reported() -> None:
     scene = Scene({A: ((0, 0),)})
-    scene.checker.enter(1.0, B, (0, 0))
+    scene.checker.enter(1.0, B, (0, 0), OTHER_BLOCK)
     assert scene.kinds == ["cell"]
 
 
@@ -162,7 +166,7 @@ def test_a_vehicle_that_has_left_frees_its_cell() -> None:
 
 def test_a_motion_without_a_plan_is_reported() -> None:
     scene = Scene()
-    scene.checker.enter(0.0, A, (0, 0))
+    scene.checker.enter(0.0, A, (0, 0), OTHER_BLOCK)
     scene.checker.begin(1.0, A, 1, ((0, 0), (1, 0)), MOVE_S)
     assert scene.kinds == ["motion"]
 

@@ -7,8 +7,10 @@ import random
 import pytest
 
 from laneweave.launch.fault_search.fault_run import FaultRun
-from laneweave.launch.fault_search.faults import HEALTHY, FaultMix
+from laneweave.launch.fault_search.faults import FaultEvent
+from laneweave.launch.fault_search.lasting_faults import HEALTHY, LastingFaults
 from laneweave.launch.fault_search.profiles import PROFILES
+from laneweave.launch.fault_search.story import Story
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import Node
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
@@ -19,19 +21,19 @@ from laneweave.protocol.wire.topics import Keys
 @pytest.fixture
 def world() -> FaultRun:
     """A calm world that has run for two seconds."""
-    world = FaultRun(3, PROFILES["calm"])
+    world = FaultRun(Story.drawn(3, PROFILES["calm"]))
     world.network.run(2.0)
     return world
 
 
 def harm(world: FaultRun, kind: str) -> None:
-    world.faults._apply(kind)
+    world.faults.apply(FaultEvent(world.network.now_s, kind, 1))
 
 
 def test_malformed_bytes_are_malformed(world: FaultRun) -> None:
     keys = Keys(world.setup.scenario.network.realm)
     for _ in range(2000):
-        key, payload = world.faults._malformed()
+        key, payload = world.faults.messages._malformed()
         known = keys.read(key)
         kind = known[0].kind if known is not None else None
         if kind is not None:
@@ -101,26 +103,51 @@ def test_faults_end_by_themselves(world: FaultRun) -> None:
     assert world.network.dropped == dropped
 
 
-def test_an_unknown_fault_is_an_error(world: FaultRun) -> None:
-    with pytest.raises(ValueError, match="unknown fault: rain"):
-        harm(world, "rain")
+def test_an_unknown_fault_is_an_error() -> None:
+    with pytest.raises(BadInputError, match="got 'rain'; allowed: leader-kill"):
+        FaultEvent(1.0, "rain", 1)
 
 
 def test_lasting_faults_are_counted() -> None:
-    mix = FaultMix.drawn(PROFILES["clocks"], random.Random(1))
-    kinds = mix.kinds()
+    lasting = LastingFaults.drawn(PROFILES["clocks"], random.Random(1))
+    kinds = lasting.kinds()
     assert kinds["wrong-clocks"] == 1
-    assert ("loss" in kinds) == (mix.conditions.loss > 0)
-    assert FaultMix.drawn(PROFILES["calm"], random.Random(1)).kinds() == {}
+    assert ("loss" in kinds) == (lasting.conditions.loss > 0)
+    assert LastingFaults.drawn(PROFILES["calm"], random.Random(1)).kinds() == {}
 
 
 @pytest.mark.slow
 def test_every_kind_in_a_profile_can_be_applied() -> None:
     for kind in sorted({kind for profile in PROFILES.values() for kind in profile.event_kinds}):
-        world = FaultRun(3, PROFILES["calm"])
+        world = FaultRun(Story.drawn(3, PROFILES["calm"]))
         world.network.run(2.0)
+        harm(world, "agent-kill")  # there are states of earlier processes
+        world.network.run(6.0)
         harm(world, kind)
-        assert world.faults.counts[kind] == 1, kind
+        assert world.faults.counts[kind] >= (kind != "harmful-plan"), kind
+        world.network.run(8.0)
+        assert world.checker.violations == [], kind
+
+
+def test_a_changed_plan_is_counted_when_it_is_sent_and_refused_by_all() -> None:
+    world = FaultRun(Story.drawn(3, PROFILES["calm"]))
+    harm(world, "harmful-plan")
+    assert world.faults.counts["harmful-plan"] == 0
+    world.network.run(6.0)
+    assert world.faults.counts["harmful-plan"] == 1
+    assert len(world.checker.claims.harmful) == 1
+    assert world.checker.violations == []
+
+
+def test_another_road_begins_after_a_restart_of_the_bridge(world: FaultRun) -> None:
+    before = world.road
+    harm(world, "road-restart")
+    assert "road" not in world.network
+    world.faults.heal()
+    world.network.run(4.0)
+    assert world.road is not before
+    assert world.road.bridge > before.bridge
+    assert world.road.vehicles.keys() == before.vehicles.keys()
 
 
 def _rejected(network: SimulatedNetwork) -> int:

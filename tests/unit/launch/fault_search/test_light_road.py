@@ -9,8 +9,9 @@ import pytest
 
 from laneweave.launch.fault_search.checker import Checker
 from laneweave.launch.fault_search.checker_geometry import Geometry
-from laneweave.launch.fault_search.light_road import LightRoad
-from laneweave.launch.fault_search.setup import make_scenario
+from laneweave.launch.fault_search.drawn_entrance import DrawnEntrance
+from laneweave.launch.fault_search.light_road import LightRoad, Reception
+from laneweave.launch.fault_search.setup import RoadSetup
 from laneweave.launch.fault_search.stand_ins import Visit
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Arrived, Effect, PeerDown, PeerUp, Send, Started, Wakeup
@@ -26,7 +27,7 @@ from laneweave.protocol.wire.messages import (
 )
 from laneweave.protocol.wire.topics import COMMAND, PREPARE, VEHICLE_ALIVE
 
-SCENARIO = make_scenario(lanes=3, max_joined=1)
+SCENARIO = RoadSetup(lanes=3).make_scenario()
 A = Name("a")
 OWN = {"vehicle": "a"}
 
@@ -39,16 +40,17 @@ class Bench:
         self.log: list[tuple[float, str]] = []
         checker = Checker(Geometry(15.0, 3.5, 5.0, 1.8), lambda *event: self.log.append(event))
         given = {"enters_s": 0.0, "leaves_s": None} | visit
+        guest = Visit(A, (4, 1), **given)  # type: ignore[arg-type]
+        self.reception = Reception.IN_TIME
         self.road = LightRoad(
             SCENARIO,
-            [Visit(A, (4, 1), **given)],  # type: ignore[arg-type]
-            {A: 2},
+            DrawnEntrance([guest], {A: 2}),
+            {A: guest},
             checker,
             count(100).__next__,
             lambda: 0.8,
-            lambda: self.loses,
+            lambda _: self.reception,
         )
-        self.loses = False
         self.now_s = 0.0
         list(self.road.handle(Started(), 0.0))
 
@@ -60,9 +62,11 @@ class Bench:
     def sense(self) -> Sense:
         return next(message for message in self.tick() if isinstance(message, Sense))
 
-    def command(self, incarnation: int, cell: Cell, tick: int | None = None) -> list[object]:
+    def command(
+        self, incarnation: int, cell: Cell, tick: int | None = None, accepted: Ballot | None = None
+    ) -> list[object]:
         tick = self.road.tick if tick is None else tick
-        command = Command(A, incarnation, tick, cell, tick + 8, (4, 1), b"")
+        command = Command(A, incarnation, tick, cell, tick + 8, (4, 1), b"", accepted=accepted)
         return messages(self.road.handle(Arrived(COMMAND, OWN, command), self.now_s))
 
     def agent(self, *, up: bool) -> None:
@@ -98,9 +102,18 @@ def test_the_process_in_charge_moves_the_body(bench: Bench) -> None:
 
 def test_a_lost_command_changes_nothing(bench: Bench) -> None:
     bench.tick()
-    bench.loses = True
+    bench.reception = Reception.LOST
     bench.command(7, (4, 2))
     assert len(bench.log) == 1
+
+
+def test_a_late_command_is_stored_but_not_executed(bench: Bench) -> None:
+    bench.tick()
+    bench.reception = Reception.LATE
+    promised = Ballot(1, Name("c1"), 1, 1)
+    bench.command(7, (4, 2), accepted=promised)
+    assert len(bench.log) == 1
+    assert bench.road.vehicles[A].controller.accepted == promised
 
 
 def test_a_late_command_counts_unless_a_newer_one_was_there(bench: Bench) -> None:
@@ -166,5 +179,6 @@ def test_a_leaving_vehicle_is_notified_and_in_no_census(bench: Bench) -> None:
 
 def test_new_preferred_lanes_are_in_the_next_census(bench: Bench) -> None:
     bench.road.prefer({A: 0})
-    (census,) = [message for message in bench.tick() if isinstance(message, Census)]
+    sent = [message for _ in range(10) for message in bench.tick()]
+    (census,) = [message for message in sent if isinstance(message, Census)]
     assert census.on_road[0].preferred_lane == 0

@@ -19,10 +19,11 @@ from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.search import (
     SearchResult,
     describe,
-    run_seeds,
+    run_tasks,
     search,
     timeline_of,
 )
+from laneweave.launch.fault_search.story import Story
 from laneweave.protocol.errors import BadInputError
 from support import commands
 from support.commands import LANEWEAVE, Here
@@ -48,9 +49,9 @@ def test_bad_jobs(jobs: int) -> None:
 @pytest.mark.slow
 def test_several_processes_have_the_results_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search_module, "BATCH", 2)
-    seeds = range(4)  # a batch for each process
-    one = search(seeds, CALM, jobs=1, digest=True)
-    two = search(seeds, CALM, jobs=2, digest=True)
+    seeds = range(4)  # two batches
+    one = search(seeds, [CALM], jobs=1, digest=True)
+    two = search(seeds, [CALM], jobs=2, digest=True)
     assert one.digests == two.digests
     assert one.digest == two.digest
     assert evolve(one.totals, cpu_s=0.0, virtual_s=0.0) == evolve(
@@ -62,7 +63,7 @@ def test_several_processes_have_the_results_of_one(monkeypatch: pytest.MonkeyPat
 @pytest.mark.slow
 def test_profiles_and_seeds_make_different_runs() -> None:
     digests = {
-        run_seeds([seed], PROFILES[name], digest=True)[0].digest
+        run_tasks([(seed, name)], digest=True)[0].digest
         for seed in (1, 2)
         for name in ("calm", "dense")
     }
@@ -71,8 +72,8 @@ def test_profiles_and_seeds_make_different_runs() -> None:
 
 def test_failures_are_described_with_the_command_that_replays_them() -> None:
     violation = Violation("cell", 3.25, ("v01", "v02"), "both occupy [(0, 0)]")
-    failed = (SeedResult(17, (violation,), Totals(runs=1)),)
-    lines = list(describe(SearchResult(Totals(runs=20), failed), CALM))
+    failed = (SeedResult(17, (violation,), Totals(runs=1), profile="calm"),)
+    lines = list(describe(SearchResult(Totals(runs=20), failed)))
     assert lines[:3] == [
         "seed 17 failed:",
         "     3.250 s  cell: v01, v02: both occupy [(0, 0)]",
@@ -83,7 +84,7 @@ def test_failures_are_described_with_the_command_that_replays_them() -> None:
 
 @pytest.mark.slow
 def test_a_crash_in_a_computation_is_a_violation() -> None:
-    run = FaultRun(0, CALM)
+    run = FaultRun(Story.drawn(0, CALM))
     run.network.at(1.0, run.network.failed_jobs.append, (1.0, "c1", "ValueError: no"))
     (violation,) = run.run().violations
     found = violation.kind, violation.vehicles, violation.text
@@ -91,8 +92,8 @@ def test_a_crash_in_a_computation_is_a_violation() -> None:
 
 
 def test_timeline_of_a_run() -> None:
-    lines = list(timeline_of(1, CALM))
-    assert lines[0] == "seed 1, profile calm:"
+    lines = list(timeline_of(Story.drawn(1, CALM)))
+    assert lines[0] == "calm 1:"
     told = "\n".join(lines)
     for words in ("PREPARE", "PLAN", "STATE", "COMMAND", "moves", "all faults end", "*** v01"):
         assert words in told
@@ -115,7 +116,7 @@ def test_the_command() -> None:
     ("arguments", "line"),
     [
         (["--seeds", "9:3"], "--seeds: got '9:3'; allowed: A:B with A < B"),
-        (["--profile", "mild"], "--profile: got 'mild'; allowed: mixed, calm"),
+        (["--profile", "mild"], "--profile: got 'mild'; allowed: guided, mixed, calm"),
         (["--jobs", "0"], "--jobs: got 0; allowed: [1, 256]"),
     ],
 )

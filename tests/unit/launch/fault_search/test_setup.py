@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from laneweave.launch.fault_search.profiles import PROFILES, profile_named
+from laneweave.launch.fault_search.profiles import PROFILES, profiles_named
 from laneweave.launch.fault_search.setup import BLOCK_COLUMNS, Setup
 from laneweave.launch.fault_search.stand_ins import Visit
 from laneweave.protocol.config.cross_checks import check_scenario
@@ -14,10 +14,15 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.wire.messages import ClosedFormation, Name
 
 EVERY = pytest.mark.parametrize(
-    "name", [name for name, profile in PROFILES.items() if not profile.rolling]
+    "name",
+    [name for name, profile in PROFILES.items() if not (profile.rolling or profile.roadside)],
 )
 ROLLING = pytest.mark.parametrize(
-    "name", [name for name, profile in PROFILES.items() if profile.rolling]
+    "name",
+    [name for name, profile in PROFILES.items() if profile.rolling and not profile.roadside],
+)
+ROADSIDE = pytest.mark.parametrize(
+    "name", [name for name, profile in PROFILES.items() if profile.roadside]
 )
 
 
@@ -96,16 +101,16 @@ def test_lanes_are_crowded_now_and_then() -> None:
 def test_profiles_draw_from_their_ranges() -> None:
     for name, profile in PROFILES.items():
         for setup, _ in draw(name):
-            assert setup.mix.conditions.loss in profile.loss
+            assert setup.lasting.conditions.loss in profile.loss
             assert setup.scenario.road.lanes in range(profile.lanes[0], profile.lanes[1] + 1)
-            if not profile.rolling:
+            if not (profile.rolling or profile.roadside):
                 assert len(setup.formations) in range(profile.blocks[0], profile.blocks[1] + 1)
     assert all(len(setup.visits) == 12 for setup, _ in draw("dense"))
 
 
 def test_an_unknown_profile_is_refused() -> None:
-    with pytest.raises(BadInputError, match="mixed, calm, loss"):
-        profile_named("mild")
+    with pytest.raises(BadInputError, match="guided, mixed, calm, loss"):
+        profiles_named("mild")
 
 
 @ROLLING
@@ -119,6 +124,18 @@ def test_a_stretch_of_the_rolling_operation_has_one_owner_for_each_cell(name: st
             assert grant.t_s >= enters[grant.owner]
         wanted = Counter(setup.preferences(rng, last=True).values())
         assert max(wanted.values()) <= setup.stretch_columns
+
+
+@ROADSIDE
+def test_the_roadside_admits_all_vehicles_in_turn(name: str) -> None:
+    for setup, rng in draw(name, 20):
+        check_scenario(setup.scenario)
+        lanes = setup.preferences(rng, last=False)
+        entrance = setup.make_entrance(lanes, bridge=1)
+        entered = [each for tick in range(1000) for each in entrance.admit(tick * 0.1)]
+        assert {each.arrival.vehicle for each in entered} == set(lanes)
+        for each in entered:
+            assert each.arrival.preferred_lane == lanes[Name(each.arrival.vehicle)]
 
 
 def test_dense_stretches_are_dense() -> None:

@@ -56,6 +56,8 @@ class Member:
         self.clock: Clock | None = None
         """None: virtual time."""
         self.connected = True
+        self.lost_s = 0.0
+        """Time at which the connection was last lost."""
         self.unplugged = False
         """Disconnected on its own: a restored router does not reconnect it."""
         self.connection = 0

@@ -14,6 +14,7 @@ objects, without encoding or checks, for speed.
 from __future__ import annotations
 
 import heapq
+import math
 from bisect import insort
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
@@ -162,7 +163,7 @@ class SimulatedNetwork(Simulation):
         """Receivers of each key, in the order in which they started."""
         self._keys_by_prefix: dict[str, list[str]] = {}
         """Keys with routes, grouped by the key without its last part."""
-        self._cut: Callable[[str, str], bool] | None = None
+        self._extra_delay_s: Callable[[str, str, str], float] | None = None
         self._router_up = True
         self._outages = 0
         self._queries: dict[int, _OpenQuery] = {}
@@ -215,6 +216,11 @@ class SimulatedNetwork(Simulation):
         """Return a node."""
         return self._members[name].node
 
+    def offline_s(self, name: str) -> float:
+        """Return for how long a running node has been without a connection; 0 if it is paused."""
+        member = self._members[name]
+        return 0.0 if member.connected or member.paused else self.now_s - member.lost_s
+
     # --- faults of nodes --------------------------------------------------------------------
 
     def kill(self, name: str) -> None:
@@ -262,9 +268,12 @@ class SimulatedNetwork(Simulation):
 
     # --- faults of the network --------------------------------------------------------------
 
-    def cut(self, blocked: Callable[[str, str], bool] | None) -> None:
-        """Drop messages from a to b if `blocked(a, b)`; None ends the partition."""
-        self._cut = blocked
+    def hinder(self, extra_delay_s: Callable[[str, str, str], float] | None) -> None:
+        """Delay messages from a to b on a key by `extra_delay_s(a, b, key)`; infinity: drop them.
+
+        None ends all delays.
+        """
+        self._extra_delay_s = extra_delay_s
 
     def disconnect(self, name: str) -> None:
         """Disconnect a node; its tokens vanish for all other nodes at once.
@@ -309,20 +318,18 @@ class SimulatedNetwork(Simulation):
         if source is None or not source.connected:
             self.dropped += 1
             return
-        conditions, cut, draw = self.conditions, self._cut, self.random.random
+        conditions, draw = self.conditions, self.random.random
+        hindrance = self._extra_delay_s
         duplication, loss = conditions.duplication, conditions.loss
         route = self._routes.get(key)
         message = Received(key, payload)
         for receiver in self._route(key) if route is None else route:
-            if (
-                not receiver.connected
-                or (cut is not None and cut(sender, receiver.name))
-                or (loss and draw() < loss)
-            ):
+            extra_s = 0.0 if hindrance is None else hindrance(sender, receiver.name, key)
+            if not receiver.connected or extra_s == math.inf or (loss and draw() < loss):
                 self.dropped += 1
                 continue
             # `_send` inlined, because most events of a simulation originate here.
-            arrival_s = self.now_s + conditions.delay_s + conditions.jitter_s * draw()
+            arrival_s = self.now_s + conditions.delay_s + conditions.jitter_s * draw() + extra_s
             arguments = (receiver.connection, message)
             heapq.heappush(self.queue, (arrival_s, next(self.order), receiver.receive, arguments))
             if duplication and draw() < duplication:
@@ -419,7 +426,7 @@ class SimulatedNetwork(Simulation):
         broken = [member for member in members if member.connected]
         for member in broken:
             self._hide(member)
-            member.connected = False
+            member.connected, member.lost_s = False, self.now_s
             member.connection += 1
             self._abandon_queries(member)
         for member in broken:

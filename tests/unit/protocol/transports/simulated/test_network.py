@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import pytest
@@ -82,20 +83,46 @@ def test_messages_overtake_each_other_with_jitter() -> None:
     assert all(0.102 <= now_s <= 0.112 + 1e-9 for now_s in receiver.times(node.Arrived))
 
 
-def test_a_cut_loses_messages_where_it_says_until_it_heals() -> None:
+def test_a_hindrance_loses_messages_where_it_says_until_it_ends() -> None:
     receivers = {name: listener() for name in ("b", "c")}
     network = network_of(more=receivers, a=Recorder())
-    network.cut(lambda sender, receiver: (sender, receiver) == ("a", "b"))
+    lost_between = ("a", "b")
+    network.hinder(lambda *names_and_key: math.inf if names_and_key[:2] == lost_between else 0.0)
     send(network, "a", 1)
     send(network, "c", 2)
     network.run(0.2)
     assert receivers["b"].numbers == [2]
     assert receivers["c"].numbers == [1, 2]
     assert network.dropped == 1
-    network.cut(None)
+    network.hinder(None)
     send(network, "a", 3)
     network.run(0.3)
     assert receivers["b"].numbers == [2, 3]
+
+
+def test_a_hindrance_delays_messages_of_a_key() -> None:
+    receiver = listener()
+    network = network_of(a=Recorder(), b=receiver)
+    network.hinder(lambda _sender, _receiver, key: 0.5 if key == KEY else 0.0)
+    send(network, "a", 1)
+    network.run(0.5)
+    assert receiver.numbers == []
+    network.run(0.7)
+    assert receiver.numbers == [1]
+
+
+def test_the_time_without_a_connection() -> None:
+    network = network_of(a=Recorder())
+    network.run(1.0)
+    assert network.offline_s("a") == 0.0
+    network.disconnect("a")
+    network.run(1.5)
+    assert network.offline_s("a") == 0.5
+    network.pause("a")
+    assert network.offline_s("a") == 0.0
+    network.resume("a")
+    network.reconnect("a")
+    assert network.offline_s("a") == 0.0
 
 
 @pytest.mark.parametrize("skip_codec", [False, True])

@@ -1,0 +1,238 @@
+"""Checks of what processes claim in messages, when they send them; part of the checker.
+
+A collision needs a wrong claim and a vehicle that acts on it at the wrong time. The claims
+themselves must be true at any time, so they show a violated rule much sooner.
+
+| kind | violation |
+|---|---|
+| `false` | a state claims what its motion controller or body does not confirm |
+| `gate` | a start gate is reported open before all members have reported that they are ready |
+| `basis` | a plan starts from cells or names processes that no promise has reported |
+| `roster` | a plan lacks a vehicle that entered in its blocks |
+| `two-plans` | two different rosters or plans are sent under one ballot |
+| `harmful` | a vehicle accepts or begins a plan that it must refuse |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from attrs import define, field, frozen
+
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Name,
+    PendingTransfer,
+    Plan,
+    Prepare,
+    VehicleState,
+)
+
+Report = Callable[[str, float, list[str], str], None]
+"""Callback for a violation: kind, virtual time, vehicles, text."""
+
+
+@frozen
+class Stored:
+    """What a motion controller has stored."""
+
+    attendant: int
+    joined: tuple[int, ...]
+    accepted: Ballot | None
+    promised: Ballot | None
+    owned: tuple[Cell, ...]
+    transfer: PendingTransfer | None
+
+
+@frozen
+class Harm:
+    """A plan that was changed on its way: who must refuse it, and what was changed."""
+
+    refusing: frozenset[Name]
+    """Vehicles that must not accept it. No vehicle may open its gate."""
+    text: str
+
+
+@define
+class Claims:
+    """Checker of claims in a run."""
+
+    report: Report
+    plans: dict[Ballot, Plan]
+    """All plans sent so far; shared with the checker."""
+    harmful: dict[Ballot, Harm] = field(factory=dict)
+    """Plans that were changed on their way."""
+    _stored: dict[str, Stored] = field(factory=dict)
+    """Newest content of each motion controller."""
+    _in_charge: set[tuple[str, int]] = field(factory=set)
+    """(vehicle, incarnation) of each process that has been in charge."""
+    _acceptances: set[tuple[str, int, Ballot]] = field(factory=set)
+    """(vehicle, incarnation, ballot) of each stored acceptance."""
+    _holdings: set[tuple[str, Ballot | None, tuple[Cell, ...]]] = field(factory=set)
+    """(vehicle, promise, owned cells) stored at the same time."""
+    _promised_cells: set[tuple[str, int, Ballot, Cell]] = field(factory=set)
+    """(vehicle, incarnation, ballot, hold cell) of each promise."""
+    _ready: dict[Ballot, set[str]] = field(factory=dict)
+    """Vehicles that have reported under each ballot that they are ready."""
+    _rosters: dict[Ballot, Prepare] = field(factory=dict)
+    _blocks: dict[str, int] = field(factory=dict)
+    """Block in which each vehicle on the road entered."""
+    _earlier: set[tuple[str, int]] = field(factory=set)
+    """(vehicle, incarnation) of each process that has acted on an earlier road."""
+    _reported: set[tuple[str, str, str]] = field(factory=set)
+
+    # --- the road -----------------------------------------------------------------------------
+
+    def begin_road(self) -> None:
+        """Begin another road: processes that have acted on this one do not belong to it."""
+        self._earlier |= self._in_charge
+        self._stored.clear()
+        self._blocks.clear()
+
+    def is_earlier(self, vehicle: str, incarnation: int) -> bool:
+        """Return whether a process has acted on an earlier road."""
+        return (vehicle, incarnation) in self._earlier
+
+    def enter(self, t_s: float, vehicle: str, block: int) -> None:
+        """Record that a vehicle has entered in a block, which no plan may contain."""
+        self._blocks[vehicle] = block
+        for ballot, plan in self.plans.items():
+            harmful = ballot in self.harmful
+            if block in plan.formations and not harmful and self._is_current(plan):
+                self._tell("roster", t_s, vehicle, f"enters in a block of {short(ballot)}")
+
+    def leave(self, vehicle: str) -> None:
+        """Record that a vehicle has left the road."""
+        self._blocks.pop(vehicle, None)
+
+    def store(self, vehicle: str, stored: Stored) -> None:
+        """Record what a motion controller has stored."""
+        if self._stored.get(vehicle) == stored:
+            return
+        self._stored[vehicle] = stored
+        self._in_charge.add((vehicle, stored.attendant))
+        self._holdings.add((vehicle, stored.promised, stored.owned))
+        if stored.accepted is not None:
+            self._acceptances.add((vehicle, stored.attendant, stored.accepted))
+
+    # --- messages -----------------------------------------------------------------------------
+
+    def on_promise(self, state: VehicleState) -> None:
+        """Record the hold cell with which a process promises a ballot."""
+        if state.promised is not None:
+            basis = state.vehicle, state.incarnation, state.promised, state.hold_cell
+            self._promised_cells.add(basis)
+
+    def on_state(
+        self, t_s: float, state: VehicleState, finished: int, cell_at_rest: Cell | None
+    ) -> None:
+        """Check the state of a vehicle on the road.
+
+        Args:
+            t_s: virtual time.
+            state: the state, as sent.
+            finished: number of motions that the body has completed under the promised ballot.
+            cell_at_rest: cell in which the body rests; None while it moves.
+        """
+        name, ballot = state.vehicle, state.promised
+        stored = self._stored.get(name)
+        if stored is None or self.is_earlier(name, state.incarnation):
+            return
+        if (name, state.incarnation) not in self._in_charge:
+            self._false(t_s, state, "its process has never been in charge")
+        if not set(state.joined) <= set(stored.joined):
+            self._false(t_s, state, f"joined {state.joined}, but stored are {stored.joined}")
+        if state.owned and (name, ballot, state.owned) not in self._holdings:
+            self._false(t_s, state, f"owns {list(state.owned)} with {short(ballot)}")
+        if state.incarnation == stored.attendant and not state.moving:
+            if cell_at_rest is None:
+                self._false(t_s, state, "holds, but its body moves")
+            elif cell_at_rest != state.hold_cell:
+                self._false(t_s, state, f"holds {state.hold_cell}, but rests in {cell_at_rest}")
+        if state.accepted and ballot is not None:
+            self._on_acceptance(t_s, state, ballot, finished)
+
+    def _on_acceptance(
+        self, t_s: float, state: VehicleState, ballot: Ballot, finished: int
+    ) -> None:
+        name, plan, harm = state.vehicle, self.plans.get(ballot), self.harmful.get(ballot)
+        if (name, state.incarnation, ballot) not in self._acceptances:
+            self._false(t_s, state, f"accepted {short(ballot)}, which is not stored")
+        if state.completed > finished:
+            self._false(t_s, state, f"completed {state.completed} moves, its body {finished}")
+        if plan is not None and not state.attended and plan.moves.get(name):
+            self._false(t_s, state, f"accepts moves in {short(ballot)} without an agent")
+        if harm is not None and (name in harm.refusing or state.go):
+            self._tell("harmful", t_s, name, f"executes {short(ballot)}: {harm.text}")
+        ready = self._ready.setdefault(ballot, set())
+        if state.ready:
+            ready.add(name)
+        if state.go and plan is not None:
+            missing = set(plan.roster) - ready - {name}
+            if missing:
+                text = f"{short(ballot)} opens before {' '.join(sorted(missing))}"
+                self._tell("gate", t_s, name, text)
+
+    def on_prepare(self, t_s: float, prepare: Prepare) -> None:
+        """Check that a ballot has one roster."""
+        known = self._rosters.setdefault(prepare.ballot, prepare)
+        if known is not prepare and known != prepare:
+            names = sorted({*known.roster, *prepare.roster})
+            self._tell("two-plans", t_s, names[0], f"two rosters under {short(prepare.ballot)}")
+
+    def on_plan(self, t_s: float, plan: Plan) -> None:
+        """Check the first message with a plan."""
+        if plan.ballot in self.harmful or not self._is_current(plan):
+            return
+        for name in plan.roster:
+            basis = name, plan.incarnations[name], plan.ballot, plan.start_cells[name]
+            if basis not in self._promised_cells:
+                text = f"{short(plan.ballot)} starts in {plan.start_cells[name]} without a promise"
+                self._tell("basis", t_s, name, text)
+        left_out = {name for name, block in self._blocks.items() if block in plan.formations}
+        for missing in sorted(left_out - set(plan.roster)):
+            self._tell("roster", t_s, missing, f"not in {short(plan.ballot)} of its block")
+
+    # --- violations ---------------------------------------------------------------------------
+
+    def _is_current(self, plan: Plan) -> bool:
+        """Return whether a plan was made for this road."""
+        return not all(self.is_earlier(*process) for process in plan.incarnations.items())
+
+    def _false(self, t_s: float, state: VehicleState, text: str) -> None:
+        self._tell("false", t_s, state.vehicle, f"it reports that it {text}")
+
+    def _tell(self, kind: str, t_s: float, vehicle: str, text: str) -> None:
+        if (kind, vehicle, text) not in self._reported:
+            self._reported.add((kind, vehicle, text))
+            self.report(kind, t_s, [vehicle], text)
+
+
+def short(ballot: Ballot | None) -> str:
+    """Return a ballot as text."""
+    return "nothing" if ballot is None else ".".join(str(part) for part in ballot)
+
+
+def swept_cells(origin: Cell, target: Cell) -> frozenset[Cell]:
+    """Return the cells in the bounding box of a move."""
+    columns, lanes = zip(origin, target, strict=True)
+    return frozenset(
+        (column, lane)
+        for column in range(min(columns), max(columns) + 1)
+        for lane in range(min(lanes), max(lanes) + 1)
+    )
+
+
+def required_before(plan: Plan, vehicle: str, index: int) -> Iterable[tuple[Name, int]]:
+    """Yield (vehicle, number of its moves) that must be complete before a move may begin."""
+    step, origin, target = plan.moves[Name(vehicle)][index]
+    own = swept_cells(origin, target)
+    for other, moves in plan.moves.items():
+        meeting = [
+            number + 1
+            for number, (at, begin, end) in enumerate(moves)
+            if at < step and not own.isdisjoint(swept_cells(begin, end))
+        ]
+        if other != vehicle and meeting:
+            yield other, max(meeting)

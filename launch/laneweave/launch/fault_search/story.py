@@ -1,0 +1,95 @@
+"""Stories: everything that determines a run, so that it can be changed, stored and run again."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from attrs import frozen
+
+from laneweave.launch.fault_search.faults import FaultEvent, draw_events
+from laneweave.launch.fault_search.profiles import Profile
+from laneweave.launch.fault_search.setup import Setup
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.structuring import strict_converter, structure
+from laneweave.protocol.wire.messages import Name
+
+SCHEMA = "laneweave.story/1"
+NEW_PREFERENCES_S = (0.8, 3.0)
+"""Range of intervals at which the preferred lanes change during the fault phase."""
+
+
+@frozen
+class Preferences:
+    """The preferred lanes of all vehicles from a time on."""
+
+    t_s: float
+    lanes: Mapping[Name, int]
+
+
+@frozen(kw_only=True)
+class Story:
+    """Setup and events of a run; the same story gives the same run."""
+
+    name: str
+    seed: int
+    """Seed of all that the run itself draws: message faults, durations, back-offs."""
+    setup: Setup
+    preferences: tuple[Preferences, ...]
+    """Changes of the preferred lanes, by time; the first at time 0."""
+    events: tuple[FaultEvent, ...] = ()
+    """Fault events, by time."""
+
+    @classmethod
+    def drawn(cls, seed: int, profile: Profile) -> Story:
+        """Draw the story of a seed from a profile."""
+        rng = random.Random(f"{profile.name}/{seed}")  # noqa: S311 (simulation, no secrets)
+        setup = Setup.drawn(profile, rng)
+        fault_s = setup.lasting.fault_s
+        return cls(
+            name=f"{profile.name} {seed}",
+            seed=seed,
+            setup=setup,
+            preferences=tuple(_draw_preferences(setup, fault_s, rng)),
+            events=draw_events(profile, fault_s, rng),
+        )
+
+    @property
+    def fault_s(self) -> float:
+        """Duration of the fault phase."""
+        return self.setup.lasting.fault_s
+
+    @classmethod
+    def read(cls, path: Path) -> Story:
+        """Read a story from a file.
+
+        Raises:
+            BadInputError: the file cannot be read, or is not a story.
+        """
+        try:
+            table = json.loads(path.read_text("utf-8"))
+        except (OSError, ValueError) as error:
+            raise BadInputError("story", str(path), f"a readable JSON file ({error})") from error
+        if not isinstance(table, dict) or table.pop("schema", None) != SCHEMA:
+            raise BadInputError("story", str(path), f'a file with "schema": "{SCHEMA}"')
+        return structure(table, cls)
+
+    def text(self) -> str:
+        """Return the story as JSON."""
+        table = {"schema": SCHEMA, **strict_converter(detailed=False).unstructure(self)}
+        return json.dumps(table, indent=1) + "\n"
+
+
+def _draw_preferences(setup: Setup, fault_s: float, rng: random.Random) -> Iterator[Preferences]:
+    """Draw changes until the end of the fault phase; all vehicles can follow the last one."""
+    first = setup.preferences(rng, last=False)
+    yield Preferences(0.0, first)
+    t_s, last = 0.0, False
+    while not last:
+        t_s += rng.uniform(*NEW_PREFERENCES_S)
+        last = t_s + NEW_PREFERENCES_S[1] > fault_s
+        entered = setup.road.roadside and not setup.road.rolling
+        lanes = first if last and entered else setup.preferences(rng, last=last)
+        yield Preferences(t_s, lanes)

@@ -1,0 +1,111 @@
+"""Planted bugs with which neither the scenarios nor the fault search were developed.
+
+They show how well the fault search finds errors that nobody had in mind. Each violates a promise of
+docs/SAFETY.md under some schedule of faults that the assumptions allow; some of these schedules are
+rare. No scenario is written for them.
+"""
+
+from __future__ import annotations
+
+from laneweave.coordinator.ballots import ballot_round as ballot
+from laneweave.protocol.vehicle import plan_execution as vehicle
+from support import broken_unseen as broken
+from support.planted_bugs import Bug
+
+UNSEEN: tuple[Bug, ...] = (
+    # --- plan execution, agents
+    Bug("move-of-an-earlier-charge", "V1",
+        "An agent that takes charge again resumes the last move of its earlier time in charge.",
+        plant=broken.keep_move),
+    Bug("gate-opens-while-moving", "V5",
+        "A vehicle whose motion of an older plan is in progress opens its start gate.",
+        vehicle_row=broken.gate_while_moving),
+    Bug("motion-stays-in-plan", "V2",
+        "A promise leaves the motion in progress marked as a move of the plan.",
+        replaced={vehicle.drop_plan: broken.drop_plan_only}),
+    Bug("dependency-on-last-step-only", "V6",
+        "A move waits only for interfering moves of the step before it.",
+        plant=broken.wait_for_previous_step),
+    Bug("any-stored-acceptance-confirms", "V3",
+        "A stored acceptance of an earlier plan confirms the newest one.",
+        replaced={vehicle.is_stored: broken.any_acceptance_is_stored}),
+    Bug("repeated-prepare-drops-plan", "V2",
+        "A repeated PREPARE of the promised ballot drops its plan.",
+        replaced={vehicle.is_above_promise: broken.is_at_least_promise}),
+    Bug("restarted-agent-counts-as-holding", "V1",
+        "An agent that takes charge of a moving vehicle assumes that it holds.",
+        plant=broken.take_over_at_rest),
+    Bug("seen-vehicles-of-the-old-road", "C9",
+        "After a restart of the bridge, a shard makes no agents for names that it saw before.",
+        collides=False, plant=broken.remember_seen_vehicles),
+    # --- ballots, election, formations
+    Bug("ballot-not-above-promises", "L3",
+        "A new ballot is not raised above what the vehicles have promised.",
+        collides=False, plant=broken.ignore_promises),
+    Bug("outbid-by-term-only", "L7",
+        "A higher promise of the same term does not count as outbidding.",
+        collides=False, replaced={ballot.has_higher_promise: broken.has_higher_term}),
+    Bug("groups-not-merged", "joining",
+        "A newly reported group of blocks replaces the known groups instead of being merged.",
+        collides=False, plant=broken.join_directly),
+    Bug("joined-with-an-open-formation", "census",
+        "A joint formation counts as closed once its foremost block is closed.",
+        plant=broken.compare_foremost_block),
+    Bug("ballots-numbered-by-formation", "L3",
+        "Each formation of a leader numbers its ballots from 1, also after being joined.",
+        collides=False, plant=broken.number_ballots_by_formation),
+    Bug("dropped-result-blocks-planning", "L5",
+        "A result that is no longer needed leaves its computation marked as running.",
+        collides=False, plant=broken.keep_dropped_computation),
+    # --- the rolling operation
+    Bug("acceptance-closes-transfer", "transfer",
+        "Leaders count a vehicle that has accepted a ballot as one that has left it closed.",
+        plant=broken.close_on_equal_promise),
+    Bug("newer-transfer-cancels-older", "transfer",
+        "Leaders conclude from a member's newer transfer that the older one never opened.",
+        plant=broken.cancel_on_newer_transfer),
+    Bug("departed-member-ignored", "transfer",
+        "Leaders treat a transfer as closed although a departed member may have opened it.",
+        plant=broken.forget_departed_members),
+    Bug("partners-not-asked", "transfer",
+        "The roster lacks the vehicles whose promises determine what a member owns.",
+        collides=False, plant=broken.leave_partners_out),
+    Bug("unknown-cells-guessed", "transfer",
+        "A vehicle whose cells are not known is planned with those that its controller stores.",
+        plant=broken.guess_unknown_cells),
+    Bug("late-plan-blocks-planning", "L5",
+        "A late or failed plan leaves its computation marked as running.",
+        collides=False, plant=broken.keep_late_order),
+    Bug("assigned-cells-kept", "ownership",
+        "A vehicle that gives away a cell assigned by the roadside keeps it.",
+        plant=broken.keep_assigned_cells),
+    # --- the motion controller, attendance
+    Bug("any-transfer-opened", "ownership",
+        "An open gate of an older ballot opens the newest transfer.",
+        plant=broken.open_any_transfer),
+    Bug("late-command-closes-transfer", "ownership",
+        "A late COMMAND closes a transfer of the same ballot that is open.",
+        plant=broken.store_same_transfer_again),
+    Bug("joined-blocks-replaced", "joining",
+        "A late COMMAND with fewer joined blocks removes the others.",
+        plant=broken.replace_joined_blocks),
+    Bug("caretaker-below-agent", "caretaker",
+        "A caretaker's incarnation is taken from the clock, even if the agent's is higher.",
+        collides=False, plant=broken.take_charge_by_the_clock),
+    Bug("claim-is-no-presence", "charge",
+        "An agent that claims its vehicle counts as absent until its token appears.",
+        collides=False, plant=broken.await_token),
+    # --- the road
+    Bug("waiting-cell-assigned-again", "ownership",
+        "An empty cell that waited for a vehicle is assigned again at each tick.",
+        plant=broken.keep_waiting_cells),
+    Bug("formation-listed-by-block", "census",
+        "The census lists a formation only while a vehicle of its foremost block is on the road.",
+        collides=False, plant=broken.list_by_block),
+    Bug("formations-overlap", "census",
+        "A formation begins behind the last vehicle, not the last column, of the one before it.",
+        plant=broken.begin_behind_last_vehicle),
+    Bug("census-of-the-old-road", "C9",
+        "After a restart of the bridge, a coordinator keeps the last census of the old road.",
+        collides=False, plant=broken.keep_census),
+)  # fmt: skip

@@ -1,0 +1,123 @@
+"""Claims in messages that the motion controllers and bodies do not confirm are reported."""
+
+from __future__ import annotations
+
+import pytest
+from attrs import evolve
+
+from laneweave.launch.fault_search.claims import Claims, Harm, Stored, required_before
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.wire.messages import Ballot, Name, Prepare, VehicleState
+from support.states import holding, make_plan
+
+A, B = Name("a"), Name("b")
+BALLOT = Ballot(1, Name("c1"), 1, 1)
+BLOCK = 0
+STORED = Stored(
+    attendant=1, joined=(BLOCK,), accepted=BALLOT, promised=None, owned=(), transfer=None
+)
+CELLS: dict[Name, Cell] = {A: (0, 0), B: (2, 0)}
+PLAN = make_plan(CELLS, {A: ((0, (0, 0), (0, 1)),), B: ()}, ballot=BALLOT)
+ACCEPTED = holding(A, BALLOT, (0, 0), accepted=True, joined=(BLOCK,))
+
+
+class Scene:
+    """Two vehicles whose processes have promised a ballot and received its plan."""
+
+    def __init__(self) -> None:
+        """Send nothing yet."""
+        self.kinds: list[str] = []
+        self.claims = Claims(self._tell, {BALLOT: PLAN})
+        for name in CELLS:
+            self.claims.enter(0.0, name, 99)
+            self.claims.store(name, STORED)
+
+    def _tell(self, kind: str, t_s: float, vehicles: list[str], text: str) -> None:
+        del t_s, vehicles, text
+        self.kinds.append(kind)
+
+    def send(self, state: VehicleState, finished: int = 0, at_rest: Cell | None = (0, 0)) -> None:
+        self.claims.on_state(1.0, state, finished, at_rest)
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene()
+
+
+def test_true_states_are_not_reported(scene: Scene) -> None:
+    scene.send(ACCEPTED)
+    scene.send(evolve(ACCEPTED, vehicle=B, ready=True, hold_cell=(2, 0)), at_rest=(2, 0))
+    scene.send(evolve(ACCEPTED, go=True, ready=True))
+    scene.send(evolve(ACCEPTED, go=True, completed=1, hold_cell=(0, 1)), 1, (0, 1))
+    assert scene.kinds == []
+
+
+@pytest.mark.parametrize(
+    ("state", "finished", "at_rest"),
+    [
+        (evolve(ACCEPTED, incarnation=2, accepted=False), 0, (0, 0)),  # never in charge
+        (evolve(ACCEPTED, joined=(BLOCK, 1)), 0, (0, 0)),
+        (evolve(ACCEPTED, promised=BALLOT._replace(seq=2)), 0, (0, 0)),  # not stored
+        (evolve(ACCEPTED, completed=1), 0, (0, 0)),
+        (ACCEPTED, 0, None),  # holds, but moves
+        (ACCEPTED, 0, (0, 1)),  # another cell
+        (evolve(ACCEPTED, owned=((5, 5),)), 0, (0, 0)),
+        (evolve(ACCEPTED, attended=False), 0, (0, 0)),  # moves without an agent
+    ],
+)
+def test_a_false_state_is_reported(
+    scene: Scene, state: VehicleState, finished: int, at_rest: Cell | None
+) -> None:
+    scene.send(state, finished, at_rest)
+    assert scene.kinds == ["false"]
+
+
+def test_a_gate_that_opens_too_early_is_reported(scene: Scene) -> None:
+    scene.send(evolve(ACCEPTED, go=True))
+    assert scene.kinds == ["gate"]
+
+
+def test_who_must_refuse_a_harmful_plan_must_not_accept_it(scene: Scene) -> None:
+    scene.claims.harmful[BALLOT] = Harm(frozenset({B}), "wrong")
+    scene.send(ACCEPTED)
+    assert scene.kinds == []
+    scene.send(evolve(ACCEPTED, vehicle=B, hold_cell=(2, 0)), at_rest=(2, 0))
+    assert scene.kinds == ["harmful"]
+
+
+def test_a_plan_needs_promises_from_its_start_cells(scene: Scene) -> None:
+    scene.claims.on_promise(evolve(ACCEPTED, accepted=False))
+    scene.claims.on_promise(holding(B, BALLOT, (3, 0)))
+    scene.claims.on_plan(1.0, PLAN)
+    assert scene.kinds == ["basis"]
+
+
+def test_a_plan_contains_all_vehicles_of_its_blocks(scene: Scene) -> None:
+    for name, cell in CELLS.items():
+        scene.claims.on_promise(holding(name, BALLOT, cell))
+    scene.claims.on_plan(1.0, PLAN)
+    assert scene.kinds == []
+    scene.claims.enter(2.0, "c", PLAN.formations[0])
+    scene.claims.on_plan(3.0, PLAN)
+    assert scene.kinds == ["roster", "roster"]
+
+
+def test_a_ballot_has_one_roster(scene: Scene) -> None:
+    for roster in ((A, B), (A, B), (A,)):
+        scene.claims.on_prepare(1.0, Prepare(BALLOT, (BLOCK,), roster))
+    assert scene.kinds == ["two-plans"]
+
+
+def test_a_process_of_an_earlier_road_may_report_anything(scene: Scene) -> None:
+    scene.claims.begin_road()
+    scene.claims.store(A, evolve(STORED, attendant=2, accepted=None))
+    scene.send(evolve(ACCEPTED, completed=7))
+    assert scene.kinds == []
+
+
+def test_what_must_have_ended_before_a_move() -> None:
+    moves = {A: ((0, (0, 0), (1, 1)), (1, (1, 1), (2, 1))), B: ((2, (0, 1), (0, 0)),)}
+    plan = make_plan({A: (0, 0), B: (0, 1)}, moves, ballot=BALLOT)
+    assert list(required_before(plan, A, 0)) == []
+    assert list(required_before(plan, B, 0)) == [(A, 1)]
