@@ -19,7 +19,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Sequence
-from itertools import combinations
+from itertools import combinations, islice
 from operator import itemgetter
 
 from laneweave.coordinator.planning.budget import Budget
@@ -33,6 +33,8 @@ State = tuple[Cells, Labels]
 _MAX_GOALS = 2_000
 _MAX_MOVES = 2_000_000
 """Limits that keep memory below about 1 GB."""
+_MOVES_BETWEEN = 1000
+"""Joint moves between readings of the clock."""
 
 JointMove = tuple[Cells, Callable[[Labels], Labels]]
 """The sorted cells before the move, and a function that returns their labels, given the labels
@@ -90,11 +92,12 @@ class JointSearch:
         targets = self._problem.targets
         goals: list[dict[int, int]] = [{}]
         for k, (team, size) in enumerate(zip(teams, sizes, strict=True)):
-            goals = [
+            extended = (
                 goal | dict.fromkeys(chosen, 2 * k)
                 for goal in goals
                 for chosen in combinations(sorted(team - goal.keys()), size)
-            ]
+            )
+            goals = list(islice(extended, _MAX_GOALS + 1))
             if len(goals) > _MAX_GOALS:
                 self.ended = True
                 return
@@ -137,7 +140,9 @@ class JointSearch:
         active, known = self._active, self._cost
         moves = self._joint_moves_to(cells)
         self._move_count += len(moves)
-        for cells_before, labels_before in moves:
+        for number, (cells_before, labels_before) in enumerate(moves):
+            if number % _MOVES_BETWEEN == 0:
+                self._budget.check_time()
             before = labels_before(both)
             if before not in active:
                 active[before] = sum(label & 1 for label in before)
@@ -162,9 +167,11 @@ class JointSearch:
                 for move, start, more in self._moves_into_cell(cell)
                 if not excluded & move
             ]
-        found = self._joint_moves[cells] = []
+        found = []
         count = len(cells)
-        for starts, _ in partial:
+        for number, (starts, _) in enumerate(partial):
+            if number % _MOVES_BETWEEN == 0:
+                self._budget.check_time()
             origins = [
                 i if start == cell else i + count
                 for i, (start, cell) in enumerate(zip(starts, cells, strict=True))
@@ -172,6 +179,7 @@ class JointSearch:
             before, picked = zip(*sorted(zip(starts, origins, strict=True)), strict=True)
             found.append((before, _picker(picked)))
         self._move_count += len(found)
+        self._joint_moves[cells] = found
         return found
 
     def _moves_into_cell(self, cell: int) -> list[tuple[int, int, int]]:
