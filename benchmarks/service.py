@@ -3,7 +3,7 @@
     python benchmarks/service.py [--json docs/evidence/service.json]
 
 Real processes: a router, coordinators started with `laneweave coordinator`, and clients in a
-separate process. Requests are formations of 6 to 18 vehicles. Four measurements:
+separate process. Requests are formations of 6 to 18 vehicles. The measurements:
 
 - *alone*: the solver in a process without other work, one request after the other. Its rate is the
   upper bound for a worker.
@@ -17,6 +17,13 @@ separate process. Requests are formations of 6 to 18 vehicles. Four measurements
   formations, and with small ones at hundreds of requests per second.
 - *loss*: three coordinators with one worker each, of which one after another is killed. The figures
   count the requests that were in flight when one was killed, or were sent within the next second.
+- *cancel*: a client asks for a plan that takes 5 s, and cancels its task, exceeds its timeout, or
+  is killed. The figures are the latencies of a small request that another client sends at that
+  moment to the same single worker.
+- *flood*: the latency of small requests that one client sends one after the other, alone and while
+  another client has 1000 requests in flight. The flooding client is a `PlanClient`, which waits
+  before it repeats a refused request, or a program that sends another request at once.
+- *road*: a run at the pace of real time, alone and under each of these floods.
 """
 
 from __future__ import annotations
@@ -25,12 +32,15 @@ import argparse
 import asyncio
 import contextlib
 import json
+import multiprocessing
 import os
 import random
+import signal
 import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from pathlib import Path
@@ -44,7 +54,11 @@ from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan, warm_up
 from laneweave.coordinator.service.client import AsyncPlanClient, PlanClient, PlanError
+from laneweave.coordinator.service.format import JSON
 from laneweave.launch.bench.request_families import formation_request
+from laneweave.protocol.security.connection import Access
+from laneweave.protocol.transports.zenoh.transport import ZenohTransport
+from laneweave.protocol.wire.topics import SERVICE, Keys
 from laneweave.sim_bridge.recording.trips import percentiles_of
 
 LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
@@ -57,6 +71,16 @@ LOSSES = 10
 LOSS_PAUSE_S = 3.0
 LOSS_RATE_PER_S = 60.0
 START_S = 60.0
+LONG_S = 5.0
+LONG_VEHICLES = 40
+LEAVE_AFTER_S = 0.5
+LEAVES = 10
+FLOOD_REQUESTS = 1000
+"""Number of requests that a flooding client has in flight."""
+FLOOD_START_S = 5.0
+QUIET_REQUESTS = 60
+QUIET_PAUSE_S = 0.02
+RUN_OPTIONS = ("--duration", "15", "--pace", "1", "--no-progress")
 
 
 def instance(seed: int, sizes: Sequence[int]) -> PlanRequest:
@@ -298,18 +322,189 @@ def loss() -> dict[str, Any]:
     }
 
 
+def long_request(seed: int) -> PlanRequest:
+    """Return a request that is planned until its deadline."""
+    return formation_request(seed, vehicles=LONG_VEHICLES, deadline_s=LONG_S)
+
+
+async def cancel_task(endpoint: str, request: PlanRequest) -> None:
+    """Ask, and cancel the task that waits for the answer."""
+    async with AsyncPlanClient(endpoint) as client:
+        task = asyncio.create_task(client.plan(request))
+        await asyncio.sleep(LEAVE_AFTER_S)
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+async def exceed_timeout(endpoint: str, request: PlanRequest) -> None:
+    """Ask, and wait for less time than the plan takes."""
+    async with AsyncPlanClient(endpoint) as client:
+        with contextlib.suppress(TimeoutError):
+            await client.plan(request, LEAVE_AFTER_S)
+
+
+async def be_killed(endpoint: str, request: PlanRequest) -> None:
+    """Ask in a process that is killed."""
+    context = multiprocessing.get_context("spawn")
+    asked = context.Event()
+    process = context.Process(target=_ask_forever, args=(endpoint, request, asked))
+    process.start()
+    await asyncio.to_thread(asked.wait)
+    await asyncio.sleep(LEAVE_AFTER_S)
+    os.kill(process.pid or 0, signal.SIGKILL)
+    process.join()
+
+
+def _ask_forever(endpoint: str, request: PlanRequest, asked: threading.Event) -> None:
+    with PlanClient(endpoint) as client:
+        asked.set()
+        client.plan(request)
+
+
+def cancel() -> list[dict[str, Any]]:
+    """Measure how soon a worker is free after the client of its request has left."""
+    ways = {"task cancelled": cancel_task, "timeout": exceed_timeout, "client killed": be_killed}
+
+    async def latencies_ms(endpoint: str, leave: Callable[..., Awaitable[None]]) -> list[float]:
+        found = []
+        async with AsyncPlanClient(endpoint) as client:
+            for seed in range(LEAVES):
+                await leave(endpoint, long_request(seed))
+                small = formation_request(seed, deadline_s=DEADLINE_S)
+                found.append(1e3 * (await request_plan(client, small)).latency_s)
+        return found
+
+    with network(coordinators=1, workers=1) as net:
+        return [
+            {"client": name, "times": LEAVES, "plan_s": LONG_S}
+            | {"next_ms": quantiles(asyncio.run(latencies_ms(net.endpoint, leave)))}
+            for name, leave in ways.items()
+        ]
+
+
+def flood_patiently(endpoint: str) -> None:
+    """Keep requests in flight with a client that waits before it repeats a refused one."""
+
+    async def ask_in_turn(client: AsyncPlanClient, seed: int) -> None:
+        while True:
+            with contextlib.suppress(PlanError, TimeoutError):
+                await client.plan(formation_request(seed), DEADLINE_S)
+
+    async def work() -> None:
+        async with AsyncPlanClient(endpoint) as client:
+            await asyncio.gather(*(ask_in_turn(client, seed) for seed in range(FLOOD_REQUESTS)))
+
+    asyncio.run(work())
+
+
+def flood_at_once(endpoint: str) -> None:
+    """Keep requests in flight without a pause, whatever the answers are."""
+    transport = ZenohTransport(Access(endpoint), lambda _: None)
+    key = Keys("default").key(SERVICE)
+    payloads = [JSON.write(formation_request(seed).to_dict()) for seed in range(FLOOD_REQUESTS)]
+    free = threading.Semaphore(FLOOD_REQUESTS)
+    number = 0
+    while True:
+        free.acquire()
+        number += 1
+        payload = payloads[number % FLOOD_REQUESTS]
+        query = transport.query(key, payload, DEADLINE_S, JSON.encoding)
+        query.add_done_callback(lambda _: free.release())
+
+
+FLOODS: dict[str, Callable[[str], None] | None] = {
+    "none": None,
+    "waits when refused": flood_patiently,
+    "sends at once": flood_at_once,
+}
+
+
+@contextlib.contextmanager
+def flooded(endpoint: str, flood: Callable[[str], None] | None) -> Iterator[None]:
+    """Run a flooding client in another process."""
+    if flood is None:
+        yield
+        return
+    process = multiprocessing.get_context("spawn").Process(target=flood, args=(endpoint,))
+    process.start()
+    try:
+        time.sleep(FLOOD_START_S)
+        yield
+    finally:
+        process.kill()
+        process.join()
+
+
+def flood() -> list[dict[str, Any]]:
+    """Measure the latency of a client while another one floods the service."""
+
+    async def latencies_ms(endpoint: str) -> list[float]:
+        found = []
+        async with AsyncPlanClient(endpoint) as client:
+            for seed in range(QUIET_REQUESTS):
+                small = formation_request(seed, deadline_s=DEADLINE_S)
+                found.append(1e3 * (await request_plan(client, small)).latency_s)
+                await asyncio.sleep(QUIET_PAUSE_S)
+        return found
+
+    with network(coordinators=1, workers=1) as net:
+        rows = []
+        for name, other in FLOODS.items():
+            with flooded(net.endpoint, other):
+                quiet_ms = asyncio.run(latencies_ms(net.endpoint))
+            rows.append(
+                {"flood": name, "requests": QUIET_REQUESTS, "quiet_ms": quantiles(quiet_ms)}
+            )
+            time.sleep(FLOOD_START_S)
+        return rows
+
+
+def road() -> list[dict[str, Any]]:
+    """Measure runs while a client floods the leader's planning service."""
+    return [{"flood": name} | _run_flooded(other) for name, other in FLOODS.items()]
+
+
+def _run_flooded(other: Callable[[str], None] | None) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory(prefix="lw-") as name:
+        folder = Path(name)
+        with subprocess.Popen(  # noqa: S603
+            [LANEWEAVE, "run", *RUN_OPTIONS, "--out", str(folder / "out")],
+            env=os.environ | {"TMPDIR": name},
+            stdout=subprocess.DEVNULL,
+        ) as run:
+            _until(lambda: any(folder.glob("laneweave-*/router.sock")))
+            (socket,) = folder.glob("laneweave-*/router.sock")
+            with flooded(f"unixsock-stream/{socket}", other):
+                run.wait()
+        summary = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))
+    return {
+        "real_time_factor": summary["runtime"]["real_time_factor"],
+        "tick_ms": summary["runtime"]["tick_ms"],
+        "leader_changes": summary["failover"]["leader_changes"],
+        "overlaps": summary["safety"]["overlaps"],
+        "vehicles": summary["vehicles"],
+    }
+
+
 def quantiles(values: list[float]) -> dict[str, float | None]:
     """Return the percentiles and the maximum of a distribution."""
     return percentiles_of(np.array(values), 50, 95, 99, largest=True)
 
 
+MEASUREMENTS = ("load", "half", "loss", "cancel", "flood", "road")
+
+
 def main() -> None:
     """Run all measurements, or the selected one."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--json", type=Path, help="output file")
-    parser.add_argument("--only", choices=("load", "half", "loss"))
+    parser.add_argument("--json", type=Path, help="output file; `--only` replaces one part of it")
+    parser.add_argument("--only", choices=MEASUREMENTS)
     options = parser.parse_args()
-    found: dict[str, Any] = {"cores": len(os.sched_getaffinity(0))}
+    found: dict[str, Any] = {}
+    if options.only is not None and options.json and options.json.exists():
+        found = json.loads(options.json.read_text(encoding="utf-8"))
+    found["cores"] = len(os.sched_getaffinity(0))
     if options.only in (None, "load"):
         found["alone"] = alone()
         rate = found["alone"]["rate_per_s"]
@@ -320,6 +515,11 @@ def main() -> None:
     if options.only in (None, "loss"):
         warm_up()
         found["loss"] = loss()
+    found |= {
+        name: measure()
+        for name, measure in (("cancel", cancel), ("flood", flood), ("road", road))
+        if options.only in (None, name)
+    }
     text = json.dumps(found, indent=2) + "\n"
     if options.json:
         options.json.write_text(text, encoding="utf-8")
