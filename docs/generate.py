@@ -472,6 +472,8 @@ def _service() -> str:
             _service_load(measured["load"]),
             _service_added(measured["half"]),
             _service_loss(measured["loss"]),
+            _service_cancel(measured["cancel"]),
+            _service_flood(measured["flood"], measured["road"]),
         )
     )
 
@@ -531,6 +533,31 @@ def _service_loss(loss: dict[str, Any]) -> Iterator[str]:
         f"| {loss['answered']} | {loss['around_the_kills']} "
         f"| {beyond['p50']:.0f} / {beyond['p99']:.0f} / {beyond['max']:.0f} ms |"
     )
+
+
+def _service_cancel(rows: list[dict[str, Any]]) -> Iterator[str]:
+    yield "| client leaves a plan of 5 s | times | answer to the next request p50 / max |"
+    yield "|---|---|---|"
+    for row in rows:
+        next_ms = row["next_ms"]
+        yield (
+            f"| {row['client']} | {row['times']} | {next_ms['p50']:.0f} / {next_ms['max']:.0f} ms |"
+        )
+
+
+def _service_flood(quiet: list[dict[str, Any]], roads: list[dict[str, Any]]) -> Iterator[str]:
+    yield (
+        "| 1000 requests in flight from another client, which | latency p50 / p99 "
+        "| a run: real-time factor | tick p50 / p99 | leader changes |"
+    )
+    yield "|---|---|---|---|---|"
+    for row, road in zip(quiet, roads, strict=True):
+        quiet_ms, tick_ms = row["quiet_ms"], road["tick_ms"]
+        yield (
+            f"| {row['flood']} | {quiet_ms['p50']:.0f} / {quiet_ms['p99']:.0f} ms "
+            f"| {road['real_time_factor']:.2f} | {tick_ms['p50']:.0f} / {tick_ms['p99']:.0f} ms "
+            f"| {road['leader_changes']} |"
+        )
 
 
 def _workers(run: dict[str, Any]) -> str:

@@ -19,6 +19,7 @@ import zenoh
 from laneweave.launch.deploy.certificate_authority import issue, load_authority, make_authority
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.field_validators import link_of
+from laneweave.protocol.runtime.transport import Query
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import REQUEST_MARGIN
@@ -27,6 +28,7 @@ from laneweave.protocol.wire.identities import parse_identity
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,
+    CLIENT_ALIVE,
     CLOCK,
     COMMAND,
     COORDINATOR_ALIVE,
@@ -218,10 +220,12 @@ def test_nobody_shows_somebody_elses_token(network: Network) -> None:
         KEYS.key(VEHICLE_ALIVE, vehicle=B): f"vehicle.{B}",
         KEYS.key(COORDINATOR_ALIVE, coordinator="c1", incarnation=7): "coordinator.c1",
         KEYS.key(BRIDGE_ALIVE, incarnation=8): "bridge",
+        KEYS.key(CLIENT_ALIVE, session="secret", client="other"): "client.other",
     }
     bridge.transport.watch(KEYS.all_of(VEHICLE_ALIVE))
     leader.transport.watch(KEYS.all_of(COORDINATOR_ALIVE))
     leader.transport.watch(KEYS.all_of(BRIDGE_ALIVE))
+    leader.transport.watch(KEYS.all_of(CLIENT_ALIVE))
     snooper = network.join("client.plan")
     for expression in ("**", *EVERYTHING, KEYS.all_of(VEHICLE_ALIVE), *shown):
         snooper.transport.watch(expression)
@@ -258,6 +262,26 @@ def test_only_coordinators_serve_and_only_clients_ask(network: Network) -> None:
     for who in ("bridge", f"vehicle.{A}", "fleet.agents-1", "observer.watch", *STRANGERS):
         assert answer_to(network.join(who), key, timeout_s=0.1) == b""
     assert answer_to(client, key) == b"coordinator.c1"
+
+
+def test_a_query_has_the_name_of_its_clients_certificate(network: Network) -> None:
+    coordinator, client = network.join("coordinator.c1"), network.join("client.other")
+    coordinator.transport.watch(KEYS.all_of(CLIENT_ALIVE))
+    key = KEYS.key(SERVICE)
+    coordinator.transport.serve(key)
+    own = KEYS.key(CLIENT_ALIVE, session="s", client="other")
+    forged = KEYS.key(CLIENT_ALIVE, session="s", client="plan")
+    for token in (own, forged):
+        client.transport.announce(token)
+    until(lambda: coordinator.tokens() == {own})
+    for number, sender in enumerate((own, forged, "", "x" * 2000)):
+        client.transport.query(key, b"%d" % number, 5.0, sender=sender)
+
+    def queries() -> list[tuple[bytes, str]]:
+        return [(q.payload, q.sender) for q in list(coordinator.got) if isinstance(q, Query)]
+
+    until(lambda: len(queries()) == 4)
+    assert queries() == [(b"0", own), (b"1", ""), (b"2", ""), (b"3", "")]
 
 
 def test_what_is_too_long_does_not_come_in(network: Network) -> None:

@@ -11,6 +11,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.service.client import (
     AsyncPlanClient,
     PlanClient,
+    RequestCancelledError,
     RequestRefusedError,
     ServiceUnavailableError,
 )
@@ -34,7 +36,10 @@ from support.harness import END_S, Ended, laboratory
 from support.mutations import ask_all, mutants
 from support.service_lab import REALM, Load, ServiceLab, request, slow_request
 
-QUEUE_LIMIT = 64
+QUEUE_LIMIT, CLIENT_LIMIT = 64, 32
+FLOOD = 500
+SLOW_S = 60.0
+"""Deadline of a request that takes as long as it may."""
 FLAT_MB = 20.0
 KEY = Keys(REALM).key(SERVICE)
 NAMES = ("c1", "c2", "c3")
@@ -42,7 +47,7 @@ THREADS = 12
 
 
 def start(folder: Path, names: tuple[str, ...]) -> Iterator[ServiceLab]:
-    limit = f"queue_limit = {QUEUE_LIMIT}"
+    limit = f"queue_limit = {QUEUE_LIMIT}\nclient_queue_limit = {CLIENT_LIMIT}"
     with laboratory(folder) as lab, ServiceLab(lab, names, limit).running() as running:
         yield running
 
@@ -245,10 +250,104 @@ def test_a_queue_that_is_full_refuses_and_drops_what_is_late(
         assert answer.ok or len(data["message"].splitlines()) == 1
     assert codes[OVERLOADED] >= 1
     # A few may have come when others had been dropped, or be what the worker has last.
-    assert codes[LATE] >= QUEUE_LIMIT / 2
+    assert codes[LATE] >= CLIENT_LIMIT / 2
     assert set(codes) <= {OVERLOADED, LATE, "feasible", "optimal", "timeout"}
     # Late requests are answered before a worker gets to them, which would take 150 s.
     assert time.monotonic() < begun_s + 75.0
+
+
+def test_a_flood_does_not_exclude_another_client(
+    service: ServiceLab, transport: ZenohTransport, client: PlanClient
+) -> None:
+    made = [json.dumps(service.for_one("c1", request())).encode() for _ in range(FLOOD)]
+    quiet = [PlanRequest.from_dict(service.for_one("c1", request())) for _ in range(10)]
+    asking = [transport.query(KEY, payload, END_S) for payload in made]
+    for each in quiet:
+        # Clients are served in turn, and the limit is that of the other one.
+        assert client.plan(each, END_S).status == "optimal"
+    answers = [future.result() for future in asking]
+    refusals = [json.loads(one.payload) for one in answers if one is not None and not one.ok]
+    assert len(refusals) >= FLOOD / 4
+    for refusal in refusals:
+        assert refusal["code"] == OVERLOADED
+        assert "service.client_queue_limit: got 32 pending" in refusal["message"]
+        assert refusal["retry_after_s"] > 0
+
+
+# --- cancelled requests -----------------------------------------------------------------------
+
+KILLED = """
+import sys
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.service.client import PlanClient
+import json
+with PlanClient(sys.argv[1]) as client:
+    client.plan(PlanRequest.from_dict(json.loads(sys.argv[2])), timeout_s=100.0)
+"""
+
+
+def leave_by_timeout(service: ServiceLab, asked: PlanRequest, begun: Callable[[], None]) -> None:
+    with PlanClient(service.access) as client:
+        with pytest.raises(TimeoutError):
+            client.plan(asked, timeout_s=1.0)
+        begun()
+
+
+def leave_by_cancelling(service: ServiceLab, asked: PlanRequest, begun: Callable[[], None]) -> None:
+    with PlanClient(service.access) as client, ThreadPoolExecutor(1) as pool:
+        planning = pool.submit(client.plan, asked, END_S)
+        begun()
+        client.cancel(asked.id)
+        with pytest.raises(RequestCancelledError):
+            planning.result(END_S)
+
+
+def leave_by_task(service: ServiceLab, asked: PlanRequest, begun: Callable[[], None]) -> None:
+    async def ask_and_cancel() -> None:
+        async with AsyncPlanClient(service.access) as client:
+            task = asyncio.create_task(client.plan(asked, END_S))
+            await asyncio.to_thread(begun)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+
+    asyncio.run(ask_and_cancel())
+
+
+def leave_by_death(service: ServiceLab, asked: PlanRequest, begun: Callable[[], None]) -> None:
+    command = [sys.executable, "-c", KILLED, service.endpoint, json.dumps(asked.to_dict())]
+    with subprocess.Popen(command) as process:
+        begun()
+        process.kill()
+
+
+@pytest.mark.parametrize(
+    "leave", [leave_by_timeout, leave_by_cancelling, leave_by_task, leave_by_death]
+)
+def test_a_request_whose_client_leaves_frees_its_worker(
+    service: ServiceLab,
+    client: PlanClient,
+    leave: Callable[[ServiceLab, PlanRequest, Callable[[], None]], None],
+) -> None:
+    (worker,) = service.workers("c1")
+    spent_s = cpu_s(worker)
+    slow = PlanRequest.from_dict(service.for_one("c1", slow_request("", SLOW_S)))
+    next_one = PlanRequest.from_dict(service.for_one("c1", request()))
+    began_s = time.monotonic()
+    leave(
+        service,
+        slow,
+        lambda: service.lab.wait_until(lambda: cpu_s(worker) > spent_s + 0.1, END_S),
+    )
+    assert client.plan(next_one, END_S).status == "optimal"
+    assert time.monotonic() < began_s + SLOW_S
+    assert service.workers("c1") == [worker]
+
+
+def cpu_s(process: int) -> float:
+    """Return the CPU time that a process has used."""
+    times = psutil.Process(process).cpu_times()
+    return float(times.user + times.system)
 
 
 # --- death ------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
 from laneweave.coordinator.rolling.operation import RollingOperation
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
+from laneweave.coordinator.service.pending import ClientSession
 from laneweave.coordinator.service.server import PlanningService
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import MetricsSnapshot, metric
@@ -58,12 +59,14 @@ from laneweave.protocol.wire.newest import NewestRoad
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,
+    CLIENT_ALIVE,
     CLOCK,
     COORDINATOR_ALIVE,
     EVENT,
     HEARTBEAT,
     REPORT,
     SERVICE,
+    SERVICE_CANCEL,
     STATE,
     incarnation_of,
 )
@@ -256,17 +259,28 @@ class CoordinatorCore:
                 self.election.on_messages_dropped(now_s)
             case LinkUp() | LinkDown():
                 self.election.on_link(up=isinstance(event, LinkUp), now_s=now_s)
-            case QueryArrived(token, payload, encoding):
-                others = self.election.living(now_s)
-                yield from self.service.take(
-                    token, payload, encoding, self._new_job(), others, now_s
-                )
+            case PeerUp(topic, parameters) if topic is CLIENT_ALIVE:
+                self.service.open_session(ClientSession.of(parameters))
+            case PeerDown(topic, parameters) if topic is CLIENT_ALIVE:
+                yield from self.service.close_session(ClientSession.of(parameters))
+            case QueryArrived():
+                yield from self._on_query(event, now_s)
             case Computed():
                 yield from self._on_computed(event, now_s)
             case Stopping():
                 yield self._report()
             case _:
                 pass
+
+    def _on_query(self, query: QueryArrived, now_s: float) -> Iterator[Effect]:
+        session = ClientSession.of(query.sender)
+        if query.topic is SERVICE_CANCEL:
+            yield from self.service.cancel(query.token, query.payload, query.encoding, session)
+            return
+        others = self.election.living(now_s)
+        yield from self.service.take(
+            query.token, query.payload, query.encoding, session, self._new_job(), others, now_s
+        )
 
     def _start(self, now_s: float) -> Iterator[Effect]:
         self.election.started_s = self._next_heartbeat_s = self._next_report_s = now_s
@@ -275,10 +289,12 @@ class CoordinatorCore:
         yield Listen(CENSUS)
         yield Watch(COORDINATOR_ALIVE)
         yield Watch(BRIDGE_ALIVE)
+        yield Watch(CLIENT_ALIVE)
         yield Announce(
             COORDINATOR_ALIVE, {"coordinator": self.name, "incarnation": self._incarnation}
         )
         yield Serve(SERVICE)
+        yield Serve(SERVICE_CANCEL)
 
     def _on_candidate(self, name: str, incarnation: int, now_s: float) -> None:
         if name == self.name and incarnation != self._incarnation:

@@ -18,6 +18,7 @@ from laneweave.protocol.runtime.node import (
     Announce,
     Compute,
     Computed,
+    Decline,
     Delegate,
     Effect,
     Listen,
@@ -27,6 +28,7 @@ from laneweave.protocol.runtime.node import (
     Reply,
     Send,
     Serve,
+    StopJob,
     Stopping,
     Unlisten,
     Wakeup,
@@ -50,12 +52,14 @@ from laneweave.protocol.wire.messages import (
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,
+    CLIENT_ALIVE,
     CLOCK,
     COORDINATOR_ALIVE,
     HEARTBEAT,
     PLAN,
     PREPARE,
     SERVICE,
+    SERVICE_CANCEL,
     STATE,
 )
 from support.paper import PAPER
@@ -73,8 +77,10 @@ def test_start() -> None:
         Listen(CENSUS),
         Watch(COORDINATOR_ALIVE),
         Watch(BRIDGE_ALIVE),
+        Watch(CLIENT_ALIVE),
         Announce(COORDINATOR_ALIVE, {"coordinator": "c1", "incarnation": 1}),
         Serve(SERVICE),
+        Serve(SERVICE_CANCEL),
     ]
 
 
@@ -524,16 +530,38 @@ def test_a_new_ballot_is_above_what_vehicles_show(shown: Ballot) -> None:
 # --- the service ------------------------------------------------------------------------------
 
 
+PLAN_REQUEST = (
+    b'{"schema": "laneweave.plan.request/1", "grid": {"columns": 2, "lanes": 2},'
+    b' "vehicles": [{"id": "a", "cell": [0, 0]}], "targets": [[1, 0]]}'
+)
+
+
 def test_the_service_answers_without_leading() -> None:
     desk = Desk()
-    request = (
-        b'{"schema": "laneweave.plan.request/1", "grid": {"columns": 2, "lanes": 2},'
-        b' "vehicles": [{"id": "a", "cell": [0, 0]}], "targets": [[1, 0]]}'
-    )
-    (job,) = [e for e in desk.give(QueryArrived(5, request)) if isinstance(e, Delegate)]
+    (job,) = [e for e in desk.give(QueryArrived(5, PLAN_REQUEST)) if isinstance(e, Delegate)]
     (reply,) = [
         e for e in desk.give(run_delegated(job, lambda: desk.now_s)) if isinstance(e, Reply)
     ]
     assert (reply.token, reply.ok) == (5, True)
     (refusal,) = [e for e in desk.give(QueryArrived(6, b"{}")) if isinstance(e, Reply)]
     assert (refusal.token, refusal.ok) == (6, False)
+
+
+def test_a_request_ends_with_its_clients_session() -> None:
+    desk = Desk()
+    sender = {"session": "s", "client": "dispatch"}
+    assert desk.give(PeerUp(CLIENT_ALIVE, sender)) == []
+    (job,) = desk.give(QueryArrived(5, PLAN_REQUEST, sender=sender))
+    assert isinstance(job, Delegate)
+    effects = desk.give(PeerDown(CLIENT_ALIVE, sender))
+    assert [type(effect) for effect in effects] == [Reply, StopJob]
+    assert desk.give(QueryArrived(6, PLAN_REQUEST, sender=sender)) == [Decline(6)]
+
+
+def test_a_client_cancels_its_request() -> None:
+    desk = Desk()
+    named = PLAN_REQUEST.replace(b'"grid"', b'"id": "r1", "grid"')
+    desk.give(QueryArrived(5, named))
+    cancellation = b'{"schema": "laneweave.plan.cancel/1", "id": "r1"}'
+    effects = desk.give(QueryArrived(6, cancellation, topic=SERVICE_CANCEL))
+    assert [type(effect) for effect in effects] == [Reply, StopJob, Reply]

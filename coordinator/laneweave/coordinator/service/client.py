@@ -11,14 +11,20 @@ A client of a deployment, secured or not, reads the deployment's configuration a
     PlanClient(client_access(Path("deployment.toml"), "dispatch"))
 
 Several threads, or tasks, may share a client. If a coordinator exits before it has answered,
-the client sends the request again under the same id.
+the client sends the request again under the same id. A request whose call ends without an answer
+(timeout, Ctrl-C, cancelled task) is cancelled, as are all requests of a client that disconnects.
+
+Coordinators serve clients in turn. A client is a certificate's name; on a network that is not
+secured, each connection is a client of its own.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 import uuid
+from collections.abc import Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from types import TracebackType
@@ -30,11 +36,13 @@ from attrs import define, field
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.service.format import (
+    CANCELLED,
     INVALID,
     JSON,
     LATE,
     OVERLOADED,
     Refusal,
+    cancel_request,
     format_of,
 )
 from laneweave.protocol.config.scenario_files import load_scenario
@@ -43,8 +51,8 @@ from laneweave.protocol.runtime.transport import Answer
 from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import connect_blocking
-from laneweave.protocol.wire.identities import Identity
-from laneweave.protocol.wire.topics import SERVICE, Keys, Party
+from laneweave.protocol.wire.identities import Identity, parse_identity
+from laneweave.protocol.wire.topics import CLIENT_ALIVE, SERVICE, SERVICE_CANCEL, Keys, Party
 
 DEFAULT_TIMEOUT_S = 10.0
 LONGEST_ATTEMPT_S = 86_400.0
@@ -52,6 +60,9 @@ LONGEST_ATTEMPT_S = 86_400.0
 FIRST_PAUSE_S = 0.02
 """First pause before a request is sent again; it doubles with each attempt."""
 LONGEST_PAUSE_S = 0.5
+"""Longest pause, unless a coordinator asks for a longer one."""
+CANCEL_S = 1.0
+"""Timeout of a cancellation."""
 ABSENT_S = 3.0
 """Time without any answer after which the service counts as absent. A killed coordinator is
 detected at once, a hanging one after `network.lease_s`; a restarted router is found within a
@@ -81,6 +92,10 @@ class ServiceOverloadedError(PlanError):
 
 class DeadlinePassedError(PlanError):
     """The request's deadline passed before a worker was free."""
+
+
+class RequestCancelledError(PlanError):
+    """The request was cancelled."""
 
 
 class PlanningFailedError(PlanError):
@@ -126,11 +141,14 @@ class PendingRequest:
             return self._read(answer)
         refusal = self._refusal(answer)
         if refusal.code == OVERLOADED:
-            return self._pause(now_s, ServiceOverloadedError(refusal.message))
+            overloaded = ServiceOverloadedError(refusal.message)
+            return self._pause(now_s, overloaded, refusal.retry_after_s or 0.0)
         if refusal.code == INVALID:
             raise RequestRefusedError(refusal.message, refusal.field)
         if refusal.code == LATE:
             raise DeadlinePassedError(refusal.message)
+        if refusal.code == CANCELLED:
+            raise RequestCancelledError(refusal.message)
         raise PlanningFailedError(refusal.message)
 
     def _after_silence(self, now_s: float) -> float:
@@ -141,9 +159,10 @@ class PendingRequest:
             raise absent
         return self._pause(now_s, absent)
 
-    def _pause(self, now_s: float, otherwise: PlanError) -> float:
+    def _pause(self, now_s: float, otherwise: PlanError, min_s: float = 0.0) -> float:
         """Return the next, longer pause; raise `otherwise` if no time is left for it."""
         pause_s, self._pause_s = self._pause_s, min(2 * self._pause_s, LONGEST_PAUSE_S)
+        pause_s = max(pause_s, min_s)
         if self.left_s(now_s) <= pause_s:
             raise otherwise
         return pause_s
@@ -184,8 +203,16 @@ def client_access(config: Path, name: str = "plan", endpoint: str | None = None)
     return access_of(scenario, Identity(Party.CLIENT, name).common_name)
 
 
+def _token_key(access: Access, keys: Keys) -> str:
+    """Return a new key for the liveliness token of a client."""
+    session = uuid.uuid4().hex
+    secured = access.credentials is not None
+    name = parse_identity(access.identity).name if secured else session
+    return keys.key(CLIENT_ALIVE, session=session, client=name)
+
+
 class _Connection:
-    """A session with a router, and the key of the service."""
+    """A session with a router, its liveliness token, and the keys of the service."""
 
     def __init__(self, access: Access | str, patience_s: float = ABSENT_S) -> None:
         """Connect.
@@ -199,20 +226,45 @@ class _Connection:
         """
         access = Access(access) if isinstance(access, str) else access
         self._patience_s = patience_s
-        self._key = Keys(access.realm).key(SERVICE)
+        keys = Keys(access.realm)
+        self._key = keys.key(SERVICE)
+        self._cancel_key = keys.key(SERVICE_CANCEL)
+        self._token_key = _token_key(access, keys)
         self._transport = connect_blocking(access, lambda _: None)
+        self._transport.announce(self._token_key)
         self._closed = False
 
-    def _begin(self, request: PlanRequest, timeout_s: float) -> PendingRequest:
+    def cancel(self, request_id: str) -> None:
+        """Cancel a request of this client, if it is pending; does not wait.
+
+        Its calls of `plan` raise `RequestCancelledError`.
+
+        Args:
+            request_id: `id` of the request.
+        """
+        payload = JSON.write(cancel_request(request_id))
+        self._transport.query(self._cancel_key, payload, CANCEL_S, JSON.encoding, self._token_key)
+
+    @contextlib.contextmanager
+    def _pending(self, request: PlanRequest, timeout_s: float) -> Iterator[PendingRequest]:
+        """Provide a request to send; cancel it if the block ends without an answer."""
         if not request.id:
             request = attrs.evolve(request, id=uuid.uuid4().hex)
-        return PendingRequest(request, timeout_s, time.monotonic(), patience_s=self._patience_s)
+        try:
+            yield PendingRequest(request, timeout_s, time.monotonic(), patience_s=self._patience_s)
+        except PlanError:
+            raise
+        except BaseException:
+            self.cancel(request.id)
+            raise
 
     def _ask(self, pending: PendingRequest) -> Future[Answer | None]:
         if self._closed:
             raise ServiceUnavailableError("this client is closed")
         left_s = min(max(0.0, pending.left_s(time.monotonic())), LONGEST_ATTEMPT_S)
-        return self._transport.query(self._key, pending.payload, left_s, JSON.encoding)
+        return self._transport.query(
+            self._key, pending.payload, left_s, JSON.encoding, self._token_key
+        )
 
     def _close(self) -> None:
         self._closed = True
@@ -234,16 +286,17 @@ class PlanClient(_Connection):
             ServiceUnavailableError: there is no coordinator, or this client is closed.
             ServiceOverloadedError: the coordinators were overloaded at every attempt.
             DeadlinePassedError: no worker was free before the request's deadline.
+            RequestCancelledError: the request was cancelled.
             PlanningFailedError: an error occurred in the service.
             TimeoutError: no answer within `timeout_s`.
         """
-        pending = self._begin(request, timeout_s)
-        while True:
-            answer = self._ask(pending).result()
-            outcome = pending.after(answer, time.monotonic())
-            if isinstance(outcome, PlanResponse):
-                return outcome
-            time.sleep(outcome)
+        with self._pending(request, timeout_s) as pending:
+            while True:
+                answer = self._ask(pending).result()
+                outcome = pending.after(answer, time.monotonic())
+                if isinstance(outcome, PlanResponse):
+                    return outcome
+                time.sleep(outcome)
 
     def close(self) -> None:
         """Disconnect; waiting calls raise `ServiceUnavailableError`."""
@@ -270,13 +323,13 @@ class AsyncPlanClient(_Connection):
         self, request: PlanRequest, timeout_s: float = DEFAULT_TIMEOUT_S
     ) -> PlanResponse:
         """Send a request and return the plan; see `PlanClient.plan`."""
-        pending = self._begin(request, timeout_s)
-        while True:
-            answer = await asyncio.wrap_future(self._ask(pending))
-            outcome = pending.after(answer, time.monotonic())
-            if isinstance(outcome, PlanResponse):
-                return outcome
-            await asyncio.sleep(outcome)
+        with self._pending(request, timeout_s) as pending:
+            while True:
+                answer = await asyncio.wrap_future(self._ask(pending))
+                outcome = pending.after(answer, time.monotonic())
+                if isinstance(outcome, PlanResponse):
+                    return outcome
+                await asyncio.sleep(outcome)
 
     async def close(self) -> None:
         """Disconnect; waiting calls raise `ServiceUnavailableError`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import json
+import math
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -20,9 +21,14 @@ OVERLOADED: Final = "overloaded"
 """The coordinator is overloaded; sending the request again later may help."""
 LATE: Final = "late"
 """The deadline passed before a worker was free."""
+CANCELLED: Final = "cancelled"
+"""The client has cancelled the request."""
 FAILED: Final = "failed"
 """Planning failed because of an error in the service."""
-CODES: Final = (INVALID, OVERLOADED, LATE, FAILED)
+CODES: Final = (INVALID, OVERLOADED, LATE, CANCELLED, FAILED)
+
+CANCEL_SCHEMA: Final = "laneweave.plan.cancel/1"
+"""Schema of a cancellation: a map with `schema` and the `id` of the request to cancel."""
 
 
 @frozen
@@ -35,17 +41,35 @@ class Refusal:
     """One readable line."""
     field: str
     """The invalid field of the request; empty: no particular field."""
+    retry_after_s: float | None = None
+    """Time after which the request should be sent again [s]; None: unknown, or never."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the error reply as a map."""
-        return {"field": self.field, "message": self.message, "code": self.code}
+        data = {"field": self.field, "message": self.message, "code": self.code}
+        if self.retry_after_s is None:
+            return data
+        return data | {"retry_after_s": self.retry_after_s}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Refusal:
         """Read an error reply; a missing code is `INVALID` if a field is named, else `FAILED`."""
         field = one_line(str(data.get("field", "")))
         message = one_line(str(data.get("message", "")))
-        return cls(str(data.get("code", INVALID if field else FAILED)), message, field)
+        code = str(data.get("code", INVALID if field else FAILED))
+        return cls(code, message, field, _seconds(data.get("retry_after_s")))
+
+
+def _seconds(value: object) -> float | None:
+    """Return a positive, finite number of seconds; None for anything else."""
+    if isinstance(value, int | float) and math.isfinite(value) and value > 0:
+        return float(value)
+    return None
+
+
+def cancel_request(request_id: str) -> dict[str, Any]:
+    """Return the cancellation of a request as a map."""
+    return {"schema": CANCEL_SCHEMA, "id": request_id}
 
 
 @frozen
@@ -75,6 +99,14 @@ class Format:
         if not isinstance(data, dict):
             raise BadInputError(name, type(data).__name__, f"a map in {self.encoding}")
         return data
+
+    def read_cancelled_id(self, payload: bytes) -> str:
+        """Return the id of the request that a payload cancels; empty if it is no cancellation."""
+        try:
+            data = self.read(payload)
+        except BadInputError:
+            return ""
+        return str(data.get("id", "")) if data.get("schema") == CANCEL_SCHEMA else ""
 
     def reply(self, token: int, answer: PlanResponse | Refusal) -> Reply:
         """Return the effect that answers a query."""

@@ -2,25 +2,25 @@
 
 Every coordinator receives every request and accepts those that are assigned to it (`rendezvous`),
 so any number of coordinators can share the load without exchanging messages. A request waits for a
-free worker until its deadline at the latest, and is answered in the remaining time. A repeated
-request with the same id gets the same answer.
+free worker until its deadline at the latest, and is answered in the remaining time. Clients are
+served in turn. A request that its client cancels, or whose client is gone, is dropped, and its
+worker stops. A repeated request with the same id gets the same answer.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Iterator
 from functools import partial
 from hashlib import blake2b
-from itertools import islice
 from typing import ClassVar
 
 import attrs
-from attrs import define, field, frozen
+from attrs import frozen
 
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
 from laneweave.coordinator.service.format import (
+    CANCELLED,
     FAILED,
     INVALID,
     JSON,
@@ -31,17 +31,38 @@ from laneweave.coordinator.service.format import (
     Refusal,
     format_of,
 )
+from laneweave.coordinator.service.pending import (
+    ClientSession,
+    OpenQuery,
+    PendingPlan,
+    PendingPlans,
+)
 from laneweave.coordinator.service.rendezvous import is_assigned_to
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import metric
-from laneweave.protocol.runtime.node import TOO_LATE, Decline, Delegate, Effect, Reply
+from laneweave.protocol.runtime.node import (
+    TOO_LATE,
+    Clock,
+    Decline,
+    Delegate,
+    Effect,
+    Reply,
+    StopJob,
+)
 from laneweave.protocol.scenario.deployment_fields import Service
 from laneweave.protocol.scenario.fields import DEFAULT_SOLVER
 
-HANDED_OUT_AHEAD = 1
-"""Jobs queued for each worker in addition to its current one, so that it is never idle."""
 CACHE_BYTES = 1 << 26
 """Upper bound on the total size of cached answers."""
+AHEAD_BELOW_S = 0.02
+"""Mean time of plans below which each worker has one job ahead, so that it is not idle between two.
+With longer plans, idle time matters less than the delay of the next client in turn."""
+FIRST_MEAN_S = 0.01
+"""Assumed mean time of a plan before the first one."""
+MEAN_WEIGHT = 0.1
+"""Weight of the newest plan in the mean time of plans."""
+MIN_RETRY_S, MAX_RETRY_S = 0.05, 5.0
+"""Range of the time after which a client should send a refused request again."""
 
 
 @frozen
@@ -61,6 +82,9 @@ class ServiceMetrics:
     late_total: int = metric(
         "Requests dropped because no worker was free before the deadline", default=0
     )
+    cancelled_total: int = metric(
+        "Requests dropped because their clients cancelled them or are gone", default=0
+    )
     failed_total: int = metric("Requests whose planning failed", default=0)
     planning_seconds_total: float = metric("Time spent in solvers", default=0.0)
     service_seconds_total: float = metric(
@@ -68,23 +92,6 @@ class ServiceMetrics:
     )
     waiting: int = metric("Requests waiting for a worker", default=0)
     planning: int = metric("Requests handed to workers", default=0)
-
-
-@define(eq=False)
-class _Entry:
-    """A request that waits for a worker or is being answered."""
-
-    request: PlanRequest
-    arrived_s: float
-    job: int
-    clients: list[tuple[int, Format]] = field(factory=list)
-    """Token and format of each query that waits for the answer."""
-    dropped: bool = False
-    """Whether the request was answered before its computation finished."""
-
-    @property
-    def deadline_s(self) -> float:
-        return self.arrived_s + self.request.deadline_s
 
 
 @frozen
@@ -122,10 +129,13 @@ class PlanningService:
         self._plan = plan
         self._settings = settings
         self._workers = workers
-        self._waiting: deque[_Entry] = deque()
-        self._planning: dict[int, _Entry] = {}
-        self._pending: dict[str, _Entry] = {}
-        """Unanswered requests by id; requests without an id are not included."""
+        self._pending = PendingPlans(workers)
+        self._by_id: dict[str, PendingPlan] = {}
+        """Pending requests by id; requests without an id are not included."""
+        self._sessions: set[ClientSession] = {ClientSession()}
+        """Live sessions; that of unknown clients is never closed."""
+        self._mean_s = FIRST_MEAN_S
+        """Mean time of recent plans."""
         self._answers: dict[str, _CachedAnswer] = {}
         """Cached answers by request id, oldest first."""
         self._cached_bytes = 0
@@ -134,18 +144,13 @@ class PlanningService:
     @property
     def metrics(self) -> ServiceMetrics:
         """Counters and current load."""
-        return attrs.evolve(self._metrics, waiting=len(self._waiting), planning=len(self._planning))
+        pending = self._pending
+        return attrs.evolve(self._metrics, waiting=pending.waiting, planning=pending.planning)
 
     @property
     def wakeup_s(self) -> float | None:
         """Earliest deadline of a waiting request."""
-        return min((entry.deadline_s for entry in self._not_begun()), default=None)
-
-    def _not_begun(self) -> Iterator[_Entry]:
-        """Yield the requests on which no worker has begun; workers take jobs in order."""
-        ahead = islice(self._planning.values(), self._workers, None)
-        yield from (entry for entry in ahead if not entry.dropped)
-        yield from self._waiting
+        return min((entry.deadline_s for entry in self._pending.not_begun), default=None)
 
     # --- queries ------------------------------------------------------------------------------
 
@@ -154,16 +159,20 @@ class PlanningService:
         token: int,
         payload: bytes,
         encoding: str,
+        session: ClientSession,
         job: int,
         others: Iterable[str],
         now_s: float,
     ) -> Iterator[Effect]:
-        """Accept a request, decline it for another coordinator, or refuse it.
+        """Accept a request, decline it, or refuse it.
+
+        Requests of other coordinators and of clients that are gone are declined.
 
         Args:
             token: token of the query.
             payload: encoded request.
             encoding: MIME type given by the client, if any.
+            session: session of the client.
             job: id for the computation of the request.
             others: names of the other live coordinators.
             now_s: node clock.
@@ -173,31 +182,50 @@ class PlanningService:
             yield Decline(token)
             return
         self._count("taken_total")
-        form = format_of(payload, encoding)
+        if session not in self._sessions:
+            self._count("cancelled_total")
+            yield Decline(token)
+            return
+        query = OpenQuery(token, format_of(payload, encoding), session)
+        if self._pending.count(session.client) >= self._settings.client_queue_limit:
+            # Without reading the request: a flood should cost little.
+            yield self._refuse(query, self._client_overload(session.client))
+            return
+        yield from self._take(query, payload, job, now_s)
+
+    def _take(self, query: OpenQuery, payload: bytes, job: int, now_s: float) -> Iterator[Effect]:
+        """Read a request and answer, refuse or queue it."""
+        form = query.form
         try:
             request = self._read(form, payload)
             self._expire_answers(now_s)
             entry, cached = self._known(request)
         except BadInputError as error:
             self._count("invalid_total")
-            yield form.reply(token, Refusal(INVALID, str(error), error.field))
+            yield form.reply(query.token, Refusal(INVALID, str(error), error.field))
             return
         if entry is not None:
             self._count("repeated_total")
-            entry.clients.append((token, form))
+            entry.queries.append(query)
             return
         if cached is not None:
             self._count("repeated_total")
-            yield Reply(token, form.write(MSGPACK.read(cached.answer)), encoding=form.encoding)
+            answer = form.write(MSGPACK.read(cached.answer))
+            yield Reply(query.token, answer, encoding=form.encoding)
             return
-        if len(self._waiting) + len(self._planning) >= self._settings.queue_limit:
-            self._count("overloaded_total")
-            yield form.reply(token, self._overloaded())
-            return
-        entry = _Entry(request, now_s, job, [(token, form)])
+        client = query.session.client
+        if len(self._pending) >= self._settings.queue_limit:
+            refusal = self._overload()
+            displaced = self._pending.displaced_by(client)
+            if displaced is None:
+                yield self._refuse(query, refusal)
+                return
+            self._forget(displaced)
+            yield from (self._refuse(each, refusal) for each in displaced.queries)
+        entry = PendingPlan(request, now_s, job, client, [query])
         if request.id:
-            self._pending[request.id] = entry
-        self._waiting.append(entry)
+            self._by_id[request.id] = entry
+        self._pending.add(entry)
         yield from self._hand_out(now_s)
 
     def _read(self, form: Format, payload: bytes) -> PlanRequest:
@@ -212,9 +240,9 @@ class PlanningService:
             raise BadInputError("deadline_s", request.deadline_s, allowed)
         return request
 
-    def _known(self, request: PlanRequest) -> tuple[_Entry | None, _CachedAnswer | None]:
+    def _known(self, request: PlanRequest) -> tuple[PendingPlan | None, _CachedAnswer | None]:
         """Return the entry or the cached answer of a repeated request."""
-        entry, cached = self._pending.get(request.id), self._answers.get(request.id)
+        entry, cached = self._by_id.get(request.id), self._answers.get(request.id)
         another = (entry is not None and entry.request != request) or (
             cached is not None and cached.request != _digest(request)
         )
@@ -222,28 +250,91 @@ class PlanningService:
             raise BadInputError("id", request.id, "an id that no other recent request has")
         return entry, cached
 
-    def _overloaded(self) -> Refusal:
-        limit = self._settings.queue_limit
-        text = (
-            f"service.queue_limit: got {limit} pending requests; allowed: {limit}; try again later"
-        )
-        return Refusal(OVERLOADED, text, "")
+    # --- overload -----------------------------------------------------------------------------
+
+    def _refuse(self, query: OpenQuery, refusal: Refusal) -> Reply:
+        self._count("overloaded_total")
+        return query.form.reply(query.token, refusal)
+
+    def _client_overload(self, client: str) -> Refusal:
+        count = self._pending.count(client)
+        ahead = count * self._pending.clients
+        what = f"{count} pending requests of this client"
+        return self._overloaded("client_queue_limit", what, ahead)
+
+    def _overload(self) -> Refusal:
+        count = len(self._pending)
+        return self._overloaded("queue_limit", f"{count} pending requests", count)
+
+    def _overloaded(self, limit: str, what: str, ahead: int) -> Refusal:
+        """Return the refusal for a limit; half of the requests ahead should be planned first."""
+        planned_s = ahead / 2 * self._mean_s / self._workers
+        retry_after_s = round(min(max(MIN_RETRY_S, planned_s), MAX_RETRY_S), 2)
+        allowed = getattr(self._settings, limit)
+        text = f"service.{limit}: got {what}; allowed: {allowed}; try again in {retry_after_s:g} s"
+        return Refusal(OVERLOADED, text, "", retry_after_s)
+
+    # --- cancellation -------------------------------------------------------------------------
+
+    def open_session(self, session: ClientSession) -> None:
+        """Register a session of a client."""
+        self._sessions.add(session)
+
+    def close_session(self, session: ClientSession) -> Iterator[Effect]:
+        """Drop all requests of a session that has ended."""
+        self._sessions.discard(session)
+        for entry in self._pending.of_session(session):
+            yield from self._withdraw(
+                entry, [query for query in entry.queries if query.session == session]
+            )
+
+    def cancel(
+        self, token: int, payload: bytes, encoding: str, session: ClientSession
+    ) -> Iterator[Effect]:
+        """Cancel a client's request, or decline if this service does not have it.
+
+        Args:
+            token: token of the query that cancels the request.
+            payload: encoded cancellation.
+            encoding: MIME type given by the client, if any.
+            session: session of the client; only the client's own queries are cancelled.
+        """
+        form = format_of(payload, encoding)
+        entry = self._by_id.get(form.read_cancelled_id(payload))
+        queries = [] if entry is None else entry.queries
+        own = [query for query in queries if query.session.client == session.client]
+        if entry is None or not own:
+            yield Decline(token)
+            return
+        yield from self._withdraw(entry, own)
+        yield Reply(token, form.write({"id": entry.request.id}), encoding=form.encoding)
+
+    def _withdraw(self, entry: PendingPlan, queries: list[OpenQuery]) -> Iterator[Effect]:
+        """Answer cancelled queries, and drop the request if there are no others for it."""
+        for query in queries:
+            entry.queries.remove(query)
+            yield query.form.reply(query.token, Refusal(CANCELLED, "cancelled by the client", ""))
+        if not entry.queries:
+            self._count("cancelled_total")
+            self._forget(entry)
+            if self._pending.drop(entry):
+                yield StopJob(entry.job)
+
+    def _forget(self, entry: PendingPlan) -> bool:
+        """Remove a request from those known by id; return whether it was one of them."""
+        return self._by_id.pop(entry.request.id, None) is not None
 
     # --- planning -----------------------------------------------------------------------------
 
     def owns(self, job: int) -> bool:
         """Return whether a computation belongs to a request."""
-        return job in self._planning
+        return self._pending.owns(job)
 
     def _hand_out(self, now_s: float) -> Iterator[Effect]:
-        """Hand waiting requests to workers, in order of arrival."""
-        max_planning = self._workers * (1 + HANDED_OUT_AHEAD)
-        while self._waiting and len(self._planning) < max_planning:
-            entry = self._waiting.popleft()
-            if entry.deadline_s <= now_s:
-                yield from self._end(entry, self._late(entry, now_s), now_s)
-                continue
-            self._planning[entry.job] = entry
+        """Hand waiting requests to workers, clients in turn."""
+        yield from self.drop_late(now_s)
+        ahead = int(self._mean_s < AHEAD_BELOW_S)
+        while (entry := self._pending.next_for_worker(ahead)) is not None:
             solver = entry.request.solver or self._solver
             memory_mb = self._settings.worker_memory_mb
             plan = partial(self._plan, solver=solver, max_memory_mb=memory_mb)
@@ -252,13 +343,13 @@ class PlanningService:
 
     def finish(self, job: int, result: object, error: str, now_s: float) -> Iterator[Effect]:
         """Answer a request whose computation has finished."""
-        entry = self._planning.pop(job)
+        entry = self._pending.finish(job)
         if not entry.dropped:
             yield from self._end(entry, self._outcome(entry, result, error, now_s), now_s)
         yield from self._hand_out(now_s)
 
     def _outcome(
-        self, entry: _Entry, result: object, error: str, now_s: float
+        self, entry: PendingPlan, result: object, error: str, now_s: float
     ) -> PlanResponse | Refusal:
         if isinstance(result, PlanResponse):
             return result
@@ -269,15 +360,12 @@ class PlanningService:
 
     def drop_late(self, now_s: float) -> Iterator[Effect]:
         """Drop requests whose deadlines passed while they waited."""
-        late = [entry for entry in self._not_begun() if entry.deadline_s <= now_s]
+        late = [entry for entry in self._pending.not_begun if entry.deadline_s <= now_s]
         for entry in late:
-            if entry.job in self._planning:
-                entry.dropped = True
-            else:
-                self._waiting.remove(entry)
+            self._pending.drop(entry)  # a worker does not begin a late job
             yield from self._end(entry, self._late(entry, now_s), now_s)
 
-    def _late(self, entry: _Entry, now_s: float) -> Refusal:
+    def _late(self, entry: PendingPlan, now_s: float) -> Refusal:
         self._count("late_total")
         waited_s, deadline_s = now_s - entry.arrived_s, entry.request.deadline_s
         text = (
@@ -286,16 +374,19 @@ class PlanningService:
         )
         return Refusal(LATE, text, "deadline_s")
 
-    def _end(self, entry: _Entry, answer: PlanResponse | Refusal, now_s: float) -> Iterator[Effect]:
+    def _end(
+        self, entry: PendingPlan, answer: PlanResponse | Refusal, now_s: float
+    ) -> Iterator[Effect]:
         """Answer all queries for a request; if the answer is a plan, cache it."""
         if isinstance(answer, PlanResponse):
             self._count("answered_total")
             planned_s = answer.solve_ms / 1e3
+            self._mean_s += MEAN_WEIGHT * (planned_s - self._mean_s)
             self._count("planning_seconds_total", planned_s)
             self._count("service_seconds_total", max(0.0, now_s - entry.arrived_s - planned_s))
-        for token, form in entry.clients:
-            yield form.reply(token, answer)
-        if self._pending.pop(entry.request.id, None) and isinstance(answer, PlanResponse):
+        for query in entry.queries:
+            yield query.form.reply(query.token, answer)
+        if self._forget(entry) and isinstance(answer, PlanResponse):
             cached = _CachedAnswer(_digest(entry.request), MSGPACK.write(answer.to_dict()), now_s)
             self._answers[entry.request.id] = cached
             self._cached_bytes += len(cached.answer)
@@ -322,9 +413,11 @@ def _digest(request: PlanRequest) -> bytes:
     return blake2b(JSON.write(request.to_dict()), digest_size=16).digest()
 
 
-def plan_in_time(plan: PlanFunction, request: PlanRequest, left_s: float) -> PlanResponse:
-    """Answer a request in the time left until its deadline."""
+def plan_in_time(
+    plan: PlanFunction, request: PlanRequest, left_s: float, clock: Clock
+) -> PlanResponse:
+    """Answer a request in the time left until its deadline [s]; `clock` may stop the planner."""
     left_s = min(left_s, request.deadline_s)
-    response = plan(attrs.evolve(request, deadline_s=left_s))
+    response = plan(attrs.evolve(request, deadline_s=left_s), clock=clock)
     waited_ms = round(1e3 * (request.deadline_s - left_s), 3)
     return attrs.evolve(response, waited_ms=waited_ms)

@@ -6,21 +6,27 @@ import contextlib
 import queue
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator
 
 from laneweave.protocol.runtime.metrics import SnapshotRequest
 from laneweave.protocol.runtime.node import Computed, Stopping
-from laneweave.protocol.runtime.transport import Delivery, Overflow, Query, Received
+from laneweave.protocol.runtime.round_robin import RoundRobin
+from laneweave.protocol.runtime.transport import (
+    Delivery,
+    Overflow,
+    Query,
+    Received,
+    sender_name,
+)
 
 MAX_QUERY_WAIT_S = 0.02
 """Longest time a query waits while other work is queued, unless `QUERY_SHARE` requires more."""
 MAX_WAITING = 100
 """Maximum number of waiting messages of one sender or receiver; further ones are dropped.
 
-It is the last part of a key, so that other parts, which a sender may choose, do not matter. A flood
-from one sender then delays messages of others only briefly. Every message may be lost, and
-a correct sender has at most a few messages under way."""
+A flood from one sender (`sender_name`) then delays messages of others only briefly. Every message
+may be lost, and a correct sender has at most a few messages under way."""
 OVERFLOW_S = 0.1
 """Interval at which the node is notified of dropped messages."""
 QUERY_SHARE = 0.1
@@ -33,18 +39,19 @@ Item = Delivery | Computed | SnapshotRequest | Stopping
 class Inbox:
     """Input queue of a node.
 
-    Queries yield to other work for at most `MAX_QUERY_WAIT_S`. `QUERY_SHARE` keeps a flood of
-    queries from blocking a leader, and `MAX_WAITING` a flood of messages.
+    The first query yields to other work for at most `MAX_QUERY_WAIT_S`. `QUERY_SHARE` keeps a flood
+    of queries from blocking a leader, and `MAX_WAITING` a flood of messages. Queries of several
+    senders are taken round robin; those without a known sender count as of one sender.
     """
 
     def __init__(self) -> None:
         """Create an empty queue."""
         self._items: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
-        self._queries: deque[Query] = deque()
+        self._queries: RoundRobin[Query] = RoundRobin()
         self._waiting: Counter[str] = Counter()
-        """Number of waiting messages by the last part of their keys."""
+        """Number of waiting messages by sender."""
         self._lock = threading.Lock()
-        """Guards `_waiting`; never needed in a signal handler."""
+        """Guards `_queries` and `_waiting`; never needed in a signal handler."""
         self._overflowed: dict[str, None] = {}
         """Keys of messages dropped since the last `Overflow`."""
         self._next_overflow_s = 0.0
@@ -55,7 +62,8 @@ class Inbox:
     def put(self, item: Item) -> None:
         """Add an input; safe in any thread, callback or signal handler (`put` is reentrant)."""
         if isinstance(item, Query):
-            self._queries.append(item)
+            with self._lock:
+                self._queries.append(sender_name(item.sender), item)
             self._items.put(None)  # wake up `take`
         elif isinstance(item, Received) and not self._admit(item.key):
             self._overflowed[item.key] = None
@@ -79,12 +87,14 @@ class Inbox:
             overflowed, self._overflowed = self._overflowed, {}
             yield from map(Overflow, overflowed)
         if self._queries and (self._items.empty() or now_s > self._next_query_s):
-            yield self._queries.popleft()
+            with self._lock:
+                query = self._queries.pop()
+            yield query
             took_s = time.monotonic() - now_s
             self._next_query_s = now_s + max(MAX_QUERY_WAIT_S, took_s / QUERY_SHARE)
 
     def _admit(self, key: str) -> bool:
-        name = key.rpartition("/")[2]
+        name = sender_name(key)
         with self._lock:
             if self._waiting[name] >= MAX_WAITING:
                 return False
@@ -92,7 +102,7 @@ class Inbox:
             return True
 
     def _release(self, key: str) -> None:
-        name = key.rpartition("/")[2]
+        name = sender_name(key)
         with self._lock:
             self._waiting[name] -= 1
             if not self._waiting[name]:

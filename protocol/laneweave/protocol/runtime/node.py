@@ -8,6 +8,7 @@ input, which never reaches a core.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any, Protocol
@@ -31,12 +32,21 @@ from laneweave.protocol.runtime.transport import (
 )
 from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import Name, Report
-from laneweave.protocol.wire.topics import Keys, Topic
+from laneweave.protocol.wire.topics import SERVICE, Keys, Topic
 
 log = structlog.get_logger(__name__)
 
 TOO_LATE = "the deadline passed before the computation began"
 """Error of a delegated computation whose deadline passed before it started."""
+STOPPED = "the computation was stopped"
+"""Error of a delegated computation after `StopJob`."""
+
+Clock = Callable[[], float]
+"""Returns the time [s]."""
+
+
+class StoppedError(Exception):
+    """A delegated computation must end, since its result is no longer needed."""
 
 
 @frozen
@@ -92,12 +102,15 @@ class Computed:
 
 @frozen
 class QueryArrived:
-    """A query to this node's service; answered with `Reply` or `Decline`."""
+    """A query on a topic that this node serves; answered with `Reply` or `Decline`."""
 
     token: int
     payload: bytes
     encoding: str = ""
     """MIME type of the payload; empty: unknown."""
+    topic: Topic = SERVICE
+    sender: Mapping[str, str] = field(factory=dict)
+    """Parameters of the querying process's liveliness token; empty: unknown."""
 
 
 @frozen
@@ -192,12 +205,24 @@ class Delegate:
 
     `work` must be picklable. It is called with the time left until `deadline_s` [s]; if none is
     left, the job fails. A worker that exceeds the deadline by `worker_pool.OVERDUE_S` is killed.
+    The second argument is the clock that `work` should read: it raises `StoppedError` after
+    `StopJob`.
     """
 
     job: int
-    work: Callable[[float], Any]
+    work: Callable[[float, Clock], Any]
     deadline_s: float
     """Time on the clock of `now_s`."""
+
+
+@frozen
+class StopJob:
+    """Stop a delegated computation, or do not begin it, since its result is no longer needed.
+
+    `Computed` follows: with the error `STOPPED`, or with the result if that is already complete.
+    """
+
+    job: int
 
 
 @frozen
@@ -224,6 +249,7 @@ Effect = (
     | Decline
     | Compute
     | Delegate
+    | StopJob
     | Refuse
     | End
 )
@@ -257,7 +283,7 @@ class Node:
         core: Core,
         transport: Transport,
         keys: Keys,
-        submit: Callable[[Compute | Delegate], None],
+        submit: Callable[[Compute | Delegate | StopJob], None],
         label: Name,
         read: Callable[[str, bytes], Arrived] | None = None,
         write: Callable[[object], bytes] = encode,
@@ -268,7 +294,7 @@ class Node:
             core: receives the events.
             transport: executes the effects.
             keys: key grammar of the realm.
-            submit: runs a computation elsewhere, then calls `dispatch(Computed(...))`.
+            submit: runs a computation elsewhere, then calls `dispatch(Computed(...))`; or stops it.
             label: unique name of this process in reports.
             read: decodes a message, by default `read_message`; may cache.
             write: encodes a message for `read`.
@@ -333,11 +359,17 @@ class Node:
         if isinstance(delivery, (LinkUp, LinkDown)):
             return delivery
         if isinstance(delivery, Query):
-            return QueryArrived(delivery.token, delivery.payload, delivery.encoding)
+            return self._query_event(delivery)
         known = known_key(self._keys, delivery.key)
         if isinstance(delivery, Overflow):
             return MessagesDropped(*known)
         return PeerUp(*known) if isinstance(delivery, TokenUp) else PeerDown(*known)
+
+    def _query_event(self, query: Query) -> QueryArrived:
+        topic, _ = known_key(self._keys, query.key)
+        known = self._keys.read(query.sender)
+        sender = {} if known is None else known[1]
+        return QueryArrived(query.token, query.payload, query.encoding, topic, sender)
 
     def _reject(self, key: str, error: BadInputError) -> None:
         self.rejected += 1
@@ -363,7 +395,7 @@ class Node:
     def _execute(self, effect: Effect) -> None:
         transport = self._transport
         match effect:
-            case Compute() | Delegate():
+            case Compute() | Delegate() | StopJob():
                 self._submit(effect)
             case Reply(token, payload, ok, encoding):
                 transport.answer(token, payload, ok=ok, encoding=encoding)
@@ -426,17 +458,22 @@ def run_job(job: Compute) -> Computed:
     """Run a computation and return its result or error."""
     try:
         return Computed(job.job, job.work())
+    except StoppedError:
+        return Computed(job.job, None, STOPPED)
     except Exception as error:
         log.exception("computation failed", job=job.job)
         return Computed(job.job, None, error_text(error))
 
 
-def run_delegated(job: Delegate, now_s: Callable[[], float]) -> Computed:
-    """Run a delegated computation in this process unless its deadline has passed by `now_s`."""
+def run_delegated(job: Delegate, now_s: Clock, clock: Clock = time.monotonic) -> Computed:
+    """Run a delegated computation in this process unless its deadline has passed by `now_s`.
+
+    The computation reads `clock`, which may raise `StoppedError`.
+    """
     left_s = job.deadline_s - now_s()
     if left_s <= 0:
         return Computed(job.job, None, TOO_LATE)
-    return run_job(Compute(job.job, partial(job.work, left_s)))
+    return run_job(Compute(job.job, partial(job.work, left_s, clock)))
 
 
 def error_text(error: Exception) -> str:

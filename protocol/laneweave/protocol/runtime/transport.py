@@ -66,6 +66,8 @@ class Query:
     token: int
     encoding: str = ""
     """MIME type of the payload; empty: unknown."""
+    sender: str = ""
+    """Key of a liveliness token that the querying process has declared; empty: unknown."""
 
 
 @frozen
@@ -86,6 +88,14 @@ def update_tokens(tokens: dict[str, None], event: TokenUp | TokenDown) -> bool:
         return not known
     tokens.pop(event.key, None)
     return known
+
+
+def sender_name(key: str) -> str:
+    """Return the name of a sender: the last part of its key.
+
+    Other parts, which a sender may choose, do not matter.
+    """
+    return key.rpartition("/")[2]
 
 
 Delivery = Received | Overflow | TokenUp | TokenDown | LinkUp | LinkDown | Query

@@ -111,6 +111,8 @@ class Service:
     other solver completes the plan; without an optimality proof its status is `feasible`."""
     queue_limit: int = field(default=256, validator=within(1, 100_000))
     """Maximum number of waiting and running requests; further ones are rejected."""
+    client_queue_limit: int = field(default=64, validator=within(1, 100_000))
+    """Maximum number of waiting and running requests of one client; further ones are rejected."""
     max_request_bytes: int = field(default=262_144, validator=within(1024, 1 << 20))
     """Maximum size of a request; longer ones are rejected."""
     max_deadline_s: float = field(default=600.0, validator=within(0.001, 3600.0))

@@ -176,8 +176,19 @@ BRIDGE_ALIVE = Topic(
     "bridge-alive", "alive/bridge/{incarnation}", None, Party.BRIDGE, Quality.ASSURED,
     readers=(Party.COORDINATOR, Party.VEHICLE, Party.OBSERVER), exchange=Exchange.TOKENS,
 )  # fmt: skip
+# A sender is known by the last part of its keys. The session is a secret between a client and the
+# coordinators: who knows it can send requests in the client's name.
+CLIENT_ALIVE = Topic(
+    "client-alive", "alive/client/{session}/{client}", None, Party.CLIENT, Quality.ASSURED,
+    readers=(Party.COORDINATOR,), exchange=Exchange.TOKENS,
+)  # fmt: skip
 SERVICE = Topic(
     "service", "service/plan", None, Party.CLIENT, Quality.ASSURED,
+    readers=(Party.COORDINATOR,), exchange=Exchange.QUERIES,
+    remark="a query",
+)  # fmt: skip
+SERVICE_CANCEL = Topic(
+    "service-cancel", "service/cancel", None, Party.CLIENT, Quality.ASSURED,
     readers=(Party.COORDINATOR,), exchange=Exchange.QUERIES,
     remark="a query",
 )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from itertools import pairwise
 from typing import Any
 
@@ -22,11 +23,13 @@ from laneweave.coordinator.service.client import (
     PendingRequest,
     PlanError,
     PlanningFailedError,
+    RequestCancelledError,
     RequestRefusedError,
     ServiceOverloadedError,
     ServiceUnavailableError,
 )
 from laneweave.coordinator.service.format import (
+    CANCELLED,
     FAILED,
     INVALID,
     JSON,
@@ -78,6 +81,7 @@ def test_a_plan_is_the_plan(form: Format, *, told: bool) -> None:
     [
         (INVALID, RequestRefusedError),
         (LATE, DeadlinePassedError),
+        (CANCELLED, RequestCancelledError),
         (FAILED, PlanningFailedError),
         ("of tomorrow", PlanningFailedError),
     ],
@@ -181,6 +185,21 @@ def test_an_overload_is_waited_out_for_as_long_as_was_asked() -> None:
     with pytest.raises(ServiceOverloadedError, match="ask again later") as caught:
         after_pauses(inquiry(60.0), [OVERLOAD])
     assert given_up_s(caught.value) > 60.0 - 2 * LONGEST_PAUSE_S
+
+
+def test_a_coordinator_may_ask_for_a_longer_pause() -> None:
+    asked = inquiry()
+    overload = refusal(field="", message="later", code=OVERLOADED, retry_after_s=3.0)
+    assert asked.after(overload, START_S) == 3.0
+    assert asked.after(OVERLOAD, START_S) == 2 * FIRST_PAUSE_S
+    with pytest.raises(ServiceOverloadedError):
+        asked.after(overload, START_S + 7.5)
+
+
+@pytest.mark.parametrize("advice", [0, -1.0, math.inf, math.nan, "soon", None])
+def test_strange_advice_is_ignored(advice: object) -> None:
+    overload = refusal(field="", message="later", code=OVERLOADED, retry_after_s=advice)
+    assert inquiry().after(overload, START_S) == FIRST_PAUSE_S
 
 
 def test_each_attempt_asks_the_same() -> None:

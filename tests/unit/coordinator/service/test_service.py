@@ -7,23 +7,36 @@ import tracemalloc
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import attrs
 import msgpack
 import pytest
 from attrs import define, field
 from hypothesis import given
 from hypothesis import strategies as st
 
+from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.service import server as service
-from laneweave.coordinator.service.format import FAILED, INVALID, LATE, OVERLOADED
+from laneweave.coordinator.service.format import (
+    CANCEL_SCHEMA,
+    CANCELLED,
+    FAILED,
+    INVALID,
+    LATE,
+    OVERLOADED,
+    cancel_request,
+)
+from laneweave.coordinator.service.pending import ClientSession
 from laneweave.coordinator.service.rendezvous import is_assigned_to
 from laneweave.coordinator.service.server import PlanningService, ServiceMetrics
 from laneweave.protocol.runtime.node import (
+    STOPPED,
     Computed,
     Decline,
     Delegate,
     Effect,
     Reply,
+    StopJob,
     run_delegated,
 )
 from laneweave.protocol.scenario.deployment_fields import Service
@@ -45,6 +58,7 @@ CODECS = pytest.mark.parametrize(
     ],
     ids=["JSON", "MessagePack"],
 )
+UNKNOWN = ClientSession()
 SETTINGS = Service(queue_limit=8, max_request_bytes=4096, cache_entries=4, cache_s=60.0)
 
 
@@ -57,14 +71,25 @@ class Desk:
     replies: dict[int, Reply] = field(factory=dict)
     orders: list[Delegate] = field(factory=list)
     left: list[int] = field(factory=list)
+    stopped: list[int] = field(factory=list)
+    """Jobs that workers should stop."""
     _tokens: int = 0
 
-    def ask(self, data: object, *, encoding: str = "", others: tuple[str, ...] = ()) -> int:
+    def ask(
+        self,
+        data: object,
+        *,
+        encoding: str = "",
+        others: tuple[str, ...] = (),
+        session: ClientSession = UNKNOWN,
+    ) -> int:
         """Ask something; return the token."""
         payload = data if isinstance(data, bytes) else json.dumps(data).encode()
         self._tokens += 1
         job = 1000 + self._tokens
-        self._note(self.service.take(self._tokens, payload, encoding, job, others, self.now_s))
+        self._note(
+            self.service.take(self._tokens, payload, encoding, session, job, others, self.now_s)
+        )
         return self._tokens
 
     def work(self) -> None:
@@ -83,6 +108,17 @@ class Desk:
         self.now_s += seconds
         self._note(self.service.drop_late(self.now_s))
 
+    def leave(self, session: ClientSession) -> None:
+        """End a client's session."""
+        self._note(self.service.close_session(session))
+
+    def cancel(self, data: object, *, session: ClientSession = UNKNOWN) -> int:
+        """Cancel a request; return the token."""
+        self._tokens += 1
+        payload = json.dumps(data).encode()
+        self._note(self.service.cancel(self._tokens, payload, "", session))
+        return self._tokens
+
     def answer(self, token: int) -> dict[str, Any]:
         """Return what a question was answered, in JSON."""
         found: dict[str, Any] = json.loads(self.replies[token].payload)
@@ -98,6 +134,8 @@ class Desk:
                     self.orders.append(effect)
                 case Decline(token):
                     self.left.append(token)
+                case StopJob(job):
+                    self.stopped.append(job)
                 case _:
                     raise AssertionError(effect)
 
@@ -342,6 +380,218 @@ def test_too_many_requests_in_hand_are_refused_until_one_is_done(desk: Desk) -> 
     assert "service.queue_limit" in refusal["message"]
     desk.work()
     assert desk.ask(REQUEST) not in desk.replies
+
+
+def opened(desk: Desk, client: str, session: str = "1") -> ClientSession:
+    session_of = ClientSession(client, session)
+    desk.service.open_session(session_of)
+    return session_of
+
+
+def make_desk(**settings: Any) -> Desk:  # noqa: ANN401 (any setting)
+    return Desk(PlanningService("c1", Service(**settings), 1, plan))
+
+
+def test_a_client_over_its_limit_is_refused_and_others_are_not() -> None:
+    desk = make_desk(client_queue_limit=3)
+    flood, quiet = opened(desk, "flood"), opened(desk, "quiet")
+    tokens = [desk.ask(REQUEST, session=flood) for _ in range(4)]
+    assert not set(tokens[:3]) & set(desk.replies)
+    refusal = desk.answer(tokens[3])
+    assert (refusal["code"], refusal["field"]) == (OVERLOADED, "")
+    assert refusal["message"] == (
+        "service.client_queue_limit: got 3 pending requests of this client; allowed: 3; "
+        f"try again in {refusal['retry_after_s']:g} s"
+    )
+    assert desk.ask(REQUEST, session=quiet) not in desk.replies
+    # All sessions of a client count together.
+    assert desk.ask(REQUEST, session=opened(desk, "flood", "2")) in desk.replies
+
+
+def test_unknown_clients_count_as_one() -> None:
+    desk = make_desk(client_queue_limit=2)
+    tokens = [desk.ask(REQUEST) for _ in range(3)]
+    assert tokens[2] in desk.replies
+
+
+def test_the_advice_when_to_send_again_follows_the_time_of_plans() -> None:
+    desk = make_desk(client_queue_limit=1)
+    desk.ask(REQUEST)
+    assert desk.answer(desk.ask(REQUEST))["retry_after_s"] == service.MIN_RETRY_S
+    for _ in range(50):
+        answered_in(desk, 4000.0)
+        desk.ask(REQUEST)
+    assert desk.answer(desk.ask(REQUEST))["retry_after_s"] == pytest.approx(2.0, rel=0.02)
+
+
+def answered_in(desk: Desk, solve_ms: float) -> None:
+    """Finish the oldest order with a plan that took this long."""
+    answer = plan(PlanRequest.from_dict(REQUEST))
+    order = desk.orders.pop(0)
+    desk.end(Computed(order.job, attrs.evolve(answer, solve_ms=solve_ms)))
+
+
+def test_workers_get_none_ahead_while_plans_take_long(desk: Desk) -> None:
+    for _ in range(6):
+        desk.ask(REQUEST)
+    assert len(desk.orders) == 2
+    answered_in(desk, 1000.0)
+    assert len(desk.orders) == 1
+    for _ in range(50):
+        answered_in(desk, 1.0)
+        desk.ask(REQUEST)
+    assert len(desk.orders) == 2
+
+
+def test_clients_are_served_in_turn(desk: Desk) -> None:
+    flood, quiet = opened(desk, "flood"), opened(desk, "quiet")
+    tokens = [desk.ask(REQUEST, session=flood) for _ in range(6)]
+    late = desk.ask(REQUEST, session=quiet)
+    order = []
+    for _ in range(7):
+        desk.work()
+        order += [token for token in desk.replies if token not in order]
+    # Two are with the worker, and one more is next in turn.
+    assert order == [*tokens[:3], late, *tokens[3:]]
+
+
+def test_a_full_queue_displaces_the_newest_of_the_client_with_the_most(desk: Desk) -> None:
+    flood, quiet = opened(desk, "flood"), opened(desk, "quiet")
+    tokens = [desk.ask(named(f"f{n}"), session=flood) for n in range(SETTINGS.queue_limit)]
+    token = desk.ask(REQUEST, session=quiet)
+    assert token not in desk.replies
+    assert list(desk.replies) == tokens[-1:]
+    refusal = desk.answer(tokens[-1])
+    assert refusal["code"] == OVERLOADED
+    assert "service.queue_limit: got 8 pending requests; allowed: 8" in refusal["message"]
+    # Its id is free again.
+    assert desk.ask(named("f7", mode=2), session=quiet) not in desk.replies
+    # The shares are now nearly equal: of the flood three wait, of the other one three.
+    desk.ask(REQUEST, session=quiet)
+    assert desk.answer(desk.ask(REQUEST, session=quiet))["code"] == OVERLOADED
+    for _ in range(SETTINGS.queue_limit):
+        desk.work()
+    assert desk.orders == []
+
+
+# --- cancelled requests -----------------------------------------------------------------------
+
+
+def test_a_cancelled_request_frees_its_worker(desk: Desk) -> None:
+    first, second = desk.ask(named("r")), desk.ask(REQUEST)
+    done = desk.cancel(cancel_request("r"))
+    assert desk.answer(done) == {"id": "r"}
+    assert desk.answer(first)["code"] == CANCELLED
+    (job,) = desk.stopped
+    desk.end(Computed(job, None, STOPPED))
+    del desk.orders[0]
+    desk.work()
+    assert desk.answer(second)["status"] == "optimal"
+    metrics = desk.service.metrics
+    assert (metrics.cancelled_total, metrics.answered_total, metrics.failed_total) == (1, 1, 0)
+
+
+def test_a_cancelled_request_that_waits_is_not_planned(desk: Desk) -> None:
+    for number in range(4):
+        desk.ask(named(f"r{number}"))
+    desk.cancel(cancel_request("r3"))
+    assert not desk.stopped
+    assert desk.service.metrics.waiting == 1
+    for _ in range(3):
+        desk.work()
+    assert not desk.orders
+
+
+def test_the_result_of_a_cancelled_request_is_discarded(desk: Desk) -> None:
+    desk.ask(named("r"))
+    desk.cancel(cancel_request("r"))
+    again = desk.ask(named("r"))
+    desk.work()  # the first one was complete before it could be stopped
+    assert again not in desk.replies
+    desk.work()
+    assert desk.answer(again)["status"] == "optimal"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        cancel_request("another"),
+        cancel_request(""),
+        {"schema": CANCEL_SCHEMA},
+        named("r"),
+        {"id": "r"},
+        [],
+    ],
+    ids=["unknown", "empty", "no id", "request", "no schema", "list"],
+)
+def test_what_cancels_no_request_is_declined(desk: Desk, data: object) -> None:
+    token, anonymous = desk.ask(named("r")), desk.ask(REQUEST)
+    assert desk.cancel(data) in desk.left
+    assert not {token, anonymous} & set(desk.replies)
+
+
+def test_a_client_cannot_cancel_the_request_of_another(desk: Desk) -> None:
+    session, other = opened(desk, "a"), opened(desk, "b")
+    token = desk.ask(named("r"), session=session)
+    for attempt in (UNKNOWN, other):
+        assert desk.cancel(cancel_request("r"), session=attempt) in desk.left
+    assert token not in desk.replies
+    # Another session of the same client can.
+    desk.cancel(cancel_request("r"), session=opened(desk, "a", "2"))
+    assert desk.answer(token)["code"] == CANCELLED
+
+
+def test_a_request_is_planned_while_anyone_waits_for_it(desk: Desk) -> None:
+    session, other = opened(desk, "a"), opened(desk, "b")
+    first, second = (desk.ask(named("r"), session=each) for each in (session, other))
+    desk.leave(session)
+    assert desk.answer(first)["code"] == CANCELLED
+    assert not desk.stopped
+    desk.work()
+    assert desk.answer(second)["status"] == "optimal"
+
+
+def test_all_requests_of_a_closed_session_are_dropped(desk: Desk) -> None:
+    session, other = opened(desk, "a"), opened(desk, "a", "2")
+    tokens = [desk.ask(REQUEST, session=session) for _ in range(5)]
+    kept = desk.ask(REQUEST, session=other)
+    desk.leave(session)
+    assert set(desk.replies) == set(tokens)
+    assert len(desk.stopped) == 2
+    for job in desk.stopped:
+        desk.end(Computed(job, None, STOPPED))
+    del desk.orders[:2]
+    desk.work()
+    assert desk.answer(kept)["status"] == "optimal"
+    assert desk.service.metrics.cancelled_total == 5
+
+
+def test_a_late_request_is_not_cancelled_again(desk: Desk) -> None:
+    session = opened(desk, "a")
+    desk.ask(REQUEST | {"deadline_s": 50.0})
+    late = desk.ask(named("r", deadline_s=5.0), session=session)
+    desk.wait(5.1)
+    assert desk.answer(late)["code"] == LATE
+    again = desk.ask(named("r", deadline_s=5.0))
+    desk.leave(session)
+    assert not desk.stopped
+    assert again not in desk.replies
+
+
+def test_a_request_that_arrives_after_its_client_left_is_declined(desk: Desk) -> None:
+    session = opened(desk, "a")
+    desk.leave(session)
+    assert desk.ask(REQUEST, session=session) in desk.left
+    assert not desk.orders
+
+
+def test_cancelled_requests_do_not_count(desk: Desk) -> None:
+    session = opened(desk, "a")
+    for _ in range(SETTINGS.queue_limit):
+        desk.ask(REQUEST, session=session)
+    desk.leave(session)
+    tokens = [desk.ask(REQUEST) for _ in range(SETTINGS.queue_limit)]
+    assert not set(tokens) & set(desk.replies)
 
 
 # --- the same request again -------------------------------------------------------------------

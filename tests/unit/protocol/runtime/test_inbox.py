@@ -69,6 +69,16 @@ def test_questions_that_take_long_get_a_small_part_of_the_time() -> None:
         assert next_s - begin_s >= (end_s - begin_s) / QUERY_SHARE
 
 
+def test_senders_of_queries_are_served_in_turn() -> None:
+    inbox = Inbox()
+    flood = [Query("k", b"", n, sender=f"alive/client/{n}/flood") for n in range(50)]
+    quiet = Query("k", b"", 100, sender="alive/client/1/quiet")
+    for query in (*flood, quiet):
+        inbox.put(query)
+    taken = [item for _ in range(110) for item in inbox.take(0.0)]
+    assert taken == [flood[0], quiet, *flood[1:]]
+
+
 def test_a_flood_on_one_key_delays_other_keys_only_briefly() -> None:
     inbox, other = Inbox(), Received("other", b"")
     for _ in range(50 * MAX_WAITING):

@@ -32,6 +32,7 @@ from laneweave.protocol.runtime.node import (
     Send,
     Serve,
     Started,
+    StopJob,
     Unlisten,
     Wakeup,
     Watch,
@@ -65,7 +66,7 @@ class Bench:
 
     core: Recorder = field(factory=Recorder)
     transport: Mock = field(factory=lambda: Mock(spec=Transport))
-    jobs: list[Compute | Delegate] = field(factory=list)
+    jobs: list[Compute | Delegate | StopJob] = field(factory=list)
     node: Node = field(init=False)
 
     @node.default
@@ -94,7 +95,22 @@ def bench() -> Bench:
         (Overflow(BEAT_KEY), MessagesDropped(topics.HEARTBEAT, {"coordinator": "c1"})),
         (LinkUp(), LinkUp()),
         (LinkDown(), LinkDown()),
-        (Query("any/key", b"q", 4), QueryArrived(4, b"q")),
+        (Query("laneweave/r/service/plan", b"q", 4), QueryArrived(4, b"q")),
+        (
+            Query(
+                "laneweave/r/service/cancel", b"q", 4, sender="laneweave/r/alive/client/s/dispatch"
+            ),
+            QueryArrived(
+                4,
+                b"q",
+                topic=topics.SERVICE_CANCEL,
+                sender={"session": "s", "client": "dispatch"},
+            ),
+        ),
+        (
+            Query("laneweave/r/service/plan", b"q", 4, sender="laneweave/r/alive/client/s/é"),
+            QueryArrived(4, b"q"),
+        ),
         (
             TokenUp("laneweave/r/alive/vehicle/v1"),
             PeerUp(topics.VEHICLE_ALIVE, {"vehicle": "v1"}),
@@ -189,6 +205,7 @@ def test_effects_reach_the_transport(bench: Bench) -> None:
         Reply(5, b"a"),
         Reply(6, b"e", ok=False, encoding="application/json"),
         Decline(7),
+        StopJob(1),
         Send(topics.HEARTBEAT, BEAT, {"coordinator": "c1"}),
         work,
     )
@@ -205,7 +222,7 @@ def test_effects_reach_the_transport(bench: Bench) -> None:
         call.decline(7),
         call.publish(BEAT_KEY, encode(BEAT), topics.Quality.LATEST),
     ]
-    assert bench.jobs == [work]
+    assert bench.jobs == [StopJob(1), work]
 
 
 def test_a_report_gets_the_counters_of_the_node(bench: Bench) -> None:

@@ -19,13 +19,14 @@ import psutil
 import pytest
 
 from laneweave.protocol.runtime import worker_pool
-from laneweave.protocol.runtime.node import Computed, Delegate
+from laneweave.protocol.runtime.node import STOPPED, Clock, Computed, Delegate
 from laneweave.protocol.runtime.worker_pool import WorkerPool
 from support import worker_jobs as jobs
 from support.waiting import wait_until
 
 pytestmark = pytest.mark.slow
 
+Work = Callable[[float, Clock], Any]
 WAIT_S = 60.0
 """Nothing here takes a tenth of this; it only guards against hanging."""
 
@@ -39,14 +40,14 @@ class Bench:
         self.done: queue.SimpleQueue[Computed] = queue.SimpleQueue()
         self._jobs = 0
 
-    def order(self, work: Callable[[float], Any], within_s: float = WAIT_S) -> int:
+    def order(self, work: Work, within_s: float = WAIT_S) -> int:
         """Order a job; returns its number."""
         self._jobs += 1
         job = Delegate(self._jobs, work, time.monotonic() + within_s)
         self.pool.submit(job, self.done.put)
         return self._jobs
 
-    def do(self, work: Callable[[float], Any], within_s: float = WAIT_S) -> Computed:
+    def do(self, work: Work, within_s: float = WAIT_S) -> Computed:
         """Have a job done."""
         job = self.order(work, within_s)
         computed = self.done.get(timeout=WAIT_S)
@@ -92,6 +93,10 @@ def test_a_job_is_done_by_another_process(one: Bench) -> None:
     assert one.process_id() == process_id
 
 
+def test_workers_are_nicer_than_the_process_that_has_the_pool(one: Bench) -> None:
+    assert one.do(jobs.niceness).result == os.nice(0) + worker_pool.NICENESS
+
+
 def test_a_job_knows_how_much_time_is_left(one: Bench) -> None:
     assert 50.0 < one.do(jobs.left, within_s=60.0).result <= 60.0
 
@@ -128,12 +133,10 @@ def test_a_deadline_that_passes_while_the_job_waits_counts(one: Bench, tmp_path:
 
 @pytest.mark.parametrize(
     "work",
-    [lambda _: None, jobs.Shy(), jobs.lock, jobs.shy],
+    [lambda *_: None, jobs.Shy(), jobs.lock, jobs.shy],
     ids=["job", "job there", "result", "result here"],
 )
-def test_what_cannot_be_pickled_is_an_error_of_its_job_only(
-    one: Bench, work: Callable[[float], Any]
-) -> None:
+def test_what_cannot_be_pickled_is_an_error_of_its_job_only(one: Bench, work: Work) -> None:
     before = one.process_id()
     computed = one.do(work)
     assert computed.result is None
@@ -196,6 +199,50 @@ def test_a_worker_that_goes_on_too_long_is_killed(
     assert one.process_id() != before
 
 
+# --- jobs that are stopped --------------------------------------------------------------------
+
+
+def test_a_stopped_job_ends_at_once_and_its_worker_continues(one: Bench, tmp_path: Path) -> None:
+    before = one.process_id()
+    job = one.order(partial(jobs.read_clock, tmp_path / "begun"))
+    wait_until(lambda: jobs.noted(tmp_path / "begun") == [before], WAIT_S)
+    stopped_s = time.monotonic()
+    one.pool.stop(job)
+    assert one.done.get(timeout=WAIT_S) == Computed(job, None, STOPPED)
+    assert time.monotonic() < stopped_s + worker_pool.STOP_S
+    assert one.process_id() == before
+
+
+def test_a_stopped_job_that_waits_is_not_begun(one: Bench, tmp_path: Path) -> None:
+    running = one.order(partial(jobs.sleep, 0.2))
+    waiting = one.order(partial(jobs.note, tmp_path / "begun"))
+    one.pool.stop(waiting)
+    assert one.done.get(timeout=WAIT_S) == Computed(running, 0.2)
+    assert one.done.get(timeout=WAIT_S) == Computed(waiting, None, STOPPED)
+    assert not jobs.noted(tmp_path / "begun")
+
+
+def test_a_worker_whose_job_does_not_stop_is_killed(
+    one: Bench, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    before = one.process_id()
+    monkeypatch.setattr(worker_pool, "STOP_S", 0.05)
+    job = one.order(partial(jobs.hang_at_first, tmp_path / "begun"))
+    wait_until(lambda: jobs.noted(tmp_path / "begun") == [before], WAIT_S)
+    one.pool.stop(job)
+    assert one.done.get(timeout=WAIT_S) == Computed(job, None, STOPPED)
+    assert one.process_id() != before
+    assert jobs.noted(tmp_path / "begun") == [before]
+
+
+def test_stopping_a_complete_job_has_no_effect(one: Bench) -> None:
+    job = one.order(jobs.process_id)
+    before = one.done.get(timeout=WAIT_S).result
+    one.pool.stop(job)
+    one.pool.stop(job + 1)
+    assert one.process_id() == before
+
+
 def test_workers_ignore_ctrl_c(one: Bench) -> None:
     before = one.process_id()
     os.kill(before, signal.SIGINT)
@@ -247,7 +294,7 @@ from support import worker_jobs as jobs
 
 if __name__ == "__main__":
     folder, fork = Path(sys.argv[1]), sys.argv[2] == "True"
-    pool = WorkerPool(2, partial(jobs.note, folder / "warm", 0.0))
+    pool = WorkerPool(2, partial(jobs.note, folder / "warm"))
     if fork:
         pool.fork()
     met = []

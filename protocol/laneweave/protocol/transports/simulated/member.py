@@ -10,6 +10,7 @@ from laneweave.protocol.runtime.node import (
     Computed,
     Delegate,
     Node,
+    StopJob,
     Stopping,
     Wakeup,
     run_delegated,
@@ -171,8 +172,13 @@ class Member:
 
     # --- computations -----------------------------------------------------------------------
 
-    def compute(self, job: Compute | Delegate) -> None:
-        """Run a computation and deliver its result after its virtual duration."""
+    def compute(self, job: Compute | Delegate | StopJob) -> None:
+        """Run a computation and deliver its result after its virtual duration.
+
+        A computation that should stop has been run already; its result is delivered.
+        """
+        if isinstance(job, StopJob):
+            return
         simulation = self._simulation
         conditions, draw = simulation.conditions, simulation.random.random
         duration_s = conditions.compute_s

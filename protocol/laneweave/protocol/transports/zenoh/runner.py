@@ -21,6 +21,7 @@ from laneweave.protocol.runtime.node import (
     Delegate,
     Node,
     Started,
+    StopJob,
     Stopping,
     Wakeup,
     run_job,
@@ -62,13 +63,15 @@ def run_core(
     inbox = Inbox()
     worker = _Worker(inbox.put)
 
-    def submit(job: Compute | Delegate) -> None:
+    def submit(job: Compute | Delegate | StopJob) -> None:
         if isinstance(job, Compute):
             worker.submit(job)
-        elif pool is not None:
+        elif pool is None:
+            inbox.put(Computed(job.job, None, "this process has no workers"))
+        elif isinstance(job, Delegate):
             pool.submit(job, inbox.put)
         else:
-            inbox.put(Computed(job.job, None, "this process has no workers"))
+            pool.stop(job.job)
 
     with stop_signals(lambda: inbox.put(Stopping())):
         # Until the process is connected, the inbox can contain only `Stopping`.

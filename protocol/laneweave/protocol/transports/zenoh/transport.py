@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, InvalidStateError
+from functools import partial
 from typing import Any
 
 import structlog
@@ -23,6 +24,7 @@ import zenoh
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import check_endpoint
 from laneweave.protocol.runtime.metrics import Observe, RouterMetrics, unobserved
+from laneweave.protocol.runtime.open_queries import OpenQueries
 from laneweave.protocol.runtime.processes import stop_signals
 from laneweave.protocol.runtime.transport import (
     Answer,
@@ -33,6 +35,7 @@ from laneweave.protocol.runtime.transport import (
     Received,
     TokenDown,
     TokenUp,
+    sender_name,
     update_tokens,
 )
 from laneweave.protocol.security.certificates import check_credentials
@@ -53,8 +56,8 @@ _QUALITY: dict[Quality, dict[str, Any]] = {
     )
 }
 
-MAX_OPEN_QUERIES = 4096
-"""Maximum number of open queries; further ones are declined."""
+MAX_SENDER_BYTES = 1024
+"""Maximum size of an attachment that can be a key."""
 TOO_LONG = bytes(MAX_BYTES + 1)
 """Substitute for a payload that is too long to read."""
 ROUTER_RUNTIME = "(rx: (worker_threads: 64))"
@@ -131,9 +134,7 @@ class ZenohTransport:
         """Keys of the tokens that the node has been notified of."""
         self._seen_lock = threading.Lock()
         self._served: dict[str, Any] = {}
-        self._queries: dict[int, zenoh.Query] = {}
-        self._query_lock = threading.Lock()
-        self._query_count = 0
+        self._queries: OpenQueries[zenoh.Query] = OpenQueries()
         self._closed = False
         self._link_listener = self._session.info.declare_transport_events_listener(
             self._on_link, history=False
@@ -178,11 +179,11 @@ class ZenohTransport:
     def serve(self, key: str) -> None:
         """Deliver queries on a key."""
         if key not in self._served and not self._closed:
-            self._served[key] = self._session.declare_queryable(key, self._on_query)
+            self._served[key] = self._session.declare_queryable(key, partial(self._on_query, key))
 
     def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
         """Answer a query; unknown tokens are ignored."""
-        query = self._pop_query(token)
+        query = self._queries.pop(token)
         if query is None:
             return
         with contextlib.suppress(zenoh.ZError):
@@ -194,18 +195,22 @@ class ZenohTransport:
 
     def decline(self, token: int) -> None:
         """Leave a query to the other servers of its key."""
-        query = self._pop_query(token)
+        query = self._queries.pop(token)
         if query is not None:
             query.drop()  # type: ignore[no-untyped-call]
 
-    def _pop_query(self, token: int) -> zenoh.Query | None:
-        with self._query_lock:
-            return self._queries.pop(token, None)
-
     def query(
-        self, key: str, payload: bytes, timeout_s: float, encoding: str = ""
+        self, key: str, payload: bytes, timeout_s: float, encoding: str = "", sender: str = ""
     ) -> Future[Answer | None]:
         """Query the servers of a key.
+
+        Args:
+            key: key of the query.
+            payload: content of the query.
+            timeout_s: time after which the query ends without an answer.
+            encoding: MIME type of the payload.
+            sender: key of a liveliness token of this process, which tells servers that watch the
+                token who asks, and when this process is gone; empty: none.
 
         Returns:
             A future for the first answer. Its result is None if the key has no server, or if all
@@ -224,6 +229,7 @@ class ZenohTransport:
                 zenoh.handlers.Callback(take, lambda: _settle(first, None)),
                 payload=payload,
                 encoding=encoding or None,
+                attachment=sender or None,
                 timeout=timeout_s,
                 consolidation=zenoh.ConsolidationMode.NONE,
             )
@@ -254,19 +260,26 @@ class ZenohTransport:
     def _on_link(self, event: zenoh.TransportEvent) -> None:
         self._deliver(LinkUp() if event.kind == zenoh.SampleKind.PUT else LinkDown())
 
-    def _on_query(self, query: zenoh.Query) -> None:
-        with self._query_lock:
-            if len(self._queries) >= MAX_OPEN_QUERIES:
-                query.drop()  # type: ignore[no-untyped-call]
-                return
-            self._query_count += 1
-            token = self._query_count
-            self._queries[token] = query
+    def _on_query(self, key: str, query: zenoh.Query) -> None:
+        sender = self._sender_of(query)
+        token = self._queries.add(sender_name(sender), query)
+        if token is None:
+            query.drop()  # type: ignore[no-untyped-call]
+            return
         payload = b""
         if query.payload is not None:
             payload = query.payload.to_bytes() if len(query.payload) <= MAX_BYTES else TOO_LONG
         encoding = "" if query.encoding is None else str(query.encoding)
-        self._deliver(Query(str(query.key_expr), payload, token, encoding))
+        self._deliver(Query(key, payload, token, encoding, sender))
+
+    def _sender_of(self, query: zenoh.Query) -> str:
+        """Return the token key in a query's attachment; empty unless its token is visible."""
+        attachment = query.attachment
+        if attachment is None or len(attachment) > MAX_SENDER_BYTES:
+            return ""
+        key = attachment.to_bytes().decode(errors="replace")
+        with self._seen_lock:
+            return key if key in self._seen else ""
 
 
 def connect(

@@ -263,7 +263,7 @@ def test_computations_take_their_own_time_each_and_end_in_order() -> None:
 def test_delegated_computations_hold_up_no_others() -> None:
     conditions = Conditions(compute_s=0.0, compute_jitter_s=1.0)
     jobs = [
-        Delegate(number, lambda _: 7, 1000.0) if number % 2 else Compute(number, lambda: 7)
+        Delegate(number, lambda *_: 7, 1000.0) if number % 2 else Compute(number, lambda: 7)
         for number in range(40)
     ]
     numbers = [event.job for event in computing(conditions, *jobs).of(Computed)]  # type: ignore[union-attr]
