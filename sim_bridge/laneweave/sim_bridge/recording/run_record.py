@@ -1,9 +1,13 @@
 """The record of a run: its files, and the results of all roles in `summary.json`.
 
-    trajectories.parquet   one row per vehicle per tick, written in row groups during the run
-    trips.parquet          one row per demanded vehicle, written at the end
-    ticks.parquet          one row per tick, written at the end
+    trajectories.parquet   one row per vehicle per tick
+    trips.parquet          one row per demanded vehicle
+    ticks.parquet          one row per tick
     events.jsonl           one JSON object per line, flushed line by line
+
+The Parquet files are written in row groups during the run, and can be read after each of them. So
+the record stores only what is on the road or not written yet, however long the run is. The summary
+is computed from the files when the run ends.
 
 The metadata of the first two files contain the scenario as JSON (key `SCENARIO_KEY`), so that
 figures can be drawn from these files alone.
@@ -11,28 +15,21 @@ figures can be drawn from these files alone.
 
 from __future__ import annotations
 
-import json
-import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from enum import Enum
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from attrs import define, field
-from numpy.typing import NDArray
 
-from laneweave.protocol.scenario.fields import SOLVERS, Scenario, solver_of_event
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import (
     SCHEMA,
-    DurationMs,
     LeaderChanges,
     Messages,
-    Planning,
-    PlanningMs,
     RunSummary,
     RuntimeFigures,
     Tracking,
@@ -49,21 +46,16 @@ from laneweave.protocol.wire.events import (
     LEFT,
     LEFT_OFF_LANE,
     OVERLAP,
-    PLAN_EVENTS,
     RUN_ENDED,
 )
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
+from laneweave.sim_bridge.recording.events import Events
+from laneweave.sim_bridge.recording.reports import ReportTotals
+from laneweave.sim_bridge.recording.ticks import Ticks
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
-from laneweave.sim_bridge.recording.trips import (
-    Trip,
-    metadata_of,
-    percentiles_of,
-    throughput,
-    travel_time,
-    trips_table,
-)
+from laneweave.sim_bridge.recording.trips import Trips, metadata_of, throughput, travel_time
 from laneweave.sim_bridge.road.demand import Arrival
 
 
@@ -133,18 +125,15 @@ class RunRecord:
         self._method = method
         self._stopwatch = stopwatch
         self._began = stopwatch()
-        self._metadata = metadata_of(scenario)
-        self._events = (folder / "events.jsonl").open("w", encoding="utf-8", buffering=1)
+        metadata = metadata_of(scenario)
+        self._events = Events(folder / "events.jsonl")
         self._trajectories = Trajectories(
-            folder / "trajectories.parquet", self._metadata, scenario.vehicle.min_accel_mps2
+            folder / "trajectories.parquet", metadata, scenario.vehicle.min_accel_mps2
         )
-        self._trips: dict[Name, Trip] = {}
+        self._trips = Trips(folder / "trips.parquet", metadata)
+        self._ticks = Ticks(folder / "ticks.parquet")
         self._leadership = _Leadership()
-        self._reports: dict[tuple[Name, Name], Report] = {}
-        self._plans: list[dict[str, Any]] = []
-        self._plans_by_solver = Counter(dict.fromkeys(SOLVERS, 0))
-        self._ticks: list[tuple[float, int, float]] = []
-        """(road time [s], vehicles on the road, duration [ms]) of each tick."""
+        self._reports = ReportTotals()
         self._rung_ticks: Counter[Rung] = Counter()
         self._caretaker_takeovers = 0
         self._agent_takeovers = 0
@@ -157,11 +146,11 @@ class RunRecord:
 
     def event(self, t_s: float, kind: str, /, **data: object) -> None:
         """Write an event from the bridge."""
-        self._write_event(t_s, kind, {"role": "bridge"} | data)
+        self._events.add(t_s, kind, {"role": "bridge"} | data)
 
     def on_demanded(self, arrival: Arrival) -> None:
         """Record the arrival of a vehicle."""
-        self._trips[Name(arrival.vehicle)] = Trip(arrival)
+        self._trips.add(arrival)
 
     def on_entered(self, vehicle: RecordedVehicle) -> None:
         """Record a vehicle that has entered the road."""
@@ -246,7 +235,7 @@ class RunRecord:
 
     def on_tick(self, t_s: float, on_road: int, duration_s: float) -> None:
         """Record the duration of a tick."""
-        self._ticks.append((t_s, on_road, duration_s * 1e3))
+        self._ticks.add(t_s, on_road, duration_s)
 
     # --- the other roles ----------------------------------------------------------------------
 
@@ -254,16 +243,11 @@ class RunRecord:
         """Record an event from another role."""
         # The message's role and name override those in its data.
         data = event.data | {"role": event.role, "name": event.name}
-        self._write_event(event.t_s, event.kind, data)
-        if event.kind in PLAN_EVENTS:
-            self._plans.append(event.data)
-            solver = solver_of_event(event.kind, event.data)
-            if solver is not None:
-                self._plans_by_solver[solver] += 1
+        self._events.add(event.t_s, event.kind, data)
 
     def on_report(self, report: Report) -> None:
         """Record the counters of a role, replacing its earlier ones."""
-        self._reports[report.role, report.name] = report
+        self._reports.add(report)
 
     def on_heartbeat(self, heartbeat: Heartbeat, t_s: float, now_s: float) -> None:
         """Record leader changes and leaderless periods; `now_s` is the node's clock."""
@@ -287,42 +271,15 @@ class RunRecord:
             return
         self.event(t_s, RUN_ENDED, ending=ending.value)
         self._closed = True
-        trips = trips_table(self._trips.values(), self._metadata)
-        try:
-            self._trajectories.close()
-        finally:
-            self._events.close()
-            pq.write_table(trips, self._folder / "trips.parquet", compression="zstd")
-        self._write_ticks()
-        write_summary(self._folder, self._summary(trips, t_s, ending))
-
-    def _write_event(self, t_s: float, kind: str, data: Mapping[str, object]) -> None:
-        """Write a line to `events.jsonl` immediately unless the record is closed.
-
-        Values that JSON does not support are written as text; keys `t_s` and `kind` in the data are
-        ignored.
-        """
-        if not self._closed:
-            own: dict[str, object] = {"t_s": t_s, "kind": kind}
-            self._events.write(json.dumps({**own, **data, **own}, default=str) + "\n")
-
-    def _write_ticks(self) -> None:
-        """Write `ticks.parquet`: the duration of each tick, and the vehicle count on the road."""
-        types = {"t_s": pa.float64(), "on_road": pa.int32(), "tick_ms": pa.float32()}
-        columns = zip(*self._ticks, strict=True) if self._ticks else ((), (), ())
-        table = pa.table(
-            {
-                name: pa.array(values, kind)
-                for (name, kind), values in zip(types.items(), columns, strict=True)
-            }
-        )
-        pq.write_table(table, self._folder / "ticks.parquet", compression="zstd")
+        with ExitStack() as closing:
+            for file in (self._events, self._trajectories, self._trips, self._ticks):
+                closing.callback(file.close)
+        write_summary(self._folder, self._summary(self._trips.table(), t_s, ending))
 
     def _summary(self, trips: pa.Table, t_s: float, ending: Ending) -> RunSummary:
         scenario, wall_s = self._scenario, self._stopwatch() - self._began
         left = trips.num_rows - trips["left_s"].null_count
         on_preferred_lane = trips["on_preferred_lane"].to_pylist().count(True)
-        reports = self._reports.values()
         return RunSummary(
             schema=SCHEMA,
             method=self._method,
@@ -344,21 +301,19 @@ class RunRecord:
             throughput_veh_per_lane_h=throughput(trips, scenario.road.lanes),
             safety=self._trajectories.safety(),
             ending=ending.value,
-            planning=self._planning(),
+            planning=self._events.planning(),
             tracking=self._tracking(),
             runtime=RuntimeFigures(
                 real_time_factor=round(t_s / wall_s, 3) if wall_s > 0 else 0.0,
                 wall_s=round(wall_s, 3),
                 processes=None,
                 vehicles_per_process=scenario.runtime.vehicles_per_process,
-                tick_ms=DurationMs(
-                    **percentiles_of(np.array([tick[2] for tick in self._ticks]), 50, 99)
-                ),
+                tick_ms=self._ticks.durations(),
             ),
             messages=Messages(
-                published=_per_process(reports, "published"),
+                published=self._reports.total("published"),
                 dropped_by_faults=0,
-                rejected=_per_process(reports, "rejected"),
+                rejected=self._reports.total("rejected"),
             ),
             failover=LeaderChanges(
                 leader_changes=self._leadership.changes,
@@ -366,35 +321,20 @@ class RunRecord:
             ),
         )
 
-    def _planning(self) -> Planning:
-        plans = self._plans
-        solve_ms = np.array([_number(plan.get("solve_ms")) for plan in plans])
-        sizes = (int(_number(plan.get("vehicles"))) for plan in plans)
-        return Planning(
-            plans=len(plans),
-            optimal=sum(plan.get("status") == "optimal" for plan in plans),
-            largest_formation=max(sizes, default=0),
-            by_solver=dict(self._plans_by_solver),
-            fallbacks=sum(plan.get("fallback") is True for plan in plans),
-            solve_ms=PlanningMs(**percentiles_of(solve_ms, 50, 95, largest=True)),
-        )
-
     def _tracking(self) -> Tracking:
-        reports, ticks = self._reports.values(), self._rung_ticks
-        solves = sum(report.solves for report in reports)
-        osqp_solves = sum(report.osqp_solves for report in reports)
-        solve_ms = _milliseconds(report.solve_ms for report in reports)
+        reports, ticks = self._reports, self._rung_ticks
+        solves, osqp_solves = reports.total("solves"), reports.total("osqp_solves")
         return Tracking(
             solves=solves,
             osqp_solves=osqp_solves,
             unconstrained_steps=solves - osqp_solves,
-            unusable=sum(report.unusable for report in reports),
+            unusable=reports.total("unusable"),
             hold_law_ticks=ticks[Rung.HOLD] + ticks[Rung.GIVE_WAY],
             emergency_ticks=ticks[Rung.EMERGENCY],
             missed_ticks=self.missed_ticks,
             caretaker_takeovers=self._caretaker_takeovers,
             agent_takeovers=self._agent_takeovers,
-            solve_ms=DurationMs(**percentiles_of(solve_ms, 50, 99)),
+            solve_ms=reports.solve_ms(),
         )
 
 
@@ -402,22 +342,3 @@ def _sample(vehicle: RecordedVehicle) -> Sample:
     s_m, v_mps, a_mps2, y_m, _, _ = vehicle.state
     column, lane = vehicle.cell
     return (vehicle.name, s_m, y_m, v_mps, a_mps2, column, lane)
-
-
-def _per_process(reports: Iterable[Report], counter: str) -> int:
-    """Return the sum of a counter over processes, each of which may report for several vehicles."""
-    newest: dict[Name, int] = {}
-    for report in reports:
-        newest[report.process] = max(newest.get(report.process, 0), getattr(report, counter))
-    return sum(newest.values())
-
-
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else 0.0
-
-
-def _milliseconds(packed: Iterable[bytes]) -> NDArray[np.float64]:
-    """Return the valid durations in reports from other processes."""
-    whole = b"".join(each for each in packed if len(each) % 4 == 0)
-    values = np.frombuffer(whole, dtype="<f4").astype(np.float64)
-    return values[np.isfinite(values) & (values >= 0.0)]

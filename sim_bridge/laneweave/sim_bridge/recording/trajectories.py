@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from laneweave.protocol.summary import Safety
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
+from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 from laneweave.sim_bridge.recording.trips import Metadata, finite
 
 ROWS_PER_GROUP = 100_000
 """Number of rows that are written together."""
+TICKS_PER_GROUP = 3000
+"""Maximum number of ticks whose rows are written together."""
 EMERGENCY_SHARE = 0.9
 """Fraction of the braking limit beyond which braking counts as emergency braking."""
 
@@ -44,17 +46,16 @@ class Trajectories:
         """Open the file; `min_accel_mps2` is the braking limit."""
         self.peak = 0
         """Maximum number of vehicles on the road at a tick."""
-        self._schema = pa.schema(_COLUMNS, metadata)
-        self._writer = pq.ParquetWriter(
+        self._file = GrowingParquet(
             path,
-            self._schema,
-            compression="zstd",
-            use_dictionary=["t_s", "vehicle", "column", "lane"],  # type: ignore[arg-type]
+            pa.schema(_COLUMNS, metadata),
+            use_dictionary=["t_s", "vehicle", "column", "lane"],
             use_byte_stream_split=["s_m", "y_m", "speed_mps", "accel_mps2"],
         )
         self._times: list[float] = []
         self._rows: list[Sample] = []
         """Buffered rows; `_times` contains their times."""
+        self._buffered_ticks = 0
         self._brake_mps2 = EMERGENCY_SHARE * min_accel_mps2
         self._last_s, self._last_accels = -math.inf, dict[str, float]()
         """Time of the last tick, and accelerations of all vehicles at that tick."""
@@ -81,7 +82,8 @@ class Trajectories:
         self._times += [t_s] * len(rows)
         self._rows += rows
         self.peak = max(self.peak, len(rows))
-        if len(self._rows) >= ROWS_PER_GROUP:
+        self._buffered_ticks += 1
+        if len(self._rows) >= ROWS_PER_GROUP or self._buffered_ticks >= TICKS_PER_GROUP:
             self._write_rows()
 
     def distances(
@@ -114,10 +116,11 @@ class Trajectories:
         try:
             self._write_rows()
         finally:
-            self._writer.close()
+            self._file.close()
 
     def _write_rows(self) -> None:
         """Write the buffered rows as one row group."""
+        self._buffered_ticks = 0
         if not self._rows:
             return
         columns = [self._times, *zip(*self._rows, strict=True)]
@@ -125,4 +128,4 @@ class Trajectories:
         arrays = [
             pa.array(column, field.type) for column, field in zip(columns, _COLUMNS, strict=True)
         ]
-        self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
+        self._file.append(pa.RecordBatch.from_arrays(arrays, schema=self._file.schema))

@@ -5,22 +5,29 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable
+from itertools import islice, takewhile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 from attrs import define
 from numpy.typing import NDArray
 
 from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import TravelTime
+from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 from laneweave.sim_bridge.road.demand import Arrival
 
 Metadata = dict[bytes | str, bytes | str]
 SCENARIO_KEY = b"laneweave.scenario"
 """Key of the scenario in the metadata of a run's Parquet files."""
+ROWS_PER_GROUP = 500
+"""Number of rows that are written together."""
 WARM_UP_S = 60.0
 """Road time from which entering vehicles are counted; until then the road fills up."""
 
@@ -50,6 +57,11 @@ class Trip:
     formation: int | None = None
     final_lane: int | None = None
 
+    def is_final(self, last_arrival_s: float) -> bool:
+        """Return whether later arrivals do not change the row of the trip."""
+        left, entered_s = self.left_s is not None, self.entered_s
+        return left and (entered_s is None or entered_s <= last_arrival_s)
+
     def row(self, last_arrival_s: float) -> dict[str, Any]:
         """Return the row of the trip; travel time includes waiting at the entrance."""
         demanded_s, entered_s, left_s = self.arrival.t_s, self.entered_s, self.left_s
@@ -76,12 +88,54 @@ def metadata_of(scenario: Scenario) -> Metadata:
     return {SCENARIO_KEY: json.dumps(to_tables(scenario)).encode()}
 
 
-def trips_table(trips: Iterable[Trip], metadata: Metadata) -> pa.Table:
-    """Return the table of all trips."""
-    listed = list(trips)
-    last_s = max((trip.arrival.t_s for trip in listed), default=-math.inf)
-    rows = [trip.row(last_s) for trip in listed]
+def trips_table(trips: Iterable[Trip], last_arrival_s: float, metadata: Metadata) -> pa.Table:
+    """Return the table of trips; `last_arrival_s` is the road time of the last arrival."""
+    rows = [trip.row(last_arrival_s) for trip in trips]
     return pa.Table.from_pylist(rows, schema=pa.schema(_COLUMNS, metadata))
+
+
+class Trips:
+    """Writer of trips, in order of arrival; stores only those that it has not written yet."""
+
+    def __init__(self, path: Path, metadata: Metadata) -> None:
+        """Open the file."""
+        self._path = path
+        self._metadata = metadata
+        self._file = GrowingParquet(path, pa.schema(_COLUMNS, metadata))
+        self._trips: dict[Name, Trip] = {}
+        """Trips that are not written yet, in order of arrival."""
+        self._last_arrival_s = -math.inf
+
+    def __getitem__(self, vehicle: Name) -> Trip:
+        """Return the trip of a vehicle that is waiting or on the road."""
+        return self._trips[vehicle]
+
+    def add(self, arrival: Arrival) -> None:
+        """Add the trip of a vehicle that arrives; write a row group if enough trips are final."""
+        self._trips[Name(arrival.vehicle)] = Trip(arrival)
+        self._last_arrival_s = max(self._last_arrival_s, arrival.t_s)
+        first = islice(self._trips.values(), ROWS_PER_GROUP)
+        final = list(takewhile(lambda trip: trip.is_final(self._last_arrival_s), first))
+        if len(final) == ROWS_PER_GROUP:
+            self._write(final)
+
+    def close(self) -> None:
+        """Write the remaining trips, and close the file."""
+        try:
+            self._write(list(self._trips.values()))
+        finally:
+            self._file.close()
+
+    def table(self) -> pa.Table:
+        """Return all trips, read from the file."""
+        return pq.read_table(self._path)
+
+    def _write(self, trips: list[Trip]) -> None:
+        """Write trips as one row group, and discard them."""
+        rows = [trip.row(self._last_arrival_s) for trip in trips]
+        self._file.append(pa.RecordBatch.from_pylist(rows, self._file.schema))
+        for trip in trips:
+            del self._trips[Name(trip.arrival.vehicle)]
 
 
 def travel_time(trips: pa.Table) -> TravelTime:

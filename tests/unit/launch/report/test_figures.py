@@ -37,7 +37,8 @@ def record(folder: Path, scenario: Scenario, trips: Sequence[Trip]) -> None:
     """Write the files of a run whose vehicles drive at 15 m/s on the lanes of their arrival."""
     metadata = metadata_of(scenario)
     folder.mkdir(exist_ok=True)
-    pq.write_table(trips_table(trips, metadata), folder / "trips.parquet")
+    last_arrival_s = max((trip.arrival.t_s for trip in trips), default=0.0)
+    pq.write_table(trips_table(trips, last_arrival_s, metadata), folder / "trips.parquet")
     with closing(Trajectories(folder / "trajectories.parquet", metadata, -9.0)) as trajectories:
         for tick in range(1300):
             samples: list[Sample] = []

@@ -14,11 +14,14 @@ from attrs import astuple
 
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import Safety, TravelTime
+from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording import trajectories as trajectories_module
+from laneweave.sim_bridge.recording import trips as trips_module
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import (
     Trip,
+    Trips,
     metadata_of,
     throughput,
     travel_time,
@@ -43,7 +46,8 @@ def trip(
 
 
 def table(*trips: Trip) -> pa.Table:
-    return trips_table(trips, METADATA)
+    last_arrival_s = max((each.arrival.t_s for each in trips), default=0.0)
+    return trips_table(trips, last_arrival_s, METADATA)
 
 
 @pytest.fixture
@@ -122,6 +126,49 @@ def test_only_vehicles_between_warm_up_and_last_arrival_count() -> None:
 def test_a_run_without_counted_vehicles_has_no_figures(trips: tuple[Trip, ...]) -> None:
     assert travel_time(table(*trips)) == TravelTime(mean=None, p50=None, p95=None, max=None)
     assert throughput(table(*trips), 3) is None
+
+
+def test_trips_are_written_in_order_of_arrival_as_soon_as_they_are_final(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trips_module, "ROWS_PER_GROUP", 3)
+    path = tmp_path / "trips.parquet"
+    expected = [trip(n, 60.0 + n, 60.5 + n, 130.0 + n if n != 14 else None) for n in range(20)]
+    with closing(Trips(path, METADATA)) as trips:
+        for number, done in enumerate(expected):
+            trips.add(done.arrival)
+            mine = trips[Name(done.arrival.vehicle)]
+            mine.entered_s, mine.formation = done.entered_s, done.formation
+            if number >= 2:
+                gone = expected[number - 2]
+                old = trips[Name(gone.arrival.vehicle)]
+                old.left_s, old.final_lane = gone.left_s, gone.final_lane
+        # The vehicle that is still on the road delays the trips of those behind it.
+        assert pq.read_table(path).num_rows == 12
+        assert len(trips._trips) == 8
+    rows = table(*expected).to_pylist()
+    for row in rows[-2:]:
+        row.update(dict.fromkeys(("left_s", "final_lane", "on_preferred_lane", "travel_time_s")))
+        row["counted"] = False
+    assert trips.table().to_pylist() == rows
+    assert rows[12]["counted"]
+
+
+def test_a_trip_is_final_when_a_vehicle_has_arrived_after_its_entry() -> None:
+    done = trip(1, 60.0, 65.0, 130.0)
+    assert not done.is_final(64.9)
+    assert done.is_final(65.0)
+    assert not trip(1, 60.0, 65.0).is_final(200.0)
+
+
+def test_few_rows_are_written_after_some_time(
+    trajectories: Trajectories, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trajectories_module, "TICKS_PER_GROUP", 4)
+    with closing(trajectories):
+        for tick in range(6):
+            trajectories.tick(0.1 * tick, [("a", 0.0, 1.0, 15.0, 0.0, None, 0)])
+        assert pq.read_table(tmp_path / "trajectories.parquet").num_rows == 4
 
 
 def test_safety_is_the_worst_of_the_run(trajectories: Trajectories) -> None:

@@ -1,0 +1,60 @@
+"""Ticks: one row per tick in `ticks.parquet`, with its duration and the number of vehicles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from laneweave.protocol.summary import DurationMs
+from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
+from laneweave.sim_bridge.recording.trips import percentiles_of
+
+ROWS_PER_GROUP = 3000
+"""Number of rows that are written together."""
+_COLUMNS: list[pa.Field[Any]] = [
+    pa.field("t_s", pa.float64()),
+    pa.field("on_road", pa.int32()),
+    pa.field("tick_ms", pa.float32()),
+]
+
+
+class Ticks:
+    """Writer of the durations of ticks."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file."""
+        self._path = path
+        self._file = GrowingParquet(path, pa.schema(_COLUMNS))
+        self._rows: list[tuple[float, int, float]] = []
+        """Buffered rows."""
+
+    def add(self, t_s: float, on_road: int, duration_s: float) -> None:
+        """Record a tick: road time, vehicles on the road, and duration."""
+        self._rows.append((t_s, on_road, duration_s * 1e3))
+        if len(self._rows) >= ROWS_PER_GROUP:
+            self._write_rows()
+
+    def close(self) -> None:
+        """Write the buffered rows, and close the file."""
+        try:
+            self._write_rows()
+        finally:
+            self._file.close()
+
+    def durations(self) -> DurationMs:
+        """Return statistics of all ticks, read from the file."""
+        tick_ms = pq.read_table(self._path, columns=["tick_ms"])["tick_ms"].to_numpy()
+        return DurationMs(**percentiles_of(tick_ms.astype(np.float64), 50, 99))
+
+    def _write_rows(self) -> None:
+        if not self._rows:
+            return
+        columns, self._rows = zip(*self._rows, strict=True), []
+        arrays = [
+            pa.array(column, field.type) for column, field in zip(columns, _COLUMNS, strict=True)
+        ]
+        self._file.append(pa.RecordBatch.from_arrays(arrays, schema=self._file.schema))
