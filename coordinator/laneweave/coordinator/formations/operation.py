@@ -107,6 +107,7 @@ class FormationsOperation:
             self._groups.join(numbers)
             yield LogEntry(FORMATIONS_JOINED, {"formations": list(numbers), "why": "room"})
             formations = closed_formations(census, t_s, self._scenario, self._groups)
+        self._groups.forget_departed(census, self._scenario.lattice.block_of)
         for number in set(self.leaders) - set(formations):
             del self.leaders[number]
         for number, formation in formations.items():

@@ -14,7 +14,7 @@ formations stay joined until their vehicles have left. Every vehicle stores the 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from itertools import pairwise
 
 from attrs import define, field, frozen
@@ -59,7 +59,10 @@ class Formation:
 
 @define
 class Groups:
-    """Groups of blocks planned together, as known to one leader; groups only grow."""
+    """Groups of blocks planned together, as known to one leader.
+
+    Groups only grow, and are forgotten when all their vehicles have left the road.
+    """
 
     changed: bool = False
     """Set when blocks are joined; the reader resets it."""
@@ -77,6 +80,20 @@ class Groups:
         self._group |= dict.fromkeys(union, union)
         self.changed = True
         return True
+
+    def forget_departed(self, census: Census, block_of: Callable[[int], int]) -> None:
+        """Discard the groups whose vehicles have all left the road.
+
+        Args:
+            census: vehicles on the road, and the last block that no vehicle can enter any more.
+            block_of: returns the block of a column.
+        """
+        present = {block_of(entry.cell[0]) for entry in census.on_road}
+        self._group = {
+            number: numbers
+            for number, numbers in self._group.items()
+            if numbers[-1] > census.closed_to or not present.isdisjoint(numbers)
+        }
 
     def forget(self) -> None:
         """Discard all groups: a new road has other formations."""

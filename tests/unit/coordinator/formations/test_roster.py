@@ -161,3 +161,21 @@ def test_longer_slots_are_fewer(slot_s: float, left_s: float) -> None:
     steps = steps_left(cells, t_s, slot_s, GROWING)
     assert steps * slot_s <= max(left_s, 0.0) + 1e-3
     assert (steps + 1) * slot_s > left_s
+
+
+# --- departed vehicles ------------------------------------------------------------------------
+
+
+def test_groups_are_forgotten_when_all_their_vehicles_have_left() -> None:
+    groups = joined(0, 1)
+    groups.join((2, 3))
+    groups.join((4, 5))
+    groups.join((5, 6))
+    seen = Census(NOW_S, entries_of(d=(LATTICE.block_range(3)[0], 0)), (), closed_to=5)
+    groups.forget_departed(seen, LATTICE.block_of)
+    assert groups.of(0) == (0,)
+    assert groups.of(2) == (2, 3)  # a vehicle of block 3 is on the road
+    assert groups.of(4) == (4, 5, 6)  # vehicles may still enter block 6
+    groups.forget_departed(evolve(seen, closed_to=6), LATTICE.block_of)
+    assert groups.of(4) == (4,)
+    assert groups.of(2) == (2, 3)
