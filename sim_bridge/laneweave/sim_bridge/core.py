@@ -10,6 +10,7 @@ silent or always late gets a caretaker (`attendance`).
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
 from typing import ClassVar
@@ -68,6 +69,8 @@ CATCH_UP_S = 1.0
 """Maximum delay of the road that later, shorter ticks make up for [s, on the node's clock]."""
 SHUT_DOWN_S = 2.0
 """Maximum wait for final reports after a run has ended."""
+REPORT_TICKS = 600
+"""Number of ticks after a vehicle has left for which the final report of its agent is awaited."""
 
 
 @frozen
@@ -145,6 +148,8 @@ class BridgeCore:
         self._at_entrance: list[RoadVehicle] = []
         self._unreported: set[str] = {BRIDGE}
         """Processes whose final report is awaited."""
+        self._departures: deque[tuple[int, Name]] = deque()
+        """Tick and name of each vehicle that has left in the last `REPORT_TICKS`."""
         self._agent_wait_s = scenario.runtime.agent_start_s
         """Maximum wait for agents at the entrance."""
         self._ending = Ending.COMPLETE
@@ -396,8 +401,12 @@ class BridgeCore:
                 del self.vehicles[name]
                 self._world.remove(name)
                 self._roadside.count_left()
+                self._departures.append((self.tick, name))
                 self._record.on_left(vehicle, self.t_s, attended=name not in self._attendance)
                 yield from self._attendance.leave(vehicle)
+        while self._departures and self._departures[0][0] < self.tick - REPORT_TICKS:
+            # The agent was killed, or its report was lost.
+            self._unreported.discard(self._departures.popleft()[1])
 
     def _is_over(self) -> bool:
         if not self.vehicles and self._roadside.exhausted(self.t_s):

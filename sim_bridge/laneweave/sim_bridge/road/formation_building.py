@@ -37,30 +37,28 @@ class ColumnBlocks:
     """Maximum time between a vehicle and its cell at the start of the road."""
     first_open_column: float = math.inf
     """Foremost column that can still be entered; infinite: any."""
-    _taken: Counter[int] = field(factory=Counter)
-    _preferring: Counter[tuple[int, int]] = field(factory=Counter)
-    """Number of vehicles by (block, preferred lane)."""
+    _preferring: dict[int, Counter[int]] = field(factory=dict)
+    """Number of vehicles by preferred lane, for each block that is not closed."""
     _next: int = 0
     """Next block to be closed."""
 
     def try_add(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
         """Add a vehicle that would enter in a cell; return False if it needs a later cell."""
         del t_s
-        block = self.lattice.block_of(cell[0])
+        preferring = self._preferring.setdefault(self.lattice.block_of(cell[0]), Counter())
         if (
-            self._taken[block] >= self.max_vehicles
-            or self._preferring[block, preferred_lane] >= self.lattice.block_columns
+            preferring.total() >= self.max_vehicles
+            or preferring[preferred_lane] >= self.lattice.block_columns
         ):
             return False
-        self._taken[block] += 1
-        self._preferring[block, preferred_lane] += 1
+        preferring[preferred_lane] += 1
         return True
 
     def closed(self, t_s: float) -> list[ClosedFormation]:
         """Return the formations whose last columns have passed since the last call."""
         closed = []
         while (closed_s := self._closing_s(self._next)) <= t_s:
-            if self._taken[self._next]:
+            if self._preferring.pop(self._next, None):
                 closed.append(ClosedFormation(self._next, self._next, closed_s))
             self._next += 1
         return closed

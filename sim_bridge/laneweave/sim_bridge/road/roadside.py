@@ -65,7 +65,8 @@ class Roadside:
         self._recent: list[tuple[int, int, Name]] = []
         """(column, lane, name) of recently entered vehicles."""
         self._next: list[list[tuple[int, Name]]] = [[] for _ in range(self._lanes)]
-        """Vehicles that have entered since cells were last assigned, by lane, foremost first."""
+        """Vehicles that have entered since cells were last assigned, by lane, foremost first; empty
+        with formations."""
         self._unassigned: list[Cell] = []
         """Empty cells without an owner."""
         self._assigned_to = [1 + MAX_EMPTY] * self._lanes
@@ -95,9 +96,10 @@ class Roadside:
         for arrival in self._arrivals[first : self._queued]:
             self._meter.demand(arrival)
         admissions = self._meter.admit(t_s)
-        for admission in admissions:
-            column, lane = admission.cell
-            self._next[lane].append((column, Name(admission.arrival.vehicle)))
+        if self._rolling:
+            for admission in admissions:
+                column, lane = admission.cell
+                self._next[lane].append((column, Name(admission.arrival.vehicle)))
         self._entered += len(admissions)
         self._census_changed |= bool(admissions)
         return admissions

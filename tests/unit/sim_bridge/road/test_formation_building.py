@@ -316,6 +316,7 @@ def test_a_block_is_closed_when_its_last_column_has_passed() -> None:
     assert builder.closed(8.5) == []  # block 1 is empty
     assert builder.closed_to == 1
     assert builder.closed(13.0) == [ClosedFormation(2, 2, 12.5)]
+    assert not builder._preferring
 
 
 # --- which one a scenario has -----------------------------------------------------------------
