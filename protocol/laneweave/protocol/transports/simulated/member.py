@@ -53,6 +53,8 @@ class Member:
         self.watched: dict[str, None] = {}
         self.tokens: dict[str, None] = {}
         self.served: set[str] = set()
+        self.routed: dict[str, None] = {}
+        """Keys with routes that messages of this member led to."""
         self.closed = False
         self.clock: Clock | None = None
         """None: virtual time."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 import heapq
 import math
 from bisect import insort
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import lru_cache, partial
 from itertools import count
 
@@ -45,14 +45,14 @@ from laneweave.protocol.transports.simulated.member import Member, Tokens
 from laneweave.protocol.transports.simulated.virtual_time import Clock, Conditions, Simulation
 from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import Name
-from laneweave.protocol.wire.topics import Keys, Quality, Topic, matches, matches_any
+from laneweave.protocol.wire.topics import Keys, Quality, matches, matches_any
 
 KILL_SEEN_S = 0.005
 """Time until others detect a killed process (measured on Zenoh: 2 to 9 ms)."""
 REJOIN_S = (0.2, 0.9)
 """Range of the time that nodes take to reconnect to a restored router (measured on Zenoh)."""
 _CACHE_SIZE = 4096
-"""Size of the shared caches of decoded messages."""
+"""Size of the shared caches of decoded messages and of keys."""
 
 
 class Parcel(bytes):
@@ -71,8 +71,7 @@ class _Reader:
     """Decoder of a realm's messages, which are bytes or objects."""
 
     def __init__(self, keys: Keys, read_payload: Callable[[bytes, type], object]) -> None:
-        self._keys = keys
-        self._known: dict[str, tuple[Topic, Mapping[str, str]]] = {}
+        self._known = lru_cache(maxsize=_CACHE_SIZE)(partial(known_key, keys))
         # A plan has several receivers with different keys, but is decoded only once.
         read = partial(read_message, keys, decode=read_payload)
         self._read = lru_cache(maxsize=_CACHE_SIZE)(read)
@@ -80,10 +79,7 @@ class _Reader:
     def __call__(self, key: str, payload: bytes) -> Arrived:
         if not isinstance(payload, Parcel):
             return self._read(key, payload)
-        known = self._known.get(key)
-        if known is None:
-            known = self._known[key] = known_key(self._keys, key)
-        return Arrived(known[0], known[1], payload.message)
+        return Arrived(*self._known(key), payload.message)
 
 
 @frozen
@@ -160,8 +156,10 @@ class SimulatedNetwork(Simulation):
         self.tokens = Tokens(self, self._members)
         self._clocks: dict[str, Clock] = {}
         self._routes: dict[str, tuple[Member, ...]] = {}
-        """Receivers of each key, in the order in which they started."""
-        self._keys_by_prefix: dict[str, list[str]] = {}
+        """Receivers of each key that has any, in the order in which they started."""
+        self._first_sender: dict[str, Member] = {}
+        """Member whose message led to the route of each key."""
+        self._keys_by_prefix: dict[str, dict[str, None]] = {}
         """Keys with routes, grouped by the key without its last part."""
         self._extra_delay_s: Callable[[str, str, str], float] | None = None
         self._router_up = True
@@ -307,7 +305,7 @@ class SimulatedNetwork(Simulation):
 
     def inject(self, key: str, payload: bytes) -> None:
         """Deliver arbitrary bytes on a key."""
-        for receiver in self._route(key):
+        for receiver in self._receivers(key):
             self._send(receiver, Received(key, payload))
 
     # --- called by transports ---------------------------------------------------------------
@@ -323,7 +321,7 @@ class SimulatedNetwork(Simulation):
         duplication, loss = conditions.duplication, conditions.loss
         route = self._routes.get(key)
         message = Received(key, payload)
-        for receiver in self._route(key) if route is None else route:
+        for receiver in self._new_route(key, source) if route is None else route:
             extra_s = 0.0 if hindrance is None else hindrance(sender, receiver.name, key)
             if not receiver.connected or extra_s == math.inf or (loss and draw() < loss):
                 self.dropped += 1
@@ -378,7 +376,10 @@ class SimulatedNetwork(Simulation):
             receivers = [other for other in self._routes[key] if other is not member]
             if not member.closed and matches_any(member.subscriptions, key):
                 insort(receivers, member, key=lambda other: other.number)
-            self._routes[key] = tuple(receivers)
+            if receivers:
+                self._routes[key] = tuple(receivers)
+            else:
+                self._forget_route(key)
 
     def _known_keys(self, expression: str) -> list[str]:
         """Return the keys with routes that an expression matches."""
@@ -386,7 +387,7 @@ class SimulatedNetwork(Simulation):
         if not star:
             return [expression] if expression in self._routes else []
         if not rest and fixed.endswith("/"):
-            return self._keys_by_prefix.get(fixed, [])
+            return list(self._keys_by_prefix.get(fixed, ()))
         return [key for key in self._routes if matches(expression, key)]
 
     def remove(self, name: str) -> None:
@@ -408,6 +409,8 @@ class SimulatedNetwork(Simulation):
         member.closed = True
         for expression in member.subscriptions:
             self.update_routes(member, expression)
+        for key in list(member.routed):
+            self._forget_route(key)
         if member.visible:
             self.at(self.now_s + seen_after_s, self._hide, member)
         self.at(self.now_s + seen_after_s, self._abandon_queries, member)
@@ -455,19 +458,37 @@ class SimulatedNetwork(Simulation):
         if not (lost_again or member.paused or member.unplugged or member.closed):
             self._join(member)
 
-    def _route(self, key: str) -> tuple[Member, ...]:
-        route = self._routes.get(key)
-        if route is None:
-            route = self._routes[key] = tuple(
-                member
-                for member in self._members.values()
-                if matches_any(member.subscriptions, key)
-            )
-            self._keys_by_prefix.setdefault(key[: key.rfind("/") + 1], []).append(key)
+    def _receivers(self, key: str) -> tuple[Member, ...]:
+        """Return the members that subscribe to a key, in the order in which they started."""
+        return tuple(
+            member for member in self._members.values() if matches_any(member.subscriptions, key)
+        )
+
+    def _new_route(self, key: str, sender: Member) -> tuple[Member, ...]:
+        """Return the receivers of a key; store them until there are none, or the sender leaves."""
+        route = self._receivers(key)
+        if route:
+            self._routes[key], self._first_sender[key] = route, sender
+            self._keys_by_prefix.setdefault(_prefix_of(key), {})[key] = None
+            sender.routed[key] = None
         return route
+
+    def _forget_route(self, key: str) -> None:
+        if self._routes.pop(key, None) is not None:
+            del self._first_sender.pop(key).routed[key]
+            prefix = _prefix_of(key)
+            keys = self._keys_by_prefix[prefix]
+            del keys[key]
+            if not keys:
+                del self._keys_by_prefix[prefix]
 
     def _send(self, receiver: Member, delivery: Delivery) -> None:
         # Must draw exactly as `transmit` does.
         conditions = self.conditions
         arrival_s = self.now_s + conditions.delay_s + conditions.jitter_s * self.random.random()
         self.at(arrival_s, receiver.receive, receiver.connection, delivery)
+
+
+def _prefix_of(key: str) -> str:
+    """Return a key without its last part."""
+    return key[: key.rfind("/") + 1]
