@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections import deque
 
 from attrs import define, field
 
@@ -18,6 +19,8 @@ from laneweave.protocol.wire.messages import LogEvent
 IN_FORCE = "plan-in-force"
 IN_FLIGHT_S = 0.05
 """Maximum delay of messages sent by a leader before it was paused."""
+MAX_ROAD_TIMES = 10_000
+"""Number of road times that are stored; formations close less than this number of ticks ago."""
 
 
 @define
@@ -40,8 +43,9 @@ class Failover:
     _killed: bool = False
     _led_again: bool = False
     """Whether another process has led since the newest fault."""
-    _road_s: list[float] = field(factory=list)
-    _seen_s: list[float] = field(factory=list)
+    _road_s: deque[float] = field(factory=lambda: deque(maxlen=MAX_ROAD_TIMES))
+    """Observed road times, in ascending order."""
+    _seen_s: deque[float] = field(factory=lambda: deque(maxlen=MAX_ROAD_TIMES))
     """Time at which each road time of `_road_s` was first observed."""
 
     def on_leader_fault(self, view: RoadView, now_s: float, for_s: float | None) -> None:

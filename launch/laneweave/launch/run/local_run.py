@@ -87,9 +87,8 @@ class LocalRun:
     """Options that every role receives."""
     _injection: FaultInjection | None = None
     _board: SharedBoard = field(init=False)
-    _group_of: dict[str, int] = field(init=False)
-    """Group index of each vehicle; a group of successive arrivals shares an agent process."""
-    _started_groups: set[int] = field(factory=set)
+    _group_of: dict[str, tuple[str, ...]] = field(factory=dict)
+    """Group of each vehicle without an agent so far: successive arrivals that share a process."""
     _problems: list[str] = field(factory=list)
     _failed_agents: int = 0
     _stop: bool = False
@@ -97,10 +96,10 @@ class LocalRun:
     def __attrs_post_init__(self) -> None:
         """Assign the demanded vehicles to groups."""
         per_process = self.scenario.runtime.vehicles_per_process
-        self._group_of = {
-            arrival.vehicle: index // per_process
-            for index, arrival in enumerate(arrivals(self.scenario))
-        }
+        names = [arrival.vehicle for arrival in arrivals(self.scenario)]
+        for first in range(0, len(names), per_process):
+            group = tuple(names[first : first + per_process])
+            self._group_of |= dict.fromkeys(group, group)
 
     def run(self) -> Outcome:
         """Run the scenario and return its outcome.
@@ -228,14 +227,15 @@ class LocalRun:
         reason = f": {error}" if error else ""
         self._problems.append(f"{subject} ended with status {end.status}{reason}")
 
-    def _agents_to_start(self, observer: Observer) -> Iterator[list[str]]:
+    def _agents_to_start(self, observer: Observer) -> Iterator[tuple[str, ...]]:
         """Yield each group of vehicles once its first vehicle has been announced."""
         census = observer.view.census
         for announced in census.announced if census is not None else ():
-            index = self._group_of.get(announced.vehicle)
-            if index is not None and index not in self._started_groups:
-                self._started_groups.add(index)
-                yield [name for name, group in self._group_of.items() if group == index]
+            group = self._group_of.get(announced.vehicle, ())
+            for vehicle in group:
+                del self._group_of[vehicle]
+            if group:
+                yield group
 
     def _request_stop(self) -> None:
         self._stop = True

@@ -52,7 +52,7 @@ class RoleProcesses:
     _running: dict[str, ForkServerProcess] = field(factory=dict)
     _starts: dict[str, RoleStart] = field(factory=dict)
     _process_of: dict[str, str] = field(factory=dict)
-    """Name of the agent process of each vehicle."""
+    """Name of the agent process of each vehicle, until it exits on its own."""
     _paused: set[str] = field(factory=set)
 
     def start(self, role: str, name: str, **options: object) -> None:
@@ -87,6 +87,8 @@ class RoleProcesses:
             process = self._running.pop(name)
             process.join()
             self._paused.discard(name)
+            for vehicle in self._starts.pop(name).options.get("vehicles", ()):
+                del self._process_of[vehicle]
             yield RoleExit(name, process.exitcode)
 
     # --- control by faults --------------------------------------------------------------------
@@ -119,7 +121,7 @@ class RoleProcesses:
             self._signal(name, signal.SIGCONT)
 
     def restart(self, name: str) -> None:
-        """Restart a role that has exited, with its original arguments.
+        """Restart a role that was killed, with its original arguments.
 
         Raises:
             CommandFailedError: the process cannot be created.

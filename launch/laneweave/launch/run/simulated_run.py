@@ -28,7 +28,7 @@ from laneweave.protocol.runtime.node import Arrived, Core, Effect, Event, Listen
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
-from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.wire.messages import Census, Name
 from laneweave.sim_bridge.core import BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
@@ -70,7 +70,7 @@ class SimulatedRoles:
     start: Callable[[str], None]
     """Starts a coordinator or agent by name."""
     agents: dict[str, str] = field(factory=dict)
-    """Agent name of each vehicle."""
+    """Agent name of each vehicle that is announced, or on the road, or has a running agent."""
     _router_runs: bool = True
 
     @property
@@ -119,10 +119,14 @@ class SimulatedRun:
     faults: FaultSpec = field(factory=FaultSpec)
     conditions: Conditions = field(factory=Conditions)
     show_progress: bool = True
+    watch: Callable[[RoadView], None] | None = None
+    """Called every `PROGRESS_EVERY_TICKS` with the observed state."""
     _view: RoadView = field(factory=RoadView)
     _roles: SimulatedRoles = field(init=False)
     _injection: FaultInjection | None = None
     _board: LocalBoard = field(factory=LocalBoard)
+    _handled_census: Census | None = None
+    """Census for which agents were last started."""
     _injected_road_s: float = -1.0
     """Road time at which faults were last applied."""
     _incarnations: Iterator[int] = field(factory=lambda: count(1))
@@ -191,6 +195,8 @@ class SimulatedRun:
             if bridge.tick >= shown + PROGRESS_EVERY_TICKS:
                 shown = bridge.tick
                 progress.show(self._view)
+                if self.watch is not None:
+                    self.watch(self._view)
 
     def _inject(self, injection: FaultInjection, now_s: float) -> None:
         """Apply faults if the road time has advanced, or a resume or restart is due."""
@@ -200,11 +206,20 @@ class SimulatedRun:
             injection.step(road_s, now_s, self._view)
 
     def _start_agents(self) -> None:
-        agents, census = self._roles.agents, self._view.census
-        for announced in census.announced if census is not None else ():
-            if announced.vehicle not in agents:
-                agents[announced.vehicle] = f"{AGENT_PREFIX}{announced.vehicle}"
-                self._start(agents[announced.vehicle])
+        """Start the agents of newly announced vehicles, and forget those of departed ones."""
+        roles, census = self._roles, self._view.census
+        if census is None or census is self._handled_census:
+            return
+        self._handled_census = census
+        listed = {announced.vehicle for announced in census.announced}
+        listed |= {entry.vehicle for entry in census.on_road}
+        for vehicle, name in list(roles.agents.items()):
+            if vehicle not in listed and name not in roles.network:
+                del roles.agents[vehicle]
+        for announced in census.announced:
+            if announced.vehicle not in roles.agents:
+                roles.agents[announced.vehicle] = f"{AGENT_PREFIX}{announced.vehicle}"
+                self._start(roles.agents[announced.vehicle])
 
     def _start(self, name: str) -> None:
         """Start or restart a coordinator or an agent."""
