@@ -1,0 +1,114 @@
+"""Containers that grow with each vehicle that has passed, in runs in virtual time."""
+
+from __future__ import annotations
+
+import gc
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from attrs import define, field
+
+from laneweave.launch.observe.road_view import RoadView
+from laneweave.launch.run.simulated_run import SimulatedRun
+from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.transports.simulated import network
+from laneweave.sim_bridge import core as bridge
+from laneweave.sim_bridge.recording import reports, ticks, trajectories, trips
+
+BOUNDS: tuple[tuple[ModuleType, str], ...] = (
+    (bridge, "REPORT_TICKS"),
+    (network, "_CACHE_SIZE"),
+    (reports, "MAX_SENDERS"),
+    (ticks, "ROWS_PER_GROUP"),
+    (trajectories, "TICKS_PER_GROUP"),
+    (trips, "ROWS_PER_GROUP"),
+)
+"""Sizes of buffers and caches, which would otherwise still grow during a short run."""
+SMALL = 10
+PER_VEHICLE = 0.12
+"""Entries for each vehicle that passed from which a container counts as growing: fewer than one for
+each formation."""
+
+
+@define
+class Growth:
+    """Lengths of all containers in this process, measured at some road times."""
+
+    at_s: tuple[float, ...]
+    """Road times, ascending."""
+    left: list[int] = field(factory=list)
+    """Number of vehicles that have left at these times."""
+    _lengths: list[dict[int, int]] = field(factory=list)
+    """Length of each container by its id."""
+    _containers: list[Any] = field(factory=list)
+    """All containers at the last of these times."""
+
+    def watch(self, view: RoadView) -> None:
+        """Measure when the next road time is reached."""
+        if view.clock is None or len(self.left) == len(self.at_s):
+            return
+        if view.clock.t_s >= self.at_s[len(self.left)]:
+            gc.collect()
+            self._containers = [one for one in gc.get_objects() if _is_unbounded(one)]
+            self._lengths.append({id(one): len(one) for one in self._containers})
+            self.left.append(view.clock.left)
+
+    def growing(self) -> list[str]:
+        """Return the containers that have grown in every interval, with their newest entries."""
+        steps = [
+            PER_VEHICLE * (after - before)
+            for before, after in zip(self.left, self.left[1:], strict=False)
+        ]
+        found = []
+        for one in self._containers:
+            lengths = [known.get(id(one), len(one)) for known in self._lengths]
+            if all(
+                after - before >= step
+                for before, after, step in zip(lengths, lengths[1:], steps, strict=False)
+            ):
+                found.append(f"{type(one).__name__} {lengths}: ... {str(list(one)[-3:])[:300]}")
+        return found
+
+
+def _is_unbounded(one: object) -> bool:
+    """Return whether something is a container without a maximum length."""
+    return isinstance(one, (dict, list, set)) or (isinstance(one, deque) and one.maxlen is None)
+
+
+def growth_of(
+    folder: Path,
+    patch: pytest.MonkeyPatch,
+    formation: Mapping[str, str],
+    *,
+    first_s: float,
+    phase_s: float,
+    phases: int = 2,
+) -> Growth:
+    """Drive a dense stream over a short road in virtual time, and measure the growth.
+
+    Args:
+        folder: folder of the run.
+        patch: reduces the sizes of buffers and caches.
+        formation: fields of the scenario's formation.
+        first_s: road time of the first measurement.
+        phase_s: time between measurements, longer than a vehicle is announced or on the road.
+        phases: number of intervals.
+    """
+    for module, name in BOUNDS:
+        patch.setattr(module, name, SMALL)
+    at_s = tuple(first_s + phase_s * number for number in range(phases + 1))
+    scenario = parse_scenario(
+        {
+            "road": {"s1_m": 20.0, "s2_m": 20.0, "s3_m": 160.0},
+            "demand": {"volume_veh_per_lane_h": 1600.0, "duration_s": at_s[-1]},
+            "formation": dict(formation),
+        }
+    )
+    growth = Growth(at_s)
+    outcome = SimulatedRun(scenario, folder, show_progress=False, watch=growth.watch).run()
+    assert not outcome.problems
+    return growth
