@@ -30,7 +30,16 @@ from laneweave.protocol.security.connection import (
 )
 from laneweave.protocol.wire.codec import MAX_BYTES
 from laneweave.protocol.wire.identities import Identity, parse_identity
-from laneweave.protocol.wire.topics import ANY_SENDER, ROLES, TOPICS, Exchange, Keys, Party, Topic
+from laneweave.protocol.wire.topics import (
+    ANY_SENDER,
+    ROLES,
+    TOPICS,
+    Exchange,
+    Keys,
+    Party,
+    Topic,
+    declared,
+)
 
 CA_FILE = "LANEWEAVE_CA_FILE"
 CERTIFICATE_FILE = "LANEWEAVE_CERTIFICATE_FILE"
@@ -73,6 +82,13 @@ READING: dict[Exchange, tuple[tuple[Flow, str], ...]] = {
     Exchange.QUERIES: ((Flow.IN, "declare_queryable"), (Flow.IN, "reply"), (Flow.OUT, "query")),
 }
 """Rights of a topic's readers."""
+DECLARED = (
+    "declare_subscriber",
+    "declare_liveliness_subscriber",
+    "liveliness_query",
+    "liveliness_token",
+)
+"""Kinds of messages with key expressions in the form `topics.declared`."""
 
 
 @frozen
@@ -213,7 +229,9 @@ def access_control(scenario: Scenario) -> dict[str, Any]:
                 "permission": "allow",
                 "flows": [str(rule.flow)],
                 "messages": [rule.message],
-                "key_exprs": list(rule.keys),
+                "key_exprs": [
+                    declared(key) if rule.message in DECLARED else key for key in rule.keys
+                ],
             }
             for rule in rules_of(identity, scenario)
         ]

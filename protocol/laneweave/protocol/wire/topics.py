@@ -280,6 +280,22 @@ def incarnation_of(parameters: Mapping[str, str]) -> int:
     return int(incarnation) if incarnation.isdecimal() else -1
 
 
+def declared(expression: str) -> str:
+    """Return the form of a key expression in which subscriptions and tokens are declared to Zenoh.
+
+    Its first part is a wildcard. Client and router never forget the parts of a declared expression
+    before its first wildcard (Zenoh 1.10.2), and routing searches them for every message. So with
+    keys that end with the name of a vehicle, memory and CPU time would grow with each vehicle.
+    """
+    head, slash, rest = expression.partition("/")
+    return f"*/{rest}" if slash and "*" not in head else expression
+
+
+def undeclared(key: str) -> str:
+    """Return the key of a token from its declared form."""
+    return PREFIX + key[key.index("/") :]
+
+
 def matches(expression: str, key: str) -> bool:
     """Return whether an expression matches a key (`*`: one part; `**`: any number of parts)."""
     if "*" not in expression:

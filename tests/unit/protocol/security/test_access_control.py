@@ -11,6 +11,7 @@ from laneweave.protocol.config.participants import identities_of
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario, to_tables
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import (
+    DECLARED,
     Flow,
     Rule,
     access_control,
@@ -166,6 +167,10 @@ def test_the_form_that_zenoh_takes() -> None:
     used = {rule for policy in control["policies"] for rule in policy["rules"]}
     assert used == set(ids)
     assert {name for policy in control["policies"] for name in policy["subjects"]} == set(subjects)
+    for rule in control["rules"]:
+        (message,) = rule["messages"]
+        begin = "*/r/" if message in DECLARED else PREFIX
+        assert all(key.startswith(begin) for key in rule["key_exprs"])
     # The router carries everything and takes part in nothing.
     assert set(subjects) == {one.common_name for one in identities_of(SCENARIO)} - {"router"}
     json.dumps(control, allow_nan=False)

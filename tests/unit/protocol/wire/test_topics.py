@@ -153,3 +153,18 @@ def test_a_missing_parameter_is_a_mistake_of_the_caller() -> None:
 )
 def test_matching_follows_zenohs_rules(expression: str, key: str, *, expected: bool) -> None:
     assert topics.matches(expression, key) is expected
+
+
+@pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda topic: topic.name)
+def test_declared_expressions_begin_with_a_wildcard_and_match_the_same_keys(
+    topic: topics.Topic,
+) -> None:
+    keys = topics.Keys("site")
+    key = keys.key(topic, **filled(topic))
+    for expression in (key, keys.all_of(topic)):
+        declared = topics.declared(expression)
+        assert declared.startswith("*/")
+        assert topics.matches(declared, key)
+        assert topics.declared(declared) == declared
+    assert topics.undeclared(topics.declared(key)) == key
+    assert topics.declared("**") == "**"

@@ -42,7 +42,7 @@ from laneweave.protocol.security.certificates import check_credentials
 from laneweave.protocol.security.connection import Access, RouterGuard
 from laneweave.protocol.transports.zenoh.settings import Setting, client_settings, router_settings
 from laneweave.protocol.wire.codec import MAX_BYTES
-from laneweave.protocol.wire.topics import Party, Quality
+from laneweave.protocol.wire.topics import Party, Quality, declared, undeclared
 
 log = structlog.get_logger(__name__)
 
@@ -149,7 +149,7 @@ class ZenohTransport:
         """Subscribe to matching keys; repeated calls have no effect."""
         if key_expression not in self._subscriptions and not self._closed:
             self._subscriptions[key_expression] = self._session.declare_subscriber(
-                key_expression, self._on_sample
+                declared(key_expression), self._on_sample
             )
 
     def unsubscribe(self, key_expression: str) -> None:
@@ -161,7 +161,7 @@ class ZenohTransport:
     def announce(self, key: str) -> None:
         """Declare a liveliness token."""
         if key not in self._tokens and not self._closed:
-            self._tokens[key] = self._session.liveliness().declare_token(key)
+            self._tokens[key] = self._session.liveliness().declare_token(declared(key))
 
     def withdraw(self, key: str) -> None:
         """Withdraw a liveliness token."""
@@ -173,7 +173,7 @@ class ZenohTransport:
         """Watch matching liveliness tokens; repeated calls have no effect."""
         if key_expression not in self._watched and not self._closed:
             self._watched[key_expression] = self._session.liveliness().declare_subscriber(
-                key_expression, self._on_token, history=True
+                declared(key_expression), self._on_token, history=True
             )
 
     def serve(self, key: str) -> None:
@@ -252,7 +252,7 @@ class ZenohTransport:
     def _on_token(self, sample: zenoh.Sample) -> None:
         # The session reports its own tokens, and sometimes the router reports them again.
         kind = TokenUp if sample.kind == zenoh.SampleKind.PUT else TokenDown
-        event = kind(str(sample.key_expr))
+        event = kind(undeclared(str(sample.key_expr)))
         with self._seen_lock:
             if update_tokens(self._seen, event):
                 self._deliver(event)
