@@ -75,6 +75,8 @@ SERVICE = DOCS / "evidence" / "service.json"
 """Output of `benchmarks/service.py`."""
 EVALUATED = DOCS / "evidence" / "evaluation.json"
 """Output of `benchmarks/evaluate.py`."""
+LONG = DOCS / "evidence" / "long-run.json"
+"""Memory of long runs, by `benchmarks/long_run.py`."""
 STABILITY = DOCS / "evidence" / "stability.json"
 """Output of `benchmarks/stability.py`."""
 CONFLICTS = DOCS / "images" / "conflict-table.png"
@@ -463,6 +465,31 @@ def _links() -> str:
     return "\n".join(lines)
 
 
+def _long_runs() -> str:
+    """Return the table of the memory of long runs, by `benchmarks/long_run.py`."""
+    lines = [
+        (
+            "| run | road | vehicles that passed | vehicle ticks | process "
+            "| memory after 10 min, at the end | growth | file descriptors | threads |"
+        ),
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, run in json.loads(LONG.read_text(encoding="utf-8")).items():
+        about = (
+            f"| {name}, {run['volume_veh_per_lane_h']:g} vehicles/(lane h) | {run['road_s']:,} s "
+            f"| {run['left']:,} | {run['vehicle_ticks'] / 1e6:.2f} million "
+        )
+        for role, found in run["roles"].items():
+            memory, handles, threads = (
+                ", ".join(f"{value:g}" for value in found[figure])
+                for figure in ("memory_mb", "handles", "threads")
+            )
+            growth = f"{found['growth_percent']:+.1f} %"
+            lines.append(f"{about}| {role} | {memory} MB | {growth} | {handles} | {threads} |")
+            about = "| | | | "
+    return "\n".join(lines)
+
+
 def _service() -> str:
     """Return the tables of the planning service, by `benchmarks/service.py`."""
     measured = json.loads(SERVICE.read_text(encoding="utf-8"))
@@ -593,6 +620,7 @@ def parts() -> dict[str, str]:
         "rights": rights_table(),
         "hosts": _hosts(),
         "links": _links(),
+        "long runs": _long_runs(),
         **document_parts(read_evidence(EVALUATED)),
     }
 
