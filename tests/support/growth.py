@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import gc
+import re
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -53,7 +54,7 @@ class Growth:
             return
         if view.clock.t_s >= self.at_s[len(self.left)]:
             gc.collect()
-            self._containers = [one for one in gc.get_objects() if _is_unbounded(one)]
+            self._containers = list(_unbounded_containers())
             self._lengths.append({id(one): len(one) for one in self._containers})
             self.left.append(view.clock.left)
 
@@ -74,8 +75,16 @@ class Growth:
         return found
 
 
+def _unbounded_containers() -> Iterator[Any]:
+    """Yield all containers in this process that have no maximum length."""
+    objects = gc.get_objects()
+    # The collector does not know dictionaries of numbers and texts: find them in other objects.
+    found = {id(one): one for one in (*objects, *gc.get_referents(*objects)) if _is_unbounded(one)}
+    found.pop(id(vars(re)["_cache"]), None)
+    yield from found.values()
+
+
 def _is_unbounded(one: object) -> bool:
-    """Return whether something is a container without a maximum length."""
     return isinstance(one, (dict, list, set)) or (isinstance(one, deque) and one.maxlen is None)
 
 
