@@ -346,7 +346,7 @@ class Checker:
 
     def _check_claims(self, t_s: float, state: VehicleState) -> None:
         name = state.vehicle
-        self.claims.on_promise(state)
+        self.claims.record(state)
         if name not in self._bodies:
             return
         end_s, cell, _ = self._moving.get(name, (t_s, None, None))

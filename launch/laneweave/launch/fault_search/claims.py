@@ -10,6 +10,7 @@ themselves must be true at any time, so they show a violated rule much sooner.
 | `basis` | a plan starts from cells or names processes that no promise has reported |
 | `roster` | a plan lacks a vehicle that entered in its blocks |
 | `two-plans` | two different rosters or plans are sent under one ballot |
+| `adoption` | a leader adopts a plan that a member has never accepted |
 | `harmful` | a vehicle accepts or begins a plan that it must refuse |
 """
 
@@ -71,8 +72,10 @@ class Claims:
     """(vehicle, incarnation, ballot) of each stored acceptance."""
     _holdings: set[tuple[str, Ballot | None, tuple[Cell, ...]]] = field(factory=set)
     """(vehicle, promise, owned cells) stored at the same time."""
-    _promised_cells: set[tuple[str, int, Ballot, Cell]] = field(factory=set)
-    """(vehicle, incarnation, ballot, hold cell) of each promise."""
+    _promises: set[tuple[str, int, Ballot, Cell, tuple[int, ...]]] = field(factory=set)
+    """(vehicle, incarnation, ballot, hold cell, joined blocks) of each promise."""
+    _accepted: dict[Ballot, set[str]] = field(factory=dict)
+    """Vehicles that have reported that they have accepted each ballot."""
     _ready: dict[Ballot, set[str]] = field(factory=dict)
     """Vehicles that have reported under each ballot that they are ready."""
     _rosters: dict[Ballot, Prepare] = field(factory=dict)
@@ -118,16 +121,22 @@ class Claims:
 
     # --- messages -----------------------------------------------------------------------------
 
-    def on_promise(self, state: VehicleState) -> None:
-        """Record the hold cell with which a process promises a ballot."""
-        if state.promised is not None:
-            basis = state.vehicle, state.incarnation, state.promised, state.hold_cell
-            self._promised_cells.add(basis)
+    def record(self, state: VehicleState) -> None:
+        """Record what leaders and other vehicles may conclude from a state."""
+        name, ballot = state.vehicle, state.promised
+        if ballot is None:
+            return
+        about = name, state.incarnation, ballot, state.hold_cell
+        self._promises.add((*about, () if state.owned else state.joined))
+        if state.accepted:
+            self._accepted.setdefault(ballot, set()).add(name)
+            if state.ready:
+                self._ready.setdefault(ballot, set()).add(name)
 
     def on_state(
         self, t_s: float, state: VehicleState, finished: int, cell_at_rest: Cell | None
     ) -> None:
-        """Check the state of a vehicle on the road.
+        """Check the recorded state of a vehicle on the road.
 
         Args:
             t_s: virtual time.
@@ -165,14 +174,17 @@ class Claims:
             self._false(t_s, state, f"accepts moves in {short(ballot)} without an agent")
         if harm is not None and (name in harm.refusing or state.go):
             self._tell("harmful", t_s, name, f"executes {short(ballot)}: {harm.text}")
-        ready = self._ready.setdefault(ballot, set())
-        if state.ready:
-            ready.add(name)
         if state.go and plan is not None:
-            missing = set(plan.roster) - ready - {name}
+            missing = set(plan.roster) - self._ready.get(ballot, set()) - {name}
             if missing:
                 text = f"{short(ballot)} opens before {' '.join(sorted(missing))}"
                 self._tell("gate", t_s, name, text)
+
+    def on_adoption(self, t_s: float, ballot: Ballot, roster: Iterable[Name]) -> None:
+        """Check that all members have reported that they have accepted the ballot."""
+        for name in roster:
+            if name not in self._accepted.get(ballot, ()):
+                self._tell("adoption", t_s, name, f"has not accepted {short(ballot)}")
 
     def on_prepare(self, t_s: float, prepare: Prepare) -> None:
         """Check that a ballot has one roster."""
@@ -186,8 +198,8 @@ class Claims:
         if plan.ballot in self.harmful or not self._is_current(plan):
             return
         for name in plan.roster:
-            basis = name, plan.incarnations[name], plan.ballot, plan.start_cells[name]
-            if basis not in self._promised_cells:
+            about = name, plan.incarnations[name], plan.ballot, plan.start_cells[name]
+            if (*about, () if plan.before else plan.formations) not in self._promises:
                 text = f"{short(plan.ballot)} starts in {plan.start_cells[name]} without a promise"
                 self._tell("basis", t_s, name, text)
         left_out = {name for name, block in self._blocks.items() if block in plan.formations}

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
 
 from attrs import define, evolve, field, frozen
 
@@ -17,8 +18,13 @@ from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.protocol.state_machine import Function, RuleBook, Transition
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
 
+ADOPTION = "leader L2 STATE to in force"
+"""Feature of a leader that adopts a plan."""
 UNIFORM_SHARE = 0.3
 """Share of the runs whose profiles are equally likely."""
+
+OnReached = Callable[[str, Any], None]
+"""Called with each feature that is reached, and the state machine, after the transition."""
 
 
 @frozen
@@ -31,12 +37,12 @@ class Rules:
     transfer: RuleBook = TRANSFER_RULES
     """Rules of leaders of cell transfers (rolling operation)."""
 
-    def observed(self, seen: set[str]) -> Rules:
-        """Return the same rules, which add what they reach to `seen`."""
+    def observed(self, on_reached: OnReached) -> Rules:
+        """Return the same rules, which report what they reach."""
         return Rules(
-            _observed("vehicle", self.vehicle, seen),
-            _observed("leader", self.leader, seen),
-            _observed("transfer", self.transfer, seen),
+            _observed("vehicle", self.vehicle, on_reached),
+            _observed("leader", self.leader, on_reached),
+            _observed("transfer", self.transfer, on_reached),
         )
 
 
@@ -58,14 +64,14 @@ def _feature(book: str, row: Transition) -> str:
     return f"{book} {row.rule} {row.event}{phases}"
 
 
-def _observed(name: str, book: RuleBook, seen: set[str]) -> RuleBook:
-    return RuleBook(_observed_row(_feature(name, row), row, seen) for row in book.table)
+def _observed(name: str, book: RuleBook, on_reached: OnReached) -> RuleBook:
+    return RuleBook(_observed_row(_feature(name, row), row, on_reached) for row in book.table)
 
 
-def _observed_row(feature: str, row: Transition, seen: set[str]) -> Transition:
+def _observed_row(feature: str, row: Transition, on_reached: OnReached) -> Transition:
     def applied(machine: object, message: object) -> None:
-        del machine, message
-        seen.add(feature)
+        del message
+        on_reached(feature, machine)
 
     def observed(guard: Function) -> Function:
         refused = f"{feature}: not {guard.__name__}"
@@ -73,13 +79,13 @@ def _observed_row(feature: str, row: Transition, seen: set[str]) -> Transition:
         def recorded(machine: object, message: object) -> bool:
             holds = bool(guard(machine, message))
             if not holds:
-                seen.add(refused)
+                on_reached(refused, machine)
             return holds
 
         return recorded
 
     guards = tuple(observed(guard) for guard in row.guards)
-    return evolve(row, guards=guards, actions=(applied, *row.actions))
+    return evolve(row, guards=guards, actions=(*row.actions, applied))
 
 
 @define

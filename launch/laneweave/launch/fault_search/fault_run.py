@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import count
+from typing import Any
 
 import attrs
 from attrs import field, frozen
@@ -22,7 +23,7 @@ from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVeh
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
 from laneweave.launch.fault_search.checker import Checker, Violation
 from laneweave.launch.fault_search.checker_geometry import Geometry
-from laneweave.launch.fault_search.coverage import Rules
+from laneweave.launch.fault_search.coverage import ADOPTION, Rules
 from laneweave.launch.fault_search.fault_context import ROAD
 from laneweave.launch.fault_search.faults import RandomFaults
 from laneweave.launch.fault_search.lasting_faults import CLOCK_DRIFT, CLOCK_OFFSET_S
@@ -166,7 +167,7 @@ class FaultRun:
         )
         self._features: set[str] = set()
         """Rules and guards reached so far."""
-        self._rules = rules.observed(self._features)
+        self._rules = rules.observed(self._on_reached)
         self._timeline = timeline
         self._incarnations = count(1)
         self.faults = RandomFaults(
@@ -385,6 +386,11 @@ class FaultRun:
         if self._timeline is not None:
             self._timeline.add_message(now_s, sender, effect)
         return effect
+
+    def _on_reached(self, feature: str, machine: Any) -> None:  # noqa: ANN401 (a state machine)
+        self._features.add(feature)
+        if feature == ADOPTION:
+            self.checker.claims.on_adoption(self.network.now_s, machine.ballot, machine.roster)
 
     def _on_compute(self, name: str) -> None:
         self.checker.computes(self.network.now_s, name)

@@ -244,6 +244,7 @@ class RandomFaults:
 ACTIONS: Mapping[str, Callable[[RandomFaults], Callable[[str], bool]]] = {
     "leader-kill": lambda faults: faults.processes.kill,
     "coordinator-kill": lambda faults: faults.processes.kill,
+    "all-coordinators-kill": lambda faults: faults.processes.kill_coordinators,
     "agent-kill": lambda faults: faults.processes.kill_agent,
     "agent-twin": lambda faults: faults.processes.start_twin,
     "leader-pause": lambda faults: faults.processes.pause,

@@ -64,6 +64,11 @@ class ProcessFaults:
             )
         return True
 
+    def kill_coordinators(self, _: str) -> bool:
+        """Kill all coordinators at once, so that none of the next ones knows earlier terms."""
+        killed = [self.kill(name) for name in self._processes.coordinators]
+        return any(killed)
+
     def pause(self, name: str) -> bool:
         """Pause a process for some time."""
         if name not in self._context.network:

@@ -39,6 +39,7 @@ MEAN_HEADWAYS_S = (0.3, 3.0)
 
 # Operation in formations
 SLOT_S, MOVE_S = 1.0, 0.8
+MODES = (1, 1, 2)
 LAST_COLUMNS = (1, 1, -3, -7)
 """Rear columns of the rearmost formation to draw from. Vehicles in columns >= 0 are on the road at
 the start; the others enter later, and the formation closes when its rear column enters."""
@@ -55,7 +56,6 @@ MAX_JOINED_SIZE = 10
 # Rolling operation
 SLOTS_S = (1.0, 1.0, 1.0, 2.0)
 """Slot lengths to draw from. Ballots often abort with the shortest."""
-MODES = (1, 1, 2)
 MOVE_SHARE = 0.8
 """Duration of a move as a share of the slot."""
 SLOTS_ON_ROAD = 45
@@ -110,6 +110,7 @@ class RoadSetup:
                 cycle_s=self.slot_s,
                 move_s=self.move_s,
                 max_joined=self.max_joined,
+                mode=self.mode,
                 # Limit planning by nodes: a deadline would make plans depend on the machine.
                 planning_deadline_s=3600.0,
                 max_nodes=500,
@@ -162,7 +163,12 @@ class Setup:
         if profile.rolling:
             return cls._drawn_rolling(profile, lanes, rng)
         growing = rng.random() < profile.growing
-        road = RoadSetup(lanes=lanes, max_joined=rng.randint(*profile.max_joined), growing=growing)
+        road = RoadSetup(
+            lanes=lanes,
+            max_joined=rng.randint(*profile.max_joined),
+            growing=growing,
+            mode=rng.choice(MODES),
+        )
         scenario = road.make_scenario()
         formations = tuple(_draw_formations(profile, scenario, rng))
         lasting = LastingFaults.drawn(profile, rng)
@@ -203,6 +209,7 @@ class Setup:
                 max_joined=rng.randint(*profile.max_joined),
                 growing=rng.random() < profile.growing,
                 max_vehicles=rng.randint(2, MAX_SIZE),
+                mode=rng.choice(MODES),
             )
         scenario = road.make_scenario()
         lasting = LastingFaults.drawn(profile, rng)

@@ -59,7 +59,7 @@ class Scene:
         }
         cells = {name: path[0] for name, path in paths.items()}
         for name, cell in cells.items():
-            self.checker.claims.on_promise(state(name, seq, cell))
+            self.checker.claims.record(state(name, seq, cell))
         self.checker.sent(0.0, make_plan(cells, moves, ballot=ballot(seq)))
 
     def move(self, t_s: float, name: Name, seq: int, target: Cell, lasts_s: float = MOVE_S) -> None:

@@ -37,6 +37,7 @@ class Scene:
         self.kinds.append(kind)
 
     def send(self, state: VehicleState, finished: int = 0, at_rest: Cell | None = (0, 0)) -> None:
+        self.claims.record(state)
         self.claims.on_state(1.0, state, finished, at_rest)
 
 
@@ -87,20 +88,29 @@ def test_who_must_refuse_a_harmful_plan_must_not_accept_it(scene: Scene) -> None
 
 
 def test_a_plan_needs_promises_from_its_start_cells(scene: Scene) -> None:
-    scene.claims.on_promise(evolve(ACCEPTED, accepted=False))
-    scene.claims.on_promise(holding(B, BALLOT, (3, 0)))
+    scene.claims.record(evolve(ACCEPTED, accepted=False))
+    scene.claims.record(holding(B, BALLOT, (3, 0)))
     scene.claims.on_plan(1.0, PLAN)
     assert scene.kinds == ["basis"]
 
 
 def test_a_plan_contains_all_vehicles_of_its_blocks(scene: Scene) -> None:
     for name, cell in CELLS.items():
-        scene.claims.on_promise(holding(name, BALLOT, cell))
+        scene.claims.record(holding(name, BALLOT, cell))
     scene.claims.on_plan(1.0, PLAN)
     assert scene.kinds == []
     scene.claims.enter(2.0, "c", PLAN.formations[0])
     scene.claims.on_plan(3.0, PLAN)
     assert scene.kinds == ["roster", "roster"]
+
+
+def test_only_a_plan_that_all_have_accepted_is_adopted(scene: Scene) -> None:
+    scene.send(ACCEPTED)
+    scene.claims.on_adoption(1.0, BALLOT, CELLS)
+    assert scene.kinds == ["adoption"]
+    scene.claims.record(evolve(ACCEPTED, vehicle=B))
+    scene.claims.on_adoption(1.0, BALLOT, CELLS)
+    assert scene.kinds == ["adoption"]
 
 
 def test_a_ballot_has_one_roster(scene: Scene) -> None:
