@@ -13,7 +13,7 @@ from attrs import define, evolve, field
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import Drive
-from laneweave.launch.fault_search.stand_ins import LightDriver
+from laneweave.launch.fault_search.road.stand_ins import LightDriver
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Arrived, Effect, Send, Started
 from laneweave.protocol.scenario.deployment_fields import Network

@@ -26,7 +26,7 @@ from attrs import define, evolve, field
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.rolling.transfer import CellTransfer
-from laneweave.launch.fault_search.cell_ownership import CellOwnership
+from laneweave.launch.fault_search.checks.cell_ownership import CellOwnership
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Command, Heartbeat, Name, VehicleState
 from scenarios.scenario_leaders import RESEND_S, Mail, post

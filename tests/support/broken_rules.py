@@ -15,7 +15,7 @@ from laneweave.coordinator.election import Election
 from laneweave.coordinator.formations import operation, roster
 from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.roster import Formation, Groups
-from laneweave.launch.fault_search.light_road import LightRoad
+from laneweave.launch.fault_search.road.light_road import LightRoad
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect
 from laneweave.protocol.scenario.fields import Scenario

@@ -9,7 +9,7 @@ from attrs import evolve
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
-from laneweave.launch.fault_search.stand_ins import LightDriver
+from laneweave.launch.fault_search.road.stand_ins import LightDriver
 from laneweave.protocol.runtime.node import Announce, Arrived, Effect, PeerDown, PeerUp, Refuse
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.wire.bounds import CLAIM_AHEAD_NS, DAY_NS, Bounds, max_term

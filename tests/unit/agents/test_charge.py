@@ -9,7 +9,7 @@ import pytest
 from attrs import evolve
 
 from laneweave.agents.core import AgentCore
-from laneweave.launch.fault_search.stand_ins import LightDriver
+from laneweave.launch.fault_search.road.stand_ins import LightDriver
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect, Send, Wakeup
 from laneweave.protocol.scenario.fields import Scenario

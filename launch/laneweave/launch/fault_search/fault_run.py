@@ -21,14 +21,14 @@ from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
-from laneweave.launch.fault_search.checker import Checker, Violation
-from laneweave.launch.fault_search.checker_geometry import Geometry
+from laneweave.launch.fault_search.checks.checker import Checker, Violation
+from laneweave.launch.fault_search.checks.geometry import Geometry
 from laneweave.launch.fault_search.coverage import ADOPTION, Rules
-from laneweave.launch.fault_search.fault_context import ROAD
-from laneweave.launch.fault_search.faults import RandomFaults
-from laneweave.launch.fault_search.lasting_faults import CLOCK_DRIFT, CLOCK_OFFSET_S
-from laneweave.launch.fault_search.light_road import LightRoad, Reception
-from laneweave.launch.fault_search.stand_ins import LightDriver, LightPlanner
+from laneweave.launch.fault_search.events.fault_context import ROAD
+from laneweave.launch.fault_search.events.faults import RandomFaults
+from laneweave.launch.fault_search.events.lasting_faults import CLOCK_DRIFT, CLOCK_OFFSET_S
+from laneweave.launch.fault_search.road.light_road import LightRoad, Reception
+from laneweave.launch.fault_search.road.stand_ins import LightDriver, LightPlanner
 from laneweave.launch.fault_search.story import Story
 from laneweave.launch.fault_search.timeline import Timeline
 from laneweave.protocol.lattice import Cell
@@ -209,6 +209,8 @@ class FaultRun:
             while network.failed_jobs:
                 self.checker.crashed(*network.failed_jobs.pop())
             self._check_leaders()
+            if self.faults.healed:
+                self._restart_agents()
         self.checker.advance(network.now_s)
         for name in self._not_arrived():
             vehicle = self.road.vehicles[name]
@@ -316,6 +318,11 @@ class FaultRun:
         core = self.network.node(name).core
         core = core.core if isinstance(core, _ListenedCore) else core
         return isinstance(core, CoordinatorCore) and core.election.leading
+
+    def _restart_agents(self) -> None:
+        """Restart agents that have ended, for example because of a late message of another road."""
+        for name in self.agents:
+            self.start(name)
 
     def _check_leaders(self) -> None:
         """Check that disconnected candidates do not lead, and that one leads without faults."""

@@ -18,7 +18,7 @@ from attrs import evolve, field, frozen
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from laneweave.launch.fault_search.checker import Violation
+from laneweave.launch.fault_search.checks.checker import Violation
 from laneweave.launch.fault_search.coverage import Coverage, Rules, all_features
 from laneweave.launch.fault_search.fault_run import RULES, FaultRun, SeedResult, Totals
 from laneweave.launch.fault_search.profiles import PROFILES, Profile

@@ -14,15 +14,15 @@ from functools import cached_property
 
 from attrs import evolve, frozen
 
-from laneweave.launch.fault_search.drawn_entrance import DrawnEntrance, Entrance, Grant
-from laneweave.launch.fault_search.lasting_faults import (
+from laneweave.launch.fault_search.events.lasting_faults import (
     CLOCK_DRIFT,
     CLOCK_OFFSET_S,
     LEASE_S,
     LastingFaults,
 )
 from laneweave.launch.fault_search.profiles import Profile
-from laneweave.launch.fault_search.stand_ins import Visit
+from laneweave.launch.fault_search.road.drawn_entrance import DrawnEntrance, Entrance, Grant
+from laneweave.launch.fault_search.road.stand_ins import Visit
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.deployment_fields import Network
 from laneweave.protocol.scenario.fields import FormationSettings, Road, Runtime, Scenario

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from attrs import frozen
 
-from laneweave.launch.fault_search.faults import FaultEvent, draw_events
+from laneweave.launch.fault_search.events.faults import FaultEvent, draw_events
 from laneweave.launch.fault_search.profiles import Profile
 from laneweave.launch.fault_search.setup import Setup
 from laneweave.protocol.errors import BadInputError

@@ -13,7 +13,7 @@ from laneweave.agents.driving.reference import Reference
 from laneweave.agents.driving.surroundings import SENSED_S, Surroundings
 from laneweave.agents.driving.tracking_problem import Gaps
 from laneweave.agents.host import AgentHost
-from laneweave.launch.fault_search.stand_ins import LightDriver
+from laneweave.launch.fault_search.road.stand_ins import LightDriver
 from laneweave.protocol.lattice import STRETCH_COLUMNS, Cell
 from laneweave.protocol.runtime.node import Arrived, Effect, Listen, Send, Unlisten
 from laneweave.protocol.vehicle.motion import cell_state

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from laneweave.launch.fault_search.cell_ownership import CellOwnership
+from laneweave.launch.fault_search.checks.cell_ownership import CellOwnership
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Name, PendingTransfer
 

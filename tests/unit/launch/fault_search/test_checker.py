@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import pytest
 
-from laneweave.launch.fault_search.checker import MAX_VIOLATIONS, Checker
-from laneweave.launch.fault_search.checker_geometry import Geometry
+from laneweave.launch.fault_search.checks.checker import MAX_VIOLATIONS, Checker
+from laneweave.launch.fault_search.checks.geometry import Geometry
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Name, Sense, VehicleState
 from support.states import holding, make_plan

@@ -5,7 +5,7 @@ import random
 
 import pytest
 
-from laneweave.launch.fault_search.checker_geometry import Body, Geometry, overlap_between
+from laneweave.launch.fault_search.checks.geometry import Body, Geometry, overlap_between
 
 GEOMETRY = Geometry(pitch_m=15.0, lane_width_m=3.5, length_m=5.0, width_m=1.8)
 Cell = tuple[int, int]

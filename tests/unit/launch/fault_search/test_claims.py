@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 from attrs import evolve
 
-from laneweave.launch.fault_search.claims import Claims, Harm, Stored, required_before
+from laneweave.launch.fault_search.checks.claims import Claims, Stored, required_before
+from laneweave.launch.fault_search.events.forgeries import Harm
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Name, Prepare, VehicleState
 from support.states import holding, make_plan

@@ -6,9 +6,9 @@ import random
 
 import pytest
 
+from laneweave.launch.fault_search.events.faults import FaultEvent
+from laneweave.launch.fault_search.events.lasting_faults import HEALTHY, LastingFaults
 from laneweave.launch.fault_search.fault_run import FaultRun
-from laneweave.launch.fault_search.faults import FaultEvent
-from laneweave.launch.fault_search.lasting_faults import HEALTHY, LastingFaults
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.story import Story
 from laneweave.protocol.errors import BadInputError

@@ -7,12 +7,12 @@ from itertools import count, pairwise
 
 import pytest
 
-from laneweave.launch.fault_search.checker import Checker
-from laneweave.launch.fault_search.checker_geometry import Geometry
-from laneweave.launch.fault_search.drawn_entrance import DrawnEntrance
-from laneweave.launch.fault_search.light_road import LightRoad, Reception
+from laneweave.launch.fault_search.checks.checker import Checker
+from laneweave.launch.fault_search.checks.geometry import Geometry
+from laneweave.launch.fault_search.road.drawn_entrance import DrawnEntrance
+from laneweave.launch.fault_search.road.light_road import LightRoad, Reception
+from laneweave.launch.fault_search.road.stand_ins import Visit
 from laneweave.launch.fault_search.setup import RoadSetup
-from laneweave.launch.fault_search.stand_ins import Visit
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Arrived, Effect, PeerDown, PeerUp, Send, Started, Wakeup
 from laneweave.protocol.vehicle.motion import at_rest_in_cell

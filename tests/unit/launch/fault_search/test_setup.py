@@ -7,8 +7,8 @@ from itertools import pairwise
 import pytest
 
 from laneweave.launch.fault_search.profiles import PROFILES, profiles_named
+from laneweave.launch.fault_search.road.stand_ins import Visit
 from laneweave.launch.fault_search.setup import BLOCK_COLUMNS, Setup
-from laneweave.launch.fault_search.stand_ins import Visit
 from laneweave.protocol.config.cross_checks import check_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.wire.messages import ClosedFormation, Name

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Protocol
 
-from laneweave.launch.fault_search.fault_context import LONG_S, ROAD, SHORT_S, FaultContext
+from laneweave.launch.fault_search.events.fault_context import LONG_S, ROAD, SHORT_S, FaultContext
 
 CLOCK_JUMP_S = (-2.0, 2.0)
 NO_RESTART = 0.25

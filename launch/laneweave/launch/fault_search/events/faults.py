@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterable, Mapping
 
 from attrs import define, field, frozen
 
-from laneweave.launch.fault_search.claims import Harm
-from laneweave.launch.fault_search.fault_context import ROAD, FaultContext
-from laneweave.launch.fault_search.injected_messages import InjectedMessages
-from laneweave.launch.fault_search.lasting_faults import HEALTHY, LastingFaults
-from laneweave.launch.fault_search.network_faults import NetworkFaults
-from laneweave.launch.fault_search.process_faults import Processes, ProcessFaults
+from laneweave.launch.fault_search.events.fault_context import ROAD, FaultContext
+from laneweave.launch.fault_search.events.forgeries import Harm
+from laneweave.launch.fault_search.events.injected_messages import InjectedMessages
+from laneweave.launch.fault_search.events.lasting_faults import HEALTHY, LastingFaults
+from laneweave.launch.fault_search.events.network_faults import NetworkFaults
+from laneweave.launch.fault_search.events.process_faults import Processes, ProcessFaults
 from laneweave.launch.fault_search.profiles import Profile
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import Send

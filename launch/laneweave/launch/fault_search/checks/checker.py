@@ -30,9 +30,9 @@ from collections.abc import Callable, Iterable, Iterator
 
 from attrs import define, frozen
 
-from laneweave.launch.fault_search.cell_ownership import CellOwnership
-from laneweave.launch.fault_search.checker_geometry import Body, Geometry, overlap_between
-from laneweave.launch.fault_search.claims import Claims, Stored, required_before, short
+from laneweave.launch.fault_search.checks.cell_ownership import CellOwnership
+from laneweave.launch.fault_search.checks.claims import Claims, Stored, required_before, short
+from laneweave.launch.fault_search.checks.geometry import Body, Geometry, overlap_between
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import (
     Ballot,

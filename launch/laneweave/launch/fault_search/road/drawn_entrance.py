@@ -11,7 +11,7 @@ from typing import Protocol
 
 from attrs import frozen
 
-from laneweave.launch.fault_search.stand_ins import Visit
+from laneweave.launch.fault_search.road.stand_ins import Visit
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect, Send
 from laneweave.protocol.wire.messages import Census, CensusEntry, ClosedFormation, Name, RoadClock

@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
 
-from laneweave.launch.fault_search.checker import Checker
-from laneweave.launch.fault_search.claims import Stored
-from laneweave.launch.fault_search.drawn_entrance import Entrance
-from laneweave.launch.fault_search.stand_ins import LightVehicle, Visit
+from laneweave.launch.fault_search.checks.checker import Checker
+from laneweave.launch.fault_search.checks.claims import Stored
+from laneweave.launch.fault_search.road.drawn_entrance import Entrance
+from laneweave.launch.fault_search.road.stand_ins import LightVehicle, Visit
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import (
     Announce,

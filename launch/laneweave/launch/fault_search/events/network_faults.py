@@ -8,7 +8,7 @@ from functools import partial
 
 import attrs
 
-from laneweave.launch.fault_search.fault_context import LONG_S, FaultContext
+from laneweave.launch.fault_search.events.fault_context import LONG_S, FaultContext
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.topics import (
     CENSUS,

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable
 
 from attrs import define, field, frozen
 
+from laneweave.launch.fault_search.events.forgeries import Harm
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import (
     Ballot,
@@ -44,15 +45,6 @@ class Stored:
     promised: Ballot | None
     owned: tuple[Cell, ...]
     transfer: PendingTransfer | None
-
-
-@frozen
-class Harm:
-    """A plan that was changed on its way: who must refuse it, and what was changed."""
-
-    refusing: frozenset[Name]
-    """Vehicles that must not accept it. No vehicle may open its gate."""
-    text: str
 
 
 @define

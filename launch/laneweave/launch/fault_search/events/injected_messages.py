@@ -9,9 +9,8 @@ from collections.abc import Callable
 import attrs
 from attrs import define, field
 
-from laneweave.launch.fault_search.claims import Harm
-from laneweave.launch.fault_search.fault_context import FaultContext
-from laneweave.launch.fault_search.forgeries import absurd, harmful, malformed
+from laneweave.launch.fault_search.events.fault_context import FaultContext
+from laneweave.launch.fault_search.events.forgeries import Harm, absurd, harmful, malformed
 from laneweave.protocol.runtime.node import Send
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.messages import (

@@ -9,9 +9,8 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterable, Mapping
 
-from attrs import evolve
+from attrs import evolve, frozen
 
-from laneweave.launch.fault_search.claims import Harm
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove, territory
 from laneweave.protocol.wire.codec import decode
@@ -32,6 +31,16 @@ ABSURD_NUMBERS = (2**63 - 1, 2**62)
 ABSURD_S = 1e12
 FAR_COLUMNS = 1000
 """Distance to a cell that no vehicle can own."""
+
+
+@frozen
+class Harm:
+    """A plan that was changed on its way: who must refuse it, and what was changed."""
+
+    refusing: frozenset[Name]
+    """Vehicles that must not accept it. No vehicle may open its gate."""
+    text: str
+
 
 Forgery = Callable[[Plan, random.Random], tuple[Plan, Harm] | None]
 """Changes a plan such that vehicles must refuse it; None if this plan cannot be changed so."""
