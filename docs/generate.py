@@ -52,6 +52,7 @@ from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import TOPICS, Exchange, Party, Topic
 from laneweave.sim_bridge.core import BridgeMetrics
 from support.planted_bugs import BUGS
+from support.unseen_bugs import UNSEEN
 
 DOCS = Path(__file__).resolve().parent
 FOUND = DOCS / "evidence" / "planted-bugs-found.json"
@@ -233,7 +234,7 @@ def _documented(node: ast.Module | ast.ClassDef) -> Iterator[tuple[str, str]]:
 
 def _planted_bugs() -> str:
     """Return the table of planted bugs."""
-    found = json.loads(FOUND.read_text(encoding="utf-8"))
+    found = json.loads(FOUND.read_text(encoding="utf-8"))["found"]
     lines = [
         "| planted bug | rule | what is broken | failed scenario | outcome | random search |",
         "|---|---|---|---|---|---|",
@@ -244,6 +245,27 @@ def _planted_bugs() -> str:
         lines.append(
             f"| `{bug.name}` | {bug.rule} | {bug.text} | `{bug.scenario}` | {end} | {seed} |"
         )
+    return "\n".join(lines)
+
+
+def _unseen_bugs() -> str:
+    """Return the table of planted bugs for which neither scenarios nor search were written."""
+    found = json.loads(FOUND.read_text(encoding="utf-8"))["found"]
+    lines = ["| planted bug | rule | what is broken | random search |", "|---|---|---|---|"]
+    lines += [
+        f"| `{bug.name}` | {bug.rule} | {bug.text} | {found.get(bug.name, '-')} |" for bug in UNSEEN
+    ]
+    return "\n".join(lines)
+
+
+def _found_bugs() -> str:
+    """Return the number of planted bugs that the random search finds."""
+    recorded = json.loads(FOUND.read_text(encoding="utf-8"))
+    lines = ["| planted bugs | found by the random search |", "|---|---|"]
+    for text, bugs in (("with a scenario", BUGS), ("unseen", UNSEEN)):
+        count = sum(recorded["found"].get(bug.name, "-") != "-" for bug in bugs)
+        lines.append(f"| {len(bugs)} {text} | {count} ({count / len(bugs):.0%}) |")
+    lines.append(f"| seeds for each bug | at most {recorded['seeds']} |")
     return "\n".join(lines)
 
 
@@ -605,6 +627,8 @@ def parts() -> dict[str, str]:
         "transfer rules": _rule_table(TRANSFER_RULES),
         "transfer phases": _phase_diagram(TRANSFER_RULES, BallotPhase.PREPARING),
         "planted bugs": _planted_bugs(),
+        "unseen bugs": _unseen_bugs(),
+        "found bugs": _found_bugs(),
         "profiles": _profiles(),
         "resilience": _resilience(),
         "planner": _planner(),

@@ -1,21 +1,25 @@
 """Which planted bugs does the random search find, and with which seed?
 
-    python tests/simulation/search_bugs.py [--unseen] [SEEDS] [BUG ...]
+    python tests/simulation/search_bugs.py [SEEDS] [BUG ...]
+    python tests/simulation/search_bugs.py --stories BUG ...
 
-prints a Markdown table: for each bug of `planted_bugs.BUGS`, or of `unseen_bugs.UNSEEN`, the first
-seed that catches it, and what was violated. The search uses the guided choice of profiles.
+The first form prints for each bug of `planted_bugs.BUGS` and `unseen_bugs.UNSEEN` the first seed
+that catches it, and what was violated, as JSON: the content of
+docs/evidence/planted-bugs-found.json. The search uses the guided choice of profiles. The second
+form writes shrunk runs to tests/simulation/stories.
 """
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
 import pytest
-from attrs import frozen
+from attrs import evolve, frozen
 
 if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.toml
     sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -23,11 +27,13 @@ if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.tom
 from laneweave.launch.fault_search.coverage import Coverage
 from laneweave.launch.fault_search.profiles import GUIDED, PROFILES, profiles_named
 from laneweave.launch.fault_search.search import ROUND, run_story, silence_logs
+from laneweave.launch.fault_search.shrinking import shrink
 from laneweave.launch.fault_search.story import Story
 from support.planted_bugs import BUGS, Bug
 from support.unseen_bugs import UNSEEN
 
 SEEDS = 2000
+STORIES = Path(__file__).parent / "stories"
 
 
 @frozen
@@ -83,28 +89,40 @@ def _search(name: str, count: int) -> Catch | None:
     return first_catch(bug_named(name), range(count))
 
 
-def table(bugs: Sequence[Bug], catches: Iterable[Catch | None]) -> Iterator[str]:
-    """Yield the lines of a Markdown table."""
-    yield "| planted bug | rule | what is broken | random search |"
-    yield "|---|---|---|---|"
-    found = 0
-    for bug, catch in zip(bugs, catches, strict=True):
-        found += catch is not None
-        seen = "-" if catch is None else f"{catch.profile} {catch.seed}: {', '.join(catch.kinds)}"
-        yield f"| `{bug.name}` | {bug.rule} | {bug.text} | {seen} |"
-    yield f"{found} of {len(bugs)} found"
+def shrunk_story(bug: Bug, catch: Catch) -> Story:
+    """Return the smallest story found that fails with a planted bug as a catch does."""
+    with pytest.MonkeyPatch.context() as patch:
+        bug.plant(patch)
+        story = Story.drawn(catch.seed, PROFILES[catch.profile])
+        return shrink(story, lambda smaller: run_story(smaller, bug.rules).violations)
+
+
+def write_stories(names: Sequence[str]) -> None:
+    """Write a shrunk story for each bug to `STORIES`."""
+    silence_logs()
+    for name in names:
+        catch = first_catch(bug_named(name), range(SEEDS))
+        if catch is not None:
+            story = evolve(shrunk_story(bug_named(name), catch), name=name)
+            (STORIES / f"{name}.json").write_text(story.text(), "utf-8")
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Print the table."""
-    every = UNSEEN if "--unseen" in arguments else BUGS
-    count, *names = [each for each in arguments if each != "--unseen"] or [str(SEEDS)]
-    bugs = [bug for bug in every if not names or bug.name in names]
+    """Print what is found as JSON, or write stories."""
+    if arguments[:1] == ["--stories"]:
+        write_stories(arguments[1:])
+        return
+    count, *names = arguments or [str(SEEDS)]
+    bugs = [bug.name for bug in (*BUGS, *UNSEEN) if not names or bug.name in names]
+    found: dict[str, str] = {}
     with ProcessPoolExecutor() as pool:
-        catches = pool.map(partial(_search, count=int(count)), [bug.name for bug in bugs])
-        for line in table(bugs, catches):
-            sys.stdout.write(line + "\n")
-            sys.stdout.flush()
+        for name, catch in zip(
+            bugs, pool.map(partial(_search, count=int(count)), bugs), strict=True
+        ):
+            seen = "-" if catch is None else f"{catch.profile} {catch.seed}: {catch.kinds[0]}"
+            found[name] = seen
+            sys.stderr.write(f"{name}: {seen}\n")
+    sys.stdout.write(json.dumps({"seeds": int(count), "found": found}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -20,6 +20,8 @@ from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
 
 ADOPTION = "leader L2 STATE to in force"
 """Feature of a leader that adopts a plan."""
+PLANNING = "leader L5 promised to planning"
+"""Feature of a leader that has received all promises."""
 UNIFORM_SHARE = 0.3
 """Share of the runs whose profiles are equally likely."""
 

@@ -23,7 +23,7 @@ from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVeh
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
 from laneweave.launch.fault_search.checks.checker import Checker, Violation
 from laneweave.launch.fault_search.checks.geometry import Geometry
-from laneweave.launch.fault_search.coverage import ADOPTION, Rules
+from laneweave.launch.fault_search.coverage import ADOPTION, PLANNING, Rules
 from laneweave.launch.fault_search.events.fault_context import ROAD
 from laneweave.launch.fault_search.events.faults import RandomFaults
 from laneweave.launch.fault_search.events.lasting_faults import CLOCK_DRIFT, CLOCK_OFFSET_S
@@ -396,8 +396,11 @@ class FaultRun:
 
     def _on_reached(self, feature: str, machine: Any) -> None:  # noqa: ANN401 (a state machine)
         self._features.add(feature)
+        claims, now_s = self.checker.claims, self.network.now_s
         if feature == ADOPTION:
-            self.checker.claims.on_adoption(self.network.now_s, machine.ballot, machine.roster)
+            claims.on_adoption(now_s, machine.ballot, machine.roster, machine.states)
+        elif feature == PLANNING:
+            claims.on_planning(now_s, machine.promises, machine.states)
 
     def _on_compute(self, name: str) -> None:
         self.checker.computes(self.network.now_s, name)

@@ -10,6 +10,7 @@ from laneweave.launch.fault_search.checks.checker import Violation
 from laneweave.launch.fault_search.events.faults import LAST_S
 from laneweave.launch.fault_search.events.lasting_faults import HEALTHY, LastingFaults
 from laneweave.launch.fault_search.story import Story
+from laneweave.protocol.wire.messages import Name
 
 MAX_RUNS = 300
 """Maximum number of runs for shrinking one story."""
@@ -53,15 +54,23 @@ def _smaller(story: Story, violation: Violation) -> Iterator[Story]:
         for first in range(0, count, size):
             yield evolve(story, events=story.events[:first] + story.events[first + size :])
         size //= 2
-    visits = story.setup.visits
-    for index in range(len(visits) if len(visits) > 1 else 0):
-        kept = visits[:index] + visits[index + 1 :]
-        yield evolve(story, setup=evolve(story.setup, visits=kept))
+    if len(story.setup.visits) > 1:
+        yield from (_without(visit.vehicle, story) for visit in story.setup.visits)
     for index in range(1, len(story.preferences) - 1):
         kept_changes = story.preferences[:index] + story.preferences[index + 1 :]
         yield evolve(story, preferences=kept_changes)
     for lasting in _calmer(story.setup.lasting):
         yield evolve(story, setup=evolve(story.setup, lasting=lasting))
+
+
+def _without(vehicle: Name, story: Story) -> Story:
+    """Return the story without a vehicle."""
+    visits = tuple(visit for visit in story.setup.visits if visit.vehicle != vehicle)
+    preferences = tuple(
+        evolve(change, lanes={name: lane for name, lane in change.lanes.items() if name != vehicle})
+        for change in story.preferences
+    )
+    return evolve(story, setup=evolve(story.setup, visits=visits), preferences=preferences)
 
 
 def _shorter(story: Story, violation: Violation) -> Iterator[Story]:

@@ -10,13 +10,13 @@ themselves must be true at any time, so they show a violated rule much sooner.
 | `basis` | a plan starts from cells or names processes that no promise has reported |
 | `roster` | a plan lacks a vehicle that entered in its blocks |
 | `two-plans` | two different rosters or plans are sent under one ballot |
-| `adoption` | a leader adopts a plan that a member has never accepted |
+| `adoption` | a leader adopts a plan that a member does not execute |
 | `harmful` | a vehicle accepts or begins a plan that it must refuse |
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 from attrs import define, field, frozen
 
@@ -31,6 +31,8 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 
+LOWEST = Ballot(-1, Name(""), 0, 0)
+States = Mapping[Name, VehicleState]
 Report = Callable[[str, float, list[str], str], None]
 """Callback for a violation: kind, virtual time, vehicles, text."""
 
@@ -144,6 +146,10 @@ class Claims:
             self._false(t_s, state, "its process has never been in charge")
         if not set(state.joined) <= set(stored.joined):
             self._false(t_s, state, f"joined {state.joined}, but stored are {stored.joined}")
+        if stored.owned and state.attended and state.incarnation == stored.attendant:
+            binding = stored.promised or LOWEST
+            if (ballot or LOWEST) < binding:
+                self._false(t_s, state, f"promises {short(ballot)} below {short(binding)}")
         if state.owned and (name, ballot, state.owned) not in self._holdings:
             self._false(t_s, state, f"owns {list(state.owned)} with {short(ballot)}")
         if state.incarnation == stored.attendant and not state.moving:
@@ -172,11 +178,37 @@ class Claims:
                 text = f"{short(ballot)} opens before {' '.join(sorted(missing))}"
                 self._tell("gate", t_s, name, text)
 
-    def on_adoption(self, t_s: float, ballot: Ballot, roster: Iterable[Name]) -> None:
-        """Check that all members have reported that they have accepted the ballot."""
+    def on_adoption(
+        self, t_s: float, ballot: Ballot, roster: Iterable[Name], known: States
+    ) -> None:
+        """Check that all members have accepted the ballot, also as far as its new leader knows.
+
+        Args:
+            t_s: virtual time.
+            ballot: adopted ballot.
+            roster: members of the formation.
+            known: newest state of each member that the leader has received.
+        """
         for name in roster:
-            if name not in self._accepted.get(ballot, ()):
-                self._tell("adoption", t_s, name, f"has not accepted {short(ballot)}")
+            state = known.get(name)
+            if (
+                name not in self._accepted.get(ballot, ())
+                or state is None
+                or (state.promised, state.accepted, state.overdue) != (ballot, True, False)
+            ):
+                self._tell("adoption", t_s, name, f"does not execute {short(ballot)}")
+
+    def on_planning(self, t_s: float, promises: States, known: States) -> None:
+        """Check that no promise for which a leader plans is of a process that has ended.
+
+        Args:
+            t_s: virtual time.
+            promises: promises that the leader counts.
+            known: newest state of each member that the leader has received.
+        """
+        for name, promise in promises.items():
+            if name in known and known[name].incarnation != promise.incarnation:
+                self._tell("basis", t_s, name, "the process that promised has ended")
 
     def on_prepare(self, t_s: float, prepare: Prepare) -> None:
         """Check that a ballot has one roster."""

@@ -106,12 +106,29 @@ def test_a_plan_contains_all_vehicles_of_its_blocks(scene: Scene) -> None:
 
 
 def test_only_a_plan_that_all_have_accepted_is_adopted(scene: Scene) -> None:
-    scene.send(ACCEPTED)
-    scene.claims.on_adoption(1.0, BALLOT, CELLS)
-    assert scene.kinds == ["adoption"]
-    scene.claims.record(evolve(ACCEPTED, vehicle=B))
-    scene.claims.on_adoption(1.0, BALLOT, CELLS)
-    assert scene.kinds == ["adoption"]
+    known = {A: ACCEPTED, B: evolve(ACCEPTED, vehicle=B)}
+    for state in known.values():
+        scene.claims.record(state)
+    scene.claims.on_adoption(1.0, BALLOT, CELLS, known)
+    assert scene.kinds == []
+    scene.claims.on_adoption(1.0, BALLOT, CELLS, known | {B: evolve(known[B], overdue=True)})
+    scene.claims.on_adoption(1.0, BALLOT._replace(seq=2), CELLS, known)
+    assert scene.kinds == ["adoption"] * 3
+
+
+def test_promises_of_ended_processes_do_not_count(scene: Scene) -> None:
+    promises = {A: ACCEPTED, B: evolve(ACCEPTED, vehicle=B)}
+    scene.claims.on_planning(1.0, promises, promises)
+    assert scene.kinds == []
+    scene.claims.on_planning(1.0, promises, {B: evolve(promises[B], incarnation=2)})
+    assert scene.kinds == ["basis"]
+
+
+def test_a_process_keeps_the_stored_promise(scene: Scene) -> None:
+    stored = evolve(STORED, promised=BALLOT._replace(seq=2), owned=((0, 0),))
+    scene.claims.store(A, stored)
+    scene.send(evolve(ACCEPTED, accepted=False))
+    assert scene.kinds == ["false"]
 
 
 def test_a_ballot_has_one_roster(scene: Scene) -> None:
