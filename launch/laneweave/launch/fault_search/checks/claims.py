@@ -11,6 +11,7 @@ themselves must be true at any time, so they show a violated rule much sooner.
 | `roster` | a plan lacks a vehicle that entered in its blocks |
 | `two-plans` | two different rosters or plans are sent under one ballot |
 | `adoption` | a leader adopts a plan that a member does not execute |
+| `busy` | a leader does not pause after failed planning |
 | `harmful` | a vehicle accepts or begins a plan that it must refuse |
 """
 
@@ -31,6 +32,8 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 
+PAUSE_S = 0.9
+"""Minimum time between two attempts to plan under one ballot."""
 LOWEST = Ballot(-1, Name(""), 0, 0)
 States = Mapping[Name, VehicleState]
 Report = Callable[[str, float, list[str], str], None]
@@ -70,6 +73,8 @@ class Claims:
     """(vehicle, incarnation, ballot, hold cell, joined blocks) of each promise."""
     _accepted: dict[Ballot, set[str]] = field(factory=dict)
     """Vehicles that have reported that they have accepted each ballot."""
+    _planned_s: dict[Ballot, float] = field(factory=dict)
+    """Time at which planning last began under each ballot."""
     _ready: dict[Ballot, set[str]] = field(factory=dict)
     """Vehicles that have reported under each ballot that they are ready."""
     _rosters: dict[Ballot, Prepare] = field(factory=dict)
@@ -198,14 +203,18 @@ class Claims:
             ):
                 self._tell("adoption", t_s, name, f"does not execute {short(ballot)}")
 
-    def on_planning(self, t_s: float, promises: States, known: States) -> None:
-        """Check that no promise for which a leader plans is of a process that has ended.
+    def on_planning(self, t_s: float, ballot: Ballot, promises: States, known: States) -> None:
+        """Check that a leader pauses after failed planning, and counts no promise that has ended.
 
         Args:
             t_s: virtual time.
+            ballot: ballot for which the leader plans.
             promises: promises that the leader counts.
             known: newest state of each member that the leader has received.
         """
+        if t_s < self._planned_s.get(ballot, -PAUSE_S) + PAUSE_S:
+            self._tell("busy", t_s, min(promises), f"planned again at once under {short(ballot)}")
+        self._planned_s[ballot] = t_s
         for name, promise in promises.items():
             if name in known and known[name].incarnation != promise.incarnation:
                 self._tell("basis", t_s, name, "the process that promised has ended")

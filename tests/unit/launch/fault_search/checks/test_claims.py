@@ -118,10 +118,16 @@ def test_only_a_plan_that_all_have_accepted_is_adopted(scene: Scene) -> None:
 
 def test_promises_of_ended_processes_do_not_count(scene: Scene) -> None:
     promises = {A: ACCEPTED, B: evolve(ACCEPTED, vehicle=B)}
-    scene.claims.on_planning(1.0, promises, promises)
+    scene.claims.on_planning(1.0, BALLOT, promises, promises)
     assert scene.kinds == []
-    scene.claims.on_planning(1.0, promises, {B: evolve(promises[B], incarnation=2)})
+    scene.claims.on_planning(2.0, BALLOT, promises, {B: evolve(promises[B], incarnation=2)})
     assert scene.kinds == ["basis"]
+
+
+def test_planning_is_not_repeated_at_once(scene: Scene) -> None:
+    for t_s in (1.0, 2.0, 2.5):
+        scene.claims.on_planning(t_s, BALLOT, {A: ACCEPTED}, {})
+    assert scene.kinds == ["busy"]
 
 
 def test_a_process_keeps_the_stored_promise(scene: Scene) -> None:
