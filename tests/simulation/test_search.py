@@ -1,6 +1,6 @@
 """Random search: whatever happens to network and processes, no rule of the checker is broken.
 
-Each seed draws roads, vehicles, preferred lanes and faults (`laneweave.launch.fault_search`). The
+Each seed draws road, vehicles, preferred lanes and faults (`laneweave.launch.fault_search`). The
 command printed with a failure replays it. The whole programme is
 
     laneweave simulate --seeds 0:20000
@@ -23,7 +23,7 @@ from laneweave.launch.fault_search.setup import SLOT_S
 from laneweave.launch.fault_search.story import Story
 
 BATCH = 20
-SEEDS = 40
+SEEDS = 20
 DIGESTS = range(1000, 1006)
 _PRINT_DIGESTS = """
 import json, sys
@@ -72,7 +72,7 @@ def test_no_rule_is_broken_and_all_vehicles_arrive_long(
 
 @pytest.mark.parametrize("profile", [name for name in PROFILES if name != "mixed"])
 def test_profile(profile: str) -> None:
-    search(profile, range({"rolling-dense": 3}.get(profile, 5)))
+    search(profile, range({"rolling-dense": 2}.get(profile, 4)))
 
 
 @pytest.mark.full
@@ -86,10 +86,12 @@ def test_formations_are_joined() -> None:
     assert search("joint", range(110, 122)).joint_plans > 0
 
 
-def test_every_kind_of_fault_happens() -> None:
-    faults = search("mixed", range(300, 320)).faults
+def test_every_kind_of_fault_is_drawn() -> None:
     mixed = PROFILES["mixed"]
-    lasting = {
+    stories = [Story.drawn(seed, mixed) for seed in range(200)]
+    assert {event.kind for story in stories for event in story.events} == set(mixed.event_kinds)
+    lasting = {kind for story in stories for kind in story.setup.lasting.kinds()}
+    assert lasting == {
         "loss",
         "duplication",
         "reordering",
@@ -100,8 +102,6 @@ def test_every_kind_of_fault_happens() -> None:
         "slow-moves",
         "wrong-clocks",
     }
-    assert set(faults) == set(mixed.event_kinds) | lasting
-    assert all(count > 0 for count in faults.values())
 
 
 @pytest.mark.parametrize("seed", range(10))

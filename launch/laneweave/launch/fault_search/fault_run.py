@@ -10,6 +10,7 @@ import random
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from itertools import count
 from typing import Any
 
@@ -43,12 +44,16 @@ RULES = Rules()
 TWIN = ".2"
 """Suffix of the name of the second process of a vehicle."""
 COORDINATORS = ("c1", "c2", "c3")
+INCARNATIONS_PER_S = 10_000
+"""Lead of incarnations per second by which a clock is ahead."""
 MAX_MOTION_SLOTS = 3.0
 """Maximum duration of a slow motion, in slots."""
 PATIENCE_S = 90.0
 """Time limit for all vehicles to arrive after the fault phase."""
 MAX_FUTILE_PLANS = 5
 """Number of plans after which a vehicle that has not moved counts as stuck."""
+MIN_ROAD_S = 10.0
+"""Time after its beginning at which slots of a road must have been planned."""
 HEALTHY_SLOTS = 8
 """Number of slots after the fault phase (rolling operation)."""
 NOTICE_S = 0.1
@@ -180,6 +185,8 @@ class FaultRun:
         )
         self._proposed: Counter[str] = Counter()
         """Number of plans after the fault phase that move or hold each vehicle."""
+        self._planned_slots = 0
+        """Number of plans after the fault phase (rolling operation)."""
         self._first_cells: dict[Name, Cell] = {}
         """First cell of each vehicle after the fault phase (rolling operation)."""
         self._moved: set[Name] = set()
@@ -216,6 +223,8 @@ class FaultRun:
             vehicle = self.road.vehicles[name]
             text = f"in {vehicle.controller.hold_cell}, prefers lane {vehicle.preferred_lane}"
             self.checker.stuck(network.now_s, name, text)
+        if self._rolling and not self.checker.violations:
+            self._check_planning()
         return self._result(time.process_time() - began_s)
 
     # --- processes ----------------------------------------------------------------------------
@@ -263,11 +272,17 @@ class FaultRun:
             )
         else:
             vehicle = Name(name.removesuffix(TWIN))
+            incarnation = partial(self._new_incarnation, vehicle)
             agent = AgentCore(vehicle, incarnation, scenario, LightDriver, rules.vehicle)
             runtime = scenario.runtime
             bounds = Bounds(incarnation(), runtime.tick_s, runtime.max_road_s)
             core = AgentHost(lambda _: agent, [vehicle], bounds=bounds)
         self._add(name, core)
+
+    def _new_incarnation(self, vehicle: Name) -> int:
+        """Return an incarnation by the clock of a vehicle's host, which may be ahead of others."""
+        ahead_s = max(0.0, self.setup.visit_of[vehicle].clock_offset_s)
+        return next(self._incarnations) + round(INCARNATIONS_PER_S * ahead_s)
 
     def _add(self, name: str, core: Core) -> None:
         listened = _ListenedCore(core, name, self._on_message, self._on_compute)
@@ -279,7 +294,7 @@ class FaultRun:
         road = LightRoad(
             self.setup.scenario,
             self.setup.make_entrance(self.story.preferences[0].lanes, bridge),
-            {visit.vehicle: visit for visit in self.setup.visits},
+            self.setup.visit_of,
             self.checker,
             self._incarnations.__next__,
             self._move_lasts_s,
@@ -303,6 +318,7 @@ class FaultRun:
         ) -> StreamPlan:
             table = planner(slot, vehicles, before, blocked)
             if self.faults.healed:
+                self._planned_slots += 1
                 paths = table.paths.items()
                 self._proposed.update(vehicle.vehicle for vehicle in vehicles if vehicle.held)
                 self._proposed.update(
@@ -434,6 +450,13 @@ class FaultRun:
                 cell = vehicle.controller.hold_cell
                 if self._first_cells.setdefault(name, cell) != cell:
                     self._moved.add(name)
+
+    def _check_planning(self) -> None:
+        """Check that slots have been planned since the fault phase (rolling operation)."""
+        vehicles = self.road.vehicles
+        if vehicles and self.road.t_s > MIN_ROAD_S and not self._planned_slots:
+            name = next(iter(vehicles))
+            self.checker.stuck(self.network.now_s, name, "no slot is planned")
 
     def _not_arrived(self) -> list[Name]:
         """Return the vehicles that should be at rest in their preferred lanes, but are not.

@@ -146,6 +146,11 @@ class Setup:
         """Scenario of the road."""
         return self.road.make_scenario()
 
+    @cached_property
+    def visit_of(self) -> dict[Name, Visit]:
+        """Visit of each vehicle."""
+        return {visit.vehicle: visit for visit in self.visits}
+
     @property
     def adjoin(self) -> bool:
         """Whether there are two adjacent formations that can join."""

@@ -10,6 +10,8 @@ from typing import Protocol
 from laneweave.launch.fault_search.events.fault_context import LONG_S, ROAD, SHORT_S, FaultContext
 
 CLOCK_JUMP_S = (-2.0, 2.0)
+PAUSED_TWINS = 0.3
+"""Share of vehicles with two processes of which the first one is paused."""
 NO_RESTART = 0.25
 """Share of killed agents that are restarted only after the fault phase."""
 
@@ -97,17 +99,20 @@ class ProcessFaults:
         return True
 
     def start_twin(self, name: str) -> bool:
-        """Start a second process for a vehicle; for some time, the first one receives no SENSE."""
+        """Start a second process for a vehicle; the first one pauses, or receives no SENSE."""
         if name not in self._context.network or name not in self._processes.agents:
             return False
         twin = self._processes.start_twin(name)
         if twin in self._twins:
             return False
         self._twins.append(twin)
-        self._hinder(
-            lambda sender, receiver, _: math.inf if (sender, receiver) == (ROAD, name) else 0.0,
-            f"{name} receives SENSE again",
-        )
+        if self._context.rng.random() < PAUSED_TWINS:
+            self.pause(name)
+        else:
+            self._hinder(
+                lambda sender, receiver, _: math.inf if (sender, receiver) == (ROAD, name) else 0.0,
+                f"{name} receives SENSE again",
+            )
         victim = self._context.rng.choice((name, twin))
         kill = partial(self._if_present, victim, self._context.network.kill)
         self._context.later(LONG_S, kill, f"{victim} is killed")
