@@ -15,6 +15,7 @@ from laneweave.launch.cli.options import (
     parse_seeds,
     shows_progress,
 )
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.files import write_atomically
 
 if TYPE_CHECKING:
@@ -61,6 +62,8 @@ def simulate(
     search.silence_logs()
     if story is not None:
         _run_story(Story.read(story), verbose=verbose)
+    if shrink is not None and not shrink.parent.is_dir():
+        raise BadInputError("--shrink", str(shrink), "a file in an existing folder")
     chosen = profiles.profiles_named(profile)
     numbers, count = parse_seeds(seeds), check_jobs(jobs)
     show = shows_progress(no_progress)

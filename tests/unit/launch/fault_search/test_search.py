@@ -116,6 +116,7 @@ def test_the_command() -> None:
     ("arguments", "line"),
     [
         (["--seeds", "9:3"], "--seeds: got '9:3'; allowed: A:B with A < B"),
+        (["--shrink", "/none/x"], "--shrink: got '/none/x'; allowed: a file in an existing folder"),
         (["--profile", "mild"], "--profile: got 'mild'; allowed: guided, mixed, calm"),
         (["--jobs", "0"], "--jobs: got 0; allowed: [1, 256]"),
     ],

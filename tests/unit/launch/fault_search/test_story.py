@@ -14,6 +14,7 @@ from laneweave.launch.fault_search.search import run_story
 from laneweave.launch.fault_search.shrinking import shrink
 from laneweave.launch.fault_search.story import Story
 from laneweave.protocol.errors import BadInputError
+from support import commands
 from support.commands import Here
 
 
@@ -45,6 +46,17 @@ def test_a_malformed_story_is_refused_in_one_line(
     table = json.loads(Story.drawn(1, PROFILES["calm"]).text()) | change
     path.write_text(json.dumps(table), "utf-8")
     assert words in laneweave.refused("simulate", "--story", str(path))
+
+
+@pytest.mark.slow
+def test_the_command_runs_a_story(tmp_path: Path) -> None:
+    path = tmp_path / "story.json"
+    path.write_text(Story.drawn(1, PROFILES["calm"]).text(), "utf-8")
+    done = commands.laneweave("simulate", "--story", str(path), "--verbose")
+    assert done.returncode == 0
+    lines = done.stdout.splitlines()
+    assert lines[0] == "calm 1:"
+    assert lines[-1] == "passed"
 
 
 def test_a_story_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
