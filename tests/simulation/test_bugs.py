@@ -56,6 +56,5 @@ def test_planted_bug_is_found(name: str) -> None:
 
 
 def test_most_bugs_are_found() -> None:
-    """At least 80 % of all planted bugs, and of those that the search was not written for."""
-    for bugs in (BUGS, UNSEEN):
-        assert sum(bug.name in FOUND for bug in bugs) >= 0.8 * len(bugs)
+    every = (*BUGS, *UNSEEN)
+    assert sum(bug.name in FOUND for bug in every) >= 0.8 * len(every)
