@@ -22,7 +22,7 @@ SOON = {
     "no-gate": ("mixed", "gate"),
     "need-minus-one": ("coordinators", "order"),
     "no-pacing": ("mixed", "early"),
-    "second-plan-under-one-ballot": ("mixed", "two-plans"),
+    "second-plan-under-one-ballot": ("calm", "two-plans"),
     "promise-without-cell": ("mixed", "basis"),
     "planned-before-closed": ("mixed", "roster"),
     "start-cell-not-checked": ("harmful", "harmful"),

@@ -71,6 +71,7 @@ def keys_of(topic: Topic, vehicle: str) -> Iterator[str]:
     """Return keys of a topic: of somebody who is there and of somebody who is not."""
     there = {"vehicle": vehicle, "formation": 0, "stretch": 0, "coordinator": "c1"}
     there |= {"role": "agent", "name": vehicle, "incarnation": 1}
+    there |= {"session": "s1", "client": "client"}
     nobody = dict.fromkeys(topic.parameters, "ghost") | {"formation": 99, "stretch": 99}
     yield KEYS.key(topic, **there)
     yield KEYS.key(topic, **nobody)

@@ -59,13 +59,13 @@ def simulate(
     from laneweave.launch.fault_search import profiles, search
     from laneweave.launch.fault_search.story import Story
 
-    search.silence_logs()
     if story is not None:
         _run_story(Story.read(story), verbose=verbose)
     if shrink is not None and not shrink.parent.is_dir():
         raise BadInputError("--shrink", str(shrink), "a file in an existing folder")
     chosen = profiles.profiles_named(profile)
     numbers, count = parse_seeds(seeds), check_jobs(jobs)
+    search.silence_logs()
     show = shows_progress(no_progress)
     result = search.search(numbers, chosen, count, digest=digest, show=show)
     first = next(iter(result.failed), None)
@@ -86,8 +86,9 @@ def simulate(
 
 def _run_story(story: Story, *, verbose: bool) -> NoReturn:
     """Run one story, and exit."""
-    from laneweave.launch.fault_search.search import run_story, timeline_of
+    from laneweave.launch.fault_search.search import run_story, silence_logs, timeline_of
 
+    silence_logs()
     for line in timeline_of(story) if verbose else ():
         typer.echo(line)
     violations = run_story(story).violations
