@@ -26,8 +26,7 @@ if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.tom
 
 from laneweave.launch.fault_search.coverage import Coverage
 from laneweave.launch.fault_search.profiles import GUIDED, PROFILES, profiles_named
-from laneweave.launch.fault_search.search import ROUND, run_story, silence_logs
-from laneweave.launch.fault_search.shrinking import shrink
+from laneweave.launch.fault_search.search import rounds, run_story, shrunk, silence_logs
 from laneweave.launch.fault_search.story import Story
 from support.planted_bugs import BUGS, Bug
 from support.unseen_bugs import UNSEEN
@@ -66,11 +65,8 @@ def _first_failure(bug: Bug, seeds: range, profile: str) -> Catch | None:
     coverage = Coverage()
     with pytest.MonkeyPatch.context() as patch:
         bug.plant(patch)
-        for first in range(seeds.start, seeds.stop, ROUND):
-            numbers = range(first, min(first + ROUND, seeds.stop))
-            for seed, name in zip(
-                numbers, coverage.choose(names, len(numbers), first), strict=True
-            ):
+        for tasks in rounds(seeds, names, coverage):
+            for seed, name in tasks:
                 result = run_story(Story.drawn(seed, PROFILES[name]), bug.rules)
                 if result.violations:
                     kinds = tuple(dict.fromkeys(each.kind for each in result.violations))
@@ -93,8 +89,7 @@ def shrunk_story(bug: Bug, catch: Catch) -> Story:
     """Return the smallest story found that fails with a planted bug as a catch does."""
     with pytest.MonkeyPatch.context() as patch:
         bug.plant(patch)
-        story = Story.drawn(catch.seed, PROFILES[catch.profile])
-        return shrink(story, lambda smaller: run_story(smaller, bug.rules).violations)
+        return shrunk(Story.drawn(catch.seed, PROFILES[catch.profile]), bug.rules)
 
 
 def write_stories(names: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ from laneweave.coordinator.election import Election
 from laneweave.coordinator.formations import operation, roster
 from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.roster import Formation, Groups
-from laneweave.launch.fault_search.road.light_road import LightRoad
+from laneweave.launch.fault_search.road.drawn_entrance import DrawnEntrance
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect
 from laneweave.protocol.scenario.fields import Scenario
@@ -303,16 +303,16 @@ def close_at_once(patch: pytest.MonkeyPatch) -> None:
 
 
 def close_early(patch: pytest.MonkeyPatch) -> None:
-    closing_s, close_formations = ColumnBlocks._closing_s, LightRoad._close_formations
+    closing_s, close_formations = ColumnBlocks._closing_s, DrawnEntrance.close_formations
 
     def block_mutant(self: ColumnBlocks, block: int) -> float:
         return closing_s(self, block) - EARLY_S
 
-    def light_mutant(self: LightRoad, t_s: float) -> None:
-        close_formations(self, t_s + EARLY_S)
+    def drawn_mutant(self: DrawnEntrance, t_s: float) -> list[ClosedFormation]:
+        return close_formations(self, t_s + EARLY_S)
 
     patch.setattr(ColumnBlocks, "_closing_s", block_mutant)
-    patch.setattr(LightRoad, "_close_formations", light_mutant)
+    patch.setattr(DrawnEntrance, "close_formations", drawn_mutant)
 
 
 def join_nothing(patch: pytest.MonkeyPatch) -> None:

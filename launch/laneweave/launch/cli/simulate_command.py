@@ -74,7 +74,7 @@ def simulate(
         for line in search.timeline_of(Story.drawn(seed, profiles.PROFILES[name])):
             typer.echo(line)
     if shrink is not None and first is not None:
-        smaller = search.shrunk_story(first.seed, profiles.PROFILES[first.profile])
+        smaller = search.shrunk(Story.drawn(first.seed, profiles.PROFILES[first.profile]))
         write_atomically(shrink, smaller.text())
         typer.echo(f"story of seed {first.seed}: {shrink}")
     if digest:

@@ -22,8 +22,9 @@ from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
-from laneweave.launch.fault_search.checks.checker import Checker, Violation
+from laneweave.launch.fault_search.checks.checker import Checker
 from laneweave.launch.fault_search.checks.geometry import Geometry
+from laneweave.launch.fault_search.checks.violations import Violation
 from laneweave.launch.fault_search.coverage import ADOPTION, PLANNING, Rules
 from laneweave.launch.fault_search.events.fault_context import ROAD
 from laneweave.launch.fault_search.events.faults import RandomFaults
@@ -192,8 +193,6 @@ class FaultRun:
         self._moved: set[Name] = set()
         """Vehicles that have moved since the fault phase."""
         self._preferences = story.preferences[0].lanes
-        self._clocks: dict[str, tuple[float, float]] = {}
-        """Offset and rate of the clock of each machine."""
         self._takeovers = 0
         """Number of takeovers by caretakers on earlier roads."""
         self.road = self._make_road()
@@ -357,7 +356,6 @@ class FaultRun:
         for name in (*COORDINATORS, *(visit.vehicle for visit in self.setup.visits)):
             offset_s = self._rng.uniform(-CLOCK_OFFSET_S, CLOCK_OFFSET_S)
             rate = 1.0 + self._rng.uniform(-CLOCK_DRIFT, CLOCK_DRIFT)
-            self._clocks[name] = offset_s, rate
             self.network.set_clock(name, offset_s, rate)
 
     def jump_clock(self, name: str, jump_s: float) -> None:
@@ -369,9 +367,7 @@ class FaultRun:
         if vehicle is not None:
             vehicle.clock_jump_s = jump_s
         elif name in COORDINATORS and jump_s:
-            offset_s, rate = self._clocks.get(name, (0.0, 1.0))
-            self._clocks[name] = offset_s + abs(jump_s), rate
-            self.network.set_clock(name, *self._clocks[name])
+            self.network.advance_clock(name, abs(jump_s))
 
     # --- draws for the road -------------------------------------------------------------------
 

@@ -18,7 +18,7 @@ from attrs import evolve, field, frozen
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from laneweave.launch.fault_search.checks.checker import Violation
+from laneweave.launch.fault_search.checks.violations import Violation
 from laneweave.launch.fault_search.coverage import Coverage, Rules, all_features
 from laneweave.launch.fault_search.fault_run import RULES, FaultRun, SeedResult, Totals
 from laneweave.launch.fault_search.profiles import PROFILES, Profile
@@ -119,14 +119,14 @@ def search(
     )
     with bar, _workers(jobs if len(seeds) > BATCH else 1) as run:
         shown = bar.add_task(" ".join(each.name for each in profiles), total=len(seeds), failed=0)
-        for tasks in _rounds(seeds, [each.name for each in profiles], result.coverage):
+        for tasks in rounds(seeds, [each.name for each in profiles], result.coverage):
             for outcomes in run(tasks, digest):
                 result = _with(result, outcomes)
                 bar.update(shown, completed=result.totals.runs, failed=len(result.failed))
     return result
 
 
-def _rounds(seeds: range, profiles: Sequence[str], coverage: Coverage) -> Iterator[list[Task]]:
+def rounds(seeds: range, profiles: Sequence[str], coverage: Coverage) -> Iterator[list[Task]]:
     """Yield the tasks of each round, with profiles chosen by the coverage of earlier rounds."""
     size = ROUND if len(profiles) > 1 else len(seeds)
     for first in range(0, len(seeds), size):
@@ -270,7 +270,6 @@ def timeline_of(story: Story) -> Iterator[str]:
     yield from timeline.around(outcome.violations)
 
 
-def shrunk_story(seed: int, profile: Profile) -> Story:
-    """Return the smallest story found that fails as the run of a seed does."""
-    story = Story.drawn(seed, profile)
-    return shrink(story, lambda smaller: run_story(smaller).violations)
+def shrunk(story: Story, rules: Rules = RULES) -> Story:
+    """Return the smallest story found that fails as the given one does."""
+    return shrink(story, lambda smaller: run_story(smaller, rules).violations)

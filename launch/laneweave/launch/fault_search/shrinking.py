@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 from attrs import evolve
 
-from laneweave.launch.fault_search.checks.checker import Violation
+from laneweave.launch.fault_search.checks.violations import Violation
 from laneweave.launch.fault_search.events.faults import LAST_S
 from laneweave.launch.fault_search.events.lasting_faults import HEALTHY, LastingFaults
 from laneweave.launch.fault_search.story import Story

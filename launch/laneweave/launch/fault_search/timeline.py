@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from laneweave.launch.fault_search.checks.checker import Violation
 from laneweave.launch.fault_search.checks.claims import short
+from laneweave.launch.fault_search.checks.violations import Violation
 from laneweave.protocol.runtime.node import Send
 from laneweave.protocol.wire.messages import (
     Command,

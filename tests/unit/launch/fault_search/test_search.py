@@ -13,7 +13,7 @@ from attrs import evolve
 
 from laneweave.launch.cli.options import check_jobs, parse_seeds
 from laneweave.launch.fault_search import search as search_module
-from laneweave.launch.fault_search.checks.checker import Violation
+from laneweave.launch.fault_search.checks.violations import Violation
 from laneweave.launch.fault_search.fault_run import FaultRun, SeedResult, Totals
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.search import (

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from attrs import evolve
 
-from laneweave.launch.fault_search.checks.checker import Violation
+from laneweave.launch.fault_search.checks.violations import Violation
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.search import run_story
 from laneweave.launch.fault_search.shrinking import shrink

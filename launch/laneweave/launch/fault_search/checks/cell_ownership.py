@@ -9,16 +9,13 @@ no cell has been transferred.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from attrs import frozen
 
+from laneweave.launch.fault_search.checks.violations import Report, once
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, PendingTransfer
 
 Cells = frozenset[Cell]
-Report = Callable[[str, float, list[str], str], None]
-"""Callback for a violation: kind, virtual time, vehicles, text."""
 
 
 @frozen
@@ -41,8 +38,7 @@ class CellOwnership:
 
     def __init__(self, report: Report) -> None:
         """Start without vehicles; `report` is called once for each violation."""
-        self._report = report
-        self._reported: set[tuple[str, str, str]] = set()
+        self._report = once(report)
         self._holdings: dict[str, Holding] = {}
         self._opened: set[Ballot] = set()
         """Ballots under which a vehicle has taken possession."""
@@ -90,13 +86,8 @@ class CellOwnership:
             for cell in owned:
                 other = owners.setdefault(cell, vehicle)
                 if other != vehicle:
-                    self._report_once("owner", t_s, [vehicle, other], f"both own {cell}")
+                    self._report("owner", t_s, [vehicle, other], f"both own {cell}")
             foreign = self._bodies.get(vehicle, frozenset()) - (holding.cells & owned)
             if foreign:
                 text = f"its body is in {sorted(foreign)}, which it does not own"
-                self._report_once("trespass", t_s, [vehicle], text)
-
-    def _report_once(self, kind: str, t_s: float, vehicles: list[str], text: str) -> None:
-        if (kind, vehicles[0], text) not in self._reported:
-            self._reported.add((kind, vehicles[0], text))
-            self._report(kind, t_s, vehicles, text)
+                self._report("trespass", t_s, [vehicle], text)

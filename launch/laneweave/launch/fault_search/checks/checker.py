@@ -28,11 +28,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 
-from attrs import define, frozen
+from attrs import define
 
 from laneweave.launch.fault_search.checks.cell_ownership import CellOwnership
 from laneweave.launch.fault_search.checks.claims import Claims, Stored, required_before, short
 from laneweave.launch.fault_search.checks.geometry import Body, Geometry, overlap_between
+from laneweave.launch.fault_search.checks.violations import Violation
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import (
     Ballot,
@@ -48,21 +49,6 @@ MAX_VIOLATIONS = 20
 CLOCK_TOLERANCE_S = 0.01
 MAX_COMPUTATIONS = 15
 """Maximum number of computations that a process starts in a second."""
-
-
-@frozen
-class Violation:
-    """A violated property."""
-
-    kind: str
-    t_s: float
-    """Virtual time."""
-    vehicles: tuple[str, ...]
-    text: str
-
-    def __str__(self) -> str:
-        """Return the violation as one line."""
-        return f"{self.t_s:8.3f} s  {self.kind}: {', '.join(self.vehicles)}: {self.text}"
 
 
 @define

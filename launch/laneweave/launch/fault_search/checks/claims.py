@@ -17,10 +17,11 @@ themselves must be true at any time, so they show a violated rule much sooner.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 
 from attrs import define, field, frozen
 
+from laneweave.launch.fault_search.checks.violations import Report, once
 from laneweave.launch.fault_search.events.forgeries import Harm
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import (
@@ -36,8 +37,6 @@ PAUSE_S = 0.9
 """Minimum time between two attempts to plan under one ballot."""
 LOWEST = Ballot(-1, Name(""), 0, 0)
 States = Mapping[Name, VehicleState]
-Report = Callable[[str, float, list[str], str], None]
-"""Callback for a violation: kind, virtual time, vehicles, text."""
 
 
 @frozen
@@ -56,7 +55,7 @@ class Stored:
 class Claims:
     """Checker of claims in a run."""
 
-    report: Report
+    report: Report = field(converter=once)
     plans: dict[Ballot, Plan]
     """All plans sent so far; shared with the checker."""
     harmful: dict[Ballot, Harm] = field(factory=dict)
@@ -82,7 +81,6 @@ class Claims:
     """Block in which each vehicle on the road entered."""
     _earlier: set[tuple[str, int]] = field(factory=set)
     """(vehicle, incarnation) of each process that has acted on an earlier road."""
-    _reported: set[tuple[str, str, str]] = field(factory=set)
 
     # --- the road -----------------------------------------------------------------------------
 
@@ -249,9 +247,7 @@ class Claims:
         self._tell("false", t_s, state.vehicle, f"it reports that it {text}")
 
     def _tell(self, kind: str, t_s: float, vehicle: str, text: str) -> None:
-        if (kind, vehicle, text) not in self._reported:
-            self._reported.add((kind, vehicle, text))
-            self.report(kind, t_s, [vehicle], text)
+        self.report(kind, t_s, [vehicle], text)
 
 
 def short(ballot: Ballot | None) -> str:

@@ -28,10 +28,10 @@ FIRST_S = 0.3
 LAST_S = 0.3
 """Time before the end of the fault phase after which no fault event begins."""
 MAX_SKIPPED = 4
-"""Maximum number of occasions that an ambush lets pass."""
-AMBUSH_DELAY_S = (0.0, 0.0, 0.002, 0.05, 0.3)
-"""Delays between an occasion and the fault to draw from."""
-AMBUSHES = ("kill", "pause", "cut", "twin", "mute")
+"""Maximum number of messages that a triggered fault ignores."""
+TRIGGER_DELAY_S = (0.0, 0.0, 0.002, 0.05, 0.3)
+"""Delays between a trigger and its fault to draw from."""
+TRIGGERED_KINDS = ("kill", "pause", "cut", "twin", "mute")
 _TARGETED = ("leader", "coordinator", "agent", "cut")
 """Prefixes of the event kinds that have a target."""
 
@@ -97,7 +97,7 @@ def _is_plan(message: object) -> bool:
     return isinstance(message, Plan)
 
 
-_OCCASIONS: tuple[Callable[[object], bool], ...] = (
+_TRIGGERS: tuple[Callable[[object], bool], ...] = (
     _is_promise,
     _is_acceptance,
     _is_opening,
@@ -109,12 +109,12 @@ _OCCASIONS: tuple[Callable[[object], bool], ...] = (
 
 
 @define
-class _Ambush:
-    """A fault that waits for an occasion: a message of some kind."""
+class _TriggeredFault:
+    """A fault that happens when a message of some kind is sent."""
 
-    occasion: Callable[[object], bool]
+    trigger: Callable[[object], bool]
     skip: int
-    """Number of occasions to let pass."""
+    """Number of such messages to ignore first."""
     kind: str
     delay_s: float
     rng: random.Random
@@ -141,7 +141,7 @@ class RandomFaults:
         self.processes = ProcessFaults(self._context, processes, self.network.hinder)
         self.messages = InjectedMessages(self._context, keys, harmed, self._count_changed_plan)
         self._all_processes = processes
-        self._ambushes: list[_Ambush] = []
+        self._waiting: list[_TriggeredFault] = []
 
     @property
     def healed(self) -> bool:
@@ -161,25 +161,25 @@ class RandomFaults:
         network.conditions = HEALTHY
         network.hinder(None)
         network.restore_router()
-        self._ambushes.clear()
+        self._waiting.clear()
         self.messages.heal()
         self.processes.heal()
 
     def on_sent(self, sender: str, effect: Send) -> None:
-        """Keep some messages, and spring an ambush that waits for this one."""
+        """Keep some messages, and apply a fault that this one triggers."""
         if self.healed:
             return
         self.messages.keep(effect)
-        for ambush in self._ambushes:
-            if not ambush.occasion(effect.message):
+        for fault in self._waiting:
+            if not fault.trigger(effect.message):
                 continue
-            ambush.skip -= 1
-            if ambush.skip >= 0:
+            fault.skip -= 1
+            if fault.skip >= 0:
                 continue
-            self._ambushes.remove(ambush)
-            victim = self._victim(sender, effect.parameters, ambush.rng)
-            at_s = self._context.network.now_s + ambush.delay_s
-            self._context.network.at(at_s, self._spring, ambush, victim)
+            self._waiting.remove(fault)
+            victim = self._victim(sender, effect.parameters, fault.rng)
+            at_s = self._context.network.now_s + fault.delay_s
+            self._context.network.at(at_s, self._apply_triggered, fault, victim)
             return
 
     def apply(self, event: FaultEvent) -> None:
@@ -201,15 +201,15 @@ class RandomFaults:
             return rng.choice(self._context.network.names)
         return rng.choice(processes.coordinators)
 
-    def lie_in_ambush(self, _: str) -> bool:
-        """Let a process fail at a certain step of the protocol."""
+    def wait_for_trigger(self, _: str) -> bool:
+        """Let a process fail when a message of some kind is sent."""
         rng = self._context.rng
-        self._ambushes.append(
-            _Ambush(
-                rng.choice(_OCCASIONS),
+        self._waiting.append(
+            _TriggeredFault(
+                rng.choice(_TRIGGERS),
                 rng.randint(0, MAX_SKIPPED),
-                rng.choice(AMBUSHES),
-                rng.choice(AMBUSH_DELAY_S),
+                rng.choice(TRIGGERED_KINDS),
+                rng.choice(TRIGGER_DELAY_S),
                 self._context.new_rng(),
             )
         )
@@ -220,12 +220,12 @@ class RandomFaults:
         names = sorted({sender, str(parameters.get("vehicle", sender))} - {ROAD})
         return rng.choice(names or [sender])
 
-    def _spring(self, ambush: _Ambush, victim: str) -> None:
+    def _apply_triggered(self, fault: _TriggeredFault, victim: str) -> None:
         if self._context.healed:
             return
-        self._context.rng = ambush.rng
-        self._context.log(f"--- ambush: {ambush.kind} of {victim}")
-        match ambush.kind:
+        self._context.rng = fault.rng
+        self._context.log(f"--- triggered: {fault.kind} of {victim}")
+        match fault.kind:
             case "kill":
                 self.processes.kill(victim)
             case "pause":
@@ -255,7 +255,7 @@ ACTIONS: Mapping[str, Callable[[RandomFaults], Callable[[str], bool]]] = {
     "coordinator-clock-jump": lambda faults: faults.processes.jump_clock,
     "cut": lambda faults: faults.processes.disconnect,
     "road-restart": lambda faults: faults.processes.restart_road,
-    "ambush": lambda faults: faults.lie_in_ambush,
+    "triggered": lambda faults: faults.wait_for_trigger,
     "harmful-plan": lambda faults: faults.messages.change_next_plan,
     "partition": lambda faults: faults.network.partition,
     "blackout": lambda faults: faults.network.blackout,

@@ -43,7 +43,6 @@ class NetworkFaults:
         self._conditions = conditions
         self._keys = keys
         self._hindrances: list[Callable[[str, str, str], float]] = []
-        self._topic_of: dict[str, Topic | None] = {}
         self._blackouts = 0
 
     def partition(self, _: str) -> bool:
@@ -70,10 +69,10 @@ class NetworkFaults:
         topic = rng.choice(_HINDERED)
         extra_s = math.inf if rng.random() < ALL_LOST else rng.uniform(*HINDRANCE_S)
         sends = rng.random() < 0.5
-        about = self._topics_of_keys
 
         def delay_s(sender: str, receiver: str, key: str) -> float:
-            return extra_s if (sender if sends else receiver) == name and about(key) is topic else 0
+            concerned = (sender if sends else receiver) == name
+            return extra_s if concerned and self._is_about(key, topic) else 0.0
 
         self._context.log(
             f"--- {topic.name} {'from' if sends else 'to'} {name}: {extra_s:.2f} s late"
@@ -81,11 +80,9 @@ class NetworkFaults:
         self.hinder(delay_s, f"{topic.name} is no longer hindered")
         return True
 
-    def _topics_of_keys(self, key: str) -> Topic | None:
-        if key not in self._topic_of:
-            known = self._keys.read(key)
-            self._topic_of[key] = None if known is None else known[0]
-        return self._topic_of[key]
+    def _is_about(self, key: str, topic: Topic) -> bool:
+        known = self._keys.read(key)
+        return known is not None and known[0] is topic
 
     def hinder(self, delay_s: Callable[[str, str, str], float], what: str) -> None:
         """Delay messages for some time; `what` describes the end."""

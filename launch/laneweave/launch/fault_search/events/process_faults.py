@@ -16,7 +16,7 @@ NO_RESTART = 0.25
 """Share of killed agents that are restarted only after the fault phase."""
 
 Hinder = Callable[[Callable[[str, str, str], float], str], None]
-"""Delays messages for some time: takes the delay, and a description of its end."""
+"""Delays messages for some time; arguments: extra delay [s] of a message, text for the end."""
 
 
 class Processes(Protocol):

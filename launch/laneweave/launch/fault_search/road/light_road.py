@@ -93,7 +93,7 @@ class LightRoad:
         self.bridge = bridge
         self.began_s = began_s
         self._preferred_lanes: Mapping[Name, int] = {}
-        """Preferred lanes that differ from those at the entrance."""
+        """Newest preferred lanes; empty: those at the entrance."""
         self._attendance = Attendance(scenario, new_incarnation)
         self._bounds = Bounds(bridge, self._tick_s, scenario.runtime.max_road_s)
 
@@ -174,7 +174,7 @@ class LightRoad:
         t_s = self.t_s
         self._checker.advance(now_s)
         self._let_enter(now_s)
-        self._close_formations(now_s)
+        self._close_formations()
         self._entrance.assign_empty_cells(self.vehicles)
         yield from self._let_leave(now_s)
         for name, vehicle in self.vehicles.items():
@@ -201,12 +201,11 @@ class LightRoad:
                 vehicle.prefer(self._preferred_lanes[name])
             self._checker.enter(now_s, name, admission.cell, vehicle.block)
 
-    def _close_formations(self, now_s: float) -> None:
+    def _close_formations(self) -> None:
         for closed in self._entrance.close_formations(self.t_s):
             for vehicle in self.vehicles.values():
                 if vehicle.block in closed.blocks:
                     vehicle.join(closed)
-                    self._report_stored(vehicle.name, now_s)
 
     def _report_stored(self, name: Name, now_s: float) -> None:
         controller = self.vehicles[name].controller

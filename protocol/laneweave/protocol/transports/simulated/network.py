@@ -264,6 +264,11 @@ class SimulatedNetwork(Simulation):
         if name in self._members:
             self._members[name].set_clock(clock)
 
+    def advance_clock(self, name: str, by_s: float) -> None:
+        """Let a node's clock jump ahead."""
+        clock = self._clocks.get(name, Clock(0.0, 1.0))
+        self.set_clock(name, clock.offset_s + by_s, clock.rate)
+
     # --- faults of the network --------------------------------------------------------------
 
     def hinder(self, extra_delay_s: Callable[[str, str, str], float] | None) -> None:

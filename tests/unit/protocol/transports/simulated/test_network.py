@@ -15,7 +15,7 @@ from laneweave.protocol.transports.simulated.network import (
     Parcel,
     SimulatedNetwork,
 )
-from laneweave.protocol.transports.simulated.virtual_time import Conditions
+from laneweave.protocol.transports.simulated.virtual_time import Clock, Conditions
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.topics import COMMAND, HEARTBEAT, SERVICE, VEHICLE_ALIVE, Keys
 from support.node_recorder import (
@@ -109,6 +109,15 @@ def test_a_hindrance_delays_messages_of_a_key() -> None:
     assert receiver.numbers == []
     network.run(0.7)
     assert receiver.numbers == [1]
+
+
+def test_a_clock_jumps_ahead_and_keeps_its_rate() -> None:
+    network = network_of(a=Recorder())
+    network.set_clock("a", 1.0, 2.0)
+    network.advance_clock("a", 0.5)
+    assert network._clocks["a"] == Clock(1.5, 2.0)
+    network.advance_clock("b", 0.5)
+    assert network._clocks["b"] == Clock(0.5, 1.0)
 
 
 def test_the_time_without_a_connection() -> None:
