@@ -206,7 +206,7 @@ class CoordinatorCore:
             effects += self._on_election(now_s)
             effects += self._lead(now_s)
             effects += self._periodic_messages(now_s)
-            effects += self.service.drop_late(now_s)
+            effects += self.service.wake(now_s)
             self._set_wakeup(now_s)
         return effects
 

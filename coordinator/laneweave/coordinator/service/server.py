@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from functools import partial
-from hashlib import blake2b
 from typing import ClassVar
 
 import attrs
@@ -19,14 +18,13 @@ from attrs import frozen
 
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
+from laneweave.coordinator.service.answers import CachedAnswer, CachedAnswers
 from laneweave.coordinator.service.format import (
     CANCELLED,
     FAILED,
     INVALID,
-    JSON,
     LATE,
     MSGPACK,
-    OVERLOADED,
     Format,
     Refusal,
     format_of,
@@ -37,6 +35,7 @@ from laneweave.coordinator.service.pending import (
     PendingPlan,
     PendingPlans,
 )
+from laneweave.coordinator.service.refusals import PacedRefusals
 from laneweave.coordinator.service.rendezvous import is_assigned_to
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import metric
@@ -52,8 +51,6 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.scenario.deployment_fields import Service
 from laneweave.protocol.scenario.fields import DEFAULT_SOLVER
 
-CACHE_BYTES = 1 << 26
-"""Upper bound on the total size of cached answers."""
 AHEAD_BELOW_S = 0.02
 """Mean time of plans below which each worker has one job ahead, so that it is not idle between two.
 With longer plans, idle time matters less than the delay of the next client in turn."""
@@ -61,8 +58,6 @@ FIRST_MEAN_S = 0.01
 """Assumed mean time of a plan before the first one."""
 MEAN_WEIGHT = 0.1
 """Weight of the newest plan in the mean time of plans."""
-MIN_RETRY_S, MAX_RETRY_S = 0.05, 5.0
-"""Range of the time after which a client should send a refused request again."""
 
 
 @frozen
@@ -92,16 +87,6 @@ class ServiceMetrics:
     )
     waiting: int = metric("Requests waiting for a worker", default=0)
     planning: int = metric("Requests handed to workers", default=0)
-
-
-@frozen
-class _CachedAnswer:
-    """A cached answer, packed: as Python objects it would take 20 times as much memory."""
-
-    request: bytes
-    """Digest of the request."""
-    answer: bytes
-    answered_s: float
 
 
 class PlanningService:
@@ -136,9 +121,8 @@ class PlanningService:
         """Live sessions; that of unknown clients is never closed."""
         self._mean_s = FIRST_MEAN_S
         """Mean time of recent plans."""
-        self._answers: dict[str, _CachedAnswer] = {}
-        """Cached answers by request id, oldest first."""
-        self._cached_bytes = 0
+        self._answers = CachedAnswers(settings)
+        self._refusals = PacedRefusals()
         self._metrics = ServiceMetrics()
 
     @property
@@ -149,8 +133,11 @@ class PlanningService:
 
     @property
     def wakeup_s(self) -> float | None:
-        """Earliest deadline of a waiting request."""
-        return min((entry.deadline_s for entry in self._pending.not_begun), default=None)
+        """Earliest deadline of a waiting request, or time at which a refusal is due."""
+        times = [entry.deadline_s for entry in self._pending.not_begun]
+        if (refusal_s := self._refusals.wakeup_s) is not None:
+            times.append(refusal_s)
+        return min(times, default=None)
 
     # --- queries ------------------------------------------------------------------------------
 
@@ -189,7 +176,7 @@ class PlanningService:
         query = OpenQuery(token, format_of(payload, encoding), session)
         if self._pending.count(session.client) >= self._settings.client_queue_limit:
             # Without reading the request: a flood should cost little.
-            yield self._refuse(query, self._client_overload(session.client))
+            yield from self._refuse_over_limit(query, now_s)
             return
         yield from self._take(query, payload, job, now_s)
 
@@ -198,7 +185,7 @@ class PlanningService:
         form = query.form
         try:
             request = self._read(form, payload)
-            self._expire_answers(now_s)
+            self._answers.expire(now_s)
             entry, cached = self._known(request)
         except BadInputError as error:
             self._count("invalid_total")
@@ -210,18 +197,19 @@ class PlanningService:
             return
         if cached is not None:
             self._count("repeated_total")
-            answer = form.write(MSGPACK.read(cached.answer))
+            answer = form.write(MSGPACK.read(cached.packed))
             yield Reply(query.token, answer, encoding=form.encoding)
             return
         client = query.session.client
         if len(self._pending) >= self._settings.queue_limit:
-            refusal = self._overload()
+            count = len(self._pending)
             displaced = self._pending.displaced_by(client)
             if displaced is None:
-                yield self._refuse(query, refusal)
+                yield from self._refuse_in_total(query, count, now_s)
                 return
             self._forget(displaced)
-            yield from (self._refuse(each, refusal) for each in displaced.queries)
+            for each in displaced.queries:
+                yield from self._refuse_in_total(each, count, now_s)
         entry = PendingPlan(request, now_s, job, client, [query])
         if request.id:
             self._by_id[request.id] = entry
@@ -240,11 +228,11 @@ class PlanningService:
             raise BadInputError("deadline_s", request.deadline_s, allowed)
         return request
 
-    def _known(self, request: PlanRequest) -> tuple[PendingPlan | None, _CachedAnswer | None]:
+    def _known(self, request: PlanRequest) -> tuple[PendingPlan | None, CachedAnswer | None]:
         """Return the entry or the cached answer of a repeated request."""
         entry, cached = self._by_id.get(request.id), self._answers.get(request.id)
         another = (entry is not None and entry.request != request) or (
-            cached is not None and cached.request != _digest(request)
+            cached is not None and not cached.is_for(request)
         )
         if another:
             raise BadInputError("id", request.id, "an id that no other recent request has")
@@ -252,27 +240,26 @@ class PlanningService:
 
     # --- overload -----------------------------------------------------------------------------
 
-    def _refuse(self, query: OpenQuery, refusal: Refusal) -> Reply:
-        self._count("overloaded_total")
-        return query.form.reply(query.token, refusal)
-
-    def _client_overload(self, client: str) -> Refusal:
-        count = self._pending.count(client)
-        ahead = count * self._pending.clients
+    def _refuse_over_limit(self, query: OpenQuery, now_s: float) -> Iterator[Effect]:
+        """Refuse a request of a client that has too many."""
+        count = self._pending.count(query.session.client)
         what = f"{count} pending requests of this client"
-        return self._overloaded("client_queue_limit", what, ahead)
+        ahead = count * self._pending.clients
+        yield from self._refuse(query, "client_queue_limit", what, ahead, now_s)
 
-    def _overload(self) -> Refusal:
-        count = len(self._pending)
-        return self._overloaded("queue_limit", f"{count} pending requests", count)
+    def _refuse_in_total(self, query: OpenQuery, count: int, now_s: float) -> Iterator[Effect]:
+        """Refuse a request because there are too many of all clients."""
+        what = f"{count} pending requests"
+        yield from self._refuse(query, "queue_limit", what, count, now_s)
 
-    def _overloaded(self, limit: str, what: str, ahead: int) -> Refusal:
-        """Return the refusal for a limit; half of the requests ahead should be planned first."""
+    def _refuse(
+        self, query: OpenQuery, limit: str, what: str, ahead: int, now_s: float
+    ) -> Iterator[Effect]:
+        """Refuse a request; half of the requests ahead should be planned before it comes again."""
+        self._count("overloaded_total")
+        reason = f"service.{limit}: got {what}; allowed: {getattr(self._settings, limit)}"
         planned_s = ahead / 2 * self._mean_s / self._workers
-        retry_after_s = round(min(max(MIN_RETRY_S, planned_s), MAX_RETRY_S), 2)
-        allowed = getattr(self._settings, limit)
-        text = f"service.{limit}: got {what}; allowed: {allowed}; try again in {retry_after_s:g} s"
-        return Refusal(OVERLOADED, text, "", retry_after_s)
+        yield from self._refusals.refuse(query, reason, planned_s, now_s)
 
     # --- cancellation -------------------------------------------------------------------------
 
@@ -332,7 +319,7 @@ class PlanningService:
 
     def _hand_out(self, now_s: float) -> Iterator[Effect]:
         """Hand waiting requests to workers, clients in turn."""
-        yield from self.drop_late(now_s)
+        yield from self._drop_late(now_s)
         ahead = int(self._mean_s < AHEAD_BELOW_S)
         while (entry := self._pending.next_for_worker(ahead)) is not None:
             solver = entry.request.solver or self._solver
@@ -358,7 +345,12 @@ class PlanningService:
         self._count("failed_total")
         return Refusal(FAILED, f"planning failed: {error}", "")
 
-    def drop_late(self, now_s: float) -> Iterator[Effect]:
+    def wake(self, now_s: float) -> Iterator[Effect]:
+        """Do what is due: see `wakeup_s`."""
+        yield from self._drop_late(now_s)
+        yield from self._refusals.release(now_s)
+
+    def _drop_late(self, now_s: float) -> Iterator[Effect]:
         """Drop requests whose deadlines passed while they waited."""
         late = [entry for entry in self._pending.not_begun if entry.deadline_s <= now_s]
         for entry in late:
@@ -387,30 +379,11 @@ class PlanningService:
         for query in entry.queries:
             yield query.form.reply(query.token, answer)
         if self._forget(entry) and isinstance(answer, PlanResponse):
-            cached = _CachedAnswer(_digest(entry.request), MSGPACK.write(answer.to_dict()), now_s)
-            self._answers[entry.request.id] = cached
-            self._cached_bytes += len(cached.answer)
-            self._expire_answers(now_s)
-
-    def _expire_answers(self, now_s: float) -> None:
-        """Remove the oldest answers while they are too many, too large or too old."""
-        answers, settings = self._answers, self._settings
-        while answers:
-            oldest = next(iter(answers))
-            old = answers[oldest].answered_s <= now_s - settings.cache_s
-            many = len(answers) > settings.cache_entries or self._cached_bytes > CACHE_BYTES
-            if not many and not old:
-                return
-            self._cached_bytes -= len(answers.pop(oldest).answer)
+            self._answers.add(entry.request, answer, now_s)
 
     def _count(self, name: str, by: float = 1) -> None:
         counted = getattr(self._metrics, name) + by
         self._metrics = attrs.evolve(self._metrics, **{name: counted})
-
-
-def _digest(request: PlanRequest) -> bytes:
-    # MessagePack cannot encode every text that JSON can represent.
-    return blake2b(JSON.write(request.to_dict()), digest_size=16).digest()
 
 
 def plan_in_time(

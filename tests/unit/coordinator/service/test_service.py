@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.solve import plan
-from laneweave.coordinator.service import server as service
+from laneweave.coordinator.service import answers, refusals
 from laneweave.coordinator.service.format import (
     CANCEL_SCHEMA,
     CANCELLED,
@@ -106,7 +106,7 @@ class Desk:
     def wait(self, seconds: float) -> None:
         """Let time pass."""
         self.now_s += seconds
-        self._note(self.service.drop_late(self.now_s))
+        self._note(self.service.wake(self.now_s))
 
     def leave(self, session: ClientSession) -> None:
         """End a client's session."""
@@ -417,11 +417,97 @@ def test_unknown_clients_count_as_one() -> None:
 def test_the_advice_when_to_send_again_follows_the_time_of_plans() -> None:
     desk = make_desk(client_queue_limit=1)
     desk.ask(REQUEST)
-    assert desk.answer(desk.ask(REQUEST))["retry_after_s"] == service.MIN_RETRY_S
+    assert desk.answer(desk.ask(REQUEST))["retry_after_s"] == refusals.MIN_RETRY_S
     for _ in range(50):
         answered_in(desk, 4000.0)
         desk.ask(REQUEST)
     assert desk.answer(desk.ask(REQUEST))["retry_after_s"] == pytest.approx(2.0, rel=0.02)
+
+
+def refused_at_s(desk: Desk, count: int, every_s: float, client: ClientSession) -> list[float]:
+    """Let a client over its limit ask again and again; return when each request was refused."""
+    asked, refused_s = list[int](), dict[int, float]()
+    for number in range(100_000):
+        if number < count:
+            asked.append(desk.ask(REQUEST, session=client))
+            desk.wait(every_s)
+        else:
+            wakeup_s = desk.service.wakeup_s
+            assert wakeup_s is not None
+            desk.wait(max(0.0, wakeup_s - desk.now_s))
+        for token in asked:
+            if token in desk.replies:
+                refused_s.setdefault(token, desk.now_s)
+        if len(refused_s) == count:
+            break
+    return list(refused_s.values())
+
+
+def test_a_flooding_client_is_refused_at_a_limited_rate() -> None:
+    desk = make_desk(client_queue_limit=1, max_deadline_s=600.0)
+    flood, quiet = opened(desk, "flood"), opened(desk, "quiet")
+    desk.ask(REQUEST | {"deadline_s": 600.0}, session=flood)
+    desk.ask(REQUEST | {"deadline_s": 600.0}, session=quiet)
+    begun_s = desk.now_s
+    many = refusals.PROMPT + 100
+    refused_s = refused_at_s(desk, many, 0.0, flood)
+    prompt = [at_s for at_s in refused_s if at_s == begun_s]
+    assert len(prompt) == refusals.PROMPT
+    assert refused_s[-1] - begun_s == pytest.approx(100 / refusals.RATE_PER_S)
+    # It has used up its rate, and another client has not.
+    token = desk.ask(REQUEST, session=flood)
+    assert token not in desk.replies
+    assert desk.ask(REQUEST, session=quiet) in desk.replies
+    # After a while without refusals, they are prompt again.
+    desk.wait(refusals.PROMPT / refusals.RATE_PER_S)
+    assert token in desk.replies
+    assert desk.ask(REQUEST, session=flood) in desk.replies
+
+
+def test_a_refusal_is_held_back_for_at_most_the_longest_advice() -> None:
+    desk = make_desk(client_queue_limit=1)
+    flood = opened(desk, "flood")
+    desk.ask(REQUEST | {"deadline_s": 600.0}, session=flood)
+    begun_s = desk.now_s
+    refused_s = refused_at_s(desk, 900, 0.0, flood)
+    assert refused_s[-1] == begun_s + refusals.MAX_RETRY_S
+    # However long the flood was, the next refusals are not later.
+    for _ in range(20):
+        refused_at_s(desk, 900, 0.0, flood)
+    (soon_s,) = refused_at_s(desk, 1, 0.0, flood)
+    assert soon_s <= desk.now_s + refusals.MAX_RETRY_S
+    desk.wait(2 * refusals.MAX_RETRY_S)
+    assert desk.ask(REQUEST, session=flood) in desk.replies
+
+
+def test_a_held_refusal_advises_the_rest_of_the_time() -> None:
+    desk = make_desk(client_queue_limit=1)
+    desk.ask(REQUEST | {"deadline_s": 600.0})
+    for _ in range(200):
+        answered_in(desk, 4000.0)
+        desk.ask(REQUEST | {"deadline_s": 600.0})
+    advised = [
+        desk.answer(token)["retry_after_s"]
+        for token in [desk.ask(REQUEST) for _ in range(refusals.PROMPT)]
+    ]
+    assert set(advised) == {2.0}
+    token = desk.ask(REQUEST)
+    desk.wait(0.5)
+    rest_s = desk.answer(token)["retry_after_s"]
+    assert rest_s == pytest.approx(1.5)
+    assert desk.answer(token)["message"].endswith(f"try again in {rest_s:g} s")
+
+
+def test_held_refusals_do_not_use_up_all_open_queries() -> None:
+    desk = make_desk(client_queue_limit=1)
+    floods = [opened(desk, f"flood-{number}") for number in range(8)]
+    for flood in floods:
+        desk.ask(REQUEST | {"deadline_s": 600.0}, session=flood)
+    tokens = [desk.ask(REQUEST, session=flood) for _ in range(300) for flood in floods]
+    held = [token for token in tokens if token not in desk.replies]
+    assert len(held) == refusals.MAX_HELD
+    desk.wait(refusals.MAX_RETRY_S)
+    assert set(held) <= set(desk.replies)
 
 
 def answered_in(desk: Desk, solve_ms: float) -> None:
@@ -675,7 +761,7 @@ def test_answers_are_forgotten_when_they_are_long(
     for number in range(3):
         desk.ask(named(str(number)))
         desk.work()
-    monkeypatch.setattr(service, "CACHE_BYTES", 300)
+    monkeypatch.setattr(answers, "CACHE_BYTES", 300)
     desk.ask(named("3"))
     desk.work()
     desk.ask(named("3"))
