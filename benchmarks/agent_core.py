@@ -206,6 +206,8 @@ class Road:
                 self.scenario,
                 lambda scenario: TimedDriver(scenario, self.tracking),
             ),
+            next(incarnations),
+            self.scenario.runtime,
             [vehicle.name],
         )
         node = Node(host, outbox, KEYS, lambda _: None, Name("bench"))

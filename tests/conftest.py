@@ -1,4 +1,4 @@
-"""Settings for all tests: signals, order, and a summary of tests skipped without a browser."""
+"""Settings for all tests: signals, order, hypothesis, and a summary of tests without a browser."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import gc
 import signal
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from support.chromium import NO_BROWSER
 
@@ -13,6 +14,10 @@ FIRST = ("tests/system/", "tests/simulation/")
 """Folders of long tests. They run first, so that parallel workers finish at about the same time."""
 SHORT = "tests/system/test_bad_input.py"
 """System tests that are short."""
+
+
+settings.register_profile("any-load", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any-load")  # no test depends on the machine's load
 
 
 def pytest_configure() -> None:

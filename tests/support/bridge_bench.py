@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -335,15 +335,21 @@ class Street:
 
     def start_agents(self, *vehicles: str) -> Sleeper:
         """Start one process for some vehicles."""
-        host = Sleeper(AgentHost(self._make_agent, [Name(vehicle) for vehicle in vehicles]))
+        names = [Name(vehicle) for vehicle in vehicles]
+        host = Sleeper(self._make_host(names))
         self._add(f"agent-{vehicles[0]}", host)
         return host
 
     def start_shard(self, index: int = 0, count: int = 1) -> AgentHost:
         """Start a process for all vehicles of its shard."""
-        host = AgentHost(self._make_agent, shard=Shard(index, count))
+        host = self._make_host(shard=Shard(index, count))
         self._add(f"shard-{index}", host)
         return host
+
+    def _make_host(self, vehicles: Sequence[Name] = (), shard: Shard | None = None) -> AgentHost:
+        return AgentHost(
+            self._make_agent, self._new_incarnation(), self.scenario.runtime, vehicles, shard
+        )
 
     def _make_agent(self, vehicle: Name) -> AgentCore:
         self.agents[vehicle] = AgentCore(vehicle, self._new_incarnation, self.scenario)

@@ -26,6 +26,7 @@ from laneweave.protocol.runtime.node import (
     Watch,
 )
 from laneweave.protocol.scenario.deployment_fields import Shard
+from laneweave.protocol.scenario.fields import Runtime
 from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.messages import Census, Motion, Name, VehicleState
 from laneweave.protocol.wire.newest import NewestRoad
@@ -60,17 +61,19 @@ class AgentHost:
     def __init__(
         self,
         make_agent: Callable[[Name], AgentCore],
+        incarnation: int,
+        runtime: Runtime,
         vehicles: Iterable[Name] = (),
         shard: Shard | None = None,
-        bounds: Bounds | None = None,
     ) -> None:
         """Host the named vehicles, or all announced vehicles of a shard.
 
         Args:
             make_agent: returns the agent of a vehicle.
+            incarnation: of this process; bounds those that it receives.
+            runtime: tick, and limits of road time.
             vehicles: names of the vehicles; empty with a shard.
             shard: share of the announced vehicles.
-            bounds: limits of received numbers; None: none.
         """
         self._make_agent = make_agent
         self._shard = shard
@@ -82,8 +85,8 @@ class AgentHost:
         """Stretches whose motions each vehicle needed at the last update."""
         self._states: list[tuple[int, ...]] = []
         """Blocks whose states each vehicle needed at the last update."""
-        self._bounds = bounds
-        self._road = NewestRoad()
+        self._bounds = Bounds(incarnation, runtime.tick_s, runtime.max_road_s)
+        self._road = NewestRoad(runtime.max_pace)
         self._no_bridge_since_s: float | None = 0.0
         """Time at which the bridge was lost; None: a bridge is up."""
         self._solves = self._unusable = 0
@@ -141,8 +144,7 @@ class AgentHost:
                 return effects + self._dispatch_to_all(event, now_s)
             case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
                 incarnation = incarnation_of(parameters)
-                if self._bounds is not None:
-                    self._bounds.check_incarnation(incarnation, now_s)
+                self._bounds.check_incarnation(incarnation, now_s)
                 return self._on_bridge(incarnation, now_s) if incarnation >= 0 else []
             case PeerDown(topic, parameters) if topic is BRIDGE_ALIVE:
                 return self._on_bridge_down(incarnation_of(parameters), now_s)
@@ -226,8 +228,7 @@ class AgentHost:
         shard, road = self._shard, self._road
         if shard is None or census.bridge not in (0, road.bridge):
             return effects
-        if self._bounds is not None:
-            self._bounds.check(census, road.latest_s(now_s), now_s)
+        self._bounds.check(census, road.latest_s(now_s), now_s)
         road.on_message(census.bridge, census.t_s, now_s)
         if census.t_s < road.t_s:
             return effects  # late

@@ -16,7 +16,6 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.vehicle.motion import cell_state
-from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.messages import Name, Sense
 
@@ -63,11 +62,12 @@ def run_agents(
     Raises:
         BadInputError: no router answers at the endpoint.
     """
-    incarnations, runtime = Incarnations(), scenario.runtime
+    incarnations = Incarnations()
     host = AgentHost(
         lambda vehicle: AgentCore(vehicle, incarnations, scenario),
+        incarnations(),
+        scenario.runtime,
         [Name(vehicle) for vehicle in vehicles],
         shard,
-        Bounds(incarnations(), runtime.tick_s, runtime.max_road_s),
     )
     run_core(wrap(host), access, observe=observe)

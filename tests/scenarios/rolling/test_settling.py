@@ -50,7 +50,7 @@ def path(reference: Reference, tick: int = BEGIN_TICK) -> np.ndarray:
 
 
 @given(st.floats(-22.5, 22.5), st.floats(-1.0, 1.0))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_leads_from_where_it_is_to_rest_in_the_cell(offset_m: float, faster_mps: float) -> None:
     rows = path(settling(beside(offset_m, faster_mps=faster_mps)))
     np.testing.assert_allclose(rows[0], [offset_m, faster_mps, 0, 0, 0, 0], atol=1e-6)
@@ -58,7 +58,7 @@ def test_leads_from_where_it_is_to_rest_in_the_cell(offset_m: float, faster_mps:
 
 
 @given(st.floats(-22.5, 22.5))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_no_limit_is_approached_and_no_vehicle_overshoots(offset_m: float) -> None:
     reference = settling(beside(offset_m))
     rows = path(reference)

@@ -12,7 +12,7 @@ from laneweave.agents.host import AgentHost
 from laneweave.launch.fault_search.road.stand_ins import LightDriver
 from laneweave.protocol.runtime.node import Announce, Arrived, Effect, PeerDown, PeerUp, Refuse
 from laneweave.protocol.scenario.deployment_fields import Shard
-from laneweave.protocol.wire.bounds import CLAIM_AHEAD_NS, DAY_NS, Bounds, max_term
+from laneweave.protocol.wire.bounds import CLAIM_AHEAD_NS, DAY_NS, max_term
 from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import (
     Ballot,
@@ -177,8 +177,9 @@ class Fleet:
         """Host the agent of one vehicle."""
         self.host = AgentHost(
             lambda name: AgentCore(name, lambda: 1, PAPER, LightDriver),
+            BRIDGE,
+            PAPER.runtime,
             shard=Shard(0, 1),
-            bounds=Bounds(BRIDGE, TICK_S, PAPER.runtime.max_road_s),
         )
         self.now_s = 0.0
         self.token(BRIDGE)

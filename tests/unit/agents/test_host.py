@@ -36,7 +36,9 @@ STATES_OF_0 = topics.STATE, {"formation": 0}
 
 
 def make_host(*vehicles: Name, shard: Shard | None = None) -> AgentHost:
-    return AgentHost(lambda name: AgentCore(name, lambda: 1, PAPER), vehicles, shard)
+    return AgentHost(
+        lambda name: AgentCore(name, lambda: 1, PAPER), 1, PAPER.runtime, vehicles, shard
+    )
 
 
 def give(host: AgentHost, event: node.Event, now_s: float = 0.0) -> list[node.Effect]:
@@ -223,7 +225,9 @@ def test_what_is_no_newer_bridge_changes_nothing(other: str) -> None:
         give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": "7"}), 11.0)
     give(shard, census(A))
     for host in (named, shard):
-        assert give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": other}), 12.0) == []
+        effects = give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": other}), 12.0)
+        # Only the first is an incarnation.
+        assert [type(effect) for effect in effects] == ([] if other == "6" else [node.Refuse])
         assert give(host, node.PeerDown(topics.BRIDGE_ALIVE, {"incarnation": other}), 13.0) == []
         assert host.wakeup_s is None
         assert give(host, node.Wakeup(), 14.0 + NO_BRIDGE_S) == []

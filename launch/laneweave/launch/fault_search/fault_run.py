@@ -38,7 +38,6 @@ from laneweave.protocol.runtime.node import Compute, Core, Effect, Event, Send
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import TraceDigest
-from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.messages import Name
 
 RULES = Rules()
@@ -273,9 +272,7 @@ class FaultRun:
             vehicle = Name(name.removesuffix(TWIN))
             incarnation = partial(self._new_incarnation, vehicle)
             agent = AgentCore(vehicle, incarnation, scenario, LightDriver, rules.vehicle)
-            runtime = scenario.runtime
-            bounds = Bounds(incarnation(), runtime.tick_s, runtime.max_road_s)
-            core = AgentHost(lambda _: agent, [vehicle], bounds=bounds)
+            core = AgentHost(lambda _: agent, incarnation(), scenario.runtime, [vehicle])
         self._add(name, core)
 
     def _new_incarnation(self, vehicle: Name) -> int:

@@ -16,6 +16,7 @@ from laneweave.launch.observe.message_loss import LossMeter
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import Arrived, PeerDown, PeerUp
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
+from laneweave.protocol.scenario.fields import HIGHEST_PACE
 from laneweave.protocol.wire.messages import (
     Census,
     Heartbeat,
@@ -93,8 +94,8 @@ class RoadView:
     states: dict[Name, VehicleState] = field(factory=dict)
     """Newest state of each vehicle."""
     loss: LossMeter = field(init=False)
-    road: NewestRoad = field(factory=NewestRoad)
-    """The newest road."""
+    road: NewestRoad = field(factory=lambda: NewestRoad(HIGHEST_PACE))
+    """The newest road, at any pace: observers do not know the scenario."""
     roads: int = 0
     """Number of roads observed so far."""
     clock_received_s: float = 0.0

@@ -229,7 +229,9 @@ class SimulatedRun:
             self._add(name, core, "coordinator")
         else:
             vehicle = Name(name.removeprefix(AGENT_PREFIX))
-            self._add(name, AgentHost(self._make_agent, [vehicle]), "vehicle")
+            incarnation, runtime = next(self._incarnations), self.scenario.runtime
+            host = AgentHost(self._make_agent, incarnation, runtime, [vehicle])
+            self._add(name, host, "vehicle")
 
     def _add(self, name: str, core: Core, receiver: str) -> None:
         injection = self._injection

@@ -42,6 +42,8 @@ CYCLE_STEP_S = 0.2
 """Step between values of T_F; few values keep the number of planned trajectories low."""
 SLACK_S = 0.2
 """Part of T_F without motion if `formation.move_s` is not set."""
+HIGHEST_PACE = 1000.0
+"""Upper bound of `runtime.max_pace`."""
 MAX_HORIZON_TICKS = 200
 """Maximum horizon of the tracker."""
 
@@ -377,7 +379,7 @@ class Runtime:
     """Maximum wait at the entrance for a vehicle's agent (wall-clock seconds)."""
     announce_s: float = field(default=6.0, validator=within(0.0, 600.0))
     """Time by which announcements precede arrivals, so that agents can start (road seconds)."""
-    max_pace: float = field(default=10.0, validator=within(0.01, 1000.0))
+    max_pace: float = field(default=10.0, validator=within(0.01, HIGHEST_PACE))
     """Maximum road seconds per wall-clock second. Network and planning take wall-clock time, which
     must be short compared with the time between a plan and its start."""
     coordinators: int = field(default=3, validator=within(1, 9))

@@ -15,8 +15,6 @@ from laneweave.protocol.errors import BadInputError
 
 FORGET_S = 0.5
 """Time after which a value is forgotten if only other ones arrive."""
-HIGHEST_PACE = 1000.0
-"""Upper bound of `runtime.max_pace`."""
 AHEAD_S = 10.0
 """Maximum lead of a road time over the newest one, in addition to the time since that one."""
 
@@ -50,7 +48,7 @@ class NewestRoad:
     A road is shown by the messages and by the liveliness token of its bridge.
     """
 
-    max_pace: float = HIGHEST_PACE
+    max_pace: float
     """Maximum road seconds per second of the node's clock."""
     number: int = 0
     """Number of changes: after a change, everything received before is of another road."""

@@ -101,7 +101,9 @@ A, B, C = Name("A"), Name("B"), Name("C")
 
 def host_of(*vehicles: Name) -> AgentHost:
     Listener.heard = {}
-    return AgentHost(lambda name: AgentCore(name, lambda: 1, SCENARIO, Listener), vehicles)
+    return AgentHost(
+        lambda name: AgentCore(name, lambda: 1, SCENARIO, Listener), 1, SCENARIO.runtime, vehicles
+    )
 
 
 def put(

@@ -35,7 +35,7 @@ def infeasible() -> QuadraticProgram:
     )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=6))
 def test_solves_projections_onto_boxes(entries: list[tuple[float, float]]) -> None:
     lower, upper = np.sort(np.array(entries)).T.copy()

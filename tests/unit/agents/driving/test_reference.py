@@ -86,7 +86,7 @@ def test_impossible_moves_raise(table: dict[str, dict[str, float]]) -> None:
         move_profile(parse_scenario(table), 1, 1)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.sampled_from(MOVES), st.integers(38, 60))
 def test_slower_moves_keep_all_limits_and_end_at_rest(move: tuple[int, int], ticks: int) -> None:
     profile = move_profile(SCENARIO, *move, ticks)

@@ -111,7 +111,7 @@ def test_ideal_move_ends_in_the_target_cell_within_limits(dx: int, dy: int) -> N
 
 
 @pytest.mark.slow
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(
     st.floats(-60, 60),
     st.floats(-14, 9),
@@ -156,7 +156,7 @@ def predicted(state: State, result: TrackResult) -> list[tuple[State, Jerk]]:
     return way
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.tuples(
         st.floats(-8, 8),

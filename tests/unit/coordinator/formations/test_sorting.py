@@ -256,7 +256,7 @@ def tasks(draw: st.DrawFn) -> SortingTask:
     return task(held, dict(zip(names, lanes, strict=False)), *unattended, numbers=numbers)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(tasks())
 def test_sortings_stay_inside_and_name_vehicles_off_their_lanes(order: SortingTask) -> None:
     sorting = sort(order)

@@ -36,7 +36,7 @@ def _sorted(costs: IntMatrix, allowed: BoolMatrix) -> list[Assignment]:
     return sorted(found, key=lambda a: (a.cost, a.targets))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(matrices())
 def test_order_is_by_cost_then_by_vector_and_complete(case: tuple[IntMatrix, BoolMatrix]) -> None:
     assert list(assignments(*case)) == _sorted(*case)

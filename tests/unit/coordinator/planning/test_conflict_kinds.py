@@ -3,7 +3,7 @@
 import itertools
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
@@ -21,7 +21,6 @@ def moves(draw: st.DrawFn) -> Move:
     return cell, (cell[0] + step[0], cell[1] + step[1])
 
 
-@settings(deadline=None)
 @given(moves(), moves(), st.tuples(st.integers(-5, 5), st.integers(-5, 5)))
 def test_conflicts_do_not_depend_on_the_place(a: Move, b: Move, shift: Cell) -> None:
     def moved(move: Move) -> Move:

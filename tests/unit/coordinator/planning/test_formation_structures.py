@@ -119,7 +119,7 @@ def shortest_total_way(
 
 
 @pytest.mark.slow
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(crowds(), st.sampled_from(STRUCTURES))
 def test_targets_are_a_structure_with_the_shortest_total_distance(
     crowd: tuple[Grid, list[Cell], list[int | None]], structure: str

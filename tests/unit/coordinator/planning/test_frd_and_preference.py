@@ -1,7 +1,7 @@
 """The formation relative distance, its weights, and the preference matrix."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
@@ -27,7 +27,6 @@ def test_the_equation_of_the_paper() -> None:
     assert frd((0, 0), (5, 2), Weights(straight=0, oblique=1)) == 2
 
 
-@settings(deadline=None)
 @given(CELLS, CELLS, st.sampled_from([1, 2]))
 def test_default_weights_give_the_number_of_steps_on_a_free_grid(
     a: Cell, b: Cell, mode: Mode

@@ -61,7 +61,7 @@ def test_conflict_sets_hold_exactly_the_conflicting_moves(
         assert found == {b for b in moves if model.kind(a, b) is not None}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.sampled_from(GRIDS), st.sampled_from([1, 2]), st.integers(0, 2**200))
 def test_sets_of_cells_and_moves(grid: Grid, mode: Mode, pattern: int) -> None:
     table = MoveTable(grid, mode, MODELS[0])

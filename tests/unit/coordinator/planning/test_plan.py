@@ -39,7 +39,7 @@ def _corridor(*vehicles: tuple[Cell, int], columns: int = 4) -> PlanRequest:
 
 
 @pytest.mark.slow
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(requests())
 def test_cost_is_optimal_or_infeasibility_is_proven(request: PlanRequest) -> None:
     response = plan(request)

@@ -7,7 +7,7 @@ from typing import Any
 
 import attrs
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
@@ -173,7 +173,6 @@ def test_requests_made_in_code_are_checked_too() -> None:
         attrs.evolve(request, conflicts=("nodes",))
 
 
-@settings(deadline=None)
 @given(requests())
 def test_json_round_trip(request: PlanRequest) -> None:
     assert PlanRequest.from_dict(json.loads(json.dumps(request.to_dict()))) == request

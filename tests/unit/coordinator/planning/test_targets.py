@@ -59,7 +59,7 @@ def parallel_targets(
 # --- a whole formation ------------------------------------------------------------------------
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(formations())
 def test_each_lane_provides_free_cells_for_those_who_prefer_it(
     drawn: tuple[dict[Name, Cell], dict[Name, int], set[Cell]],
@@ -77,7 +77,7 @@ def test_each_lane_provides_free_cells_for_those_who_prefer_it(
         assert sum(name in targets.off_lane for name in wanting) == max(0, len(wanting) - free)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(formations(most_blocked=0, fitting=True))
 def test_without_blocked_cells_it_is_the_parallel_structure_of_each_lane(
     drawn: tuple[dict[Name, Cell], dict[Name, int], set[Cell]],

@@ -141,7 +141,7 @@ SCENARIOS = st.builds(
 )
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(SCENARIOS)
 def test_tables_give_the_same_scenario_back(scenario: Scenario) -> None:
     tables = to_tables(scenario)

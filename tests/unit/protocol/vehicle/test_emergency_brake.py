@@ -68,7 +68,7 @@ def integrated_way_m(v: float, a: float, brake_mps2: float, lag_s: float) -> flo
     st.floats(5.0, 12.0),
     st.sampled_from((0.0, 0.1, 0.2)),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_a_body_that_brakes_goes_as_far_as_integration_says(
     v_mps: float, share: float, brake_mps2: float, lag_s: float
 ) -> None:

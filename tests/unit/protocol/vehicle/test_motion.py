@@ -125,7 +125,7 @@ def test_stops_in_time_though_it_was_speeding_up(limits: Vehicle, v_mps: float) 
     other_mps=st.floats(0.0, 20.0),
     v_mps=st.floats(0.0, 20.0),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_never_hits_the_vehicle_ahead_where_that_can_be_avoided(
     gap_m: float, other_mps: float, v_mps: float
 ) -> None:

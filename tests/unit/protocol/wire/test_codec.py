@@ -166,7 +166,7 @@ def test_a_sample_comes_back_equal_and_well_typed(sample: object) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 def test_any_value_comes_back(kind: type) -> None:
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=25)
     @given(values(kind))
     def check(message: object) -> None:
         decoded = decode(encode(message), kind)
@@ -441,7 +441,7 @@ JUNK = st.recursive(
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.sampled_from(list(SAMPLES.values())), st.data())
 def test_junk_in_a_field_never_gives_wrong_types(sample: object, data: st.DataObject) -> None:
     version, kind, body = envelope(sample)

@@ -42,7 +42,7 @@ def test_a_small_gap_or_one_behind_a_slow_vehicle_does_not_suit() -> None:
     assert not following.is_safe(0.0, 15.0, 14.91, 0.0)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     gap=st.sampled_from(["front-to-front", "net"]),
     speed_mps=SPEEDS,

@@ -73,7 +73,7 @@ def test_three_abreast_that_want_to_change_round_all_do(rule: dict[str, Any], s_
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     rule=st.sampled_from(METHODS),
     places=st.lists(

@@ -83,7 +83,7 @@ JERKS = st.lists(st.sampled_from((-15.0, -5.0, 0.0, 5.0, 15.0)), min_size=1, max
 )
 @example((16.5, -6.0), (16.0, 0.0), 0.0, [-15.0], [-15.0], 0)
 @example((20.8, -8.48), (19.45, 0.1), 0.0, [-15.0], [-15.0], 0)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_no_vehicle_hits_one_that_brakes_as_hard_as_it_can(
     own_motion: tuple[float, float],
     other_motion: tuple[float, float],

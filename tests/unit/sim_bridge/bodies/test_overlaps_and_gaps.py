@@ -60,7 +60,7 @@ def depth(pose: Pose, points: np.ndarray[tuple[int, int], np.dtype[np.float64]])
 
 @pytest.mark.slow
 @given(ROADS)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_overlaps_agree_with_point_sampling(road: dict[str, Pose]) -> None:
     found = set(bodies(road).overlapping_pairs())
     for one, other in itertools.combinations(sorted(road), 2):
@@ -121,7 +121,7 @@ def brute_gap(road: dict[str, Pose]) -> float:
 
 @pytest.mark.slow
 @given(st.lists(POSES, min_size=2, max_size=4))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_least_gap_agrees_with_slices(poses: list[Pose]) -> None:
     poses = [(s, y, 0.0 if abs(heading) < 1e-3 else heading, v) for s, y, heading, v in poses]
     road = {str(number): pose for number, pose in enumerate(poses)}
@@ -135,7 +135,7 @@ def test_least_gap_agrees_with_slices(poses: list[Pose]) -> None:
 
 
 @given(ROADS)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_a_negative_gap_means_an_overlap(road: dict[str, Pose]) -> None:
     gap = bodies(road).min_gaps().gap_m
     overlaps = bool(bodies(road).overlapping_pairs())
@@ -175,7 +175,7 @@ def test_sensing_sees_how_others_accelerate() -> None:
 
 
 @given(ROADS)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_sensing_agrees_with_brute_force(road: dict[str, Pose]) -> None:
     seen = sense(road)
     lanes_of = {}

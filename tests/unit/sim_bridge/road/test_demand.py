@@ -27,7 +27,7 @@ def test_equal_seeds_give_equal_arrivals_and_others_do_not() -> None:
     duration=st.floats(1.0, 200.0),
     longer=st.floats(0.0, 200.0),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_longer_stream_begins_with_the_shorter_one(
     seed: int, volume: float, duration: float, longer: float
 ) -> None:

@@ -67,7 +67,7 @@ def check(grid: Lattice, spread_s: float, admissions: list[Admission]) -> None:
 @given(
     demands(), st.sampled_from([(0.0, True), (0.25, True), (1.0, True), (0.5, False), (0.7, False)])
 )
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=250)
 def test_rules_hold_and_everyone_enters(
     case: tuple[Lattice, int, list[Arrival]], how: tuple[float, bool]
 ) -> None:
@@ -89,7 +89,7 @@ def test_rules_hold_and_everyone_enters(
 
 
 @given(demands(), st.floats(0.05, 7.0))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_decisions_need_no_knowledge_of_the_future(
     case: tuple[Lattice, int, list[Arrival]], tick_s: float
 ) -> None:

@@ -144,7 +144,7 @@ def cases(draw: st.DrawFn) -> Case:
 @pytest.mark.slow
 @pytest.mark.parametrize("grows", [True, False], ids=["growing", "blocks of columns"])
 @given(case=cases())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_every_vehicle_is_in_one_formation_that_has_room_for_all_of_its_wishes(
     case: Case, *, grows: bool
 ) -> None:

@@ -42,7 +42,7 @@ def rolling_meter() -> EntryMeter:
 
 
 @given(streams(headway_s=COLUMN_S))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_a_vehicle_one_column_behind_its_predecessor_does_not_wait(stream: list[Arrival]) -> None:
     meter = rolling_meter()
     for arrival in stream:
@@ -129,7 +129,7 @@ class Entrance:
 
 @pytest.mark.slow
 @given(streams(), st.sampled_from([0.1, 0.3, 1.0, 2.5]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_every_cell_near_a_vehicle_has_an_owner(stream: list[Arrival], tick_s: float) -> None:
     entrance = Entrance(stream, tick_s=tick_s).run(120.0)
     assert len(entrance.vehicles) == len(stream)

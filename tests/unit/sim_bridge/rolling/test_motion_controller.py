@@ -185,7 +185,7 @@ def histories(draw: st.DrawFn) -> list[Command | Cell]:
 
 @pytest.mark.slow
 @given(histories(), st.integers(0, 20))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_however_orders_arrive_what_is_kept_is_sound(
     history: list[Command | Cell], restart: int
 ) -> None:

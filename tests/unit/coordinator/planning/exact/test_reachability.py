@@ -29,7 +29,7 @@ def _explore(request: PlanRequest, max_moves: int = 10**6) -> tuple[Problem, Rea
     return problem, explore(problem, request.choices(), Budget(), max_moves)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(requests())
 def test_reachability_agrees_with_the_joint_search(request: PlanRequest) -> None:
     problem, verdict = _explore(request)

@@ -156,7 +156,7 @@ def test_waiting_in_a_crossed_cell_is_a_conflict(mode: Mode, lateness_s: float) 
 
 
 @pytest.mark.slow
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(geometries())
 def test_disjoint_footprints_are_never_too_close(geometry: BodyGeometry) -> None:
     """They are separated by a column or by a lane, so the table forbids none of them."""
@@ -166,7 +166,7 @@ def test_disjoint_footprints_are_never_too_close(geometry: BodyGeometry) -> None
 
 
 @pytest.mark.slow
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(geometries())
 def test_the_table_is_symmetric(
     geometry: BodyGeometry,
@@ -187,7 +187,7 @@ def test_backwards_it_forbids_the_same_or_more(geometry: BodyGeometry) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(geometries(), st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 0.5))
 def test_more_clearance_or_more_lateness_removes_nothing(
     geometry: BodyGeometry, along: float, across: float, late_s: float
@@ -210,7 +210,7 @@ def test_more_clearance_or_more_lateness_removes_nothing(
 
 
 @pytest.mark.slow
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(geometries(), st.integers(0, 10**6))
 def test_it_contains_what_simulated_bodies_do(geometry: BodyGeometry, seed: int) -> None:
     """Forbidden pairs are too close with slightly larger clearances."""

@@ -74,7 +74,7 @@ def problems(draw: st.DrawFn) -> tuple[MoveTable, int, int, Bans]:
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(problems())
 def test_diagram_holds_all_shortest_paths(case: tuple[MoveTable, int, int, Bans]) -> None:
     table, start, target, bans = case
@@ -87,7 +87,7 @@ def test_diagram_holds_all_shortest_paths(case: tuple[MoveTable, int, int, Bans]
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(problems(), st.data())
 def test_choice_has_fewest_conflicts_then_fewest_moves_then_lowest_index(
     case: tuple[MoveTable, int, int, Bans], data: st.DataObject

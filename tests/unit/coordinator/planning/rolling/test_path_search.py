@@ -57,7 +57,7 @@ def is_legal(road: StreamRoad, plan: StreamPlan, vehicles: list[StreamVehicle]) 
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(streams())
 def test_every_stream_gets_complete_paths_without_conflicts(stream: Stream) -> None:
     road, slot, vehicles, blocked = stream
@@ -72,7 +72,7 @@ def test_every_stream_gets_complete_paths_without_conflicts(stream: Stream) -> N
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(streams())
 def test_vehicles_need_not_be_where_they_were_planned(stream: Stream) -> None:
     """All vehicles are a cell further; some are new, held, gone, or have another target lane."""
