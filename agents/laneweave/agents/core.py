@@ -216,7 +216,9 @@ class AgentCore:
             return []
         was_in_charge = self.in_charge
         self._sense = sense
-        if sense.attendant > self._incarnation:
+        # Clocks of different machines may give a caretaker the same incarnation.
+        taken = sense.caretaker and sense.attendant == self._incarnation
+        if taken or sense.attendant > self._incarnation:
             self._command, self.wanted_motions = None, ()
             if not sense.caretaker:
                 return []  # another agent is in charge

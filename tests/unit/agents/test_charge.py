@@ -222,6 +222,19 @@ def test_superseded_by_the_caretaker_it_claims_with_a_new_incarnation_and_no_mem
     assert seat.shown.accepted
 
 
+def test_a_caretaker_with_the_same_incarnation_is_superseded() -> None:
+    """Clocks of different machines may give both the same number."""
+    seat = Seat()
+    seat.take_charge()
+    seat.prepare()
+    effects = seat.feel(seat.shown.incarnation, caretaker=True)
+    assert kinds(effects) == [Command]
+    claim = command_of(effects)
+    assert claim.incarnation > seat.shown.incarnation
+    assert kinds(seat.feel(claim.incarnation)) == [Command, VehicleState]
+    assert (seat.shown.incarnation, seat.shown.promised) == (claim.incarnation, None)
+
+
 def test_a_lost_claim_is_repeated_with_the_same_incarnation_and_without_old_promises() -> None:
     seat = Seat()
     seat.take_charge()

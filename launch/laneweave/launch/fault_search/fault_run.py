@@ -409,7 +409,9 @@ class FaultRun:
         if feature == ADOPTION:
             claims.on_adoption(now_s, machine.ballot, machine.roster, machine.states)
         elif feature == PLANNING:
-            claims.on_planning(now_s, machine.ballot, machine.promises, machine.states)
+            claims.on_planning(
+                now_s, machine.now_s, machine.ballot, machine.promises, machine.states
+            )
 
     def _on_compute(self, name: str) -> None:
         self.checker.computes(self.network.now_s, name)

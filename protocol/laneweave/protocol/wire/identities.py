@@ -4,14 +4,18 @@
 
 The *identity* is the common name of a process's certificate and determines its rights
 (`security.access_control`). The *incarnation* identifies one start of a process: a time in ns whose
-low bits are the process id. Incarnations ascend, and two live processes of a machine never have the
-same one, even after `above` has raised one beyond the clock.
+low bits are the process id, combined with a hash of the machine and the container, in which process
+ids may be the same. Incarnations ascend, and two live processes of a machine never have the same
+one, even after `above` has raised one beyond the clock.
 """
 
 from __future__ import annotations
 
 import os
+import platform
 import time
+from hashlib import blake2b
+from pathlib import Path
 
 from attrs import frozen
 
@@ -26,8 +30,8 @@ IDENTITY_RULE = (
     f"at most {MAX_COMMON_NAME} characters"
 )
 _PROCESS_BITS = 22
-"""Number of low bits of an incarnation that contain the Linux process id; the bits above them count
-steps of 4 ms."""
+"""Number of low bits of an incarnation that identify the process: as many as a Linux process id
+has. The bits above them count steps of 4 ms."""
 _STEP = 1 << _PROCESS_BITS
 
 
@@ -66,12 +70,23 @@ class Incarnations:
     def __init__(self) -> None:
         """Start below every incarnation."""
         self._last = 0
+        self._process = (os.getpid() ^ _host_hash()) % _STEP
 
     def __call__(self) -> int:
         """Return an unused incarnation."""
-        number = time.time_ns() // _STEP * _STEP + os.getpid() % _STEP
+        number = time.time_ns() // _STEP * _STEP + self._process
         self._last = number = above(number, self._last)
         return number
+
+
+def _host_hash() -> int:
+    """Return a hash of what distinguishes process ids: the started machine, and the container."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
+        container = Path("/proc/self/ns/pid").stat().st_ino
+    except OSError:  # not Linux
+        boot, container = platform.node(), 0
+    return int.from_bytes(blake2b(f"{boot}/{container}".encode(), digest_size=8).digest())
 
 
 def above(number: int, floor: int) -> int:

@@ -17,6 +17,7 @@ themselves must be true at any time, so they show a violated rule much sooner.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 
 from attrs import define, field, frozen
@@ -201,18 +202,21 @@ class Claims:
             ):
                 self._tell("adoption", t_s, name, f"does not execute {short(ballot)}")
 
-    def on_planning(self, t_s: float, ballot: Ballot, promises: States, known: States) -> None:
+    def on_planning(
+        self, t_s: float, leader_s: float, ballot: Ballot, promises: States, known: States
+    ) -> None:
         """Check that a leader pauses after failed planning, and counts no promise that has ended.
 
         Args:
             t_s: virtual time.
+            leader_s: the leader's clock, which may jump.
             ballot: ballot for which the leader plans.
             promises: promises that the leader counts.
             known: newest state of each member that the leader has received.
         """
-        if t_s < self._planned_s.get(ballot, -PAUSE_S) + PAUSE_S:
+        if leader_s < self._planned_s.get(ballot, -math.inf) + PAUSE_S:
             self._tell("busy", t_s, min(promises), f"planned again at once under {short(ballot)}")
-        self._planned_s[ballot] = t_s
+        self._planned_s[ballot] = leader_s
         for name, promise in promises.items():
             if name in known and known[name].incarnation != promise.incarnation:
                 self._tell("basis", t_s, name, "the process that promised has ended")

@@ -118,15 +118,18 @@ def test_only_a_plan_that_all_have_accepted_is_adopted(scene: Scene) -> None:
 
 def test_promises_of_ended_processes_do_not_count(scene: Scene) -> None:
     promises = {A: ACCEPTED, B: evolve(ACCEPTED, vehicle=B)}
-    scene.claims.on_planning(1.0, BALLOT, promises, promises)
+    scene.claims.on_planning(1.0, 1.0, BALLOT, promises, promises)
     assert scene.kinds == []
-    scene.claims.on_planning(2.0, BALLOT, promises, {B: evolve(promises[B], incarnation=2)})
+    scene.claims.on_planning(2.0, 2.0, BALLOT, promises, {B: evolve(promises[B], incarnation=2)})
     assert scene.kinds == ["basis"]
 
 
 def test_planning_is_not_repeated_at_once(scene: Scene) -> None:
     for t_s in (1.0, 2.0, 2.5):
-        scene.claims.on_planning(t_s, BALLOT, {A: ACCEPTED}, {})
+        scene.claims.on_planning(t_s, t_s, BALLOT, {A: ACCEPTED}, {})
+    assert scene.kinds == ["busy"]
+    # The clock of the leader has jumped.
+    scene.claims.on_planning(2.6, 3.5, BALLOT, {A: ACCEPTED}, {})
     assert scene.kinds == ["busy"]
 
 
