@@ -22,8 +22,8 @@ def owned_cells(
     """Return the cells that a vehicle owns, from its state and the states of others.
 
     The start gate of its pending transfer is open if any member of the roster reports it open. It
-    never opens if any member has promised a higher ballot without storing the transfer, or if all
-    have promised higher ballots with closed gates. If a member can no longer report the gate,
+    never opens if any member has promised a higher ballot and was never ready for the plan, or if
+    all have promised higher ballots with closed gates. If a member can no longer report the gate,
     because it has a newer transfer or has left the road, only cells in both `before` and `after`
     are certain; while the vehicle moves, no cells are, since it may still be in another one.
 
@@ -42,7 +42,7 @@ def owned_cells(
     signs = _signs(state, transfer, states, gone)
     if _Sign.OPEN in signs:
         return after
-    if _Sign.WITHOUT in signs or signs == {_Sign.CLOSED}:
+    if _Sign.NEVER_READY in signs or signs == {_Sign.CLOSED}:
         return before
     if state.moving or signs.isdisjoint({_Sign.NEWER, _Sign.GONE}):
         return None
@@ -65,7 +65,7 @@ def partners(state: VehicleState, states: States) -> frozenset[Name]:
     if transfer is None or transfer.open:
         return frozenset()
     signs = _signs(state, transfer, states, ())
-    if _Sign.OPEN in signs or _Sign.WITHOUT in signs or signs == {_Sign.CLOSED}:
+    if _Sign.OPEN in signs or _Sign.NEVER_READY in signs or signs == {_Sign.CLOSED}:
         return frozenset()
     return frozenset(name for name in transfer.roster if name in states)
 
@@ -75,7 +75,7 @@ class _Sign(Enum):
 
     OPEN = "the gate is open"
     CLOSED = "the vehicle has promised a higher ballot with a closed gate"
-    WITHOUT = "the vehicle has promised a higher ballot without storing the transfer"
+    NEVER_READY = "the vehicle has promised a higher ballot, and was never ready for the plan"
     NEWER = "the vehicle has a newer transfer"
     GONE = "the vehicle has left the road"
     NONE = "no evidence"
@@ -102,4 +102,8 @@ def _sign(state: VehicleState | None, transfer: PendingTransfer) -> _Sign:
         return _Sign.OPEN
     if state.promised is None or state.promised <= transfer.ballot or not state.owned:
         return _Sign.NONE
-    return _Sign.CLOSED if known else _Sign.WITHOUT
+    if not known or theirs is None:
+        return _Sign.NEVER_READY  # it has not accepted the plan
+    # With a closed gate, a vehicle that was ready is still in its start cell, which is in `after`.
+    elsewhere = not state.moving and state.hold_cell not in theirs.after
+    return _Sign.NEVER_READY if elsewhere else _Sign.CLOSED

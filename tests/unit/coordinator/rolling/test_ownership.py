@@ -15,6 +15,10 @@ BETWEEN = Ballot(2, Name("c1"), 10, 2)
 """Above MID, below HIGH."""
 OPEN = PendingTransfer(MID, open=True)
 TRANSFER = pending(A, MID, (A, B, C))
+TRANSFER_OF_B = pending(B, MID, (A, B, C))
+TRANSFER_OF_C = PendingTransfer(MID, ((9, 2),), ((9, 2),), (A, B, C))
+STRANDED = (5, 0)
+"""A cell that A does not own afterwards."""
 CLOSED = state(A, HIGH, TRANSFER)
 """A has promised more, and its gate was closed then."""
 
@@ -47,18 +51,18 @@ def test_a_higher_promise_without_the_transfer_keeps_the_gate_closed(
         state(C, LOW),
         state(C, None),
         state(C, BETWEEN, owned=()),  # its controller has not noted the promise
-        state(C, MID, TRANSFER),  # it may open its gate yet
+        state(C, MID, TRANSFER_OF_C),  # it may open its gate yet
     ],
 )  # fmt: skip
 def test_states_that_may_still_change_tell_nothing(silent: VehicleState) -> None:
-    others = {B: state(B, HIGH, TRANSFER), C: silent}
+    others = {B: state(B, HIGH, TRANSFER_OF_B), C: silent}
     assert owned_cells(CLOSED, others) is None
     assert certain_cells(CLOSED, others) == SURE
     assert partners(CLOSED, others) == {B, C}
 
 
 def test_when_all_have_promised_more_with_closed_gates_the_old_cells_are_owned() -> None:
-    others = {B: state(B, BETWEEN, TRANSFER), C: state(C, HIGH, TRANSFER)}
+    others = {B: state(B, BETWEEN, TRANSFER_OF_B), C: state(C, HIGH, TRANSFER_OF_C)}
     assert owned_cells(CLOSED, others) == certain_cells(CLOSED, others) == OWNED_BEFORE
     assert partners(CLOSED, others) == frozenset()
     assert owned_cells(state(A, MID, TRANSFER), others) is None  # A may open its own gate
@@ -72,19 +76,31 @@ def test_cells_owned_either_way_are_certain(
     """A member may have opened the gate; it has left, or has had another plan since."""
     there = {} if newer is None else {C: newer}
     gone = {C} if newer is None else set[Name]()
-    assert owned_cells(CLOSED, {B: state(B, HIGH, TRANSFER), **there}, gone) == SURE
-    assert owned_cells(CLOSED, {B: state(B, MID, TRANSFER), **there}, gone) == SURE
+    assert owned_cells(CLOSED, {B: state(B, HIGH, TRANSFER_OF_B), **there}, gone) == SURE
+    assert owned_cells(CLOSED, {B: state(B, MID, TRANSFER_OF_B), **there}, gone) == SURE
     assert owned_cells(CLOSED, {B: state(B, HIGH, OPEN), **there}, gone) == OWNED_AFTER
     assert owned_cells(CLOSED, {B: state(B, HIGH), **there}, gone) == OWNED_BEFORE
-    assert partners(CLOSED, {B: state(B, HIGH, TRANSFER), **there}) == {B, *there}
+    assert partners(CLOSED, {B: state(B, HIGH, TRANSFER_OF_B), **there}) == {B, *there}
     # Under way it may still be in a cell that it is about to give.
     moving = evolve(CLOSED, moving=True)
     assert owned_cells(moving, there, gone) is None
     assert certain_cells(moving, there, gone) == SURE
 
 
+def test_a_vehicle_that_rests_outside_its_start_cell_was_never_ready() -> None:
+    """Its controller refused an earlier move; so no gate has opened, even of one that has left."""
+    stranded, other = evolve(CLOSED, hold_cell=STRANDED), state(B, HIGH, TRANSFER_OF_B)
+    assert owned_cells(stranded, {B: other}, {C}) == OWNED_BEFORE
+    assert partners(stranded, {B: other}) == frozenset()
+    assert owned_cells(other, {A: stranded}, {C}) == frozenset(BEFORE[B])
+    assert owned_cells(other, {A: CLOSED}, {C}) == {*BEFORE[B]} & {*AFTER[B]}
+    # It may be on its way to its start cell, or become ready yet.
+    assert owned_cells(evolve(stranded, moving=True), {}, {C}) is None
+    assert owned_cells(evolve(stranded, promised=MID), {}, {C}) == SURE
+
+
 def test_states_of_other_vehicles_and_own_older_ones_are_ignored() -> None:
-    stranger, others = Name("X"), {B: state(B, MID, TRANSFER), C: state(C, MID, TRANSFER)}
+    stranger, others = Name("X"), {B: state(B, MID, TRANSFER_OF_B), C: state(C, MID, TRANSFER_OF_C)}
     assert owned_cells(CLOSED, {stranger: state(stranger, HIGH), **others}) is None
     assert owned_cells(CLOSED, {A: state(A, HIGH, OPEN), **others}) is None
 

@@ -149,9 +149,11 @@ WRONG = {
     "no member owned": [state(A, MID), state(B, MID, owned=((2, 1),))],
     "a cell has two owners": [state(A, MID, owned=(*BEFORE[A], (2, 1))), state(B, MID)],
     "the cells of B are not known": [
-        state(C, LOW, PendingTransfer(LOW, (), (), (A, B, C))),  # it may open its gate yet
+        state(
+            C, LOW, PendingTransfer(LOW, ((9, 2),), ((9, 2),), (A, B, C))
+        ),  # it may open its gate yet
         state(A, MID, PendingTransfer(LOW, BEFORE[A], BEFORE[A], (A,))),
-        state(B, MID, PendingTransfer(LOW, BEFORE[B], (), (A, B, C))),
+        state(B, MID, PendingTransfer(LOW, BEFORE[B], AFTER[B], (A, B, C))),
     ],
     "outbid": [state(A, MID), state(B, HIGH)],
     "A has restarted": [state(A, MID), evolve(state(A, LOW), incarnation=8)],
