@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import msgpack
@@ -302,9 +302,9 @@ def test_a_minute_of_all_absurd_messages_from_a_process_with_a_certificate(
         [network.access(each) for each in ("bridge", "coordinator.c3", FAULTY, OTHER)],
         lambda vehicle: Shard(0, 2).contains(vehicle) == own,
     )
-    forged = forge(forger, ALL)
-    watch()
-    forger.close()
+    with closing(forger):
+        forged = forge(forger, ALL)
+        watch()
     ended = lab.finish(bridge, RUN_S)
     assert (ended.status, ended.complaints) == (0, []), ended
     stop(lab, *roles)
