@@ -17,6 +17,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import Arrived, PeerDown, PeerUp
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.fields import HIGHEST_PACE
+from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.messages import (
     Census,
     Heartbeat,
@@ -96,8 +97,12 @@ class RoadView:
     loss: LossMeter = field(init=False)
     road: NewestRoad = field(factory=lambda: NewestRoad(HIGHEST_PACE))
     """The newest road, at any pace: observers do not know the scenario."""
+    bounds: Bounds | None = None
+    """Limits of received numbers; None: none."""
     roads: int = 0
     """Number of roads observed so far."""
+    _road_number: int = 0
+    """Number of the road that clock, census and states are about."""
     clock_received_s: float = 0.0
     first_clock: RoadClock | None = None
     """Clock with the lowest tick."""
@@ -152,9 +157,10 @@ class RoadView:
             case LogEvent():
                 self._events.append(event)
             case PeerUp() | PeerDown():
-                self._on_token(event)
+                self._on_token(event, now_s)
             case LinkUp() | LinkDown():
                 self.linked = isinstance(event, LinkUp)
+                self.road.on_link_down()
             case _:
                 pass
 
@@ -203,12 +209,14 @@ class RoadView:
 
     def _is_of_newest_road(self, message: RoadClock | Census, now_s: float) -> bool:
         """Return whether a message belongs to the newest road; start a new road if necessary."""
-        number = self.road.number
         try:
+            if self.bounds is not None:
+                self.bounds.check(message, self.road.latest_s(now_s), now_s)
             is_newest = self.road.on_message(message.bridge, message.t_s, now_s)
         except BadInputError:
             return False
-        if self.roads == 0 or self.road.number != number:
+        if self.roads == 0 or self.road.number != self._road_number:
+            self._road_number = self.road.number
             if self.roads:
                 self.clock = self.first_clock = self.census = None
                 self.states, self.loss = {}, self._new_meter()
@@ -243,14 +251,19 @@ class RoadView:
             self.term = heartbeat.term
         self.heartbeats[heartbeat.coordinator, heartbeat.incarnation] = heartbeat, now_s
 
-    def _on_token(self, event: PeerUp | PeerDown) -> None:
+    def _on_token(self, event: PeerUp | PeerDown, now_s: float) -> None:
         topic, parameters, up = event.topic, event.parameters, isinstance(event, PeerUp)
         if topic is COORDINATOR_ALIVE:
             process = Name(parameters["coordinator"]), incarnation_of(parameters)
             _update(self.coordinator_tokens, process, present=up)
             _update(self.departed, process, present=not up)
         elif topic is BRIDGE_ALIVE:
-            _update(self.bridge_tokens, incarnation_of(parameters), present=up)
+            bridge = incarnation_of(parameters)
+            _update(self.bridge_tokens, bridge, present=up)
+            if not up:
+                self.road.on_token_down(bridge, now_s)
+            elif self.bounds is None or 0 <= bridge <= self.bounds.max_incarnation(now_s):
+                self.road.on_token_up(bridge, now_s)
         elif topic is VEHICLE_ALIVE:
             _update(self.agent_tokens, Name(parameters["vehicle"]), present=up)
 

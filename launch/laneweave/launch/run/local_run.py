@@ -38,7 +38,9 @@ from laneweave.protocol.scenario.deployment_fields import Security
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
-from laneweave.protocol.wire.topics import Keys
+from laneweave.protocol.wire.bounds import Bounds
+from laneweave.protocol.wire.identities import Incarnations
+from laneweave.protocol.wire.topics import BRIDGE_ALIVE, Keys
 from laneweave.sim_bridge.road.demand import arrivals
 
 MAX_TEMPORARY_BYTES = 70
@@ -158,7 +160,13 @@ class LocalRun:
     def _supervise(self, progress: RunProgress) -> None:
         processes, injection = self._processes, self._injection
         processes.start(ROUTER, ROUTER)
-        observer = Observer(Keys(self.scenario.network.realm))
+        runtime = self.scenario.runtime
+        bounds = Bounds(Incarnations()(), runtime.tick_s, runtime.max_road_s)
+        observer = Observer(
+            Keys(self.scenario.network.realm),
+            view=RoadView(bounds=bounds),
+            tokens=(BRIDGE_ALIVE,),
+        )
         with contextlib.closing(self._connect(observer)) as transport:
             observer.subscribe(transport)
             for name in processes.coordinators:
