@@ -236,7 +236,7 @@ def close_on_equal_promise(patch: Patch) -> None:
         accepted = state is not None and state.promised == pending.ballot and state.owned
         if found is ownership._Sign.NONE and state is not None and accepted:
             known = state.transfer is not None and state.transfer.ballot == pending.ballot
-            return ownership._Sign.CLOSED if known else ownership._Sign.WITHOUT
+            return ownership._Sign.CLOSED if known else ownership._Sign.NEVER_READY
         return found
 
     patch.setattr(ownership, "_sign", mutant)

@@ -98,8 +98,16 @@ class FormationLeader(BallotRound):
         for vehicle in set(self.formation.roster) - set(formation.roster):
             self.states.pop(vehicle, None)
             self.ages.pop(vehicle, None)
+            self.reconsider()
         self.take(MEMBERS, now_s, formation)
         self.formation = formation
+
+    def reconsider(self) -> None:
+        """Plan again for members that could not reach their lanes: there is more room now.
+
+        A member has left, or there is another formation to join.
+        """
+        self.out_of_reach = frozenset()
 
     def on_state(self, state: VehicleState, now_s: float) -> None:
         """Handle the state of a member (L2, L4, L6, L7, L8)."""

@@ -114,8 +114,17 @@ class FormationsOperation:
             leader = self.leaders.get(number)
             if leader is None or leader.formation.numbers != formation.numbers:
                 self.leaders[number] = self._lead_formation(formation, t_s, now_s)
+                self._reconsider_neighbours(formation)
             else:
                 leader.on_members(formation, now_s)
+
+    def _reconsider_neighbours(self, formation: Formation) -> None:
+        """Let the formations beside a new one plan again if they may join it and lack room."""
+        if self._scenario.formation.max_joined > 1:
+            beside = {formation.numbers[0] - 1, formation.numbers[-1] + 1}
+            for leader in self.leaders.values():
+                if not beside.isdisjoint(leader.formation.numbers):
+                    leader.reconsider()
 
     def _lead_formation(self, formation: Formation, t_s: float, now_s: float) -> FormationLeader:
         leader = FormationLeader(

@@ -33,6 +33,7 @@ from laneweave.launch.fault_search.road.light_road import LightRoad, Reception
 from laneweave.launch.fault_search.road.stand_ins import LightDriver, LightPlanner
 from laneweave.launch.fault_search.story import Story
 from laneweave.launch.fault_search.timeline import Timeline
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Compute, Core, Effect, Event, Send
 from laneweave.protocol.scenario.fields import Scenario
@@ -212,7 +213,10 @@ class FaultRun:
         while network.now_s < end_s and not self._is_over():
             network.run(network.now_s + CHECK_S)
             while network.failed_jobs:
-                self.checker.crashed(*network.failed_jobs.pop())
+                failed = network.failed_jobs.pop()
+                # States of an earlier road may contradict others; the leader plans again later.
+                if not failed[-1].startswith(BadInputError.__name__):
+                    self.checker.crashed(*failed)
             self._check_leaders()
             if self.faults.healed:
                 self._restart_agents()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from attrs import evolve
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
@@ -130,6 +131,19 @@ def test_without_neighbours_a_formation_is_planned_alone() -> None:
     effects = desk.give(run_job(job))
     assert plan_of(effects).formations == (0,)
     assert len(notes(effects, "lane-out-of-reach")) == 1
+
+
+@pytest.mark.parametrize(("scenario", "again"), [(JOINING, True), (PAPER, False)])
+def test_who_is_out_of_reach_is_planned_again_if_there_is_a_formation_to_join(
+    scenario: Scenario, again: bool
+) -> None:
+    desk = Desk(scenario=scenario)
+    (job,) = jobs(desk.collect_promises(FULL, LANES))
+    desk.give(run_job(job))
+    assert desk.leaders[0].out_of_reach
+    desk.tell(census(FULL | NEXT, LANES, t_s=T_S))
+    assert sorted(desk.leaders) == [0, 1]
+    assert (not desk.leaders[0].out_of_reach) == again
 
 
 def test_the_last_formation_is_joined_with_the_one_before_it() -> None:

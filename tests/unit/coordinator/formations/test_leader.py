@@ -589,6 +589,19 @@ def test_states_of_vehicles_that_left_are_forgotten(reach: Reach) -> None:
         assert prepares_anew(leader, ballot)
 
 
+def test_a_member_out_of_reach_is_planned_again_when_another_one_has_left() -> None:
+    """The cell of that one is free now."""
+    leader, ballot = planning(A, B)
+    leader.on_plan(plan_of(leader), 0.0, [A])
+    hear(leader, *(state(name, ballot, accepted=True) for name in (A, B)))
+    hear(leader, astray(t_s=1.0))
+    assert phase(leader) is BallotPhase.IN_FORCE
+    leader.on_members(formation(A), 1.0)
+    assert phase(leader) is BallotPhase.IN_FORCE
+    hear(leader, astray(t_s=2.0))
+    assert phase(leader) is BallotPhase.PREPARING
+
+
 def test_a_formation_that_was_given_up_stays_so() -> None:
     leader, ballot = planning(A)
     leader.take(TOO_LATE, 0.0)

@@ -93,7 +93,7 @@ def test_a_vehicle_that_rests_outside_its_start_cell_was_never_ready() -> None:
     assert owned_cells(stranded, {B: other}, {C}) == OWNED_BEFORE
     assert partners(stranded, {B: other}) == frozenset()
     assert owned_cells(other, {A: stranded}, {C}) == frozenset(BEFORE[B])
-    assert owned_cells(other, {A: CLOSED}, {C}) == {*BEFORE[B]} & {*AFTER[B]}
+    assert owned_cells(other, {A: CLOSED}, {C}) == frozenset(BEFORE[B]) & {*AFTER[B]}
     # It may be on its way to its start cell, or become ready yet.
     assert owned_cells(evolve(stranded, moving=True), {}, {C}) is None
     assert owned_cells(evolve(stranded, promised=MID), {}, {C}) == SURE
