@@ -42,6 +42,9 @@ _CLONE_NEWNET = 0x40000000
 _PATH = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"))
 _PARTS = 10_000
 """Denominator of shares of lost packets."""
+_DEVICE = ("address", "02:00:0a:4d:ff:01", "arp", "off")
+"""Properties of all devices. ARP would delay packets over a restored link by up to 1 s. Without it,
+packets are addressed to the sender's own hardware address, so both ends need the same."""
 _UPLINK = "uplink"
 """A group's end of its device pair; the hub's end is named after the group."""
 
@@ -187,8 +190,8 @@ class GroupNetwork:
 
     def _link(self, group: str) -> None:
         hub, leaf = self._namespaces[HUB], self._namespaces[group]
-        ends = ("link", "add", "name", group, "type", "veth", "peer", "name", _UPLINK)
-        hub.run("ip", *ends, "netns", str(leaf.process_id))
+        pair = ("name", group, *_DEVICE, "type", "veth", "peer", "name", _UPLINK, *_DEVICE)
+        hub.run("ip", "link", "add", *pair, "netns", str(leaf.process_id))
         for namespace, device, last in ((hub, group, 1), (leaf, _UPLINK, 2)):
             namespace.run("ip", "addr", "add", f"{self._network(group)}.{last}/30", "dev", device)
             namespace.run("ip", "link", "set", "dev", device, "up")
