@@ -5,10 +5,11 @@
 
 Each experiment is one run of the deployment of compose.yaml, as processes on hosts that are network
 namespaces (tests/support/hosts.py). A link is cut, or a service is killed and restarted with the
-same command; with `--losses`, all links lose or delay packets. Roles start before their router. Figures are
-read from the run's folder and written to FOLDER/hosts.json, or FOLDER/links.json. Finished
-experiments are kept, unless `--only` names them. The exit status is 1 if bodies overlapped, a run
-did not finish, or a process failed. The script needs permission to create network namespaces.
+same command; with `--losses`, all links lose or delay packets. Roles start before their router.
+Figures are read from the run's folder and written to FOLDER/hosts.json, or FOLDER/links.json.
+Finished experiments are kept, unless `--only` names them. The exit status is 1 if bodies
+overlapped, a run did not finish, or a process failed. The script needs permission to create network
+namespaces.
 `--link`: protocol and options of endpoints, such as `quic?mixed_rel=1`; `tcp` and `udp` are without
 certificates. `--short`: vehicles arrive for 20 s instead of 90 s.
 """

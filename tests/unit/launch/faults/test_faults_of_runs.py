@@ -126,7 +126,11 @@ def test_lost_packets_are_refused_without_namespaces(monkeypatch: pytest.MonkeyP
 
 def test_only_links_that_may_be_delayed_have_a_relay(monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[GroupNetwork] = []
-    monkeypatch.setattr(GroupNetwork, "open", lambda network: opened.append(network))
+
+    def record(network: GroupNetwork) -> None:
+        opened.append(network)
+
+    monkeypatch.setattr(GroupNetwork, "open", record)
     monkeypatch.setattr(GroupNetwork, "check_filters", lambda _: None)
     faults = (LinkFault(of="bridge", jitter_s=0.1, from_s=5.0), LinkFault(loss=0.1))
     injection_of(FaultSpec(link=faults))
