@@ -11,8 +11,8 @@ def packets(count: int) -> list[bytes]:
     return [b"%d" % number for number in range(count)]
 
 
-def queue(**fields: float) -> DelayQueue:
-    return DelayQueue(random.Random(1), **fields)
+def queue(delay_s: float = 0.0, jitter_s: float = 0.0) -> DelayQueue:
+    return DelayQueue(random.Random(1), delay_s, jitter_s)
 
 
 def test_a_packet_waits_for_the_delay() -> None:
