@@ -5,10 +5,11 @@
 
 Each experiment is one run of the deployment of compose.yaml, as processes on hosts that are network
 namespaces (tests/support/hosts.py). A link is cut, or a service is killed and restarted with the
-same command; with `--losses`, all links lose packets. Roles start before their router. Figures are
-read from the run's folder and written to FOLDER/hosts.json, or FOLDER/links.json. Finished
-experiments are kept, unless `--only` names them. The exit status is 1 if bodies overlapped, a run
-did not finish, or a process failed. The script needs permission to create network namespaces.
+same command; with `--losses`, all links lose or delay packets. Roles start before their router.
+Figures are read from the run's folder and written to FOLDER/hosts.json, or FOLDER/links.json.
+Finished experiments are kept, unless `--only` names them. The exit status is 1 if bodies
+overlapped, a run did not finish, or a process failed. The script needs permission to create network
+namespaces.
 `--link`: protocol and options of endpoints, such as `quic?mixed_rel=1`; `tcp` and `udp` are without
 certificates. `--short`: vehicles arrive for 20 s instead of 90 s.
 """
@@ -143,6 +144,10 @@ LOSSES = (
         Experiment(f"loss-{percent}", f"{percent} %", nothing, Link(loss=percent / 100))
         for percent in (2, 10, 25)
     ),
+    *(
+        Experiment(f"delay-{ms}", f"0 %, {ms} ms", nothing, Link(delay_s=ms / 1000))
+        for ms in (20, 50)
+    ),
     Experiment(
         "bursts-10", "10 %, 20 successive packets each time", nothing, Link(loss=0.1, burst=20)
     ),
@@ -157,6 +162,7 @@ def run(
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     demand = {"duration_s": duration_s}
     options: dict[str, Any] = {"pace": pace, "link": link, "apart": experiment.apart}
+    options["delayed"] = experiment.loss.delay_s > 0.0
     with open_hosts(folder, **options, demand=demand) as hosts:
         hosts.start_all(experiment.loss)
         hosts.wait_road(BEGIN_S, LONGEST_S)
@@ -216,7 +222,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     names = [one.name for one in (*FAULTS, *LOSSES[1:])]
     parser.add_argument("--only", nargs="+", choices=names)
-    parser.add_argument("--losses", action="store_true", help="lossy links instead of faults")
+    parser.add_argument("--losses", action="store_true", help="bad links instead of faults")
     parser.add_argument("--link", default="tls", help="protocol and options of endpoints")
     parser.add_argument("--short", action="store_true", help="fewer arrivals")
     parser.add_argument("--pace", type=float, help="road seconds per second")

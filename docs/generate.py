@@ -466,12 +466,12 @@ def _hosts() -> str:
 
 
 def _links() -> str:
-    """Return the table of links that lose packets, by `benchmarks/hosts.py --losses`."""
+    """Return the table of links that lose or delay packets, by `benchmarks/hosts.py --losses`."""
     measured = json.loads(LINKS.read_text(encoding="utf-8"))
     calm_s = min(run["travel_time_s"] for run in measured.values())
     lines = [
         (
-            "| endpoint | packets lost per link | pace | tick p50 / p99 | leader changes "
+            "| endpoint | packets lost per link, delay | pace | tick p50 / p99 | leader changes "
             "| in their lane | overlaps | travel time |"
         ),
         "|---|---|---|---|---|---|---|---|",

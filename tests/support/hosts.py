@@ -211,6 +211,7 @@ def open_hosts(
     pace: float,
     link: str = "tls",
     apart: bool = False,
+    delayed: bool = False,
     environment: Mapping[str, str] | None = None,
     **tables: Mapping[str, object],
 ) -> Iterator[Hosts]:
@@ -222,6 +223,7 @@ def open_hosts(
         link: protocol and options of endpoints, such as `quic?mixed_rel=1`; without encryption
             (`tcp`, `udp`) anybody may do anything.
         apart: whether the second agents process has a host of its own.
+        delayed: whether links can delay packets.
         environment: of the services; none: this process's.
         **tables: entries of scenarios/compose.toml that are to be different, by table.
 
@@ -234,7 +236,8 @@ def open_hosts(
     text = _configuration(_network(folder, link) | tables)
     (folder / "deployment.toml").write_text(text, encoding="utf-8")
     (folder / "hosts").write_text(f"127.0.0.1 localhost\n{HUB_ADDRESS} router\n", encoding="utf-8")
-    network = GroupNetwork(fork_server(), (*LINKS, APART) if apart else LINKS)
+    names = (*LINKS, APART) if apart else LINKS
+    network = GroupNetwork(fork_server(), names, delayed=names if delayed else ())
     network.open()
     services = compose()["services"]
     hosts = Hosts(folder, network, services, pace, environment or os.environ, apart)

@@ -232,8 +232,7 @@ class FaultInjection:
             links: dict[str, Link] = {}
             for fault in in_force.values():
                 if isinstance(fault, LinkFault):
-                    state = Link(loss=fault.loss, burst=fault.burst)
-                    links = dict.fromkeys(fault.groups, state) | links
+                    links = dict.fromkeys(fault.groups, _state(fault)) | links
                 elif self._uses_links(fault):
                     links[fault.between[0]] = Link(up=False)
             try:
@@ -244,3 +243,8 @@ class FaultInjection:
             kind = name.partition("[")[0]
             self._record(road_s, name, kind, "began" if name in in_force else "ended")
         self._in_force = set(in_force)
+
+
+def _state(fault: LinkFault) -> Link:
+    """Return the state of a link with a fault."""
+    return Link(loss=fault.loss, burst=fault.burst, delay_s=fault.delay_s, jitter_s=fault.jitter_s)

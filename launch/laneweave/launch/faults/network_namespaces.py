@@ -2,30 +2,31 @@
 
 The namespaces form a star. The router runs in the hub, which has the same address for all groups. A
 pair of virtual Ethernet devices (veth) connects each group to the hub. Packet filters at both ends
-of a pair drop a share of the received packets. Taking the hub's end down disconnects the group: all
+of a pair drop a share of the received packets. If a link can delay packets, a process passes them
+between two devices instead (`packet_relay`). Taking the hub's end down disconnects the group: all
 packets are lost, connections end when their leases expire, and the group loses the liveliness
 tokens of all others. The launcher reaches the router through a Unix socket, which is independent of
 namespaces.
 
 The namespaces have no names; each is held by a process of the run. The kernel removes a namespace
 with its devices and addresses when its last process exits, so nothing remains after a run. This
-requires CAP_SYS_ADMIN and the program `ip`, and `nft` for links that lose packets.
+requires CAP_SYS_ADMIN and the program `ip`, `nft` for links that lose packets, and /dev/net/tun for
+links that delay packets.
 """
 
 from __future__ import annotations
 
-import ctypes
 import os
 import shutil
-import signal
-import subprocess
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, ForkServerProcess
-from pathlib import Path
+from typing import Self
 
 from attrs import define, field, frozen
 
+from laneweave.launch.faults.namespace_processes import ANSWER_S, hold_namespace
+from laneweave.launch.faults.packet_relay import MAX_WAITING, relay_packets
 from laneweave.launch.faults.specification import NAMESPACES, FaultSpec
 from laneweave.protocol.errors import BadInputError
 
@@ -35,13 +36,14 @@ LISTEN = "tcp/0.0.0.0:7447"
 """Zenoh endpoint on which the router listens for the groups."""
 ENDPOINT = f"tcp/{HUB_ADDRESS}:7447"
 """Zenoh endpoint of the router for all groups."""
-ANSWER_S = 10.0
-"""Maximum time to create a namespace or to run a command in it."""
 HUB = "hub"
-_CLONE_NEWNET = 0x40000000
 _PATH = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"))
 _PARTS = 10_000
 """Denominator of shares of lost packets."""
+_DEVICE = ("address", "02:00:0a:4d:ff:01", "arp", "off")
+"""Properties of all devices. ARP would delay packets over a restored link by up to 1 s. Without it,
+packets are addressed to the sender's own hardware address, so both ends need the same."""
+_EXITED = "the process of a namespace or a link has exited"
 _UPLINK = "uplink"
 """A group's end of its device pair; the hub's end is named after the group."""
 
@@ -55,6 +57,10 @@ class Link:
     """Share of packets lost in each direction, in [0, 1]."""
     burst: int = 1
     """Number of successive packets lost together; 1: packets are lost independently."""
+    delay_s: float = 0.0
+    """Delay in each direction."""
+    jitter_s: float = 0.0
+    """Maximum of an additional, uniformly distributed delay of each packet."""
 
 
 PERFECT = Link()
@@ -64,65 +70,20 @@ class NamespacesUnavailableError(RuntimeError):
     """Network namespaces cannot be created or used; the message gives the reason."""
 
 
-def join_namespace(process_id: int) -> None:
-    """Move this process, which must be single-threaded, into the namespace of another process.
-
-    Raises:
-        OSError: permission is missing, or the other process does not exist.
-    """
-    libc = ctypes.CDLL(None, use_errno=True)
-    with Path(f"/proc/{process_id}/ns/net").open("rb") as namespace:
-        _check(libc.setns(namespace.fileno(), _CLONE_NEWNET))
-
-
-def hold_namespace(connection: Connection) -> None:
-    """Create a network namespace, and run commands in it until the connection is closed.
-
-    Receives each command as a list of words. Sends an error text (empty on success) after creating
-    the namespace and after each command.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        _check(ctypes.CDLL(None, use_errno=True).unshare(_CLONE_NEWNET))
-    except OSError as error:
-        connection.send(f"cannot create a network namespace: {error.strerror}")
-        return
-    connection.send("")
-    while True:
-        try:
-            words = connection.recv()
-        except EOFError:
-            return
-        connection.send(_run(words))
-
-
-def _check(status: int) -> None:
-    if status != 0:
-        number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number))
-
-
-def _run(words: list[str]) -> str:
-    try:
-        done = subprocess.run(  # noqa: S603 (the words come from this module)
-            words, capture_output=True, text=True, timeout=ANSWER_S / 2, check=False
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        return str(error)
-    return "" if done.returncode == 0 else f"{' '.join(words)}: {done.stderr.strip()}"
-
-
 @define
-class _Namespace:
-    """A namespace and the process that holds it, controlled by the launcher."""
+class _Helper:
+    """A process controlled by the launcher; it exits when the connection is closed."""
 
     process: ForkServerProcess
     connection: Connection
 
     @classmethod
-    def make(cls, context: ForkServerContext, name: str) -> _Namespace:
+    def start(
+        cls, context: ForkServerContext, name: str, target: Callable[..., None], *arguments: object
+    ) -> Self:
+        """Start a process that first sends an error text, which is empty on success."""
         ours, theirs = context.Pipe()
-        process = context.Process(target=hold_namespace, args=(theirs,), name=f"namespace-{name}")
+        process = context.Process(target=target, args=(theirs, *arguments), name=name)
         process.start()
         theirs.close()
         return cls(process, ours)
@@ -131,22 +92,19 @@ class _Namespace:
     def process_id(self) -> int:
         return self.process.pid or 0
 
-    def run(self, name: str, *words: str) -> None:
-        """Run a program in this namespace."""
-        program = shutil.which(name, path=_PATH)
-        if program is None:
-            raise NamespacesUnavailableError(f"the program `{name}` is not installed")
+    def ask(self, request: object) -> None:
+        """Send a request and check the answer."""
         try:
-            self.connection.send([program, *words])
+            self.connection.send(request)
         except OSError as error:
-            raise NamespacesUnavailableError("the process of a namespace has exited") from error
+            raise NamespacesUnavailableError(_EXITED) from error
         self.check_answer()
 
     def check_answer(self) -> None:
         try:
             answer = self.connection.recv() if self.connection.poll(ANSWER_S) else "no answer"
         except (EOFError, OSError) as error:
-            raise NamespacesUnavailableError("the process of a namespace has exited") from error
+            raise NamespacesUnavailableError(_EXITED) from error
         if answer:
             raise NamespacesUnavailableError(answer)
 
@@ -159,11 +117,28 @@ class _Namespace:
 
 
 @define
+class _Namespace(_Helper):
+    """A namespace and the process that holds it."""
+
+    def run(self, name: str, *words: str) -> None:
+        """Run a program in this namespace."""
+        program = shutil.which(name, path=_PATH)
+        if program is None:
+            raise NamespacesUnavailableError(f"the program `{name}` is not installed")
+        self.ask([program, *words])
+
+
+@define
 class GroupNetwork:
     """Namespaces of a run: the hub with the router, and one per group."""
 
     context: ForkServerContext
     groups: tuple[str, ...]
+    delayed: Collection[str] = ()
+    """Groups whose links can delay packets."""
+    seed: int = 0
+    """Of the jitter."""
+    _relays: dict[str, _Helper] = field(factory=dict)
     _namespaces: dict[str, _Namespace] = field(factory=dict)
     _links: dict[str, Link] = field(factory=dict)
 
@@ -175,7 +150,9 @@ class GroupNetwork:
         """
         try:
             for name in (HUB, *self.groups):
-                namespace = self._namespaces[name] = _Namespace.make(self.context, name)
+                namespace = self._namespaces[name] = _Namespace.start(
+                    self.context, f"namespace-{name}", hold_namespace
+                )
                 namespace.check_answer()
                 namespace.run("ip", "link", "set", "lo", "up")
             self._namespaces[HUB].run("ip", "addr", "add", f"{HUB_ADDRESS}/32", "dev", "lo")
@@ -187,11 +164,20 @@ class GroupNetwork:
 
     def _link(self, group: str) -> None:
         hub, leaf = self._namespaces[HUB], self._namespaces[group]
-        ends = ("link", "add", "name", group, "type", "veth", "peer", "name", _UPLINK)
-        hub.run("ip", *ends, "netns", str(leaf.process_id))
+        state = ["up"]
+        if group in self.delayed:
+            state += ["txqueuelen", str(MAX_WAITING)]
+            ends = ((hub.process_id, group), (leaf.process_id, _UPLINK))
+            seed = f"{self.seed}/{group}"
+            relay = _Helper.start(self.context, f"link-{group}", relay_packets, ends, seed)
+            self._relays[group] = relay
+            relay.check_answer()
+        else:
+            pair = ("name", group, *_DEVICE, "type", "veth", "peer", "name", _UPLINK, *_DEVICE)
+            hub.run("ip", "link", "add", *pair, "netns", str(leaf.process_id))
         for namespace, device, last in ((hub, group, 1), (leaf, _UPLINK, 2)):
             namespace.run("ip", "addr", "add", f"{self._network(group)}.{last}/30", "dev", device)
-            namespace.run("ip", "link", "set", "dev", device, "up")
+            namespace.run("ip", "link", "set", "dev", device, *state)
         leaf.run("ip", "route", "add", "default", "via", f"{self._network(group)}.1")
 
     def _network(self, group: str) -> str:
@@ -215,6 +201,8 @@ class GroupNetwork:
             if wanted.up != current.up:
                 state = "up" if wanted.up else "down"
                 self._namespaces[HUB].run("ip", "link", "set", "dev", group, state)
+            if (wanted.delay_s, wanted.jitter_s) != (current.delay_s, current.jitter_s):
+                self._relays[group].ask((wanted.delay_s, wanted.jitter_s))
             if (wanted.loss, wanted.burst) != (current.loss, current.burst):
                 self._filter(group, [(_UPLINK, wanted)])
         if filter_rules(self._links.items()) != hub:
@@ -238,8 +226,9 @@ class GroupNetwork:
 
     def close(self) -> None:
         """Release the namespaces; call this after the roles in them have exited."""
-        for namespace in self._namespaces.values():
-            namespace.close()
+        for helper in (*self._relays.values(), *self._namespaces.values()):
+            helper.close()
+        self._relays.clear()
         self._namespaces.clear()
 
 
@@ -276,7 +265,7 @@ def _condition(link: Link) -> str:
 
 
 def open_network(
-    specification: FaultSpec, context: ForkServerContext
+    specification: FaultSpec, context: ForkServerContext, seed: int
 ) -> tuple[GroupNetwork | None, str]:
     """Create the namespaces that partitions and faults of links use.
 
@@ -291,14 +280,15 @@ def open_network(
     groups |= dict.fromkeys(group for fault in specification.link for group in fault.groups)
     if not groups:
         return None, ""
-    network = GroupNetwork(context, tuple(groups))
+    delayed = {group for fault in specification.link if fault.delays for group in fault.groups}
+    network = GroupNetwork(context, tuple(groups), delayed, seed)
     try:
         network.open()
         if specification.link:
             network.check_filters()
     except NamespacesUnavailableError as error:
         if specification.link:
-            allowed = f"nothing, because links cannot lose packets here ({error})"
+            allowed = f"nothing, because links cannot lose or delay packets here ({error})"
             raise BadInputError("link[0]", "a table", allowed) from error
         for name, partition in specification.partitions():
             if partition.method == NAMESPACES:

@@ -32,6 +32,8 @@ OTHERS = "others"
 ALL = "all"
 AUTO, NAMESPACES, MESSAGES = "auto", "namespaces", "messages"
 MAX_BURST_LOSS = 0.5
+MIN_LOSS = 0.001
+MAX_PACKET_DELAY_S = 10.0
 MAX_S = 1e6
 MAX_TIMES = 10_000
 MIN_EVERY_S = 0.1
@@ -50,6 +52,11 @@ def _duration(_: object, attribute: attrs.Attribute[Any], value: NumberOrRange) 
         raise BadInputError(
             attribute.name, value, "a number in (0, 600], or [a, b] with 0 < a <= b <= 600"
         )
+
+
+def _loss(_: object, attribute: attrs.Attribute[Any], value: float) -> None:
+    if value != 0.0 and not MIN_LOSS <= value <= 1.0:
+        raise BadInputError(attribute.name, value, f"0, or [{MIN_LOSS:g}, 1]")
 
 
 @frozen(kw_only=True)
@@ -194,24 +201,37 @@ class Partition(TimedFault):
 
 @frozen(kw_only=True)
 class LinkFault(TimedFault):
-    """Lose packets on links between groups and the router."""
+    """Lose and delay packets on links between groups and the router."""
 
     of: str = field(default=ALL, validator=one_of(*GROUPS, ALL))
-    """Group whose link loses packets, in both directions; `all`: every group's."""
-    loss: float = field(validator=within(0.001, 1.0))
+    """Group whose link is affected, in both directions; `all`: every group's."""
+    loss: float = field(default=0.0, validator=_loss)
     """Share of packets that are lost in each direction; at most 0.5 with bursts."""
     burst: int = field(default=1, validator=within(1, 1000))
     """Number of successive packets lost together; 1: each packet is lost independently."""
+    delay_s: float = field(default=0.0, validator=within(0.0, MAX_PACKET_DELAY_S))
+    """Wall-clock delay of each packet in each direction."""
+    jitter_s: float = field(default=0.0, validator=within(0.0, MAX_PACKET_DELAY_S))
+    """Maximum of an additional, uniformly distributed delay of each packet; reorders packets."""
 
     def __attrs_post_init__(self) -> None:
         """Check that the fields do not contradict each other."""
         super().__attrs_post_init__()
+        if not self.loss and not self.delays:
+            raise BadInputError("loss", "nothing", "a share of packets, or delay_s or jitter_s")
+        if self.burst > 1 and not self.loss:
+            raise BadInputError("burst", self.burst, "1 without loss")
         if self.burst > 1 and self.loss > MAX_BURST_LOSS:
             raise BadInputError("burst", self.burst, f"1 if loss is above {MAX_BURST_LOSS:g}")
 
     @property
+    def delays(self) -> bool:
+        """Whether packets are delayed."""
+        return self.delay_s > 0.0 or self.jitter_s > 0.0
+
+    @property
     def groups(self) -> tuple[str, ...]:
-        """Groups whose links lose packets."""
+        """Groups whose links are affected."""
         return GROUPS if self.of == ALL else (self.of,)
 
 
@@ -262,7 +282,9 @@ class FaultSpec:
             if partition.method == NAMESPACES:
                 raise BadInputError(f"{name}.method", NAMESPACES, f"{MESSAGES} {where}")
         if self.link:
-            allowed = f"nothing {where}, which has no packets; use [[messages]] to lose messages"
+            allowed = (
+                f"nothing {where}, which has no packets; use [[messages]] to lose or delay messages"
+            )
             raise BadInputError("link", "a table", allowed)
 
 

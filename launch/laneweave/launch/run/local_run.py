@@ -257,7 +257,8 @@ def fault_injection(
     Raises:
         BadInputError: a partition requires network namespaces, which cannot be created.
     """
-    network, reason = open_network(faults, processes.context)
+    seed = scenario.seed if faults.seed is None else faults.seed
+    network, reason = open_network(faults, processes.context, seed)
     lease_s = scenario.network.lease_s
     return FaultInjection(faults, scenario.seed, processes, lease_s, network, reason)
 

@@ -24,7 +24,7 @@ from typing import Any
 
 import structlog
 
-from laneweave.launch.faults.network_namespaces import join_namespace
+from laneweave.launch.faults.namespace_processes import join_namespace
 from laneweave.launch.run.logs import log_to_file
 from laneweave.launch.run.run_folder import LOG_FILE
 from laneweave.launch.run_methods import FORMATION

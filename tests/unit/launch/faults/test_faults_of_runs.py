@@ -119,8 +119,24 @@ def test_a_partition_that_requires_namespaces_is_refused_without_them(
 
 def test_lost_packets_are_refused_without_namespaces(monkeypatch: pytest.MonkeyPatch) -> None:
     without_namespaces(monkeypatch)
-    with pytest.raises(BadInputError, match=r"link\[0\]: .*not permitted"):
-        injection_of(FaultSpec(link=(LinkFault(of="bridge", loss=0.1),)))
+    for fault in (LinkFault(of="bridge", loss=0.1), LinkFault(delay_s=0.1)):
+        with pytest.raises(BadInputError, match=r"link\[0\]: .*not permitted"):
+            injection_of(FaultSpec(link=(fault,)))
+
+
+def test_only_links_that_may_be_delayed_have_a_relay(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[GroupNetwork] = []
+
+    def record(network: GroupNetwork) -> None:
+        opened.append(network)
+
+    monkeypatch.setattr(GroupNetwork, "open", record)
+    monkeypatch.setattr(GroupNetwork, "check_filters", lambda _: None)
+    faults = (LinkFault(of="bridge", jitter_s=0.1, from_s=5.0), LinkFault(loss=0.1))
+    injection_of(FaultSpec(link=faults))
+    (network,) = opened
+    assert set(network.groups) == set(GROUPS)
+    assert network.delayed == {"bridge"}
 
 
 class _FakeNetwork(GroupNetwork):
@@ -136,7 +152,7 @@ class _FakeNetwork(GroupNetwork):
 def test_links_follow_the_faults_in_force(board: SharedBoard) -> None:
     del board
     lossy = LinkFault(loss=0.1, from_s=1.0, until_s=4.0)
-    bursts = LinkFault(of="coordinators", loss=0.2, burst=5, from_s=2.0)
+    bursts = LinkFault(of="coordinators", loss=0.2, burst=5, delay_s=0.1, jitter_s=0.2, from_s=2.0)
     cut = Partition(between=("coordinators", "others"), from_s=3.0, until_s=5.0)
     specification = FaultSpec(link=(lossy, bursts), partition=(cut,))
     network = _FakeNetwork(processes().context, GROUPS)
@@ -145,7 +161,7 @@ def test_links_follow_the_faults_in_force(board: SharedBoard) -> None:
     for road_s in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0):
         injection.step(road_s, road_s, RoadView())
         found.append([network._links.get(group) for group in ("bridge", "coordinators")])
-    some, many, down = Link(loss=0.1), Link(loss=0.2, burst=5), Link(up=False)
+    some, many, down = Link(loss=0.1), Link(True, 0.2, 5, 0.1, 0.2), Link(up=False)
     # The first table counts, and a cut before any loss.
     assert found == [
         [None, None],

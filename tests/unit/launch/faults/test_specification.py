@@ -78,6 +78,9 @@ def test_a_file_may_have_every_field(tmp_path: Path) -> None:
         burst = 20
         from_s = 7
         until_s = 8
+        [[link]]
+        delay_s = 0.02
+        jitter_s = 0.01
         """,
     )
     assert found == FaultSpec(
@@ -103,9 +106,11 @@ def test_a_file_may_have_every_field(tmp_path: Path) -> None:
         link=(
             LinkFault(loss=0.1),
             LinkFault(of="bridge", loss=0.05, burst=20, from_s=7.0, until_s=8.0),
+            LinkFault(delay_s=0.02, jitter_s=0.01),
         ),
     )
-    assert [fault.groups for fault in found.link] == [GROUPS, ("bridge",)]
+    assert [fault.groups for fault in found.link] == [GROUPS, ("bridge",), GROUPS]
+    assert [fault.delays for fault in found.link] == [False, False, True]
     assert found
 
 
@@ -143,7 +148,13 @@ def test_a_file_may_have_every_field(tmp_path: Path) -> None:
         ("[[messages]]\nfrom_s = 3\nuntil_s = 3", "messages[0].until_s"),
         ('[[partition]]\nbetween = ["bridge"]', "partition[0].between"),
         ("[[link]]", "link[0].loss"),
+        ("[[link]]\nloss = 0.0", "link[0].loss"),
         ("[[link]]\nloss = 1.5", "link[0].loss"),
+        ("[[link]]\nloss = -0.1", "link[0].loss"),
+        ("[[link]]\ndelay_s = -0.1", "link[0].delay_s"),
+        ("[[link]]\ndelay_s = 11", "link[0].delay_s"),
+        ("[[link]]\njitter_s = nan", "link[0].jitter_s"),
+        ("[[link]]\ndelay_s = 0.1\nburst = 2", "link[0].burst"),
         ("[[link]]\nloss = 0.1\nburst = 0", "link[0].burst"),
         ("[[link]]\nloss = 0.6\nburst = 2", "link[0].burst"),
         ("[[link]]\nloss = 0.0001", "link[0].loss"),

@@ -14,8 +14,9 @@ from laneweave.protocol.wire.topics import TOPICS, Keys
 
 DROP_AFTER_US = 50
 OPEN_MS = 2000
-"""Timeout of one attempt to connect. An attempt over a cut link lasts until its timeout, even if
-the link is restored earlier."""
+"""Timeout of one attempt to connect. An attempt over a cut link sends again after 1 s. With shorter
+timeouts clients abandon attempts that a busy router has not reached yet; it handles one abandoned
+attempt in 0.1 s, so that a few clients can keep each other out for good (docs/adr/0036)."""
 Setting = tuple[str, Any]
 
 
@@ -26,7 +27,7 @@ def client_settings(access: Access) -> Iterator[Setting]:
     # Zenoh accepts these values only together.
     yield (
         "connect/retry",
-        {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5},
+        {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1.5},
     )
     # Matters on links that carry reliable and unreliable messages (`?mixed_rel=1`). `Session.put`
     # has no such argument.
