@@ -55,7 +55,12 @@ SMALL_FORMATIONS = """
 max_vehicles = 3
 """
 """So that one is planned every second or two."""
-WITHOUT_PLANS = {"census-empty"}
+WITHOUT_PLANS = {
+    "census-empty",
+    "clock-bridge-possible",
+    "sense-bridge-possible",
+    "token-possible",
+}
 """Rows with possible numbers that show another road: while they arrive, nothing is planned."""
 ALL = [row for row in ROWS if row not in WITHOUT_PLANS]
 SLOT_S = 6.0

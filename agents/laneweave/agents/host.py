@@ -28,7 +28,7 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.scenario.fields import Runtime
 from laneweave.protocol.wire.bounds import Bounds
-from laneweave.protocol.wire.messages import Census, Motion, Name, Sense, VehicleState
+from laneweave.protocol.wire.messages import Census, Motion, Name, VehicleState
 from laneweave.protocol.wire.newest import NewestRoad
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
@@ -169,8 +169,6 @@ class AgentHost:
             effects = self._on_census(message, now_s)
             self._update_subscriptions(effects)
             return effects
-        if isinstance(message, Sense):
-            self._road.check_token(message.bridge)
         name = event.parameters.get("vehicle")
         return self._dispatch(event, Name(name), now_s) if name in self._agents else []
 

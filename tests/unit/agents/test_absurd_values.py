@@ -10,15 +10,7 @@ from attrs import evolve
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.launch.fault_search.road.stand_ins import LightDriver
-from laneweave.protocol.runtime.node import (
-    Announce,
-    Arrived,
-    Effect,
-    PeerDown,
-    PeerUp,
-    Refuse,
-    Withdraw,
-)
+from laneweave.protocol.runtime.node import Announce, Arrived, Effect, PeerDown, PeerUp, Refuse
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.wire.bounds import CLAIM_AHEAD_NS, DAY_NS, max_term
 from laneweave.protocol.wire.identities import above
@@ -217,21 +209,9 @@ def test_a_shard_ignores_the_token_of_an_impossible_bridge() -> None:
     assert fleet.census() == []
 
 
-def test_a_shard_is_on_the_road_of_its_bridge_as_long_as_that_has_its_token() -> None:
+def test_a_shard_returns_to_the_bridge_whose_token_is_left() -> None:
     fleet = Fleet()
-    assert fleet.token(DAY_NS) == fleet.census() == []
-    assert Withdraw(VEHICLE_ALIVE, {"vehicle": ME}) in fleet.token(BRIDGE, up=False)
-    fleet.token(BRIDGE)
+    fleet.token(DAY_NS)
+    assert fleet.census() == []
     fleet.token(DAY_NS, up=False)
     assert Announce(VEHICLE_ALIVE, {"vehicle": ME}) in fleet.census()
-
-
-def test_a_bridge_without_a_token_has_no_vehicles_while_another_one_has_a_token() -> None:
-    fleet = Fleet()
-    sense = Arrived(SENSE, {"vehicle": ME}, sense_in(HOME, tick=20, bridge=BRIDGE))
-    forged = Arrived(SENSE, {"vehicle": ME}, sense_in(HOME, tick=20, bridge=DAY_NS))
-    assert refused(fleet.host.handle(forged, fleet.now_s))
-    assert sent(fleet.host.handle(sense, fleet.now_s), Command)
-    # A token may be lost with the connection: then every bridge is accepted.
-    fleet.token(BRIDGE, up=False)
-    assert sent(fleet.host.handle(forged, fleet.now_s), Command)

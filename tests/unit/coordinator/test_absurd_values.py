@@ -150,7 +150,6 @@ def test_what_the_bridge_does_not_show_is_forgotten(
     make: Callable[[Road], tuple[Topic, object]],
 ) -> None:
     road = Road()
-    road.give(PeerUp(BRIDGE_ALIVE, {"incarnation": str(DAY_NS)}))
     for _ in range(20):
         road.send(*make(road))
         road.drive(0.1)
@@ -159,24 +158,9 @@ def test_what_the_bridge_does_not_show_is_forgotten(
     assert road.knows_its_road
 
 
-def test_a_bridge_with_only_a_token_or_only_messages_changes_nothing() -> None:
-    road = Road()
-    leader = road.leaders[0]
-    forged = {"incarnation": str(DAY_NS)}
-    for _ in range(20):
-        assert refused(road.send(CLOCK, clock(road.t_s, bridge=DAY_NS)))
-        assert refused(road.send(CENSUS, road.census(bridge=DAY_NS, on_road=())))
-        for news in (PeerUp, PeerDown):
-            road.give(news(BRIDGE_ALIVE, forged))
-            assert road.knows_its_road
-        road.drive(0.1)
-    assert road.leaders[0] is leader
-
-
 def test_a_token_that_vanishes_gives_the_road_back() -> None:
     road = Road()
     road.give(PeerUp(BRIDGE_ALIVE, {"incarnation": str(DAY_NS)}))
-    road.send(CLOCK, clock(0.0, bridge=DAY_NS))
     assert not road.knows_its_road
     road.give(PeerDown(BRIDGE_ALIVE, {"incarnation": str(DAY_NS)}))
     road.drive(0.1)

@@ -90,7 +90,6 @@ def test_a_new_bridge_has_a_new_road() -> None:
     (order,) = jobs(desk.collect_promises({A: (0, 0), B: (-4, 0)}, {A: 1}))
     desk.tell(state(A, joined=(0, 1)))
     assert sorted(desk.leaders) == [0]
-    desk.give(PeerDown(BRIDGE_ALIVE, {"incarnation": "7"}))
     desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))
     assert (desk.leaders, desk.core.census, desk.core.t_s) == ({}, None, 0.0)
     assert desk.give(run_job(order)) == []  # a plan for the road that is no more
@@ -130,7 +129,6 @@ def test_a_newer_bridge_is_met_by_its_news_before_its_token_is_seen(index: int) 
     desk = Desk()
     desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
     desk.collect_promises({A: (0, 0)}, {A: 1})
-    desk.give(PeerDown(BRIDGE_ALIVE, {"incarnation": "7"}))
     newer = of_bridge(8, {B: (0, 0)}, 1.0)
     desk.tell(newer[index])
     assert (desk.leaders, desk.core.t_s) == ({}, 1.0)

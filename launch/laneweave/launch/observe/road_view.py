@@ -101,8 +101,6 @@ class RoadView:
     """Limits of received numbers; None: none."""
     roads: int = 0
     """Number of roads observed so far."""
-    _road_number: int = 0
-    """Number of the road that clock, census and states are about."""
     clock_received_s: float = 0.0
     first_clock: RoadClock | None = None
     """Clock with the lowest tick."""
@@ -157,10 +155,9 @@ class RoadView:
             case LogEvent():
                 self._events.append(event)
             case PeerUp() | PeerDown():
-                self._on_token(event, now_s)
+                self._on_token(event)
             case LinkUp() | LinkDown():
                 self.linked = isinstance(event, LinkUp)
-                self.road.on_link_down()
             case _:
                 pass
 
@@ -209,14 +206,14 @@ class RoadView:
 
     def _is_of_newest_road(self, message: RoadClock | Census, now_s: float) -> bool:
         """Return whether a message belongs to the newest road; start a new road if necessary."""
+        number = self.road.number
         try:
             if self.bounds is not None:
                 self.bounds.check(message, self.road.latest_s(now_s), now_s)
             is_newest = self.road.on_message(message.bridge, message.t_s, now_s)
         except BadInputError:
             return False
-        if self.roads == 0 or self.road.number != self._road_number:
-            self._road_number = self.road.number
+        if self.roads == 0 or self.road.number != number:
             if self.roads:
                 self.clock = self.first_clock = self.census = None
                 self.states, self.loss = {}, self._new_meter()
@@ -251,19 +248,14 @@ class RoadView:
             self.term = heartbeat.term
         self.heartbeats[heartbeat.coordinator, heartbeat.incarnation] = heartbeat, now_s
 
-    def _on_token(self, event: PeerUp | PeerDown, now_s: float) -> None:
+    def _on_token(self, event: PeerUp | PeerDown) -> None:
         topic, parameters, up = event.topic, event.parameters, isinstance(event, PeerUp)
         if topic is COORDINATOR_ALIVE:
             process = Name(parameters["coordinator"]), incarnation_of(parameters)
             _update(self.coordinator_tokens, process, present=up)
             _update(self.departed, process, present=not up)
         elif topic is BRIDGE_ALIVE:
-            bridge = incarnation_of(parameters)
-            _update(self.bridge_tokens, bridge, present=up)
-            if not up:
-                self.road.on_token_down(bridge, now_s)
-            elif self.bounds is None or 0 <= bridge <= self.bounds.max_incarnation(now_s):
-                self.road.on_token_up(bridge, now_s)
+            _update(self.bridge_tokens, incarnation_of(parameters), present=up)
         elif topic is VEHICLE_ALIVE:
             _update(self.agent_tokens, Name(parameters["vehicle"]), present=up)
 

@@ -40,7 +40,7 @@ from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.identities import Incarnations
-from laneweave.protocol.wire.topics import BRIDGE_ALIVE, Keys
+from laneweave.protocol.wire.topics import Keys
 from laneweave.sim_bridge.road.demand import arrivals
 
 MAX_TEMPORARY_BYTES = 70
@@ -162,11 +162,8 @@ class LocalRun:
         processes.start(ROUTER, ROUTER)
         runtime = self.scenario.runtime
         bounds = Bounds(Incarnations()(), runtime.tick_s, runtime.max_road_s)
-        observer = Observer(
-            Keys(self.scenario.network.realm),
-            view=RoadView(bounds=bounds),
-            tokens=(BRIDGE_ALIVE,),
-        )
+        view = RoadView(bounds=bounds)
+        observer = Observer(Keys(self.scenario.network.realm), view=view)
         with contextlib.closing(self._connect(observer)) as transport:
             observer.subscribe(transport)
             for name in processes.coordinators:

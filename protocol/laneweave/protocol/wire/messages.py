@@ -230,11 +230,10 @@ class Sense:
 
     Missing: sent again every `runtime.tick_resend_s` until `runtime.tick_deadline_s`; then the
     vehicle continues its last trajectory. Duplicated: the agent repeats its answer. Older than the
-    newest tick of the same bridge, or from an earlier bridge: ignored. From a newer bridge without
-    a token, while another one has a token: refused. From another newer bridge, or if only older
-    ones arrive for 0.5 s: the agent discards its state and takes a new incarnation. A message with
-    `left` is repeated for 20 ticks or until the agent's token vanishes; when a run ends, each
-    vehicle on the road receives one.
+    newest tick of the same bridge, or from an earlier bridge: ignored. From a newer bridge, or if
+    only older ones arrive for 0.5 s: the agent discards its state and takes a new incarnation. A
+    message with `left` is repeated for 20 ticks or until the agent's token vanishes; when a run
+    ends, each vehicle on the road receives one.
     """
 
     vehicle: Name

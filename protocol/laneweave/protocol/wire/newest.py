@@ -45,8 +45,7 @@ class Newest:
 class NewestRoad:
     """The newest road: incarnation of its bridge, and its road time.
 
-    A road is shown by the messages and by the liveliness token of its bridge. While a bridge has
-    its token, a newer one counts only if it shows both.
+    A road is shown by the messages and by the liveliness token of its bridge.
     """
 
     max_pace: float
@@ -75,15 +74,9 @@ class NewestRoad:
         return self.t_s + AHEAD_S + self.max_pace * max(now_s - self._time.shown_s, 0.0)
 
     def on_token_up(self, bridge: int, now_s: float) -> None:
-        """Register the token of a bridge; a newer bridge has a new road.
-
-        If the present bridge has its token, the road changes with the first message of the newer
-        one.
-        """
-        has_token = self.bridge in self._tokens
+        """Register the token of a bridge; a newer bridge has a new road."""
         self._tokens.add(bridge)
-        if not has_token:
-            self._take_bridge(bridge, now_s)
+        self._take_bridge(bridge, now_s)
 
     def on_token_down(self, bridge: int, now_s: float) -> None:
         """Return to the newest bridge that still has a token, if any."""
@@ -96,18 +89,6 @@ class NewestRoad:
         """Forget all tokens: they are shown again when the connection is restored."""
         self._tokens.clear()
 
-    def check_token(self, bridge: int) -> None:
-        """Check that the sender of a message has a token if it is newer than the present bridge.
-
-        A bridge shows its token before it sends. If there is no token at all, as after a lost
-        connection, every bridge is accepted.
-
-        Raises:
-            BadInputError: the bridge is newer and has no token, but another one has.
-        """
-        if self._tokens and bridge > self.bridge and bridge not in self._tokens:
-            raise BadInputError("bridge", bridge, "that of a bridge with a token")
-
     def on_message(self, bridge: int, t_s: float, now_s: float) -> bool:
         """Register a message of a bridge; return whether it is of the newest road.
 
@@ -117,9 +98,8 @@ class NewestRoad:
             now_s: the node's clock.
 
         Raises:
-            BadInputError: the bridge has no token, or the road time is later than possible.
+            BadInputError: the road time is later than possible.
         """
-        self.check_token(bridge)
         if bridge and not self._take_bridge(bridge, now_s):
             return False
         latest_s, before_s = self.latest_s(now_s), self.t_s

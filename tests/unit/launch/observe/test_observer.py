@@ -6,18 +6,13 @@ from attrs import evolve
 
 from laneweave.launch.observe.observer import Observer
 from laneweave.launch.observe.road_view import RoadView
-from laneweave.protocol.runtime.node import PeerDown, PeerUp
 from laneweave.protocol.runtime.transport import LinkDown, Received, TokenUp
-from laneweave.protocol.wire.bounds import DAY_NS, Bounds
+from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.messages import Census, Heartbeat, Name, RoadClock
-from laneweave.protocol.wire.topics import BRIDGE_ALIVE, HEARTBEAT, Keys
+from laneweave.protocol.wire.topics import HEARTBEAT, Keys
 
 HUGE = 2**63 - 1
-
-
-def token(kind: type[PeerUp | PeerDown], bridge: int) -> PeerUp | PeerDown:
-    return kind(BRIDGE_ALIVE, {"incarnation": str(bridge)})
 
 
 def clock(tick: int) -> RoadClock:
@@ -59,16 +54,11 @@ def test_messages_of_an_earlier_bridge_are_ignored() -> None:
 def test_a_view_with_bounds_keeps_its_road_whatever_is_forged() -> None:
     """Otherwise the launcher would not start the agents of announced vehicles."""
     view = RoadView(bounds=Bounds(1000, 0.1, 3600.0))
-    view.update(token(PeerUp, 7), 0.0)
     for tenth in range(1, 30):
         now_s = tenth / 10
         view.update(evolve(clock(tenth), bridge=7), now_s)
         view.update(Census(now_s, (), (), closed_to=tenth, bridge=7), now_s)
-        for bridge in (HUGE, DAY_NS):
-            for kind in (PeerUp, PeerDown):
-                view.update(token(kind, bridge), now_s)
-            view.update(Census(now_s, (), (), bridge=bridge), now_s)
-        view.update(token(PeerUp, HUGE), now_s)
+        view.update(evolve(clock(tenth), bridge=HUGE), now_s)
         view.update(Census(now_s, (), (), bridge=HUGE), now_s)
         view.update(Census(1e12, (), (), bridge=7), now_s)
         assert (view.roads, view.bridge, view.t_s) == (1, 7, tenth / 10)

@@ -206,7 +206,6 @@ def test_a_road_that_has_ended_is_healthy(listener: Listener) -> None:
 
 
 def test_another_bridge_is_another_road(healthy: Listener) -> None:
-    healthy.bridge(up=False)
     for tick in (3, 4):
         healthy.clock(tick, bridge=8)
     found = healthy.status()
