@@ -228,7 +228,7 @@ def test_rules_between_fields_name_existing_fields() -> None:
         ("## Kills: `[[kill]]`", Kill),
         ("## Pauses: `[[pause]]`", Pause),
         ("## Partitions: `[[partition]]`", Partition),
-        ("## Lost packets: `[[link]]`", LinkFault),
+        ("## Lost and delayed packets: `[[link]]`", LinkFault),
     ],
 )
 def test_tables_of_faults(heading: str, kind: type) -> None:
@@ -245,7 +245,7 @@ def test_tables_of_faults(heading: str, kind: type) -> None:
 def test_presets_and_groups_of_faults() -> None:
     presets = rows(section(read("FAULTS.md"), "## Presets"))
     assert tuple(sorted(code(cells[0]) for cells in presets)) == preset_names()
-    for heading in ("## Partitions: `[[partition]]`", "## Lost packets: `[[link]]`"):
+    for heading in ("## Partitions: `[[partition]]`", "## Lost and delayed packets: `[[link]]`"):
         part = section(read("FAULTS.md"), heading)
         assert all(f"`{group}`" in part for group in GROUPS), heading
 
