@@ -63,6 +63,9 @@ WITHOUT_PLANS = {
 }
 """Rows with possible numbers that show another road: while they arrive, nothing is planned."""
 ALL = [row for row in ROWS if row not in WITHOUT_PLANS]
+OUTBIDDING = {"prepare-possible", "state-term-possible"}
+"""Rows with possible promises to another leader. In the rolling operation they also hold vehicles
+that need cells of the victim."""
 SLOT_S = 6.0
 ROLLING = f"""
 [formation]
@@ -269,7 +272,7 @@ def rolling_delays_s(folder: Path, forger: Forger, forged: Forged) -> list[float
 def test_a_minute_of_all_absurd_messages_in_the_rolling_operation(lab: Lab) -> None:
     road = lab.path("absurd.toml", f"{ROAD}{ROLLING}")
     with running(lab, road, "--duration", "145", "--pace", 2.0) as (forger, folder):
-        forged = forge(forger, ALL)
+        forged = forge(forger, [row for row in ALL if row not in OUTBIDDING])
         watch()
 
     assert forged.messages >= 50 * MINUTE_S
