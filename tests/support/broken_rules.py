@@ -353,7 +353,8 @@ def keep_incarnation(patch: pytest.MonkeyPatch) -> None:
 
     def mutant(self: AgentCore, message: Any, now_s: float) -> Any:  # noqa: ANN401
         # As if there had been no caretaker: earlier promises still count.
-        return sense(self, evolve(message, attendant=self._incarnation), now_s)
+        as_before = evolve(message, attendant=self._incarnation, caretaker=False)
+        return sense(self, as_before, now_s)
 
     patch.setattr(AgentCore, "_on_sense", mutant)
 
