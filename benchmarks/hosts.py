@@ -161,8 +161,12 @@ def run(
     folder.mkdir(parents=True)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     demand = {"duration_s": duration_s}
-    options: dict[str, Any] = {"pace": pace, "link": link, "apart": experiment.apart}
-    options["delayed"] = experiment.loss.delay_s > 0.0
+    options: dict[str, Any] = {
+        "pace": pace,
+        "link": link,
+        "apart": experiment.apart,
+        "delayed": experiment.loss.delay_s > 0.0,
+    }
     with open_hosts(folder, **options, demand=demand) as hosts:
         hosts.start_all(experiment.loss)
         hosts.wait_road(BEGIN_S, LONGEST_S)

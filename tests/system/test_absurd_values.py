@@ -83,7 +83,7 @@ DEMAND = ("--volume", "1400", "--duration", "40", "--seed", "1")
 
 @frozen
 class Forged:
-    """What was sent, and the time of the road in which it was."""
+    """Number of forged messages, and the period of road time in which they were sent."""
 
     messages: int
     began_s: float

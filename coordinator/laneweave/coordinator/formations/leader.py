@@ -103,9 +103,9 @@ class FormationLeader(BallotRound):
         self.formation = formation
 
     def reconsider(self) -> None:
-        """Plan again for members that could not reach their lanes: there is more room now.
+        """Consider all lanes within reach again, so that members off their lanes are planned again.
 
-        A member has left, or there is another formation to join.
+        There is more room: a member has left, or there is another formation to join.
         """
         self.out_of_reach = frozenset()
 

@@ -97,12 +97,13 @@ def _sign(state: VehicleState | None, transfer: PendingTransfer) -> _Sign:
     theirs = state.transfer
     if theirs is not None and theirs.ballot > transfer.ballot:
         return _Sign.NEWER
-    known = theirs is not None and theirs.ballot == transfer.ballot
-    if known and theirs is not None and theirs.open:
+    if theirs is not None and theirs.ballot < transfer.ballot:
+        theirs = None  # of an earlier plan
+    if theirs is not None and theirs.open:
         return _Sign.OPEN
     if state.promised is None or state.promised <= transfer.ballot or not state.owned:
         return _Sign.NONE
-    if not known or theirs is None:
+    if theirs is None:
         return _Sign.NEVER_READY  # it has not accepted the plan
     # With a closed gate, a vehicle that was ready is still in its start cell, which is in `after`.
     elsewhere = not state.moving and state.hold_cell not in theirs.after

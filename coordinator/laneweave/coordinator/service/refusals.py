@@ -75,7 +75,10 @@ class PacedRefusals:
             now_s: node clock.
         """
         client = query.session.client
-        used_s = max(now_s, self._used_until_s.get(client, now_s))
+        # Forget clients whose rate is free again.
+        used = self._used_until_s.items()
+        self._used_until_s = {name: until_s for name, until_s in used if until_s > now_s}
+        used_s = self._used_until_s.get(client, now_s)
         due_s = min(max(now_s, used_s - _PROMPT_S), now_s + MAX_RETRY_S)
         self._used_until_s[client] = min(used_s, now_s + _PROMPT_S + MAX_RETRY_S) + 1 / RATE_PER_S
         held = _HeldRefusal(due_s, next(self._numbers), query, reason, now_s + retry_after_s)
@@ -88,6 +91,3 @@ class PacedRefusals:
         """Send the refusals that are due."""
         while self._held and self._held[0].due_s <= now_s:
             yield heapq.heappop(self._held).reply(now_s)
-        if not self._held:
-            used = self._used_until_s.items()
-            self._used_until_s = {client: used_s for client, used_s in used if used_s > now_s}

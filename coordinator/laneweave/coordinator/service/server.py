@@ -174,9 +174,10 @@ class PlanningService:
             yield Decline(token)
             return
         query = OpenQuery(token, format_of(payload, encoding), session)
-        if self._pending.count(session.client) >= self._settings.client_queue_limit:
+        count = self._pending.count(session.client)
+        if count >= self._settings.client_queue_limit:
             # Without reading the request: a flood should cost little.
-            yield from self._refuse_over_limit(query, now_s)
+            yield from self._refuse_over_limit(query, count, now_s)
             return
         yield from self._take(query, payload, job, now_s)
 
@@ -201,8 +202,8 @@ class PlanningService:
             yield Reply(query.token, answer, encoding=form.encoding)
             return
         client = query.session.client
-        if len(self._pending) >= self._settings.queue_limit:
-            count = len(self._pending)
+        count = len(self._pending)
+        if count >= self._settings.queue_limit:
             displaced = self._pending.displaced_by(client)
             if displaced is None:
                 yield from self._refuse_in_total(query, count, now_s)
@@ -240,9 +241,8 @@ class PlanningService:
 
     # --- overload -----------------------------------------------------------------------------
 
-    def _refuse_over_limit(self, query: OpenQuery, now_s: float) -> Iterator[Effect]:
+    def _refuse_over_limit(self, query: OpenQuery, count: int, now_s: float) -> Iterator[Effect]:
         """Refuse a request of a client that has too many."""
-        count = self._pending.count(query.session.client)
         what = f"{count} pending requests of this client"
         ahead = count * self._pending.clients
         yield from self._refuse(query, "client_queue_limit", what, ahead, now_s)

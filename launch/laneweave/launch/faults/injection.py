@@ -116,7 +116,7 @@ class FaultInjection:
     def seed_of_start(self, name: str) -> str:
         """Return the seed of the message faults for the next start of a role."""
         start = self._starts[name] = self._starts.get(name, 0) + 1
-        seed = self.seed if self.specification.seed is None else self.specification.seed
+        seed = self.specification.seed_of_run(self.seed)
         return f"{seed}/{name}/{start}"
 
     def step(self, road_s: float, now_s: float, view: RoadView) -> None:

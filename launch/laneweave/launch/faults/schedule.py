@@ -46,7 +46,7 @@ class FaultSchedule:
 
     def __init__(self, specification: FaultSpec, seed: int) -> None:
         """Draw the events with the seed of the specification, or with `seed` if it has none."""
-        seed = seed if specification.seed is None else specification.seed
+        seed = specification.seed_of_run(seed)
         self._specification = specification
         self._reached_s = 0.0
         self._coming = heapq.merge(

@@ -251,6 +251,10 @@ class FaultSpec:
         """Return whether there are any faults."""
         return bool(self.messages or self.kill or self.pause or self.partition or self.link)
 
+    def seed_of_run(self, scenario_seed: int) -> int:
+        """Return the seed of all draws in a run of a scenario with this seed."""
+        return scenario_seed if self.seed is None else self.seed
+
     def role_faults(self) -> Iterator[tuple[str, RoleFault]]:
         """Yield kills and pauses with their names, such as `kill[0]`."""
         for kind in ("kill", "pause"):

@@ -254,7 +254,7 @@ def fault_injection(
     Raises:
         BadInputError: a partition requires network namespaces, which cannot be created.
     """
-    seed = scenario.seed if faults.seed is None else faults.seed
+    seed = faults.seed_of_run(scenario.seed)
     network, reason = open_network(faults, processes.context, seed)
     lease_s = scenario.network.lease_s
     return FaultInjection(faults, scenario.seed, processes, lease_s, network, reason)

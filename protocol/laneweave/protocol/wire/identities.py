@@ -80,7 +80,7 @@ class Incarnations:
 
 
 def _host_hash() -> int:
-    """Return a hash of what distinguishes process ids: the started machine, and the container."""
+    """Return a hash of the machine, since its last boot, and of the container (PID namespace)."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
         container = Path("/proc/self/ns/pid").stat().st_ino

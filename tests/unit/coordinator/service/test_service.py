@@ -454,7 +454,7 @@ def test_a_flooding_client_is_refused_at_a_limited_rate() -> None:
     prompt = [at_s for at_s in refused_s if at_s == begun_s]
     assert len(prompt) == refusals.PROMPT
     assert refused_s[-1] - begun_s == pytest.approx(100 / refusals.RATE_PER_S)
-    # It has used up its rate, and another client has not.
+    # This client has used up its rate; another one has not.
     token = desk.ask(REQUEST, session=flood)
     assert token not in desk.replies
     assert desk.ask(REQUEST, session=quiet) in desk.replies

@@ -30,7 +30,7 @@ LAST_S = 0.3
 MAX_SKIPPED = 4
 """Maximum number of messages that a triggered fault ignores."""
 TRIGGER_DELAY_S = (0.0, 0.0, 0.002, 0.05, 0.3)
-"""Delays between a trigger and its fault to draw from."""
+"""Possible delays between a trigger and its fault."""
 TRIGGERED_KINDS = ("kill", "pause", "cut", "twin", "mute")
 _TARGETED = ("leader", "coordinator", "agent", "cut")
 """Prefixes of the event kinds that have a target."""
