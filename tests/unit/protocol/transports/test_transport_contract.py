@@ -12,6 +12,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+import zenoh
 from attrs import define, field
 
 from laneweave.protocol.runtime import node
@@ -687,6 +688,36 @@ def test_a_service_that_does_not_answer_is_a_timeout(router: Router) -> None:
         assert isinstance(client, ZenohTransport)
         with pytest.raises(TimeoutError, match="in time"):
             client.query(PLAN_SERVICE, b"", 0.2).result(WAIT_S)
+
+
+class LateTokens(ZenohTransport):
+    """Hands over tokens late, as a busy machine does: their callback has a thread of its own."""
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        time.sleep(QUIET_S)
+        super()._on_token(sample)
+
+
+@pytest.mark.slow
+def test_a_query_that_overtakes_its_token_is_declined(router: Router) -> None:
+    with contextlib.closing(ZenohBed(router)) as bed:
+        client, got = bed.join("client").transport, list[Delivery]()
+        assert isinstance(client, ZenohTransport)
+        with contextlib.closing(LateTokens(Access(router.endpoint), got.append)) as server:
+            server.watch(TOKENS)
+            server.serve(PLAN_SERVICE)
+            bed.until(lambda: client.query(PLAN_SERVICE, b"", QUIET_S).exception(WAIT_S))
+            got.clear()
+            client.announce(token_key("v"))
+            asked = client.query(PLAN_SERVICE, b"early", ASK_S, sender=token_key("v"))
+            assert asked.result(WAIT_S) is None
+            bed.until(lambda: got)
+            client.query(PLAN_SERVICE, b"again", ASK_S, sender=token_key("v"))
+            bed.until(lambda: len(got) == 2)
+            token, again = got
+            assert token == TokenUp(token_key("v"))
+            assert isinstance(again, Query)
+            assert (again.payload, again.sender) == (b"again", token_key("v"))
 
 
 @define

@@ -209,8 +209,9 @@ class ZenohTransport:
             payload: content of the query.
             timeout_s: time after which the query ends without an answer.
             encoding: MIME type of the payload.
-            sender: key of a liveliness token of this process, which tells servers that watch the
-                token who asks, and when this process is gone; empty: none.
+            sender: key of a liveliness token of this process, which tells servers who asks, and
+                when this process is gone; empty: none. Servers that do not see the token, or not
+                yet, decline.
 
         Returns:
             A future for the first answer. Its result is None if the key has no server, or if all
@@ -262,8 +263,8 @@ class ZenohTransport:
 
     def _on_query(self, key: str, query: zenoh.Query) -> None:
         sender = self._sender_of(query)
-        token = self._queries.add(sender_name(sender), query)
-        if token is None:
+        token = None if sender is None else self._queries.add(sender_name(sender), query)
+        if sender is None or token is None:
             query.drop()  # type: ignore[no-untyped-call]
             return
         payload = b""
@@ -272,14 +273,20 @@ class ZenohTransport:
         encoding = "" if query.encoding is None else str(query.encoding)
         self._deliver(Query(key, payload, token, encoding, sender))
 
-    def _sender_of(self, query: zenoh.Query) -> str:
-        """Return the token key in a query's attachment; empty unless its token is visible."""
+    def _sender_of(self, query: zenoh.Query) -> str | None:
+        """Return the key in a query's attachment; empty if there is none, None if not visible.
+
+        A query can overtake its client's token: Zenoh's callbacks have a thread for each
+        declaration. Nothing would report the end of a client whose token was not visible yet.
+        """
         attachment = query.attachment
-        if attachment is None or len(attachment) > MAX_SENDER_BYTES:
+        if attachment is None:
             return ""
+        if len(attachment) > MAX_SENDER_BYTES:
+            return None
         key = attachment.to_bytes().decode(errors="replace")
         with self._seen_lock:
-            return key if key in self._seen else ""
+            return key if key in self._seen else None
 
 
 def connect(
