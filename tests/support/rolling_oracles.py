@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from itertools import pairwise, product
+from random import Random
 
+import attrs
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
@@ -19,6 +21,7 @@ from laneweave.coordinator.planning.rolling.problem import (
     StreamVehicle,
 )
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import LaneStretch
 from oracles.binary_programme import Row, cheapest_choice
 from oracles.path_rules import conflict_kinds
 
@@ -56,17 +59,67 @@ def streams(draw: st.DrawFn) -> Stream:
     )
     slot = draw(st.integers(0, 9))
     begin = draw(st.integers(-6, 36)) - int(slot * road.advance_m / road.pitch_m)
+    road = attrs.evolve(road, stretches=draw(stretches_of(road)))
     every = list(product(range(begin, begin + draw(st.integers(1, 10))), range(road.lanes)))
     density = draw(st.sampled_from((0.2, 0.7, 0.9, 1.0)))
     random = draw(st.randoms(use_true_random=False))
     cells = random.sample(every, max(1, int(density * len(every))))
     share_held = draw(st.sampled_from((0.0, 0.0, 0.1, 0.5)))
     vehicles = [
-        StreamVehicle(f"v{i}", cell, random.randrange(road.lanes), random.random() < share_held)
+        StreamVehicle(f"v{i}", cell, targets(road, random), random.random() < share_held)
         for i, cell in enumerate(cells)
     ]
     blocked = draw(st.lists(st.sampled_from(every), max_size=4))
     return road, slot, vehicles, blocked
+
+
+@st.composite
+def stretches_of(draw: st.DrawFn, road: StreamRoad) -> tuple[LaneStretch, ...]:
+    """Draw where the lanes of a road are open: half of the roads are straight."""
+    found = [*road.stretches]
+    if draw(st.booleans()):
+        return tuple(found)
+    for lane in draw(st.sets(st.integers(0, road.lanes - 1), max_size=2)):
+        from_m = draw(st.sampled_from((-1000.0, 150.0, 315.0)))
+        to_m = from_m + draw(st.sampled_from((45.0, 120.0, 1200.0)))
+        found[lane] = LaneStretch(lane, from_m, min(to_m, road.length_m), exit="left")
+        if to_m + 10.0 < road.length_m and draw(st.booleans()):
+            opens_m = to_m + draw(st.sampled_from((10.0, 100.0)))
+            found.append(LaneStretch(lane, opens_m, max(opens_m, road.length_m), exit="again"))
+    return tuple(found)
+
+
+def targets(road: StreamRoad, random: Random) -> set[int]:
+    """Draw one or two stretches."""
+    return {random.randrange(len(road.stretches)) for _ in range(random.randint(1, 2))}
+
+
+def stretch_at(road: StreamRoad, position_m: float, lane: int) -> tuple[int, bool]:
+    """Return the stretch that has begun last in a lane, and whether a position is beyond its end.
+
+    A stretch ends before the next one by more than a vehicle can gain in a slot.
+    """
+    begun = [
+        (each.from_m, number)
+        for number, each in enumerate(road.stretches)
+        if each.lane == lane and each.from_m <= position_m + 1e-6
+    ]
+    if not begun:
+        return -1, False
+    _, number = max(begun)
+    to_m = road.stretches[number].to_m
+    for each in road.stretches:
+        if each.lane == lane and each.from_m > road.stretches[number].from_m:
+            to_m = min(to_m, each.from_m - road.advance_m - road.pitch_m)
+    return number, position_m > to_m + 1e-6
+
+
+def left(road: StreamRoad, slot: int, cell: Cell) -> bool:
+    return stretch_at(road, place_m(road, slot, cell), cell[1])[1]
+
+
+def off_target(road: StreamRoad, slot: int, vehicle: StreamVehicle, cell: Cell) -> bool:
+    return stretch_at(road, place_m(road, slot, cell), cell[1])[0] not in vehicle.targets
 
 
 def place_m(road: StreamRoad, slot: int, cell: Cell) -> float:
@@ -74,12 +127,15 @@ def place_m(road: StreamRoad, slot: int, cell: Cell) -> float:
 
 
 def may_move(road: StreamRoad, slot: int, move: Move) -> bool:
+    if not 0 <= move[1][1] < road.lanes:
+        return False
     places = [place_m(road, slot, cell) for cell in move]
-    return (
-        min(places) - road.body_m >= road.sorting_m[0]
-        and max(places) + road.advance_m <= road.sorting_m[1]
-        and 0 <= move[1][1] < road.lanes
-    )
+    rear_m, front_m = min(places) - road.body_m, max(places) + road.advance_m
+    if rear_m < road.sorting_m[0] or front_m > road.sorting_m[1]:
+        return False
+    rears = [stretch_at(road, rear_m, cell[1]) for cell in move]
+    fronts = [stretch_at(road, front_m, cell[1]) for cell in move]
+    return rears == fronts and all(n >= 0 and not beyond for n, beyond in fronts)
 
 
 def moves_from(road: StreamRoad, slot: int, vehicle: StreamVehicle, cell: Cell) -> list[Move]:
@@ -102,14 +158,16 @@ def missing(road: StreamRoad, slot: int, vehicle: StreamVehicle) -> float:
     return COSTS.missing * (1.0 + 1.0 / (1.0 + chances))
 
 
-def step_cost(vehicle: StreamVehicle, move: Move) -> float:
-    cost = COSTS.off_lane * (move[0][1] != vehicle.lane) + COSTS.move * (move[0] != move[1])
+def step_cost(road: StreamRoad, slot: int, vehicle: StreamVehicle, move: Move) -> float:
+    cost = COSTS.off_lane * off_target(road, slot, vehicle, move[0])
+    cost += COSTS.move * (move[0] != move[1])
     return cost + COSTS.backward * (move[1][0] < move[0][0])
 
 
 def cost_of(road: StreamRoad, slot: int, vehicle: StreamVehicle, way: CellPath) -> float:
-    cost = sum(step_cost(vehicle, move) for move in pairwise(way))
-    return cost + missing(road, slot, vehicle) * (way[-1][1] != vehicle.lane)
+    cost = sum(step_cost(road, s, vehicle, move) for s, move in enumerate(pairwise(way), slot))
+    last = off_target(road, slot + len(way) - 1, vehicle, way[-1])
+    return cost + missing(road, slot, vehicle) * last
 
 
 def cost_of_plan(road: StreamRoad, plan: StreamPlan, vehicles: Sequence[StreamVehicle]) -> float:
@@ -146,7 +204,7 @@ class Programme:
                         leaving.add(x)
                         for key in _rows_of(move):
                             rivals[s, *key].add(x)
-                        if place_m(road, s + 1, move[1]) <= road.length_m:
+                        if not left(road, s + 1, move[1]):
                             following[move[1]].add(x)
                     out = [(x, 1.0) for x in leaving]
                     back = [(x, -1.0) for x in arriving]
@@ -159,8 +217,8 @@ class Programme:
     def _variable(
         self, road: StreamRoad, first: int, slot: int, vehicle: StreamVehicle, move: Move
     ) -> int:
-        cost = step_cost(vehicle, move)
-        if place_m(road, slot + 1, move[1]) > road.length_m and move[1][1] != vehicle.lane:
+        cost = step_cost(road, slot, vehicle, move)
+        if left(road, slot + 1, move[1]) and off_target(road, slot + 1, vehicle, move[1]):
             cost += missing(road, first, vehicle)
         self.cost.append(cost)
         return len(self.cost) - 1

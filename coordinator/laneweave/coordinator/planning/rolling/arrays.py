@@ -21,12 +21,16 @@ from laneweave.coordinator.planning.rolling.paths_kernel import (
     MAX_EJECTED,
     PENALTY,
 )
-from laneweave.coordinator.planning.rolling.problem import StreamCosts, StreamRoad, StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import (
+    ROUNDING_M,
+    StreamCosts,
+    StreamRoad,
+    StreamVehicle,
+)
 from laneweave.protocol.lattice import Cell, Mode, displacements
 
 _SAVED = MAX_EJECTED + 32
 """Maximum number of paths saved during a chain or a reordering."""
-_ROUNDING_M = 1e-6
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -53,8 +57,17 @@ class Table(NamedTuple):
     """Column and lane of each displacement; (displacements, 2)."""
     moving_columns: Ints
     """First and last column in which moves may start in each slot; (slots, 2)."""
+    stretch: NDArray[np.int16]
+    """Stretch in which each cell is at the beginning of each slot, or by whose end it has left;
+    (slots + 1, lanes, columns)."""
+    left: Bools
+    """Whether each cell is beyond the end of its stretch; same shape."""
+    first_left: Ints
+    """First column of each lane beyond the end of a stretch; (slots + 1, lanes)."""
     road_end: Ints
-    """First column beyond the end of the road at the beginning of each slot; (slots + 1)."""
+    """First column from which all cells are beyond the ends of their stretches; (slots + 1)."""
+    several: Bools
+    """Whether cells of each lane are in different stretches; (lanes)."""
 
 
 class Paths(NamedTuple):
@@ -66,15 +79,16 @@ class Paths(NamedTuple):
     move: NDArray[np.int8]
     """Displacements; (vehicles, slots)."""
     slots: Ints
-    """Number of slots in the path up to the end of the road."""
-    target_lane: Ints
+    """Number of slots in the path up to the end of its last stretch."""
+    target: Bools
+    """Whether each stretch is a target; (vehicles, stretches)."""
     held: Bools
     missing_cost: Floats
-    """Cost of ending off the target lane."""
+    """Cost of ending elsewhere than at a target."""
     min_cost: Floats
-    """Lower bound on the cost of paths that end in the target lane."""
+    """Lower bound on the cost of paths that end at a target."""
     can_arrive: Bools
-    """Whether there are enough slots to reach the target lane, ignoring other vehicles."""
+    """Whether there are enough slots to reach a target, ignoring other vehicles."""
     penalty: Ints
     """Cost to other vehicles of a conflict with this one."""
     cost: Floats
@@ -112,6 +126,8 @@ class Scratch(NamedTuple):
     column on either side)."""
     delay: Singles
     """Extra cost of a move in each slot."""
+    row: Singles
+    """Minimum costs of a lane in a slot, including the costs of cells off the targets."""
     searches: Ints
     """(1,) number of path searches."""
     queue: Ints
@@ -156,7 +172,7 @@ def window(
     return Window(
         low,
         table,
-        _paths(costs, table, low, vehicles),
+        _paths(road, costs, table, low, vehicles),
         _costs(costs, table.steps),
         _scratch(len(vehicles), slots, reach, road.lanes),
     )
@@ -172,7 +188,8 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
             is_blocked[lane, column - low] = True
     steps = displacements(road.mode)
     load = np.zeros((slots, len(steps), road.lanes, columns), dtype=np.float32)
-    may_move = _may_move(road, at_m, is_blocked)
+    stretch, left, open_ = _stretches(road, at_m)
+    may_move = _may_move(road, open_, is_blocked)
     load[:, 1:][~may_move] = FIXED * ENTERING
     may_leave: Bools = np.asarray(may_move.any(axis=(1, 2)))
     moving_columns = np.stack(
@@ -187,48 +204,77 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
         first,
         np.array(steps, dtype=np.int64),
         np.ascontiguousarray(moving_columns.T),
-        (at_m <= road.length_m + _ROUNDING_M).sum(axis=1),
+        stretch,
+        left,
+        np.where(left.any(axis=2), left.argmax(axis=2), columns),
+        columns - np.logical_and.reduce(left, axis=1)[:, ::-1].cumprod(axis=1).sum(axis=1),
+        (stretch != stretch[:1, :, :1]).any(axis=(0, 2)),
     )
 
 
-def _may_move(road: StreamRoad, at_m: Floats, is_blocked: Bools) -> Bools:
-    """Return which moves stay on the road and in S3, and enter no blocked cell.
+def _stretches(road: StreamRoad, at_m: Floats) -> tuple[NDArray[np.int16], Bools, Bools]:
+    """Return `Table.stretch` and `Table.left`, and the cells that are open throughout each slot.
+
+    A cell is open if the whole body is, from the beginning of the slot to its end.
+    """
+    slots, columns = at_m.shape[0] - 1, at_m.shape[1]
+    stretch = np.full((slots + 1, road.lanes, columns), -1, dtype=np.int16)
+    left = np.zeros((slots + 1, road.lanes, columns), dtype=np.bool_)
+    is_open = np.zeros((slots, road.lanes, columns), dtype=np.bool_)
+    start_m, end_m = road.sorting_m
+    for lane, stretches in enumerate(road.lane_stretches):
+        for from_m, to_m, number in stretches:
+            begun = at_m >= from_m - ROUNDING_M
+            stretch[:, lane][begun] = number
+            left[:, lane][begun] = (at_m > to_m + ROUNDING_M)[begun]
+            rear = at_m[:-1] - road.body_m >= max(start_m, from_m) - ROUNDING_M
+            front = at_m[1:] <= min(end_m, to_m) + ROUNDING_M
+            is_open[:, lane] |= rear & front
+    return stretch, left, is_open
+
+
+def _may_move(road: StreamRoad, is_open: Bools, is_blocked: Bools) -> Bools:
+    """Return which moves stay in open cells of S3, and enter no blocked cell.
 
     The corners of an oblique move count as entered, except the vehicle's own cell. Shape:
     (slots, displacements without the first, lanes, columns).
     """
-    start_m, end_m = road.sorting_m
-    rear = at_m[:-1] - road.body_m >= start_m - _ROUNDING_M
-    front = at_m[1:] <= end_m + _ROUNDING_M
     lanes, columns = is_blocked.shape
     steps = displacements(road.mode)[1:]
-    allowed = np.zeros((len(rear), len(steps), lanes, columns), dtype=np.bool_)
+    allowed = np.zeros((len(is_open), len(steps), lanes, columns), dtype=np.bool_)
     for d, (column, lane) in enumerate(steps):
         here_c = slice(max(0, -column), columns - max(0, column))
         there_c = slice(max(0, column), columns + min(0, column))
         here_l = slice(max(0, -lane), lanes - max(0, lane))
         there_l = slice(max(0, lane), lanes + min(0, lane))
-        inside = (rear & front)[:, here_c] & (rear & front)[:, there_c]
+        inside = is_open[:, here_l, here_c] & is_open[:, there_l, there_c]
         free = ~is_blocked[there_l, there_c]
         if column and lane:
+            inside &= is_open[:, here_l, there_c] & is_open[:, there_l, here_c]
             free &= ~is_blocked[here_l, there_c] & ~is_blocked[there_l, here_c]
-        allowed[:, d, here_l, here_c] = inside[:, None, :] & free
+        allowed[:, d, here_l, here_c] = inside & free
     return allowed
 
 
-def _paths(costs: StreamCosts, table: Table, low: int, vehicles: Sequence[StreamVehicle]) -> Paths:
+def _paths(
+    road: StreamRoad, costs: StreamCosts, table: Table, low: int, vehicles: Sequence[StreamVehicle]
+) -> Paths:
     slots, count = len(table.load), len(vehicles)
     column, lane = np.zeros((2, count, slots + 1), dtype=np.int64)
     column[:, 0] = [vehicle.cell[0] - low for vehicle in vehicles]
     lane[:, 0] = [vehicle.cell[1] for vehicle in vehicles]
-    target_lane = np.array([vehicle.lane for vehicle in vehicles], dtype=np.int64)
+    target = np.zeros((count, len(road.stretches)), dtype=np.bool_)
+    for v, vehicle in enumerate(vehicles):
+        target[v, list(vehicle.targets)] = True
     held = np.array([vehicle.held for vehicle in vehicles], dtype=np.bool_)
     # Number of slots in which each vehicle may change lanes, ignoring others.
     begin, end = table.moving_columns.T[:, :, None]
     may_move = (begin <= column[:, 0]) & (column[:, 0] <= end)
     chances = may_move.sum(axis=0)
     # Lower bounds on the slots off the lane and on the moves.
-    away = np.abs(lane[:, 0] - target_lane)
+    of_lane = np.array([stretch.lane for stretch in road.stretches])
+    distance = np.abs(lane[:, :1] - of_lane)
+    away = np.where(target, distance, road.lanes).min(axis=1)
     waits = np.where(away > 0, may_move.argmax(axis=0), 0)
     min_cost = away * (costs.move + costs.off_lane) + waits * costs.off_lane
     min_cost += chances * min(0.0, costs.forward)
@@ -237,7 +283,7 @@ def _paths(costs: StreamCosts, table: Table, low: int, vehicles: Sequence[Stream
         lane,
         np.zeros((count, slots), dtype=np.int8),
         np.zeros(count, dtype=np.int64),
-        target_lane,
+        target,
         held,
         costs.missing * (1.0 + 1.0 / (1.0 + chances)),
         min_cost,
@@ -267,6 +313,7 @@ def _scratch(count: int, slots: int, reach: int, lanes: int) -> Scratch:
         np.zeros(count, dtype=np.bool_),
         np.zeros((slots + 1, lanes, 2 * reach + 3), dtype=np.float32),
         np.zeros(slots, dtype=np.float32),
+        np.zeros(2 * reach + 3, dtype=np.float32),
         np.zeros(1, dtype=np.int64),
         *np.zeros((5, count + 1), dtype=np.int64),
     )

@@ -97,7 +97,10 @@ class StreamPlanner:
                     arrays.scratch,
                 )
             paths |= _paths_of(order, arrays)
-        missed = tuple(v.vehicle for v in vehicles if paths[v.vehicle][-1][1] != v.lane)
+        road = self.road
+        missed = tuple(
+            v.vehicle for v in vehicles if road.exit_of(slot, paths[v.vehicle]) not in v.targets
+        )
         solve_ms = round(1e3 * (time.monotonic() - began_s), 3)
         return StreamPlan(slot, paths, missed, rounds, solve_ms)
 

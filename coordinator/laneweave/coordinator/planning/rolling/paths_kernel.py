@@ -64,9 +64,9 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
     `FIXED` vehicles are avoided. If there is no such path, returns `NO_PATH` and sets nothing.
     """
     load, steps, of_move, value = table.load, table.steps, costs.of_move, scratch.value
+    stretch, left, row = table.stretch, table.left, scratch.row
     scratch.searches[0] += 1
     slots, fan, lanes, _ = load.shape
-    target_lane = paths.target_lane[v]
     scale = np.float32(softness / (PENALTY * ENTERING) if softness > 0.0 else _IMPASSABLE)
     # Offsets in `value` are columns minus this.
     shift = paths.column[v, 0] - (value.shape[2] // 2)
@@ -75,28 +75,38 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
     value[0, paths.lane[v, 0], low] = 0.0
     best, best_s, best_offset, best_lane = min(upper_bound, _IMPASSABLE), -1, 0, 0
     for s in range(slots + 1):
-        end = table.road_end[s] - shift if s < slots else low
         for lane in range(lanes):
-            for offset in range(max(low, end), high + 1):
-                total = value[s, lane, offset] + (
-                    0.0 if lane == target_lane else paths.missing_cost[v]
-                )
+            for offset in range(max(low, table.first_left[s, lane] - shift), high + 1):
+                if s < slots and not left[s, lane, offset + shift]:
+                    continue
+                total = value[s, lane, offset]
                 if total < best:
-                    best, best_s, best_offset, best_lane = total, s, offset, lane
-        high = min(high, end - 1)
-        if high < low:
+                    if not paths.target[v, stretch[s, lane, offset + shift]]:
+                        total += paths.missing_cost[v]
+                    if total < best:
+                        best, best_s, best_offset, best_lane = total, s, offset, lane
+                value[s, lane, offset] = _UNREACHED
+        high = min(high, table.road_end[s] - 1 - shift)
+        if s == slots or high < low:
             break
         moves = (
             low + shift <= table.moving_columns[s, 1] and high + shift >= table.moving_columns[s, 0]
         )
         for lane in range(lanes):
             here = value[s, lane, low : high + 1]
+            off = np.float32(0.0)
+            if table.several[lane]:
+                for i in range(len(here)):
+                    row[i] = here[i]
+                    if not paths.target[v, stretch[s, lane, low + shift + i]]:
+                        row[i] += costs.off_lane
+                here = row[: high + 1 - low]
+            elif not paths.target[v, stretch[s, lane, low + shift]]:
+                off = costs.off_lane
             for d in range(fan if moves else 1):
                 to_lane, to = lane + steps[d, 1], low + steps[d, 0]
                 if 0 <= to_lane < lanes:
-                    base = of_move[d] + (scratch.delay[s] if d > 0 else np.float32(0.0))
-                    if lane != target_lane:
-                        base += costs.off_lane
+                    base = off + of_move[d] + (scratch.delay[s] if d > 0 else np.float32(0.0))
                     there = value[s + 1, to_lane, to : to + high + 1 - low]
                     loads = load[s, d, lane, low + shift : high + shift + 1]
                     _relax(here, there, loads, base, scale)
@@ -105,7 +115,7 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
     if best_s < 0:
         return NO_PATH
     _trace(table, paths, costs, v, scale, best_s, best_lane, best_offset, scratch)
-    return own_cost(paths, costs, v)
+    return own_cost(table, paths, costs, v)
 
 
 @njit(cache=True, nogil=True)
@@ -122,13 +132,13 @@ def _trace(table, paths, costs, v, scale, slots, lane, offset, scratch):
             before, from_lane = offset - steps[d, 0], lane - steps[d, 1]
             if not (0 <= from_lane < lanes and 1 <= before < value.shape[2] - 1):
                 continue
-            if before + shift >= table.road_end[s]:
+            if table.left[s, from_lane, before + shift]:
                 continue
             total = value[s, from_lane, before] + costs.of_move[d]
             if d > 0:
                 total += scratch.delay[s]
             total += scale * load[s, d, from_lane, before + shift]
-            if from_lane != paths.target_lane[v]:
+            if not paths.target[v, table.stretch[s, from_lane, before + shift]]:
                 total += costs.off_lane
             if total < best:
                 best, move = total, d
@@ -137,14 +147,14 @@ def _trace(table, paths, costs, v, scale, slots, lane, offset, scratch):
 
 
 @njit(cache=True, nogil=True)
-def own_cost(paths, costs, v):
+def own_cost(table, paths, costs, v):
     """Return the cost of a vehicle's path without penalties."""
     total, slots = 0.0, paths.slots[v]
     for s in range(slots):
         total += costs.of_move[paths.move[v, s]]
-        if paths.lane[v, s] != paths.target_lane[v]:
+        if not paths.target[v, table.stretch[s, paths.lane[v, s], paths.column[v, s]]]:
             total += costs.off_lane
-    if paths.lane[v, slots] != paths.target_lane[v]:
+    if not paths.target[v, table.stretch[slots, paths.lane[v, slots], paths.column[v, slots]]]:
         total += paths.missing_cost[v]
     return total
 
@@ -153,13 +163,13 @@ def own_cost(paths, costs, v):
 def follow(table, paths, costs, v, cells):
     """Set an earlier path if it is still valid and conflict-free; return whether it was set.
 
-    `cells`: columns and lanes at the beginning of each slot, up to the end of the road.
+    `cells`: columns and lanes at the beginning of each slot, up to the end of its last stretch.
     """
     slots, fan = table.load.shape[:2]
     if len(cells) == 0 or cells[0, 0] != paths.column[v, 0] or cells[0, 1] != paths.lane[v, 0]:
         return False
     s = 0
-    while s < slots and paths.column[v, s] < table.road_end[s]:
+    while s < slots and not table.left[s, paths.lane[v, s], paths.column[v, s]]:
         if s + 1 >= len(cells):
             return False
         column, lane = paths.column[v, s], paths.lane[v, s]
@@ -174,7 +184,7 @@ def follow(table, paths, costs, v, cells):
         paths.column[v, s + 1], paths.lane[v, s + 1] = cells[s + 1, 0], cells[s + 1, 1]
         s += 1
     paths.slots[v] = s
-    paths.cost[v] = own_cost(paths, costs, v)
+    paths.cost[v] = own_cost(table, paths, costs, v)
     return True
 
 
@@ -182,12 +192,13 @@ def follow(table, paths, costs, v, cells):
 def stay(table, paths, costs, v):
     """Set the path of a vehicle that stays in its cell."""
     s = 0
-    while s < len(table.load) and paths.column[v, s] < table.road_end[s]:
-        paths.column[v, s + 1], paths.lane[v, s + 1] = paths.column[v, s], paths.lane[v, s]
+    column, lane = paths.column[v, 0], paths.lane[v, 0]
+    while s < len(table.load) and not table.left[s, lane, column]:
+        paths.column[v, s + 1], paths.lane[v, s + 1] = column, lane
         paths.move[v, s] = 0
         s += 1
     paths.slots[v] = s
-    paths.cost[v] = own_cost(paths, costs, v)
+    paths.cost[v] = own_cost(table, paths, costs, v)
 
 
 @njit(cache=True, nogil=True)

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cached_property
 
-from attrs import Attribute, field, frozen
+from attrs import Attribute, Factory, field, frozen
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.protocol.lattice import Cell, Mode
+from laneweave.protocol.road_layout import LaneStretch, straight_lanes
 
+ROUNDING_M = 1e-6
+"""Tolerance for comparing positions."""
+
+Stretch = tuple[float, float, int]
+"""Begin and end of a lane stretch [m] for planning, and its index in `StreamRoad.stretches`."""
 CellPath = tuple[Cell, ...]
 """Cells at the beginning of each slot, from the current slot to the end of the road."""
 
@@ -41,21 +49,83 @@ class StreamRoad:
     """Maximum number of rounds of improvement per slot."""
     max_paths: int = 50_000
     """Maximum number of path searches (about 5 us each) per slot."""
+    stretches: tuple[LaneStretch, ...] = Factory(
+        lambda road: straight_lanes(road.lanes, road.length_m), takes_self=True
+    )
+    """Where the lanes are open; by default all of them from end to end."""
+
+    def position_m(self, slot: int, column: int) -> float:
+        """Return the position of a column at the beginning of a slot."""
+        return column * self.pitch_m + slot * self.advance_m
+
+    @cached_property
+    def lane_stretches(self) -> tuple[tuple[Stretch, ...], ...]:
+        """The stretches of each lane, in the direction of travel."""
+        by_lane = [
+            sorted(
+                (each.from_m, each.to_m, number)
+                for number, each in enumerate(self.stretches)
+                if each.lane == lane
+            )
+            for lane in range(self.lanes)
+        ]
+        return tuple(tuple(self._passable(stretches)) for stretches in by_lane)
+
+    def _passable(self, stretches: list[Stretch]) -> Iterator[Stretch]:
+        """Yield stretches that no vehicle can leave and enter the next one within a slot."""
+        jump_m = self.advance_m + self.pitch_m
+        next_m = [from_m - jump_m for from_m, _, _ in stretches[1:]] + [math.inf]
+        for (from_m, to_m, number), latest_m in zip(stretches, next_m, strict=True):
+            yield from_m, min(to_m, latest_m), number
+
+    @cached_property
+    def first_end_m(self) -> float:
+        """Position before which no stretch ends."""
+        return min(to_m for stretches in self.lane_stretches for _, to_m, _ in stretches)
+
+    def stretch_at(self, slot: int, cell: Cell) -> Stretch | None:
+        """Return the stretch in which a cell is when a slot begins, or by whose end it has left.
+
+        None: there is no such lane, or it has not begun there.
+        """
+        if not 0 <= cell[1] < self.lanes:
+            return None
+        position_m = self.position_m(slot, cell[0]) + ROUNDING_M
+        begun = None
+        for stretch in self.lane_stretches[cell[1]]:
+            if stretch[0] > position_m:
+                break
+            begun = stretch
+        return begun
+
+    def has_left(self, slot: int, cell: Cell) -> bool:
+        """Return whether a cell is beyond the end of its stretch when a slot begins."""
+        stretch = self.stretch_at(slot, cell)
+        return stretch is not None and self.position_m(slot, cell[0]) > stretch[1] + ROUNDING_M
+
+    def exit_of(self, slot: int, path: CellPath) -> int:
+        """Return the stretch by whose end a path that begins with a slot leaves; -1: none."""
+        stretch = self.stretch_at(slot + len(path) - 1, path[-1])
+        return -1 if stretch is None else stretch[2]
 
 
 @frozen
 class StreamCosts:
-    """Costs of paths; a path that ends off the target lane costs more than any other."""
+    """Costs of paths; a path that does not end at a target costs more than any other."""
 
     move: float = 0.3
     off_lane: float = 0.1
-    """Cost of each slot that begins off the target lane."""
+    """Cost of each slot that begins in a stretch that is not a target."""
     backward: float = 2.0
     """Extra cost of a move that loses a column."""
     forward: float = 0.0
     """Extra cost of a move that gains a column; a negative cost rewards gaining columns."""
     missing: float = 60.0
-    """Cost of ending off the target lane; up to twice as much near the end of the road."""
+    """Cost of ending elsewhere than at a target; up to twice as much near the end."""
+
+
+def _as_set(targets: int | Iterable[int]) -> frozenset[int]:
+    return frozenset((targets,) if isinstance(targets, int) else targets)
 
 
 @frozen
@@ -64,8 +134,8 @@ class StreamVehicle:
 
     vehicle: str
     cell: Cell
-    lane: int
-    """The target lane."""
+    targets: frozenset[int] = field(converter=_as_set)
+    """Stretches by whose ends the vehicle may leave the road; on a straight road, target lanes."""
     held: bool = False
     """Whether the vehicle must stay in its cell."""
 
@@ -77,7 +147,7 @@ class StreamPlan:
     slot: int
     paths: Mapping[str, CellPath]
     missed: tuple[str, ...]
-    """Vehicles whose paths do not end in their target lanes."""
+    """Vehicles whose paths do not end at their targets."""
     rounds: int = 0
     """Number of rounds of improvement."""
     solve_ms: float = field(default=0.0, eq=False)

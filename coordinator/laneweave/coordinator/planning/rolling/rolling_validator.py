@@ -11,14 +11,13 @@ from functools import lru_cache
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.rolling.problem import (
+    ROUNDING_M,
     CellPath,
     StreamPlan,
     StreamRoad,
     StreamVehicle,
 )
 from laneweave.protocol.lattice import Cell, Mode, displacements
-
-_ROUNDING_M = 1e-6
 
 
 def problems_of_plan(
@@ -40,11 +39,11 @@ def problems_of_plan(
     missed = {
         v.vehicle
         for v in vehicles
-        if plan.paths[v.vehicle][-1:] != () and plan.paths[v.vehicle][-1][1] != v.lane
+        if plan.paths[v.vehicle] and road.exit_of(plan.slot, plan.paths[v.vehicle]) not in v.targets
     }
     if set(plan.missed) != missed:
         problems.append(
-            f"reports {sorted(plan.missed)} off their lanes instead of {sorted(missed)}"
+            f"reports {sorted(plan.missed)} off their targets instead of {sorted(missed)}"
         )
     return problems or list(_conflicts(road, plan))
 
@@ -63,14 +62,13 @@ def _problems_of_path(
             if vehicle.held:
                 yield f"{name} is held, but moves in slot {s}"
             here = there
-    ends_m = path[-1][0] * road.pitch_m + (slot + len(path) - 1) * road.advance_m
-    if ends_m <= road.length_m + _ROUNDING_M:
-        yield f"the path of {name} ends at {ends_m} m, on the road"
+    if not road.has_left(slot + len(path) - 1, path[-1]):
+        yield f"the path of {name} ends in {path[-1]}, on the road"
     # The last slot must begin on the road.
-    if len(path) > 1:
-        last_m = path[-2][0] * road.pitch_m + (slot + len(path) - 2) * road.advance_m
-        if last_m > road.length_m + _ROUNDING_M:
-            yield f"the path of {name} continues at {last_m} m, beyond the road"
+    for s, cell in enumerate(path[:-1], start=slot):
+        if road.position_m(s, cell[0]) > road.first_end_m and road.has_left(s, cell):
+            yield f"the path of {name} continues from {cell} in slot {s}, off the road"
+            return
 
 
 def _problems_of_move(
@@ -81,14 +79,22 @@ def _problems_of_move(
         yield f"{name} jumps from {here} to {there} in slot {slot}"
     if not 0 <= there[1] < road.lanes:
         yield f"{name} leaves the road to {there} in slot {slot}"
-    rear_m = min(here[0], there[0]) * road.pitch_m + slot * road.advance_m - road.body_m
-    front_m = max(here[0], there[0]) * road.pitch_m + (slot + 1) * road.advance_m
-    start_m, end_m = road.sorting_m
-    if rear_m < start_m - _ROUNDING_M or front_m > end_m + _ROUNDING_M:
-        yield f"{name} moves between {rear_m} m and {front_m} m in slot {slot}"
     entered = {there, (here[0], there[1]), (there[0], here[1])} - {here}
     if not blocked.isdisjoint(entered):
         yield f"{name} enters {sorted(blocked & entered)} (blocked) in slot {slot}"
+    rear_m = road.position_m(slot, min(here[0], there[0])) - road.body_m
+    front_m = road.position_m(slot + 1, max(here[0], there[0]))
+    start_m, end_m = road.sorting_m
+    if rear_m < start_m - ROUNDING_M or front_m > end_m + ROUNDING_M:
+        yield f"{name} moves between {rear_m} m and {front_m} m in slot {slot}"
+        return
+    for lane in {here[1], there[1]} & {*range(road.lanes)}:
+        # A stretch must be open for the whole body and the whole slot.
+        if not any(
+            from_m <= rear_m + ROUNDING_M and front_m <= to_m + ROUNDING_M
+            for from_m, to_m, _ in road.lane_stretches[lane]
+        ):
+            yield f"{name} moves between {rear_m} m and {front_m} m, where lane {lane} is closed"
 
 
 def _conflicts(road: StreamRoad, plan: StreamPlan) -> Iterator[str]:

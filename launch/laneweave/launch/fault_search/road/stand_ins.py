@@ -199,6 +199,7 @@ class LightPlanner:
         """Create a planner for a road."""
         road = stream_road(scenario)
         self._lanes = road.lanes
+        self._stretches = road.stretches
         self._steps = [step for step in displacements(road.mode) if step != (0, 0)]
         self._seed = scenario.seed
 
@@ -214,9 +215,10 @@ class LightPlanner:
         rng = random.Random(f"{self._seed}/{slot}")  # noqa: S311 (simulation, no secrets)
         taken = {vehicle.cell for vehicle in vehicles} | set(blocked)
         paths: dict[str, CellPath] = {vehicle.vehicle: (vehicle.cell,) for vehicle in vehicles}
-        in_order = sorted(vehicles, key=lambda one: (one.cell[1] == one.lane, rng.random()))
+        in_order = sorted(vehicles, key=lambda one: (not self._away(one, one.cell), rng.random()))
         for vehicle in in_order:
-            if vehicle.held or (vehicle.cell[1] == vehicle.lane and rng.random() > UNNEEDED_MOVES):
+            arrived = not self._away(vehicle, vehicle.cell)
+            if vehicle.held or (arrived and rng.random() > UNNEEDED_MOVES):
                 continue
             target = self._target(vehicle, taken, rng)
             if target is not None:
@@ -235,4 +237,8 @@ class LightPlanner:
         ]
         if not free:
             return None
-        return min(free, key=lambda cell: (abs(cell[1] - vehicle.lane), rng.random()))
+        return min(free, key=lambda cell: (self._away(vehicle, cell), rng.random()))
+
+    def _away(self, vehicle: StreamVehicle, cell: Cell) -> int:
+        """Return the number of lanes from a cell to the nearest target."""
+        return min(abs(cell[1] - self._stretches[number].lane) for number in vehicle.targets)

@@ -21,6 +21,7 @@ from laneweave.coordinator.planning.rolling.problem import (
     StreamVehicle,
 )
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
+from laneweave.protocol.road_layout import LaneStretch
 from support import rolling_oracles as oracle
 from support.rolling_oracles import ROAD, SHORT, Stream, streams
 
@@ -75,7 +76,7 @@ def test_every_stream_gets_complete_paths_without_conflicts(stream: Stream) -> N
 @settings(max_examples=60)
 @given(streams())
 def test_vehicles_need_not_be_where_they_were_planned(stream: Stream) -> None:
-    """All vehicles are a cell further; some are new, held, gone, or have another target lane."""
+    """All vehicles are a cell further; some are new, held, gone, or have other targets."""
     road, slot, vehicles, blocked = stream
     planner = StreamPlanner(road)
     plan = planner.plan(slot, vehicles)
@@ -84,7 +85,7 @@ def test_vehicles_need_not_be_where_they_were_planned(stream: Stream) -> None:
             v,
             vehicle=v.vehicle if i % 3 else f"new{i}",
             cell=(v.cell[0] + 1, v.cell[1]),
-            lane=(v.lane + i % 2) % road.lanes,
+            targets={(n + i % 2) % len(road.stretches) for n in v.targets},
             held=i % 7 == 0,
         )
         for i, v in enumerate(vehicles[1:])
@@ -156,6 +157,100 @@ def test_a_path_blocked_by_a_held_vehicle_is_replaced() -> None:
     plan = planner.plan(0, held, before)
     assert problems_of_plan(ROAD, plan, held) == []
     assert plan.missed == ()
+
+
+# ----------------------------------------------------------------------- lanes that end, exits
+
+
+def lanes(*stretches: LaneStretch, start_m: float = 150.0) -> StreamRoad:
+    count = 1 + max(stretch.lane for stretch in stretches)
+    return StreamRoad(
+        count, 15.0, 60.0, (start_m, 1000.0), 1000.0, 5.0, max_paths=2000, stretches=stretches
+    )
+
+
+def through(*numbers: int) -> list[LaneStretch]:
+    return [LaneStretch(lane, to_m=1000.0, exit="end") for lane in numbers]
+
+
+def test_a_lane_that_ends_is_left_in_time_even_in_dense_traffic() -> None:
+    road = lanes(*through(0, 1), LaneStretch(2, to_m=800.0))
+    random = Random(7)
+    cells = [(c, lane) for c in range(-20, 10) for lane in range(3)]
+    # Nine tenths of the cells of the two other lanes are taken afterwards.
+    vehicles = [
+        StreamVehicle(f"v{i}", cell, {0, 1}) for i, cell in enumerate(random.sample(cells, 54))
+    ]
+    plan = StreamPlanner(road).plan(0, vehicles)
+    assert problems_of_plan(road, plan, vehicles) == []
+    assert plan.missed == ()
+
+
+def test_a_blocked_lane_is_used_before_and_after() -> None:
+    again = LaneStretch(0, 600.0, 1000.0, exit="end")
+    road = lanes(LaneStretch(0, to_m=500.0), *through(1), again)
+    to_its_lane = StreamVehicle("a", (15, 0), 2)
+    plan = StreamPlanner(road).plan(0, [to_its_lane])
+    assert plan.missed == ()
+    visited = [lane for _, lane in plan.paths["a"]]
+    assert visited[0] == visited[-1] == 0
+    assert 1 in visited
+
+
+def test_vehicles_take_their_exits_and_others_keep_out_of_them() -> None:
+    """A weaving section: a lane from 400 m to 700 m, by which vehicles come and go."""
+    road = lanes(LaneStretch(0, 400.0, 700.0, exit="off"), *through(1, 2))
+    comes, goes, stays = (
+        StreamVehicle("comes", (22, 0), {1, 2}),  # on the ramp, at 330 m
+        StreamVehicle("goes", (22, 1), 0),
+        StreamVehicle("stays", (23, 1), {1, 2}),
+    )
+    plan = StreamPlanner(road).plan(0, [comes, goes, stays])
+    assert problems_of_plan(road, plan, [comes, goes, stays]) == []
+    assert plan.missed == ()
+    assert len(plan.paths["goes"]) < len(plan.paths["stays"])
+    off_m = [
+        15 * column + 60 * s for s, (column, lane) in enumerate(plan.paths["goes"]) if not lane
+    ]
+    assert off_m[0] >= 405.0
+    assert off_m[-1] > 700.0
+    assert all(lane > 0 for _, lane in plan.paths["stays"])
+
+
+def test_a_vehicle_in_a_lane_without_way_out_is_planned_to_its_end() -> None:
+    road = lanes(*through(0), LaneStretch(1, to_m=800.0))
+    late = StreamVehicle("late", (52, 1), 0)  # at 780 m
+    plan = StreamPlanner(road).plan(0, [late])
+    assert plan.paths == {"late": ((52, 1), (52, 1))}
+    assert plan.missed == ("late",)
+
+
+@pytest.mark.slow
+def test_streams_on_lanes_that_end_cost_the_minimum_nearly_always() -> None:
+    """The least cost: a mixed-integer programme."""
+    random = Random(9)
+    road = attrs.evolve(
+        SHORT,
+        stretches=(
+            LaneStretch(0, to_m=150.0, exit="end"),
+            LaneStretch(1, 20.0, 150.0, exit="end"),
+            LaneStretch(2, to_m=90.0, exit="off"),
+        ),
+    )
+    equal = 0
+    for seed in range(8):
+        cells = random.sample([(c, lane) for c in range(3) for lane in (0, 2)], 4)
+        vehicles = [
+            StreamVehicle(f"v{i}", cell, oracle.targets(road, random))
+            for i, cell in enumerate(cells)
+        ]
+        plan = StreamPlanner(road, seed=seed).plan(0, vehicles)
+        assert problems_of_plan(road, plan, vehicles) == []
+        cost = oracle.cost_of_plan(road, plan, vehicles)
+        least = oracle.Programme(road, 0, vehicles).least_cost()
+        assert cost >= least - 1e-6
+        equal += cost <= least + 1e-6
+    assert equal >= 6
 
 
 # ------------------------------------------------------------------------- the same each time

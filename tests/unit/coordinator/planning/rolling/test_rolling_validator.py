@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from random import Random
 
@@ -14,6 +15,7 @@ from laneweave.coordinator.planning.rolling.problem import CellPath, StreamPlan,
 from laneweave.coordinator.planning.rolling.problem import StreamVehicle as Vehicle
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import LaneStretch
 
 ROAD = StreamRoad(3, 15.0, 60.0, (400.0, 1000.0), 1000.0, 5.0)
 MODE_2 = attrs.evolve(ROAD, mode=2, model=ConflictModel(("geometric",)))
@@ -49,7 +51,7 @@ def only_problem(
         (to_the_end((50, 0), (50, -1), (50, 0)), "leaves the road"),
         (to_the_end((50, 0))[:-1], "on the road"),
         (((50, 0),), "on the road"),
-        ((*to_the_end((50, 0)), (50, 0)), "beyond the road"),
+        ((*to_the_end((50, 0)), (50, 0)), "off the road"),
         (to_the_end((50, 0), (50, 0), (50, 0), (50, 0), (51, 0)), "moves between"),
     ],
 )
@@ -77,11 +79,57 @@ def test_moves_begin_in_s3() -> None:
     assert "moves between 385.0 m" in only_problem([vehicle], {"v": way})
 
 
+DROP = attrs.evolve(
+    ROAD,
+    stretches=(
+        LaneStretch(0, to_m=1000.0, exit="end"),
+        LaneStretch(1, to_m=1000.0, exit="end"),
+        LaneStretch(2, to_m=800.0),
+    ),
+)
+"""The left lane ends at 800 m."""
+
+
+def test_moves_leave_a_lane_before_its_end_and_do_not_enter_it_later() -> None:
+    out = (50, 2), (50, 1)  # from 750 m to 810 m
+    assert "where lane 2 is closed" in only_problem(
+        [Vehicle("v", out[0], {0, 1})], {"v": to_the_end(*out)}, road=DROP
+    )
+    in_time = to_the_end((49, 2), (49, 1))  # to 795 m
+    plan = StreamPlan(0, {"v": in_time}, ())
+    assert problems_of_plan(DROP, plan, [Vehicle("v", (49, 2), {0, 1})]) == []
+    back = to_the_end((54, 1), (54, 2))
+    assert "where lane 2 is closed" in only_problem(
+        [Vehicle("v", (54, 1), {0, 1})], {"v": back[:2]}, missed=("v",), road=DROP
+    )
+
+
+def test_paths_end_where_their_lanes_do() -> None:
+    vehicle = Vehicle("v", (53, 2), {0, 1})
+    way = ((53, 2), (53, 2))  # at 795 m, then at 855 m
+    assert problems_of_plan(DROP, StreamPlan(0, {"v": way}, ("v",)), [vehicle]) == []
+    assert "off their targets" in only_problem([vehicle], {"v": way}, road=DROP)
+    longer = (*way, (53, 2))
+    assert "continues from" in only_problem([vehicle], {"v": longer}, missed=("v",), road=DROP)
+    elsewhere = StreamPlan(0, {"v": way}, ())
+    assert problems_of_plan(DROP, elsewhere, [Vehicle("v", (53, 2), 2)]) == []
+
+
+def test_a_lane_that_opens_again_soon_ends_earlier() -> None:
+    """In a slot a vehicle can gain 75 m: it must not pass a closed part of 20 m unnoticed."""
+    again = LaneStretch(2, 820.0, 1000.0, exit="end")
+    road = attrs.evolve(DROP, stretches=(*DROP.stretches, again))
+    assert road.lane_stretches[2] == ((-math.inf, 745.0, 2), (820.0, 1000.0, 3))
+    vehicle = Vehicle("v", (49, 2), 3)
+    way = ((49, 2), (49, 2))  # at 735 m, then at 795 m
+    assert problems_of_plan(road, StreamPlan(0, {"v": way}, ("v",)), [vehicle]) == []
+
+
 def test_vehicles_that_miss_their_lanes_are_listed() -> None:
     vehicle = Vehicle("v", (50, 0), 1)
     way = to_the_end((50, 0))
     assert problems_of_plan(ROAD, StreamPlan(0, {"v": way}, ("v",)), [vehicle]) == []
-    assert "off their lanes" in only_problem([vehicle], {"v": way})
+    assert "off their targets" in only_problem([vehicle], {"v": way})
     assert "starts at" in problems_of_plan(ROAD, StreamPlan(0, {"v": ()}, ()), [vehicle])[0]
     assert "for vehicles" in only_problem([vehicle, Vehicle("w", (51, 0), 0)], {"v": way})
 
