@@ -3,6 +3,8 @@
 A lattice without faults. Arrivals are those of a scenario; each vehicle enters the free column that
 is nearest to its arrival, behind its predecessor in the lane. In each slot all vehicles on the road
 are planned, and the first step of every path is made. CPU time of one thread.
+
+Vehicles of some variants come from a ramp, at `RAMP_M` in lane 0, and some leave by an exit.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from laneweave.coordinator.planning.rolling.rolling_validator import problems_of
 from laneweave.coordinator.planning.solve import warm_up
 from laneweave.coordinator.rolling.checked_planner import REWARD, stream_road
 from laneweave.protocol.config.scenario_files import load_scenario
+from laneweave.protocol.road_layout import LaneStretch
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.road.demand import arrivals
 
@@ -51,6 +54,10 @@ SPEED_MPS, ROAD = SCENARIO.formation.speed_mps, stream_road(SCENARIO)
 PITCH_M, LENGTH_M = ROAD.pitch_m, ROAD.length_m
 
 
+RAMP_M, JOINS_M, OFF_M = 300.0, 400.0, 700.0
+"""Where vehicles enter a ramp, where its lane joins the road, and where this lane ends."""
+
+
 @frozen
 class Variant:
     """A road, costs and volumes to measure."""
@@ -58,6 +65,36 @@ class Variant:
     road: StreamRoad = ROAD
     costs: StreamCosts = field(factory=StreamCosts)
     volumes: tuple[int, ...] = (1800, 2400, 2600)
+    ramp_veh_h: float = 0.0
+    leaving_veh_h: float = 0.0
+    """Vehicles from the start of the road that leave by the exit."""
+
+    @property
+    def sorts(self) -> bool:
+        """Whether vehicles have preferred lanes."""
+        return len({stretch.exit for stretch in self.road.stretches}) == self.road.lanes
+
+    def exits(self, name: str) -> frozenset[int]:
+        """Return the stretches that lead to an exit."""
+        stretches = enumerate(self.road.stretches)
+        return frozenset(number for number, stretch in stretches if stretch.exit == name)
+
+
+def _road(*stretches: LaneStretch, main: int, cycle_s: float = 6.0) -> StreamRoad:
+    """Return a road with main lanes to its end, from the leftmost of the stretches on."""
+    first = 1 + max(stretch.lane for stretch in stretches)
+    through = [LaneStretch(first + lane, to_m=LENGTH_M, exit="end") for lane in range(main)]
+    return attrs.evolve(
+        ROAD,
+        lanes=first + main,
+        advance_m=SPEED_MPS * cycle_s,
+        sorting_m=(150.0, LENGTH_M),
+        stretches=(*stretches, *through),
+    )
+
+
+_MERGE = LaneStretch(0, JOINS_M, OFF_M)
+_WEAVE = LaneStretch(0, JOINS_M, OFF_M, exit="off")
 
 
 VARIANTS = {
@@ -81,6 +118,27 @@ VARIANTS = {
         )
     ),
     "mode 2": Variant(attrs.evolve(ROAD, mode=2, model=ConflictModel(("geometric", "closing")))),
+    "lane drop": Variant(
+        _road(LaneStretch(0, to_m=800.0), main=2), volumes=(1000, 1500, 2000, 2200)
+    ),
+    "blocked lane": Variant(
+        _road(LaneStretch(0, to_m=500.0), LaneStretch(0, 600.0, LENGTH_M, exit="end"), main=2),
+        volumes=(1000, 1450, 2000),
+    ),
+    "on-ramp": Variant(_road(_MERGE, main=3), volumes=(1600, 2000, 2300), ramp_veh_h=800.0),
+    "off-ramp": Variant(_road(_WEAVE, main=3), volumes=(2000,), leaving_veh_h=1200.0),
+    "weaving": Variant(
+        _road(_WEAVE, main=3), volumes=(1600, 2000), ramp_veh_h=600.0, leaving_veh_h=600.0
+    ),
+    **{
+        f"weaving, T_F {cycle_s:g} s": Variant(
+            _road(_WEAVE, main=3, cycle_s=cycle_s),
+            volumes=(2400,),
+            ramp_veh_h=800.0,
+            leaving_veh_h=800.0,
+        )
+        for cycle_s in (6.0, 4.0)
+    },
 }
 
 
@@ -91,26 +149,53 @@ class Traveller:
     vehicle: str
     column: int
     lane: int
-    target_lane: int
+    targets: frozenset[int]
     arrival_s: float
+    entry_m: float = 0.0
+
+    @property
+    def delay_s(self) -> float:
+        """Time by which a vehicle that stays in its column is late on the whole road."""
+        return (self.entry_m - PITCH_M * self.column) / SPEED_MPS - self.arrival_s
 
 
-def travellers(volume: float, seed: int, duration_s: float) -> list[Traveller]:
+def travellers(variant: Variant, volume: float, seed: int, duration_s: float) -> list[Traveller]:
     """Return the vehicles by time of entry, each with the free column nearest to its arrival.
 
-    Column c is at the beginning of the road at -c PITCH_M / SPEED_MPS.
+    At time 0, column c is at c PITCH_M.
     """
-    scenario = load_scenario(
-        None, seed=seed, demand__volume_veh_per_lane_h=float(volume), demand__duration_s=duration_s
-    )
-    last: dict[int, int] = {}
-    found = []
-    for one in arrivals(scenario):
-        column = -round(one.t_s * SPEED_MPS / PITCH_M)
-        column = min(column, last.get(one.lane, column + 1) - 1)
-        last[one.lane] = column
-        found.append(Traveller(one.vehicle, column, one.lane, one.preferred_lane, one.t_s))
-    return sorted(found, key=lambda one: -one.column)
+    main = len({stretch.lane for stretch in variant.road.stretches if stretch.from_m < 0.0})
+    first = variant.road.lanes - main
+    random = np.random.default_rng((seed, 1))
+    off_share = variant.leaving_veh_h / (main * volume)
+
+    def entering(
+        name: str, lanes: int, first_lane: int, entry_m: float, seed: int, volume: float
+    ) -> Iterator[Traveller]:
+        last: dict[int, int] = {}
+        scenario = load_scenario(
+            None,
+            seed=seed,
+            road__lanes=lanes,
+            demand__volume_veh_per_lane_h=float(volume),
+            demand__duration_s=duration_s,
+        )
+        for one in arrivals(scenario):
+            column = round((entry_m - one.t_s * SPEED_MPS) / PITCH_M)
+            column = min(column, last.get(one.lane, column + 1) - 1)
+            last[one.lane] = column
+            if variant.sorts:
+                targets = frozenset({one.preferred_lane})
+            else:
+                leaves = entry_m == 0.0 and random.random() < off_share
+                targets = variant.exits("off" if leaves else "end")
+            lane = first_lane + one.lane
+            yield Traveller(name + one.vehicle, column, lane, targets, one.t_s, entry_m)
+
+    found = [*entering("", main, first, 0.0, seed, volume)]
+    if variant.ramp_veh_h:
+        found += entering("ramp-", 1, 0, RAMP_M, seed + 1000, variant.ramp_veh_h)
+    return sorted(found, key=lambda one: one.entry_m - PITCH_M * one.column)
 
 
 @frozen
@@ -127,16 +212,27 @@ class Slot:
 
 @frozen
 class Departed:
-    """A vehicle that has left the road."""
+    """A vehicle that has left the road, by the end of a stretch."""
 
     traveller: Traveller
     column: int
-    lane: int
+    stretch: int
+    end_m: float
+
+    @property
+    def drift(self) -> int:
+        """Columns gained."""
+        return self.column - self.traveller.column
+
+    @property
+    def delay_s(self) -> float:
+        """Travel time minus that at v_F."""
+        return self.traveller.delay_s - PITCH_M * self.drift / SPEED_MPS
 
     @property
     def travel_s(self) -> float:
-        """Time from the arrival to the end of the road."""
-        return (LENGTH_M - PITCH_M * self.column) / SPEED_MPS - self.traveller.arrival_s
+        """Time from the arrival to the end of the stretch."""
+        return self.delay_s + (self.end_m - self.traveller.entry_m) / SPEED_MPS
 
 
 class Run:
@@ -146,7 +242,7 @@ class Run:
         """Prepare the first slot."""
         self.road = variant.road
         self.planner = StreamPlanner(variant.road, variant.costs, seed)
-        self.coming = travellers(volume, seed, duration_s)[::-1]
+        self.coming = travellers(variant, volume, seed, duration_s)[::-1]
         self.on_road: dict[str, tuple[Traveller, tuple[int, int]]] = {}
         self.plan: StreamPlan | None = None
         self.number = 0
@@ -156,16 +252,18 @@ class Run:
     def step(self) -> bool:
         """Plan and execute a slot; return whether vehicles remain."""
         front_m = self.number * self.road.advance_m
-        while self.coming and self.coming[-1].column * PITCH_M + front_m >= 0:
-            one = self.coming.pop()
+        while self.coming:
+            one = self.coming[-1]
+            if one.column * PITCH_M + front_m < one.entry_m:
+                break
             self.on_road[one.vehicle] = one, (one.column, one.lane)
-        for name, (one, (column, lane)) in list(self.on_road.items()):
-            if column * PITCH_M + front_m > self.road.length_m:
-                self.left.append(Departed(one, column, lane))
+            self.coming.pop()
+        for name, (one, cell) in list(self.on_road.items()):
+            stretch = self.road.stretch_at(self.number, cell)
+            if stretch is not None and self.road.has_left(self.number, cell):
+                self.left.append(Departed(one, cell[0], stretch[2], stretch[1]))
                 del self.on_road[name]
-        vehicles = [
-            StreamVehicle(v, cell, one.target_lane) for v, (one, cell) in self.on_road.items()
-        ]
+        vehicles = [StreamVehicle(v, cell, one.targets) for v, (one, cell) in self.on_road.items()]
         began = time.thread_time()
         plan = self.planner.plan(self.number, vehicles, self.plan)
         cpu_ms = (time.thread_time() - began) * 1e3
@@ -192,11 +290,13 @@ def measured(name: str, volume: int, seeds: int, duration_s: float) -> dict[str,
         while run.step():
             pass
         counted = [one for one in run.left if one.traveller.arrival_s >= NOT_COUNTED_S]
-        off.append(sum(one.lane != one.traveller.target_lane for one in counted))
+        off.append(sum(one.stretch not in one.traveller.targets for one in counted))
         left += counted
         slots += run.slots
-    travel_s = np.array([one.travel_s for one in left])
-    drift = np.array([one.column - one.traveller.column for one in left])
+    through = [one for one in left if one.traveller.entry_m == 0.0 and one.end_m >= LENGTH_M]
+    travel_s = np.array([one.travel_s for one in through])
+    from_ramp_s = [one.delay_s for one in left if one.traveller.entry_m > 0.0]
+    drift = np.array([one.drift for one in left])
     cpu_ms = np.array([slot.cpu_ms for slot in slots])
     rounds = np.array([slot.rounds for slot in slots])
     return {
@@ -210,6 +310,7 @@ def measured(name: str, volume: int, seeds: int, duration_s: float) -> dict[str,
         "travel_s_mean": round(float(travel_s.mean()), 2),
         "travel_s_p95": round(float(np.percentile(travel_s, 95)), 2),
         "delay_s_mean": round(float(travel_s.mean()) - LENGTH_M / SPEED_MPS, 2),
+        "ramp_delay_s_mean": round(float(np.mean(from_ramp_s)), 2) if from_ramp_s else None,
         "drift_columns_mean": round(float(drift.mean()), 3),
         "drifted_percent": round(100.0 * float((drift != 0).mean()), 1),
         "slots": len(slots),
@@ -237,6 +338,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 _SHOWN = (
     "on_lane_percent",
     "travel_s_mean",
+    "ramp_delay_s_mean",
     "drift_columns_mean",
     "rounds_mean",
     "cpu_ms_mean",
@@ -248,7 +350,7 @@ _SHOWN = (
 
 
 def main() -> None:
-    """Measure, print rows, and write them to a file."""
+    """Measure, print rows, and replace them in a file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--volumes", type=int, nargs="+", help="veh/(lane*h); default: all")
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, help="default: all")
@@ -259,15 +361,18 @@ def main() -> None:
     parser.add_argument("--json", type=Path, default=OUT, help="output file")
     options = parser.parse_args()
     warm_up()
-    results = []
+    results = {}
+    if options.json.exists():
+        rows_before = json.loads(options.json.read_text(encoding="utf-8"))
+        results = {(row["variant"], row["volume_veh_per_lane_h"]): row for row in rows_before}
     sys.stdout.write(f"{'variant':15} volume  off of      {' '.join(_SHOWN)}\n")
     for row in rows(options):
-        results.append(row)
-        shown = " ".join(f"{row[key]:>{len(key)}}" for key in _SHOWN)
+        results[row["variant"], row["volume_veh_per_lane_h"]] = row
+        shown = " ".join(f"{row[key]!s:>{len(key)}}" for key in _SHOWN)
         head = f"{row['variant']:15} {row['volume_veh_per_lane_h']:6} {row['off_lane']:4}"
         sys.stdout.write(f"{head} of {row['vehicles']:5} {shown}\n")
         sys.stdout.flush()
-    options.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    options.json.write_text(json.dumps([*results.values()], indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

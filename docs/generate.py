@@ -410,19 +410,21 @@ def _stream() -> str:
     """Return the table of results of the stream planner, by `benchmarks/stream.py`."""
     lines = [
         (
-            "| variant | veh/(lane h) | off their lanes | travel time mean / p95 | columns gained "
-            "| CPU ms p50 / mean / p99 / max |"
+            "| variant | veh/(lane h) | off their targets | travel time mean / p95 | ramp delay "
+            "| columns gained | CPU ms p50 / mean / p99 / max |"
         ),
-        "|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|",
     ]
     for row in json.loads(STREAM.read_text(encoding="utf-8")):
         cpu_ms = " / ".join(f"{row[f'cpu_ms_{key}']:.1f}" for key in ("p50", "mean", "p99", "max"))
         off, vehicles = row["off_lane"], row["vehicles"]
+        ramp_s = row.get("ramp_delay_s_mean")
+        ramp = "" if ramp_s is None else f"{ramp_s:.2f} s"
         lines.append(
             f"| {row['variant']} | {row['volume_veh_per_lane_h']} "
             f"| {off} of {vehicles:,} ({100.0 - row['on_lane_percent']:.2f} %) "
             f"| {row['travel_s_mean']:.2f} / {row['travel_s_p95']:.2f} s "
-            f"| {row['drift_columns_mean']:.2f} | {cpu_ms} |"
+            f"| {ramp} | {row['drift_columns_mean']:.2f} | {cpu_ms} |"
         )
     return "\n".join(lines)
 
