@@ -85,6 +85,23 @@ def _solver(max_vehicles: int) -> dict[str, object]:
     return {"formation.solver": "tappa" if max_vehicles <= MAX_TAPPA_VEHICLES else "branching"}
 
 
+_SUMO_HUMAN: Final = {
+    "lc2013.headway_s": 1.0,
+    "lc2013.min_gap_m": 2.5,
+    "lc2013.imperfection": 0.5,
+    "lc2013.accel_mps2": 2.6,
+    "lc2013.decel_mps2": 4.5,
+}
+"""SUMO's defaults for passenger cars, except that all drivers desire v_F."""
+_SUMO_IDEAL: Final = {"lc2013.decel_mps2": 4.5}
+"""Vehicles without imperfection that follow with moderate braking."""
+_SUMO_COOPERATIVE: Final = _SUMO_IDEAL | {
+    "lc2013.min_gap_m": 1.0,
+    "lc2013.strategic": 10.0,
+    "lc2013.assertive": 2.0,
+}
+"""Vehicles that change lanes early and accept small gaps."""
+
 METHODS: Final[dict[str, LabelledMethod]] = {
     "formation": LabelledMethod(FORMATION),
     "formations": _default(),
@@ -97,6 +114,13 @@ METHODS: Final[dict[str, LabelledMethod]] = {
     "rule-yielding": LabelledMethod(RULE, {"rule.yielding": "all"}),
     "lc2013": LabelledMethod(LC2013),
     "lc2013-4s": LabelledMethod(LC2013, {"lc2013.lane_change_s": 4.0}),
+    "lc2013-human": LabelledMethod(LC2013, _SUMO_HUMAN),
+    "lc2013-ideal": LabelledMethod(LC2013, _SUMO_IDEAL),
+    "lc2013-cooperative": LabelledMethod(LC2013, _SUMO_COOPERATIVE),
+    "lc2013-cooperative-4s": LabelledMethod(
+        LC2013, _SUMO_COOPERATIVE | {"lc2013.lane_change_s": 4.0}
+    ),
+    "sl2015-cooperative": LabelledMethod(LC2013, _SUMO_COOPERATIVE | {"lc2013.model": "SL2015"}),
 }
 """Methods by label, in the order of tables and figures."""
 

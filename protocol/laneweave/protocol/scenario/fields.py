@@ -350,12 +350,26 @@ class RuleSettings:
 
 @frozen
 class Lc2013Settings:
-    """The reference method `lc2013`: SUMO's LC2013 lane changing and Krauss car following."""
+    """The reference method `lc2013`: SUMO's own lane changing and Krauss car following."""
 
+    model: str = field(default="LC2013", validator=one_of("LC2013", "SL2015"))
+    """SUMO's lane changing model; with SL2015, vehicles also move within their lanes."""
     headway_s: float = field(default=0.66, validator=within(0.0, 10.0, open_low=True))
     """tau of the car-following model, bumper to bumper."""
     min_gap_m: float = field(default=0.0, validator=within(0.0, 50.0))
     """Net gap at standstill."""
+    imperfection: float = field(default=0.0, validator=within(0.0, 1.0))
+    """Driver imperfection (sigma): random share of the acceleration that is not used."""
+    accel_mps2: float | None = field(default=None, validator=optional(within(0.1, 20.0)))
+    """Acceleration; None: the vehicle's limit."""
+    decel_mps2: float | None = field(default=None, validator=optional(within(0.1, 20.0)))
+    """Deceleration in car following; None: the vehicle's limit, which emergencies always use."""
+    strategic: float = field(default=1.0, validator=within(0.0, 100.0))
+    """Eagerness to change lanes early for the exit (lcStrategic)."""
+    cooperative: float = field(default=1.0, validator=within(0.0, 1.0))
+    """Willingness to make room for others (lcCooperative)."""
+    assertive: float = field(default=1.0, validator=within(0.1, 10.0))
+    """Acceptance of small gaps (lcAssertive): the required gap is divided by this."""
     lane_change_s: float = field(default=0.0, validator=within(0.0, 20.0))
     """Lane change duration; 0: instantaneous."""
     lane_changes: str = field(default="sorting", validator=one_of("sorting", "everywhere"))

@@ -20,6 +20,8 @@ EDGE = "road"
 ROUTE = "road"
 VEHICLE_TYPE = "vehicle"
 MIN_MARGIN_M = 30.0
+SUBLANE_M = 0.8
+"""Lateral resolution of SUMO's sublane model."""
 
 
 def margin_m(scenario: Scenario) -> float:
@@ -49,7 +51,12 @@ def write_network(scenario: Scenario, folder: Path, *, exits: bool) -> tuple[str
     network, routes = folder / "road.net.xml", folder / "road.rou.xml"
     network.write_text("\n".join(_network(scenario, exits=exits)), encoding="utf-8")
     routes.write_text("\n".join(_routes(scenario, exits=exits)), encoding="utf-8")
-    change = ("--lanechange.duration", f"{scenario.lc2013.lane_change_s:.6f}") if exits else ()
+    settings = scenario.lc2013
+    change: tuple[str, ...] = ()
+    if exits:
+        change = "--lanechange.duration", f"{settings.lane_change_s:.6f}"
+    if exits and settings.model == "SL2015":
+        change += ("--lateral-resolution", f"{SUBLANE_M:.6f}")
     return (
         *("sumo", "--net-file", str(network), "--route-files", str(routes)),
         *("--step-length", f"{scenario.runtime.tick_s:.6f}", "--step-method.ballistic", "true"),
@@ -124,19 +131,29 @@ def _network(scenario: Scenario, *, exits: bool) -> Iterator[str]:
 def _routes(scenario: Scenario, *, exits: bool) -> Iterator[str]:
     """Yield the lines of the route file: the vehicle type, and one route or one per exit.
 
-    Drivers have no imperfection (sigma) and the same desired speed (speedDev). If SUMO does not
-    drive, `tau` and `minGap` are close to zero; the defaults would delay insertions.
+    Drivers have the same desired speed (speedDev). If SUMO does not drive, `tau` and `minGap` are
+    close to zero; the defaults would delay insertions.
     """
     vehicle, settings = scenario.vehicle, scenario.lc2013
-    tau_s, min_gap_m = (settings.headway_s, settings.min_gap_m) if exits else (0.1, 0.0)
-    models = 'carFollowModel="Krauss" laneChangeModel="LC2013"' if exits else ""
+    brake_mps2 = -vehicle.min_accel_mps2
+    tau_s, min_gap_m, accel_mps2, decel_mps2 = 0.1, 0.0, vehicle.max_accel_mps2, brake_mps2
+    models = ""
+    if exits:
+        tau_s, min_gap_m = settings.headway_s, settings.min_gap_m
+        accel_mps2 = settings.accel_mps2 or accel_mps2
+        decel_mps2 = settings.decel_mps2 or decel_mps2
+        models = (
+            f'carFollowModel="Krauss" laneChangeModel="{settings.model}"'
+            f' lcStrategic="{settings.strategic:.6f}" lcCooperative="{settings.cooperative:.6f}"'
+            f' lcAssertive="{settings.assertive:.6f}" sigma="{settings.imperfection:.6f}"'
+        )
     yield f"""<routes>
 <vType id="{VEHICLE_TYPE}"
        length="{vehicle.length_m:.6f}" width="{vehicle.width_m:.6f}"
-       minGap="{min_gap_m:.6f}" tau="{tau_s:.6f}" sigma="0" speedDev="0"
+       minGap="{min_gap_m:.6f}" tau="{tau_s:.6f}" speedDev="0"
        maxSpeed="{vehicle.max_speed_mps:.6f}"
-       accel="{vehicle.max_accel_mps2:.6f}" decel="{-vehicle.min_accel_mps2:.6f}"
-       emergencyDecel="{-vehicle.min_accel_mps2:.6f}" {models}/>"""
+       accel="{accel_mps2:.6f}" decel="{decel_mps2:.6f}"
+       emergencyDecel="{brake_mps2:.6f}" {models or 'sigma="0"'}/>"""
     if exits:
         for lane in range(scenario.road.lanes):
             yield f'<route id="{exit_route(lane)}" edges="{EDGE} exit{lane}"/>'

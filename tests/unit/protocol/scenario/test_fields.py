@@ -153,7 +153,12 @@ def test_every_wrong_type_of_every_field_is_refused_by_name(field: str, default:
         wrongs = (1, True, None, "node", {}, {"a": 1}, [True], [[]], [None], [math.nan], [{}])
     elif isinstance(default, TABLE_BY_NAME):
         wrongs = (1, True, None, [], "x", 1.5, {"a": 1}, {"a": []}, {"a": "x"}, {"a": [1]})
-    elif field in ("formation.cycle_s", "formation.planning_deadline_s"):
+    elif field in (
+        "formation.cycle_s",
+        "formation.planning_deadline_s",
+        "lc2013.accel_mps2",
+        "lc2013.decel_mps2",
+    ):
         wrongs = tuple(wrong for wrong in NOT_NUMBERS if wrong is not None)
     elif default is None:
         wrongs = ("1", True, 1.0, [], {}, math.nan)

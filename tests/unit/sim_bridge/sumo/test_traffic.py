@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from laneweave.launch.run_methods import LC2013, METHODS
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
@@ -59,6 +60,47 @@ def test_the_parameters_are_those_of_the_scenario(tmp_path: Path) -> None:
     assert (kind["carFollowModel"], kind["laneChangeModel"]) == ("Krauss", "LC2013")
     assert [float(kind[name]) for name in ("tau", "minGap", "accel", "decel")] == [0.8, 0.5, 5, 10]
     assert files[-2:] == ("--lanechange.duration", "4.000000")
+
+
+def test_drivers_are_as_the_scenario_says(tmp_path: Path) -> None:
+    table = {
+        "model": "SL2015",
+        "imperfection": 0.5,
+        "accel_mps2": 2.6,
+        "decel_mps2": 4.5,
+        "strategic": 10.0,
+        "cooperative": 0.5,
+        "assertive": 2.0,
+    }
+    options, _, routes = written(tmp_path, lc2013=table)
+    kind = next(routes.iter("vType")).attrib
+    assert kind["laneChangeModel"] == "SL2015"
+    names = (
+        "sigma",
+        "accel",
+        "decel",
+        "emergencyDecel",
+        "lcStrategic",
+        "lcCooperative",
+        "lcAssertive",
+    )
+    assert [float(kind[name]) for name in names] == [0.5, 2.6, 4.5, 10.0, 10.0, 0.5, 2.0]
+    assert "--lateral-resolution" in options
+    assert "--lateral-resolution" not in written(tmp_path)[0]
+
+
+@pytest.mark.parametrize("label", [name for name, one in METHODS.items() if one.method == LC2013])
+def test_sumo_drives_every_named_set_of_parameters(tmp_path: Path, label: str) -> None:
+    scenario = METHODS[label].settings(Scenario())
+    with SumoTraffic(scenario, tmp_path / "sumo") as traffic:
+        traffic.offer("v1", 2, 0, 0.0)
+        for _ in range(800):
+            traffic.advance()
+            ((s_m, y_m, _, _),) = traffic.positions().values()
+            if s_m > scenario.road.length_m - 5.0:
+                break
+    assert s_m > scenario.road.length_m - 5.0
+    assert y_m < scenario.road.lane_width_m
 
 
 def test_a_headway_within_a_tick_is_refused() -> None:
