@@ -81,7 +81,7 @@ class Variant:
 
 
 def _road(*stretches: LaneStretch, main: int, cycle_s: float = 6.0) -> StreamRoad:
-    """Return a road with main lanes to its end, from the leftmost of the stretches on."""
+    """Return a road with main lanes from end to end, to the left of the given stretches."""
     first = 1 + max(stretch.lane for stretch in stretches)
     through = [LaneStretch(first + lane, to_m=LENGTH_M, exit="end") for lane in range(main)]
     return attrs.evolve(

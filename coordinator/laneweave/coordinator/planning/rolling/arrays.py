@@ -58,8 +58,8 @@ class Table(NamedTuple):
     moving_columns: Ints
     """First and last column in which moves may start in each slot; (slots, 2)."""
     stretch: NDArray[np.int16]
-    """Stretch in which each cell is at the beginning of each slot, or by whose end it has left;
-    (slots + 1, lanes, columns)."""
+    """Stretch in which each cell is at the beginning of each slot, or by whose end it has left, -1:
+    none; (slots + 1, lanes, columns)."""
     left: Bools
     """Whether each cell is beyond the end of its stretch; same shape."""
     first_left: Ints
@@ -81,7 +81,7 @@ class Paths(NamedTuple):
     slots: Ints
     """Number of slots in the path up to the end of its last stretch."""
     target: Bools
-    """Whether each stretch is a target; (vehicles, stretches)."""
+    """Whether each stretch is a target, and False for no stretch; (vehicles, stretches + 1)."""
     held: Bools
     missing_cost: Floats
     """Cost of ending elsewhere than at a target."""
@@ -263,7 +263,7 @@ def _paths(
     column, lane = np.zeros((2, count, slots + 1), dtype=np.int64)
     column[:, 0] = [vehicle.cell[0] - low for vehicle in vehicles]
     lane[:, 0] = [vehicle.cell[1] for vehicle in vehicles]
-    target = np.zeros((count, len(road.stretches)), dtype=np.bool_)
+    target = np.zeros((count, len(road.stretches) + 1), dtype=np.bool_)
     for v, vehicle in enumerate(vehicles):
         target[v, list(vehicle.targets)] = True
     held = np.array([vehicle.held for vehicle in vehicles], dtype=np.bool_)
@@ -274,7 +274,7 @@ def _paths(
     # Lower bounds on the slots off the lane and on the moves.
     of_lane = np.array([stretch.lane for stretch in road.stretches])
     distance = np.abs(lane[:, :1] - of_lane)
-    away = np.where(target, distance, road.lanes).min(axis=1)
+    away = np.where(target[:, :-1], distance, road.lanes).min(axis=1)
     waits = np.where(away > 0, may_move.argmax(axis=0), 0)
     min_cost = away * (costs.move + costs.off_lane) + waits * costs.off_lane
     min_cost += chances * min(0.0, costs.forward)
