@@ -42,7 +42,7 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
-from laneweave.protocol.wire.bounds import Bounds, check_ballot
+from laneweave.protocol.wire.bounds import check_ballot
 from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import (
     Command,
@@ -97,7 +97,7 @@ class AgentCore:
         self._raised = False
         """Whether the incarnation is above the clock because that of a process in charge was."""
         runtime = scenario.runtime
-        self._bounds = Bounds(self._incarnation, runtime.tick_s, runtime.max_road_s)
+        self._bounds = runtime.bounds(self._incarnation)
         self._road = NewestRoad(runtime.max_pace)
         self._driver = make_driver(scenario)
         self._rules = rules

@@ -27,7 +27,6 @@ from laneweave.protocol.runtime.node import (
 )
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.scenario.fields import Runtime
-from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.messages import Census, Motion, Name, VehicleState
 from laneweave.protocol.wire.newest import NewestRoad
 from laneweave.protocol.wire.topics import (
@@ -85,7 +84,7 @@ class AgentHost:
         """Stretches whose motions each vehicle needed at the last update."""
         self._states: list[tuple[int, ...]] = []
         """Blocks whose states each vehicle needed at the last update."""
-        self._bounds = Bounds(incarnation, runtime.tick_s, runtime.max_road_s)
+        self._bounds = runtime.bounds(incarnation)
         self._road = NewestRoad(runtime.max_pace)
         self._no_bridge_since_s: float | None = 0.0
         """Time at which the bridge was lost; None: a bridge is up."""

@@ -43,7 +43,7 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.wire.bounds import Bounds, max_election_term
+from laneweave.protocol.wire.bounds import max_election_term
 from laneweave.protocol.wire.events import LEADER_ELECTED, LEADER_STEPPED_DOWN
 from laneweave.protocol.wire.messages import (
     Ballot,
@@ -122,7 +122,7 @@ class CoordinatorCore:
             name, scenario.service, workers, plan, scenario.formation.solver
         )
         runtime = scenario.runtime
-        self._bounds = Bounds(incarnation, runtime.tick_s, runtime.max_road_s)
+        self._bounds = runtime.bounds(incarnation)
         self._road = NewestRoad(runtime.max_pace)
         self._road_number = 0
         """Number of the road that the census and the operation are about."""

@@ -36,7 +36,7 @@ from laneweave.protocol.runtime.node import (
     Watch,
 )
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.wire.bounds import Bounds, check_ballot
+from laneweave.protocol.wire.bounds import check_ballot
 from laneweave.protocol.wire.events import AGENT_MISSING, AGENT_SILENT
 from laneweave.protocol.wire.messages import (
     Command,
@@ -142,7 +142,7 @@ class BridgeCore:
         self._min_tick_duration_s = min(self._tick_duration_s, runtime.tick_s / runtime.max_pace)
         self._incarnation = incarnation
         self._stopwatch = stopwatch
-        self._bounds = Bounds(incarnation, runtime.tick_s, runtime.max_road_s)
+        self._bounds = runtime.bounds(incarnation)
         self._attendance = Attendance(scenario, new_incarnation)
         self._answers = self._attendance.answers
         self._at_entrance: list[RoadVehicle] = []

@@ -38,7 +38,6 @@ from laneweave.protocol.scenario.deployment_fields import Security
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
-from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.topics import Keys
 from laneweave.sim_bridge.road.demand import arrivals
@@ -161,7 +160,7 @@ class LocalRun:
         processes, injection = self._processes, self._injection
         processes.start(ROUTER, ROUTER)
         runtime = self.scenario.runtime
-        bounds = Bounds(Incarnations()(), runtime.tick_s, runtime.max_road_s)
+        bounds = runtime.bounds(Incarnations()())
         view = RoadView(bounds=bounds)
         observer = Observer(Keys(self.scenario.network.realm), view=view)
         with contextlib.closing(self._connect(observer)) as transport:

@@ -20,6 +20,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import one_of, within
 from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.scenario.deployment_fields import Network, Observation, Security, Service
+from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.events import STREAM_PLANNED
 
 SCHEMA = "laneweave.scenario/1"
@@ -400,6 +401,10 @@ class Runtime:
     vehicles_per_process: int = field(default=1, validator=within(1, 1000))
     max_road_s: float = field(default=100_000.0, validator=within(1.0, 1e6))
     """Road time after which an incomplete run is stopped and counts as failed."""
+
+    def bounds(self, incarnation: int) -> Bounds:
+        """Return the bounds of numbers that a process with this incarnation receives."""
+        return Bounds(incarnation, self.tick_s, self.max_road_s)
 
 
 @frozen

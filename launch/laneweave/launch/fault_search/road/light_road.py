@@ -29,7 +29,7 @@ from laneweave.protocol.runtime.node import (
     Watch,
 )
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.wire.bounds import Bounds, check_ballot
+from laneweave.protocol.wire.bounds import check_ballot
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare
 from laneweave.protocol.wire.topics import BRIDGE_ALIVE, COMMAND, SENSE, VEHICLE_ALIVE
 from laneweave.sim_bridge.road.attendance import Absence, Attendance
@@ -95,7 +95,7 @@ class LightRoad:
         self._preferred_lanes: Mapping[Name, int] = {}
         """Newest preferred lanes; empty: those at the entrance."""
         self._attendance = Attendance(scenario, new_incarnation)
-        self._bounds = Bounds(bridge, self._tick_s, scenario.runtime.max_road_s)
+        self._bounds = scenario.runtime.bounds(bridge)
 
     @property
     def wakeup_s(self) -> float:
