@@ -35,7 +35,7 @@ from laneweave.coordinator.planning.rolling.rolling_validator import problems_of
 from laneweave.coordinator.planning.solve import warm_up
 from laneweave.coordinator.rolling.checked_planner import REWARD, stream_road
 from laneweave.protocol.config.scenario_files import load_scenario
-from laneweave.protocol.road_layout import LaneStretch
+from laneweave.protocol.road_layout import LaneSection
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.road.demand import arrivals
 
@@ -72,29 +72,29 @@ class Variant:
     @property
     def sorts(self) -> bool:
         """Whether vehicles have preferred lanes."""
-        return len({stretch.exit for stretch in self.road.stretches}) == self.road.lanes
+        return len({section.exit for section in self.road.sections}) == self.road.lanes
 
     def exits(self, name: str) -> frozenset[int]:
-        """Return the stretches that lead to an exit."""
-        stretches = enumerate(self.road.stretches)
-        return frozenset(number for number, stretch in stretches if stretch.exit == name)
+        """Return the sections that lead to an exit."""
+        sections = enumerate(self.road.sections)
+        return frozenset(number for number, section in sections if section.exit == name)
 
 
-def _road(*stretches: LaneStretch, main: int, cycle_s: float = 6.0) -> StreamRoad:
-    """Return a road with main lanes from end to end, to the left of the given stretches."""
-    first = 1 + max(stretch.lane for stretch in stretches)
-    through = [LaneStretch(first + lane, to_m=LENGTH_M, exit="end") for lane in range(main)]
+def _road(*sections: LaneSection, main: int, cycle_s: float = 6.0) -> StreamRoad:
+    """Return a road with main lanes from end to end, to the left of the given sections."""
+    first = 1 + max(section.lane for section in sections)
+    through = [LaneSection(first + lane, to_m=LENGTH_M, exit="end") for lane in range(main)]
     return attrs.evolve(
         ROAD,
         lanes=first + main,
         advance_m=SPEED_MPS * cycle_s,
         sorting_m=(150.0, LENGTH_M),
-        stretches=(*stretches, *through),
+        sections=(*sections, *through),
     )
 
 
-_MERGE = LaneStretch(0, JOINS_M, OFF_M)
-_WEAVE = LaneStretch(0, JOINS_M, OFF_M, exit="off")
+_MERGE = LaneSection(0, JOINS_M, OFF_M)
+_WEAVE = LaneSection(0, JOINS_M, OFF_M, exit="off")
 
 
 VARIANTS = {
@@ -119,10 +119,10 @@ VARIANTS = {
     ),
     "mode 2": Variant(attrs.evolve(ROAD, mode=2, model=ConflictModel(("geometric", "closing")))),
     "lane drop": Variant(
-        _road(LaneStretch(0, to_m=800.0), main=2), volumes=(1000, 1500, 2000, 2200)
+        _road(LaneSection(0, to_m=800.0), main=2), volumes=(1000, 1500, 2000, 2200)
     ),
     "blocked lane": Variant(
-        _road(LaneStretch(0, to_m=500.0), LaneStretch(0, 600.0, LENGTH_M, exit="end"), main=2),
+        _road(LaneSection(0, to_m=500.0), LaneSection(0, 600.0, LENGTH_M, exit="end"), main=2),
         volumes=(1000, 1450, 2000),
     ),
     "on-ramp": Variant(_road(_MERGE, main=3), volumes=(1600, 2000, 2300), ramp_veh_h=800.0),
@@ -164,7 +164,7 @@ def travellers(variant: Variant, volume: float, seed: int, duration_s: float) ->
 
     At time 0, column c is at c PITCH_M.
     """
-    main = len({stretch.lane for stretch in variant.road.stretches if stretch.from_m < 0.0})
+    main = len({section.lane for section in variant.road.sections if section.from_m < 0.0})
     first = variant.road.lanes - main
     random = np.random.default_rng((seed, 1))
     off_share = variant.leaving_veh_h / (main * volume)
@@ -212,11 +212,11 @@ class Slot:
 
 @frozen
 class Departed:
-    """A vehicle that has left the road, by the end of a stretch."""
+    """A vehicle that has left the road, by the end of a section."""
 
     traveller: Traveller
     column: int
-    stretch: int
+    section: int
     end_m: float
 
     @property
@@ -231,7 +231,7 @@ class Departed:
 
     @property
     def travel_s(self) -> float:
-        """Time from the arrival to the end of the stretch."""
+        """Time from the arrival to the end of the section."""
         return self.delay_s + (self.end_m - self.traveller.entry_m) / SPEED_MPS
 
 
@@ -259,9 +259,9 @@ class Run:
             self.on_road[one.vehicle] = one, (one.column, one.lane)
             self.coming.pop()
         for name, (one, cell) in list(self.on_road.items()):
-            stretch = self.road.stretch_at(self.number, cell)
-            if stretch is not None and self.road.has_left(self.number, cell):
-                self.left.append(Departed(one, cell[0], stretch[2], stretch[1]))
+            section = self.road.section_at(self.number, cell)
+            if section is not None and self.road.has_left(self.number, cell):
+                self.left.append(Departed(one, cell[0], section[2], section[1]))
                 del self.on_road[name]
         vehicles = [StreamVehicle(v, cell, one.targets) for v, (one, cell) in self.on_road.items()]
         began = time.thread_time()
@@ -290,7 +290,7 @@ def measured(name: str, volume: int, seeds: int, duration_s: float) -> dict[str,
         while run.step():
             pass
         counted = [one for one in run.left if one.traveller.arrival_s >= NOT_COUNTED_S]
-        off.append(sum(one.stretch not in one.traveller.targets for one in counted))
+        off.append(sum(one.section not in one.traveller.targets for one in counted))
         left += counted
         slots += run.slots
     through = [one for one in left if one.traveller.entry_m == 0.0 and one.end_m >= LENGTH_M]

@@ -21,7 +21,7 @@ from laneweave.coordinator.planning.rolling.problem import (
     StreamVehicle,
 )
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import LaneStretch
+from laneweave.protocol.road_layout import LaneSection
 from oracles.binary_programme import Row, cheapest_choice
 from oracles.path_rules import conflict_kinds
 
@@ -59,7 +59,7 @@ def streams(draw: st.DrawFn) -> Stream:
     )
     slot = draw(st.integers(0, 9))
     begin = draw(st.integers(-6, 36)) - int(slot * road.advance_m / road.pitch_m)
-    road = attrs.evolve(road, stretches=draw(stretches_of(road)))
+    road = attrs.evolve(road, sections=draw(sections_of(road)))
     every = list(product(range(begin, begin + draw(st.integers(1, 10))), range(road.lanes)))
     density = draw(st.sampled_from((0.2, 0.7, 0.9, 1.0)))
     random = draw(st.randoms(use_true_random=False))
@@ -74,52 +74,52 @@ def streams(draw: st.DrawFn) -> Stream:
 
 
 @st.composite
-def stretches_of(draw: st.DrawFn, road: StreamRoad) -> tuple[LaneStretch, ...]:
+def sections_of(draw: st.DrawFn, road: StreamRoad) -> tuple[LaneSection, ...]:
     """Draw where the lanes of a road are open: half of the roads are straight."""
-    found = [*road.stretches]
+    found = [*road.sections]
     if draw(st.booleans()):
         return tuple(found)
     for lane in draw(st.sets(st.integers(0, road.lanes - 1), max_size=2)):
         from_m = draw(st.sampled_from((-1000.0, 150.0, 315.0)))
         to_m = from_m + draw(st.sampled_from((45.0, 120.0, 1200.0)))
-        found[lane] = LaneStretch(lane, from_m, min(to_m, road.length_m), exit="left")
+        found[lane] = LaneSection(lane, from_m, min(to_m, road.length_m), exit="left")
         if to_m + 10.0 < road.length_m and draw(st.booleans()):
             opens_m = to_m + draw(st.sampled_from((10.0, 100.0)))
-            found.append(LaneStretch(lane, opens_m, max(opens_m, road.length_m), exit="again"))
+            found.append(LaneSection(lane, opens_m, max(opens_m, road.length_m), exit="again"))
     return tuple(found)
 
 
 def targets(road: StreamRoad, random: Random) -> set[int]:
-    """Draw one or two stretches."""
-    return {random.randrange(len(road.stretches)) for _ in range(random.randint(1, 2))}
+    """Draw one or two sections."""
+    return {random.randrange(len(road.sections)) for _ in range(random.randint(1, 2))}
 
 
-def stretch_at(road: StreamRoad, position_m: float, lane: int) -> tuple[int, bool]:
-    """Return the stretch that has begun last in a lane, and whether a position is beyond its end.
+def section_at(road: StreamRoad, position_m: float, lane: int) -> tuple[int, bool]:
+    """Return the section that has begun last in a lane, and whether a position is beyond its end.
 
-    A stretch ends before the next one by more than a vehicle can gain in a slot.
+    A section ends before the next one by more than a vehicle can gain in a slot.
     """
     begun = [
         (each.from_m, number)
-        for number, each in enumerate(road.stretches)
+        for number, each in enumerate(road.sections)
         if each.lane == lane and each.from_m <= position_m + 1e-6
     ]
     if not begun:
         return -1, False
     _, number = max(begun)
-    to_m = road.stretches[number].to_m
-    for each in road.stretches:
-        if each.lane == lane and each.from_m > road.stretches[number].from_m:
+    to_m = road.sections[number].to_m
+    for each in road.sections:
+        if each.lane == lane and each.from_m > road.sections[number].from_m:
             to_m = min(to_m, each.from_m - road.advance_m - road.pitch_m)
     return number, position_m > to_m + 1e-6
 
 
 def left(road: StreamRoad, slot: int, cell: Cell) -> bool:
-    return stretch_at(road, place_m(road, slot, cell), cell[1])[1]
+    return section_at(road, place_m(road, slot, cell), cell[1])[1]
 
 
 def off_target(road: StreamRoad, slot: int, vehicle: StreamVehicle, cell: Cell) -> bool:
-    return stretch_at(road, place_m(road, slot, cell), cell[1])[0] not in vehicle.targets
+    return section_at(road, place_m(road, slot, cell), cell[1])[0] not in vehicle.targets
 
 
 def place_m(road: StreamRoad, slot: int, cell: Cell) -> float:
@@ -133,8 +133,8 @@ def may_move(road: StreamRoad, slot: int, move: Move) -> bool:
     rear_m, front_m = min(places) - road.body_m, max(places) + road.advance_m
     if rear_m < road.sorting_m[0] or front_m > road.sorting_m[1]:
         return False
-    rears = [stretch_at(road, rear_m, cell[1]) for cell in move]
-    fronts = [stretch_at(road, front_m, cell[1]) for cell in move]
+    rears = [section_at(road, rear_m, cell[1]) for cell in move]
+    fronts = [section_at(road, front_m, cell[1]) for cell in move]
     return rears == fronts and all(n >= 0 and not beyond for n, beyond in fronts)
 
 

@@ -114,3 +114,12 @@ def check_lc2013(scenario: Scenario) -> None:
             headway_s,
             f"at least runtime.tick_s = {tick_s:g}: a vehicle reacts once per tick",
         )
+    limits = scenario.vehicle
+    for name, value, limit, whose in (
+        ("accel_mps2", scenario.lc2013.accel_mps2, limits.max_accel_mps2, "max_accel_mps2"),
+        ("decel_mps2", scenario.lc2013.decel_mps2, -limits.min_accel_mps2, "min_accel_mps2"),
+    ):
+        if value is not None and value > limit:
+            raise BadInputError(
+                f"lc2013.{name}", value, f"at most {limit:g}, the limit vehicle.{whose}"
+            )

@@ -53,10 +53,11 @@ def write_network(scenario: Scenario, folder: Path, *, exits: bool) -> tuple[str
     routes.write_text("\n".join(_routes(scenario, exits=exits)), encoding="utf-8")
     settings = scenario.lc2013
     change: tuple[str, ...] = ()
-    if exits:
-        change = "--lanechange.duration", f"{settings.lane_change_s:.6f}"
     if exits and settings.model == "SL2015":
-        change += ("--lateral-resolution", f"{SUBLANE_M:.6f}")
+        # SUMO accepts only one of the two options.
+        change = "--lateral-resolution", f"{SUBLANE_M:.6f}"
+    elif exits:
+        change = "--lanechange.duration", f"{settings.lane_change_s:.6f}"
     return (
         *("sumo", "--net-file", str(network), "--route-files", str(routes)),
         *("--step-length", f"{scenario.runtime.tick_s:.6f}", "--step-method.ballistic", "true"),

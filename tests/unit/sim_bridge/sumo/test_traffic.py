@@ -86,6 +86,7 @@ def test_drivers_are_as_the_scenario_says(tmp_path: Path) -> None:
     )
     assert [float(kind[name]) for name in names] == [0.5, 2.6, 4.5, 10.0, 10.0, 0.5, 2.0]
     assert "--lateral-resolution" in options
+    assert "--lanechange.duration" not in options
     assert "--lateral-resolution" not in written(tmp_path)[0]
 
 
@@ -106,6 +107,12 @@ def test_sumo_drives_every_named_set_of_parameters(tmp_path: Path, label: str) -
 def test_a_headway_within_a_tick_is_refused() -> None:
     with pytest.raises(BadInputError, match=r"lc2013\.headway_s"):
         check_lc2013(parse_scenario({"lc2013": {"headway_s": 0.05}}))
+
+
+@pytest.mark.parametrize(("name", "value"), [("accel_mps2", 5.1), ("decel_mps2", 10.1)])
+def test_drivers_do_not_exceed_the_limits_of_their_vehicles(name: str, value: float) -> None:
+    with pytest.raises(BadInputError, match=rf"lc2013\.{name}.*at most"):
+        check_lc2013(parse_scenario({"lc2013": {name: value}}))
 
 
 # --- SUMO -------------------------------------------------------------------------------------

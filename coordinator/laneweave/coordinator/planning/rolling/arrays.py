@@ -57,17 +57,17 @@ class Table(NamedTuple):
     """Column and lane of each displacement; (displacements, 2)."""
     moving_columns: Ints
     """First and last column in which moves may start in each slot; (slots, 2)."""
-    stretch: NDArray[np.int16]
-    """Stretch in which each cell is at the beginning of each slot, or by whose end it has left, -1:
+    section: NDArray[np.int16]
+    """Section in which each cell is at the beginning of each slot, or by whose end it has left, -1:
     none; (slots + 1, lanes, columns)."""
     left: Bools
-    """Whether each cell is beyond the end of its stretch; same shape."""
+    """Whether each cell is beyond the end of its section; same shape."""
     first_left: Ints
-    """First column of each lane beyond the end of a stretch; (slots + 1, lanes)."""
+    """First column of each lane beyond the end of a section; (slots + 1, lanes)."""
     road_end: Ints
-    """First column from which all cells are beyond the ends of their stretches; (slots + 1)."""
+    """First column from which all cells are beyond the ends of their sections; (slots + 1)."""
     several: Bools
-    """Whether cells of each lane are in different stretches; (lanes)."""
+    """Whether cells of each lane are in different sections; (lanes)."""
 
 
 class Paths(NamedTuple):
@@ -79,9 +79,9 @@ class Paths(NamedTuple):
     move: NDArray[np.int8]
     """Displacements; (vehicles, slots)."""
     slots: Ints
-    """Number of slots in the path up to the end of its last stretch."""
+    """Number of slots in the path up to the end of its last section."""
     target: Bools
-    """Whether each stretch is a target, and False for no stretch; (vehicles, stretches + 1)."""
+    """Whether each section is a target, and False for no section; (vehicles, sections + 1)."""
     held: Bools
     missing_cost: Floats
     """Cost of ending elsewhere than at a target."""
@@ -188,7 +188,7 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
             is_blocked[lane, column - low] = True
     steps = displacements(road.mode)
     load = np.zeros((slots, len(steps), road.lanes, columns), dtype=np.float32)
-    stretch, left, open_ = _stretches(road, at_m)
+    section, left, open_ = _sections(road, at_m)
     may_move = _may_move(road, open_, is_blocked)
     load[:, 1:][~may_move] = FIXED * ENTERING
     may_leave: Bools = np.asarray(may_move.any(axis=(1, 2)))
@@ -204,33 +204,33 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
         first,
         np.array(steps, dtype=np.int64),
         np.ascontiguousarray(moving_columns.T),
-        stretch,
+        section,
         left,
         np.where(left.any(axis=2), left.argmax(axis=2), columns),
         columns - np.logical_and.reduce(left, axis=1)[:, ::-1].cumprod(axis=1).sum(axis=1),
-        (stretch != stretch[:1, :, :1]).any(axis=(0, 2)),
+        (section != section[:1, :, :1]).any(axis=(0, 2)),
     )
 
 
-def _stretches(road: StreamRoad, at_m: Floats) -> tuple[NDArray[np.int16], Bools, Bools]:
-    """Return `Table.stretch` and `Table.left`, and the cells that are open throughout each slot.
+def _sections(road: StreamRoad, at_m: Floats) -> tuple[NDArray[np.int16], Bools, Bools]:
+    """Return `Table.section` and `Table.left`, and the cells that are open throughout each slot.
 
     A cell is open if the whole body is, from the beginning of the slot to its end.
     """
     slots, columns = at_m.shape[0] - 1, at_m.shape[1]
-    stretch = np.full((slots + 1, road.lanes, columns), -1, dtype=np.int16)
+    section = np.full((slots + 1, road.lanes, columns), -1, dtype=np.int16)
     left = np.zeros((slots + 1, road.lanes, columns), dtype=np.bool_)
     is_open = np.zeros((slots, road.lanes, columns), dtype=np.bool_)
     start_m, end_m = road.sorting_m
-    for lane, stretches in enumerate(road.lane_stretches):
-        for from_m, to_m, number in stretches:
+    for lane, sections in enumerate(road.lane_sections):
+        for from_m, to_m, number in sections:
             begun = at_m >= from_m - ROUNDING_M
-            stretch[:, lane][begun] = number
+            section[:, lane][begun] = number
             left[:, lane][begun] = (at_m > to_m + ROUNDING_M)[begun]
             rear = at_m[:-1] - road.body_m >= max(start_m, from_m) - ROUNDING_M
             front = at_m[1:] <= min(end_m, to_m) + ROUNDING_M
             is_open[:, lane] |= rear & front
-    return stretch, left, is_open
+    return section, left, is_open
 
 
 def _may_move(road: StreamRoad, is_open: Bools, is_blocked: Bools) -> Bools:
@@ -263,7 +263,7 @@ def _paths(
     column, lane = np.zeros((2, count, slots + 1), dtype=np.int64)
     column[:, 0] = [vehicle.cell[0] - low for vehicle in vehicles]
     lane[:, 0] = [vehicle.cell[1] for vehicle in vehicles]
-    target = np.zeros((count, len(road.stretches) + 1), dtype=np.bool_)
+    target = np.zeros((count, len(road.sections) + 1), dtype=np.bool_)
     for v, vehicle in enumerate(vehicles):
         target[v, list(vehicle.targets)] = True
     held = np.array([vehicle.held for vehicle in vehicles], dtype=np.bool_)
@@ -271,8 +271,8 @@ def _paths(
     begin, end = table.moving_columns.T[:, :, None]
     may_move = (begin <= column[:, 0]) & (column[:, 0] <= end)
     chances = may_move.sum(axis=0)
-    # Lower bounds on the slots off the lane and on the moves.
-    of_lane = np.array([stretch.lane for stretch in road.stretches])
+    # Lower bounds on the slots off the targets and on the moves.
+    of_lane = np.array([section.lane for section in road.sections])
     distance = np.abs(lane[:, :1] - of_lane)
     away = np.where(target[:, :-1], distance, road.lanes).min(axis=1)
     waits = np.where(away > 0, may_move.argmax(axis=0), 0)

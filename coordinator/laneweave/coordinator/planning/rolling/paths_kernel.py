@@ -64,7 +64,7 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
     `FIXED` vehicles are avoided. If there is no such path, returns `NO_PATH` and sets nothing.
     """
     load, steps, of_move, value = table.load, table.steps, costs.of_move, scratch.value
-    stretch, left, row = table.stretch, table.left, scratch.row
+    section, left, row = table.section, table.left, scratch.row
     scratch.searches[0] += 1
     slots, fan, lanes, _ = load.shape
     scale = np.float32(softness / (PENALTY * ENTERING) if softness > 0.0 else _IMPASSABLE)
@@ -81,7 +81,7 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
                     continue
                 total = value[s, lane, offset]
                 if total < best:
-                    if not paths.target[v, stretch[s, lane, offset + shift]]:
+                    if not paths.target[v, section[s, lane, offset + shift]]:
                         total += paths.missing_cost[v]
                     if total < best:
                         best, best_s, best_offset, best_lane = total, s, offset, lane
@@ -98,10 +98,10 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
             if table.several[lane]:
                 for i in range(len(here)):
                     row[i] = here[i]
-                    if not paths.target[v, stretch[s, lane, low + shift + i]]:
+                    if not paths.target[v, section[s, lane, low + shift + i]]:
                         row[i] += costs.off_lane
                 here = row[: high + 1 - low]
-            elif not paths.target[v, stretch[s, lane, low + shift]]:
+            elif not paths.target[v, section[s, lane, low + shift]]:
                 off = costs.off_lane
             for d in range(fan if moves else 1):
                 to_lane, to = lane + steps[d, 1], low + steps[d, 0]
@@ -138,7 +138,7 @@ def _trace(table, paths, costs, v, scale, slots, lane, offset, scratch):
             if d > 0:
                 total += scratch.delay[s]
             total += scale * load[s, d, from_lane, before + shift]
-            if not paths.target[v, table.stretch[s, from_lane, before + shift]]:
+            if not paths.target[v, table.section[s, from_lane, before + shift]]:
                 total += costs.off_lane
             if total < best:
                 best, move = total, d
@@ -152,9 +152,9 @@ def own_cost(table, paths, costs, v):
     total, slots = 0.0, paths.slots[v]
     for s in range(slots):
         total += costs.of_move[paths.move[v, s]]
-        if not paths.target[v, table.stretch[s, paths.lane[v, s], paths.column[v, s]]]:
+        if not paths.target[v, table.section[s, paths.lane[v, s], paths.column[v, s]]]:
             total += costs.off_lane
-    if not paths.target[v, table.stretch[slots, paths.lane[v, slots], paths.column[v, slots]]]:
+    if not paths.target[v, table.section[slots, paths.lane[v, slots], paths.column[v, slots]]]:
         total += paths.missing_cost[v]
     return total
 
@@ -163,7 +163,7 @@ def own_cost(table, paths, costs, v):
 def follow(table, paths, costs, v, cells):
     """Set an earlier path if it is still valid and conflict-free; return whether it was set.
 
-    `cells`: columns and lanes at the beginning of each slot, up to the end of its last stretch.
+    `cells`: columns and lanes at the beginning of each slot, up to the end of its last section.
     """
     slots, fan = table.load.shape[:2]
     if len(cells) == 0 or cells[0, 0] != paths.column[v, 0] or cells[0, 1] != paths.lane[v, 0]:

@@ -10,15 +10,15 @@ from attrs import Attribute, Factory, field, frozen
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.protocol.lattice import Cell, Mode
-from laneweave.protocol.road_layout import LaneStretch, straight_lanes
+from laneweave.protocol.road_layout import LaneSection, straight_lanes
 
 ROUNDING_M = 1e-6
 """Tolerance for comparing positions."""
 
-Stretch = tuple[float, float, int]
-"""Begin and end of a lane stretch [m] for planning, and its index in `StreamRoad.stretches`."""
+Section = tuple[float, float, int]
+"""Begin and end of a lane section [m] for planning, and its index in `StreamRoad.sections`."""
 CellPath = tuple[Cell, ...]
-"""Cells at the beginning of each slot, from the current slot to the end of the road."""
+"""Cells at the beginning of each slot, from the current one to the end of the last section."""
 
 
 def _one_per_cell(_road: object, _field: Attribute[ConflictModel], model: ConflictModel) -> None:
@@ -49,7 +49,7 @@ class StreamRoad:
     """Maximum number of rounds of improvement per slot."""
     max_paths: int = 50_000
     """Maximum number of path searches (about 5 us each) per slot."""
-    stretches: tuple[LaneStretch, ...] = Factory(
+    sections: tuple[LaneSection, ...] = Factory(
         lambda road: straight_lanes(road.lanes, road.length_m), takes_self=True
     )
     """Where the lanes are open; by default all of them from end to end."""
@@ -59,32 +59,32 @@ class StreamRoad:
         return column * self.pitch_m + slot * self.advance_m
 
     @cached_property
-    def lane_stretches(self) -> tuple[tuple[Stretch, ...], ...]:
-        """The stretches of each lane, in the direction of travel."""
+    def lane_sections(self) -> tuple[tuple[Section, ...], ...]:
+        """The sections of each lane, in the direction of travel."""
         by_lane = [
             sorted(
                 (each.from_m, each.to_m, number)
-                for number, each in enumerate(self.stretches)
+                for number, each in enumerate(self.sections)
                 if each.lane == lane
             )
             for lane in range(self.lanes)
         ]
-        return tuple(tuple(self._passable(stretches)) for stretches in by_lane)
+        return tuple(tuple(self._passable(sections)) for sections in by_lane)
 
-    def _passable(self, stretches: list[Stretch]) -> Iterator[Stretch]:
-        """Yield stretches that no vehicle can leave and enter the next one within a slot."""
+    def _passable(self, sections: list[Section]) -> Iterator[Section]:
+        """Yield sections, shortened so that no vehicle can pass into the next one within a slot."""
         jump_m = self.advance_m + self.pitch_m
-        next_m = [from_m - jump_m for from_m, _, _ in stretches[1:]] + [math.inf]
-        for (from_m, to_m, number), latest_m in zip(stretches, next_m, strict=True):
+        next_m = [from_m - jump_m for from_m, _, _ in sections[1:]] + [math.inf]
+        for (from_m, to_m, number), latest_m in zip(sections, next_m, strict=True):
             yield from_m, min(to_m, latest_m), number
 
     @cached_property
     def first_end_m(self) -> float:
-        """Position before which no stretch ends."""
-        return min(to_m for stretches in self.lane_stretches for _, to_m, _ in stretches)
+        """Position before which no section ends."""
+        return min(to_m for sections in self.lane_sections for _, to_m, _ in sections)
 
-    def stretch_at(self, slot: int, cell: Cell) -> Stretch | None:
-        """Return the stretch in which a cell is when a slot begins, or by whose end it has left.
+    def section_at(self, slot: int, cell: Cell) -> Section | None:
+        """Return the section in which a cell is when a slot begins, or by whose end it has left.
 
         None: there is no such lane, or it has not begun there.
         """
@@ -92,21 +92,21 @@ class StreamRoad:
             return None
         position_m = self.position_m(slot, cell[0]) + ROUNDING_M
         begun = None
-        for stretch in self.lane_stretches[cell[1]]:
-            if stretch[0] > position_m:
+        for section in self.lane_sections[cell[1]]:
+            if section[0] > position_m:
                 break
-            begun = stretch
+            begun = section
         return begun
 
     def has_left(self, slot: int, cell: Cell) -> bool:
-        """Return whether a cell is beyond the end of its stretch when a slot begins."""
-        stretch = self.stretch_at(slot, cell)
-        return stretch is not None and self.position_m(slot, cell[0]) > stretch[1] + ROUNDING_M
+        """Return whether a cell is beyond the end of its section when a slot begins."""
+        section = self.section_at(slot, cell)
+        return section is not None and self.position_m(slot, cell[0]) > section[1] + ROUNDING_M
 
     def exit_of(self, slot: int, path: CellPath) -> int:
-        """Return the stretch by whose end a path that begins with a slot leaves; -1: none."""
-        stretch = self.stretch_at(slot + len(path) - 1, path[-1])
-        return -1 if stretch is None else stretch[2]
+        """Return the section by whose end a path that begins with a slot leaves; -1: none."""
+        section = self.section_at(slot + len(path) - 1, path[-1])
+        return -1 if section is None else section[2]
 
 
 @frozen
@@ -115,7 +115,7 @@ class StreamCosts:
 
     move: float = 0.3
     off_lane: float = 0.1
-    """Cost of each slot that begins in a stretch that is not a target."""
+    """Cost of each slot that begins elsewhere than in a target."""
     backward: float = 2.0
     """Extra cost of a move that loses a column."""
     forward: float = 0.0
@@ -135,7 +135,7 @@ class StreamVehicle:
     vehicle: str
     cell: Cell
     targets: frozenset[int] = field(converter=_as_set)
-    """Stretches by whose ends the vehicle may leave the road; on a straight road, target lanes."""
+    """Sections by whose ends the vehicle may leave the road; on a straight road, target lanes."""
     held: bool = False
     """Whether the vehicle must stay in its cell."""
 

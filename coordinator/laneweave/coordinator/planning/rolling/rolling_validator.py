@@ -1,7 +1,7 @@
 """Check the plan of a stream, independently of the search.
 
-Only the definition of a conflict is shared with the planner. Every plan is checked before it is
-issued; a check takes 0.5 ms for 130 vehicles.
+Only the definitions of conflicts and of sections are shared with the planner. Every plan is checked
+before it is issued; a check takes about 1 ms for 130 vehicles.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _problems_of_path(
             here = there
     if not road.has_left(slot + len(path) - 1, path[-1]):
         yield f"the path of {name} ends in {path[-1]}, on the road"
-    # The last slot must begin on the road.
+    # All slots of the path must begin on the road.
     for s, cell in enumerate(path[:-1], start=slot):
         if road.position_m(s, cell[0]) > road.first_end_m and road.has_left(s, cell):
             yield f"the path of {name} continues from {cell} in slot {s}, off the road"
@@ -89,10 +89,10 @@ def _problems_of_move(
         yield f"{name} moves between {rear_m} m and {front_m} m in slot {slot}"
         return
     for lane in {here[1], there[1]} & {*range(road.lanes)}:
-        # A stretch must be open for the whole body and the whole slot.
+        # A section must be open for the whole body and the whole slot.
         if not any(
             from_m <= rear_m + ROUNDING_M and front_m <= to_m + ROUNDING_M
-            for from_m, to_m, _ in road.lane_stretches[lane]
+            for from_m, to_m, _ in road.lane_sections[lane]
         ):
             yield f"{name} moves between {rear_m} m and {front_m} m, where lane {lane} is closed"
 

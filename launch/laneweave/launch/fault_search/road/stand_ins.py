@@ -199,7 +199,7 @@ class LightPlanner:
         """Create a planner for a road."""
         road = stream_road(scenario)
         self._lanes = road.lanes
-        self._stretches = road.stretches
+        self._sections = road.sections
         self._steps = [step for step in displacements(road.mode) if step != (0, 0)]
         self._seed = scenario.seed
 
@@ -241,4 +241,4 @@ class LightPlanner:
 
     def _away(self, vehicle: StreamVehicle, cell: Cell) -> int:
         """Return the number of lanes from a cell to the nearest target."""
-        return min(abs(cell[1] - self._stretches[number].lane) for number in vehicle.targets)
+        return min(abs(cell[1] - self._sections[number].lane) for number in vehicle.targets)

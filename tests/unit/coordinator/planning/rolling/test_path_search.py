@@ -21,7 +21,7 @@ from laneweave.coordinator.planning.rolling.problem import (
     StreamVehicle,
 )
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
-from laneweave.protocol.road_layout import LaneStretch
+from laneweave.protocol.road_layout import LaneSection
 from support import rolling_oracles as oracle
 from support.rolling_oracles import ROAD, SHORT, Stream, streams
 
@@ -85,7 +85,7 @@ def test_vehicles_need_not_be_where_they_were_planned(stream: Stream) -> None:
             v,
             vehicle=v.vehicle if i % 3 else f"new{i}",
             cell=(v.cell[0] + 1, v.cell[1]),
-            targets={(n + i % 2) % len(road.stretches) for n in v.targets},
+            targets={(n + i % 2) % len(road.sections) for n in v.targets},
             held=i % 7 == 0,
         )
         for i, v in enumerate(vehicles[1:])
@@ -162,19 +162,19 @@ def test_a_path_blocked_by_a_held_vehicle_is_replaced() -> None:
 # ----------------------------------------------------------------------- lanes that end, exits
 
 
-def lanes(*stretches: LaneStretch, start_m: float = 150.0) -> StreamRoad:
-    count = 1 + max(stretch.lane for stretch in stretches)
+def lanes(*sections: LaneSection, start_m: float = 150.0) -> StreamRoad:
+    count = 1 + max(section.lane for section in sections)
     return StreamRoad(
-        count, 15.0, 60.0, (start_m, 1000.0), 1000.0, 5.0, max_paths=2000, stretches=stretches
+        count, 15.0, 60.0, (start_m, 1000.0), 1000.0, 5.0, max_paths=2000, sections=sections
     )
 
 
-def through(*numbers: int) -> list[LaneStretch]:
-    return [LaneStretch(lane, to_m=1000.0, exit="end") for lane in numbers]
+def through(*numbers: int) -> list[LaneSection]:
+    return [LaneSection(lane, to_m=1000.0, exit="end") for lane in numbers]
 
 
 def test_a_lane_that_ends_is_left_in_time_even_in_dense_traffic() -> None:
-    road = lanes(*through(0, 1), LaneStretch(2, to_m=800.0))
+    road = lanes(*through(0, 1), LaneSection(2, to_m=800.0))
     random = Random(7)
     cells = [(c, lane) for c in range(-20, 10) for lane in range(3)]
     # Nine tenths of the cells of the two other lanes are taken afterwards.
@@ -187,8 +187,8 @@ def test_a_lane_that_ends_is_left_in_time_even_in_dense_traffic() -> None:
 
 
 def test_a_blocked_lane_is_used_before_and_after() -> None:
-    again = LaneStretch(0, 600.0, 1000.0, exit="end")
-    road = lanes(LaneStretch(0, to_m=500.0), *through(1), again)
+    again = LaneSection(0, 600.0, 1000.0, exit="end")
+    road = lanes(LaneSection(0, to_m=500.0), *through(1), again)
     to_its_lane = StreamVehicle("a", (15, 0), 2)
     plan = StreamPlanner(road).plan(0, [to_its_lane])
     assert plan.missed == ()
@@ -199,7 +199,7 @@ def test_a_blocked_lane_is_used_before_and_after() -> None:
 
 def test_vehicles_take_their_exits_and_others_keep_out_of_them() -> None:
     """A weaving section: a lane from 400 m to 700 m, by which vehicles come and go."""
-    road = lanes(LaneStretch(0, 400.0, 700.0, exit="off"), *through(1, 2))
+    road = lanes(LaneSection(0, 400.0, 700.0, exit="off"), *through(1, 2))
     comes, goes, stays = (
         StreamVehicle("comes", (22, 0), {1, 2}),  # on the ramp, at 330 m
         StreamVehicle("goes", (22, 1), 0),
@@ -218,7 +218,7 @@ def test_vehicles_take_their_exits_and_others_keep_out_of_them() -> None:
 
 
 def test_a_vehicle_in_a_lane_without_way_out_is_planned_to_its_end() -> None:
-    road = lanes(*through(0), LaneStretch(1, to_m=800.0))
+    road = lanes(*through(0), LaneSection(1, to_m=800.0))
     late = StreamVehicle("late", (52, 1), 0)  # at 780 m
     plan = StreamPlanner(road).plan(0, [late])
     assert plan.paths == {"late": ((52, 1), (52, 1))}
@@ -231,10 +231,10 @@ def test_streams_on_lanes_that_end_cost_the_minimum_nearly_always() -> None:
     random = Random(9)
     road = attrs.evolve(
         SHORT,
-        stretches=(
-            LaneStretch(0, to_m=150.0, exit="end"),
-            LaneStretch(1, 20.0, 150.0, exit="end"),
-            LaneStretch(2, to_m=90.0, exit="off"),
+        sections=(
+            LaneSection(0, to_m=150.0, exit="end"),
+            LaneSection(1, 20.0, 150.0, exit="end"),
+            LaneSection(2, to_m=90.0, exit="off"),
         ),
     )
     equal = 0

@@ -15,7 +15,7 @@ from laneweave.coordinator.planning.rolling.problem import CellPath, StreamPlan,
 from laneweave.coordinator.planning.rolling.problem import StreamVehicle as Vehicle
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import LaneStretch
+from laneweave.protocol.road_layout import LaneSection
 
 ROAD = StreamRoad(3, 15.0, 60.0, (400.0, 1000.0), 1000.0, 5.0)
 MODE_2 = attrs.evolve(ROAD, mode=2, model=ConflictModel(("geometric",)))
@@ -81,10 +81,10 @@ def test_moves_begin_in_s3() -> None:
 
 DROP = attrs.evolve(
     ROAD,
-    stretches=(
-        LaneStretch(0, to_m=1000.0, exit="end"),
-        LaneStretch(1, to_m=1000.0, exit="end"),
-        LaneStretch(2, to_m=800.0),
+    sections=(
+        LaneSection(0, to_m=1000.0, exit="end"),
+        LaneSection(1, to_m=1000.0, exit="end"),
+        LaneSection(2, to_m=800.0),
     ),
 )
 """The left lane ends at 800 m."""
@@ -117,9 +117,9 @@ def test_paths_end_where_their_lanes_do() -> None:
 
 def test_a_lane_that_opens_again_soon_ends_earlier() -> None:
     """In a slot a vehicle can gain 75 m: it must not pass a closed part of 20 m unnoticed."""
-    again = LaneStretch(2, 820.0, 1000.0, exit="end")
-    road = attrs.evolve(DROP, stretches=(*DROP.stretches, again))
-    assert road.lane_stretches[2] == ((-math.inf, 745.0, 2), (820.0, 1000.0, 3))
+    again = LaneSection(2, 820.0, 1000.0, exit="end")
+    road = attrs.evolve(DROP, sections=(*DROP.sections, again))
+    assert road.lane_sections[2] == ((-math.inf, 745.0, 2), (820.0, 1000.0, 3))
     vehicle = Vehicle("v", (49, 2), 3)
     way = ((49, 2), (49, 2))  # at 735 m, then at 795 m
     assert problems_of_plan(road, StreamPlan(0, {"v": way}, ("v",)), [vehicle]) == []
