@@ -120,7 +120,7 @@ def _status(arguments: list[str]) -> int:
         if (error.name or "").startswith("laneweave"):
             raise
         hint = INSTALL_HINTS.get((error.name or "").partition(".")[0], SIM_HINT)
-        return _bad_input(f"{error.name}: not installed; needed by {hint}")
+        return _bad_input(f"{error.name}: not installed ({hint})")
     if result == TYPER_INTERRUPTED:
         sys.stderr.write("interrupted\n")
         return 1
