@@ -66,12 +66,13 @@ class Variant:
     costs: StreamCosts = field(factory=StreamCosts)
     volumes: tuple[int, ...] = (1800, 2400, 2600)
     ramp_veh_h: float = 0.0
+    """Flow [vehicles/h] from the ramp."""
     leaving_veh_h: float = 0.0
-    """Vehicles from the start of the road that leave by the exit."""
+    """Flow [vehicles/h] from the start of the road to the exit."""
 
     @property
     def sorts(self) -> bool:
-        """Whether vehicles have preferred lanes."""
+        """Whether each lane has an exit of its own, so that vehicles have preferred lanes."""
         return len({section.exit for section in self.road.sections}) == self.road.lanes
 
     def exits(self, name: str) -> frozenset[int]:
@@ -155,7 +156,7 @@ class Traveller:
 
     @property
     def delay_s(self) -> float:
-        """Time by which a vehicle that stays in its column is late on the whole road."""
+        """Delay on the whole road of a vehicle that stays in its column."""
         return (self.entry_m - PITCH_M * self.column) / SPEED_MPS - self.arrival_s
 
 
@@ -164,38 +165,43 @@ def travellers(variant: Variant, volume: float, seed: int, duration_s: float) ->
 
     At time 0, column c is at c PITCH_M.
     """
-    main = len({section.lane for section in variant.road.sections if section.from_m < 0.0})
-    first = variant.road.lanes - main
-    random = np.random.default_rng((seed, 1))
-    off_share = variant.leaving_veh_h / (main * volume)
+    main_lanes = len({section.lane for section in variant.road.sections if section.from_m < 0.0})
+    rng = np.random.default_rng((seed, 1))
+    off_share = variant.leaving_veh_h / (main_lanes * volume)
 
     def entering(
-        name: str, lanes: int, first_lane: int, entry_m: float, seed: int, volume: float
+        demand: Scenario, name: str, first_lane: int, entry_m: float
     ) -> Iterator[Traveller]:
         last: dict[int, int] = {}
-        scenario = load_scenario(
-            None,
-            seed=seed,
-            road__lanes=lanes,
-            demand__volume_veh_per_lane_h=float(volume),
-            demand__duration_s=duration_s,
-        )
-        for one in arrivals(scenario):
+        for one in arrivals(demand):
             column = round((entry_m - one.t_s * SPEED_MPS) / PITCH_M)
             column = min(column, last.get(one.lane, column + 1) - 1)
             last[one.lane] = column
             if variant.sorts:
                 targets = frozenset({one.preferred_lane})
             else:
-                leaves = entry_m == 0.0 and random.random() < off_share
+                leaves = entry_m == 0.0 and rng.random() < off_share
                 targets = variant.exits("off" if leaves else "end")
             lane = first_lane + one.lane
             yield Traveller(name + one.vehicle, column, lane, targets, one.t_s, entry_m)
 
-    found = [*entering("", main, first, 0.0, seed, volume)]
+    demand = _demand(main_lanes, volume, seed, duration_s)
+    found = [*entering(demand, "", variant.road.lanes - main_lanes, 0.0)]
     if variant.ramp_veh_h:
-        found += entering("ramp-", 1, 0, RAMP_M, seed + 1000, variant.ramp_veh_h)
+        demand = _demand(1, variant.ramp_veh_h, seed + 1000, duration_s)
+        found += entering(demand, "ramp-", 0, RAMP_M)
     return sorted(found, key=lambda one: one.entry_m - PITCH_M * one.column)
+
+
+def _demand(lanes: int, volume: float, seed: int, duration_s: float) -> Scenario:
+    """Return a scenario with the arrivals of an entrance."""
+    return load_scenario(
+        None,
+        seed=seed,
+        road__lanes=lanes,
+        demand__volume_veh_per_lane_h=float(volume),
+        demand__duration_s=duration_s,
+    )
 
 
 @frozen
@@ -226,7 +232,7 @@ class Departed:
 
     @property
     def delay_s(self) -> float:
-        """Travel time minus that at v_F."""
+        """Excess of the travel time over that at v_F."""
         return self.traveller.delay_s - PITCH_M * self.drift / SPEED_MPS
 
     @property

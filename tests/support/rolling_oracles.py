@@ -75,7 +75,7 @@ def streams(draw: st.DrawFn) -> Stream:
 
 @st.composite
 def sections_of(draw: st.DrawFn, road: StreamRoad) -> tuple[LaneSection, ...]:
-    """Draw where the lanes of a road are open: half of the roads are straight."""
+    """Draw the sections of the lanes of a road; about half of the roads are straight."""
     found = [*road.sections]
     if draw(st.booleans()):
         return tuple(found)

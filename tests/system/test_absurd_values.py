@@ -64,8 +64,8 @@ WITHOUT_PLANS = {
 """Rows with possible numbers that show another road: while they arrive, nothing is planned."""
 ALL = [row for row in ROWS if row not in WITHOUT_PLANS]
 OUTBIDDING = {"prepare-possible", "state-term-possible"}
-"""Rows with possible promises to another leader. In the rolling operation they also hold vehicles
-that need cells of the victim."""
+"""Rows with promises to another leader that are within the bounds. In the rolling operation, other
+vehicles that need cells of the victim cannot move either."""
 SLOT_S = 6.0
 ROLLING = f"""
 [formation]

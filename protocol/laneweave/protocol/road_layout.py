@@ -25,5 +25,5 @@ class LaneSection:
 
 
 def straight_lanes(lanes: int, length_m: float) -> tuple[LaneSection, ...]:
-    """Return one section for each lane, with an exit of its own at the end of the road."""
+    """Return one section for each lane over the whole road, each with its own exit."""
     return tuple(LaneSection(lane, to_m=length_m, exit=f"lane-{lane}") for lane in range(lanes))

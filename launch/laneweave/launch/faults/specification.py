@@ -252,7 +252,7 @@ class FaultSpec:
         return bool(self.messages or self.kill or self.pause or self.partition or self.link)
 
     def seed_of_run(self, scenario_seed: int) -> int:
-        """Return the seed of all draws in a run of a scenario with this seed."""
+        """Return the seed for all random draws: the file's, or else that of the scenario."""
         return scenario_seed if self.seed is None else self.seed
 
     def role_faults(self) -> Iterator[tuple[str, RoleFault]]:

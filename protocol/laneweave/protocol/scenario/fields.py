@@ -354,7 +354,7 @@ class Lc2013Settings:
     """The reference method `lc2013`: SUMO's own lane changing and Krauss car following."""
 
     model: str = field(default="LC2013", validator=one_of("LC2013", "SL2015"))
-    """SUMO's lane changing model; with SL2015, vehicles also move within their lanes."""
+    """SUMO's lane-changing model; with SL2015, vehicles also move within their lanes."""
     headway_s: float = field(default=0.66, validator=within(0.0, 10.0, open_low=True))
     """tau of the car-following model, bumper to bumper."""
     min_gap_m: float = field(default=0.0, validator=within(0.0, 50.0))
@@ -366,9 +366,9 @@ class Lc2013Settings:
     decel_mps2: float | None = field(default=None, validator=optional(within(0.1, 20.0)))
     """Deceleration in car following; None: the vehicle's limit, which emergencies always use."""
     strategic: float = field(default=1.0, validator=within(0.0, 100.0))
-    """Eagerness to change lanes early for the exit (lcStrategic)."""
+    """Weight of lane changes for the exit (lcStrategic); larger: earlier lane changes."""
     cooperative: float = field(default=1.0, validator=within(0.0, 1.0))
-    """Willingness to make room for others (lcCooperative)."""
+    """Weight of lane changes that make room for other vehicles (lcCooperative)."""
     assertive: float = field(default=1.0, validator=within(0.1, 10.0))
     """Acceptance of small gaps (lcAssertive): the required gap is divided by this."""
     lane_change_s: float = field(default=0.0, validator=within(0.0, 20.0))

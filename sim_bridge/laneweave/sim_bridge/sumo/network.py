@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.fields import Lc2013Settings, Scenario
 
 EDGE = "road"
 ROUTE = "road"
@@ -135,29 +135,46 @@ def _routes(scenario: Scenario, *, exits: bool) -> Iterator[str]:
     Drivers have the same desired speed (speedDev). If SUMO does not drive, `tau` and `minGap` are
     close to zero; the defaults would delay insertions.
     """
-    vehicle, settings = scenario.vehicle, scenario.lc2013
-    brake_mps2 = -vehicle.min_accel_mps2
-    tau_s, min_gap_m, accel_mps2, decel_mps2 = 0.1, 0.0, vehicle.max_accel_mps2, brake_mps2
-    models = ""
+    limits = scenario.vehicle
+    kind: dict[str, float | str] = {
+        "length": limits.length_m,
+        "width": limits.width_m,
+        "maxSpeed": limits.max_speed_mps,
+        "accel": limits.max_accel_mps2,
+        "decel": -limits.min_accel_mps2,
+        "emergencyDecel": -limits.min_accel_mps2,
+        "tau": 0.1,
+        "minGap": 0.0,
+        "sigma": 0.0,
+        "speedDev": 0.0,
+    }
     if exits:
-        tau_s, min_gap_m = settings.headway_s, settings.min_gap_m
-        accel_mps2 = settings.accel_mps2 or accel_mps2
-        decel_mps2 = settings.decel_mps2 or decel_mps2
-        models = (
-            f'carFollowModel="Krauss" laneChangeModel="{settings.model}"'
-            f' lcStrategic="{settings.strategic:.6f}" lcCooperative="{settings.cooperative:.6f}"'
-            f' lcAssertive="{settings.assertive:.6f}" sigma="{settings.imperfection:.6f}"'
-        )
-    yield f"""<routes>
-<vType id="{VEHICLE_TYPE}"
-       length="{vehicle.length_m:.6f}" width="{vehicle.width_m:.6f}"
-       minGap="{min_gap_m:.6f}" tau="{tau_s:.6f}" speedDev="0"
-       maxSpeed="{vehicle.max_speed_mps:.6f}"
-       accel="{accel_mps2:.6f}" decel="{decel_mps2:.6f}"
-       emergencyDecel="{brake_mps2:.6f}" {models or 'sigma="0"'}/>"""
+        kind |= _driver(scenario.lc2013)
+    yield "<routes>"
+    yield f'<vType id="{VEHICLE_TYPE}"'
+    for name, value in kind.items():
+        yield f'{name}="{value}"' if isinstance(value, str) else f'{name}="{value:.6f}"'
+    yield "/>"
     if exits:
         for lane in range(scenario.road.lanes):
             yield f'<route id="{exit_route(lane)}" edges="{EDGE} exit{lane}"/>'
     else:
         yield f'<route id="{ROUTE}" edges="{EDGE}"/>'
     yield "</routes>"
+
+
+def _driver(settings: Lc2013Settings) -> dict[str, float | str]:
+    """Return the attributes of the vehicle type that describe SUMO's driver."""
+    attributes: dict[str, float | str | None] = {
+        "carFollowModel": "Krauss",
+        "laneChangeModel": settings.model,
+        "tau": settings.headway_s,
+        "minGap": settings.min_gap_m,
+        "sigma": settings.imperfection,
+        "accel": settings.accel_mps2,
+        "decel": settings.decel_mps2,
+        "lcStrategic": settings.strategic,
+        "lcCooperative": settings.cooperative,
+        "lcAssertive": settings.assertive,
+    }
+    return {name: value for name, value in attributes.items() if value is not None}

@@ -58,16 +58,16 @@ class Table(NamedTuple):
     moving_columns: Ints
     """First and last column in which moves may start in each slot; (slots, 2)."""
     section: NDArray[np.int16]
-    """Section in which each cell is at the beginning of each slot, or by whose end it has left, -1:
-    none; (slots + 1, lanes, columns)."""
+    """Section in which each cell is at the beginning of each slot, or beyond whose end; -1: none;
+    (slots + 1, lanes, columns)."""
     left: Bools
     """Whether each cell is beyond the end of its section; same shape."""
     first_left: Ints
     """First column of each lane beyond the end of a section; (slots + 1, lanes)."""
     road_end: Ints
     """First column from which all cells are beyond the ends of their sections; (slots + 1)."""
-    several: Bools
-    """Whether cells of each lane are in different sections; (lanes)."""
+    mixed: Bools
+    """Whether the cells of each lane are in different sections; (lanes)."""
 
 
 class Paths(NamedTuple):
@@ -127,7 +127,7 @@ class Scratch(NamedTuple):
     delay: Singles
     """Extra cost of a move in each slot."""
     row: Singles
-    """Minimum costs of a lane in a slot, including the costs of cells off the targets."""
+    """Minimum costs of a lane in a slot, including those of cells outside target sections."""
     searches: Ints
     """(1,) number of path searches."""
     queue: Ints
@@ -234,7 +234,7 @@ def _sections(road: StreamRoad, at_m: Floats) -> tuple[NDArray[np.int16], Bools,
 
 
 def _may_move(road: StreamRoad, is_open: Bools, is_blocked: Bools) -> Bools:
-    """Return which moves stay in open cells of S3, and enter no blocked cell.
+    """Return whether each move stays in open cells of S3 and enters no blocked cell.
 
     The corners of an oblique move count as entered, except the vehicle's own cell. Shape:
     (slots, displacements without the first, lanes, columns).
@@ -271,7 +271,7 @@ def _paths(
     begin, end = table.moving_columns.T[:, :, None]
     may_move = (begin <= column[:, 0]) & (column[:, 0] <= end)
     chances = may_move.sum(axis=0)
-    # Lower bounds on the slots off the targets and on the moves.
+    # Lower bounds on the numbers of slots outside target sections and of moves.
     of_lane = np.array([section.lane for section in road.sections])
     distance = np.abs(lane[:, :1] - of_lane)
     away = np.where(target[:, :-1], distance, road.lanes).min(axis=1)

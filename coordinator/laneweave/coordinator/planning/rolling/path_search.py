@@ -99,7 +99,9 @@ class StreamPlanner:
             paths |= _paths_of(order, arrays)
         road = self.road
         missed = tuple(
-            v.vehicle for v in vehicles if road.exit_of(slot, paths[v.vehicle]) not in v.targets
+            v.vehicle
+            for v in vehicles
+            if road.last_section(slot, paths[v.vehicle]) not in v.targets
         )
         solve_ms = round(1e3 * (time.monotonic() - began_s), 3)
         return StreamPlan(slot, paths, missed, rounds, solve_ms)

@@ -95,7 +95,7 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
         for lane in range(lanes):
             here = value[s, lane, low : high + 1]
             off = np.float32(0.0)
-            if table.several[lane]:
+            if table.mixed[lane]:
                 for i in range(len(here)):
                     row[i] = here[i]
                     if not paths.target[v, section[s, lane, low + shift + i]]:

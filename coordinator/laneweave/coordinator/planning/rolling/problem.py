@@ -84,7 +84,7 @@ class StreamRoad:
         return min(to_m for sections in self.lane_sections for _, to_m, _ in sections)
 
     def section_at(self, slot: int, cell: Cell) -> Section | None:
-        """Return the section in which a cell is when a slot begins, or by whose end it has left.
+        """Return the section in which a cell is when a slot begins, or beyond whose end.
 
         None: there is no such lane, or it has not begun there.
         """
@@ -103,8 +103,8 @@ class StreamRoad:
         section = self.section_at(slot, cell)
         return section is not None and self.position_m(slot, cell[0]) > section[1] + ROUNDING_M
 
-    def exit_of(self, slot: int, path: CellPath) -> int:
-        """Return the section by whose end a path that begins with a slot leaves; -1: none."""
+    def last_section(self, slot: int, path: CellPath) -> int:
+        """Return the index of the section at whose end a path from a slot on ends; -1: none."""
         section = self.section_at(slot + len(path) - 1, path[-1])
         return -1 if section is None else section[2]
 
@@ -115,7 +115,7 @@ class StreamCosts:
 
     move: float = 0.3
     off_lane: float = 0.1
-    """Cost of each slot that begins elsewhere than in a target."""
+    """Cost of each slot at whose beginning the vehicle is outside its target sections."""
     backward: float = 2.0
     """Extra cost of a move that loses a column."""
     forward: float = 0.0

@@ -39,7 +39,8 @@ def problems_of_plan(
     missed = {
         v.vehicle
         for v in vehicles
-        if plan.paths[v.vehicle] and road.exit_of(plan.slot, plan.paths[v.vehicle]) not in v.targets
+        if plan.paths[v.vehicle]
+        and road.last_section(plan.slot, plan.paths[v.vehicle]) not in v.targets
     }
     if set(plan.missed) != missed:
         problems.append(

@@ -263,8 +263,7 @@ class ZenohTransport:
 
     def _on_query(self, key: str, query: zenoh.Query) -> None:
         sender = self._sender_of(query)
-        token = None if sender is None else self._queries.add(sender_name(sender), query)
-        if sender is None or token is None:
+        if sender is None or (token := self._queries.add(sender_name(sender), query)) is None:
             query.drop()  # type: ignore[no-untyped-call]
             return
         payload = b""
@@ -274,10 +273,11 @@ class ZenohTransport:
         self._deliver(Query(key, payload, token, encoding, sender))
 
     def _sender_of(self, query: zenoh.Query) -> str | None:
-        """Return the key in a query's attachment; empty if there is none, None if not visible.
+        """Return the token key in a query's attachment; empty without an attachment.
 
-        A query can overtake its client's token: Zenoh's callbacks have a thread for each
-        declaration. Nothing would report the end of a client whose token was not visible yet.
+        None: the attachment is not the key of a visible token. A query can overtake the token of
+        its client, since Zenoh's callbacks have a thread for each declaration; if it were accepted
+        as a query without a token, nothing would report the end of the client.
         """
         attachment = query.attachment
         if attachment is None:
