@@ -169,8 +169,8 @@ workers = 1
         process.terminate()
         ended = self.lab.finish(process, END_S)
         took_s = time.monotonic() - asked_s
-        assert (ended.status, ended.out) == (0, "")
-        assert "Traceback" not in ended.err
+        assert (ended.status, ended.out) == (0, ""), ended
+        assert "Traceback" not in ended.err, ended
         return took_s
 
     def workers(self, name: str) -> list[int]:

@@ -259,9 +259,11 @@ def test_a_queue_that_is_full_refuses_and_drops_what_is_late(
 def test_a_flood_does_not_exclude_another_client(
     service: ServiceLab, transport: ZenohTransport, client: PlanClient
 ) -> None:
-    made = [json.dumps(service.for_one("c1", request())).encode() for _ in range(FLOOD)]
+    # The first one keeps the worker until the others have come, on a slow machine too.
+    first = service.for_one("c1", slow_request("", 2.5))
+    made = [first, *(service.for_one("c1", request()) for _ in range(FLOOD))]
     quiet = [PlanRequest.from_dict(service.for_one("c1", request())) for _ in range(10)]
-    asking = [transport.query(KEY, payload, END_S) for payload in made]
+    asking = [transport.query(KEY, json.dumps(data).encode(), END_S) for data in made]
     for each in quiet:
         # Clients are served in turn, and the limit is that of the other one.
         assert client.plan(each, END_S).status == "optimal"

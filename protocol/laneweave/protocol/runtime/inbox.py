@@ -51,7 +51,7 @@ class Inbox:
         self._waiting: Counter[str] = Counter()
         """Number of waiting messages by sender."""
         self._lock = threading.Lock()
-        """Guards `_queries` and `_waiting`; never needed in a signal handler."""
+        """Guards `_queries`, `_waiting` and `_overflowed`; never needed in a signal handler."""
         self._overflowed: dict[str, None] = {}
         """Keys of messages dropped since the last `Overflow`."""
         self._next_overflow_s = 0.0
@@ -65,9 +65,7 @@ class Inbox:
             with self._lock:
                 self._queries.append(sender_name(item.sender), item)
             self._items.put(None)  # wake up `take`
-        elif isinstance(item, Received) and not self._admit(item.key):
-            self._overflowed[item.key] = None
-        else:
+        elif not isinstance(item, Received) or self._admit(item.key):
             self._items.put(item)
 
     def take(self, timeout_s: float) -> Iterator[Item]:
@@ -84,7 +82,8 @@ class Inbox:
         now_s = time.monotonic()
         if self._overflowed and now_s >= self._next_overflow_s:
             self._next_overflow_s = now_s + OVERFLOW_S
-            overflowed, self._overflowed = self._overflowed, {}
+            with self._lock:
+                overflowed, self._overflowed = self._overflowed, {}
             yield from map(Overflow, overflowed)
         if self._queries and (self._items.empty() or now_s > self._next_query_s):
             with self._lock:
@@ -94,9 +93,11 @@ class Inbox:
             self._next_query_s = now_s + max(MAX_QUERY_WAIT_S, took_s / QUERY_SHARE)
 
     def _admit(self, key: str) -> bool:
+        """Count a message as waiting, or register it as dropped; return whether it may wait."""
         name = sender_name(key)
         with self._lock:
             if self._waiting[name] >= MAX_WAITING:
+                self._overflowed[key] = None
                 return False
             self._waiting[name] += 1
             return True

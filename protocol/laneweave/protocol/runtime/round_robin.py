@@ -19,10 +19,11 @@ class RoundRobin(Generic[T]):
         """Create an empty queue."""
         self._queues: dict[str, deque[T]] = {}
         """Items of each sender, oldest first; the sender whose turn it is comes first."""
+        self._count = 0
 
     def __len__(self) -> int:
-        """Return the number of items."""
-        return sum(map(len, self._queues.values()))
+        """Return the number of items; safe while another thread changes the queue."""
+        return self._count
 
     def __iter__(self) -> Iterator[T]:
         """Yield all items, sender by sender."""
@@ -45,6 +46,7 @@ class RoundRobin(Generic[T]):
     def append(self, sender: str, item: T) -> None:
         """Add the newest item of a sender."""
         self._queues.setdefault(sender, deque()).append(item)
+        self._count += 1
 
     def pop(self) -> T:
         """Remove and return the oldest item of the sender whose turn it is.
@@ -55,6 +57,7 @@ class RoundRobin(Generic[T]):
         sender = next(iter(self._queues))
         items = self._queues.pop(sender)
         item = items.popleft()
+        self._count -= 1
         if items:
             self._queues[sender] = items  # now the last in turn
         return item
@@ -77,5 +80,6 @@ class RoundRobin(Generic[T]):
         """
         items = self._queues[sender]
         items.remove(item)
+        self._count -= 1
         if not items:
             del self._queues[sender]

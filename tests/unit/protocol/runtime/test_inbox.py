@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import sys
+import threading
 import time
+from collections.abc import Iterator
+
+import pytest
 
 from laneweave.protocol.runtime.inbox import (
     MAX_QUERY_WAIT_S,
@@ -117,3 +122,33 @@ def test_the_keys_of_dropped_messages_are_told_at_intervals() -> None:
             inbox.put(MESSAGE)
         told += sum(item == Overflow("k") for item in inbox.take(0.0))
     assert 1 <= told <= 4
+
+
+@pytest.fixture
+def _frequent_thread_switches() -> Iterator[None]:
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(interval_s)
+
+
+@pytest.mark.usefixtures("_frequent_thread_switches")
+def test_inputs_of_many_threads_arrive_while_others_are_taken() -> None:
+    threads, each = 3, 1000
+    inbox = Inbox()
+    taken: list[object] = []
+
+    def put(thread: int) -> None:
+        for number in range(each):
+            inbox.put(Query("k", b"", number, sender=f"alive/client/{thread}/c{number}"))
+            inbox.put(Received(f"state/1/v{number % 5}", b""))
+
+    putting = [threading.Thread(target=put, args=(thread,)) for thread in range(threads)]
+    for thread in putting:
+        thread.start()
+    begun_s = time.monotonic()
+    while any(thread.is_alive() for thread in putting) or len(inbox._queries) > 0:
+        taken += inbox.take(0.0)
+        assert time.monotonic() < begun_s + 60.0
+    queries = [item for item in taken if isinstance(item, Query)]
+    assert len({item.sender for item in queries}) == len(queries) == threads * each

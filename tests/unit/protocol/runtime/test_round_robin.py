@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -64,3 +67,19 @@ def test_items_are_removed_from_anywhere() -> None:
 
 def test_the_largest_sender_has_the_most_items() -> None:
     assert queue_of("abbbcc").largest_sender == "b"
+
+
+class ChangedMeanwhile(dict[str, deque[int]]):
+    """A dictionary that another thread changes whenever it is iterated."""
+
+    def values(self) -> Any:  # noqa: ANN401 (an iterator instead of a view)
+        """Begin the iteration, then add a sender."""
+        begun = iter(super().values())
+        self["another"] = deque([0])
+        return begun
+
+
+def test_the_length_is_known_while_another_thread_adds_items() -> None:
+    queue = queue_of("aab")
+    queue._queues = ChangedMeanwhile(queue._queues)
+    assert len(queue) == 3
