@@ -25,6 +25,7 @@ written term/coordinator/incarnation/seq, the higher one wins. Time is in second
 | `caretaker K for A` | the caretaker of A takes charge, because its agent died or fell silent |
 | `A senses`, `A commands` | the two halves of a tick: in between, the COMMAND is under way |
 | `body of A arrives` | the same as `A arrives` when no agent notices |
+| `body of A falls back to -1,0` | it has braked, and is in another cell than it should hold |
 | `A leaves` | the vehicle has left the road |
 | `show A` | what A knows |
 

@@ -69,6 +69,7 @@ class Runner:
             (r"(\w+) commands", self._commands),
             (r"(\w+) arrives", self._arrives),
             (r"body of (\w+) arrives", self._body_arrives),
+            (r"body of (\w+) falls back to (\S+)", self._body_falls_back),
             (r"(\w+) leaves", self._leaves),
             (r"(\w+) restarts", self._restarts),
             (r"show (\w+)", self._show),
@@ -352,6 +353,9 @@ class Runner:
 
     def _body_arrives(self, name: str) -> None:
         self.vehicles[name].at = self.vehicles[name].road.controller.hold_cell
+
+    def _body_falls_back(self, name: str, cell: str) -> None:
+        self.vehicles[name].at = cell_of(cell)
 
     # --- inspection ---------------------------------------------------------------------------
 

@@ -372,3 +372,4 @@ def accept_moves(patch: pytest.MonkeyPatch) -> None:
 
 def never_moving(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(MotionController, "moving", never)
+    patch.setattr(MotionController, "displaced", never)

@@ -162,6 +162,9 @@ BUGS: tuple[Bug, ...] = (
         replaced={vehicle.start_move: broken.start_and_count, vehicle.count_move: broken.skip}),
     Bug("old-motion-counts", "V7", "A motion of an older plan is counted in the new one.",
         "motion_of_an_old_plan", replaced={vehicle.moved_in_plan: broken.always}),
+    Bug("body-out-of-its-cell-holds", "V8",
+        "A vehicle that has fallen back counts as holding its cell.",
+        "body_out_of_its_cell", replaced={vehicle.leave_cell: broken.skip}),
     # --- a leader
     Bug("heartbeat-revives-dead-candidate", "L1", "A heartbeat in flight revives a dead candidate.",
         "late_heartbeat_of_a_dead_candidate", collides=False, plant=broken.revive),
@@ -298,6 +301,7 @@ NOT_A_SAFETY_MATTER: Mapping[Function, str] = {
     vehicle.is_moving: "a motion that is not under way cannot end",
     vehicle.has_next_move: "without a next move there is nothing to begin",
     vehicle.rest: "a vehicle that never rests never moves again",
+    vehicle.ends_in_time: "a move that begins late is stopped at the stop line of its lane",
     leader.observe_members: "how long a leader listens is a matter of progress",
     leader.back_off: "the length of a pause is a matter of progress",
     ballot.had_promised: "it only guards `void_promise` and `record_restart`",

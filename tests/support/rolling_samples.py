@@ -97,4 +97,5 @@ def state(
     return evolve(
         shown, vehicle=name, hold_cell=cell, promised=promised, transfer=transfer, owned=owned,
         accepted=accepted, ready=accepted, t_s=t_s,
+        s_m=ROLLING.lattice.cell_s_m(cell[0], t_s),
     )  # fmt: skip

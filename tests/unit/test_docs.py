@@ -164,6 +164,7 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
             "tuple[float, ...]": "list of numbers",
             "tuple[str, ...]": "list of texts",
             "bool": "`true`, `false`",
+            "tuple[Closure, ...]": "list of tables",
             "tuple[DrivingStructure, ...]": "list of tables",
         }
         return kinds[re.sub(r"[a-z]+\.", "", kind)]

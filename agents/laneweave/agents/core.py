@@ -41,6 +41,8 @@ from laneweave.protocol.runtime.node import (
 )
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
+from laneweave.protocol.vehicle.motion import displaced
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
 from laneweave.protocol.wire.bounds import check_ballot
 from laneweave.protocol.wire.identities import above
@@ -100,6 +102,7 @@ class AgentCore:
         self._bounds = runtime.bounds(self._incarnation)
         self._road = NewestRoad(runtime.max_pace)
         self._driver = make_driver(scenario)
+        self._lane_ends = LaneEnds(scenario)
         self._rules = rules
         self.wanted_motions: tuple[int, ...] = ()
         """Stretches of columns whose motions are needed now; empty while not in charge."""
@@ -214,7 +217,7 @@ class AgentCore:
             if sense.tick == self._sense.tick and self._command is not None:
                 return [*self._on_confirmation(sense), Send(COMMAND, self._command, self._own)]
             return []
-        was_in_charge = self.in_charge
+        drove = self.in_charge and self._sense is not None and not self._sense.off_lattice
         self._sense = sense
         # Clocks of different machines may give a caretaker the same incarnation.
         taken = sense.caretaker and sense.attendant == self._incarnation
@@ -226,16 +229,31 @@ class AgentCore:
         elif sense.attendant < self._incarnation and self._raised:
             # The attendant of an earlier SENSE may have been wrong, and the claim too high.
             self._claim_above(sense.attendant)
-        in_charge = self.in_charge
-        if not (was_in_charge and in_charge):
+        return self._act(sense, in_charge=self.in_charge, drove=drove)
+
+    def _wait(self, sense: Sense) -> list[Effect]:
+        """Keep the claim on a vehicle without a cell, which its motion controller drives alone."""
+        self._command = Command(
+            vehicle=self.vehicle,
+            incarnation=self._incarnation,
+            tick=sense.tick,
+            hold_cell=sense.hold_cell,
+            motion_end_tick=sense.motion_end_tick,
+            motion_origin=sense.motion_origin,
+            jerks=b"",
+        )
+        return [Send(COMMAND, self._command, self._own), *([self._state()] * self.in_charge)]
+
+    def _act(self, sense: Sense, *, in_charge: bool, drove: bool) -> list[Effect]:
+        """Answer a tick; `drove`: whether this process has driven the vehicle until now."""
+        if not (drove and in_charge) or sense.off_lattice:
             # Repeated while a claim is pending, since another process may still begin a move.
             self._take_over(sense)
-        return self._act(sense, in_charge=in_charge)
-
-    def _act(self, sense: Sense, *, in_charge: bool) -> list[Effect]:
         execution = self.execution
-        assert execution is not None  # noqa: S101 (there was a SENSE)
+        assert execution is not None  # noqa: S101 (it has taken over)
         self.wanted_motions = ()
+        if sense.off_lattice:
+            return self._wait(sense)
         if in_charge:
             stretch = stretch_of(execution.hold_cell[0])
             self.wanted_motions = stretch - 1, stretch, stretch + 1
@@ -319,6 +337,7 @@ class AgentCore:
             moving=not self._driver.at_rest(sense),
             rules=self._rules,
             owned=frozenset(sense.owned) if self._scenario.formation.rolling else None,
+            lane_ends=self._lane_ends,
         )
 
     def _decide(self, sense: Sense, execution: PlanExecution) -> None:
@@ -329,6 +348,8 @@ class AgentCore:
             self._driver.begin(self._move, sense.tick, self._move_ticks)
         if execution.moving and self._driver.at_rest(sense):
             execution.end_motion()
+        if displaced(sense.state, self._scenario.lattice, execution.hold_cell, sense.t_s):
+            execution.displace()
         move = execution.tick(sense.t_s)
         if move is not None and execution.plan is not None:
             self._move = move

@@ -317,7 +317,7 @@ class CoordinatorCore:
                     self.census = message
                     block_of = self.scenario.lattice.block_of
                     self._formation_of = {
-                        entry.vehicle: block_of(entry.cell[0]) for entry in message.on_road
+                        entry.vehicle: block_of(entry.cell[0]) for entry in message.on_lattice
                     }
                     self._road_changed = True
             case _:

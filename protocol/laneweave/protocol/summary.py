@@ -52,7 +52,7 @@ class Safety:
     """Counts and extremes over all vehicles and ticks; None: nothing was measured."""
 
     overlaps: int
-    """Pairs of bodies that intersected at some tick."""
+    """Pairs of bodies that intersected at some tick; closed parts of lanes count as bodies."""
     sumo_collisions: int
     min_gap_m: float | None
     min_headway_s: float | None

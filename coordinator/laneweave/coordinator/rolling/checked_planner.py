@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.rolling.path_search import StreamPlanner
@@ -15,14 +15,20 @@ from laneweave.coordinator.planning.rolling.problem import (
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
 from laneweave.protocol.lattice import Cell, Mode
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.lane_ends import sections_to_lines
 
 REWARD = -0.5
 """Cost of a column gained forwards if drift is rewarded; a move costs 0.3."""
 
 
-Planner = Callable[[int, Sequence[StreamVehicle], StreamPlan | None, Collection[Cell]], StreamPlan]
-"""Function of slot, vehicles, previous plan and blocked cells that returns paths for all vehicles
-from that slot on; `StreamPlanner.plan` except in fault searches and tests."""
+Planner = Callable[
+    [int, Sequence[StreamVehicle], StreamPlan | None, Collection[Cell], Mapping[int, float]],
+    StreamPlan,
+]
+"""Function of slot, vehicles, previous plan, blocked cells and earlier ends of sections.
+
+It returns paths for all vehicles from that slot on; `StreamPlanner.plan` except in fault searches
+and tests."""
 
 
 def checked(road: StreamRoad, planner: Planner) -> Planner:
@@ -33,9 +39,10 @@ def checked(road: StreamRoad, planner: Planner) -> Planner:
         vehicles: Sequence[StreamVehicle],
         before: StreamPlan | None,
         blocked: Collection[Cell],
+        ends_m: Mapping[int, float],
     ) -> StreamPlan:
-        table = planner(slot, vehicles, before, blocked)
-        problems = problems_of_plan(road, table, vehicles, blocked)
+        table = planner(slot, vehicles, before, blocked, ends_m)
+        problems = problems_of_plan(road.ending_at(ends_m), table, vehicles, blocked)
         if problems:
             raise ValueError(f"the plan of slot {slot} is invalid: {'; '.join(problems)}")
         return table
@@ -63,4 +70,5 @@ def stream_road(scenario: Scenario) -> StreamRoad:
         body_m=scenario.vehicle.length_m,
         mode=mode,
         model=ConflictModel(formation.conflict_kinds),
+        sections=sections_to_lines(scenario),
     )

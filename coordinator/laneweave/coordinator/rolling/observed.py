@@ -63,7 +63,7 @@ class ObservedRoad:
         if self.census is not None and census.t_s > self.census.t_s:
             self._census_before = self.census
         self.census = census
-        listed = {entry.vehicle for entry in census.on_road}
+        listed = {entry.vehicle for entry in census.on_lattice}
         gone = [name for name in self.states if name not in listed]
         for name in gone:
             self._left[name] = self.states.pop(name)
@@ -101,7 +101,7 @@ class ObservedRoad:
             raise ValueError("no census yet")
         states = {
             entry.vehicle: state
-            for entry in census.on_road
+            for entry in census.on_lattice
             if (state := self._state_at(t_s, entry.vehicle)) is not None
         }
         for name in self._left:
@@ -125,7 +125,7 @@ def _at(t_s: float, newest: _Message | None, before: _Message | None) -> _Messag
 
 
 def _gone(states: Iterable[VehicleState], census: Census | None) -> frozenset[Name]:
-    listed = {entry.vehicle for entry in census.on_road} if census else set[Name]()
+    listed = {entry.vehicle for entry in census.on_lattice} if census else set[Name]()
     transfers = [state.transfer for state in states if state.transfer is not None]
     return frozenset(
         name for transfer in transfers for name in transfer.roster if name not in listed

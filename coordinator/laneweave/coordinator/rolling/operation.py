@@ -23,9 +23,11 @@ from laneweave.coordinator.rolling.observed import ObservedRoad
 from laneweave.coordinator.rolling.ownership import certain_cells, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
+from laneweave.protocol.road_layout import sections_for
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.vehicle.motion import DISPLACED_ALONG_M
 from laneweave.protocol.wire.events import (
     PLAN_IN_FORCE,
     PLANNING_FAILED,
@@ -78,6 +80,7 @@ class RollingOperation:
         self._new_job = new_job
         self._planner = planner
         self._slot_s = scenario.cycles_s[0]
+        self._sections = scenario.road.sections
         self.observed = ObservedRoad()
         self.transfers: list[CellTransfer] = []
         self._transfer_of: dict[Name, CellTransfer] = {}
@@ -167,16 +170,17 @@ class RollingOperation:
             return
         if max(self._since[0], t_s - 1.5 * self._scenario.runtime.tick_s) > snapshot_s:
             snapshot_s = t_s  # too late for that snapshot: use the newest states
-        vehicles, blocked = self._observed_at(snapshot_s, slot + 1)
+        vehicles, blocked, ends_m = self._observed_at(snapshot_s, slot + 1)
         self._newest_slot = slot + 1
         job = self._new_job()
         self._ordered = (job, slot + 1)
-        yield Compute(job, partial(self._planner, slot + 1, vehicles, self._last_plan, blocked))
+        plan = partial(self._planner, slot + 1, vehicles, self._last_plan, blocked, ends_m)
+        yield Compute(job, plan)
 
     def _observed_at(
         self, snapshot_s: float, slot: int
-    ) -> tuple[tuple[StreamVehicle, ...], frozenset[Cell]]:
-        """Return the vehicles to plan for from a slot on, and the blocked cells."""
+    ) -> tuple[tuple[StreamVehicle, ...], frozenset[Cell], dict[int, float]]:
+        """Return what the planner needs: vehicles, blocked cells, and earlier ends of sections."""
         vehicles: dict[Cell, StreamVehicle] = {}
         owned, reserved = set[Cell](), set[Cell]()
         # States from an earlier term of this leader do not report current positions.
@@ -185,14 +189,15 @@ class RollingOperation:
         snapshot = self.observed.at(snapshot_s)
         # Vehicles without a state come last: they may have moved, and others may hold their cells.
         for entry in sorted(
-            snapshot.census.on_road, key=lambda entry: entry.vehicle not in snapshot.states
+            snapshot.census.on_lattice, key=lambda entry: entry.vehicle not in snapshot.states
         ):
             state = snapshot.states.get(entry.vehicle)
+            targets = sections_for(self._sections, entry.preferred_lane)
             column = entry.cell[0] if state is None else state.hold_cell[0]
             if self._scenario.lattice.cell_s_m(column, (slot - 1) * self._slot_s) < far_m:
                 continue
             if state is None:
-                unknown = StreamVehicle(entry.vehicle, entry.cell, entry.preferred_lane, held=True)
+                unknown = StreamVehicle(entry.vehicle, entry.cell, targets, held=True)
                 vehicles.setdefault(entry.cell, unknown)
                 continue
             # With an open gate the move may begin at any time. With a closed gate it never begins
@@ -201,8 +206,8 @@ class RollingOperation:
             owned |= certain_cells(state, snapshot.states, snapshot.gone)
             if late:
                 reserved |= {*state.owned} - {state.hold_cell}
-            held = late or not state.attended or state.t_s < since_s
-            known = StreamVehicle(entry.vehicle, state.hold_cell, entry.preferred_lane, held)
+            held = late or not state.attended or state.t_s < since_s or self._is_displaced(state)
+            known = StreamVehicle(entry.vehicle, state.hold_cell, targets, held)
             vehicles.setdefault(state.hold_cell, known)
         columns = [column for column, _ in vehicles] or [0]
         blocked = frozenset(
@@ -211,7 +216,30 @@ class RollingOperation:
             for lane in range(self._scenario.road.lanes)
             if (column, lane) not in owned or (column, lane) in reserved
         )
-        return tuple(vehicles.values()), blocked
+        return tuple(vehicles.values()), blocked, self._ends_m(snapshot.census)
+
+    def _is_displaced(self, state: VehicleState) -> bool:
+        """Return whether a body is farther from its cell than any move of one cell takes it.
+
+        Its plans would not come into force, since it is not ready for them.
+        """
+        lattice = self._scenario.lattice
+        cell_s_m = lattice.cell_s_m(state.hold_cell[0], state.t_s)
+        return abs(state.s_m - cell_s_m) > lattice.pitch_m + DISPLACED_ALONG_M
+
+    def _ends_m(self, census: Census) -> dict[int, float]:
+        """Return where sections end before vehicles without cells [m], by index."""
+        ends_m: dict[int, float] = {}
+        bodies = [entry.off_lattice for entry in census.on_road if entry.off_lattice is not None]
+        for number, section in enumerate(self._sections):
+            inside = [
+                body.rear_m
+                for body in bodies
+                if body.lane == section.lane and section.from_m <= body.rear_m < section.to_m
+            ]
+            if inside:
+                ends_m[number] = min(inside)
+        return ends_m
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[LogEntry]:
         """Begin ballots for the first moves of the plan requested last; ignore other results."""

@@ -36,7 +36,7 @@ def owned_cells(
         None: not known yet.
     """
     transfer = state.transfer
-    if transfer is None or transfer.open:
+    if transfer is None or transfer.open or transfer.withdrawn:
         return frozenset(state.owned)
     before, after = frozenset(transfer.before), frozenset(transfer.after)
     signs = _signs(state, transfer, states, gone)
@@ -62,7 +62,7 @@ def certain_cells(
 def partners(state: VehicleState, states: States) -> frozenset[Name]:
     """Return the vehicles whose promises determine what a vehicle owns; none if that is known."""
     transfer = state.transfer
-    if transfer is None or transfer.open:
+    if transfer is None or transfer.open or transfer.withdrawn:
         return frozenset()
     signs = _signs(state, transfer, states, ())
     if _Sign.OPEN in signs or _Sign.NEVER_READY in signs or signs == {_Sign.CLOSED}:
@@ -77,7 +77,7 @@ class _Sign(Enum):
     CLOSED = "the vehicle has promised a higher ballot with a closed gate"
     NEVER_READY = "the vehicle has promised a higher ballot, and was never ready for the plan"
     NEWER = "the vehicle has a newer transfer"
-    GONE = "the vehicle has left the road"
+    GONE = "the vehicle has left the road, or the lattice"
     NONE = "no evidence"
 
 
@@ -97,6 +97,8 @@ def _sign(state: VehicleState | None, transfer: PendingTransfer) -> _Sign:
     theirs = state.transfer
     if theirs is not None and theirs.ballot > transfer.ballot:
         return _Sign.NEWER
+    if theirs is not None and theirs.withdrawn and theirs.ballot == transfer.ballot:
+        return _Sign.GONE
     if theirs is not None and theirs.ballot < transfer.ballot:
         theirs = None  # of an earlier plan
     if theirs is not None and theirs.open:

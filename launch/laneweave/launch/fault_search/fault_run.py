@@ -315,8 +315,9 @@ class FaultRun:
             vehicles: Sequence[StreamVehicle],
             before: StreamPlan | None,
             blocked: Collection[Cell],
+            ends_m: Mapping[int, float],
         ) -> StreamPlan:
-            table = planner(slot, vehicles, before, blocked)
+            table = planner(slot, vehicles, before, blocked, ends_m)
             if self.faults.healed:
                 self._planned_slots += 1
                 paths = table.paths.items()

@@ -12,6 +12,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import is_encrypted
 from laneweave.protocol.scenario.fields import MAX_HORIZON_TICKS, Scenario
 from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
+from laneweave.protocol.vehicle.lane_ends import dead_ends, drive_out, lane_beside
 from laneweave.protocol.wire.identities import MAX_COMMON_NAME
 
 MIN_GAP_M = 1.0
@@ -53,6 +54,7 @@ def check_scenario(scenario: Scenario) -> None:
     for check in (
         _check_lanes,
         _check_motion,
+        _check_closures,
         _check_structures,
         _check_timing,
         _check_braking,
@@ -149,6 +151,84 @@ def _check_motion(scenario: Scenario) -> None:
         "geometric, or in mode 1 node, edge and special-1: moves of one step must have disjoint "
         "footprints to be executed without a timetable",
     )
+
+
+def _check_closures(scenario: Scenario) -> None:
+    """Check that closed parts of lanes are on the road, apart, and can be passed."""
+    road, operation = scenario.road, scenario.formation.operation
+    open_m: dict[int, float] = {}
+    for number, closure in enumerate(road.closures):
+        name = f"road.closures[{number}]"
+        allowed = "rolling, on a road with closures"
+        _require(scenario.formation.rolling, "formation.operation", operation, allowed)
+        allowed = f"a lane from 0 to {road.lanes - 1}"
+        _require(closure.lane < road.lanes, f"{name}.lane", closure.lane, allowed)
+        allowed = f"more than from_m, {closure.from_m:g}"
+        _require(closure.to_m > closure.from_m, f"{name}.to_m", closure.to_m, allowed)
+        after_m = open_m.get(closure.lane, 0.0)
+        _require(
+            after_m < closure.from_m < road.length_m,
+            f"{name}.from_m",
+            closure.from_m,
+            f"less than the length of the road, {road.length_m:g}, and more than {after_m:g}, "
+            f"where lane {closure.lane} is open (again)",
+        )
+        open_m[closure.lane] = closure.to_m
+        _check_capacity(scenario, closure.from_m)
+    if road.closures:
+        _check_dead_ends(scenario)
+    reaching = sorted(section.lane for section in road.sections if section.exit)
+    _require(
+        all(lane in reaching or not share for lane, share in enumerate(scenario.lane_shares)),
+        "demand.lane_shares",
+        list(scenario.demand.lane_shares),
+        f"shares of lanes that reach the end of the road, {reaching}, and 0 for the others",
+    )
+
+
+def _check_capacity(scenario: Scenario, s_m: float) -> None:
+    """Check that the lanes that are open at a position can carry the demand."""
+    road, volume = scenario.road, scenario.demand.volume_veh_per_lane_h
+    closed = {closure.lane for closure in road.closures if closure.from_m <= s_m < closure.to_m}
+    count = road.lanes - len(closed)
+    bound = scenario.formation.bound_veh_per_lane_h * count / road.lanes
+    _require(
+        volume <= bound,
+        "demand.volume_veh_per_lane_h",
+        volume,
+        f"at most {bound:g}, since {count} of {road.lanes} lanes are open at {s_m:g} m",
+    )
+
+
+def _check_dead_ends(scenario: Scenario) -> None:
+    """Check that vehicles can change lanes before each dead end, and drive on after stopping."""
+    try:
+        needed = drive_out(scenario)
+    except ValueError as error:
+        limit = scenario.vehicle.max_accel_mps2
+        raise BadInputError("vehicle.max_accel_mps2", limit, f"more: {error}") from error
+    step_m = scenario.formation.speed_mps * scenario.cycles_s[0] + scenario.vehicle.length_m
+    for end in dead_ends(scenario):
+        name = next(
+            f"road.closures[{number}].from_m"
+            for number, closure in enumerate(scenario.road.closures)
+            if (closure.lane, closure.from_m) == (end.lane, end.end_m)
+        )
+        first_m = max(end.from_m, scenario.moves_from_m) + step_m
+        _require(
+            end.line_m >= first_m,
+            name,
+            end.end_m,
+            f"at least {first_m + needed.room_m:g}: a step for changing lanes, and "
+            f"{needed.room_m:g} m for driving on after stopping at the end of the lane",
+        )
+        _require(
+            lane_beside(scenario, end) is not None,
+            name,
+            end.end_m,
+            f"the end of a lane beside one that is open from {end.line_m:g} m, its stop line, to "
+            f"{needed.distance_m:g} m after it",
+        )
 
 
 def _check_structures(scenario: Scenario) -> None:

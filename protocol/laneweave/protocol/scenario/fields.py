@@ -19,6 +19,7 @@ from attrs.validators import optional
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import one_of, within
 from laneweave.protocol.lattice import Lattice
+from laneweave.protocol.road_layout import LaneSection, open_sections
 from laneweave.protocol.scenario.deployment_fields import Network, Observation, Security, Service
 from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.events import STREAM_PLANNED
@@ -45,6 +46,7 @@ SLACK_S = 0.2
 """Part of T_F without motion if `formation.move_s` is not set."""
 HIGHEST_PACE = 1000.0
 """Upper bound of `runtime.max_pace`."""
+LONGEST_ROAD_M = 60_000.0
 MAX_HORIZON_TICKS = 200
 """Maximum horizon of the tracker."""
 
@@ -85,6 +87,18 @@ def _conflict_kinds(_: object, attribute: attrs.Attribute[Any], value: Sequence[
 
 
 @frozen
+class Closure:
+    """A part of a lane that is closed."""
+
+    lane: int = field(validator=within(0, 7))
+    from_m: float = field(validator=within(0.0, LONGEST_ROAD_M, open_low=True))
+    to_m: float = field(
+        default=LONGEST_ROAD_M, validator=within(0.0, LONGEST_ROAD_M, open_low=True)
+    )
+    """Where the lane is open again; by default, it is not."""
+
+
+@frozen
 class Road:
     """The road: segments S1 (entry), S2 (driving), S3 (lane sorting); paper, Section 5.2.1."""
 
@@ -93,6 +107,8 @@ class Road:
     s1_m: float = field(default=50.0, validator=within(0.0, 20_000.0))
     s2_m: float = field(default=350.0, validator=within(0.0, 20_000.0))
     s3_m: float = field(default=600.0, validator=within(0.0, 20_000.0, open_low=True))
+    closures: tuple[Closure, ...] = ()
+    """Closed parts of lanes."""
 
     @property
     def length_m(self) -> float:
@@ -104,6 +120,12 @@ class Road:
         """Position at which S3 and lane changes begin."""
         return self.s1_m + self.s2_m
 
+    @property
+    def sections(self) -> tuple[LaneSection, ...]:
+        """The open sections of all lanes."""
+        closed = [(one.lane, one.from_m, one.to_m) for one in self.closures]
+        return open_sections(self.lanes, self.length_m, closed)
+
 
 @frozen
 class Demand:
@@ -113,14 +135,15 @@ class Demand:
     duration_s: float = field(default=300.0, validator=within(0, 86_400, open_low=True))
     min_headway_s: float = field(default=1.0, validator=within(0.0, 60.0))
     lane_shares: tuple[float, ...] = ()
-    """Share of vehicles that prefer each lane; empty: equal shares."""
+    """Share of vehicles that prefer each lane; empty: equal shares, and on a road with closures no
+    preferences."""
 
 
 @frozen
 class DrivingStructure:
     """A geometric structure in which formations drive before they sort (paper, Section 2.2)."""
 
-    from_m: float = field(validator=within(0.0, 60_000.0))
+    from_m: float = field(validator=within(0.0, LONGEST_ROAD_M))
     """Formations change to this structure once their rear has passed this position."""
     structure: str = field(validator=one_of("parallel", "interlaced"))
     lanes: tuple[int, ...] = ()
@@ -504,7 +527,9 @@ class Scenario:
 
     @property
     def lane_shares(self) -> tuple[float, ...]:
-        """Share of vehicles that prefer each lane; the sum is one."""
+        """Share of vehicles that prefer each lane; the sum is one. Empty: no preferences."""
+        if self.road.closures and not self.demand.lane_shares:
+            return ()
         shares = self.demand.lane_shares or (1.0,) * self.road.lanes
         total = sum(shares)
         return tuple(share / total for share in shares)

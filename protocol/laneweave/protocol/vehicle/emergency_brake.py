@@ -18,10 +18,9 @@ moves of duration T_F are possible only up to some reaction time, which `config.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.motion import Jerk, State
 from laneweave.protocol.wire.messages import Neighbour
 
 ERROR_SIGMAS = 4.5
@@ -108,12 +107,16 @@ class EmergencyBrake:
         self._margin_m = assumed.margin_m
 
     def spare_m(
-        self, state: State, setpoint_mps2: float, jerk: Jerk, others: Iterable[Neighbour]
+        self,
+        state: Sequence[float],
+        setpoint_mps2: float,
+        jerk: tuple[float, float],
+        others: Iterable[Neighbour],
     ) -> float:
         """Return the net gap that remains beyond the margin if all vehicles brake.
 
         Args:
-            state: measured state of the body.
+            state: measured (s, v, a, y, v_y, a_y) of the body.
             setpoint_mps2: set-point of its acceleration along the road.
             jerk: jerk until the next tick, within the limits; only the part along the road matters.
             others: vehicles ahead that the body must not hit.
@@ -132,7 +135,7 @@ class EmergencyBrake:
             spare_m = min(spare_m, other.gap_m + path_m - own_m)
         return spare_m - self._margin_m
 
-    def _own_path_m(self, state: State, setpoint_mps2: float, jerk_mps3: float) -> float:
+    def _own_path_m(self, state: Sequence[float], setpoint_mps2: float, jerk_mps3: float) -> float:
         """Return the distance that the vehicle travels if it brakes after its reaction time."""
         _, v, a, _, _, _ = state
         lag_s, tick_s, later_s = self._lag_s, self._tick_s, self._later_s

@@ -36,6 +36,11 @@ ARRIVED_ALONG_M = 0.5
 ARRIVED_ACROSS_M = 0.3
 """Distances from the target point at which a body has arrived once the motion's time has passed."""
 
+DISPLACED_ALONG_M = 1.0
+DISPLACED_ACROSS_M = 0.5
+"""Distances from its cell from which a vehicle no longer holds it, for example after an emergency
+brake: the minimum gaps between bodies in neighbouring cells (`config.cross_checks`)."""
+
 # Poles of the hold law near -0.6 and -1.2 +- 0.8i 1/s: hardly any overshoot, and slow enough for
 # ticks of 0.1 s.
 _POSITION_GAIN = 0.35
@@ -110,6 +115,14 @@ def at_rest_in_cell(state: State, lattice: Lattice, cell: Cell, t_s: float) -> b
     goal = cell_state(lattice, cell, t_s)
     return (
         abs(state[0] - goal[0]) <= ARRIVED_ALONG_M and abs(state[3] - goal[3]) <= ARRIVED_ACROSS_M
+    )
+
+
+def displaced(state: State, lattice: Lattice, cell: Cell, t_s: float) -> bool:
+    """Return whether a body is too far from `cell` to hold it at road time `t_s` [s]."""
+    goal = cell_state(lattice, cell, t_s)
+    return (
+        abs(state[0] - goal[0]) > DISPLACED_ALONG_M or abs(state[3] - goal[3]) > DISPLACED_ACROSS_M
     )
 
 

@@ -1,4 +1,4 @@
-"""Plan execution: the vehicle's side of the protocol, rules V1 to V7.
+"""Plan execution: the vehicle's side of the protocol, rules V1 to V8.
 
 A vehicle holds its cell until all conditions of its next move are *known* to be true: it has
 accepted a plan, every member of the roster has reported that it accepted the same plan (start
@@ -19,6 +19,7 @@ from attrs import define, field
 
 from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
 from laneweave.protocol.state_machine import RuleBook, Transition
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.plans import Needs, dependencies, ownership_problems, plan_problems
 from laneweave.protocol.wire.messages import (
     Ballot,
@@ -36,6 +37,9 @@ OVERDUE_SLOTS = 1.5
 OVERDUE_S = 2.0
 """A move that has been due for 1.5 slots, or a slot and 2 s if that is less, is overdue."""
 TIME_TOLERANCE_S = 1e-6
+LATE_S = 0.2
+"""Delay with which a move that leads out of a lane may still begin; longer ones could end with the
+body partly in the lane at its stop line."""
 
 
 class ExecutionPhase(Enum):
@@ -53,7 +57,7 @@ class ExecutionPhase(Enum):
 
 
 PREPARE, PLAN, STORED, STATE = "PREPARE", "PLAN", "SENSE", "STATE"
-GATE, TICK, REST = "tick (gate)", "tick (move)", "motion ends"
+GATE, TICK, REST, BODY = "tick (gate)", "tick (move)", "motion ends", "body out of its cell"
 
 
 @define
@@ -93,6 +97,8 @@ class PlanExecution:
     """Transfer in the newest plan taken."""
     stored_transfer: PendingTransfer | None = None
     """Newest transfer that the controller has stored."""
+    lane_ends: LaneEnds | None = None
+    """Dead ends of the road; None: there are none."""
     rules: RuleBook = field(factory=lambda: VEHICLE_RULES)
 
     def __attrs_post_init__(self) -> None:
@@ -156,6 +162,10 @@ class PlanExecution:
     def end_motion(self) -> None:
         """V7: complete the current motion."""
         self.rules.take(self, REST, None)
+
+    def displace(self) -> None:
+        """V8: the body is out of the cell that the vehicle should hold."""
+        self.rules.take(self, BODY, None)
 
     @property
     def wanted_accepted(self) -> Ballot | None:
@@ -404,6 +414,17 @@ def move_is_due(execution: PlanExecution, _: object) -> bool:
     return execution.is_due(execution.t_s)
 
 
+def ends_in_time(execution: PlanExecution, _: object) -> bool:
+    """The move, begun now, ends before the stop lines of both lanes."""
+    plan, move, ends = execution.plan, execution.next_move, execution.lane_ends
+    if plan is None or move is None or not ends:
+        return True
+    _, origin, target = move
+    end_s = execution.t_s + plan.slot_s - LATE_S
+    front = max(origin[0], target[0])
+    return not any(ends.has_passed((front, lane), end_s) for lane in (origin[1], target[1]))
+
+
 def is_released(execution: PlanExecution, _: object) -> bool:
     """progress[A] >= needs[A] for all dependencies of the move."""
     progress = execution.progress
@@ -419,6 +440,11 @@ def start_move(execution: PlanExecution, _: object) -> None:
     if move is not None:
         execution.hold_cell = move[2]
         execution.moving = execution.moving_in_plan = True
+
+
+def leave_cell(execution: PlanExecution, _: object) -> None:
+    """Move back to the cell; this motion belongs to no plan."""
+    execution.moving, execution.moving_in_plan = True, False
 
 
 def is_moving(execution: PlanExecution, _: object) -> bool:
@@ -486,11 +512,12 @@ VEHICLE_RULES: RuleBook = RuleBook(
             "V6",
             TICK,
             (_GOING,),
-            (is_holding, has_next_move, move_is_due, is_released),
+            (is_holding, has_next_move, move_is_due, ends_in_time, is_released),
             (start_move,),
         ),
         Transition("V7", REST, _ANY, (is_moving, moved_in_plan), (count_move, rest)),
         Transition("V7", REST, _ANY, (is_moving,), (rest,)),
+        Transition("V8", BODY, _ANY, (is_holding,), (leave_cell,)),
     )
 )
-"""Rules V2 to V7."""
+"""Rules V2 to V8."""

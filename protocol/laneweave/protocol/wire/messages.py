@@ -78,6 +78,14 @@ class PendingTransfer:
     open: bool = False
     """Whether the start gate is open; the cells and the roster are then empty."""
 
+    @property
+    def withdrawn(self) -> bool:
+        """Whether the vehicle has left the lattice since; cells and roster are then empty.
+
+        For this ballot and all lower ones, the vehicle is gone.
+        """
+        return not self.open and not self.roster
+
 
 @frozen
 class Prepare:
@@ -279,6 +287,9 @@ class Sense:
     """Rolling operation: newest transfer of cells. Key on the wire: `deed`."""
     bridge: int = 0
     """Incarnation of the bridge [ns]; a new value means a new road; 0: not given."""
+    off_lattice: bool = False
+    """Whether the vehicle has no cell: it has stopped before the end of its lane, or drives back
+    into the lattice. Its motion controller drives alone."""
 
 
 @frozen
@@ -323,15 +334,28 @@ class Command:
 
 
 @frozen
+class OffLattice:
+    """Body of a vehicle that has no cell; part of `CensusEntry`."""
+
+    lane: int
+    """Lane whose dead end the vehicle has not left in time."""
+    rear_m: float
+    """Position of its rear bumper [m]."""
+
+
+@frozen
 class CensusEntry:
     """Vehicle on the road, as recorded at its entry; part of `Census`."""
 
     vehicle: Name
     cell: Cell
-    """Cell in which it entered; its column determines the block."""
+    """Cell in which it entered the lattice last; its column determines the block."""
     preferred_lane: int
+    """Lane in which it wants to leave the road; -1: any lane that reaches the end."""
     entered_s: float
     """Road time of its entry [s]."""
+    off_lattice: OffLattice | None = None
+    """None: the vehicle has cells, and takes part in plans."""
 
 
 @frozen
@@ -398,6 +422,11 @@ class Census:
     """All blocks up to this number are closed: their vehicles are listed or have left."""
     bridge: int = 0
     """Incarnation of the bridge [ns]; a new value means a new road; 0: not given."""
+
+    @property
+    def on_lattice(self) -> tuple[CensusEntry, ...]:
+        """The vehicles that have cells."""
+        return tuple(entry for entry in self.on_road if entry.off_lattice is None)
 
 
 @frozen

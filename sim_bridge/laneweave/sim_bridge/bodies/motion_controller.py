@@ -11,6 +11,11 @@ Without an agent or new commands, the controller executes its trajectory to the 
 that has ended or was interrupted by an emergency is not resumed: only a new command leads back to
 `execute`. The emergency brake acts on every rung and uses only local sensing.
 
+**Lanes that end.** The stop line before a dead end counts as a vehicle that stands there, on every
+rung. A vehicle whose cell has passed the line leaves the lattice: it gives up its cells, drives up
+to the line and waits. When the roadside has kept cells free for it, it drives out into the
+neighbouring lane and enters the lattice again. All of this needs neither agent nor messages.
+
 The controller also stores the data that must survive the agent: the process in charge, the joined
 blocks, the newest accepted plan, and in the rolling operation the highest promise and the owned
 cells. Only the process in charge can change the hold cell and the trajectory.
@@ -22,7 +27,7 @@ import math
 import sys
 from array import array
 from collections.abc import Iterable, Sequence
-from enum import IntEnum
+from enum import Enum, IntEnum
 
 from attrs import define, evolve, field
 
@@ -30,12 +35,14 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Lattice
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import (
     Jerk,
     State,
     at_rest_in_cell,
     cell_state,
     commanded_state,
+    displaced,
     hold_law,
     keep_gap,
     limited_accel,
@@ -46,9 +53,22 @@ from laneweave.sim_bridge.bodies.plant import Plant
 
 MAX_COLUMN = 2**31 - 1
 """Maximum column: columns are recorded as 32-bit integers. Block numbers are no larger."""
+MAX_LINE_GAP_M = 200.0
+"""Distance from which stop lines are seen; more than any stopping distance."""
+STANDING_MPS = 0.3
+"""Speed below which a vehicle stands."""
 RELEASE_M = 1.0
 """Spare distance, beyond the distance driven in a tick, at which an emergency ends. Without it,
 favourable measurement errors would release the brake repeatedly, and lost distance add up."""
+
+
+class OffLattice(Enum):
+    """What a vehicle without a cell does."""
+
+    WAITING = "waiting"
+    """It drives up to the stop line of its lane, and waits there."""
+    DRIVING_OUT = "driving out"
+    """It drives into the neighbouring lane, towards the cell in which it will enter."""
 
 
 class Rung(IntEnum):
@@ -92,7 +112,11 @@ class MotionController:
     rung_ticks: dict[Rung, int] = field(init=False)
     """Number of ticks spent on each rung."""
     neighbours: Neighbours = NO_NEIGHBOURS
-    """Measured neighbours."""
+    """Measured neighbours; stop lines count as vehicles that stand there."""
+    off_lattice: OffLattice | None = None
+    """None: the vehicle has cells."""
+    _past_line: bool = False
+    """Whether the vehicle has started from standing at a stop line, into another lane."""
     _measured: State | None = None
     _jerks: array[float] = field(init=False)
     """Pairs (along, across) for successive ticks [m/s3]."""
@@ -101,6 +125,7 @@ class MotionController:
     lattice: Lattice = field(init=False)
     tick_s: float = field(init=False)
     _brake: EmergencyBrake = field(init=False)
+    _lane_ends: LaneEnds = field(init=False)
 
     def __attrs_post_init__(self) -> None:
         """Begin without a trajectory, in the block of the cell."""
@@ -112,6 +137,7 @@ class MotionController:
         self.rung_ticks = dict.fromkeys(Rung, 0)
         self._jerks = array("f")
         self._brake = EmergencyBrake(self._scenario)
+        self._lane_ends = LaneEnds(self._scenario)
 
     @property
     def rolling(self) -> bool:
@@ -125,7 +151,64 @@ class MotionController:
 
     def perceive(self, measured: State, neighbours: Neighbours) -> None:
         """Set the measurements of this tick."""
+        if self._lane_ends:
+            lines = self._lines_ahead(measured)
+            neighbours = neighbours._replace(ahead=(*neighbours.ahead, *lines))
         self._measured, self.neighbours = measured, neighbours
+
+    # --- lanes that end -----------------------------------------------------------------------
+
+    def has_lost_cell(self, t_s: float) -> bool:
+        """Return whether the hold cell has passed the stop line of its lane."""
+        return self.off_lattice is None and self._lane_ends.has_passed(self.hold_cell, t_s)
+
+    def leave_lattice(self) -> None:
+        """Give up all cells; from now on no process can move the vehicle.
+
+        The stored transfer tells leaders that the vehicle is gone for all ballots so far.
+        """
+        self.off_lattice = OffLattice.WAITING
+        self._granted, self.owned = frozenset(), ()
+        ballots = [ballot for ballot in (self.promised, self.accepted) if ballot is not None]
+        if self.transfer is not None:
+            ballots.append(self.transfer.ballot)
+        if ballots:
+            self.transfer = PendingTransfer(max(ballots))
+        self.accepted = None
+        self._stop_motion()
+
+    def drive_out(self, cell: Cell) -> None:
+        """Begin to drive into the neighbouring lane, towards a cell that is kept free."""
+        self.off_lattice, self.hold_cell = OffLattice.DRIVING_OUT, cell
+        self._past_line = True
+        self._stop_motion()
+
+    def enter_lattice(self, cells: Iterable[Cell]) -> None:
+        """Take cells, among them the hold cell, in which the vehicle is."""
+        self.off_lattice = None
+        for cell in cells:
+            self.assign_cell(cell)
+
+    def _stop_motion(self) -> None:
+        self._jerks = self._jerks[:0]
+        self.motion_origin, self.motion_end_tick, self.motion_ticks = self.hold_cell, 0, 0
+
+    def _lines_ahead(self, measured: State) -> list[Neighbour]:
+        """Return the stop lines of the lanes that the body touches or enters, as vehicles.
+
+        For a vehicle that starts from standing at a line into another lane, the end of the lane
+        counts instead.
+        """
+        s_m, speed_mps, goal = measured[0], measured[1], self.hold_cell[1]
+        first, last = self.lattice.lanes_touched(measured[3], self._scenario.vehicle.width_m)
+        lanes = {*range(first, last + 1), goal}
+        ends = [end for lane in lanes if (end := self._lane_ends.ahead(lane, s_m)) is not None]
+        if all(end.lane == goal for end in ends):
+            self._past_line = False
+        elif speed_mps < STANDING_MPS:
+            self._past_line = True
+        lines = [(end.lane, (end.end_m if self._past_line else end.line_m) - s_m) for end in ends]
+        return [Neighbour(lane, gap_m, 0.0) for lane, gap_m in lines if gap_m < MAX_LINE_GAP_M]
 
     def accept_command(self, command: Command) -> bool:
         """Accept a command from the process in charge, or from a newer one, which takes charge.
@@ -149,6 +232,8 @@ class MotionController:
             return False
         jerks = self._checked_jerks(command)
         leaves = command.hold_cell != self.hold_cell
+        if self.off_lattice is not None and (leaves or len(jerks) > 0):
+            return False
         if command.incarnation > self.attendant:
             if leaves:
                 return False
@@ -206,7 +291,8 @@ class MotionController:
 
         In the rolling operation the transfer of this ballot must be pending.
         """
-        if self.rolling and (self.transfer is None or self.transfer.ballot != ballot):
+        transfer = self.transfer
+        if self.rolling and (transfer is None or transfer.ballot != ballot or transfer.withdrawn):
             return
         self.accepted = ballot if self.accepted is None else max(self.accepted, ballot)
 
@@ -227,15 +313,19 @@ class MotionController:
 
     def complete_transfer(self, ballot: Ballot) -> None:
         """Complete the pending transfer of a plan whose start gate is open."""
-        if self.transfer is not None and self.transfer.ballot == ballot and not self.transfer.open:
-            self.owned, self.transfer = self.transfer.after, PendingTransfer(ballot, open=True)
+        transfer = self.transfer
+        if transfer is None or transfer.ballot != ballot:
+            return
+        if not (transfer.open or transfer.withdrawn):
+            self.owned, self.transfer = transfer.after, PendingTransfer(ballot, open=True)
 
     def assign_cell(self, cell: Cell) -> None:
         """Add an empty cell that the roadside has assigned to the vehicle."""
         self._granted |= {cell}
         self.owned = tuple(sorted({*self.owned, cell}))
-        if self.transfer is not None and not self.transfer.open:
-            self.transfer = _with_cells(self.transfer, {cell})
+        transfer = self.transfer
+        if transfer is not None and not (transfer.open or transfer.withdrawn):
+            self.transfer = _with_cells(transfer, {cell})
 
     def join(self, blocks: Iterable[int]) -> None:
         """Add joined blocks."""
@@ -246,9 +336,16 @@ class MotionController:
 
         A late body continues to move after the planned end of its motion.
         """
-        return tick < self.motion_end_tick or not at_rest_in_cell(
-            self.measured, self.lattice, self.hold_cell, tick * self.tick_s
-        )
+        return tick < self.motion_end_tick or not self.at_rest(tick * self.tick_s)
+
+    def at_rest(self, t_s: float) -> bool:
+        """Return whether the body is in its cell at road time `t_s`."""
+        return at_rest_in_cell(self.measured, self.lattice, self.hold_cell, t_s)
+
+    def displaced(self, tick: int) -> bool:
+        """Return whether the body is too far from its cell to hold it at `tick`."""
+        t_s = tick * self.tick_s
+        return displaced(self.measured, self.lattice, self.hold_cell, t_s)
 
     def step(self, tick: int) -> None:
         """Advance from `tick` to the next one."""
@@ -293,14 +390,18 @@ class MotionController:
         body = self.measured
         state = commanded_state(body, self.plant.setpoint, limits, speed_mps)
         goal = cell_state(self.lattice, self.hold_cell, tick * self.tick_s)
+        if self.off_lattice is OffLattice.WAITING:
+            goal = (state[0], *goal[1:])  # at v_F in its lane, up to the line
         jerk = hold_law(state, goal, limits, self.tick_s)
-        lag_s = limits.actuator_lag_s
+        lag_s, goal_lane = limits.actuator_lag_s, self.hold_cell[1]
         ahead = [
             (
                 other.gap_m + lag_s * (other.speed_mps - body[1]),
                 other.speed_mps + lag_s * other.accel_mps2,
             )
             for other in near
+            # A vehicle that starts into another lane brakes for the end of its own only if it must.
+            if not self._past_line or other.lane == goal_lane
         ]
         min_gap_m = self._scenario.tracking.min_gap_m
         careful = keep_gap(state, jerk, ahead, limits, min_gap_m, self.tick_s)

@@ -192,12 +192,16 @@ class RunRecord:
         self._rung_ticks.update(vehicle.rung_ticks)
         self._left_unattended += not attended
         preferred_lane = vehicle.arrival.preferred_lane
-        on_preferred_lane = lane == preferred_lane
+        on_preferred_lane = vehicle.arrival.prefers(lane)
         where = {"vehicle": vehicle.name, "lane": lane}
         self.event(left_s, LEFT, **where, on_preferred_lane=on_preferred_lane)
         if not on_preferred_lane:
             lanes = {**where, "preferred_lane": preferred_lane}
             self.event(left_s, LEFT_OFF_LANE, **lanes, attended=attended)
+
+    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
+        """Record that a vehicle has left the lattice at a dead end, or comes back; see `events`."""
+        self.event(t_s, kind, vehicle=vehicle, lane=lane)
 
     def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
         """Record a vehicle that is still on the road when the run ends."""

@@ -66,13 +66,13 @@ class Trip:
         """Return the row of the trip; travel time includes waiting at the entrance."""
         demanded_s, entered_s, left_s = self.arrival.t_s, self.entered_s, self.left_s
         entered_in_time = entered_s is not None and WARM_UP_S <= entered_s <= last_arrival_s
-        left = self.final_lane is not None
+        lane = self.final_lane
         return {
             "vehicle": self.arrival.vehicle,
             "arrival_lane": self.arrival.lane,
             "preferred_lane": self.arrival.preferred_lane,
-            "final_lane": self.final_lane,
-            "on_preferred_lane": self.final_lane == self.arrival.preferred_lane if left else None,
+            "final_lane": lane,
+            "on_preferred_lane": None if lane is None else self.arrival.prefers(lane),
             "demanded_s": demanded_s,
             "entered_s": entered_s,
             "left_s": left_s,

@@ -52,19 +52,27 @@ class Caretaker:
         Raises:
             ValueError: the incarnation is not greater than that of the process in charge.
         """
-        controller = vehicle.controller
-        controller.put_in_charge(incarnation)
+        vehicle.controller.put_in_charge(incarnation)
         self._vehicle = vehicle
-        self._execution = PlanExecution(
+        self._incarnation = incarnation
+        self._off_lattice = False
+        """Whether the vehicle had no cell in the last tick."""
+        self._execution = self._begin(tick)
+
+    def _begin(self, tick: int) -> PlanExecution:
+        """Return a plan execution that begins with what the controller stores."""
+        vehicle, controller = self._vehicle, self._vehicle.controller
+        execution = PlanExecution(
             vehicle=vehicle.name,
-            incarnation=incarnation,
+            incarnation=self._incarnation,
             hold_cell=controller.hold_cell,
             lattice=controller.lattice,
             joined=controller.joined,
             moving=controller.moving(tick),
             owned=frozenset(controller.owned) if controller.rolling else None,
         )
-        self._execution.on_owned(vehicle.sense(tick, caretaker=True))
+        execution.on_owned(vehicle.sense(tick, caretaker=True))
+        return execution
 
     def on_message(self, message: Prepare | Plan, tick: int) -> VehicleState | None:
         """Promise a ballot (V2), or accept a plan in which this vehicle does not move (V3).
@@ -73,6 +81,8 @@ class Caretaker:
             The state to publish at once; None if the message has no effect.
         """
         execution, controller = self._execution, self._vehicle.controller
+        if self._off_lattice:
+            return None
         if isinstance(message, Prepare):
             accepted = execution.on_prepare(message)
             controller.join(execution.wanted_joined)
@@ -91,9 +101,16 @@ class Caretaker:
 
     def state(self, tick: int) -> VehicleState:
         """Return the state to publish; end the motion if the controller has completed it (V7)."""
-        vehicle, execution = self._vehicle, self._execution
-        if execution.moving and not vehicle.controller.moving(tick):
+        vehicle, controller = self._vehicle, self._vehicle.controller
+        off_lattice = controller.off_lattice is not None
+        if off_lattice or self._off_lattice:
+            self._execution = self._begin(tick)
+        self._off_lattice = off_lattice
+        execution = self._execution
+        if execution.moving and not controller.moving(tick):
             execution.end_motion()
+        if controller.displaced(tick):
+            execution.displace()
         return execution.state(vehicle.sense(tick, caretaker=True), attended=False)
 
 

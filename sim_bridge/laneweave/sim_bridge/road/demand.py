@@ -4,10 +4,10 @@ In each lane the headway between two arrivals is
 
     min_headway + Exp(3600 / volume - min_headway)      (mean 3600 / volume seconds),
 
-and the preferred lane of each vehicle is drawn from the scenario's lane shares. Every lane has one
-random generator for headways and one for preferences, seeded with the scenario's seed. The same
-seed gives the same arrivals, arrivals in a lane do not depend on other lanes, and a longer duration
-only appends arrivals, without changing the names of earlier ones.
+and the preferred lane of each vehicle is drawn from the scenario's lane shares, if there are any.
+Every lane has one random generator for headways and one for preferences, seeded with the scenario's
+seed. The same seed gives the same arrivals, arrivals in a lane do not depend on other lanes, and a
+longer duration only appends arrivals, without changing the names of earlier ones.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from attrs import frozen
 from numpy.random import SeedSequence, default_rng
 
 from laneweave.protocol.config.participants import vehicle_name
+from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 
 _HEADWAYS, _PREFERENCES = 0, 1
@@ -35,9 +36,13 @@ class Arrival:
     lane: int
     """Lane in which the vehicle arrives; 0 is the rightmost."""
     preferred_lane: int
-    """Lane in which the vehicle wants to leave the road."""
+    """Lane in which the vehicle wants to leave the road; `ANY_LANE`: no preference."""
     t_s: float
     """Road time at which the vehicle would pass the start of an empty road."""
+
+    def prefers(self, lane: int) -> bool:
+        """Return whether the vehicle may leave the road in a lane."""
+        return self.preferred_lane in (lane, ANY_LANE)
 
 
 def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
@@ -66,8 +71,9 @@ def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int]]:
         default_rng(SeedSequence(scenario.seed, spawn_key=(purpose, lane)))
         for purpose in (_HEADWAYS, _PREFERENCES)
     )
+    shares = scenario.lane_shares
     # Drop the last bound: rounded to less than 1, it would exclude some draws in [0, 1).
-    bounds = np.array([*accumulate(scenario.lane_shares)][:-1])
+    bounds = np.array([*accumulate(shares)][:-1])
     result: list[tuple[float, int]] = []
     t_s = 0.0
     while True:
@@ -75,4 +81,4 @@ def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int]]:
         if t_s > demand.duration_s:
             return result
         preferred = int(np.searchsorted(bounds, preferences.random(), side="right"))
-        result.append((float(t_s), preferred))
+        result.append((float(t_s), preferred if shares else ANY_LANE))

@@ -19,6 +19,7 @@ from bisect import insort
 from attrs import frozen
 
 from laneweave.protocol.lattice import Cell, Lattice
+from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.formation_building import FormationBuilder
 
@@ -73,6 +74,12 @@ class EntryMeter:
         """Queued vehicles, ordered by lane."""
         return tuple(arrival for queue in self._queues for arrival in queue)
 
+    def keep_free(self, lane: int, count: int) -> range:
+        """Return the next columns of a lane, which no vehicle may enter any more."""
+        first = self._columns[lane]
+        self._columns[lane] = first - count
+        return range(first - count + 1, first + 1)
+
     def closed_column(self, lane: int) -> int:
         """Return the rearmost column of a lane that vehicles can no longer enter."""
         return self._columns[lane] + 1
@@ -84,7 +91,7 @@ class EntryMeter:
             ValueError: a lane does not exist, or the vehicle is already queued.
         """
         lanes = range(self._lattice.lanes)
-        if arrival.lane not in lanes or arrival.preferred_lane not in lanes:
+        if arrival.lane not in lanes or arrival.preferred_lane not in (ANY_LANE, *lanes):
             raise ValueError(f"{arrival} needs lanes 0 to {self._lattice.lanes - 1}")
         if arrival.vehicle in self._names:
             raise ValueError(f"{arrival.vehicle} is already waiting")

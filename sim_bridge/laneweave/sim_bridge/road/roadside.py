@@ -23,6 +23,7 @@ from laneweave.protocol.wire.topics import CENSUS, CLOCK
 from laneweave.sim_bridge.road.demand import Arrival, arrivals, count_until
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter
 from laneweave.sim_bridge.road.formation_building import formation_builder
+from laneweave.sim_bridge.road.lane_end_control import LaneEndChange, LaneEndControl
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 CENSUS_EVERY_TICKS = 10
@@ -59,6 +60,7 @@ class Roadside:
             self._builder,
             interlaced=formation.interlaced,
         )
+        self._lane_ends = LaneEndControl(scenario, self._meter.keep_free)
         self._closed: list[ClosedFormation] = []
         """Closed formations with vehicles on the road."""
         self._closed_to = -1
@@ -131,7 +133,7 @@ class Roadside:
             for column in range(self._assigned_to[lane] - 1, closed - 1, -1):
                 if self._next[lane] and self._next[lane][0][0] == column:
                     self._store_recent(column, lane, self._next[lane].pop(0)[1])
-                else:
+                elif not self._lane_ends.is_kept_free((column, lane)):
                     self._assign((column, lane), vehicles)
             self._assigned_to[lane] = closed
         unassigned, self._unassigned = self._unassigned, []
@@ -158,6 +160,17 @@ class Roadside:
         far = column + 2 * self._max_empty
         self._recent = [one for one in self._recent if one[0] <= far]
         self._recent.append((column, lane, name))
+
+    def control_lane_ends(
+        self, vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> list[LaneEndChange]:
+        """Take vehicles off the lattice whose lanes end, and bring them back (rolling operation).
+
+        Must be called before `assign_empty_cells`, from which gaps are excluded.
+        """
+        changes = list(self._lane_ends.update(vehicles, t_s))
+        self._census_changed |= bool(changes)
+        return changes
 
     def count_left(self) -> None:
         """Count a vehicle that has passed the end of the road."""
@@ -206,6 +219,7 @@ class Roadside:
     def census(self, t_s: float, on_road: Iterable[RoadVehicle]) -> Census:
         """Return the census: vehicles on the road, announcements and closed formations."""
         vehicles = tuple(on_road)
+        off_lattice = self._lane_ends.bodies({vehicle.name: vehicle for vehicle in vehicles})
         present = {vehicle.formation for vehicle in vehicles}
         self._closed = [closed for closed in self._closed if closed.first_block in present]
         return Census(
@@ -216,6 +230,7 @@ class Roadside:
                     cell=vehicle.admission.cell,
                     preferred_lane=vehicle.admission.arrival.preferred_lane,
                     entered_s=vehicle.admission.t_s,
+                    off_lattice=off_lattice.get(vehicle.name),
                 )
                 for vehicle in vehicles
             ),

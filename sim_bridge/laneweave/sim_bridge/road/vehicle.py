@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-from attrs import define
+from attrs import define, evolve
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
@@ -125,7 +125,13 @@ class RoadVehicle:
             promised=controller.promised,
             transfer=controller.transfer,
             bridge=self.bridge,
+            off_lattice=controller.off_lattice is not None,
         )
+
+    def enter_lattice(self, cells: Sequence[Cell]) -> None:
+        """Enter the lattice again: the roadside assigns cells, among them the hold cell."""
+        self.admission = evolve(self.admission, cell=self.controller.hold_cell)
+        self.controller.enter_lattice(cells)
 
     def step(self, tick: int) -> None:
         """Advance from `tick` to the next one."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import count
 from typing import Any
 
@@ -12,7 +12,7 @@ from attrs import define, evolve, field
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry
-from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import NO_ENDS, StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import checked, stream_planner, stream_road
 from laneweave.coordinator.rolling.operation import (
     LISTEN_S,
@@ -32,6 +32,7 @@ from laneweave.protocol.wire.messages import (
     Census,
     CensusEntry,
     Name,
+    OffLattice,
     PendingTransfer,
     Plan,
     Prepare,
@@ -80,6 +81,12 @@ class Call:
     vehicles: dict[str, StreamVehicle]
     before: StreamPlan | None
     blocked: frozenset[Cell]
+    ends_m: dict[int, float]
+
+
+def place_m(state: State) -> float:
+    """Return where a vehicle is that is in its cell."""
+    return ROLLING.lattice.cell_s_m(state.hold_cell[0], state.t_s)
 
 
 @define
@@ -108,16 +115,19 @@ class Bench:
         vehicles: Iterable[StreamVehicle],
         before: StreamPlan | None = None,
         blocked: Iterable[Cell] = (),
+        ends_m: Mapping[int, float] = NO_ENDS,
     ) -> StreamPlan:
         asked = {vehicle.vehicle: vehicle for vehicle in vehicles}
-        self.calls.append(Call(slot, asked, before, frozenset(blocked)))
+        self.calls.append(Call(slot, asked, before, frozenset(blocked), dict(ends_m)))
         return StreamPlan(slot, self.ways, self.missed)
 
     def new_job(self) -> int:
         return next(iter(self.jobs))
 
     def hear(self, *states: State) -> list[LogEntry]:
-        return [entry for each in states for entry in self.control.on_state(each, 0.0) or ()]
+        """Hear the states of vehicles that are in their cells."""
+        placed = [evolve(each, s_m=place_m(each)) for each in states]
+        return [entry for each in placed for entry in self.control.on_state(each, 0.0) or ()]
 
     def order(self, t_s: float = LOOK_S, now_s: float | None = None) -> Compute | None:
         """Order at a road time; the node's clock is alike, unless it is given."""
@@ -285,6 +295,32 @@ def test_later_states_do_not_count() -> None:
     assert set(desk.calls[1].vehicles) == {B, D}
 
 
+@pytest.mark.parametrize(
+    ("ahead_m", "held"), [(15.9, False), (16.1, True), (-15.9, False), (-16.1, True)]
+)
+def test_a_body_that_is_more_than_a_move_from_its_cell_is_held(
+    ahead_m: float, *, held: bool
+) -> None:
+    """It is not ready for plans, and others plan around its cell."""
+    desk = bench(A)
+    state = evolve(shown(A), t_s=BEGUN_S + SNAPSHOT_S)
+    desk.control.on_state(evolve(state, s_m=place_m(state) + ahead_m), 0.0)
+    desk.think()
+    assert desk.calls[0].vehicles[A].held == held
+
+
+def test_vehicles_without_cells_are_not_planned_and_end_the_sections_they_are_in() -> None:
+    desk = bench(A, B)
+    entries = census(A, B).on_road
+    body = OffLattice(lane=1, rear_m=700.0)
+    desk.control.on_census(
+        evolve(census(A), on_road=(entries[0], evolve(entries[1], off_lattice=body)))
+    )
+    desk.think()
+    assert set(desk.calls[0].vehicles) == {A}
+    assert desk.calls[0].ends_m == {1: 700.0}
+
+
 def test_states_may_arrive_in_any_order() -> None:
     desk = bench(A)
     desk.hear(evolve(shown(A), hold_cell=(2, 0), t_s=LOOK_S))
@@ -431,7 +467,7 @@ def test_the_newest_state_counts_in_whichever_order_they_come(older: State, newe
         desk = Bench()
         desk.control.on_census(census(A))
         desk.hear(*states)
-        assert desk.control.observed.states[A] == newer
+        assert desk.control.observed.states[A] == evolve(newer, s_m=place_m(newer))
 
 
 def test_ballots_are_above_all_that_was_promised() -> None:

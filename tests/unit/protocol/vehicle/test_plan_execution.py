@@ -1,4 +1,4 @@
-"""Rules V1 to V7 of the execution protocol, guard by guard."""
+"""Rules V1 to V8 of the execution protocol, guard by guard."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ import pytest
 from attrs import evolve
 
 from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
+from laneweave.protocol.scenario.fields import Closure
+from laneweave.protocol.vehicle.lane_ends import LaneEnds, drive_out
 from laneweave.protocol.vehicle.plan_execution import (
+    LATE_S,
     LISTEN_S,
     VEHICLE_RULES,
     ExecutionPhase,
     PlanExecution,
 )
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
+from support.convoy import ROLLING
 from support.rule_books import RuleRecorder
 from support.states import holding
 from support.states import make_plan as plan_of
@@ -423,6 +427,44 @@ def test_the_state_says_what_the_vehicle_knows_and_senses(*, attended: bool) -> 
     assert accepted().state(late, attended=attended).overdue
 
 
+# --- bodies out of their cells, and lanes that end ----------------------------------------------
+
+
+def test_a_body_out_of_its_cell_is_not_ready_until_it_is_back() -> None:
+    execution = accepted()
+    execution.on_state(shown())
+    execution.displace()
+    assert (execution.moving, execution.moving_in_plan, execution.ready) == (True, False, False)
+    assert execution.tick(T0_S) is None
+    assert not execution.go
+    execution.end_motion()
+    assert (execution.ready, execution.completed) == (True, 0)
+    assert execution.tick(T0_S) is not None
+
+
+def test_a_body_out_of_its_cell_does_not_interrupt_a_move() -> None:
+    execution = going()
+    assert execution.tick(T0_S) is not None
+    execution.displace()
+    assert execution.moving_in_plan
+    execution.end_motion()
+    assert execution.completed == 1
+
+
+@pytest.mark.parametrize("lane", [0, 1])
+@pytest.mark.parametrize(("late_s", "begins"), [(0.0, True), (LATE_S, True), (0.3, False)])
+def test_a_move_from_or_into_a_lane_that_ends_begins_only_if_it_ends_before_the_stop_line(
+    lane: int, late_s: float, *, begins: bool
+) -> None:
+    # The move from (-4, 0) to (-4, 1) takes one slot; the line is where it ends if it is punctual.
+    line_m = ROLLING.lattice.cell_s_m(-4, T0_S + SLOT_S)
+    room_m = drive_out(ROLLING).room_m
+    road = evolve(ROLLING.road, s3_m=20_000.0, closures=(Closure(lane, line_m + room_m + 1e-6),))
+    execution = going()
+    execution.lane_ends = LaneEnds(evolve(ROLLING, road=road))
+    assert (execution.tick(T0_S + late_s) is not None) == begins
+
+
 # --- the table as a whole ---------------------------------------------------------------------
 
 
@@ -448,9 +490,12 @@ def test_a_history_takes_every_row_of_the_table() -> None:
     assert execution.on_stored(HIGH)
     for _ in range(2):
         execution.on_state(shown(ballot=HIGH, go=True))
+    for _ in range(2):
+        execution.displace()
     rules = [f"{book.table[row].rule} row {row}" for row in book.taken]
     assert rules == [
         "V7 row 9", "V2 row 0", "V2 row 1", "V3 row 2", "V3 row 3", "V4 row 5", "V5 row 6",
         "V6 row 7", "V7 row 8", "V2 row 0", "V3 row 2", "V3 row 3", "V4 row 4", "V4 row 5",
+        "V8 row 10",
     ]  # fmt: skip
     assert {*book.taken} == {*range(len(VEHICLE_RULES.table))}

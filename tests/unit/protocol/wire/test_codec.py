@@ -312,6 +312,8 @@ def right_value(hint: Any) -> Any:  # noqa: ANN401
     parts = get_args(hint)
     if get_origin(hint) is tuple:
         return [] if parts[-1] is Ellipsis else [right_value(part) for part in parts]
+    if NoneType in parts:
+        return None
     return {int: 1, float: 1.0, bool: True, bytes: b"", Name: "v1", Ballot: [1, "c", 2, 3]}[hint]
 
 

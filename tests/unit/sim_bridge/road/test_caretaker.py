@@ -174,12 +174,15 @@ def test_the_move_of_the_agent_before_it_counts_until_its_end(vehicle: RoadVehic
     assert vehicle.state[0] == pytest.approx(PAPER.lattice.cell_s_m(NEXT[0], 15.0), abs=0.1)
 
 
-def test_a_body_that_gives_way_does_not_count_as_moving(
-    caretaker: Caretaker, vehicle: RoadVehicle
+@pytest.mark.parametrize(("back_m", "moving"), [(0.8, False), (1.2, True)])
+def test_a_body_that_gives_way_counts_as_moving_once_it_is_out_of_its_cell(
+    caretaker: Caretaker, vehicle: RoadVehicle, back_m: float, *, moving: bool
 ) -> None:
     """It keeps its claim to the cell, and comes back to it."""
     caretaker.state(0)
     state = vehicle.state
-    vehicle.controller.plant._state = (state[0] - 3.0, *state[1:])
+    vehicle.controller.plant._state = (state[0] - back_m, *state[1:])
     assert vehicle.controller.moving(0)
+    assert caretaker.state(0).moving == moving
+    vehicle.controller.plant._state = state
     assert not caretaker.state(0).moving

@@ -157,7 +157,7 @@ def test_impossible_demands_are_refused() -> None:
     with pytest.raises(ValueError, match="lanes 0 to 2"):
         meter.demand(Arrival("off", 3, 0, 0.0))
     with pytest.raises(ValueError, match="lanes 0 to 2"):
-        meter.demand(Arrival("off", 0, -1, 0.0))
+        meter.demand(Arrival("off", 0, -2, 0.0))
 
 
 @pytest.mark.parametrize(("volume", "most_s"), [(1000.0, 1.5), (1450.0, 2.5), (1600.0, 4.0)])

@@ -26,6 +26,7 @@ import numpy as np
 from laneweave.coordinator.planning.rolling import search_kernel as kernel
 from laneweave.coordinator.planning.rolling.arrays import Ints, Window, window
 from laneweave.coordinator.planning.rolling.problem import (
+    NO_ENDS,
     CellPath,
     StreamCosts,
     StreamPlan,
@@ -59,6 +60,7 @@ class StreamPlanner:
         vehicles: Sequence[StreamVehicle],
         before: StreamPlan | None = None,
         blocked: Collection[Cell] = (),
+        ends_m: Mapping[int, float] = NO_ENDS,
     ) -> StreamPlan:
         """Return paths for all vehicles from the beginning of a slot on.
 
@@ -67,19 +69,21 @@ class StreamPlanner:
             vehicles: all vehicles on the road, each in a different cell.
             before: an earlier plan; the search starts from its paths that are still valid.
             blocked: cells that must not be entered; a vehicle in one may leave it.
+            ends_m: sections that end earlier now [m], by index.
 
         Raises:
             ValueError: two vehicles share a cell, or one is off the lanes.
         """
         began_s = time.monotonic()
-        _check(self.road, vehicles)
-        end = self.road.length_m - slot * self.road.advance_m
+        road = self.road.ending_at(ends_m)
+        _check(road, vehicles)
+        end = road.length_m - slot * road.advance_m
         paths: dict[str, CellPath] = {v.vehicle: (v.cell,) for v in vehicles}
-        order = [v for v in vehicles if v.cell[0] * self.road.pitch_m <= end + 1e-6]
+        order = [v for v in vehicles if v.cell[0] * road.pitch_m <= end + 1e-6]
         order.sort(key=lambda one: one.cell)
         rounds = 0
         if order:
-            arrays = window(self.road, self.costs, slot, order, blocked)
+            arrays = window(road, self.costs, slot, order, blocked)
             earlier = _earlier_paths(slot, order, before, arrays.low)
             # Hashed, so that the sequences of neighbouring slots are independent.
             rng = np.random.SeedSequence((self._seed, slot & 0xFFFFFFFF)).generate_state(1, "u8")
@@ -91,13 +95,12 @@ class StreamPlanner:
                     arrays.table,
                     arrays.paths,
                     arrays.costs,
-                    self.road.rounds,
-                    self.road.max_paths,
+                    road.rounds,
+                    road.max_paths,
                     rng,
                     arrays.scratch,
                 )
             paths |= _paths_of(order, arrays)
-        road = self.road
         missed = tuple(
             v.vehicle
             for v in vehicles

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
+from types import MappingProxyType
 
-from attrs import Attribute, Factory, field, frozen
+from attrs import Attribute, Factory, evolve, field, frozen
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.protocol.lattice import Cell, Mode
-from laneweave.protocol.road_layout import LaneSection, straight_lanes
+from laneweave.protocol.road_layout import LaneSection, open_sections
 
 ROUNDING_M = 1e-6
 """Tolerance for comparing positions."""
 
+NO_ENDS: Mapping[int, float] = MappingProxyType({})
+"""No section ends earlier than the road's description says."""
 Section = tuple[float, float, int]
 """Begin and end of a lane section [m] for planning, and its index in `StreamRoad.sections`."""
 CellPath = tuple[Cell, ...]
@@ -50,9 +53,19 @@ class StreamRoad:
     max_paths: int = 50_000
     """Maximum number of path searches (about 5 us each) per slot."""
     sections: tuple[LaneSection, ...] = Factory(
-        lambda road: straight_lanes(road.lanes, road.length_m), takes_self=True
+        lambda road: open_sections(road.lanes, road.length_m), takes_self=True
     )
     """Where the lanes are open; by default all of them from end to end."""
+
+    def ending_at(self, ends_m: Mapping[int, float]) -> StreamRoad:
+        """Return the road with earlier ends of some sections [m], by index."""
+        if not ends_m:
+            return self
+        sections = tuple(
+            evolve(section, to_m=min(section.to_m, ends_m.get(number, math.inf)))
+            for number, section in enumerate(self.sections)
+        )
+        return evolve(self, sections=sections)
 
     def position_m(self, slot: int, column: int) -> float:
         """Return the position of a column at the beginning of a slot."""

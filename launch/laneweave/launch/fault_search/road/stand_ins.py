@@ -6,13 +6,18 @@ Safety does not depend on any of them.
 from __future__ import annotations
 
 import random
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import attrs
 from attrs import frozen
 
 from laneweave.agents.driving.driver import Drive, SolverStats
-from laneweave.coordinator.planning.rolling.problem import CellPath, StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import (
+    NO_ENDS,
+    CellPath,
+    StreamPlan,
+    StreamVehicle,
+)
 from laneweave.coordinator.rolling.checked_planner import stream_road
 from laneweave.protocol.lattice import Cell, PlannedMove, displacements, footprint
 from laneweave.protocol.scenario.fields import Scenario
@@ -209,9 +214,10 @@ class LightPlanner:
         vehicles: Sequence[StreamVehicle],
         before: StreamPlan | None = None,
         blocked: Collection[Cell] = (),
+        ends_m: Mapping[int, float] = NO_ENDS,
     ) -> StreamPlan:
         """Return the cells of all vehicles at the start and the end of the next slot."""
-        del before
+        del before, ends_m
         rng = random.Random(f"{self._seed}/{slot}")  # noqa: S311 (simulation, no secrets)
         taken = {vehicle.cell for vehicle in vehicles} | set(blocked)
         paths: dict[str, CellPath] = {vehicle.vehicle: (vehicle.cell,) for vehicle in vehicles}

@@ -1,0 +1,190 @@
+"""Ends of lanes: where vehicles stop that cannot leave a lane before it ends.
+
+Before each dead end there is a *stop line*, so far from the end that a vehicle standing at it can
+accelerate and change lanes before the end (`drive_out`). All cells of the lane beyond the line are
+useless: no plan leads there, and a vehicle whose cell has passed the line has left the lattice.
+docs/SAFETY.md derives the rules.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import lru_cache
+
+from attrs import frozen
+
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import LaneSection
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.emergency_brake import ERROR_SIGMAS, EmergencyBrake, spare_error_m
+from laneweave.protocol.vehicle.motion import (
+    ARRIVED_ALONG_M,
+    State,
+    at_rest_in_cell,
+    cell_state,
+    commanded_state,
+    hold_law,
+    integrate,
+)
+from laneweave.protocol.wire.messages import Neighbour
+
+_MAX_COLUMNS = 12
+"""Upper bound on the columns that a vehicle needs to drive out."""
+_MAX_DRIVE_OUT_S = 60.0
+_FAR_M = 1000.0
+
+
+@frozen
+class DeadEnd:
+    """The dead end of a section of a lane."""
+
+    lane: int
+    from_m: float
+    """Where the section begins; -inf: before the start of the road."""
+    line_m: float
+    """The stop line."""
+    end_m: float
+    """Where the lane ends."""
+    reopens_m: float
+    """Where the lane is open again; inf: nowhere."""
+
+
+@frozen
+class DriveOut:
+    """How a vehicle gets from standing at a stop line into the neighbouring lane."""
+
+    room_m: float
+    """Distance from the stop line to the end of the lane."""
+    columns: int
+    """Number of columns of the neighbouring lane that it needs; it ends in the rearmost."""
+    distance_m: float
+    """Distance in which it arrives in its cell."""
+
+
+class LaneEnds:
+    """The dead ends of a scenario's road."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Derive the stop lines; a road without dead ends has none."""
+        self._lattice = scenario.lattice
+        self._by_lane = tuple(
+            tuple(each for each in dead_ends(scenario) if each.lane == lane)
+            for lane in range(scenario.road.lanes)
+        )
+
+    def __bool__(self) -> bool:
+        """Return whether there are any."""
+        return any(self._by_lane)
+
+    def __iter__(self) -> Iterator[DeadEnd]:
+        """Yield all dead ends, by lane and position."""
+        for ends in self._by_lane:
+            yield from ends
+
+    def ahead(self, lane: int, s_m: float) -> DeadEnd | None:
+        """Return the dead end of the section in which a position is, or which it has passed."""
+        if not 0 <= lane < len(self._by_lane):
+            return None
+        for end in self._by_lane[lane]:
+            if end.from_m <= s_m < end.reopens_m:
+                return end
+        return None
+
+    def has_passed(self, cell: Cell, t_s: float) -> bool:
+        """Return whether a cell has passed the stop line of its lane at road time `t_s`."""
+        s_m = self._lattice.cell_s_m(cell[0], t_s)
+        end = self.ahead(cell[1], s_m)
+        return end is not None and s_m > end.line_m
+
+
+def dead_ends(scenario: Scenario) -> tuple[DeadEnd, ...]:
+    """Return the dead ends of a road, by lane and position."""
+    sections = scenario.road.sections
+    if all(section.exit for section in sections):
+        return ()
+    room_m = drive_out(scenario).room_m
+    found = []
+    for number, section in enumerate(sections):
+        if not section.exit:
+            later = [each.from_m for each in sections[number + 1 :] if each.lane == section.lane]
+            reopens_m = min(later, default=math.inf)
+            line_m, end_m = section.to_m - room_m, section.to_m
+            found.append(DeadEnd(section.lane, section.from_m, line_m, end_m, reopens_m))
+    return tuple(found)
+
+
+def lane_beside(scenario: Scenario, end: DeadEnd) -> int | None:
+    """Return the lane into which vehicles drive out at a dead end; None: there is none.
+
+    It is open from before the stop line until a vehicle that drives out has arrived in its cell.
+    """
+    needed = drive_out(scenario)
+    pitch_m = scenario.lattice.pitch_m
+    from_m = end.line_m - needed.columns * pitch_m - scenario.vehicle.length_m
+    to_m = min(end.line_m + needed.distance_m, scenario.road.length_m)
+    for lane in (end.lane + 1, end.lane - 1):
+        for section in sections_to_lines(scenario):
+            if section.lane == lane and section.from_m <= from_m and to_m <= section.to_m:
+                return lane
+    return None
+
+
+def sections_to_lines(scenario: Scenario) -> tuple[LaneSection, ...]:
+    """Return the sections of a road, as far as plans may use them: dead ends at the stop lines."""
+    lines = {(each.lane, each.end_m): each.line_m for each in dead_ends(scenario)}
+    return tuple(
+        section
+        if section.exit
+        else LaneSection(section.lane, section.from_m, lines[section.lane, section.to_m])
+        for section in scenario.road.sections
+    )
+
+
+@lru_cache(maxsize=64)
+def drive_out(scenario: Scenario) -> DriveOut:
+    """Return what a vehicle needs to drive from standing into the neighbouring lane.
+
+    The motion controller drives with its hold law towards a cell of the neighbouring lane behind
+    the one that passes the vehicle when it starts. Until the body has left its lane, it must be
+    able to stop before the end with the emergency brake, which bounds the room from below.
+
+    Raises:
+        ValueError: the vehicle does not arrive in a cell (its limits are too low).
+    """
+    for columns in range(2, _MAX_COLUMNS + 1):
+        found = _drive_out(scenario, columns)
+        if found is not None:
+            return found
+    raise ValueError("vehicles that stand cannot get into the lattice within their limits")
+
+
+def _drive_out(scenario: Scenario, columns: int) -> DriveOut | None:
+    """Return the motion into the last of so many columns; None if it lags behind them."""
+    lattice, limits, tick_s = scenario.lattice, scenario.vehicle, scenario.runtime.tick_s
+    goal: Cell = (1 - columns, 1)
+    brake, lag_s = EmergencyBrake(scenario), limits.actuator_lag_s
+    # In road coordinates the commanded state is that of a lattice at rest.
+    standing: State = (0.0, 0.0, 0.0, lattice.cell_y_m(0), 0.0, 0.0)
+    state = commanded_state(standing, (0.0, 0.0), limits, lattice.speed_mps)
+    clear_m = 0.5 * (lattice.lane_width_m + limits.width_m)
+    room_m, clear = 0.0, False
+    for tick in range(1, round(_MAX_DRIVE_OUT_S / tick_s)):
+        t_s = tick * tick_s
+        jerk = hold_law(state, cell_state(lattice, goal, t_s - tick_s), limits, tick_s)
+        state = integrate(state, jerk, tick_s)
+        # The body is at most this far: it follows its commanded state.
+        s_m = state[0] + lag_s * (lattice.speed_mps - state[1]) + lag_s * max(state[2], 0.0)
+        if s_m < lattice.cell_s_m(goal[0], t_s) - ARRIVED_ALONG_M:
+            return None
+        if not clear:
+            speed_mps = state[1]
+            ahead = Neighbour(0, _FAR_M, 0.0)
+            body = (0.0, speed_mps, 0.0, 0.0, 0.0, 0.0)
+            needed_m = _FAR_M - brake.spare_m(body, state[2], jerk, [ahead])
+            errors_m = ERROR_SIGMAS * spare_error_m(scenario, speed_mps)
+            room_m = max(room_m, s_m + needed_m + errors_m)
+            clear = state[3] - lattice.cell_y_m(0) > clear_m
+        elif at_rest_in_cell(state, lattice, goal, t_s):
+            return DriveOut(math.ceil(room_m), columns, math.ceil(s_m))
+    return None

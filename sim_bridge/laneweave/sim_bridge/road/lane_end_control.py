@@ -1,0 +1,189 @@
+"""The roadside at the ends of lanes: brings vehicles that wait there back into the lattice.
+
+For each vehicle that waits at a stop line, the entry meter keeps some columns of the neighbouring
+lane free (a *gap*): no vehicle enters them, and no vehicle owns their cells, so no plan leads into
+them. When the gap passes the waiting vehicle, its motion controller drives into it, and takes its
+cells once it has arrived in the rearmost column. This needs neither agent nor leader nor message:
+it is how a vehicle enters at the start of the road.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+
+from attrs import define, frozen
+
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.lane_ends import DeadEnd, LaneEnds, drive_out, lane_beside
+from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
+from laneweave.protocol.wire.messages import Name, OffLattice
+from laneweave.sim_bridge.bodies.motion_controller import STANDING_MPS
+from laneweave.sim_bridge.bodies.motion_controller import OffLattice as Progress
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+
+START_S = 0.3
+"""Time after the front of a gap has passed in which a waiting vehicle may start into it."""
+BESIDE_M = 1.0
+"""A vehicle does not start while another is less than this ahead of it in the neighbouring lane."""
+
+KeepFree = Callable[[int, int], range]
+"""Lets a number of columns of a lane pass without vehicles, and returns them."""
+
+
+@define
+class Gap:
+    """Columns of a lane that are kept free for a vehicle that waits."""
+
+    lane: int
+    columns: range
+    vehicle: Name | None = None
+    """The vehicle that drives into the gap; None: it has not arrived."""
+
+    @property
+    def cells(self) -> tuple[Cell, ...]:
+        """All cells, rearmost first."""
+        return tuple((column, self.lane) for column in self.columns)
+
+
+@frozen
+class LaneEndChange:
+    """A vehicle has left the lattice, begins to drive out, or has entered the lattice again."""
+
+    vehicle: Name
+    kind: str
+    """`LEFT_LATTICE`, `DRIVES_OUT` or `ENTERED_LATTICE`."""
+    lane: int
+
+
+class LaneEndControl:
+    """Vehicles without cells, and the gaps that are kept free for them."""
+
+    def __init__(self, scenario: Scenario, keep_free: KeepFree) -> None:
+        """Begin without vehicles.
+
+        Args:
+            scenario: road, lattice, vehicles.
+            keep_free: see `KeepFree`.
+        """
+        self._keep_free = keep_free
+        self._lattice = scenario.lattice
+        self._ends = tuple(LaneEnds(scenario))
+        self._beside = {end: lane_beside(scenario, end) or 0 for end in self._ends}
+        self._columns = drive_out(scenario).columns if self._ends else 0
+        self._length_m = scenario.vehicle.length_m
+        self._queue_m = scenario.vehicle.length_m + scenario.tracking.min_gap_m
+        """Distance between the fronts of vehicles that stand in a queue."""
+        self._gaps: dict[DeadEnd, list[Gap]] = {end: [] for end in self._ends}
+        self._end_of: dict[Name, DeadEnd] = {}
+        """Dead end at which each vehicle without cells waits or waited."""
+
+    def is_kept_free(self, cell: Cell) -> bool:
+        """Return whether a cell belongs to a gap."""
+        return any(
+            gap.lane == cell[1] and cell[0] in gap.columns
+            for gaps in self._gaps.values()
+            for gap in gaps
+        )
+
+    def update(self, vehicles: Mapping[Name, RoadVehicle], t_s: float) -> Iterator[LaneEndChange]:
+        """Advance to road time `t_s`; yield what has changed."""
+        if not self._ends:
+            return
+        for name in [name for name in self._end_of if name not in vehicles]:
+            self._forget(name)
+        for name, vehicle in vehicles.items():
+            if vehicle.controller.has_lost_cell(t_s):
+                yield self._take_off(name, vehicle)
+        for end, gaps in self._gaps.items():
+            waiting = self._waiting(end, vehicles)
+            if waiting:
+                yield from self._start(waiting[0], gaps, t_s)
+            yield from self._arrive(gaps, vehicles, t_s)
+            gaps[:] = [gap for gap in gaps if gap.vehicle or not self._is_over(gap, end, t_s)]
+            coming = sum(gap.vehicle is None for gap in gaps)
+            for _ in range(len(waiting) - coming):
+                lane = self._beside[end]
+                gaps.append(Gap(lane, self._keep_free(lane, self._columns)))
+
+    def bodies(self, vehicles: Mapping[Name, RoadVehicle]) -> dict[Name, OffLattice]:
+        """Return the lane and the rear of each vehicle without cells.
+
+        A vehicle that still drives up to its line counts as where it will stand.
+        """
+        found: dict[Name, OffLattice] = {}
+        for end in self._ends:
+            for number, vehicle in enumerate(self._waiting(end, vehicles)):
+                stands_m = end.line_m - number * self._queue_m
+                rear_m = max(vehicle.state[0], stands_m) - self._length_m
+                found[vehicle.name] = OffLattice(end.lane, rear_m)
+        for name, end in self._end_of.items():
+            if name in vehicles and name not in found:
+                found[name] = OffLattice(end.lane, vehicles[name].state[0] - self._length_m)
+        return found
+
+    def _take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
+        cell = vehicle.controller.hold_cell
+        vehicle.controller.leave_lattice()
+        # The end that the body has ahead of it is that of its lane.
+        self._end_of[name] = next(
+            end
+            for end in self._ends
+            if end.lane == cell[1] and vehicle.state[0] < max(end.reopens_m, end.end_m)
+        )
+        return LaneEndChange(name, LEFT_LATTICE, cell[1])
+
+    def _waiting(self, end: DeadEnd, vehicles: Mapping[Name, RoadVehicle]) -> list[RoadVehicle]:
+        """Return the vehicles that wait at a dead end, foremost first."""
+        waiting = [
+            vehicles[name]
+            for name, its_end in self._end_of.items()
+            if its_end == end and vehicles[name].controller.off_lattice is Progress.WAITING
+        ]
+        return sorted(waiting, key=lambda vehicle: -vehicle.state[0])
+
+    def _start(
+        self, vehicle: RoadVehicle, gaps: Collection[Gap], t_s: float
+    ) -> Iterator[LaneEndChange]:
+        """Let the foremost waiting vehicle drive out if a gap is passing it."""
+        s_m, speed_mps = vehicle.state[0], vehicle.state[1]
+        if speed_mps > STANDING_MPS:
+            return
+        for gap in gaps:
+            passed_s = t_s - self._lattice.passing_time_s(gap.columns[-1], s_m)
+            if gap.vehicle is None and 0.0 <= passed_s <= START_S and self._is_free(vehicle, gap):
+                gap.vehicle = vehicle.name
+                vehicle.controller.drive_out((gap.columns[0], gap.lane))
+                yield LaneEndChange(vehicle.name, DRIVES_OUT, gap.lane)
+                return
+
+    def _is_free(self, vehicle: RoadVehicle, gap: Gap) -> bool:
+        """Return whether the sensors of a vehicle show that a gap is free."""
+        neighbours = vehicle.controller.neighbours
+        # The vehicle behind is a column behind the rearmost of the gap.
+        behind_m = (len(gap.columns) - 1) * self._lattice.pitch_m - self._length_m
+        return all(
+            other.gap_m > BESIDE_M for other in neighbours.ahead if other.lane == gap.lane
+        ) and all(other.gap_m > behind_m for other in neighbours.behind if other.lane == gap.lane)
+
+    def _arrive(
+        self, gaps: list[Gap], vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> Iterator[LaneEndChange]:
+        """Let vehicles that have arrived enter the lattice."""
+        for gap in [gap for gap in gaps if gap.vehicle is not None]:
+            name = gap.vehicle
+            if name is None or not vehicles[name].controller.at_rest(t_s):
+                continue
+            vehicles[name].enter_lattice(gap.cells)
+            gaps.remove(gap)
+            del self._end_of[name]
+            yield LaneEndChange(name, ENTERED_LATTICE, gap.lane)
+
+    def _is_over(self, gap: Gap, end: DeadEnd, t_s: float) -> bool:
+        """Return whether all of a gap has passed the stop line."""
+        return t_s > self._lattice.passing_time_s(gap.columns[-1], end.line_m) + START_S
+
+    def _forget(self, name: Name) -> None:
+        """Forget a vehicle that has left the road."""
+        gaps = self._gaps[self._end_of.pop(name)]
+        gaps[:] = [gap for gap in gaps if gap.vehicle != name]
