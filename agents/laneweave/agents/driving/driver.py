@@ -15,6 +15,7 @@ from attrs import define, frozen
 
 from laneweave.agents.driving.motions import REPEAT_TICKS
 from laneweave.agents.driving.reference import Reference
+from laneweave.agents.driving.stop_lines import StopLines
 from laneweave.agents.driving.surroundings import Surroundings
 from laneweave.agents.driving.tracker import Tracker
 from laneweave.agents.driving.tracking_problem import NO_GAPS
@@ -96,6 +97,7 @@ class TrackingDriver:
         self._vehicle = scenario.vehicle
         self._speed_mps = scenario.lattice.speed_mps
         self._surroundings = Surroundings(scenario)
+        self._stop_lines = StopLines(scenario)
         self._solve_ms: list[float] = []
         self._unusable = self._osqp_solves = 0
 
@@ -136,12 +138,16 @@ class TrackingDriver:
         reference, tick = self._current, sense.tick
         state = commanded_state(sense.state, sense.setpoint, self._vehicle, self._speed_mps)
         gaps = self._surroundings.gaps(sense, state, self._goal[1])
+        window = None
+        if self._stop_lines:
+            window = reference.window(tick)
+            gaps = self._stop_lines.limit(gaps, window.states, sense.state[0])
         result = None
         if gaps is NO_GAPS and tick >= reference.end_tick:
             goal = cell_state(self._lattice, self._goal, sense.t_s)
             result = self._tracker.rest(state, goal)
         if result is None:
-            result = self._tracker.solve(state, reference.window(tick), gaps)
+            result = self._tracker.solve(state, window or reference.window(tick), gaps)
         self._solve_ms.append(result.solve_ms)
         self._unusable += not result.usable
         self._osqp_solves += result.iterations > 0

@@ -26,6 +26,11 @@ Array = NDArray[np.float64]
 
 SENSED_S = 1.0
 """Time for which neighbours are assumed to keep their speed."""
+SLOW_S = 2.0
+"""The same for slow neighbours ahead, so that this vehicle need not brake hard behind them. It is
+less than the time after which a vehicle that leaves the lane in time would reach them."""
+SLOW_SHARE = 0.5
+"""Fraction of v_F below which a neighbour is slow; no vehicle that moves between cells is."""
 
 _Sensed = tuple[int, float, float]
 """(lane, front-bumper limit [m], speed [m/s]) of a sensed neighbour."""
@@ -58,11 +63,12 @@ class Surroundings:
         self._lag_s = limits.actuator_lag_s
         self._speed_mps = scenario.formation.speed_mps
         self._min_gap_m = scenario.tracking.min_gap_m
-        # Distances that this vehicle can gain or lose during the prediction.
-        self._gain_m = limits.max_accel_mps2 * SENSED_S**2 / 2.0
-        self._loss_m = -limits.min_accel_mps2 * SENSED_S**2 / 2.0
+        self._slow_mps = SLOW_SHARE * scenario.formation.speed_mps
+        # Accelerations with which this vehicle can approach its neighbours.
+        self._gain_mps2, self._loss_mps2 = limits.max_accel_mps2, limits.min_accel_mps2
         self._times_s = np.arange(scenario.horizon_ticks + 1) * scenario.runtime.tick_s
         self._beyond = self._times_s > SENSED_S + 1e-9
+        self._beyond_slow = self._times_s > SLOW_S + 1e-9
 
     def on_motion(self, motion: Motion) -> None:
         """Handle another vehicle's announced motion."""
@@ -79,10 +85,10 @@ class Surroundings:
         first, last = self._lattice.lanes_touched(sense.state[3], self._width_m)
         touched = first, last, lane
         latest = earliest = None
-        ahead, near = self._relevant(sense, state, sense.ahead, touched, _AHEAD, self._gain_m)
+        ahead, near = self._relevant(sense, state, sense.ahead, touched, _AHEAD, self._gain_mps2)
         if near:
             latest = self._at_constant_speed(near, _AHEAD)
-        behind, near = self._relevant(sense, state, sense.behind, touched, _BEHIND, -self._loss_m)
+        behind, near = self._relevant(sense, state, sense.behind, touched, _BEHIND, self._loss_mps2)
         if near:
             earliest = self._at_constant_speed(near, _BEHIND)
         if self._motions.known:
@@ -101,7 +107,7 @@ class Surroundings:
         others: tuple[Neighbour, ...],
         touched: tuple[int, int, int],
         side: _Side,
-        change_m: float,
+        accel_mps2: float,
     ) -> tuple[list[_Sensed], list[_Sensed]]:
         """Return neighbours in relevant lanes (if motions are known) and the ones within reach.
 
@@ -113,8 +119,8 @@ class Surroundings:
             others: the neighbours in one direction.
             touched: the first and the last lane that the body touches; the lane that it enters.
             side: the direction.
-            change_m: distance by which acceleration can bring the vehicle closer to its neighbours
-                during the prediction; negative behind.
+            accel_mps2: acceleration that brings the vehicle closer to its neighbours; negative
+                behind.
         """
         first, last, lane = touched
         motions_known, lag_s, sign = self._motions.known, self._lag_s, side.sign
@@ -129,7 +135,8 @@ class Surroundings:
                 if motions_known:
                     relevant.append((other.lane, front_m, other_mps))
                 # The maximum is now or at the end of the prediction, by convexity in time.
-                closer_m = (state[1] - other_mps) * SENSED_S + change_m
+                lasts_s = SLOW_S if sign > 0.0 and other_mps < self._slow_mps else SENSED_S
+                closer_m = (state[1] - other_mps + 0.5 * accel_mps2 * lasts_s) * lasts_s
                 if sign * closer_m < 0.0:
                     closer_m = 0.0
                 if sign * (state[0] + closer_m) > sign * front_m:
@@ -140,8 +147,10 @@ class Surroundings:
         """Return the nearest limits (N + 1,) set by neighbours at constant speed."""
         positions = np.full(self._times_s.shape, side.free)
         for _, front_m, speed_mps in others:
-            positions = side.nearest(positions, front_m + speed_mps * self._times_s)
-        positions[self._beyond] = side.free
+            limits = front_m + speed_mps * self._times_s
+            slow = side is _AHEAD and speed_mps < self._slow_mps
+            limits[self._beyond_slow if slow else self._beyond] = side.free
+            positions = side.nearest(positions, limits)
         return positions
 
     def _with_motions(

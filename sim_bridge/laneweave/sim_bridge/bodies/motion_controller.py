@@ -112,7 +112,7 @@ class MotionController:
     rung_ticks: dict[Rung, int] = field(init=False)
     """Number of ticks spent on each rung."""
     neighbours: Neighbours = NO_NEIGHBOURS
-    """Measured neighbours; stop lines count as vehicles that stand there."""
+    """Measured neighbours."""
     off_lattice: OffLattice | None = None
     """None: the vehicle has cells."""
     _past_line: bool = False
@@ -151,9 +151,6 @@ class MotionController:
 
     def perceive(self, measured: State, neighbours: Neighbours) -> None:
         """Set the measurements of this tick."""
-        if self._lane_ends:
-            lines = self._lines_ahead(measured)
-            neighbours = neighbours._replace(ahead=(*neighbours.ahead, *lines))
         self._measured, self.neighbours = measured, neighbours
 
     # --- lanes that end -----------------------------------------------------------------------
@@ -353,6 +350,8 @@ class MotionController:
         near: Sequence[Neighbour] = self.neighbours.ahead
         if near:
             near = self._relevant(near, measured[3])
+        if self._lane_ends:
+            near = [*near, *self._lines_ahead(measured)]
         rung, jerk = self._next(tick, near)
         if near and self._must_brake(measured, jerk, near):
             rung = Rung.EMERGENCY

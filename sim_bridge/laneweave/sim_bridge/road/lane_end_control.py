@@ -9,7 +9,8 @@ it is how a vehicle enters at the start of the road.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+import math
+from collections.abc import Collection, Iterator, Mapping
 
 from attrs import define, frozen
 
@@ -20,15 +21,16 @@ from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LAT
 from laneweave.protocol.wire.messages import Name, OffLattice
 from laneweave.sim_bridge.bodies.motion_controller import STANDING_MPS
 from laneweave.sim_bridge.bodies.motion_controller import OffLattice as Progress
+from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
+OPEN_GAPS = 1
+"""Number of gap lengths of columns between two gaps of a lane that vehicles may enter, so that the
+traffic of this lane, and vehicles that change into it, keep most of its cells."""
 START_S = 0.3
 """Time after the front of a gap has passed in which a waiting vehicle may start into it."""
 BESIDE_M = 1.0
 """A vehicle does not start while another is less than this ahead of it in the neighbouring lane."""
-
-KeepFree = Callable[[int, int], range]
-"""Lets a number of columns of a lane pass without vehicles, and returns them."""
 
 
 @define
@@ -59,14 +61,9 @@ class LaneEndChange:
 class LaneEndControl:
     """Vehicles without cells, and the gaps that are kept free for them."""
 
-    def __init__(self, scenario: Scenario, keep_free: KeepFree) -> None:
-        """Begin without vehicles.
-
-        Args:
-            scenario: road, lattice, vehicles.
-            keep_free: see `KeepFree`.
-        """
-        self._keep_free = keep_free
+    def __init__(self, scenario: Scenario, meter: EntryMeter) -> None:
+        """Begin without vehicles."""
+        self._meter = meter
         self._lattice = scenario.lattice
         self._ends = tuple(LaneEnds(scenario))
         self._beside = {end: lane_beside(scenario, end) or 0 for end in self._ends}
@@ -75,6 +72,8 @@ class LaneEndControl:
         self._queue_m = scenario.vehicle.length_m + scenario.tracking.min_gap_m
         """Distance between the fronts of vehicles that stand in a queue."""
         self._gaps: dict[DeadEnd, list[Gap]] = {end: [] for end in self._ends}
+        self._next_from: list[float] = [math.inf] * scenario.road.lanes
+        """Column of each lane from which the next gap may be kept free."""
         self._end_of: dict[Name, DeadEnd] = {}
         """Dead end at which each vehicle without cells waits or waited."""
 
@@ -102,9 +101,8 @@ class LaneEndControl:
             yield from self._arrive(gaps, vehicles, t_s)
             gaps[:] = [gap for gap in gaps if gap.vehicle or not self._is_over(gap, end, t_s)]
             coming = sum(gap.vehicle is None for gap in gaps)
-            for _ in range(len(waiting) - coming):
-                lane = self._beside[end]
-                gaps.append(Gap(lane, self._keep_free(lane, self._columns)))
+            if len(waiting) > coming:
+                self._request(self._beside[end], gaps)
 
     def bodies(self, vehicles: Mapping[Name, RoadVehicle]) -> dict[Name, OffLattice]:
         """Return the lane and the rear of each vehicle without cells.
@@ -121,6 +119,13 @@ class LaneEndControl:
             if name in vehicles and name not in found:
                 found[name] = OffLattice(end.lane, vehicles[name].state[0] - self._length_m)
         return found
+
+    def _request(self, lane: int, gaps: list[Gap]) -> None:
+        """Keep the next columns of a lane free, unless the last gap was too close ahead."""
+        if self._meter.closed_column(lane) <= self._next_from[lane]:
+            columns = self._meter.keep_free(lane, self._columns)
+            self._next_from[lane] = columns[0] - OPEN_GAPS * self._columns
+            gaps.append(Gap(lane, columns))
 
     def _take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
         cell = vehicle.controller.hold_cell

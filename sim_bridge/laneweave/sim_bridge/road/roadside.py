@@ -60,7 +60,7 @@ class Roadside:
             self._builder,
             interlaced=formation.interlaced,
         )
-        self._lane_ends = LaneEndControl(scenario, self._meter.keep_free)
+        self._lane_ends = LaneEndControl(scenario, self._meter)
         self._closed: list[ClosedFormation] = []
         """Closed formations with vehicles on the road."""
         self._closed_to = -1

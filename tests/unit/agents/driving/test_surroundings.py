@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from attrs import evolve
 
-from laneweave.agents.driving.surroundings import SENSED_S, Surroundings
+from laneweave.agents.driving.surroundings import SENSED_S, SLOW_S, SLOW_SHARE, Surroundings
 from laneweave.agents.driving.tracking_problem import NO_GAPS, Gaps
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
@@ -40,7 +40,7 @@ def gaps_of(felt: Sense, lane: int = HOME[1], *, all_of_them: bool = False) -> G
     """Return the gaps; if wished, also those that the module takes to be out of question."""
     surroundings = Surroundings(SCENARIO)
     if all_of_them:
-        surroundings._gain_m = surroundings._loss_m = 1e6
+        surroundings._gain_mps2, surroundings._loss_mps2 = 1e6, -1e6
     state = commanded_state(felt.state, felt.setpoint, LIMITS, V_F)
     return surroundings.gaps(felt, state, lane)
 
@@ -91,16 +91,29 @@ def test_without_neighbours_ahead_or_behind_there_are_no_gaps_there() -> None:
 
 
 def test_they_go_on_at_constant_speed_as_long_as_that_may_be_believed() -> None:
-    slow, fast = Neighbour(1, 20.0, 2.0), Neighbour(1, 14.0, 24.0)
+    slow, fast = Neighbour(1, 10.0, 9.0), Neighbour(1, 14.0, 24.0)
+    assert slow.speed_mps > SLOW_SHARE * V_F
     gaps = gaps_of(sense((slow,), (fast,)))
-    lag_m = LAG_S * (2.0 - V_F)
-    expected = 20.0 - LEAST_M + lag_m + 2.0 * TIMES_S[KNOWN]
+    lag_m = LAG_S * (9.0 - V_F)
+    expected = 10.0 - LEAST_M + lag_m + 9.0 * TIMES_S[KNOWN]
     assert off(gaps.latest)[KNOWN] == pytest.approx(expected)
     expected = LEAST_M - 14.0 + LAG_S * (24.0 - V_F) + 24.0 * TIMES_S[KNOWN]
     assert off(gaps.earliest)[KNOWN] == pytest.approx(expected)
     assert (off(gaps.latest)[~KNOWN] == np.inf).all()
     assert (off(gaps.earliest)[~KNOWN] == -np.inf).all()
     assert 0 < KNOWN.sum() < N
+
+
+def test_slow_neighbours_ahead_are_believed_longer() -> None:
+    """So that a vehicle need not brake hard behind one that stands."""
+    known = TIMES_S <= SLOW_S + 1e-9
+    standing = Neighbour(1, 30.0, 0.0)
+    latest = off(gaps_of(sense((standing,))).latest)
+    assert latest[known] == pytest.approx(30.0 - LEAST_M - LAG_S * V_F)
+    assert (latest[~known] == np.inf).all()
+    assert KNOWN.sum() < known.sum() < N
+    behind = (Neighbour(1, 3.0, 1.0),)
+    assert (off(gaps_of(sense((), behind), all_of_them=True).earliest)[~KNOWN] == -np.inf).all()
 
 
 def test_positions_are_commanded_positions_of_the_other_body() -> None:
