@@ -66,9 +66,10 @@ class Rig:
     def new_incarnation(self) -> int:
         return next(self._incarnations)
 
-    def sense(self, *, left: bool = False) -> Sense:
+    def sense(self, *, left: bool = False, off_lattice: bool = False) -> Sense:
         self.controller.perceive(self.state, Neighbours(self.ahead, ()))
-        self._sensed = self.vehicle.sense(self.tick, caretaker=False, left=left)
+        sensed = self.vehicle.sense(self.tick, caretaker=False, left=left)
+        self._sensed = evolve(sensed, off_lattice=off_lattice)
         return self._sensed
 
     def hand(self, topic: Topic, message: object) -> list[Effect]:

@@ -223,3 +223,31 @@ def test_restart_of_a_vehicle_that_is_late_still_counts_as_moving() -> None:
     while rig.run().moving:
         assert rig.tick < 400
     assert rig.shown[-1].ready
+
+
+# --- off the lattice --------------------------------------------------------------------------
+
+
+def test_without_a_cell_it_only_keeps_its_claim_and_then_begins_anew() -> None:
+    rig = up_and_running()
+    rig.accept((0, HOME, (-1, 2)))
+    for _ in range(3):
+        rig.coast(1)
+        effects = rig.hand(topics.SENSE, rig.sense(off_lattice=True))
+        (command,) = sent(effects, Command)
+        assert (command.jerks, command.promised, command.accepted) == (b"", None, None)
+        assert command.incarnation == 1
+        assert not rig.shown[-1].accepted
+        assert rig.agent.wanted_motions == ()
+        # A plan that comes late moves nobody.
+        plan = make_plan({ME: HOME}, {ME: ((0, HOME, (-1, 2)),)})
+        rig.hand(topics.PLAN, plan)
+    there: Cell = (-5, 1)
+    rig.coast(1)
+    effects = rig.hand(
+        topics.SENSE, attrs.evolve(rig.sense(), hold_cell=there, motion_origin=there)
+    )
+    (command,) = sent(effects, Command)
+    assert command.hold_cell == there
+    assert rig.shown[-1].hold_cell == there
+    assert rig.agent.in_charge

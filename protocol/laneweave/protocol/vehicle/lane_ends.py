@@ -21,14 +21,16 @@ from laneweave.protocol.vehicle.emergency_brake import ERROR_SIGMAS, EmergencyBr
 from laneweave.protocol.vehicle.motion import (
     ARRIVED_ALONG_M,
     State,
-    at_rest_in_cell,
     cell_state,
     commanded_state,
+    has_settled,
     hold_law,
     integrate,
 )
 from laneweave.protocol.wire.messages import Neighbour
 
+START_S = 0.3
+"""Time after the front of a gap has passed in which a waiting vehicle may start into it."""
 _MAX_COLUMNS = 12
 """Upper bound on the columns that a vehicle needs to drive out."""
 _MAX_DRIVE_OUT_S = 60.0
@@ -59,7 +61,7 @@ class DriveOut:
     columns: int
     """Number of columns of the neighbouring lane that it needs; it ends in the rearmost."""
     distance_m: float
-    """Distance in which it arrives in its cell."""
+    """Distance in which it settles in its cell."""
 
 
 class LaneEnds:
@@ -153,24 +155,30 @@ def drive_out(scenario: Scenario) -> DriveOut:
         ValueError: the vehicle does not arrive in a cell (its limits are too low).
     """
     for columns in range(2, _MAX_COLUMNS + 1):
-        found = _drive_out(scenario, columns)
-        if found is not None:
-            return found
+        found = [_drive_out(scenario, columns, late_s) for late_s in (0.0, START_S)]
+        possible = [each for each in found if each is not None]
+        if len(possible) == len(found):
+            room_m, distance_m = (math.ceil(max(each)) for each in zip(*possible, strict=True))
+            return DriveOut(room_m, columns, distance_m)
     raise ValueError("vehicles that stand cannot get into the lattice within their limits")
 
 
-def _drive_out(scenario: Scenario, columns: int) -> DriveOut | None:
-    """Return the motion into the last of so many columns; None if it lags behind them."""
+def _drive_out(scenario: Scenario, columns: int, late_s: float) -> tuple[float, float] | None:
+    """Return room and distance [m] of the motion into the last of so many columns.
+
+    The vehicle starts some time after the front column has passed it. None: it falls behind the
+    columns, or does not settle.
+    """
     lattice, limits, tick_s = scenario.lattice, scenario.vehicle, scenario.runtime.tick_s
     goal: Cell = (1 - columns, 1)
     brake, lag_s = EmergencyBrake(scenario), limits.actuator_lag_s
-    # In road coordinates the commanded state is that of a lattice at rest.
     standing: State = (0.0, 0.0, 0.0, lattice.cell_y_m(0), 0.0, 0.0)
     state = commanded_state(standing, (0.0, 0.0), limits, lattice.speed_mps)
     clear_m = 0.5 * (lattice.lane_width_m + limits.width_m)
-    room_m, clear = 0.0, False
+    room_m = distance_m = settled_s = 0.0
+    clear = False
     for tick in range(1, round(_MAX_DRIVE_OUT_S / tick_s)):
-        t_s = tick * tick_s
+        t_s = late_s + tick * tick_s
         jerk = hold_law(state, cell_state(lattice, goal, t_s - tick_s), limits, tick_s)
         state = integrate(state, jerk, tick_s)
         # The body is at most this far: it follows its commanded state.
@@ -183,8 +191,11 @@ def _drive_out(scenario: Scenario, columns: int) -> DriveOut | None:
             body = (0.0, speed_mps, 0.0, 0.0, 0.0, 0.0)
             needed_m = _FAR_M - brake.spare_m(body, state[2], jerk, [ahead])
             errors_m = ERROR_SIGMAS * spare_error_m(scenario, speed_mps)
-            room_m = max(room_m, s_m + needed_m + errors_m)
+            # A tick of travel covers starts between the two that are computed.
+            room_m = max(room_m, s_m + needed_m + errors_m + speed_mps * tick_s)
             clear = state[3] - lattice.cell_y_m(0) > clear_m
-        elif at_rest_in_cell(state, lattice, goal, t_s):
-            return DriveOut(math.ceil(room_m), columns, math.ceil(s_m))
-    return None
+        if not has_settled(state, lattice, goal, t_s):
+            distance_m, settled_s = s_m, t_s + tick_s
+    if not clear or settled_s > _MAX_DRIVE_OUT_S - 1.0:
+        return None
+    return room_m, distance_m

@@ -36,6 +36,8 @@ ARRIVED_ALONG_M = 0.5
 ARRIVED_ACROSS_M = 0.3
 """Distances from the target point at which a body has arrived once the motion's time has passed."""
 
+SETTLED_MPS = 0.5
+"""Difference in speed to its cell up to which a body has settled in it."""
 DISPLACED_ALONG_M = 1.0
 DISPLACED_ACROSS_M = 0.5
 """Distances from its cell from which a vehicle no longer holds it, for example after an emergency
@@ -115,6 +117,14 @@ def at_rest_in_cell(state: State, lattice: Lattice, cell: Cell, t_s: float) -> b
     goal = cell_state(lattice, cell, t_s)
     return (
         abs(state[0] - goal[0]) <= ARRIVED_ALONG_M and abs(state[3] - goal[3]) <= ARRIVED_ACROSS_M
+    )
+
+
+def has_settled(state: State, lattice: Lattice, cell: Cell, t_s: float) -> bool:
+    """Return whether a body is in `cell` at road time `t_s` [s], and about as fast as the cell."""
+    return (
+        at_rest_in_cell(state, lattice, cell, t_s)
+        and abs(state[1] - lattice.speed_mps) <= SETTLED_MPS
     )
 
 

@@ -43,6 +43,7 @@ from laneweave.protocol.vehicle.motion import (
     cell_state,
     commanded_state,
     displaced,
+    has_settled,
     hold_law,
     keep_gap,
     limited_accel,
@@ -333,11 +334,13 @@ class MotionController:
 
         A late body continues to move after the planned end of its motion.
         """
-        return tick < self.motion_end_tick or not self.at_rest(tick * self.tick_s)
+        return tick < self.motion_end_tick or not at_rest_in_cell(
+            self.measured, self.lattice, self.hold_cell, tick * self.tick_s
+        )
 
-    def at_rest(self, t_s: float) -> bool:
-        """Return whether the body is in its cell at road time `t_s`."""
-        return at_rest_in_cell(self.measured, self.lattice, self.hold_cell, t_s)
+    def has_settled(self, t_s: float) -> bool:
+        """Return whether the body has settled in its cell at road time `t_s`."""
+        return has_settled(self.measured, self.lattice, self.hold_cell, t_s)
 
     def displaced(self, tick: int) -> bool:
         """Return whether the body is too far from its cell to hold it at `tick`."""

@@ -16,7 +16,7 @@ from attrs import define, frozen
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.lane_ends import DeadEnd, LaneEnds, drive_out, lane_beside
+from laneweave.protocol.vehicle.lane_ends import START_S, DeadEnd, LaneEnds, drive_out, lane_beside
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
 from laneweave.protocol.wire.messages import Name, OffLattice
 from laneweave.sim_bridge.bodies.motion_controller import STANDING_MPS
@@ -27,8 +27,6 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 OPEN_GAPS = 1
 """Number of gap lengths of columns between two gaps of a lane that vehicles may enter, so that the
 traffic of this lane, and vehicles that change into it, keep most of its cells."""
-START_S = 0.3
-"""Time after the front of a gap has passed in which a waiting vehicle may start into it."""
 BESIDE_M = 1.0
 """A vehicle does not start while another is less than this ahead of it in the neighbouring lane."""
 
@@ -177,7 +175,7 @@ class LaneEndControl:
         """Let vehicles that have arrived enter the lattice."""
         for gap in [gap for gap in gaps if gap.vehicle is not None]:
             name = gap.vehicle
-            if name is None or not vehicles[name].controller.at_rest(t_s):
+            if name is None or not vehicles[name].controller.has_settled(t_s):
                 continue
             vehicles[name].enter_lattice(gap.cells)
             gaps.remove(gap)

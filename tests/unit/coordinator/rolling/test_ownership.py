@@ -109,3 +109,29 @@ def test_a_single_member_of_a_plan_knows_what_it_owns() -> None:
     alone = pending(A, MID, (A,))
     assert owned_cells(state(A, HIGH, alone), {}) == OWNED_BEFORE
     assert owned_cells(state(A, MID, alone), {}) is None
+
+
+# --- vehicles that have left the lattice --------------------------------------------------------
+
+
+@pytest.mark.parametrize("ballot", [MID, BETWEEN, HIGH])
+def test_a_vehicle_that_has_left_the_lattice_is_gone_for_all_ballots_so_far(ballot: Ballot) -> None:
+    """Like one that has left the road: nobody knows whether it saw the gate open."""
+    withdrawn = state(C, HIGH, PendingTransfer(ballot), owned=())
+    others = {B: state(B, HIGH, TRANSFER_OF_B), C: withdrawn}
+    assert owned_cells(CLOSED, others) == SURE
+    assert partners(CLOSED, others) == {B, C}
+    knows = state(B, MID, OPEN)
+    assert owned_cells(CLOSED, others | {B: knows}) == OWNED_AFTER
+
+
+def test_a_vehicle_that_left_before_a_ballot_still_counts_in_it() -> None:
+    again = state(C, HIGH, PendingTransfer(LOW), owned=((9, 2),))
+    assert owned_cells(CLOSED, {B: state(B, HIGH, TRANSFER_OF_B), C: again}) == OWNED_BEFORE
+
+
+def test_a_vehicle_that_has_entered_again_owns_what_the_roadside_has_assigned() -> None:
+    cells = ((-9, 1), (-8, 1))
+    again = state(C, HIGH, PendingTransfer(HIGH), owned=cells)
+    assert owned_cells(again, {}) == certain_cells(again, {}) == set(cells)
+    assert partners(again, {}) == frozenset()

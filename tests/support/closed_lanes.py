@@ -1,0 +1,77 @@
+"""Roads whose lanes end, and vehicles on them without a network."""
+
+from __future__ import annotations
+
+from attrs import define, evolve, field
+
+from laneweave.protocol.scenario.fields import Closure, Road, Scenario
+from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose, pose_of
+from laneweave.sim_bridge.road.roadside import Roadside
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.convoy import ROLLING
+
+DROP_M = 800.0
+DROP = evolve(
+    ROLLING,
+    road=Road(s1_m=50.0, s2_m=100.0, s3_m=850.0, closures=(Closure(0, DROP_M),)),
+)
+"""Lane 0 of three ends at 800 of 1000 m."""
+BLOCKED = evolve(DROP, road=evolve(DROP.road, closures=(Closure(1, 600.0, 700.0),)))
+"""Lane 1 of three is closed from 600 to 700 m."""
+
+
+@define
+class LonelyRoad:
+    """Vehicles at the real roadside that no agent drives: they hold, and nothing else happens."""
+
+    scenario: Scenario
+    roadside: Roadside = field(init=False)
+    vehicles: dict[Name, RoadVehicle] = field(factory=dict)
+    tick: int = 0
+    left: list[tuple[Name, float]] = field(factory=list)
+    """Vehicles that have left the road, and when."""
+    overlaps: list[tuple[float, str, str]] = field(factory=list)
+    events: list[tuple[float, str, Name]] = field(factory=list)
+    """Changes at the ends of lanes."""
+
+    def __attrs_post_init__(self) -> None:
+        """Open the entrance, with the scenario's arrivals."""
+        self.roadside = Roadside(self.scenario, bridge=1)
+
+    @property
+    def t_s(self) -> float:
+        return self.tick * self.scenario.runtime.tick_s
+
+    def step(self) -> None:
+        """Drive one tick."""
+        scenario, t_s = self.scenario, self.t_s
+        self.roadside.newly_demanded(t_s)
+        for admission in self.roadside.admit(t_s):
+            vehicle = RoadVehicle.entering(admission, t_s, scenario, 1)
+            self.vehicles[vehicle.name] = vehicle
+        for change in self.roadside.control_lane_ends(self.vehicles, t_s):
+            self.events.append((t_s, change.kind, change.vehicle))
+        self.roadside.assign_empty_cells(self.vehicles)
+        for vehicle in self.vehicles.values():
+            vehicle.step(self.tick)
+        self.tick += 1
+        for name, vehicle in list(self.vehicles.items()):
+            if vehicle.state[0] >= scenario.road.length_m:
+                self.left.append((name, self.t_s))
+                del self.vehicles[name]
+        self.sense()
+
+    def sense(self) -> None:
+        """Let all vehicles sense their neighbours, and record overlaps."""
+        road, size = self.scenario.road, self.scenario.vehicle
+        states: dict[str, State] = {name: vehicle.state for name, vehicle in self.vehicles.items()}
+        poses: dict[str, Pose] = {name: pose_of(state) for name, state in states.items()}
+        bodies = Bodies(poses, size.length_m, size.width_m)
+        accels: dict[str, float] = {name: state[2] for name, state in states.items()}
+        neighbours = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels)
+        for name, vehicle in self.vehicles.items():
+            vehicle.perceive(neighbours[name])
+        pairs = [*bodies.overlapping_pairs(), *bodies.in_closed_lanes(road)]
+        self.overlaps += [(self.t_s, *pair) for pair in pairs]

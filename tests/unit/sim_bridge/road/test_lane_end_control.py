@@ -1,0 +1,231 @@
+"""Vehicles that nobody drives out of a lane that ends: they stop, wait and come back alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import pytest
+from attrs import evolve
+
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.scenario.fields import Demand, Scenario
+from laneweave.protocol.vehicle.lane_ends import DeadEnd, LaneEnds, dead_ends, drive_out
+from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
+from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLattice, Rung
+from laneweave.sim_bridge.road import lane_end_control
+from laneweave.sim_bridge.road.entry import EntryMeter
+from laneweave.sim_bridge.road.lane_end_control import LaneEndControl
+from support.closed_lanes import BLOCKED, DROP, LonelyRoad
+
+KINDS = (LEFT_LATTICE, DRIVES_OUT, ENTERED_LATTICE)
+HARDEST_MPS2 = -7.0
+MAX_S = 900.0
+
+
+def lonely_road(scenario: Scenario, volume: float, duration_s: float, seed: int = 1) -> LonelyRoad:
+    demand = Demand(volume_veh_per_lane_h=volume, duration_s=duration_s)
+    return LonelyRoad(evolve(scenario, demand=demand, seed=seed))
+
+
+def check(road: LonelyRoad) -> None:
+    """Drive until all have left, and check every tick."""
+    owners: dict[Cell, Name] = {}
+    while not road.roadside.exhausted(road.t_s) or road.vehicles:
+        road.step()
+        assert road.t_s < MAX_S, "somebody is left standing"
+        assert road.overlaps == []
+        for name, vehicle in road.vehicles.items():
+            controller = vehicle.controller
+            assert controller.rung is not Rung.EMERGENCY
+            assert vehicle.state[2] > HARDEST_MPS2
+            assert (controller.owned == ()) == (controller.off_lattice is not None)
+            for cell in controller.owned:
+                owner = owners.setdefault(cell, name)
+                assert owner == name or owner not in road.vehicles, "a cell has two owners"
+                owners[cell] = name
+    left, out = ([one for _, k, one in road.events if k == kind] for kind in KINDS[:2])
+    assert len(left) >= 3
+    assert sorted(left) == sorted(out)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "volume", "seed"), [(DROP, 300.0, 1), (DROP, 1800.0, 2), (BLOCKED, 1000.0, 1)],
+    ids=["few", "many", "blocked lane"],
+)  # fmt: skip
+def test_all_of_them_leave_the_road_and_nobody_touches_anything(
+    scenario: Scenario, volume: float, seed: int
+) -> None:
+    check(lonely_road(scenario, volume, 60.0, seed))
+
+
+def test_a_single_vehicle_waits_for_the_gap_that_comes_from_the_entrance() -> None:
+    road = lonely_road(DROP, 40.0, 100.0)
+    (end,) = dead_ends(DROP)
+    while len(road.events) < 3:
+        road.step()
+    (off_s, out_s, in_s), kinds, names = zip(*road.events, strict=True)
+    assert kinds == KINDS
+    (name,) = set(names)
+    travel_s = end.line_m / DROP.lattice.speed_mps
+    assert off_s + travel_s - 2.0 <= out_s <= off_s + travel_s + 10.0
+    assert in_s <= out_s + 15.0
+    # It has entered the rearmost of the columns, and owns all of them.
+    controller = road.vehicles[name].controller
+    columns = drive_out(DROP).columns
+    assert controller.hold_cell == controller.owned[0]
+    assert len(controller.owned) == columns
+    assert road.vehicles[name].admission.cell == controller.hold_cell
+
+
+def test_between_two_gaps_there_is_as_much_room_for_traffic() -> None:
+    road = lonely_road(DROP, 2400.0, 100.0)
+    while road.t_s < 100.0:
+        road.step()
+    gaps = sorted(
+        (gap.columns[0], gap.columns[-1])
+        for gaps in road.roadside._lane_ends._gaps.values()
+        for gap in gaps
+        if gap.vehicle is None
+    )
+    assert len(gaps) > 3
+    columns = drive_out(DROP).columns
+    for (rear, front), (next_rear, _) in pairwise(gaps):
+        assert front - rear == columns - 1
+        assert next_rear - front > columns
+
+
+def test_the_census_tells_where_they_stand() -> None:
+    road = lonely_road(DROP, 1000.0, 60.0)
+    (end,) = dead_ends(DROP)
+    while sum(kind == LEFT_LATTICE for _, kind, _ in road.events) < 3 or road.t_s < 90.0:
+        road.step()
+    census = road.roadside.census(road.t_s, road.vehicles.values())
+    bodies = {
+        entry.vehicle: entry.off_lattice
+        for entry in census.on_road
+        if entry.off_lattice is not None
+    }
+    assert len(bodies) >= 3
+    assert {entry.vehicle for entry in census.on_lattice} == set(road.vehicles) - set(bodies)
+    for name, body in bodies.items():
+        assert body.lane == end.lane
+        if road.vehicles[name].state[1] < 0.1:
+            rear_m = road.vehicles[name].state[0] - DROP.vehicle.length_m
+            assert body.rear_m == pytest.approx(rear_m, abs=8.0)
+
+
+# --- planted bugs -------------------------------------------------------------------------------
+
+Plant = Callable[[pytest.MonkeyPatch], None]
+leave_lattice, drive_out_of = MotionController.leave_lattice, MotionController.drive_out
+
+
+def no_stop_line(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(MotionController, "_lines_ahead", lambda *_: [])
+
+
+def line_at_the_end(patch: pytest.MonkeyPatch) -> None:
+    """There is no room to accelerate before the end of the lane."""
+    ahead, ends_of = LaneEnds.ahead, LaneEnds.__iter__
+
+    def at_the_end(end: DeadEnd) -> DeadEnd:
+        return evolve(end, line_m=end.end_m)
+
+    def ahead_of(self: LaneEnds, lane: int, s_m: float) -> DeadEnd | None:
+        end = ahead(self, lane, s_m)
+        return None if end is None else at_the_end(end)
+
+    patch.setattr(LaneEnds, "ahead", ahead_of)
+    patch.setattr(LaneEnds, "__iter__", lambda self: map(at_the_end, ends_of(self)))
+
+
+def keeps_its_cells(patch: pytest.MonkeyPatch) -> None:
+    def leave(self: MotionController) -> None:
+        owned = self.owned
+        leave_lattice(self)
+        self.owned = owned
+
+    patch.setattr(MotionController, "leave_lattice", leave)
+
+
+def gap_is_given_away(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(LaneEndControl, "is_kept_free", lambda *_: False)
+
+
+def gap_is_entered(patch: pytest.MonkeyPatch) -> None:
+    """The entry meter only says that it keeps columns free, and sensors are not asked."""
+    patch.setattr(LaneEndControl, "_is_free", lambda *_: True)
+    patch.setattr(
+        EntryMeter,
+        "keep_free",
+        lambda self, lane, count: range(self._columns[lane] - count + 1, self._columns[lane] + 1),
+    )
+
+
+def gap_too_short(patch: pytest.MonkeyPatch) -> None:
+    short = evolve(drive_out(DROP), columns=1)
+    patch.setattr(lane_end_control, "drive_out", lambda _: short)
+
+
+def starts_without_a_gap(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(lane_end_control, "START_S", 1e9)
+    patch.setattr(LaneEndControl, "_is_free", lambda *_: True)
+    real = LaneEndControl._start
+
+    def start(self: LaneEndControl, vehicle: object, gaps: object, t_s: float) -> object:
+        return real(self, vehicle, gaps, t_s + 30.0)  # type: ignore[arg-type]
+
+    patch.setattr(LaneEndControl, "_start", start)
+
+
+def waits_forever(patch: pytest.MonkeyPatch) -> None:
+    """Only the first gap is asked for."""
+    patch.setattr(lane_end_control, "OPEN_GAPS", 10_000)
+
+
+def last_first(patch: pytest.MonkeyPatch) -> None:
+    """The rearmost vehicle of a queue drives out through the others."""
+    real = LaneEndControl._waiting
+    patch.setattr(LaneEndControl, "_waiting", lambda *given: real(*given)[::-1])
+
+
+def drives_on(patch: pytest.MonkeyPatch) -> None:
+    """A vehicle off the lattice aims at its cell, which is beyond the end of the lane."""
+
+    def leave(self: MotionController) -> None:
+        leave_lattice(self)
+        self.off_lattice, self._past_line = OffLattice.DRIVING_OUT, True
+
+    patch.setattr(MotionController, "leave_lattice", leave)
+
+
+def line_forgotten_when_driving_out(patch: pytest.MonkeyPatch) -> None:
+    """The way out is blocked by the line at which the vehicle stands."""
+
+    def drive(self: MotionController, cell: Cell) -> None:
+        drive_out_of(self, cell)
+        self._past_line = False
+
+    patch.setattr(MotionController, "drive_out", drive)
+    patch.setattr("laneweave.sim_bridge.bodies.motion_controller.STANDING_MPS", -1.0)
+
+
+@pytest.mark.parametrize(
+    ("plant", "duration_s"),
+    [
+        (no_stop_line, 40.0), (line_at_the_end, 40.0), (keeps_its_cells, 40.0),
+        (starts_without_a_gap, 40.0), (waits_forever, 40.0), (last_first, 40.0),
+        (drives_on, 40.0), (line_forgotten_when_driving_out, 40.0),
+        # Only traffic notices these.
+        (gap_is_given_away, 120.0), (gap_is_entered, 120.0), (gap_too_short, 120.0),
+    ],
+)  # fmt: skip
+def test_planted_bugs_are_noticed(
+    plant: Plant, duration_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant(monkeypatch)
+    road = lonely_road(DROP, 1500.0, duration_s)
+    with pytest.raises(AssertionError):
+        check(road)
