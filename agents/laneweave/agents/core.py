@@ -179,6 +179,8 @@ class AgentCore:
     def _on_message(self, message: object) -> list[Effect]:
         execution = self.execution
         assert execution is not None  # noqa: S101 (in charge: there was a SENSE)
+        if self._sense is not None and self._sense.off_lattice:
+            return []
         match message:
             case VehicleState():
                 execution.on_state(message)
@@ -246,6 +248,10 @@ class AgentCore:
 
     def _act(self, sense: Sense, *, in_charge: bool, drove: bool) -> list[Effect]:
         """Answer a tick; `drove`: whether this process has driven the vehicle until now."""
+        if sense.off_lattice and drove:
+            # What it has promised and accepted is void: it begins anew, like another process.
+            self._claim_above(self._incarnation)
+            in_charge = False
         if not (drove and in_charge) or sense.off_lattice:
             # Repeated while a claim is pending, since another process may still begin a move.
             self._take_over(sense)
@@ -253,6 +259,7 @@ class AgentCore:
         assert execution is not None  # noqa: S101 (it has taken over)
         self.wanted_motions = ()
         if sense.off_lattice:
+            execution.on_owned(sense)  # the promise stays
             return self._wait(sense)
         if in_charge:
             stretch = stretch_of(execution.hold_cell[0])

@@ -228,26 +228,30 @@ def test_restart_of_a_vehicle_that_is_late_still_counts_as_moving() -> None:
 # --- off the lattice --------------------------------------------------------------------------
 
 
-def test_without_a_cell_it_only_keeps_its_claim_and_then_begins_anew() -> None:
+def test_without_a_cell_it_begins_anew_and_only_keeps_its_claim() -> None:
     rig = up_and_running()
     rig.accept((0, HOME, (-1, 2)))
-    for _ in range(3):
+    controller = rig.controller
+    controller.leave_lattice()
+    for _ in range(4):
         rig.coast(1)
         effects = rig.hand(topics.SENSE, rig.sense(off_lattice=True))
         (command,) = sent(effects, Command)
-        assert (command.jerks, command.promised, command.accepted) == (b"", None, None)
-        assert command.incarnation == 1
-        assert not rig.shown[-1].accepted
+        assert controller.accept_command(command)
+        # What the earlier process has promised and accepted is void for this one.
+        assert (command.incarnation, command.jerks, command.accepted) == (2, b"", None)
         assert rig.agent.wanted_motions == ()
-        # A plan that comes late moves nobody.
+        # A plan or a promise that is asked for now moves nobody.
         plan = make_plan({ME: HOME}, {ME: ((0, HOME, (-1, 2)),)})
-        rig.hand(topics.PLAN, plan)
+        assert rig.hand(topics.PREPARE, Prepare(BALLOT, (0,), (ME,))) == []
+        assert rig.hand(topics.PLAN, plan) == []
+    state = rig.shown[-1]
+    assert (state.incarnation, state.accepted) == (2, False)
     there: Cell = (-5, 1)
+    controller.drive_out(there)
+    controller.enter_lattice([there])
     rig.coast(1)
-    effects = rig.hand(
-        topics.SENSE, attrs.evolve(rig.sense(), hold_cell=there, motion_origin=there)
-    )
-    (command,) = sent(effects, Command)
-    assert command.hold_cell == there
+    (command,) = sent(rig.hand(topics.SENSE, rig.sense()), Command)
+    assert (command.hold_cell, command.incarnation) == (there, 2)
     assert rig.shown[-1].hold_cell == there
     assert rig.agent.in_charge

@@ -57,6 +57,8 @@ MIN_ROAD_S = 10.0
 """Time after its beginning at which slots of a road must have been planned."""
 HEALTHY_SLOTS = 8
 """Number of slots after the fault phase (rolling operation)."""
+STANDING_S = 120.0
+"""Time after these slots in which vehicles that stand before the end of a lane must drive on."""
 NOTICE_S = 0.1
 """Time after which a candidate must have noticed that it is disconnected."""
 ELECTED_S = 5.0
@@ -226,6 +228,8 @@ class FaultRun:
             text = f"in {vehicle.controller.hold_cell}, prefers lane {vehicle.preferred_lane}"
             self.checker.stuck(network.now_s, name, text)
         if self._rolling and not self.checker.violations:
+            for name in self._standing:
+                self.checker.stuck(network.now_s, name, "it stands before the end of its lane")
             self._check_planning()
         return self._result(time.process_time() - began_s)
 
@@ -431,7 +435,10 @@ class FaultRun:
         self._record_moves()
         if self.checker.violations:
             return True
-        return self.faults.healed and not self._rolling and not self._not_arrived()
+        if self._rolling:
+            healthy_s = self.network.now_s - self.story.fault_s
+            return healthy_s >= self._healthy_s and not self._standing
+        return self.faults.healed and not self._not_arrived()
 
     @property
     def _rolling(self) -> bool:
@@ -439,9 +446,18 @@ class FaultRun:
 
     @property
     def _patience_s(self) -> float:
-        if self._rolling:
-            return HEALTHY_SLOTS * self.setup.scenario.cycles_s[0]
-        return PATIENCE_S
+        return self._healthy_s + STANDING_S if self._rolling else PATIENCE_S
+
+    @property
+    def _healthy_s(self) -> float:
+        """Time after the fault phase for which slots are planned (rolling operation)."""
+        return HEALTHY_SLOTS * self.setup.scenario.cycles_s[0]
+
+    @property
+    def _standing(self) -> list[Name]:
+        """Vehicles that have stopped before the end of their lane."""
+        vehicles = self.road.vehicles.items()
+        return [name for name, one in vehicles if one.controller.off_lattice is not None]
 
     def _record_moves(self) -> None:
         """Record which vehicles have moved since the fault phase (rolling operation)."""
@@ -470,8 +486,11 @@ class FaultRun:
         not_arrived = [
             name
             for name, vehicle in self.road.vehicles.items()
-            if vehicle.controller.hold_cell[1] != vehicle.preferred_lane
-            or not vehicle.body.has_arrived(road_s)
+            if vehicle.controller.off_lattice is None
+            and (
+                vehicle.controller.hold_cell[1] != vehicle.preferred_lane
+                or not vehicle.body.has_arrived(road_s)
+            )
         ]
         if not self._rolling:
             return not_arrived

@@ -31,6 +31,8 @@ class Profile:
     """Whether to use the rolling operation, in which vehicles own cells."""
     roadside: bool = False
     """Whether vehicles enter one after another at the real roadside."""
+    lane_ends: bool = False
+    """Whether lane 0 ends before the road (rolling operation at the real roadside)."""
     density: tuple[float, float] = (0.3, 0.7)
     """Occupied share of the cells in which vehicles may enter (rolling operation)."""
     vehicles: Span = (2, 16)

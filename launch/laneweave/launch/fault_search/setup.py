@@ -25,7 +25,7 @@ from laneweave.launch.fault_search.road.drawn_entrance import DrawnEntrance, Ent
 from laneweave.launch.fault_search.road.stand_ins import Visit
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.deployment_fields import Network
-from laneweave.protocol.scenario.fields import FormationSettings, Road, Runtime, Scenario
+from laneweave.protocol.scenario.fields import Closure, FormationSettings, Road, Runtime, Scenario
 from laneweave.protocol.wire.messages import ClosedFormation, Name
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.roadside import Roadside
@@ -64,6 +64,8 @@ MAX_BEHIND = 3
 """Number of empty cells that the last vehicle in a lane owns behind itself."""
 BEFORE_COLUMNS = (3, 4, 6)
 """Lengths of the road before S3 to draw from at the real roadside, in columns."""
+LANE_ENDS_M = (150.0, 300.0)
+"""Range of distances between the first position of moves and the end of lane 0."""
 STREAM_PLANNER = 0.05
 """Share of runs with the stream planner, which takes ten times as long as the rest of a run."""
 
@@ -89,6 +91,8 @@ class RoadSetup:
     seed: int = 0
     stream_planner: bool = False
     """Whether the stream planner replaces `LightPlanner` (rolling operation)."""
+    lane_0_ends_m: float | None = None
+    """Where lane 0 ends (rolling operation at the real roadside); None: with the road."""
 
     def make_scenario(self) -> Scenario:
         """Return the scenario of the road."""
@@ -116,8 +120,10 @@ class RoadSetup:
                 max_nodes=500,
             )
             s3_m = 20_000.0
+        ends_m = self.lane_0_ends_m
+        closures = () if ends_m is None else (Closure(0, ends_m),)
         return Scenario(
-            road=Road(lanes=self.lanes, s1_m=0.0, s2_m=self.before_m, s3_m=s3_m),
+            road=Road(lanes=self.lanes, s1_m=0.0, s2_m=self.before_m, s3_m=s3_m, closures=closures),
             formation=formation,
             network=Network(heartbeat_s=0.2, election_s=0.6, lease_s=LEASE_S),
             runtime=Runtime(tick_s=TICK_S, agent_silent_s=1.5),
@@ -207,6 +213,8 @@ class Setup:
     def _drawn_at_roadside(cls, profile: Profile, lanes: int, rng: random.Random) -> Setup:
         if profile.rolling:
             road = _draw_rolling_road(lanes, rng, before_columns=rng.choice(BEFORE_COLUMNS))
+            if profile.lane_ends:
+                road = evolve(road, lane_0_ends_m=road.before_m + rng.uniform(*LANE_ENDS_M))
         else:
             road = RoadSetup(
                 lanes=lanes,
@@ -251,6 +259,8 @@ class Setup:
         columns = [len(one.columns(lattice)) for one in self.formations]
         if self.road.rolling or self.road.roadside:
             room = [self.stretch_columns] * lanes
+            if self.road.lane_0_ends_m is not None:
+                room[0] = 0  # nobody can leave the road in lane 0
             weights = [6.0 if self.crowded and lane == 0 else 1.0 for lane in range(lanes)]
             vehicles = [visit.vehicle for visit in self.visits]
             return _draw_lanes(vehicles, room, weights, rng)

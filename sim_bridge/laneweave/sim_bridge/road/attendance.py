@@ -52,27 +52,19 @@ class Caretaker:
         Raises:
             ValueError: the incarnation is not greater than that of the process in charge.
         """
-        vehicle.controller.put_in_charge(incarnation)
+        controller = vehicle.controller
+        controller.put_in_charge(incarnation)
         self._vehicle = vehicle
-        self._incarnation = incarnation
-        self._off_lattice = False
-        """Whether the vehicle had no cell in the last tick."""
-        self._execution = self._begin(tick)
-
-    def _begin(self, tick: int) -> PlanExecution:
-        """Return a plan execution that begins with what the controller stores."""
-        vehicle, controller = self._vehicle, self._vehicle.controller
-        execution = PlanExecution(
+        self._execution = PlanExecution(
             vehicle=vehicle.name,
-            incarnation=self._incarnation,
+            incarnation=incarnation,
             hold_cell=controller.hold_cell,
             lattice=controller.lattice,
             joined=controller.joined,
             moving=controller.moving(tick),
             owned=frozenset(controller.owned) if controller.rolling else None,
         )
-        execution.on_owned(vehicle.sense(tick, caretaker=True))
-        return execution
+        self._execution.on_owned(vehicle.sense(tick, caretaker=True))
 
     def on_message(self, message: Prepare | Plan, tick: int) -> VehicleState | None:
         """Promise a ballot (V2), or accept a plan in which this vehicle does not move (V3).
@@ -81,8 +73,6 @@ class Caretaker:
             The state to publish at once; None if the message has no effect.
         """
         execution, controller = self._execution, self._vehicle.controller
-        if self._off_lattice:
-            return None
         if isinstance(message, Prepare):
             accepted = execution.on_prepare(message)
             controller.join(execution.wanted_joined)
@@ -101,12 +91,8 @@ class Caretaker:
 
     def state(self, tick: int) -> VehicleState:
         """Return the state to publish; end the motion if the controller has completed it (V7)."""
-        vehicle, controller = self._vehicle, self._vehicle.controller
-        off_lattice = controller.off_lattice is not None
-        if off_lattice or self._off_lattice:
-            self._execution = self._begin(tick)
-        self._off_lattice = off_lattice
-        execution = self._execution
+        vehicle, execution = self._vehicle, self._execution
+        controller = vehicle.controller
         if execution.moving and not controller.moving(tick):
             execution.end_motion()
         if controller.displaced(tick):
@@ -239,10 +225,18 @@ class Attendance:
 
     def take_charge(self, vehicle: RoadVehicle, tick: int) -> Iterator[Effect]:
         """Put a caretaker in charge of a vehicle."""
-        incarnation = above(self._new_incarnation(), vehicle.controller.attendant)
-        self._caretakers[vehicle.name] = Caretaker(vehicle, incarnation, tick)
+        self._put_caretaker(vehicle, tick)
         yield Listen(PREPARE, {"vehicle": vehicle.name})
         yield Listen(PLAN, {"vehicle": vehicle.name})
+
+    def begin_anew(self, vehicle: RoadVehicle, tick: int) -> None:
+        """Replace the vehicle's caretaker, if it has one: its cells have changed without a plan."""
+        if vehicle.name in self:
+            self._put_caretaker(vehicle, tick)
+
+    def _put_caretaker(self, vehicle: RoadVehicle, tick: int) -> None:
+        incarnation = above(self._new_incarnation(), vehicle.controller.attendant)
+        self._caretakers[vehicle.name] = Caretaker(vehicle, incarnation, tick)
 
     def on_message(self, vehicle: Name, message: Prepare | Plan, tick: int) -> Iterator[Effect]:
         """Pass a message to the vehicle's caretaker, and publish its answer."""

@@ -14,6 +14,7 @@ machines of the processes, and shares no code with them.
 | `owner` | a cell has two owners (rolling operation, see `cell_ownership`) |
 | `trespass` | a body is in a cell that its vehicle does not own (rolling operation) |
 | `gate` | a motion begins before any vehicle of the plan has taken possession (rolling operation) |
+| `closed` | a body is in a lane that has ended |
 | `monotone` | a process revokes a promise, an acceptance, progress, a join, or a takeover |
 | `leader` | a coordinator without a connection leads, or there is not one leader at the end |
 | `busy` | a process starts computations without a pause |
@@ -206,6 +207,10 @@ class Checker:
     def stuck(self, t_s: float, vehicle: str, text: str) -> None:
         """Record that a vehicle has not arrived long after all faults have ended."""
         self._report("stuck", t_s, [vehicle], text)
+
+    def beyond_end(self, t_s: float, vehicle: str, text: str) -> None:
+        """Record that a body is in a lane that has ended."""
+        self._report("closed", t_s, [vehicle], text)
 
     def crashed(self, t_s: float, process: str, error: str) -> None:
         """Record that a computation of a process has failed, which the process itself retries."""

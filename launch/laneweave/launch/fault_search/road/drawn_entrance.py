@@ -6,7 +6,7 @@ vehicles are on the road at the start, in drawn cells, formations and owners of 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Protocol
 
 from attrs import frozen
@@ -18,6 +18,7 @@ from laneweave.protocol.wire.messages import Census, CensusEntry, ClosedFormatio
 from laneweave.protocol.wire.topics import CENSUS, CLOCK
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.lane_end_control import LaneEndChange
 from laneweave.sim_bridge.road.roadside import CENSUS_EVERY_TICKS
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
@@ -47,6 +48,11 @@ class Entrance(Protocol):
 
     def assign_empty_cells(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
         """Assign empty cells to vehicles (rolling operation)."""
+
+    def control_lane_ends(
+        self, vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> Sequence[LaneEndChange]:
+        """Take vehicles off the lattice whose lanes end, and bring them back."""
 
     def count_left(self) -> None:
         """Count a vehicle that has left the road."""
@@ -112,6 +118,13 @@ class DrawnEntrance:
             grant = self._grants.pop(0)
             if grant.owner in vehicles:
                 vehicles[grant.owner].controller.assign_cell(grant.cell)
+
+    def control_lane_ends(
+        self, vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> Sequence[LaneEndChange]:
+        """Do nothing: these roads have no lanes that end."""
+        del vehicles, t_s
+        return ()
 
     def count_left(self) -> None:
         """Publish a census soon."""

@@ -8,6 +8,7 @@ what caretakers publish. Vehicles enter through an `Entrance`, which may be the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
 
@@ -29,11 +30,15 @@ from laneweave.protocol.runtime.node import (
     Watch,
 )
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.wire.bounds import check_ballot
+from laneweave.protocol.wire.events import DRIVES_OUT, LEFT_LATTICE
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare
 from laneweave.protocol.wire.topics import BRIDGE_ALIVE, COMMAND, SENSE, VEHICLE_ALIVE
 from laneweave.sim_bridge.road.attendance import Absence, Attendance
 
+DRIVE_OUT_S = 8.0
+"""Time in which a vehicle drives from standing into its cell."""
 AGENT_START_S = 1.0
 """Time after which a caretaker takes charge of a vehicle that entered without an agent."""
 
@@ -96,6 +101,7 @@ class LightRoad:
         """Newest preferred lanes; empty: those at the entrance."""
         self._attendance = Attendance(scenario, new_incarnation)
         self._bounds = scenario.runtime.bounds(bridge)
+        self._lane_ends = LaneEnds(scenario)
 
     @property
     def wakeup_s(self) -> float:
@@ -175,11 +181,13 @@ class LightRoad:
         self._checker.advance(now_s)
         self._let_enter(now_s)
         self._close_formations()
+        self._control_lane_ends(now_s)
         self._entrance.assign_empty_cells(self.vehicles)
         yield from self._let_leave(now_s)
         for name, vehicle in self.vehicles.items():
             self._report_stored(name, now_s)
             vehicle.body.t_s = t_s
+            self._check_lane(name, vehicle, now_s)
         yield from self._attend(now_s)
         self._attendance.start_tick(self.vehicles, now_s)
         for name, vehicle in self.vehicles.items():
@@ -207,8 +215,37 @@ class LightRoad:
                 if vehicle.block in closed.blocks:
                     vehicle.join(closed)
 
+    def _control_lane_ends(self, now_s: float) -> None:
+        """Let vehicles stop before the end of their lane, and come back; see `LaneEndControl`.
+
+        For the checker, a vehicle without cells has left the road.
+        """
+        for change in self._entrance.control_lane_ends(self.vehicles, self.t_s):
+            vehicle = self.vehicles[change.vehicle]
+            self._attendance.begin_anew(vehicle, self.tick)
+            cell = vehicle.controller.hold_cell
+            if change.kind == LEFT_LATTICE:
+                self._checker.leave(now_s, change.vehicle)
+                end = self._lane_ends.ahead(change.lane, vehicle.body.state[0])
+                vehicle.body.stop_at(math.inf if end is None else end.line_m)
+            elif change.kind == DRIVES_OUT:
+                vehicle.body.drive_out(cell, self.t_s, DRIVE_OUT_S)
+            else:
+                self._checker.enter(now_s, change.vehicle, cell, vehicle.block)
+
+    def _check_lane(self, name: Name, vehicle: LightVehicle, now_s: float) -> None:
+        """Report a body in a lane that has ended."""
+        s_m, _, _, y_m, _, _ = vehicle.body.state
+        end = self._lane_ends.ahead(int(y_m // self._scenario.road.lane_width_m), s_m)
+        if end is not None and s_m > end.end_m:
+            self._checker.beyond_end(
+                now_s, name, f"at {s_m:.1f} m, its lane ends at {end.end_m:g} m"
+            )
+
     def _report_stored(self, name: Name, now_s: float) -> None:
         controller = self.vehicles[name].controller
+        if controller.off_lattice is not None:
+            return
         stored = Stored(
             controller.attendant,
             controller.joined,
@@ -227,8 +264,10 @@ class LightRoad:
             if each.leaves_by(self.t_s) or each.body.state[0] > length_m
         ]
         for name in leaving:
-            yield from self._attendance.leave(self.vehicles.pop(name))
-            self._checker.leave(now_s, name)
+            vehicle = self.vehicles.pop(name)
+            yield from self._attendance.leave(vehicle)
+            if vehicle.controller.off_lattice is None:
+                self._checker.leave(now_s, name)
             self._entrance.count_left()
         yield from self._attendance.notify_departed(self.tick)
 

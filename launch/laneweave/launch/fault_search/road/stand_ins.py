@@ -5,6 +5,7 @@ Safety does not depend on any of them.
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Collection, Mapping, Sequence
 
@@ -62,6 +63,8 @@ class LightBody(Plant):
         self._origin: tuple[float, float] = cell
         self._goal: Cell = cell
         self._begin_s = self._end_s = 0.0
+        self._stop_m = math.inf
+        """Position at which the body waits; infinite while it is on the lattice."""
 
     @property
     def state(self) -> State:
@@ -70,12 +73,25 @@ class LightBody(Plant):
         lattice = self._lattice
         s_m = lattice.speed_mps * self.t_s + column * lattice.pitch_m
         y_m = (lane + 0.5) * lattice.lane_width_m
+        if s_m >= self._stop_m:
+            return (self._stop_m, 0.0, 0.0, y_m, 0.0, 0.0)
         return (s_m, lattice.speed_mps, 0.0, y_m, 0.0, 0.0)
 
     def go(self, cell: Cell, now_s: float, lasts_s: float) -> None:
         """Begin a motion to a cell from the current position."""
         self._origin, self._goal = self._place(now_s), cell
         self._begin_s, self._end_s = now_s, now_s + lasts_s
+
+    def stop_at(self, s_m: float) -> None:
+        """Drive on to a position, and wait there."""
+        self._stop_m = s_m
+
+    def drive_out(self, cell: Cell, now_s: float, lasts_s: float) -> None:
+        """Begin a motion from the place where the body waits to a cell."""
+        column = (self._stop_m - self._lattice.speed_mps * now_s) / self._lattice.pitch_m
+        self._origin, self._goal = (column, self._goal[1]), cell
+        self._begin_s, self._end_s = now_s, now_s + lasts_s
+        self._stop_m = math.inf
 
     def has_arrived(self, now_s: float) -> bool:
         """Return whether the body is in the centre of its target cell."""
@@ -202,9 +218,10 @@ class LightPlanner:
 
     def __init__(self, scenario: Scenario) -> None:
         """Create a planner for a road."""
-        road = stream_road(scenario)
+        road = self._road = stream_road(scenario)
         self._lanes = road.lanes
         self._sections = road.sections
+        self._some_end = any(not section.exit for section in road.sections)
         self._steps = [step for step in displacements(road.mode) if step != (0, 0)]
         self._seed = scenario.seed
 
@@ -226,19 +243,22 @@ class LightPlanner:
             arrived = not self._away(vehicle, vehicle.cell)
             if vehicle.held or (arrived and rng.random() > UNNEEDED_MOVES):
                 continue
-            target = self._target(vehicle, taken, rng)
+            target = self._target(slot, vehicle, taken, rng)
             if target is not None:
                 paths[vehicle.vehicle] = (vehicle.cell, target)
                 taken |= footprint(vehicle.cell, target)
         return StreamPlan(slot, paths, ())
 
-    def _target(self, vehicle: StreamVehicle, taken: set[Cell], rng: random.Random) -> Cell | None:
+    def _target(
+        self, slot: int, vehicle: StreamVehicle, taken: set[Cell], rng: random.Random
+    ) -> Cell | None:
         column, lane = vehicle.cell
         cells = [(column + along, lane + across) for along, across in self._steps]
         free = [
             cell
             for cell in cells
             if 0 <= cell[1] < self._lanes
+            and not (self._some_end and self._road.has_left(slot + 1, cell))
             and taken.isdisjoint(footprint(vehicle.cell, cell) - {vehicle.cell})
         ]
         if not free:
