@@ -56,6 +56,8 @@ MAX_COLUMN = 2**31 - 1
 """Maximum column: columns are recorded as 32-bit integers. Block numbers are no larger."""
 MAX_LINE_GAP_M = 200.0
 """Distance from which stop lines are seen; more than any stopping distance."""
+BESIDE_M = 1.0
+"""Net gap along the road below which another body is beside this one."""
 STANDING_MPS = 0.3
 """Speed below which a vehicle stands."""
 RELEASE_M = 1.0
@@ -212,10 +214,11 @@ class MotionController:
         """Accept a command from the process in charge, or from a newer one, which takes charge.
 
         A command is rejected if its incarnation is older than that of the process in charge, if its
-        tick is not later than that of the last command, or if the vehicle does not own its hold
-        cell (rolling operation). A newer incarnation takes charge. Its first command must keep the
-        hold cell: no plan can allow a process to move the vehicle before it is in charge. A
-        rejected process may try again at the next tick.
+        tick is not later than that of the last command, if the vehicle does not own its hold cell
+        (rolling operation), or if it changes to a lane in which a body is beside this one. A newer
+        incarnation takes charge. Its first command must keep the hold cell: no plan can allow a
+        process to move the vehicle before it is in charge. A rejected process may try again at the
+        next tick.
 
         A command without jerks and with the current hold cell does not change the motion.
 
@@ -239,6 +242,8 @@ class MotionController:
         self.command_tick = command.tick
         self.store_requests(command)
         if self.rolling and leaves and command.hold_cell not in self.owned:
+            return False
+        if command.hold_cell[1] != self.hold_cell[1] and self._is_beside(command.hold_cell[1]):
             return False
         if len(jerks) > 0 or leaves:
             self._jerks, self._jerks_tick = jerks, command.tick
@@ -366,6 +371,14 @@ class MotionController:
         self.rung = rung
         self.rung_ticks[rung] += 1
         self._measured = None
+
+    def _is_beside(self, lane: int) -> bool:
+        """Return whether a measured neighbour in a lane is beside this vehicle.
+
+        In cells that are free there is none; a body may have stopped there meanwhile.
+        """
+        ahead, behind = self.neighbours
+        return any(other.lane == lane and other.gap_m < BESIDE_M for other in (*ahead, *behind))
 
     def _checked_jerks(self, command: Command) -> array[float]:
         for cell in (command.hold_cell, command.motion_origin):

@@ -19,7 +19,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import START_S, DeadEnd, LaneEnds, drive_out, lane_beside
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
 from laneweave.protocol.wire.messages import Name, OffLattice
-from laneweave.sim_bridge.bodies.motion_controller import STANDING_MPS
+from laneweave.sim_bridge.bodies.motion_controller import BESIDE_M, STANDING_MPS
 from laneweave.sim_bridge.bodies.motion_controller import OffLattice as Progress
 from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -27,8 +27,6 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 OPEN_GAPS = 1
 """Number of gap lengths of columns between two gaps of a lane that vehicles may enter, so that the
 traffic of this lane, and vehicles that change into it, keep most of its cells."""
-BESIDE_M = 1.0
-"""A vehicle does not start while another is less than this ahead of it in the neighbouring lane."""
 
 
 @define

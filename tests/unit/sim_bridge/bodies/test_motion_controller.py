@@ -10,8 +10,9 @@ from attrs import evolve
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.motion import Jerk, cell_state
-from laneweave.protocol.wire.messages import Ballot, Command, Name
+from laneweave.protocol.wire.messages import Ballot, Command, Name, Neighbour
 from laneweave.sim_bridge.bodies.motion_controller import MAX_COLUMN, MotionController, Rung
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Neighbours
 from support import states
 from support.paper import PAPER
 from support.road_vehicles import controller_in, known
@@ -309,3 +310,24 @@ def test_a_motion_is_over_when_its_time_is_and_the_body_is_there(
 def _moving_after(controller: MotionController, tick: int) -> bool:
     controller.step(tick - 1)
     return controller.moving(tick)
+
+
+@pytest.mark.parametrize("side", ["ahead", "behind"])
+@pytest.mark.parametrize(
+    ("lane", "gap_m", "accepted"),
+    [(2, 0.9, False), (2, -4.0, False), (2, 1.1, True), (0, 0.0, True)],
+)
+def test_no_lane_change_begins_beside_another_body(
+    controller: MotionController, side: str, lane: int, gap_m: float, *, accepted: bool
+) -> None:
+    """Whatever the plan says: the body may have stopped there since."""
+    other = (Neighbour(lane, gap_m, 0.0),)
+    seen = Neighbours(other, ()) if side == "ahead" else Neighbours((), other)
+    controller.perceive(controller.plant.state, seen)
+    there: Cell = (HOME[0], 2)
+    assert controller.accept_command(command(1, (0.0, 0.1), hold_cell=there)) == accepted
+    assert controller.hold_cell == (there if accepted else HOME)
+    # A move within the lane may begin.
+    controller.hold_cell = HOME
+    ahead: Cell = (HOME[0] + 1, HOME[1])
+    assert controller.accept_command(command(2, (0.1, 0.0), hold_cell=ahead))
