@@ -12,13 +12,16 @@ from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.convoy import ROLLING
 
-DROP_M = 800.0
-DROP = evolve(
-    ROLLING,
-    road=Road(s1_m=50.0, s2_m=100.0, s3_m=850.0, closures=(Closure(0, DROP_M),)),
-)
+
+def road_with(*closures: Closure, s3_m: float = 850.0) -> Scenario:
+    """Return the rolling operation on three lanes; lanes may be changed from 100 m on."""
+    road = Road(s1_m=50.0, s2_m=100.0, s3_m=s3_m, closures=closures)
+    return evolve(ROLLING, road=road)
+
+
+DROP = road_with(Closure(0, 800.0))
 """Lane 0 of three ends at 800 of 1000 m."""
-BLOCKED = evolve(DROP, road=evolve(DROP.road, closures=(Closure(1, 600.0, 700.0),)))
+BLOCKED = road_with(Closure(1, 600.0, 700.0))
 """Lane 1 of three is closed from 600 to 700 m."""
 
 
