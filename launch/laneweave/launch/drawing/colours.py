@@ -1,9 +1,8 @@
-"""Colours and names of lanes, and the scene of a road, for figures and the live page."""
+"""Colours and names of lanes and vehicles, for figures and the live page."""
 
 from __future__ import annotations
 
-from typing import Any
-
+from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 
 _THREE_LANES = ("#2f6fc4", "#3f9b4f", "#cf3f3a")
@@ -18,6 +17,8 @@ _MORE_LANES = (
     "#d46fae",
     "#808080",
 )
+NEUTRAL = "#8a8f96"
+"""Colour of vehicles without a known preferred lane; `web/road.js` has the same."""
 SPEED_SPAN_MPS = 5.0
 """Difference from the lattice speed at which the shade is darkest or lightest."""
 SHADE_STRENGTH = 0.45
@@ -41,18 +42,18 @@ def lane_names(lanes: int) -> tuple[str, ...]:
     return tuple(f"lane {lane}" for lane in range(lanes))
 
 
-def road_scene(scenario: Scenario) -> dict[str, Any]:
-    """Return the road, bodies, lattice and colours in the format that `web/road.js` reads."""
-    road, formation = scenario.road, scenario.formation
-    return {
-        "road": {
-            "length_m": road.length_m,
-            "lanes": road.lanes,
-            "lane_width_m": road.lane_width_m,
-            "sorting_start_m": road.sorting_start_m,
-        },
-        "body_m": [scenario.vehicle.length_m, scenario.vehicle.width_m],
-        "lattice": {"speed_mps": formation.speed_mps, "pitch_m": formation.gap_m},
-        "shade": {"span_mps": SPEED_SPAN_MPS, "strength": SHADE_STRENGTH},
-        "colours": list(lane_colours(road.lanes)),
-    }
+def vehicle_colour(lanes: int, preferred_lane: int) -> str:
+    """Return the colour of vehicles with a preferred lane; `ANY_LANE`: without one."""
+    if preferred_lane == ANY_LANE:
+        return NEUTRAL
+    colours = lane_colours(lanes)
+    return colours[preferred_lane % len(colours)]
+
+
+def vehicle_legend(scenario: Scenario) -> tuple[tuple[str, str], ...]:
+    """Return the colours of vehicles and their meanings, from the left lane."""
+    if not scenario.lane_shares:
+        return ((NEUTRAL, "no preferred lane"),)
+    lanes = scenario.road.lanes
+    entries = zip(lane_colours(lanes), lane_names(lanes), strict=True)
+    return tuple((colour, f"prefers {name}") for colour, name in entries)[::-1]

@@ -16,13 +16,12 @@ import pyarrow.parquet as pq
 
 from laneweave.launch.recordings.runs import Run
 from laneweave.protocol.files import write_atomically
-from laneweave.protocol.summary import RunSummary
 
 SCHEMA_KEY, SCHEMA = b"laneweave.schema", b"laneweave.sweep.results/1"
 KEYS = ["label", "volume_veh_per_lane_h"]
 """Columns whose values are the same for runs that differ only in their seeds."""
 PREFERRED = "preferred_percent"
-"""Column with the share of vehicles that left in their preferred lanes [%]."""
+"""Column with the share of vehicles that left in their preferred lanes [%], or null."""
 
 
 def results_table(runs: Iterable[Run]) -> pa.Table:
@@ -40,7 +39,7 @@ def results_table(runs: Iterable[Run]) -> pa.Table:
         "reason": pa.array([run.reason for run in listed], pa.string()),
         "wall_s": pa.array([run.wall_s for run in listed], pa.float64()),
     }
-    flat = [_figures(run.summary) if run.summary else {} for run in listed]
+    flat = [_figures(run) for run in listed]
     for name in dict.fromkeys(name for one in flat for name in one if name not in arrays):
         values = [one.get(name) for one in flat]
         counts = all(isinstance(value, int) for value in values if value is not None)
@@ -91,10 +90,12 @@ def flatten(tables: Mapping[str, Any], separator: str) -> dict[str, Any]:
     return flat
 
 
-def _figures(summary: RunSummary) -> dict[str, float | int | None]:
-    """Return all numbers in a summary by path; unknown numbers are None."""
+def _figures(run: Run) -> dict[str, float | int | None]:
+    """Return all numbers in the summary of a run by path; unknown numbers are None."""
+    if run.summary is None:
+        return {}
     return {
         name: value
-        for name, value in flatten(summary.to_json(), "_").items()
+        for name, value in flatten(run.summary.to_json(), "_").items()
         if value is None or (isinstance(value, (int, float)) and not isinstance(value, bool))
-    } | {PREFERRED: summary.preferred_percent}
+    } | {PREFERRED: run.preferred_percent}

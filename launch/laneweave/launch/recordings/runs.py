@@ -57,6 +57,16 @@ class Run:
         return (self.folder / TRAJECTORIES).is_file()
 
     @property
+    def preferred_percent(self) -> float | None:
+        """Percentage of the departed vehicles that left in their preferred lane.
+
+        None: no vehicle left, or vehicles have no preferred lanes.
+        """
+        if self.summary is None or not self.scenario.lane_shares:
+            return None
+        return self.summary.preferred_percent
+
+    @property
     def order(self) -> tuple[tuple[int, str], float, int]:
         """Sort key: label, volume, seed."""
         return rank(self.label), self.volume_veh_per_lane_h, self.scenario.seed

@@ -15,11 +15,12 @@ from typing import Any, Final
 import numpy as np
 from attrs import frozen
 
-from laneweave.launch.drawing.colours import road_scene
+from laneweave.launch.drawing.road_scene import road_scene
 from laneweave.launch.formation_columns import Formations
 from laneweave.launch.recordings.formations import closed_formations
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import Floats, Tracks, read_trips
+from laneweave.protocol.road_layout import ANY_LANE
 
 FORMAT: Final = "laneweave.animation/1"
 KINDS: Final = {"s_m": "<u2", "y_m": "<u2", "speed_mps": "u1"}
@@ -94,7 +95,7 @@ def _sample(run: Run, tracks: Tracks, formations: Formations) -> _Samples:
         vehicles.append(
             {
                 "name": tracks.names[number],
-                "lane": int(trip.get("preferred_lane") or 0),
+                "lane": int(trip.get("preferred_lane", ANY_LANE)),
                 "formation": trip["formation"] if trip.get("formation") in known else None,
                 "first": first,
                 "count": count,

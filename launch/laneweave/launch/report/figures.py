@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from attrs import frozen
 
+from laneweave.launch.drawing.closed_parts import CLOSED_FILL, closed_parts
 from laneweave.launch.drawing.figures import INK
 from laneweave.launch.recordings.runs import Comparison, Run
 from laneweave.launch.recordings.trajectories import Floats, read_tracks
@@ -25,7 +25,6 @@ from laneweave.launch.report.style import (
     spread_evenly,
     volume_title,
 )
-from laneweave.protocol.summary import RunSummary
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,6 +37,8 @@ LOWER_SHARE = 0.66
 """Share of the height below the break of the axis, for methods without jams."""
 GROUP_WIDTH = 0.8
 """Total width of the boxes at a volume; the distance between volumes is 1."""
+CLOSED_WIDTH = 0.025
+"""Width of the marks of closed parts, as a share of the width of the axes."""
 BIN_M, BIN_S = 20.0, 5.0
 """Bin sizes for mean speeds."""
 
@@ -155,32 +156,43 @@ def _travel_times(runs: Iterable[Run]) -> Floats:
 
 
 def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
-    """Draw throughput and the share of vehicles in the preferred lane against the demand."""
+    """Draw throughput and the share of vehicles in the preferred lane against the demand.
+
+    The share is left out if vehicles have no preferred lanes.
+    """
     volumes = np.array(comparison.volumes)
     range_veh_per_lane_h = float(np.ptp(volumes)) or 400.0
     span = volumes[[0, -1]] + np.array([-0.06, 0.06]) * range_veh_per_lane_h
-    with picture(9.2, 3.7, out, dpi) as figure:
-        left, right = figure.subplots(1, 2)
+    panels = 2 if any(run.scenario.lane_shares for run in comparison.runs) else 1
+    with picture(4.6 * panels, 3.7, out, dpi) as figure:
+        shown = figure.subplots(1, panels, squeeze=False)[0]
+        left = shown[0]
         left.plot(span, span, zorder=0, **REFERENCE)
         text = "dashed: throughput = demand"
         left.annotate(text, (0.97, 0.04), xycoords="axes fraction", ha="right", **SMALL_TEXT)
         left.set_ylabel("throughput (veh/(lane·h))")
-        right.set_ylabel("left in the preferred lane (%)")
-        for axes, figure_name in (
-            (left, "throughput_veh_per_lane_h"),
-            (right, "preferred_percent"),
-        ):
-            _draw_seeds(axes, comparison, attrgetter(figure_name), 0.012 * range_veh_per_lane_h)
+        for axes, value in zip(shown, (_throughput, _preferred_percent), strict=False):
+            _draw_seeds(axes, comparison, value, 0.012 * range_veh_per_lane_h)
             axes.set_xlabel("traffic volume (veh/(lane·h))")
             axes.set_xlim(*span)
             axes.set_xticks(volumes if len(volumes) <= 8 else volumes[:: 1 + len(volumes) // 8])
-        low = min(right.get_ylim()[0], 95.0)
-        right.set_ylim(low, 100.0 + 0.04 * (100.0 - low))
+        for axes in shown[1:]:
+            axes.set_ylabel("left in the preferred lane (%)")
+            low = min(axes.get_ylim()[0], 95.0)
+            axes.set_ylim(low, 100.0 + 0.04 * (100.0 - low))
         legend_above(figure)
 
 
+def _throughput(run: Run) -> float | None:
+    return run.summary.throughput_veh_per_lane_h if run.summary else None
+
+
+def _preferred_percent(run: Run) -> float | None:
+    return run.preferred_percent
+
+
 def _draw_seeds(
-    axes: Axes, comparison: Comparison, value: Callable[[RunSummary], float | None], apart: float
+    axes: Axes, comparison: Comparison, value: Callable[[Run], float | None], apart: float
 ) -> None:
     """Draw each run as a dot, and means over seeds with standard deviations as a line.
 
@@ -191,8 +203,8 @@ def _draw_seeds(
         shift = (number - 0.5 * (len(labels) - 1)) * apart
         means, spreads = [], []
         for volume in comparison.volumes:
-            summaries = [run.summary for run in comparison.at(label, volume) if run.summary]
-            found = [one for one in map(value, summaries) if one is not None]
+            values = map(value, comparison.at(label, volume))
+            found = [one for one in values if one is not None]
             nothing &= not found
             means.append(float(np.mean(found)) if found else np.nan)
             spreads.append(float(np.std(found, ddof=1)) if len(found) > 1 else 0.0)
@@ -242,12 +254,22 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
             )
             start_m = run.scenario.road.sorting_start_m
             axes.axhline(start_m, color="white", linewidth=0.7, linestyle="--")
+            _mark_closed_parts(axes, run)
         axes.set_xlim(0.0, max(one.edges_s[-1] for one in maps.values()))
         axes.set_ylim(0.0, max(one.edges_m[-1] for one in maps.values()))
         figure.supxlabel("time (s)", fontsize=9)
         figure.supylabel("position on the road (m)", fontsize=9)
         bar = figure.colorbar(mesh, ax=panels, pad=0.012, aspect=22 * len(labels), fraction=0.03)
         bar.set_label("mean speed (m/s)")
+
+
+def _mark_closed_parts(axes: Axes, run: Run) -> None:
+    """Mark the positions at which a lane is closed, on the left edge and by lines."""
+    style: dict[str, Any] = {"facecolor": CLOSED_FILL, "edgecolor": INK, "linewidth": 0.0}
+    for part in closed_parts(run.scenario):
+        axes.axhspan(part.from_m, part.to_m, xmax=CLOSED_WIDTH, hatch="//////", zorder=2.5, **style)
+        for s_m in (part.from_m, part.to_m):
+            axes.axhline(s_m, color="white", linewidth=0.7, linestyle=":", zorder=2.4)
 
 
 @frozen

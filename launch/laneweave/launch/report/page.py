@@ -11,7 +11,7 @@ from attrs import frozen
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from laneweave.launch.drawing.colours import lane_names
+from laneweave.launch.drawing.road_scene import closed_parts_script
 from laneweave.launch.report.tables import Table
 from laneweave.launch.web import road_script, text_of
 from laneweave.protocol.files import write_atomically
@@ -51,12 +51,6 @@ class Animation:
 
     data: Mapping[str, Any]
 
-    @property
-    def lanes(self) -> list[tuple[str, str]]:
-        """(colour, name) of each lane, starting with the left lane."""
-        names = lane_names(self.data["road"]["lanes"])
-        return list(zip(self.data["colours"], names, strict=False))[::-1]
-
 
 @frozen
 class Section:
@@ -74,8 +68,8 @@ def render_page(title: str, lead: str, sections: Sequence[Section]) -> str:
         loader=PackageLoader(_PACKAGE), autoescape=True, undefined=StrictUndefined
     )
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
-    # Two scripts contain "use strict"; the second one has no effect.
-    scripts = road_script() + _file("player.js") + _file("controls.js")
+    # Several scripts contain "use strict"; only the first one has an effect.
+    scripts = road_script() + closed_parts_script() + _file("player.js") + _file("controls.js")
     return environment.get_template("page.html").render(
         title=title,
         lead=lead,

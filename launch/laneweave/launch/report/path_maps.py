@@ -9,6 +9,7 @@ reaches by the end of the slot.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,14 +17,17 @@ import numpy as np
 from attrs import frozen
 
 from laneweave.coordinator.planning.path_map import RelativePathMap
-from laneweave.launch.drawing.colours import lane_colours
+from laneweave.launch.drawing.colours import lane_colours, vehicle_colour
 from laneweave.launch.drawing.figures import INK, write
 from laneweave.launch.formation_columns import FormationColumns
 from laneweave.launch.recordings.formations import read_events, recorded_formations
 from laneweave.launch.recordings.runs import Run
-from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks, read_trips
+from laneweave.launch.recordings.trajectories import OFF_LATTICE, Floats, Tracks, read_trips
 from laneweave.launch.report.style import SMALL_TEXT, picture
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import ANY_LANE, sections_for
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.events import FORMATIONS_JOINED, PLAN_MADE
 
 if TYPE_CHECKING:
@@ -44,7 +48,9 @@ class DrivenMap:
     path_map: RelativePathMap
     """Path map with columns relative to the formation's rearmost column."""
     preferred_lanes: tuple[int, ...]
-    """Preferred lane of the vehicle in each row."""
+    """Preferred lane of the vehicle in each row, or `ANY_LANE`."""
+    arrived: tuple[tuple[bool, ...], ...]
+    """Whether the vehicle may leave the road in the lane of each cell."""
     start_s: float
     """Road time of the first time point."""
     slot_s: float
@@ -61,6 +67,19 @@ class DrivenMap:
         if self.rolling:
             return "the vehicles that entered in the columns of a block"
         return "a formation's vehicles"
+
+    @property
+    def colours(self) -> str:
+        """Meaning of the colours of the figure."""
+        if all(lane == ANY_LANE for lane in self.preferred_lanes):
+            return (
+                "Cells have the colour of their lane, strong if the lane is open from there to the "
+                "end of the road"
+            )
+        return (
+            "The box before a name has the colour of the preferred lane; cells have the colour of "
+            "their lane, strong if it is the preferred one"
+        )
 
 
 def driven_map(run: Run, tracks: Tracks, formation: int | None) -> DrivenMap | None:
@@ -105,26 +124,45 @@ def _map_of(
     steps = max(0, int(np.ceil((last_s - start_s + 0.5 * tick_s) / slot_s)))
     # Moves begin at a tick; their target is recorded from that tick on.
     times_s = start_s - 0.5 * tick_s + slot_s * np.arange(steps + 1, dtype=np.float64)
-    rows = []
+    cells: list[tuple[Cell, ...]] = []
     for part in parts:
         # Row of the vehicle at or before each time.
         places = np.searchsorted(tracks.t_s[part], times_s, side="right") - 1
         places = np.maximum(places, 0)
         columns, lanes = tracks.column[part][places] - formation.rear, tracks.lane[part][places]
-        rows.append(tuple(zip(columns.tolist(), lanes.tolist(), strict=True)))
+        cells.append(tuple(zip(columns.tolist(), lanes.tolist(), strict=True)))
     # Order of the paper's table: from front to rear, then from right to left.
-    order = sorted(range(len(rows)), key=lambda row: (-rows[row][0][0], rows[row][0][1]))
+    order = sorted(range(len(cells)), key=lambda row: (-cells[row][0][0], cells[row][0][1]))
     return DrivenMap(
         formation.number,
         run.scenario.formation.rolling,
         RelativePathMap(
             tuple(tracks.names[members[row][0]] for row in order),
-            tuple(rows[row] for row in order),
+            tuple(cells[row] for row in order),
         ),
         tuple(members[row][1] for row in order),
+        tuple(
+            _arrived(run.scenario, members[row][1], cells[row], formation.rear, times_s)
+            for row in order
+        ),
         start_s,
         slot_s,
         run.scenario.road.lanes,
+    )
+
+
+def _arrived(
+    scenario: Scenario, preferred_lane: int, cells: Sequence[Cell], rear: int, times_s: Floats
+) -> tuple[bool, ...]:
+    """Return whether each cell is in a section of a lane by which the vehicle may leave."""
+    lattice, sections = scenario.lattice, scenario.road.sections
+    allowed = [sections[number] for number in sections_for(sections, preferred_lane)]
+    places = [
+        (lane, lattice.cell_s_m(rear + column, t_s))
+        for (column, lane), t_s in zip(cells, times_s.tolist(), strict=True)
+    ]
+    return tuple(
+        any(one.lane == lane and one.from_m <= s_m for one in allowed) for lane, s_m in places
     )
 
 
@@ -154,7 +192,7 @@ def _driven_slots(
 
 
 def draw_path_map(driven: DrivenMap, out: Path, dpi: int) -> None:
-    """Draw the table; cells have the colour of their lane, strong if the lane is preferred."""
+    """Draw the table; cells have the colour of their lane, strong if the vehicle has arrived."""
     path_map = driven.path_map
     rows, points = len(path_map.rows), path_map.steps + 1
     with picture(2.3 + 1.12 * points, 0.8 + 0.36 * (rows + 1), out, dpi) as figure:
@@ -175,18 +213,20 @@ def draw_path_map(driven: DrivenMap, out: Path, dpi: int) -> None:
 
 
 def _draw_row(axes: Axes, row: int, driven: DrivenMap) -> None:
-    """Draw a vehicle's row: its name with the colour of the preferred lane, then its cells."""
+    """Draw a vehicle's row: its name with the colour of any preferred lane, then its cells."""
     from matplotlib.patches import FancyBboxPatch, Rectangle  # noqa: PLC0415 - lazily
 
-    colours, preferred = lane_colours(driven.lanes), driven.preferred_lanes[row]
+    colours, arrived = lane_colours(driven.lanes), driven.arrived[row]
     name, cells = driven.path_map.ids[row], driven.path_map.rows[row]
     style: dict[str, Any] = {"boxstyle": "round,pad=0,rounding_size=0.1", "ec": INK, "lw": 0.5}
-    colour = colours[preferred % len(colours)]
-    axes.add_patch(FancyBboxPatch((-1.25, row + 0.2), 0.3, 0.6, fc=colour, **style))
+    preferred = driven.preferred_lanes[row]
+    if preferred != ANY_LANE:
+        colour = vehicle_colour(driven.lanes, preferred)
+        axes.add_patch(FancyBboxPatch((-1.25, row + 0.2), 0.3, 0.6, fc=colour, **style))
     shown = name if len(name) <= _MAX_NAME else name[: _MAX_NAME - 1] + "…"
     write(axes, (-0.85, row + 0.5), shown, _SIZE_PT)
     for point, (cell, before) in enumerate(zip(cells, (cells[0], *cells), strict=False)):
-        colour, alpha = colours[cell[1] % len(colours)], 0.62 if cell[1] == preferred else 0.16
+        colour, alpha = colours[cell[1] % len(colours)], 0.62 if arrived[point] else 0.16
         corner = (point + 0.03, row + 0.06)
         axes.add_patch(Rectangle(corner, 0.94, 0.88, facecolor=colour, alpha=alpha, linewidth=0.0))
         weight = "normal" if cell == before else "bold"

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from attrs import define, field
 
+from laneweave.launch.drawing.closed_parts import describe_closed_parts
 from laneweave.launch.drawing.figures import DPI
 from laneweave.launch.recordings.runs import Comparison, Run, single_run
 from laneweave.launch.recordings.trajectories import read_tracks
@@ -33,13 +34,14 @@ TRAVEL_CAPTION = (
 )
 FLOW_CAPTION = (
     "Left: rate at which vehicles pass the end of the road, between the first and the last "
-    "counted one. Right: share of vehicles that left in their preferred lanes. Small dots: runs; "
-    "bars: standard deviations over seeds."
+    "counted one. Right: share of vehicles that left in their preferred lanes, if they have any. "
+    "Small dots: runs; bars: standard deviations over seeds."
 )
 SPEED_CAPTION = (
     "Mean speed in bins of 20 m and 5 s, in the first run with trajectories of each method and "
     "volume. Grey: no vehicle. Dashed: start of lane sorting."
 )
+SPEED_CLOSED_CAPTION = " Hatched, between dotted lines: positions at which a lane is closed."
 SPACING_CAPTION = (
     "Spacing: distance between the front bumpers of successive vehicles in a lane, sampled every "
     "second. Time headway: spacing divided by the speed of the following, moving vehicle. "
@@ -97,9 +99,13 @@ def report_run(run: Run, *, formation: int | None = None, dpi: int = DPI) -> Pat
     For arguments and errors see `report_comparison`.
     """
     road, title = run.scenario.road, f"laneweave run: {run.folder.resolve().name}"
-    lead = (
-        f"{_title(run)}. {road.lanes} lanes, {road.length_m:g} m; lane sorting begins at "
-        f"{road.sorting_start_m:g} m. Vehicles arrive for {run.scenario.demand.duration_s:g} s."
+    lead = _sentences(
+        f"{_title(run)}.",
+        f"{road.lanes} lanes, {road.length_m:g} m; lane sorting begins at "
+        f"{road.sorting_start_m:g} m.",
+        describe_closed_parts(run.scenario),
+        "" if run.scenario.lane_shares else "Vehicles have no preferred lanes.",
+        f"Vehicles arrive for {run.scenario.demand.duration_s:g} s.",
     )
     names = {"travel_times.png": "travel_time.png", "speeds.png": "speed.png"}
     names[f"road-{run.label}.png"] = "road.png"
@@ -126,7 +132,11 @@ def report_comparison(
     """
     out.mkdir(parents=True, exist_ok=True)
     runs = len(comparison.runs)
-    lead = f"{runs} runs of {', '.join(comparison.labels)}; {len(comparison.failed)} failed."
+    roads = {describe_closed_parts(run.scenario) for run in comparison.runs}
+    lead = _sentences(
+        f"{runs} runs of {', '.join(comparison.labels)}; {len(comparison.failed)} failed.",
+        roads.pop() if len(roads) == 1 else "The runs differ in the closed parts of lanes.",
+    )
     sections = _sections(comparison, _Report(out / "figures", REPORT_DPI), formation)
     return write_page(title, lead, sections, out)
 
@@ -160,11 +170,12 @@ def _sections(comparison: Comparison, report: _Report, formation: int | None) ->
             "Throughput and share in the preferred lane against traffic volume",
         )
     if busiest:
+        closed = any(run.scenario.road.closures for run in busiest)
         report.add(
             "Speed over space and time",
             "speeds.png",
             partial(figures.draw_speeds, comparison),
-            SPEED_CAPTION,
+            SPEED_CAPTION + SPEED_CLOSED_CAPTION * closed,
             "Heat maps of mean speed over time and position, one for each method and volume",
         )
         pictures = [one for run in busiest for one in _snapshots(report, run)]
@@ -179,13 +190,20 @@ def _sections(comparison: Comparison, report: _Report, formation: int | None) ->
 def _snapshots(report: _Report, run: Run) -> list[Picture]:
     # A comparison shows the paper's stretch for all methods, if the road is long enough.
     fits = not report.names and run.scenario.road.length_m >= PAPER_STRETCH_M[1]
-    stretch_m = PAPER_STRETCH_M if fits else None
+    stretch_m = PAPER_STRETCH_M if fits and not run.scenario.road.closures else None
+    preferences = bool(run.scenario.lane_shares)
+    caption = _sentences(
+        f"{_title(run)}. Four times at intervals of the shortest T_F.",
+        "Colours show the preferred lanes;" if preferences else "Vehicles have no preferred lanes;",
+        "faster vehicles are lighter.",
+        "Hatched: closed; thick line: stop line before it." if run.scenario.road.closures else "",
+    )
+    coloured = " coloured by preferred lane" if preferences else ""
     return report.draw(
         f"road-{run.label}.png",
         lambda path, dpi: road_snapshots(run.folder, path, stretch_m=stretch_m, dpi=dpi),
-        f"{_title(run)}. Four times at intervals of the shortest T_F. Colours show the preferred "
-        "lanes; faster vehicles are lighter.",
-        f"Four strips of road with vehicles coloured by preferred lane, {run.label}",
+        caption,
+        f"Four strips of road with vehicles{coloured}, {run.label}",
     )
 
 
@@ -196,10 +214,9 @@ def _add_path_map(report: _Report, driven: DrivenMap | None) -> None:
         "Relative path map",
         "path_map.png",
         partial(draw_path_map, driven),
-        f"Cells (column, lane) of {driven.vehicles} at the ends of slots, as driven. The box "
-        "before a name has the colour of the preferred lane; cells have the colour of their lane, "
-        "strong if it is the preferred one; bold: moved in the preceding slot. Cost: the sum "
-        "over the vehicles of the slot in which they arrive.",
+        f"Cells (column, lane) of {driven.vehicles} at the ends of slots, as driven. "
+        f"{driven.colours}; bold: moved in the preceding slot. Cost: the sum over the vehicles of "
+        "the slot in which they arrive.",
         f"Table of the cells of {driven.name} by vehicle and slot",
     )
 
@@ -230,6 +247,11 @@ def _add_distributions(report: _Report, comparison: Comparison, example: Run) ->
 
 def _has_formations(run: Run) -> bool:
     return run.summary is not None and run.summary.planning.largest_formation > 0
+
+
+def _sentences(*parts: str) -> str:
+    """Join the sentences that are not empty."""
+    return " ".join(part for part in parts if part)
 
 
 def _title(run: Run) -> str:

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from laneweave.launch.drawing.closed_parts import CLOSED_FILL, CLOSED_HATCH, closed_parts
 from laneweave.launch.drawing.colours import (
+    NEUTRAL,
     SHADE_STRENGTH,
     SPEED_SPAN_MPS,
-    lane_colours,
-    lane_names,
+    vehicle_colour,
+    vehicle_legend,
 )
 from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK
 from laneweave.launch.formation_columns import Formations
@@ -20,6 +22,7 @@ from laneweave.launch.recordings.formations import closed_formations
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.recordings.trajectories import Floats, Tracks, read_tracks, read_trips
 from laneweave.launch.report.style import picture
+from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 
 if TYPE_CHECKING:
@@ -29,10 +32,17 @@ if TYPE_CHECKING:
 _ASPHALT, _PAINT = "#eeeff1", "#ffffff"
 _OWNED = ("#e2e4e8", "#d5d8dd")
 """Alternating colours for the columns of formations."""
-_ACROSS_SCALE = 1.8
-"""Scale across the road relative to the scale along it; lanes would be too thin otherwise."""
+_CLOSED: Any = {"fc": CLOSED_FILL, "ec": CLOSED_HATCH, "hatch": "/////", "lw": 1.0}
+_ACROSS_SCALE, _LONG_ACROSS_SCALE = 1.8, 2.1
+"""Scale across the road relative to the scale along it, because lanes would be too thin otherwise;
+the second one is for stretches longer than `_LONG_M`."""
+_LONG_M = 450.0
+_MAX_LEGEND_COLUMNS = 7
 _HEADROOM_M = 4.5
 """Space above the road for formation numbers."""
+_MAX_STRETCH_M, _MAX_CLOSED_M, _BEYOND_M = 740.0, 120.0, 50.0
+"""On roads with closed parts: maximum length of the stretch, maximum length of a closed part that
+is shown to its end, and length shown beyond its beginning or end."""
 
 
 def road_snapshots(
@@ -47,29 +57,29 @@ def road_snapshots(
 
     Vehicles have the colour of their preferred lane; faster vehicles are lighter. Left lanes are on
     top, and traffic moves to the right. The columns of formations are in alternating shades of
-    grey, with the formation numbers above the road.
+    grey, with the formation numbers above the road. Closed parts of lanes are hatched.
 
     Args:
         folder: folder of the run.
         out: file of the picture; its suffix defines the format.
         times: road times [s]; empty: the four times, spaced by the shortest T_F, at which the most
             vehicles change lanes.
-        stretch_m: (from m, to m); None: from 20 m before lane sorting begins to 300 m beyond that
-            point.
+        stretch_m: (from m, to m); None: `default_stretch_m`.
         dpi: resolution in dots per inch.
     """
     scenario = scenario_of(folder / "trajectories.parquet")
     road = scenario.road
     if stretch_m is None:
-        start_m = max(0.0, road.sorting_start_m - 20.0)
-        stretch_m = (start_m, min(road.length_m, start_m + 320.0))
+        stretch_m = default_stretch_m(scenario)
     tracks = read_tracks(folder)
     if not times:
         times = _instants(tracks, scenario, stretch_m)
     trips = read_trips(folder)
     formations = closed_formations(folder, scenario)
     width_in, road_m = 9.6, road.lanes * road.lane_width_m + _HEADROOM_M
-    strip_in = _ACROSS_SCALE * (width_in - 0.9) * road_m / (stretch_m[1] - stretch_m[0])
+    length_m = stretch_m[1] - stretch_m[0]
+    across = _ACROSS_SCALE if length_m <= _LONG_M else _LONG_ACROSS_SCALE
+    strip_in = across * (width_in - 0.9) * road_m / length_m
     with picture(width_in, 0.9 + len(times) * (strip_in + 0.06), out, dpi) as figure:
         strips = figure.subplots(len(times), 1, sharex=True, squeeze=False)[:, 0]
         for axes, t_s in zip(strips, times, strict=True):
@@ -79,11 +89,28 @@ def road_snapshots(
             for number, name in enumerate(tracks.names):
                 pose = _pose(tracks, number, t_s)
                 if pose is not None and stretch_m[0] <= pose[0] <= stretch_m[1] + 10.0:
-                    preferred = trips[name]["preferred_lane"] if name in trips else 0
+                    preferred = trips[name]["preferred_lane"] if name in trips else ANY_LANE
                     _draw_vehicle(axes, pose, preferred, scenario)
         strips[-1].tick_params(axis="x", bottom=True, labelbottom=True)
         strips[-1].set_xlabel("position on the road (m)")
         _draw_legend(figure, scenario)
+
+
+def default_stretch_m(scenario: Scenario) -> tuple[float, float]:
+    """Return the stretch of road that is shown by default.
+
+    It begins 20 m before lane sorting and is 320 m long. If the road has closed parts, it extends
+    beyond the beginning of the first one, and, if that is short, beyond its end.
+    """
+    road = scenario.road
+    start_m, length_m = max(0.0, road.sorting_start_m - 20.0), 320.0
+    if closed := closed_parts(scenario):
+        first = min(closed, key=lambda part: part.from_m)
+        short = first.to_m - first.from_m <= _MAX_CLOSED_M
+        end_m = (first.to_m if short else first.from_m) + _BEYOND_M
+        start_m = max(start_m, end_m - _MAX_STRETCH_M)
+        length_m = max(length_m, end_m - start_m)
+    return start_m, min(road.length_m, start_m + length_m)
 
 
 def _pose(tracks: Tracks, number: int, t_s: float) -> tuple[float, float, float, float] | None:
@@ -113,6 +140,7 @@ def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -
             linestyle="-" if edge else (0, (7, 6)),
             zorder=1,
         )
+    _draw_closed_parts(axes, scenario)
     if stretch_m[0] < road.sorting_start_m < stretch_m[1]:
         place = ([road.sorting_start_m] * 2, [0.0, width_m])
         axes.plot(*place, color=INK, linewidth=1.0, linestyle=":", zorder=2)
@@ -120,6 +148,18 @@ def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -
     axes.tick_params(axis="x", bottom=False, labelbottom=False)
     axes.spines[:].set_visible(False)
     axes.grid(visible=False)
+
+
+def _draw_closed_parts(axes: Axes, scenario: Scenario) -> None:
+    """Draw closed parts with hatching, and the stop lines before them."""
+    from matplotlib.patches import Rectangle  # noqa: PLC0415 - lazily
+
+    width_m = scenario.road.lane_width_m
+    for part in closed_parts(scenario):
+        corner, length_m = (part.from_m, part.lane * width_m), part.to_m - part.from_m
+        axes.add_patch(Rectangle(corner, length_m, width_m, zorder=1.5, **_CLOSED))
+        lane_m = (corner[1], corner[1] + width_m)
+        axes.plot([part.line_m] * 2, lane_m, color=INK, linewidth=1.6, zorder=2)
 
 
 def _draw_formations(
@@ -168,8 +208,8 @@ def _draw_vehicle(
         box = np.array([[rear, -half], [front, -half], [front, half], [rear, half]])
         return np.asarray((box * [length_m, width_m]) @ turn + centre, dtype=np.float64)
 
-    colours = lane_colours(scenario.road.lanes)
-    colour = _shade(colours[preferred % len(colours)], speed_mps - scenario.formation.speed_mps)
+    own_colour = vehicle_colour(scenario.road.lanes, preferred)
+    colour = _shade(own_colour, speed_mps - scenario.formation.speed_mps)
     axes.add_patch(
         Polygon(shape(-0.5, 0.5, 0.5), facecolor=colour, edgecolor=INK, linewidth=0.5, zorder=3)
     )
@@ -178,20 +218,24 @@ def _draw_vehicle(
 
 def _draw_legend(figure: Figure, scenario: Scenario) -> None:
     """Draw the legend of colours above the strips."""
+    from matplotlib.lines import Line2D  # noqa: PLC0415 - lazily
     from matplotlib.patches import Patch  # noqa: PLC0415 - lazily
 
     speed_mps = scenario.formation.speed_mps
-    colours = lane_colours(scenario.road.lanes)
-    names = lane_names(scenario.road.lanes)
-    entries: list[tuple[Any, str]] = [
-        (colours[lane], f"prefers {names[lane]}") for lane in reversed(range(len(colours)))
-    ]
+    entries: list[tuple[Any, str]] = [*vehicle_legend(scenario)]
     for over_mps, word in ((-SPEED_SPAN_MPS, "slower"), (SPEED_SPAN_MPS, "faster")):
-        entries.append((_shade("#8a8f96", over_mps), f"{word} than {speed_mps:g} m/s"))
+        entries.append((_shade(NEUTRAL, over_mps), f"{word} than {speed_mps:g} m/s"))
+    handles: list[Patch | Line2D] = [
+        Patch(fc=colour, ec=INK, lw=0.5, label=label) for colour, label in entries
+    ]
+    if scenario.road.closures:
+        handles.append(Patch(label="closed", **_CLOSED))
+        style: dict[str, Any] = {"marker": "|", "markersize": 9, "markeredgewidth": 1.6}
+        handles.append(Line2D([], [], color=INK, linewidth=0.0, label="stop line", **style))
     figure.legend(
-        handles=[Patch(fc=colour, ec=INK, lw=0.5, label=label) for colour, label in entries],
+        handles=handles,
         loc="outside upper center",
-        ncols=len(entries),
+        ncols=min(len(handles), _MAX_LEGEND_COLUMNS),
         fontsize=8,
         handlelength=1.6,
         columnspacing=1.6,

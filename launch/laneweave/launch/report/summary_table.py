@@ -8,25 +8,36 @@ from collections import Counter
 from laneweave.protocol.scenario.fields import COMFORT_MPS2
 from laneweave.protocol.summary import Planning, RunSummary, Safety
 
+NO_PREFERENCES = "no preferred lanes"
 MAX_LISTED = 5
 """Maximum number of recovery times that are listed individually."""
 
 
-def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
-    """Return the rows (figure, value) of a run's table."""
-    return [*_traffic_rows(summary), *_control_rows(summary), *_fault_rows(summary)]
+def summary_rows(summary: RunSummary, *, preferences: bool = True) -> list[tuple[str, str]]:
+    """Return the rows (figure, value) of a run's table.
+
+    Args:
+        summary: summary of the run.
+        preferences: whether vehicles have preferred lanes.
+    """
+    return [
+        *_traffic_rows(summary, preferences=preferences),
+        *_control_rows(summary),
+        *_fault_rows(summary),
+    ]
 
 
-def _traffic_rows(summary: RunSummary) -> list[tuple[str, str]]:
+def _traffic_rows(summary: RunSummary, *, preferences: bool) -> list[tuple[str, str]]:
     vehicles, safety, travel_s = summary.vehicles, summary.safety, summary.travel_time_s
     tracking, share = summary.tracking, (summary.preferred_percent or 0.0) / 100.0
+    preferred = f"{vehicles.on_preferred_lane} ({share:.2%})" if preferences else NO_PREFERENCES
     low, high = _text(safety.min_accel_mps2), _text(safety.max_accel_mps2)
     return [
         ("demand", f"{summary.volume_veh_per_lane_h:g} vehicles/(lane h), seed {summary.seed}"),
         ("simulated time", f"{summary.simulated_s:.1f} s"),
         ("vehicles left / entered", f"{vehicles.left} / {vehicles.entered}"),
         ("maximum at one time", f"{vehicles.peak}"),
-        ("in their preferred lane", f"{vehicles.on_preferred_lane} ({share:.2%})"),
+        ("in their preferred lane", preferred),
         ("travel time mean / p95 / max", _join(travel_s.mean, travel_s.p95, travel_s.max) + " s"),
         ("ticks driven without an agent", _count(tracking.hold_law_ticks)),
         ("ticks of emergency braking", _count(tracking.emergency_ticks)),

@@ -61,7 +61,9 @@ def tables_of(comparison: Comparison) -> list[Table]:
     """Return the tables of a report on a single run, or on several runs side by side."""
     if len(comparison.runs) == 1 and not comparison.failed:
         return [run_table(comparison.runs[0])]
-    results = results_table(comparison.runs)
+    results, traffic = results_table(comparison.runs), _TRAFFIC
+    if not any(run.scenario.lane_shares for run in comparison.runs):
+        traffic = tuple(column for column in _TRAFFIC if column[1] != PREFERRED)
     columns = (*_TRAFFIC, *_SAFETY, *_PLANNING)
     wanted = [(column, function) for _, column, function, _ in columns if function]
     wanted += [(column, "stddev") for column, function in wanted if function == "mean"]
@@ -69,7 +71,7 @@ def tables_of(comparison: Comparison) -> list[Table]:
     rows = [row | {"solvers": _solvers(row)} for row in over_seeds(results, wanted)]
     planned = [row for row in rows if row["planning_plans_sum"]]
     return [
-        _table(rows, _TRAFFIC, "Means over the seeds ± standard deviation."),
+        _table(rows, traffic, "Means over the seeds ± standard deviation."),
         _table(rows, _SAFETY, "Extremes or sums over the seeds."),
         _table(planned, _PLANNING, "Planning: sums over the seeds; sizes and times are maxima."),
         failed_table(comparison),
@@ -78,7 +80,8 @@ def tables_of(comparison: Comparison) -> list[Table]:
 
 def run_table(run: Run) -> Table:
     """Return the table of one run."""
-    rows = summary_rows(run.summary) if run.summary else []
+    preferences = bool(run.scenario.lane_shares)
+    rows = summary_rows(run.summary, preferences=preferences) if run.summary else []
     caption = "Results of the run; all values are in summary.json."
     return Table(("", "value"), [("method", run.label), *rows], caption, 2)
 

@@ -13,7 +13,9 @@ depend on earlier frames, so any frame may be skipped.
 | `session` | unique identifier of the server; frames of other sessions are unrelated |
 | `step_s` | time between two frames: wall-clock time if live, road time if recorded |
 | `first`, `last` | numbers of the available frames; `last` < `first`: none |
-| `road`, `body_m`, `lattice`, `shade`, `colours`, `names` | parameters for drawing the road |
+| `road`, `body_m`, `lattice`, `shade`, `colours`, `neutral` | parameters for drawing the road |
+| `preferences` | whether vehicles have preferred lanes |
+| `legend` | colours of vehicles: list of [colour, meaning] |
 | `rolling` | whether there are no formations: rolling operation or a reference method |
 | `losses` | recorded: message counts of the summary; live: null |
 
@@ -38,10 +40,10 @@ live frames are sent on request.
 | `vehicles` | list of rows, one per vehicle |
 
 **Row** of a vehicle: `[name, s, y, speed, lane, formation, hold, target, flags, owned]`: s of the
-front bumper, y of the body centre, preferred lane (-1: unknown), number of the closed formation
-(-1: none), hold cell and target cell as [column, lane] or 0, sum of flags (1 moves, 2 has no agent,
-4 not heard from, 8 overdue), and the other owned cells as column, lane, column, lane, ... The
-target is the last cell of the plan that the vehicle has accepted but not completed.
+front bumper, y of the body centre, preferred lane (-1: none, or unknown), number of the closed
+formation (-1: none), hold cell and target cell as [column, lane] or 0, sum of flags (1 moves, 2 has
+no agent, 4 not heard from, 8 overdue), and the other owned cells as column, lane, column, lane, ...
+The target is the last cell of the plan that the vehicle has accepted but not completed.
 
 **Request** from the page: `{"want": [from, to]}`, at most `MAX_REQUESTED` frame numbers. The
 response has the available frames: `{"reel": [from, to], "first": n, "last": n, "frames": [...]}`.
@@ -56,7 +58,7 @@ from typing import Any, Final, Protocol
 
 from attrs import define, field, frozen
 
-from laneweave.launch.drawing.colours import lane_names, road_scene
+from laneweave.launch.drawing.road_scene import road_scene
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario, solver_of_event
 from laneweave.protocol.wire.events import (
@@ -238,7 +240,6 @@ def scene_of(scenario: Scenario, kind: str, title: str, step_s: float) -> dict[s
         "title": title,
         "step_s": step_s,
         **road_scene(scenario),
-        "names": list(lane_names(scenario.road.lanes)),
         "rolling": scenario.formation.rolling,
         "losses": None,
     }

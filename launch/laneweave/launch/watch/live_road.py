@@ -23,6 +23,7 @@ from laneweave.launch.watch.frames import (
     plan_row,
 )
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import (
     Ballot,
@@ -187,7 +188,7 @@ class LiveRoad:
         elif state is not None:
             owner = formations.at(lattice.block_range(state.formation).start)
         formation = -1 if owner is None else owner.number
-        preferred = entry.preferred_lane if entry is not None else -1
+        preferred = entry.preferred_lane if entry is not None else ANY_LANE
         if state is not None and abs(t_s - state.t_s) <= UNHEARD_S:
             flags = MOVING * state.moving | UNATTENDED * (not state.attended)
             return Row(

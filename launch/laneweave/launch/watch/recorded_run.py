@@ -23,6 +23,7 @@ from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks, read_t
 from laneweave.launch.run_methods import FORMATION
 from laneweave.launch.watch.frames import MOVING, EventFeed, Row, compact, plan_row, scene_of
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.wire.events import ENTERED, FORMATIONS_JOINED, LEADER, LEFT
 
 STEP_S = 0.2
@@ -131,7 +132,7 @@ class Recording:
                 s_m=float(tracks.s_m[place]),
                 y_m=y_m,
                 speed_mps=float(tracks.speed_mps[place]),
-                preferred_lane=int(trip.get("preferred_lane", -1)),
+                preferred_lane=int(trip.get("preferred_lane", ANY_LANE)),
                 formation=formation.number if formation and formation.closed_s <= t_s else -1,
                 hold=cell,
                 target=None,

@@ -22,6 +22,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
+from laneweave.launch.drawing.road_scene import closed_parts_script
 from laneweave.launch.watch.frames import FrameSource, batch, opening
 from laneweave.launch.web import road_script, text_of
 
@@ -120,6 +121,7 @@ def make_app(source: FrameSource, browsers: Browsers, health: Health) -> Starlet
         routes=[
             *(_file(path, name, kind) for path, (name, kind) in _FILES.items()),
             Route("/road.js", _answer(road_script(), "text/javascript")),
+            Route("/closed_parts.js", _answer(closed_parts_script(), "text/javascript")),
             Route("/healthz", healthz),
             WebSocketRoute("/stream", stream),
         ]

@@ -14,9 +14,11 @@ import pytest
 from attrs import evolve
 from PIL import Image
 
+from laneweave.launch.drawing.road_scene import road_scene
 from laneweave.launch.recordings.runs import POINT_FILE, Comparison, runs_of
 from laneweave.launch.report.page import Animation, Section, render_page
 from laneweave.launch.report.tables import Table, tables_of
+from laneweave.protocol.scenario.fields import Scenario
 from support.commands import Here
 from support.summaries import make_summary
 
@@ -189,7 +191,7 @@ def test_an_error_of_the_report_is_not_reported_as_bad_input(
 
 
 def test_a_page_escapes_its_texts() -> None:
-    road = {"road": {"lanes": 1}, "colours": ["#000000"], "lattice": {"speed_mps": 15.0}}
+    road = road_scene(Scenario())
     texts = "</script><b>"
     page = render_page(
         texts,

@@ -61,4 +61,4 @@ def test_the_scene_contains_the_numbers_of_frames() -> None:
     scene = json.loads(opening(source, "this server"))["scene"]
     assert (scene["first"], scene["last"], scene["session"]) == (15, 24, "this server")
     assert (scene["kind"], scene["title"], scene["rolling"]) == ("live", "here", False)
-    assert len(scene["colours"]) == len(scene["names"]) == scene["road"]["lanes"] == 3
+    assert len(scene["colours"]) == len(scene["legend"]) == scene["road"]["lanes"] == 3

@@ -62,7 +62,8 @@ class Player {
     const { run } = this;
     const present = laneweave.allAt(run, this.t);
     const bodies = present.map(([vehicle, state]) => ({ ...state, name: vehicle.name, lane: vehicle.lane }));
-    this.painter.paint(laneweave.stretches(run, this.follow, this.t, WINDOW_M), bodies);
+    const stretches = laneweave.stretches(run, this.follow, this.t, WINDOW_M);
+    this.painter.paint(stretches, bodies, [laneweaveClosed.closedParts]);
     this.slider.value = this.t;
     const mean = present.reduce((sum, [, state]) => sum + state.v, 0) / (present.length || 1);
     const speed = present.length ? `, mean ${mean.toFixed(1)} m/s` : "";

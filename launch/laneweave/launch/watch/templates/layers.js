@@ -24,8 +24,8 @@ const laneweaveLayers = (() => {
   }
 
   function ownColour(painter, body) {
-    const { colours } = painter.scene;
-    return body.lane < 0 ? painter.theme.faint : colours[body.lane % colours.length];
+    const { colours, neutral } = painter.scene;
+    return body.lane < 0 ? neutral : colours[body.lane % colours.length];
   }
 
   /** Draw the hold cells of vehicles with a frame, their other owned cells without. */

@@ -86,6 +86,7 @@ class Watch {
     document.title = `${scene.title} · laneweave`;
     part("title").textContent = scene.title;
     part("cells-name").textContent = this.live || !scene.rolling ? "cells" : "held cells";
+    part("sorted-name").textContent = scene.preferences ? "In their lane" : "Mean speed";
     part("paces").hidden = this.live;
     if (!this.live && this.place === null) {
       this.place = this.store.first;
@@ -246,7 +247,7 @@ class Watch {
     const picture = laneweaveFrames.between(frame, next, share);
     this.picture = picture;
     const { t, bodies } = picture;
-    const layers = [];
+    const layers = [laneweaveClosed.closedParts];
     if (t !== null) {
       const { formations, joined } = this.current;
       layers.push(laneweaveLayers.blocks(formations, joined, t));
@@ -295,8 +296,14 @@ class Watch {
     const [demanded, entered, , left] = frame.counts ?? [0, 0, 0, 0];
     setText("count", frame.counts ? `${this.picture.bodies.length}` : "–");
     setText("counts", frame.counts ? `${entered} of ${demanded} entered, ${left} left` : "");
-    setText("sorted", knownLane ? `${Math.round((100 * inLane) / knownLane)} %` : "–");
-    setText("speed", speed === null ? "" : `${inLane} of ${knownLane}; mean ${speed.toFixed(1)} m/s`);
+    const mean = speed === null ? "" : `${speed.toFixed(1)} m/s`;
+    if (scene.preferences) {
+      setText("sorted", knownLane ? `${Math.round((100 * inLane) / knownLane)} %` : "–");
+      setText("speed", mean && `${inLane} of ${knownLane}; mean ${mean}`);
+    } else {
+      setText("sorted", mean || "–");
+      setText("speed", "no preferred lanes");
+    }
     setText("leader", frame.leader ? `${frame.leader[0]}, term ${frame.leader[1]}` : "none");
     part("leader").classList.toggle("bad", !frame.leader);
     this.showCandidates(frame.candidates);
@@ -397,7 +404,7 @@ class Watch {
   }
 
   showLegend() {
-    const { colours, names, lattice, rolling } = this.store.scene;
+    const { legend, road, lattice, rolling } = this.store.scene;
     const entry = (style, words) => {
       const span = document.createElement("span");
       if (style) {
@@ -409,7 +416,7 @@ class Watch {
       span.append(words);
       return span;
     };
-    const own = names.map((name, lane) => entry({ kind: "car", colour: colours[lane] }, `prefers ${name}`));
+    const own = legend.map(([colour, words]) => entry({ kind: "car", colour }, words));
     const rest = [
       entry(null, `darker: slower than ${lattice.speed_mps} m/s; lighter: faster`),
       entry({ kind: "cell" }, this.live && rolling ? "cells that a vehicle owns; framed: its hold cell" : "hold cell of a vehicle"),
@@ -420,7 +427,10 @@ class Watch {
       rest.push(entry({ kind: "ghost" }, "not heard from: expected position"));
       rest.push(entry({ kind: "odd" }, "without agent, or overdue"));
     }
-    part("legend").replaceChildren(...own.reverse(), ...rest);
+    if (road.closed.length > 0) {
+      rest.push(entry({ kind: "closed" }, "closed"), entry({ kind: "stop-line" }, "stop line"));
+    }
+    part("legend").replaceChildren(...own, ...rest);
   }
 }
 

@@ -1,0 +1,51 @@
+"use strict";
+// Closed parts of lanes, as a layer of the road (laneweave/launch/web/road.js). The road of the scene
+// has `closed` [[lane, from, to], ...] and `stop_lines` [[lane, s], ...], in m.
+
+const laneweaveClosed = (() => {
+  const HATCH_PX = 7; // distance between the lines
+
+  /** Draw closed parts with hatching, and the stop lines before them. */
+  function closedParts(painter) {
+    const { pen, theme } = painter;
+    const { closed, stop_lines: stopLines, lane_width_m: width } = painter.scene.road;
+    const high = painter.y(0) - painter.y(width);
+    for (const [lane, from, to] of closed) {
+      if (painter.shows(from, to)) hatch(painter, from, to, painter.y((lane + 1) * width), high);
+    }
+    pen.strokeStyle = theme.ink;
+    pen.lineWidth = 2;
+    for (const [lane, s] of stopLines) {
+      const top = painter.y((lane + 1) * width);
+      if (painter.shows(s, s)) laneweaveRoad.line(pen, painter.x(s), top, painter.x(s), top + high);
+    }
+  }
+
+  function hatch(painter, from, to, top, high) {
+    const { pen, theme } = painter;
+    const [begin, end] = [painter.x(from), painter.x(to)];
+    const [left, right] = [Math.max(begin, 0), Math.min(end, painter.width)];
+    pen.save();
+    pen.beginPath();
+    pen.rect(left, top, right - left, high);
+    pen.clip();
+    pen.fillStyle = theme.asphalt; // covers the lane markings
+    pen.fillRect(left, top, right - left, high);
+    pen.globalAlpha = 0.25;
+    pen.fillStyle = pen.strokeStyle = theme.faint;
+    pen.fillRect(left, top, right - left, high);
+    pen.globalAlpha = 0.6;
+    pen.lineWidth = 1;
+    // Fix the lines to the road, not to the canvas.
+    const skipped = Math.floor((left - begin) / HATCH_PX) * HATCH_PX;
+    for (let foot = begin + skipped - high; foot < right; foot += HATCH_PX) {
+      laneweaveRoad.line(pen, foot, top + high, foot + high, top);
+    }
+    pen.globalAlpha = 1;
+    pen.lineWidth = 3;
+    pen.strokeRect(begin, top, end - begin, high);
+    pen.restore();
+  }
+
+  return { closedParts };
+})();

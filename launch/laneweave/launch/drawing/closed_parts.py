@@ -1,0 +1,52 @@
+"""Closed parts of lanes as shown in figures and on pages: extents, stop lines, descriptions."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from attrs import frozen
+
+from laneweave.launch.drawing.colours import lane_names
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.lane_ends import dead_ends
+
+CLOSED_FILL, CLOSED_HATCH = "#d3d7dc", "#9aa2ac"
+"""Colours of closed parts in figures."""
+_MAX_NAMED: Final = 3
+"""Maximum number of lanes on roads whose lanes have names like `right`."""
+
+
+@frozen
+class ClosedPart:
+    """A closed part of a lane, as far as it is on the road."""
+
+    lane: int
+    from_m: float
+    to_m: float
+    line_m: float
+    """The stop line before it."""
+
+
+def closed_parts(scenario: Scenario) -> tuple[ClosedPart, ...]:
+    """Return the closed parts of a road, by lane and position."""
+    road = scenario.road
+    line_m = {(end.lane, end.end_m): end.line_m for end in dead_ends(scenario)}
+    return tuple(
+        ClosedPart(
+            part.lane, part.from_m, min(part.to_m, road.length_m), line_m[part.lane, part.from_m]
+        )
+        for part in sorted(road.closures, key=lambda part: (part.lane, part.from_m))
+    )
+
+
+def describe_closed_parts(scenario: Scenario) -> str:
+    """Return a sentence for each closed part of the road; empty: there is none."""
+    lanes, length_m = scenario.road.lanes, scenario.road.length_m
+    sentences = []
+    for part in closed_parts(scenario):
+        name = f"Lane {part.lane} (0: rightmost)"
+        if lanes <= _MAX_NAMED:
+            name = f"The {lane_names(lanes)[part.lane]} lane"
+        end = f"{part.to_m:g} m" if part.to_m < length_m else "the end of the road"
+        sentences.append(f"{name} is closed from {part.from_m:g} m to {end}.")
+    return " ".join(sentences)

@@ -1,0 +1,43 @@
+"""The scene of a road, drawn in reports and on the live page by `web/road.js` and a layer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from laneweave.launch.drawing.closed_parts import closed_parts
+from laneweave.launch.drawing.colours import (
+    NEUTRAL,
+    SHADE_STRENGTH,
+    SPEED_SPAN_MPS,
+    lane_colours,
+    vehicle_legend,
+)
+from laneweave.launch.web import text_of
+from laneweave.protocol.scenario.fields import Scenario
+
+
+def road_scene(scenario: Scenario) -> dict[str, Any]:
+    """Return the road, bodies, lattice and colours in the format that the scripts read."""
+    road, formation, closed = scenario.road, scenario.formation, closed_parts(scenario)
+    return {
+        "road": {
+            "length_m": road.length_m,
+            "lanes": road.lanes,
+            "lane_width_m": road.lane_width_m,
+            "sorting_start_m": road.sorting_start_m,
+            "closed": [[part.lane, part.from_m, part.to_m] for part in closed],
+            "stop_lines": [[part.lane, part.line_m] for part in closed],
+        },
+        "body_m": [scenario.vehicle.length_m, scenario.vehicle.width_m],
+        "lattice": {"speed_mps": formation.speed_mps, "pitch_m": formation.gap_m},
+        "shade": {"span_mps": SPEED_SPAN_MPS, "strength": SHADE_STRENGTH},
+        "colours": list(lane_colours(road.lanes)),
+        "neutral": NEUTRAL,
+        "preferences": bool(scenario.lane_shares),
+        "legend": [list(entry) for entry in vehicle_legend(scenario)],
+    }
+
+
+def closed_parts_script() -> str:
+    """Return the script that draws closed parts of lanes and defines `laneweaveClosed`."""
+    return text_of("laneweave.launch.drawing", "closed_parts.js")
