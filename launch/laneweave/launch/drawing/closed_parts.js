@@ -3,7 +3,8 @@
 // has `closed` [[lane, from, to], ...] and `stop_lines` [[lane, s], ...], in m.
 
 const laneweaveClosed = (() => {
-  const HATCH_PX = 7; // distance between the lines
+  const HATCH_PX = 7; // distance between the lines of the hatching
+  const LINE_PX = 3; // width of stop lines
 
   /** Draw closed parts with hatching, and the stop lines before them. */
   function closedParts(painter) {
@@ -14,10 +15,13 @@ const laneweaveClosed = (() => {
       if (painter.shows(from, to)) hatch(painter, from, to, painter.y((lane + 1) * width), high);
     }
     pen.strokeStyle = theme.ink;
-    pen.lineWidth = 2;
+    pen.lineWidth = LINE_PX;
     for (const [lane, s] of stopLines) {
+      if (!painter.shows(s, s)) continue;
+      // Keep all of the line on the canvas if it is at the border of the stretch.
+      const x = Math.max(LINE_PX / 2, Math.min(painter.width - LINE_PX / 2, painter.x(s)));
       const top = painter.y((lane + 1) * width);
-      if (painter.shows(s, s)) laneweaveRoad.line(pen, painter.x(s), top, painter.x(s), top + high);
+      laneweaveRoad.line(pen, x, top, x, top + high);
     }
   }
 

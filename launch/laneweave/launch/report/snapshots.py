@@ -107,7 +107,7 @@ def default_stretch_m(scenario: Scenario) -> tuple[float, float]:
     if closed := closed_parts(scenario):
         first = min(closed, key=lambda part: part.from_m)
         short = first.to_m - first.from_m <= _MAX_CLOSED_M
-        end_m = (first.to_m if short else first.from_m) + _BEYOND_M
+        end_m = min(road.length_m, (first.to_m if short else first.from_m) + _BEYOND_M)
         start_m = max(start_m, end_m - _MAX_STRETCH_M)
         length_m = max(length_m, end_m - start_m)
     return start_m, min(road.length_m, start_m + length_m)

@@ -3,7 +3,7 @@
 A pure core that turns messages and times into frames. Every vehicle publishes its state in each
 tick; until the next state arrives, its position is extrapolated from its speed. After `UNHEARD_S`
 without a state, the vehicle is drawn in its cell and marked: without new information it holds its
-cell, but its position is unknown.
+cell, but its position is unknown. If its cell has passed a stop line, it is drawn at that line.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from laneweave.launch.watch.frames import (
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.wire.messages import (
     Ballot,
     CensusEntry,
@@ -52,6 +53,7 @@ class LiveRoad:
     def __init__(self, scenario: Scenario, wall_s: float) -> None:
         """Start at a wall-clock time, connected to the router."""
         self.scenario = scenario
+        self._lane_ends = LaneEnds(scenario)
         self.view = RoadView(loss_window_ticks=LOSS_WINDOW_TICKS)
         self._targets: dict[Ballot, dict[Name, Cell]] = {}
         """Last cell of each moving vehicle, by plan."""
@@ -198,20 +200,23 @@ class LiveRoad:
                 speed_mps=state.speed_mps,
                 preferred_lane=preferred,
                 formation=formation,
-                hold=state.hold_cell,
+                hold=None if self._lane_ends.has_passed(state.hold_cell, t_s) else state.hold_cell,
                 target=self._target_of(state),
                 flags=flags | OVERDUE * state.overdue,
                 owned=[cell for cell in state.owned if cell != state.hold_cell],
             )
         cell = state.hold_cell if state is not None else entry.cell if entry is not None else (0, 0)
+        s_m, off_lattice = lattice.cell_s_m(cell[0], t_s), self._lane_ends.has_passed(cell, t_s)
+        if off_lattice and (end := self._lane_ends.ahead(cell[1], s_m)) is not None:
+            s_m = end.line_m
         return Row(
             name=name,
-            s_m=lattice.cell_s_m(cell[0], t_s),
+            s_m=s_m,
             y_m=lattice.cell_y_m(cell[1]),
             speed_mps=lattice.speed_mps,
             preferred_lane=preferred,
             formation=formation,
-            hold=cell,
+            hold=None if off_lattice else cell,
             target=None,
             flags=UNHEARD,
         )

@@ -24,6 +24,7 @@ from laneweave.launch.run_methods import FORMATION
 from laneweave.launch.watch.frames import MOVING, EventFeed, Row, compact, plan_row, scene_of
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.wire.events import ENTERED, FORMATIONS_JOINED, LEADER, LEFT
 
 STEP_S = 0.2
@@ -64,6 +65,7 @@ class Recording:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise not_a_run(folder, error) from error
         self._run = run
+        self._lane_ends = LaneEnds(run.scenario)
         tick_s = run.scenario.runtime.tick_s
         stride = max(1, round(STEP_S / tick_s))
         self._step_s = stride * tick_s
@@ -121,6 +123,8 @@ class Recording:
             trip = self._trips.get(name, {})
             column, lane = int(tracks.column[place]), int(tracks.lane[place])
             cell: Cell | None = None if column == OFF_LATTICE else (column, lane)
+            if cell is not None and self._lane_ends.has_passed(cell, t_s):
+                cell = None
             y_m = float(tracks.y_m[place])
             formation = self._formations.get(trip.get("formation", -1))
             moving = abs(y_m - (lane + 0.5) * width_m) > STILL_M

@@ -12,6 +12,7 @@ from laneweave.launch.recordings.results_over_seeds import PREFERRED, over_seeds
 from laneweave.launch.recordings.runs import Run
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import RunSummary
+from support.closed_lanes import DROP
 from support.summaries import make_summary
 
 
@@ -48,6 +49,12 @@ def test_the_share_on_the_preferred_lane() -> None:
     vehicles = ({"left": 0, "on_preferred_lane": 0}, {"left": 4, "on_preferred_lane": 3})
     table = results_table(run(n, make_summary(vehicles=one)) for n, one in enumerate(vehicles))
     assert table[PREFERRED].to_pylist() == [None, 75.0]
+
+
+def test_vehicles_without_preferences_have_no_such_share() -> None:
+    table = results_table([Run(Path("x"), "rolling", "formation", DROP, make_summary())])
+    assert table[PREFERRED].to_pylist() == [None]
+    assert table["vehicles_on_preferred_lane"].to_pylist() == [100]
 
 
 def test_counts_are_integers() -> None:

@@ -28,10 +28,13 @@ from laneweave.launch.report.distributions import (
     count,
 )
 from laneweave.launch.report.figures import _break
-from laneweave.launch.report.path_maps import driven_map
+from laneweave.launch.report.path_maps import _arrived, driven_map
 from laneweave.launch.report.style import label_colours, spread_evenly
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.road_layout import ANY_LANE
+from laneweave.protocol.scenario.fields import Scenario
+from support.closed_lanes import BLOCKED
 from support.older_recordings import older_recording
 from support.tracks import make_tracks
 
@@ -50,6 +53,18 @@ def centres(counts: Counts, quantity: Quantity) -> list[float]:
     """Return the middles of the bins that are not empty."""
     middles = 0.5 * (quantity.edges[1:] + quantity.edges[:-1])
     return [round(float(one), 3) for one in middles[counts.of[quantity.name] > 0]]
+
+
+def test_vehicles_arrive_in_lanes_by_which_they_may_leave() -> None:
+    path = ((0, 0), (0, 0), (0, 1))
+    times_s = np.array([0.0, 20.0, 60.0])
+    # Lane 1 is closed from 600 to 700 m: cells of lane 1 at 0, 300 and 900 m; lane 0 is open.
+    cells = tuple((column, 1 - lane) for column, lane in path)
+    assert _arrived(BLOCKED, ANY_LANE, path, 0, times_s) == (True, True, True)
+    assert _arrived(BLOCKED, ANY_LANE, cells, 0, times_s) == (False, False, True)
+    assert _arrived(BLOCKED, 1, path, 0, times_s) == (False, False, True)
+    assert _arrived(Scenario(), 1, path, 0, times_s) == (False, False, True)
+    assert _arrived(Scenario(), 0, path, 0, times_s) == (True, True, False)
 
 
 def test_spacings_are_those_to_the_next_ahead_on_the_lane() -> None:

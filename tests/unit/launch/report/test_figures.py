@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from attrs import evolve
+from PIL import Image
 
-from laneweave.launch.drawing.colours import lane_colours
+from laneweave.launch.drawing.closed_parts import CLOSED_FILL
+from laneweave.launch.drawing.colours import NEUTRAL, lane_colours
 from laneweave.launch.recordings.runs import Comparison, Run, scenario_of
-from laneweave.launch.report.figures import draw_speeds, draw_travel_times
-from laneweave.launch.report.snapshots import road_snapshots
+from laneweave.launch.report.figures import draw_flows, draw_speeds, draw_travel_times
+from laneweave.launch.report.report import report_run
+from laneweave.launch.report.snapshots import default_stretch_m, road_snapshots
+from laneweave.launch.report.tables import run_table, tables_of
 from laneweave.protocol.config.scenario_files import parse_scenario
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.road_layout import ANY_LANE
+from laneweave.protocol.scenario.fields import Closure, Scenario
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import Trip, metadata_of, trips_table
 from laneweave.sim_bridge.road.demand import Arrival
+from support.closed_lanes import DROP
 from support.commands import loads
+from support.summaries import make_summary
 
 
 def make_run(folder: Path, lanes: int = 3, vehicles: int = 12, *, lattice: bool = True) -> Path:
@@ -79,6 +88,88 @@ def test_pictures_of_any_number_of_lanes(tmp_path: Path, lanes: int) -> None:
 def test_pictures_of_an_empty_run(tmp_path: Path) -> None:
     record(tmp_path, parse_scenario({}), ())
     draw_all(tmp_path)
+
+
+def make_run_without_preferences(folder: Path) -> Path:
+    """Record vehicles that drive straight on in two lanes, beside a lane that ends."""
+    trips = [
+        Trip(
+            Arrival(f"v{n}", 1 + n % 2, ANY_LANE, 55.0 + n), 55.5 + n, 122.2 + n, n // 6, 1 + n % 2
+        )
+        for n in range(12)
+    ]
+    record(folder, DROP, trips)
+    return folder
+
+
+def colours_of(path: Path) -> set[tuple[int, ...]]:
+    """Return the colours of at least a few pixels of a picture."""
+    with Image.open(path) as image:
+        found = image.convert("RGB").getcolors(maxcolors=1 << 24) or []
+    return {colour for count, colour in found if count > 5 and isinstance(colour, tuple)}
+
+
+def rgb(colour: str) -> tuple[int, ...]:
+    return tuple(bytes.fromhex(colour[1:]))
+
+
+def test_pictures_show_closed_parts_and_vehicles_without_preferences(tmp_path: Path) -> None:
+    folder = make_run_without_preferences(tmp_path)
+    draw_all(folder)
+    road_snapshots(folder, folder / "road.png", times=[90.0, 100.0, 110.0], dpi=150)
+    shown = colours_of(folder / "road.png")
+    assert {rgb(NEUTRAL), rgb(CLOSED_FILL)} <= shown
+    assert not shown & {rgb(colour) for colour in lane_colours(3)}
+    draw_speeds(comparison(folder), folder / "heat.png", dpi=150)
+    assert rgb(CLOSED_FILL) in colours_of(folder / "heat.png")
+
+
+@pytest.mark.parametrize(
+    ("closures", "stretch_m"),
+    [
+        ((), (130.0, 450.0)),
+        ((Closure(0, 800.0),), (130.0, 850.0)),
+        ((Closure(0, 950.0),), (260.0, 1000.0)),
+        ((Closure(0, 600.0, 700.0), Closure(1, 900.0)), (130.0, 750.0)),
+        ((Closure(0, 350.0, 900.0),), (130.0, 450.0)),
+    ],
+)
+def test_snapshots_show_the_first_closed_part(
+    closures: tuple[Closure, ...], stretch_m: tuple[float, float]
+) -> None:
+    assert default_stretch_m(evolve(DROP, road=evolve(DROP.road, closures=closures))) == stretch_m
+
+
+def test_the_share_in_the_preferred_lane_is_left_out_without_preferences(tmp_path: Path) -> None:
+    widths = []
+    for scenario in (Scenario(), DROP):
+        run = Run(tmp_path, "rolling", "formation", scenario, make_summary())
+        draw_flows(Comparison.of([run]), tmp_path / "flows.png", dpi=60)
+        with Image.open(tmp_path / "flows.png") as image:
+            widths.append(image.width)
+        headings = tables_of(Comparison.of([run, evolve(run, label="other")]))[0].headings
+        assert ("in the preferred lane (%)" in headings) == (scenario is not DROP)
+    assert widths[1] == widths[0] // 2
+
+
+def test_the_table_of_a_run_without_preferences(tmp_path: Path) -> None:
+    for scenario, shown in ((Scenario(), "100 (100.00%)"), (DROP, "no preferred lanes")):
+        run = Run(tmp_path, "rolling", "formation", scenario, make_summary())
+        assert ("in their preferred lane", shown) in run_table(run).rows
+
+
+def test_the_page_of_a_run_describes_closed_parts(tmp_path: Path) -> None:
+    folder = make_run_without_preferences(tmp_path)
+    page = report_run(Run(folder, "rolling", "formation", DROP, make_summary()), dpi=50)
+    text = page.read_text(encoding="utf-8")
+    assert "The right lane is closed from 800 m to the end of the road." in text
+    assert "Vehicles have no preferred lanes." in text
+    assert "strong if the lane is open from there to the end of the road" in text
+    assert "prefers" not in text.partition("<script")[0]
+    assert '<i class="closed"></i>closed' in text
+    data = json.loads(text.partition('id="animation-0">')[2].partition("</script>")[0])
+    assert {vehicle["lane"] for vehicle in data["vehicles"]} == {ANY_LANE}
+    assert data["road"]["closed"] == [[0, 800.0, 1000.0]]
 
 
 def test_given_times_and_stretch_and_resolution(tmp_path: Path) -> None:

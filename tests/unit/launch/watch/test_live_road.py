@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from typing import Any
 
 import pytest
@@ -13,8 +14,10 @@ from laneweave.launch.watch.live_road import STILL_S, LiveRoad
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.lane_ends import dead_ends
 from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name
+from support.closed_lanes import DROP
 from support.convoy import BALLOT, ROLLING, Convoy
 
 FORMATIONS: Scenario = parse_scenario({})
@@ -81,6 +84,26 @@ def test_targets_are_those_of_accepted_plans() -> None:
         hear(road, CONVOY, START + 20)
         road.update(evolve(done, **changed), 2.0)
         assert shown(road)["vehicles"][0][7] == 0
+
+
+def test_a_vehicle_whose_cell_has_passed_a_stop_line_is_shown_without_a_cell() -> None:
+    convoy = Convoy(9, scenario=DROP)
+    (end,) = dead_ends(DROP)
+    t_s = (START + 20) / 10
+    for beyond_m, held in ((-1.0, True), (1.0, False)):
+        road = watched(convoy=convoy)
+        column = math.floor((end.line_m - DROP.lattice.cell_s_m(0, t_s)) / DROP.lattice.pitch_m)
+        cell = (column + (beyond_m > 0.0), 0)
+        standing = evolve(convoy.state(0, START + 20), s_m=end.line_m - 2.0, hold_cell=cell)
+        road.update(standing, 2.0)
+        row = shown(road)["vehicles"][0]
+        assert (row[1], row[4]) == (end.line_m - 2.0, 0)
+        assert row[6] == (list(cell) if held else 0)
+        # Without a state, it is expected in its cell, or at the line.
+        road.update(convoy.clock(START + 60), 6.0)
+        if not held:
+            row = shown(road, 6.0)["vehicles"][0]
+            assert (row[1], row[6], row[8]) == (end.line_m, 0, UNHEARD)
 
 
 def test_positions_are_extrapolated_between_states() -> None:

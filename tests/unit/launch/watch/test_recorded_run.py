@@ -9,12 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from attrs import evolve
 
 from laneweave.launch.recordings.runs import single_run
 from laneweave.launch.recordings.trajectories import read_tracks
 from laneweave.launch.watch.frames import MOVING
 from laneweave.launch.watch.recorded_run import Recording
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.fields import Closure
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from support.commands import Here
 from support.older_recordings import older_recording
 
@@ -106,6 +109,23 @@ def test_formations_that_plan_together(recorded: Path, tmp_path: Path) -> None:
     recording = Recording(folder)
     assert recording.frame(70)["joined"] == []
     assert recording.frame(100)["joined"] == [[first[0], second[0]]]
+
+
+def test_cells_beyond_a_stop_line_are_not_shown(recorded: Path) -> None:
+    recording, scenario = Recording(recorded), single_run(recorded).scenario
+    rolling = evolve(scenario.formation, operation="rolling")
+    road = evolve(scenario.road, closures=(Closure(0, 300.0),))
+    ends = LaneEnds(evolve(scenario, formation=rolling, road=road))
+    recording._lane_ends = ends
+    (end,) = ends
+    seen = [0, 0]
+    for frame in frames(recording):
+        for row in frame["vehicles"]:
+            if row[6]:
+                assert not ends.has_passed(tuple(row[6]), frame["t"])
+            seen[not row[6]] += 1
+            assert row[6] or row[1] > end.line_m - scenario.lattice.pitch_m
+    assert min(seen) > 50
 
 
 def test_there_are_no_frames_before_and_after(recorded: Path) -> None:

@@ -112,7 +112,9 @@ def site(shared_site: Site) -> Site:
     return shared_site
 
 
-@pytest.mark.parametrize("path", ["/", "/road.js", "/frames.js", "/layers.js", "/watch.js"])
+@pytest.mark.parametrize(
+    "path", ["/", "/road.js", "/closed_parts.js", "/frames.js", "/layers.js", "/watch.js"]
+)
 def test_the_page_needs_no_other_server(site: Site, path: str) -> None:
     status, kind, text = site.get(path)
     assert status == 200
