@@ -1,8 +1,8 @@
 """SUMO's own lane changing (LC2013) and car following (Krauss), for automated vehicles.
 
 Headway and desired speed are those of the other methods; vehicles are identical, with no driver
-imperfection. A vehicle's route leads to the exit of its preferred lane. In S1 and S2, lane changes
-are disabled unless the scenario allows them everywhere.
+imperfection. A vehicle's route leads to the exit of its preferred lane, if it has one. In S1 and
+S2, lane changes are disabled unless the scenario allows them everywhere.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
+from laneweave.sim_bridge.sumo.road_edges import lane_end_m
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
 
 
@@ -123,3 +124,20 @@ def check_lc2013(scenario: Scenario) -> None:
             raise BadInputError(
                 f"lc2013.{name}", value, f"at most {limit:g}, the limit vehicle.{whose}"
             )
+    _check_closures(scenario)
+
+
+def _check_closures(scenario: Scenario) -> None:
+    """Check that vehicles can leave lanes before they end, and use them again."""
+    road, settings = scenario.road, scenario.lc2013
+    start_m = 0.0 if settings.lane_changes == "everywhere" else road.sorting_start_m
+    for number, closure in enumerate(road.closures):
+        name = f"road.closures[{number}]"
+        min_m = start_m + closure.from_m - lane_end_m(scenario, closure.from_m)
+        if closure.from_m <= min_m:
+            allowed = f"more than {min_m:g}, so that vehicles can change lanes before"
+            raise BadInputError(f"{name}.from_m", closure.from_m, allowed)
+        max_m = road.length_m - scenario.vehicle.length_m
+        if max_m <= closure.to_m < road.length_m:
+            allowed = f"less than {max_m:g}, or at least {road.length_m:g}: a vehicle must fit in"
+            raise BadInputError(f"{name}.to_m", closure.to_m, allowed)

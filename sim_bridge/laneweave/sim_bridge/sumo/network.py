@@ -5,38 +5,29 @@ edge is longer than the road by `margin_m` at both ends, so that it contains the
 that enter or leave. The files are written without `netconvert`, which needs a much larger package
 than `libsumo`.
 
-If SUMO drives the vehicles, the edge ends with the road, and each lane leads to its own exit: SUMO
-moves a vehicle to the lane of its exit before the end of the road.
+If SUMO drives the vehicles, the edges end with the road, and each lane leads to its own exit: SUMO
+moves a vehicle to the lane of its exit before the end of the road. Without preferred lanes there
+are no exits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Lc2013Settings, Scenario
+from laneweave.sim_bridge.sumo.road_edges import Edge, connections, road_edges
 
-EDGE = "road"
 ROUTE = "road"
 VEHICLE_TYPE = "vehicle"
-MIN_MARGIN_M = 30.0
 SUBLANE_M = 0.8
 """Lateral resolution of SUMO's sublane model."""
 
 
-def margin_m(scenario: Scenario) -> float:
-    """Return the length by which SUMO's edge exceeds the road at each end [m].
-
-    Vehicles are removed up to one tick's travel beyond the end of the road.
-    """
-    vehicle = scenario.vehicle
-    tick_m = vehicle.max_speed_mps * scenario.runtime.tick_s
-    return max(MIN_MARGIN_M, tick_m + vehicle.length_m)
-
-
 def exit_route(lane: int) -> str:
-    """Return the name of the route to the exit of a lane."""
-    return f"{ROUTE}-{lane}"
+    """Return the name of the route to the exit of a lane; `ANY_LANE`: the one without exits."""
+    return ROUTE if lane == ANY_LANE else f"{ROUTE}-{lane}"
 
 
 def write_network(scenario: Scenario, folder: Path, *, exits: bool) -> tuple[str, ...]:
@@ -49,8 +40,9 @@ def write_network(scenario: Scenario, folder: Path, *, exits: bool) -> tuple[str
     """
     folder.mkdir(parents=True, exist_ok=True)
     network, routes = folder / "road.net.xml", folder / "road.rou.xml"
-    network.write_text("\n".join(_network(scenario, exits=exits)), encoding="utf-8")
-    routes.write_text("\n".join(_routes(scenario, exits=exits)), encoding="utf-8")
+    edges = road_edges(scenario, exits=exits)
+    network.write_text("\n".join(_network(scenario, edges, exits=exits)), encoding="utf-8")
+    routes.write_text("\n".join(_routes(scenario, edges, exits=exits)), encoding="utf-8")
     settings = scenario.lc2013
     change: tuple[str, ...] = ()
     if exits and settings.model == "SL2015":
@@ -70,66 +62,64 @@ def write_network(scenario: Scenario, folder: Path, *, exits: bool) -> tuple[str
     )
 
 
-def _network(scenario: Scenario, *, exits: bool) -> Iterator[str]:
-    """Yield the lines of the network file: the road's edge, and the edges of exits.
+def _network(scenario: Scenario, edges: Sequence[Edge], *, exits: bool) -> Iterator[str]:
+    """Yield the lines of the network file.
 
     If SUMO drives, the speed limit is the desired speed v_F. Lanes do not cross.
     """
-    road, margin = scenario.road, margin_m(scenario)
-    lanes, lane_m, end_m = range(road.lanes), road.lane_width_m, road.length_m
-    west_m, east_m, width_m = -margin, end_m + margin, road.lanes * lane_m
+    lane_m, lanes = scenario.road.lane_width_m, scenario.road.lanes
+    west_m, east_m, width_m = edges[0].from_m, edges[-1].to_m, lanes * lane_m
     speed_mps = scenario.formation.speed_mps if exits else scenario.vehicle.max_speed_mps
-
-    def lane_of(edge: str, index: int, lane: int, from_m: float, to_m: float) -> str:
-        centre_m = scenario.lattice.cell_y_m(lane)
-        return (
-            f'<lane id="{edge}_{index}" index="{index}" speed="{speed_mps:.6f}"'
-            f' length="{to_m - from_m:.6f}" width="{lane_m:.6f}"'
-            f' shape="{from_m:.6f},{centre_m:.6f} {to_m:.6f},{centre_m:.6f}"/>'
-        )
-
-    def junction(
-        name: str, x_m: float, y_m: tuple[float, float], incoming: str, kind: str = "dead_end"
-    ) -> str:
-        return (
-            f'<junction id="{name}" type="{kind}" x="{x_m:.6f}" y="{max(y_m):.6f}"'
-            f' incLanes="{incoming}" intLanes=""'
-            f' shape="{x_m:.6f},{y_m[0]:.6f} {x_m:.6f},{y_m[1]:.6f}">'
-        )
-
     yield '<net version="1.20">'
     bounds = f"{west_m:.6f},0,{east_m:.6f},{width_m:.6f}"
     yield f'<location netOffset="0,0" convBoundary="{bounds}" origBoundary="{bounds}"'
     yield ' projParameter="!"/>'
-    end, edge_end_m = ("end", end_m) if exits else ("east", east_m)
-    yield f'<edge id="{EDGE}" from="west" to="{end}" priority="1">'
-    yield from (lane_of(EDGE, lane, lane, west_m, edge_end_m) for lane in lanes)
-    yield "</edge>"
-    if exits:
-        for lane in lanes:
-            yield f'<edge id="exit{lane}" from="end" to="east{lane}" priority="1">'
-            yield lane_of(f"exit{lane}", 0, lane, end_m, east_m)
-            yield "</edge>"
-    yield junction("west", west_m, (width_m, 0.0), "") + "</junction>"
-    incoming = " ".join(f"{EDGE}_{lane}" for lane in lanes)
-    if not exits:
-        yield junction("east", east_m, (0.0, width_m), incoming) + "</junction>"
-    else:
-        yield junction("end", end_m, (0.0, width_m), incoming, "priority")
-        none = "0" * road.lanes
-        for lane in lanes:
-            yield f'<request index="{lane}" response="{none}" foes="{none}" cont="0"/>'
-        yield "</junction>"
-        for lane in lanes:
-            sides_m = lane * lane_m, (lane + 1) * lane_m
-            yield junction(f"east{lane}", east_m, sides_m, f"exit{lane}_0") + "</junction>"
-        for lane in lanes:
-            yield f'<connection from="{EDGE}" to="exit{lane}" fromLane="{lane}" toLane="0"'
-            yield ' dir="s" state="M"/>'
+    for edge in edges:
+        yield f'<edge id="{edge.name}" from="{edge.origin}" to="{edge.destination}" priority="1">'
+        for lane in edge.lanes:
+            index, centre_m = edge.index(lane), scenario.lattice.cell_y_m(lane)
+            closed = "" if lane in edge.open_lanes else ' disallow="all"'
+            yield (
+                f'<lane id="{edge.name}_{index}" index="{index}"{closed} speed="{speed_mps:.6f}"'
+                f' length="{edge.to_m - edge.from_m:.6f}" width="{lane_m:.6f}"'
+                f' shape="{edge.from_m:.6f},{centre_m:.6f} {edge.to_m:.6f},{centre_m:.6f}"/>'
+            )
+        yield "</edge>"
+    yield _junction("west", west_m, (width_m, 0.0))
+    connected = list(connections(edges))
+    for edge in edges:
+        incoming = " ".join(f"{edge.name}_{edge.index(lane)}" for lane in edge.lanes)
+        sides_m = edge.lanes[0] * lane_m, (edge.lanes[-1] + 1) * lane_m
+        count = sum(before is edge for before, _, _ in connected)
+        yield _junction(edge.destination, edge.to_m, sides_m, incoming, count)
+    for before, after, lane in connected:
+        yield (
+            f'<connection from="{before.name}" to="{after.name}"'
+            f' fromLane="{before.index(lane)}" toLane="{after.index(lane)}"'
+        )
+        yield ' dir="s" state="M"/>'
     yield "</net>"
 
 
-def _routes(scenario: Scenario, *, exits: bool) -> Iterator[str]:
+def _junction(
+    name: str, x_m: float, y_m: tuple[float, float], incoming: str = "", connected: int = 0
+) -> str:
+    """Return the lines of a junction with its incoming lanes and its number of connections."""
+    none = "0" * connected
+    requests = "".join(
+        f'\n<request index="{number}" response="{none}" foes="{none}" cont="0"/>'
+        for number in range(connected)
+    )
+    return (
+        f'<junction id="{name}" type="{"priority" if connected else "dead_end"}"'
+        f' x="{x_m:.6f}" y="{max(y_m):.6f}" incLanes="{incoming}" intLanes=""'
+        f' shape="{x_m:.6f},{y_m[0]:.6f} {x_m:.6f},{y_m[1]:.6f}">'
+        + (f"{requests}\n" if connected else "")
+        + "</junction>"
+    )
+
+
+def _routes(scenario: Scenario, edges: Sequence[Edge], *, exits: bool) -> Iterator[str]:
     """Yield the lines of the route file: the vehicle type, and one route or one per exit.
 
     Drivers have the same desired speed (speedDev). If SUMO does not drive, `tau` and `minGap` are
@@ -155,11 +145,12 @@ def _routes(scenario: Scenario, *, exits: bool) -> Iterator[str]:
     for name, value in kind.items():
         yield f'{name}="{value}"' if isinstance(value, str) else f'{name}="{value:.6f}"'
     yield "/>"
-    if exits:
-        for lane in range(scenario.road.lanes):
-            yield f'<route id="{exit_route(lane)}" edges="{EDGE} exit{lane}"/>'
-    else:
-        yield f'<route id="{ROUTE}" edges="{EDGE}"/>'
+    by_lane = [edge for edge in edges if edge.origin == "end"]
+    road = " ".join(edge.name for edge in edges if edge not in by_lane)
+    for edge in by_lane:
+        yield f'<route id="{exit_route(edge.lanes[0])}" edges="{road} {edge.name}"/>'
+    if not by_lane:
+        yield f'<route id="{ROUTE}" edges="{road}"/>'
     yield "</routes>"
 
 

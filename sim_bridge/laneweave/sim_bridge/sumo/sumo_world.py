@@ -18,7 +18,8 @@ from pathlib import Path
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, pose_of
-from laneweave.sim_bridge.sumo.network import EDGE, ROUTE, VEHICLE_TYPE, margin_m
+from laneweave.sim_bridge.sumo.network import ROUTE, VEHICLE_TYPE
+from laneweave.sim_bridge.sumo.road_edges import EDGE, margin_m
 from laneweave.sim_bridge.sumo.simulation import SumoSession
 
 

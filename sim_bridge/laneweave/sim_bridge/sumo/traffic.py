@@ -5,8 +5,9 @@ The calls in each tick are
     offer() waiting vehicles  ->  advance(), which returns those that entered  ->  positions()
 
 An offered vehicle waits in SUMO until there is room at its entry position. Its route, which SUMO's
-lane changing follows, leads to the exit of its preferred lane; a vehicle that does not reach this
-lane stops at the end of the road.
+lane changing follows, leads to the exit of its preferred lane, if it has one; a vehicle that does
+not reach this lane stops at the end of the road. A vehicle that does not leave a lane before it
+ends stops there.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from pathlib import Path
 
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
-from laneweave.sim_bridge.sumo.network import VEHICLE_TYPE, exit_route, margin_m
+from laneweave.sim_bridge.sumo.network import VEHICLE_TYPE, exit_route
+from laneweave.sim_bridge.sumo.road_edges import margin_m
 from laneweave.sim_bridge.sumo.simulation import SumoSession
 
 _NO_LANE_CHANGES = 0
@@ -39,7 +41,7 @@ class SumoTraffic(SumoSession):
         Args:
             vehicle: name of the vehicle.
             lane: entry lane.
-            preferred_lane: lane of the exit.
+            preferred_lane: lane of the exit, or `ANY_LANE`.
             s_m: entry position of the front bumper.
         """
         self.vehicle.add(

@@ -115,6 +115,133 @@ def test_drivers_do_not_exceed_the_limits_of_their_vehicles(name: str, value: fl
         check_lc2013(parse_scenario({"lc2013": {name: value}}))
 
 
+# --- closed parts of lanes --------------------------------------------------------------------
+
+SHORT = {"s1_m": 50.0, "s2_m": 100.0, "s3_m": 850.0}
+OPEN, CLOSED = True, False
+
+
+def closed_road(
+    folder: Path,
+    *closures: dict[str, float],
+    shares: tuple[float, ...] = (),
+    lc2013: dict[str, Any] | None = None,
+) -> tuple[ET.Element, ET.Element]:
+    """Return the network and the routes of a road with closed parts of lanes."""
+    _, network, routes = written(
+        folder,
+        road={**SHORT, "closures": list(closures)},
+        demand={"lane_shares": list(shares)},
+        formation={"operation": "rolling"},
+        lc2013=lc2013 or {},
+    )
+    return network, routes
+
+
+def lanes_by_edge(network: ET.Element) -> dict[str, tuple[float, float, dict[float, bool]]]:
+    """Return (from, to, {centre line: open}) of each edge."""
+    found = {}
+    for edge in network.iter("edge"):
+        shapes = {}
+        for index, lane in enumerate(edge.iter("lane")):
+            assert lane.attrib["id"] == f"{edge.attrib['id']}_{index}"
+            start, end = (
+                [float(one) for one in each.split(",")] for each in lane.attrib["shape"].split()
+            )
+            assert start[1] == end[1]
+            assert float(lane.attrib["length"]) == pytest.approx(end[0] - start[0])
+            shapes[start[1]] = "disallow" not in lane.attrib
+        found[edge.attrib["id"]] = (start[0], end[0], shapes)
+    return found
+
+
+def connected_positions(network: ET.Element) -> set[tuple[str, str, float]]:
+    """Return (edge, next edge, centre line); no connection leads to another lane."""
+    edges = lanes_by_edge(network)
+    found = set()
+    for one in network.iter("connection"):
+        (edge, y_m), (following, next_y_m) = (
+            (one.attrib[side], [*edges[one.attrib[side]][2]][int(one.attrib[number])])
+            for side, number in (("from", "fromLane"), ("to", "toLane"))
+        )
+        assert y_m == next_y_m
+        found.add((edge, following, y_m))
+    return found
+
+
+def routes_by_name(routes: ET.Element) -> dict[str, str]:
+    return {one.attrib["id"]: one.attrib["edges"] for one in routes.iter("route")}
+
+
+def test_a_lane_that_ends_has_no_connection(tmp_path: Path) -> None:
+    network, routes = closed_road(tmp_path, {"lane": 0, "from_m": 800.0})
+    assert lanes_by_edge(network) == {
+        "road": (-30.0, 800.0, {1.75: OPEN, 5.25: OPEN, 8.75: OPEN}),
+        "road1": (800.0, 1030.0, {5.25: OPEN, 8.75: OPEN}),
+    }
+    assert connected_positions(network) == {("road", "road1", 5.25), ("road", "road1", 8.75)}
+    assert routes_by_name(routes) == {"road": "road road1"}
+
+
+def test_a_lane_opens_again_behind_its_closed_part_and_a_body(tmp_path: Path) -> None:
+    network, routes = closed_road(tmp_path, {"lane": 0, "from_m": 600.0, "to_m": 700.0})
+    assert lanes_by_edge(network) == {
+        "road": (-30.0, 600.0, {1.75: OPEN, 5.25: OPEN, 8.75: OPEN}),
+        "road1": (600.0, 700.0, {5.25: OPEN, 8.75: OPEN}),
+        "road2": (700.0, 705.0, {1.75: CLOSED, 5.25: OPEN, 8.75: OPEN}),
+        "road3": (705.0, 1030.0, {1.75: OPEN, 5.25: OPEN, 8.75: OPEN}),
+    }
+    at_ends = [one for one in connected_positions(network) if one[2] == 1.75]
+    assert at_ends == [("road2", "road3", 1.75)]
+    assert routes_by_name(routes) == {"road": "road road1 road2 road3"}
+
+
+def test_a_closed_lane_between_open_ones_keeps_them_apart(tmp_path: Path) -> None:
+    network, _ = closed_road(tmp_path, {"lane": 1, "from_m": 600.0})
+    edges = lanes_by_edge(network)
+    assert edges["road1"] == (600.0, 1030.0, {1.75: OPEN, 5.25: CLOSED, 8.75: OPEN})
+    assert ("road", "road1", 5.25) not in connected_positions(network)
+
+
+def test_lanes_that_reach_the_end_lead_to_exits_if_vehicles_prefer_lanes(tmp_path: Path) -> None:
+    closure = {"lane": 2, "from_m": 800.0}
+    network, routes = closed_road(tmp_path, closure, shares=(0.5, 0.5, 0.0))
+    edges = lanes_by_edge(network)
+    assert edges["road1"] == (800.0, 1000.0, {1.75: OPEN, 5.25: OPEN})
+    assert edges["exit1"] == (1000.0, 1030.0, {5.25: OPEN})
+    assert routes_by_name(routes) == {f"road-{lane}": f"road road1 exit{lane}" for lane in range(2)}
+
+
+@pytest.mark.parametrize(
+    ("lc2013", "end_m"),
+    [({"lane_change_s": 4.0}, 800.0 - 2.0 * 15.0), ({"model": "SL2015"}, 800.0 - 1.75 * 15.0)],
+)
+def test_lane_changes_that_take_time_end_before_the_closed_part(
+    tmp_path: Path, lc2013: dict[str, Any], end_m: float
+) -> None:
+    network, _ = closed_road(tmp_path, {"lane": 0, "from_m": 800.0}, lc2013=lc2013)
+    assert lanes_by_edge(network)["road"][1] == pytest.approx(end_m)
+
+
+@pytest.mark.parametrize(
+    ("closure", "field"),
+    [
+        ({"lane": 0, "from_m": 300.0}, "from_m"),
+        ({"lane": 0, "from_m": 800.0, "to_m": 997.0}, "to_m"),
+    ],
+)
+def test_a_closed_part_that_leaves_no_room_is_refused(
+    closure: dict[str, float], field: str
+) -> None:
+    tables = {
+        "road": {**SHORT, "closures": [closure]},
+        "formation": {"operation": "rolling"},
+        "lc2013": {"lane_change_s": 20.0},
+    }
+    with pytest.raises(BadInputError, match=rf"road\.closures\[0\]\.{field}"):
+        check_lc2013(parse_scenario(tables))
+
+
 # --- SUMO -------------------------------------------------------------------------------------
 
 

@@ -1,0 +1,119 @@
+"""SUMO drives on roads with closed parts of lanes: all vehicles leave, and none is in the way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from laneweave.launch.run_methods import LC2013, METHODS
+from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.road_layout import ANY_LANE
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.sim_bridge.baselines.lc2013 import Lc2013Traffic, check_lc2013
+from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose
+from laneweave.sim_bridge.road.demand import arrivals, count_until
+from laneweave.sim_bridge.sumo.traffic import SumoTraffic
+
+LABELS = [name for name, one in METHODS.items() if one.method == LC2013]
+DROP = [{"lane": 0, "from_m": 800.0}]
+BLOCKED = [{"lane": 0, "from_m": 600.0, "to_m": 700.0}]
+BLOCKED_BETWEEN = [{"lane": 1, "from_m": 600.0, "to_m": 700.0}]
+
+
+def closed_road(
+    closures: list[dict[str, float]], *, volume: float = 1300.0, shares: tuple[float, ...] = ()
+) -> Scenario:
+    return parse_scenario(
+        {
+            "road": {"s1_m": 50.0, "s2_m": 100.0, "s3_m": 850.0, "closures": closures},
+            "demand": {
+                "volume_veh_per_lane_h": volume,
+                "duration_s": 30.0,
+                "lane_shares": list(shares),
+            },
+            "formation": {"operation": "rolling"},
+        }
+    )
+
+
+def drive(scenario: Scenario, folder: Path) -> dict[ReferenceVehicle, float]:
+    """Let SUMO drive all vehicles, check every tick, and return their travel times [s]."""
+    check_lc2013(scenario)
+    demand, entrance = arrivals(scenario), Entrance(scenario)
+    road, size, tick_s = scenario.road, scenario.vehicle, scenario.runtime.tick_s
+    left: dict[ReferenceVehicle, float] = {}
+    before: dict[str, Pose] = {}
+    queued = tick = 0
+    with SumoTraffic(scenario, folder / "sumo") as sumo:
+        traffic = Lc2013Traffic(scenario, sumo)
+        while len(left) < len(demand):
+            tick += 1
+            t_s = tick * tick_s
+            assert t_s < 300.0
+            first, queued = queued, count_until(demand, t_s)
+            for arrival in demand[first:queued]:
+                entrance.queue(arrival)
+            traffic.step(t_s, entrance)
+            poses = traffic.poses()
+            bodies = Bodies(poses, size.length_m, size.width_m)
+            assert bodies.overlapping_pairs() == bodies.in_closed_lanes(road) == []
+            assert traffic.collisions() == []
+            for name, pose in poses.items():
+                assert_continuous(before.get(name, pose), pose, scenario)
+            before = poses
+            for one in [one for one in traffic.vehicles if one.s_m >= road.length_m]:
+                traffic.remove(one)
+                left[one] = t_s - one.arrival.t_s
+    return left
+
+
+def assert_continuous(before: Pose, after: Pose, scenario: Scenario) -> None:
+    """A vehicle moves by its speed, and sideways by one lane at most, along the road."""
+    driven_m = 0.5 * (before[3] + after[3]) * scenario.runtime.tick_s
+    assert before == after or after[0] - before[0] == pytest.approx(driven_m, abs=0.02)
+    assert abs(after[1] - before[1]) <= scenario.road.lane_width_m + 1e-6
+    if not scenario.lc2013.lane_change_s and scenario.lc2013.model == "LC2013":
+        lane = after[1] / scenario.road.lane_width_m - 0.5
+        assert lane == pytest.approx(round(lane), abs=1e-6)
+        assert after[2] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("label", LABELS)
+@pytest.mark.parametrize("closures", [DROP, BLOCKED], ids=["drop", "blocked"])
+def test_vehicles_without_preferred_lanes_pass_closed_parts(
+    label: str, closures: list[dict[str, float]], tmp_path: Path
+) -> None:
+    scenario = METHODS[label].settings(closed_road(closures))
+    left = drive(scenario, tmp_path)
+    assert all(one.preferred_lane == ANY_LANE for one in left)
+    lanes = {one.lane for one in left}
+    assert lanes >= {1, 2}
+    assert 0 not in lanes or closures is BLOCKED
+    free_s = scenario.free_flow_s
+    assert min(left.values()) >= free_s - 0.1
+    assert sum(left.values()) / len(left) < 1.05 * free_s
+
+
+@pytest.mark.parametrize(
+    ("closures", "shares"),
+    [(DROP, (0.0, 1.0, 1.0)), (BLOCKED, (1.0, 1.0, 1.0)), (BLOCKED_BETWEEN, (1.0, 1.0, 1.0))],
+    ids=["drop", "blocked", "blocked-between"],
+)
+@pytest.mark.parametrize("label", ["lc2013", "lc2013-cooperative-4s"])
+def test_vehicles_leave_on_their_preferred_lanes(
+    label: str, closures: list[dict[str, Any]], shares: tuple[float, ...], tmp_path: Path
+) -> None:
+    scenario = METHODS[label].settings(closed_road(closures, volume=1000.0, shares=shares))
+    left = drive(scenario, tmp_path)
+    assert all(one.lane == one.preferred_lane for one in left)
+    assert sum(left.values()) / len(left) < 1.1 * scenario.free_flow_s
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("label", ["lc2013-human", "lc2013-cooperative-4s"])
+def test_a_queue_before_a_lane_drop_dissolves(label: str, tmp_path: Path) -> None:
+    scenario = METHODS[label].settings(closed_road(DROP, volume=2400.0))
+    assert max(drive(scenario, tmp_path).values()) > 70.0
