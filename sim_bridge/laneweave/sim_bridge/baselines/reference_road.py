@@ -46,13 +46,8 @@ class ReferenceVehicle:
 
     @property
     def preferred_lane(self) -> int:
-        """Lane in which the vehicle wants to leave the road."""
+        """Lane in which the vehicle wants to leave the road, or `ANY_LANE`."""
         return self.arrival.preferred_lane
-
-    @property
-    def finished(self) -> bool:
-        """Whether the vehicle has completed all lane changes."""
-        return self.lane == self.preferred_lane and self.previous_lane is None
 
     @property
     def state(self) -> State:

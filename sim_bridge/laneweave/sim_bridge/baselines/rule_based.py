@@ -45,7 +45,7 @@ class RuleTraffic:
         slowing = self._rules.sort(self._lanes)
         leaders = self._lanes.leaders()
         for vehicle in sorted(self._vehicles.values(), key=priority):
-            self._move_along(vehicle, leaders.get(vehicle, ()), slows_down=vehicle in slowing)
+            self._move_along(vehicle, leaders.get(vehicle, ()), slows_before_m=slowing.get(vehicle))
             self._move_across(vehicle)
         entered = self._admit(t_s, entrance)
         for vehicle in self._vehicles.values():
@@ -68,17 +68,24 @@ class RuleTraffic:
         self._world.remove(vehicle.name)
 
     def _move_along(
-        self, vehicle: ReferenceVehicle, leaders: Iterable[ReferenceVehicle], *, slows_down: bool
+        self,
+        vehicle: ReferenceVehicle,
+        leaders: Iterable[ReferenceVehicle],
+        *,
+        slows_before_m: float | None,
     ) -> None:
-        """Move a vehicle along the road by one tick, once all vehicles ahead have moved."""
+        """Move a vehicle along the road by one tick, once all vehicles ahead have moved.
+
+        By rule 3 it slows down before the position `slows_before_m`, if there is one.
+        """
         s_m, before_mps, tick_s = vehicle.s_m, vehicle.speed_mps, self._tick_s
         wanted_mps = min(
             self._rules.approach_speed_mps(vehicle),
             before_mps + self._limits.max_accel_mps2 * tick_s,
         )
-        if slows_down:
+        if slows_before_m is not None:
             braked_mps = before_mps - self._rule.slow_down_mps2 * tick_s
-            slow_mps = self._rules.slow_speed_mps(vehicle.s_m)
+            slow_mps = self._rules.slow_speed_mps(s_m, slows_before_m)
             wanted_mps = min(wanted_mps, max(slow_mps, braked_mps))
         follow = self._rules.following.speed_mps
         for ahead in leaders:
@@ -151,18 +158,23 @@ def check_rule(scenario: Scenario) -> None:
     # Speed decreases in proportion to the remaining distance, once per tick.
     braking_m = speed_mps**2 / -scenario.vehicle.min_accel_mps2
     min_m = braking_m + 3.0 * speed_mps * scenario.runtime.tick_s
-    if not min_m <= rule.stop_distance_m < road.s3_m:
+    sorting_m, sorting = road.s3_m, f"road.s3_m = {road.s3_m:g}"
+    for number, closure in enumerate(road.closures):
+        if closure.from_m - road.sorting_start_m < sorting_m:
+            sorting_m = closure.from_m - road.sorting_start_m
+            sorting = f"{sorting_m:g}, the part of S3 before road.closures[{number}]"
+    if not min_m <= rule.stop_distance_m < sorting_m:
         raise BadInputError(
             "rule.stop_distance_m",
             rule.stop_distance_m,
             f"at least {min_m:g}, to stop there from formation.speed_mps = {speed_mps:g}, and "
-            f"less than road.s3_m = {road.s3_m:g}",
+            f"less than {sorting}",
         )
     changes_m = (road.lanes - 1) * speed_mps * rule.lane_change_s
-    if rule.stop_distance_m + changes_m > road.s3_m:
+    if rule.stop_distance_m + changes_m > sorting_m:
         raise BadInputError(
             "rule.lane_change_s",
             rule.lane_change_s,
             f"so short that {road.lanes - 1} lane changes at formation.speed_mps = {speed_mps:g} "
-            f"and rule.stop_distance_m fit into road.s3_m = {road.s3_m:g}",
+            f"and rule.stop_distance_m fit into {sorting}",
         )

@@ -6,6 +6,9 @@ Rule 2. A vehicle changes to the next lane towards the preferred one when the ga
 Rule 3. If a gap is too small, the vehicle with lower priority slows down. Its speed decreases
         towards the end of the road.
 
+On roads with closed parts of lanes, `wanted_lanes` defines the preferred lane, and a dead end
+counts as the end of the road for vehicles that must leave a lane before it.
+
 Lane changes and speeds are pure functions of the positions.
 """
 
@@ -18,6 +21,7 @@ from itertools import pairwise
 
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.reference_road import ReferenceVehicle
+from laneweave.sim_bridge.baselines.wanted_lanes import WantedLanes
 
 
 def priority(vehicle: ReferenceVehicle) -> tuple[float, str]:
@@ -156,6 +160,7 @@ class Rules:
     def __init__(self, scenario: Scenario) -> None:
         """Read the parameters from the tables `rule`, `road`, `formation` and `vehicle`."""
         self.following = Following(scenario)
+        self._wanted = WantedLanes(scenario)
         rule, road = scenario.rule, scenario.road
         self._sorting_start_m = road.sorting_start_m
         self._sorting_m = road.s3_m
@@ -164,40 +169,44 @@ class Rules:
         self._speed_mps = scenario.formation.speed_mps
         self._all_yield = rule.yielding == "all"
         self._change_m = self._speed_mps * rule.lane_change_s
+        slip_m = road.lane_width_m / scenario.vehicle.max_slip_ratio
+        self._dead_end_change_m = max(self._change_m, slip_m) if self._change_m else 0.0
+        """Length of a lane change before a dead end, which no vehicle may pass."""
 
-    def sort(self, lanes: Lanes) -> set[ReferenceVehicle]:
-        """Apply rules 2 and 3 to all vehicles off their preferred lane, by priority.
+    def sort(self, lanes: Lanes) -> dict[ReferenceVehicle, float]:
+        """Apply rules 2 and 3 to all vehicles off the lane that they want, by priority.
 
         A lane change occupies the gap in the new lane at once.
 
         Returns:
-            The vehicles that slow down, to let another vehicle in or to get in behind it.
+            The vehicles that slow down, to let another vehicle in or to get in behind it, and the
+            end [m] before which the lane change must be complete.
         """
         unsorted = sorted(
             (
                 vehicle
                 for lane in lanes
                 for vehicle in lane
-                if vehicle.lane != vehicle.preferred_lane
-                and vehicle.previous_lane is None
-                and vehicle.s_m >= self._sorting_start_m
+                if vehicle.previous_lane is None and vehicle.s_m >= self._sorting_start_m
             ),
             key=priority,
         )
-        slowing: set[ReferenceVehicle] = set()
+        slowing: dict[ReferenceVehicle, float] = {}
         for vehicle in unsorted:
-            lane = self.next_lane(vehicle)
+            wanted = self._wanted.of(vehicle)
+            if wanted.lane == vehicle.lane:
+                continue
+            lane = vehicle.lane + (1 if wanted.lane > vehicle.lane else -1)
+            if not self._wanted.may_enter(vehicle, lane):
+                continue
             slowed = list(self._slowed(vehicle, *lanes.neighbours(vehicle, lane)))
             if not slowed:
                 lanes.begin_change(vehicle, lane)
                 if self._change_m == 0.0:
                     lanes.end_change(vehicle)
-            slowing.update(slowed)
+            for one in slowed:
+                slowing[one] = min(wanted.end_m, slowing.get(one, wanted.end_m))
         return slowing
-
-    def next_lane(self, vehicle: ReferenceVehicle) -> int:
-        """Return the next lane towards the preferred one."""
-        return vehicle.lane + (1 if vehicle.preferred_lane > vehicle.lane else -1)
 
     def _slowed(
         self,
@@ -216,24 +225,35 @@ class Rules:
         ):
             # By rule 1, a vehicle that has finished continues at v_F, and the other one waits. A
             # vehicle that is still changing may be blocked by the other one in its old lane.
-            yields = self._all_yield or not behind.finished
+            yields = self._all_yield or not self.has_finished(behind)
             yield behind if yields else vehicle
 
-    def slow_speed_mps(self, s_m: float) -> float:
-        """Return v_slow, the speed of a vehicle that slows down for others (rule 3)."""
-        beyond_stop_m = self._end_m - s_m - self._stop_m
-        share = beyond_stop_m / (self._sorting_m - self._stop_m)
+    def has_finished(self, vehicle: ReferenceVehicle) -> bool:
+        """Return whether a vehicle has completed all lane changes."""
+        return vehicle.previous_lane is None and self._wanted.of(vehicle).lane == vehicle.lane
+
+    def slow_speed_mps(self, s_m: float, end_m: float) -> float:
+        """Return v_slow, the speed of a vehicle that slows down for others (rule 3).
+
+        Args:
+            s_m: its position.
+            end_m: where the lane change for which it slows down must be complete.
+        """
+        beyond_stop_m = end_m - s_m - self._stop_m
+        share = beyond_stop_m / (self._sorting_m - (self._end_m - end_m) - self._stop_m)
         return self._speed_mps * min(max(share, 0.0), 1.0)
 
     def approach_speed_mps(self, vehicle: ReferenceVehicle) -> float:
-        """Return the maximum speed near the end of the road: v_F in the preferred lane.
+        """Return the maximum speed near the end of the road or lane: v_F in the lane it wants.
 
         In other lanes, the distance for the remaining lane changes is reserved before the end, and
         speed decreases linearly over the distance d_stop before that point. A yielding vehicle in
         the next lane stops farther back, so that a gap opens.
         """
-        remaining = abs(vehicle.preferred_lane - vehicle.lane)
-        if remaining == 0:
+        wanted = self._wanted.of(vehicle)
+        remaining = abs(wanted.lane - vehicle.lane)
+        if remaining == 0 and not wanted.dead_end:
             return self._speed_mps
-        left_m = self._end_m - vehicle.s_m - remaining * self._change_m
+        change_m = self._dead_end_change_m if wanted.dead_end else self._change_m
+        left_m = wanted.end_m - vehicle.s_m - remaining * change_m
         return self._speed_mps * min(max(left_m / self._stop_m, 0.0), 1.0)

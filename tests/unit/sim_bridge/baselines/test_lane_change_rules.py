@@ -103,10 +103,10 @@ def test_of_three_abreast_one_continues(
 
 def test_the_slow_speed_falls_to_nothing_at_the_stop_distance() -> None:
     rules = Rules(PAPER)
-    assert rules.slow_speed_mps(300.0) == 15.0
-    assert rules.slow_speed_mps(400.0) == 15.0
-    assert rules.slow_speed_mps(625.0) == pytest.approx(7.5)
-    assert rules.slow_speed_mps(850.0) == rules.slow_speed_mps(990.0) == 0.0
+    assert rules.slow_speed_mps(300.0, 1000.0) == 15.0
+    assert rules.slow_speed_mps(400.0, 1000.0) == 15.0
+    assert rules.slow_speed_mps(625.0, 1000.0) == pytest.approx(7.5)
+    assert rules.slow_speed_mps(850.0, 1000.0) == rules.slow_speed_mps(990.0, 1000.0) == 0.0
 
 
 def test_a_vehicle_on_another_lane_approaches_the_end_slowly() -> None:

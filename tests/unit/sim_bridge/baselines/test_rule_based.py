@@ -113,7 +113,7 @@ def test_a_jam_clears_up(gap: str, lane_change_s: float) -> None:
     road, demand = RuleRoad(scenario), arrivals(scenario)
     road.serve(demand, until_s=600.0)
     assert len(road.left) == len(demand) > 100
-    assert all(one.finished for one in road.left)
+    assert all((one.lane, one.previous_lane) == (one.preferred_lane, None) for one in road.left)
 
 
 @pytest.mark.parametrize("yielding", ["unsorted", "all"])
