@@ -19,7 +19,8 @@ def road_with(*closures: Closure, s3_m: float = 850.0) -> Scenario:
     return evolve(ROLLING, road=road)
 
 
-DROP = road_with(Closure(0, 800.0))
+DROP_M = 800.0
+DROP = road_with(Closure(0, DROP_M))
 """Lane 0 of three ends at 800 of 1000 m."""
 BLOCKED = road_with(Closure(1, 600.0, 700.0))
 """Lane 1 of three is closed from 600 to 700 m."""

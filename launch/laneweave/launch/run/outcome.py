@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from laneweave.launch.faults.failover import Failover
+from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.report.summary_table import summary_rows
 from laneweave.protocol.summary import RunSummary, read_summary, write_summary
 
@@ -91,7 +92,9 @@ def print_outcome(outcome: Outcome, console: Console) -> None:
         table = Table(title=f"laneweave run: {outcome.folder}", show_header=False)
         table.add_column()
         table.add_column(justify="right")
-        for label, value in summary_rows(summary):
+        trips = outcome.folder / "trips.parquet"
+        preferences = not trips.is_file() or bool(scenario_of(trips).lane_shares)
+        for label, value in summary_rows(summary, preferences=preferences):
             table.add_row(label, value)
         console.print(table)
     for problem in outcome.problems:

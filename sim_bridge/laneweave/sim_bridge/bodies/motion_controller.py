@@ -37,6 +37,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import (
+    DISPLACED_ALONG_M,
     Jerk,
     State,
     at_rest_in_cell,
@@ -159,15 +160,29 @@ class MotionController:
     # --- lanes that end -----------------------------------------------------------------------
 
     def has_lost_cell(self, t_s: float) -> bool:
-        """Return whether the hold cell has passed the stop line of its lane."""
-        return self.off_lattice is None and self._lane_ends.has_passed(self.hold_cell, t_s)
+        """Return whether the hold cell has passed the stop line of the lane in which the body is.
+
+        A body that is partly in the lane of its hold cell continues its move.
+        """
+        if self.off_lattice is not None or not self._lane_ends:
+            return False
+        return self._lane_ends.has_passed((self.hold_cell[0], self._body_lane), t_s)
+
+    @property
+    def _body_lane(self) -> int:
+        """Lane of the hold cell if the body touches it; otherwise the lane of the body's centre."""
+        y_m, goal = self.measured[3], self.hold_cell[1]
+        first, last = self.lattice.lanes_touched(y_m, self._scenario.vehicle.width_m)
+        return goal if first <= goal <= last else int(y_m // self.lattice.lane_width_m)
 
     def leave_lattice(self) -> None:
         """Give up all cells; from now on no process can move the vehicle.
 
-        The stored transfer tells leaders that the vehicle is gone for all ballots so far.
+        The stored transfer tells leaders that the vehicle is gone for all ballots so far. The
+        vehicle stays in its lane.
         """
         self.off_lattice = OffLattice.WAITING
+        self.hold_cell = (self.hold_cell[0], self._body_lane)
         self._granted, self.owned = frozenset(), ()
         ballots = [ballot for ballot in (self.promised, self.accepted) if ballot is not None]
         if self.transfer is not None:
@@ -196,8 +211,8 @@ class MotionController:
     def _lines_ahead(self, measured: State) -> list[Neighbour]:
         """Return the stop lines of the lanes that the body touches or enters, as vehicles.
 
-        For a vehicle that starts from standing at a line into another lane, the end of the lane
-        counts instead.
+        For a vehicle that starts from standing and is partly in another lane, or drives out into
+        it, the end of the lane counts instead.
         """
         s_m, speed_mps, goal = measured[0], measured[1], self.hold_cell[1]
         first, last = self.lattice.lanes_touched(measured[3], self._scenario.vehicle.width_m)
@@ -205,7 +220,7 @@ class MotionController:
         ends = [end for lane in lanes if (end := self._lane_ends.ahead(lane, s_m)) is not None]
         if all(end.lane == goal for end in ends):
             self._past_line = False
-        elif speed_mps < STANDING_MPS:
+        elif speed_mps < STANDING_MPS and self._body_lane == goal:
             self._past_line = True
         lines = [(end.lane, (end.end_m if self._past_line else end.line_m) - s_m) for end in ends]
         return [Neighbour(lane, gap_m, 0.0) for lane, gap_m in lines if gap_m < MAX_LINE_GAP_M]
@@ -215,7 +230,7 @@ class MotionController:
 
         A command is rejected if its incarnation is older than that of the process in charge, if its
         tick is not later than that of the last command, if the vehicle does not own its hold cell
-        (rolling operation), or if it changes to a lane in which a body is beside this one. A newer
+        (rolling operation), or if it changes lanes in an emergency or beside another body. A newer
         incarnation takes charge. Its first command must keep the hold cell: no plan can allow a
         process to move the vehicle before it is in charge. A rejected process may try again at the
         next tick.
@@ -243,7 +258,9 @@ class MotionController:
         self.store_requests(command)
         if self.rolling and leaves and command.hold_cell not in self.owned:
             return False
-        if command.hold_cell[1] != self.hold_cell[1] and self._is_beside(command.hold_cell[1]):
+        lane = command.hold_cell[1]
+        unsafe = self.rung is Rung.EMERGENCY or self._is_beside(lane)
+        if lane != self.hold_cell[1] and unsafe:
             return False
         if len(jerks) > 0 or leaves:
             self._jerks, self._jerks_tick = jerks, command.tick
@@ -399,7 +416,8 @@ class MotionController:
     def _next(self, tick: int, near: Iterable[Neighbour]) -> tuple[Rung, Jerk]:
         """Return the rung and jerk for a tick without an emergency."""
         index = 2 * (tick - self._jerks_tick)
-        if 0 <= index < len(self._jerks):
+        stays_in_lane = self._must_stay_in_lane(tick)
+        if 0 <= index < len(self._jerks) and not stays_in_lane:
             return Rung.EXECUTE, (self._jerks[index], self._jerks[index + 1])
         limits, speed_mps = self._scenario.vehicle, self.lattice.speed_mps
         body = self.measured
@@ -407,6 +425,8 @@ class MotionController:
         goal = cell_state(self.lattice, self.hold_cell, tick * self.tick_s)
         if self.off_lattice is OffLattice.WAITING:
             goal = (state[0], *goal[1:])  # at v_F in its lane, up to the line
+        elif stays_in_lane:
+            goal = (*goal[:3], self.lattice.cell_y_m(self._body_lane), 0.0, 0.0)
         jerk = hold_law(state, goal, limits, self.tick_s)
         lag_s, goal_lane = limits.actuator_lag_s, self.hold_cell[1]
         ahead = [
@@ -421,6 +441,18 @@ class MotionController:
         min_gap_m = self._scenario.tracking.min_gap_m
         careful = keep_gap(state, jerk, ahead, limits, min_gap_m, self.tick_s)
         return (Rung.HOLD if careful == jerk else Rung.GIVE_WAY), careful
+
+    def _must_stay_in_lane(self, tick: int) -> bool:
+        """Return whether the body must not enter the lane of its hold cell.
+
+        A move keeps the cells between its ends free. A body that has fallen behind them, for
+        example in an emergency, is beside cells of others: it stays in its lane until it has caught
+        up. A body that is partly in the other lane already is seen by others, and goes on.
+        """
+        if self._body_lane == self.hold_cell[1] or self.off_lattice is not None:
+            return False
+        cell_s_m = self.lattice.cell_s_m(self.hold_cell[0], tick * self.tick_s)
+        return abs(self.measured[0] - cell_s_m) > self.lattice.pitch_m + DISPLACED_ALONG_M
 
     def _must_brake(self, measured: State, jerk: Jerk, near: Iterable[Neighbour]) -> bool:
         """Return whether an emergency begins or continues."""

@@ -24,9 +24,10 @@ from laneweave.sim_bridge.bodies.motion_controller import OffLattice as Progress
 from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
-OPEN_GAPS = 1
-"""Number of gap lengths of columns between two gaps of a lane that vehicles may enter, so that the
-traffic of this lane, and vehicles that change into it, keep most of its cells."""
+OPEN_GAPS, CROWDED_GAPS = 1, 5
+"""Number of gap lengths of columns between two gaps of a lane that vehicles may enter, so that its
+traffic, and vehicles that change into it, keep most of its cells; and the same while vehicles wait
+at the entrance of the lane. With fewer, gaps would use up the capacity of dense traffic."""
 
 
 @define
@@ -68,8 +69,8 @@ class LaneEndControl:
         self._queue_m = scenario.vehicle.length_m + scenario.tracking.min_gap_m
         """Distance between the fronts of vehicles that stand in a queue."""
         self._gaps: dict[DeadEnd, list[Gap]] = {end: [] for end in self._ends}
-        self._next_from: list[float] = [math.inf] * scenario.road.lanes
-        """Column of each lane from which the next gap may be kept free."""
+        self._last_gap: list[float] = [math.inf] * scenario.road.lanes
+        """Rearmost column of the last gap of each lane."""
         self._end_of: dict[Name, DeadEnd] = {}
         """Dead end at which each vehicle without cells waits or waited."""
 
@@ -118,14 +119,16 @@ class LaneEndControl:
 
     def _request(self, lane: int, gaps: list[Gap]) -> None:
         """Keep the next columns of a lane free, unless the last gap was too close ahead."""
-        if self._meter.closed_column(lane) <= self._next_from[lane]:
+        crowded = any(arrival.lane == lane for arrival in self._meter.waiting)
+        between = (CROWDED_GAPS if crowded else OPEN_GAPS) * self._columns
+        if self._meter.closed_column(lane) <= self._last_gap[lane] - between:
             columns = self._meter.keep_free(lane, self._columns)
-            self._next_from[lane] = columns[0] - OPEN_GAPS * self._columns
+            self._last_gap[lane] = columns[0]
             gaps.append(Gap(lane, columns))
 
     def _take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
-        cell = vehicle.controller.hold_cell
         vehicle.controller.leave_lattice()
+        cell = vehicle.controller.hold_cell
         # The end that the body has ahead of it is that of its lane.
         self._end_of[name] = next(
             end

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
@@ -12,6 +13,8 @@ from laneweave.launch.faults.failover import Failover
 from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.run.outcome import Outcome, complete_summary, print_outcome
 from laneweave.protocol.summary import RunSummary, write_summary
+from laneweave.sim_bridge.recording.trips import metadata_of, trips_table
+from support.closed_lanes import DROP
 from support.summaries import make_summary
 
 MEASURED = ("min_gap_m", "min_headway_s", "max_accel_mps2", "min_accel_mps2", "max_jerk_mps3")
@@ -97,6 +100,11 @@ def test_the_table_at_the_end(
     tmp_path: Path, found: RunSummary, more: dict[str, Any], shown: str
 ) -> None:
     assert shown in printed(judge(tmp_path, found, **more))
+
+
+def test_the_table_names_no_preferred_lanes_on_a_road_without_them(tmp_path: Path) -> None:
+    pq.write_table(trips_table([], 0.0, metadata_of(DROP)), tmp_path / "trips.parquet")
+    assert "no preferred lanes" in printed(judge(tmp_path, summary()))
 
 
 def test_all_reasons_are_printed(tmp_path: Path) -> None:

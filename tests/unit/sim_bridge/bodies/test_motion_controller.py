@@ -331,3 +331,48 @@ def test_no_lane_change_begins_beside_another_body(
     controller.hold_cell = HOME
     ahead: Cell = (HOME[0] + 1, HOME[1])
     assert controller.accept_command(command(2, (0.1, 0.0), hold_cell=ahead))
+
+
+def test_no_lane_change_begins_in_an_emergency(controller: MotionController) -> None:
+    controller.rung = Rung.EMERGENCY
+    assert not controller.accept_command(command(1, (0.0, 0.1), hold_cell=(HOME[0], 2)))
+    controller.rung = Rung.HOLD
+    assert controller.accept_command(command(2, (0.0, 0.1), hold_cell=(HOME[0], 2)))
+
+
+@pytest.mark.parametrize(
+    ("behind_m", "across_m", "changes"),
+    [
+        (0.0, 0.0, True),
+        (13.0, 0.0, True),
+        (17.0, 0.0, False),
+        (60.0, 0.3, False),
+        (60.0, 1.2, True),
+    ],
+)
+def test_a_body_far_from_its_cell_stays_in_its_lane(
+    behind_m: float, across_m: float, *, changes: bool
+) -> None:
+    """Beside it are cells of others; one that is partly in the other lane goes on."""
+    s, v, a, y, v_y, a_y = cell_state(LATTICE, HOME, 0.0)
+    controller = controller_in(
+        HOME, attendant=AGENT, state=(s - behind_m, v, a, y + across_m, v_y, a_y)
+    )
+    controller.hold_cell = (HOME[0], HOME[1] + 1)
+    # The agent wants to move over, too.
+    jerks = [(0.0, 2.0)] * 4 + [(0.0, 0.0)] * 20
+    assert controller.accept_command(command(1, *jerks, hold_cell=controller.hold_cell))
+    touched = False
+    for tick in range(1, 24):
+        controller.step(tick)
+        touched |= controller.plant.state[3] > y + across_m + 0.3
+    assert touched == changes
+
+
+def test_a_body_that_has_caught_up_changes_lanes(controller: MotionController) -> None:
+    s, v, a, y, v_y, a_y = cell_state(LATTICE, HOME, 0.0)
+    controller = controller_in(HOME, state=(s - 40.0, v, a, y, v_y, a_y))
+    controller.hold_cell = (HOME[0], HOME[1] + 1)
+    for tick in range(300):
+        controller.step(tick)
+    assert controller.has_settled(300 * TICK_S)
