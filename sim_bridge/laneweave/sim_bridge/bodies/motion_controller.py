@@ -59,6 +59,8 @@ MAX_LINE_GAP_M = 200.0
 """Distance from which stop lines are seen; more than any stopping distance."""
 BESIDE_M = 1.0
 """Net gap along the road below which another body is beside this one."""
+SLOWED_MPS = 2.0
+"""Loss of speed from which a body does not enter another lane."""
 STANDING_MPS = 0.3
 """Speed below which a vehicle stands."""
 RELEASE_M = 1.0
@@ -445,14 +447,20 @@ class MotionController:
     def _must_stay_in_lane(self, tick: int) -> bool:
         """Return whether the body must not enter the lane of its hold cell.
 
-        A move keeps the cells between its ends free. A body that has fallen behind them, for
-        example in an emergency, is beside cells of others: it stays in its lane until it has caught
-        up. A body that is partly in the other lane already is seen by others, and goes on.
+        Vehicles in that lane expect it between the cells of its move, and as fast as they are. A
+        body that has had to brake stays in its lane until it has caught up. One that is partly in
+        the other lane already is seen there, and goes on.
         """
         if self._body_lane == self.hold_cell[1] or self.off_lattice is not None:
             return False
-        cell_s_m = self.lattice.cell_s_m(self.hold_cell[0], tick * self.tick_s)
-        return abs(self.measured[0] - cell_s_m) > self.lattice.pitch_m + DISPLACED_ALONG_M
+        s_m, speed_mps = self.measured[:2]
+        columns = self.motion_origin[0], self.hold_cell[0]
+        t_s = tick * self.tick_s
+        rear_m = self.lattice.cell_s_m(min(columns), t_s) - DISPLACED_ALONG_M
+        front_m = self.lattice.cell_s_m(max(columns), t_s) + DISPLACED_ALONG_M
+        # Only moves along the road change the speed.
+        slowed = columns[0] == columns[1] and speed_mps < self.lattice.speed_mps - SLOWED_MPS
+        return slowed or not rear_m <= s_m <= front_m
 
     def _must_brake(self, measured: State, jerk: Jerk, near: Iterable[Neighbour]) -> bool:
         """Return whether an emergency begins or continues."""

@@ -341,31 +341,34 @@ def test_no_lane_change_begins_in_an_emergency(controller: MotionController) -> 
 
 
 @pytest.mark.parametrize(
-    ("behind_m", "across_m", "changes"),
+    ("behind_m", "slower_mps", "across_m", "origin", "changes"),
     [
-        (0.0, 0.0, True),
-        (13.0, 0.0, True),
-        (17.0, 0.0, False),
-        (60.0, 0.3, False),
-        (60.0, 1.2, True),
+        (0.0, 0.0, 0.0, HOME, True),
+        (0.9, 0.0, 0.0, HOME, True),
+        (1.5, 0.0, 0.0, HOME, False),
+        (0.0, 3.0, 0.0, HOME, False),
+        (60.0, 0.0, 0.3, HOME, False),
+        (60.0, 0.0, 1.2, HOME, True),  # it is in both lanes
+        (14.0, 3.0, 0.0, (HOME[0] - 1, HOME[1]), True),  # an oblique move
+        (18.0, 3.0, 0.0, (HOME[0] - 1, HOME[1]), False),
     ],
 )
-def test_a_body_far_from_its_cell_stays_in_its_lane(
-    behind_m: float, across_m: float, *, changes: bool
+def test_a_body_that_had_to_brake_stays_in_its_lane(
+    behind_m: float, slower_mps: float, across_m: float, origin: Cell, *, changes: bool
 ) -> None:
     """Beside it are cells of others; one that is partly in the other lane goes on."""
     s, v, a, y, v_y, a_y = cell_state(LATTICE, HOME, 0.0)
-    controller = controller_in(
-        HOME, attendant=AGENT, state=(s - behind_m, v, a, y + across_m, v_y, a_y)
-    )
-    controller.hold_cell = (HOME[0], HOME[1] + 1)
+    state = (s - behind_m, v - slower_mps, a, y + across_m, v_y, a_y)
+    controller = controller_in(HOME, attendant=AGENT, state=state)
+    there: Cell = (HOME[0], HOME[1] + 1)
     # The agent wants to move over, too.
-    jerks = [(0.0, 2.0)] * 4 + [(0.0, 0.0)] * 20
-    assert controller.accept_command(command(1, *jerks, hold_cell=controller.hold_cell))
+    jerks = [(0.0, 2.0)] * 6 + [(0.0, 0.0)] * 20
+    move = evolve(command(0, *jerks, hold_cell=there), motion_origin=origin)
+    assert controller.accept_command(move)
     touched = False
-    for tick in range(1, 24):
+    for tick in range(8):
         controller.step(tick)
-        touched |= controller.plant.state[3] > y + across_m + 0.3
+        touched |= controller.plant.state[3] > y + across_m + 0.05
     assert touched == changes
 
 
