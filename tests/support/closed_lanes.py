@@ -52,7 +52,7 @@ class LonelyRoad:
         """Drive one tick."""
         scenario, t_s = self.scenario, self.t_s
         self.roadside.newly_demanded(t_s)
-        for admission in self.roadside.admit(t_s):
+        for admission in self.roadside.admit(t_s, self.vehicles):
             vehicle = RoadVehicle.entering(admission, t_s, scenario, 1)
             self.vehicles[vehicle.name] = vehicle
         for change in self.roadside.control_lane_ends(self.vehicles, t_s):

@@ -311,7 +311,7 @@ class BridgeCore:
         self._tick_began = self._stopwatch()
         for arrival in self._roadside.newly_demanded(self.t_s):
             self._record.on_demanded(arrival)
-        for admission in self._roadside.admit(self.t_s):
+        for admission in self._roadside.admit(self.t_s, self.vehicles):
             self._at_entrance.append(
                 RoadVehicle.entering(admission, self.t_s, self.scenario, self._incarnation)
             )

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from bisect import insort
+from collections.abc import Collection
 
 from attrs import frozen
 
@@ -98,14 +99,19 @@ class EntryMeter:
         self._names.add(arrival.vehicle)
         insort(self._queues[arrival.lane], arrival, key=lambda other: other.t_s)
 
-    def admit(self, until_s: float) -> list[Admission]:
+    def admit(self, until_s: float, full: Collection[int] = ()) -> list[Admission]:
         """Return the vehicles that have entered since the last call, by time, then lane.
 
-        `until_s` is usually the current road time.
+        Args:
+            until_s: usually the current road time.
+            full: lanes without room at the entrance, which no vehicle may enter now.
         """
         admissions = []
-        while True:
-            t_s, lane = min((self._entry_s(lane), lane) for lane in range(self._lattice.lanes))
+        for lane in full:
+            self._free_s[lane] = max(self._free_s[lane], until_s + TIME_TOLERANCE_S)
+        lanes = [lane for lane in range(self._lattice.lanes) if lane not in full]
+        while lanes:
+            t_s, lane = min((self._entry_s(lane), lane) for lane in lanes)
             if t_s > until_s + TIME_TOLERANCE_S:
                 break
             cell = (self._columns[lane], lane)

@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from types import MappingProxyType
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect, Send
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
 from laneweave.protocol.wire.messages import (
     Announcement,
     Census,
     CensusEntry,
     ClosedFormation,
     Name,
+    Neighbour,
     RoadClock,
 )
 from laneweave.protocol.wire.topics import CENSUS, CLOCK
@@ -27,6 +30,9 @@ from laneweave.sim_bridge.road.lane_end_control import LaneEndChange, LaneEndCon
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 CENSUS_EVERY_TICKS = 10
+NO_VEHICLES: Mapping[Name, RoadVehicle] = MappingProxyType({})
+QUEUE_ROOM_M = 20.0
+"""Spare distance behind a slow vehicle near the entrance, beyond that for the hardest braking."""
 MAX_EMPTY = 12
 """Maximum distance in columns between a vehicle and empty cells assigned to it; smaller if moves
 begin near the entrance, since all cells must be assigned before a plan can transfer them."""
@@ -50,6 +56,11 @@ class Roadside:
         self._tick_s = scenario.runtime.tick_s
         self._lanes = scenario.road.lanes
         lattice, formation = scenario.lattice, scenario.formation
+        self._lattice, self._size = lattice, scenario.vehicle
+        self._brake = EmergencyBrake(scenario)
+        stopping_m = lattice.speed_mps**2 / -scenario.vehicle.min_accel_mps2
+        self._room_m = scenario.vehicle.length_m + stopping_m + lattice.speed_mps + QUEUE_ROOM_M
+        """Distance from the entrance within which bodies may keep others from entering."""
         ahead_s = self._announce_s + self._tick_s
         self._announced_per_lane = math.ceil(ahead_s / formation.entry_spacing_s) + 1
         self._rolling = formation.rolling
@@ -91,13 +102,22 @@ class Roadside:
         self._demanded = count_until(self._arrivals, t_s + TIME_TOLERANCE_S)
         return self._arrivals[first : self._demanded]
 
-    def admit(self, t_s: float) -> list[Admission]:
-        """Return the vehicles that have entered since the last call."""
+    def admit(
+        self, t_s: float, vehicles: Mapping[Name, RoadVehicle] = NO_VEHICLES
+    ) -> list[Admission]:
+        """Return the vehicles that have entered since the last call.
+
+        No vehicle enters a lane where it would have to brake hard for a queue at the entrance.
+
+        Args:
+            t_s: road time.
+            vehicles: the vehicles on the road.
+        """
         # Also queue vehicles that arrive before the next tick, since cells pass between ticks.
         first, self._queued = self._queued, count_until(self._arrivals, t_s + self._tick_s)
         for arrival in self._arrivals[first : self._queued]:
             self._meter.demand(arrival)
-        admissions = self._meter.admit(t_s)
+        admissions = self._meter.admit(t_s, self._full_lanes(vehicles))
         if self._rolling:
             for admission in admissions:
                 column, lane = admission.cell
@@ -105,6 +125,23 @@ class Roadside:
         self._entered += len(admissions)
         self._census_changed |= bool(admissions)
         return admissions
+
+    def _full_lanes(self, vehicles: Mapping[Name, RoadVehicle]) -> set[int]:
+        """Return the lanes in which a body at the entrance leaves too little room to brake."""
+        lattice, size = self._lattice, self._size
+        entering = (0.0, lattice.speed_mps, 0.0, 0.0, 0.0, 0.0)
+        full = set()
+        for vehicle in vehicles.values():
+            s_m, speed_mps, accel_mps2, y_m, _, _ = vehicle.state
+            if s_m > self._room_m:
+                continue
+            body = Neighbour(0, s_m - size.length_m, speed_mps, accel_mps2)
+            spare_m = self._brake.spare_m(entering, 0.0, (0.0, 0.0), [body])
+            slow = speed_mps < 0.5 * lattice.speed_mps
+            if spare_m < (QUEUE_ROOM_M if slow else 0.0):
+                first, last = lattice.lanes_touched(y_m, size.width_m)
+                full |= {*range(first, last + 1)}
+        return full
 
     def close_formations(self, t_s: float) -> list[ClosedFormation]:
         """Return the formations closed since the last call.

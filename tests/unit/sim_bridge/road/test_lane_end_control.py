@@ -17,6 +17,7 @@ from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffL
 from laneweave.sim_bridge.road import lane_end_control
 from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.lane_end_control import LaneEndControl
+from laneweave.sim_bridge.road.roadside import Roadside
 from support.closed_lanes import LonelyRoad, road_with
 
 DROP = road_with(Closure(0, 400.0), s3_m=450.0)
@@ -116,6 +117,22 @@ def test_the_census_tells_where_they_stand() -> None:
         if road.vehicles[name].state[1] < 0.1:
             rear_m = road.vehicles[name].state[0] - DROP.vehicle.length_m
             assert body.rear_m == pytest.approx(rear_m, abs=8.0)
+
+
+@pytest.mark.parametrize("blind", [False, True], ids=["", "planted bug"])
+def test_a_queue_that_reaches_the_entrance_keeps_vehicles_from_entering(
+    monkeypatch: pytest.MonkeyPatch, *, blind: bool
+) -> None:
+    if blind:
+        monkeypatch.setattr(Roadside, "_full_lanes", lambda *_: set())
+    road = lonely_road(road_with(Closure(0, 300.0), s3_m=350.0), 2200.0, 80.0)
+    longest = 0
+    while not road.overlaps and (road.vehicles or not road.roadside.exhausted(road.t_s)):
+        road.step()
+        assert road.t_s < MAX_S
+        longest = max(longest, sum(one.state[1] < 1.0 for one in road.vehicles.values()))
+    assert (road.overlaps != []) == blind
+    assert longest > 15
 
 
 # --- planted bugs -------------------------------------------------------------------------------
