@@ -23,7 +23,7 @@ vehicles_per_process = 1
 """
 KILLS = """[[kill]]
 target = "agent"
-count = 12
+count = 20
 between_s = [8.0, 20.0]
 """
 

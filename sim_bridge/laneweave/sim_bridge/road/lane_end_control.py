@@ -128,14 +128,11 @@ class LaneEndControl:
 
     def _take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
         vehicle.controller.leave_lattice()
-        cell = vehicle.controller.hold_cell
-        # The end that the body has ahead of it is that of its lane.
-        self._end_of[name] = next(
-            end
-            for end in self._ends
-            if end.lane == cell[1] and vehicle.state[0] < max(end.reopens_m, end.end_m)
-        )
-        return LaneEndChange(name, LEFT_LATTICE, cell[1])
+        lane, s_m = vehicle.controller.hold_cell[1], vehicle.state[0]
+        ends = [end for end in self._ends if end.lane == lane]
+        # The first that the body has not passed.
+        self._end_of[name] = next((end for end in ends if s_m < end.reopens_m), ends[-1])
+        return LaneEndChange(name, LEFT_LATTICE, lane)
 
     def _waiting(self, end: DeadEnd, vehicles: Mapping[Name, RoadVehicle]) -> list[RoadVehicle]:
         """Return the vehicles that wait at a dead end, foremost first."""
