@@ -233,6 +233,16 @@ class AgentCore:
             self._claim_above(sense.attendant)
         return self._act(sense, in_charge=self.in_charge, drove=drove)
 
+    def _has_lost_track(self, sense: Sense) -> bool:
+        """Return whether the vehicle holds a cell to which this process has not moved it.
+
+        It has left the lattice and entered it again while no SENSE arrived.
+        """
+        execution, move = self.execution, self._move
+        if execution is None or sense.hold_cell == execution.hold_cell:
+            return False
+        return move is None or sense.hold_cell != move[1]
+
     def _wait(self, sense: Sense) -> list[Effect]:
         """Keep the claim on a vehicle without a cell, which its motion controller drives alone."""
         self._command = Command(
@@ -244,11 +254,11 @@ class AgentCore:
             motion_origin=sense.motion_origin,
             jerks=b"",
         )
-        return [Send(COMMAND, self._command, self._own), *([self._state()] * self.in_charge)]
+        return [Send(COMMAND, self._command, self._own)]
 
     def _act(self, sense: Sense, *, in_charge: bool, drove: bool) -> list[Effect]:
         """Answer a tick; `drove`: whether this process has driven the vehicle until now."""
-        if sense.off_lattice and drove:
+        if drove and (sense.off_lattice or self._has_lost_track(sense)):
             # What it has promised and accepted is void: it begins anew, like another process.
             self._claim_above(self._incarnation)
             in_charge = False

@@ -245,8 +245,6 @@ def test_without_a_cell_it_begins_anew_and_only_keeps_its_claim() -> None:
         plan = make_plan({ME: HOME}, {ME: ((0, HOME, (-1, 2)),)})
         assert rig.hand(topics.PREPARE, Prepare(BALLOT, (0,), (ME,))) == []
         assert rig.hand(topics.PLAN, plan) == []
-    state = rig.shown[-1]
-    assert (state.incarnation, state.accepted) == (2, False)
     there: Cell = (-5, 1)
     controller.drive_out(there)
     controller.enter_lattice([there])
@@ -255,3 +253,21 @@ def test_without_a_cell_it_begins_anew_and_only_keeps_its_claim() -> None:
     assert (command.hold_cell, command.incarnation) == (there, 2)
     assert rig.shown[-1].hold_cell == there
     assert rig.agent.in_charge
+
+
+def test_it_begins_anew_if_its_vehicle_has_entered_the_lattice_again_unseen() -> None:
+    """No SENSE arrived while the vehicle was off the lattice."""
+    rig = up_and_running()
+    rig.accept((0, HOME, (-1, 2)))
+    controller, there = rig.controller, (-5, 1)
+    controller.leave_lattice()
+    controller.drive_out(there)
+    controller.enter_lattice([there])
+    rig.coast(30)
+    for _ in range(2):
+        (command,) = sent(rig.hand(topics.SENSE, rig.sense()), Command)
+        assert controller.accept_command(command)
+        assert (command.hold_cell, command.incarnation) == (there, 2)
+        rig.coast(1)
+    assert rig.agent.in_charge
+    assert rig.shown[-1].hold_cell == there

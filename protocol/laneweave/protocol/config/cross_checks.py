@@ -173,6 +173,14 @@ def _check_closures(scenario: Scenario) -> None:
             f"less than the length of the road, {road.length_m:g}, and more than {after_m:g}, "
             f"where lane {closure.lane} is open (again)",
         )
+        step_m = scenario.formation.speed_mps * scenario.cycles_s[0] + scenario.vehicle.length_m
+        _require(
+            closure.to_m >= road.length_m or closure.to_m + step_m <= road.length_m,
+            f"{name}.to_m",
+            closure.to_m,
+            f"at most {road.length_m - step_m:g}, a body and a step before the end of the road, or "
+            "none",
+        )
         open_m[closure.lane] = closure.to_m
         _check_capacity(scenario, closure.from_m)
     if road.closures:

@@ -70,9 +70,9 @@ class LaneEnds:
     def __init__(self, scenario: Scenario) -> None:
         """Derive the stop lines; a road without dead ends has none."""
         self._lattice = scenario.lattice
+        ends = dead_ends(scenario)
         self._by_lane = tuple(
-            tuple(each for each in dead_ends(scenario) if each.lane == lane)
-            for lane in range(scenario.road.lanes)
+            tuple(each for each in ends if each.lane == lane) for lane in range(scenario.road.lanes)
         )
 
     def __bool__(self) -> bool:
@@ -93,11 +93,17 @@ class LaneEnds:
                 return end
         return None
 
-    def has_passed(self, cell: Cell, t_s: float) -> bool:
-        """Return whether a cell has passed the stop line of its lane at road time `t_s`."""
-        s_m = self._lattice.cell_s_m(cell[0], t_s)
-        end = self.ahead(cell[1], s_m)
-        return end is not None and s_m > end.line_m
+    def has_passed(self, cell: Cell, t_s: float, since_s: float | None = None) -> bool:
+        """Return whether a cell has passed the stop line of its section.
+
+        Args:
+            cell: the cell.
+            t_s: road time.
+            since_s: road time at which the cell is in the section; None: `t_s`.
+        """
+        cell_s_m = self._lattice.cell_s_m
+        end = self.ahead(cell[1], cell_s_m(cell[0], t_s if since_s is None else since_s))
+        return end is not None and cell_s_m(cell[0], t_s) > end.line_m
 
 
 def dead_ends(scenario: Scenario) -> tuple[DeadEnd, ...]:
@@ -123,10 +129,11 @@ def lane_beside(scenario: Scenario, end: DeadEnd) -> int | None:
     """
     needed = drive_out(scenario)
     pitch_m = scenario.lattice.pitch_m
+    sections = sections_to_lines(scenario)
     from_m = end.line_m - needed.columns * pitch_m - scenario.vehicle.length_m
     to_m = min(end.line_m + needed.distance_m, scenario.road.length_m)
     for lane in (end.lane + 1, end.lane - 1):
-        for section in sections_to_lines(scenario):
+        for section in sections:
             if section.lane == lane and section.from_m <= from_m and to_m <= section.to_m:
                 return lane
     return None

@@ -420,9 +420,11 @@ def ends_in_time(execution: PlanExecution, _: object) -> bool:
     if plan is None or move is None or not ends:
         return True
     _, origin, target = move
-    end_s = execution.t_s + plan.slot_s - LATE_S
-    front = max(origin[0], target[0])
-    return not any(ends.has_passed((front, lane), end_s) for lane in (origin[1], target[1]))
+    begin_s, front = execution.t_s, max(origin[0], target[0])
+    end_s = begin_s + plan.slot_s - LATE_S
+    return not any(
+        ends.has_passed((front, lane), end_s, begin_s) for lane in (origin[1], target[1])
+    )
 
 
 def is_released(execution: PlanExecution, _: object) -> bool:

@@ -68,7 +68,7 @@ RELEASE_M = 1.0
 favourable measurement errors would release the brake repeatedly, and lost distance add up."""
 
 
-class OffLattice(Enum):
+class OffLatticePhase(Enum):
     """What a vehicle without a cell does."""
 
     WAITING = "waiting"
@@ -119,7 +119,7 @@ class MotionController:
     """Number of ticks spent on each rung."""
     neighbours: Neighbours = NO_NEIGHBOURS
     """Measured neighbours."""
-    off_lattice: OffLattice | None = None
+    off_lattice: OffLatticePhase | None = None
     """None: the vehicle has cells."""
     _past_line: bool = False
     """Whether the vehicle has started from standing at a stop line, into another lane."""
@@ -164,9 +164,12 @@ class MotionController:
     def has_lost_cell(self, t_s: float) -> bool:
         """Return whether the hold cell has passed the stop line of the lane in which the body is.
 
-        A body that is partly in the lane of its hold cell continues its move.
+        A body that is partly in the lane of its hold cell continues its move. One that has driven
+        out of another lane may come to a line, too, if it could not settle before.
         """
-        if self.off_lattice is not None or not self._lane_ends:
+        if self.off_lattice is OffLatticePhase.WAITING or not self._lane_ends:
+            return False
+        if self.off_lattice is OffLatticePhase.DRIVING_OUT and self._past_line:
             return False
         return self._lane_ends.has_passed((self.hold_cell[0], self._body_lane), t_s)
 
@@ -183,7 +186,7 @@ class MotionController:
         The stored transfer tells leaders that the vehicle is gone for all ballots so far. The
         vehicle stays in its lane.
         """
-        self.off_lattice = OffLattice.WAITING
+        self.off_lattice = OffLatticePhase.WAITING
         self.hold_cell = (self.hold_cell[0], self._body_lane)
         self._granted, self.owned = frozenset(), ()
         ballots = [ballot for ballot in (self.promised, self.accepted) if ballot is not None]
@@ -196,7 +199,7 @@ class MotionController:
 
     def drive_out(self, cell: Cell) -> None:
         """Begin to drive into the neighbouring lane, towards a cell that is kept free."""
-        self.off_lattice, self.hold_cell = OffLattice.DRIVING_OUT, cell
+        self.off_lattice, self.hold_cell = OffLatticePhase.DRIVING_OUT, cell
         self._past_line = True
         self._stop_motion()
 
@@ -210,7 +213,7 @@ class MotionController:
         self._jerks = self._jerks[:0]
         self.motion_origin, self.motion_end_tick, self.motion_ticks = self.hold_cell, 0, 0
 
-    def _lines_ahead(self, measured: State) -> list[Neighbour]:
+    def _lines_ahead(self, measured: State, tick: int) -> list[Neighbour]:
         """Return the stop lines of the lanes that the body touches or enters, as vehicles.
 
         For a vehicle that starts from standing and is partly in another lane, or drives out into
@@ -218,13 +221,18 @@ class MotionController:
         """
         s_m, speed_mps, goal = measured[0], measured[1], self.hold_cell[1]
         first, last = self.lattice.lanes_touched(measured[3], self._scenario.vehicle.width_m)
-        lanes = {*range(first, last + 1), goal}
+        lanes = {*range(first, last + 1)}
+        if not self._must_stay_in_lane(tick):
+            lanes.add(goal)
         ends = [end for lane in lanes if (end := self._lane_ends.ahead(lane, s_m)) is not None]
         if all(end.lane == goal for end in ends):
             self._past_line = False
         elif speed_mps < STANDING_MPS and self._body_lane == goal:
             self._past_line = True
-        lines = [(end.lane, (end.end_m if self._past_line else end.line_m) - s_m) for end in ends]
+        lines = [
+            (end.lane, (end.end_m if self._past_line and end.lane != goal else end.line_m) - s_m)
+            for end in ends
+        ]
         return [Neighbour(lane, gap_m, 0.0) for lane, gap_m in lines if gap_m < MAX_LINE_GAP_M]
 
     def accept_command(self, command: Command) -> bool:
@@ -378,7 +386,7 @@ class MotionController:
         if near:
             near = self._relevant(near, measured[3])
         if self._lane_ends:
-            near = [*near, *self._lines_ahead(measured)]
+            near = [*near, *self._lines_ahead(measured, tick)]
         rung, jerk = self._next(tick, near)
         if near and self._must_brake(measured, jerk, near):
             rung = Rung.EMERGENCY
@@ -425,7 +433,7 @@ class MotionController:
         body = self.measured
         state = commanded_state(body, self.plant.setpoint, limits, speed_mps)
         goal = cell_state(self.lattice, self.hold_cell, tick * self.tick_s)
-        if self.off_lattice is OffLattice.WAITING:
+        if self.off_lattice is OffLatticePhase.WAITING:
             goal = (state[0], *goal[1:])  # at v_F in its lane, up to the line
         elif stays_in_lane:
             goal = (*goal[:3], self.lattice.cell_y_m(self._body_lane), 0.0, 0.0)
@@ -456,6 +464,8 @@ class MotionController:
         s_m, speed_mps = self.measured[:2]
         columns = self.motion_origin[0], self.hold_cell[0]
         t_s = tick * self.tick_s
+        if self._lane_ends.has_passed(self.hold_cell, t_s):
+            return True  # the other lane has ended meanwhile
         rear_m = self.lattice.cell_s_m(min(columns), t_s) - DISPLACED_ALONG_M
         front_m = self.lattice.cell_s_m(max(columns), t_s) + DISPLACED_ALONG_M
         # Only moves along the road change the speed.

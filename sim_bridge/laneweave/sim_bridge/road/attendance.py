@@ -89,6 +89,11 @@ class Caretaker:
                 execution.on_stored(controller.accepted)
         return self.state(tick) if accepted else None
 
+    @property
+    def has_cells(self) -> bool:
+        """Whether the vehicle is on the lattice."""
+        return self._vehicle.controller.off_lattice is None
+
     def state(self, tick: int) -> VehicleState:
         """Return the state to publish; end the motion if the controller has completed it (V7)."""
         vehicle, execution = self._vehicle, self._execution
@@ -246,9 +251,10 @@ class Attendance:
             yield _state_effect(state)
 
     def states(self, tick: int) -> Iterator[Effect]:
-        """Publish the states of all vehicles that have caretakers."""
+        """Publish the states of all vehicles that have caretakers and cells."""
         for caretaker in self._caretakers.values():
-            yield _state_effect(caretaker.state(tick))
+            if caretaker.has_cells:
+                yield _state_effect(caretaker.state(tick))
 
     def _end_caretaker(self, vehicle: Name) -> Iterator[Effect]:
         """Remove a vehicle's caretaker, if it has one."""

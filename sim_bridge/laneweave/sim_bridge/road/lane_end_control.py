@@ -19,8 +19,11 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import START_S, DeadEnd, LaneEnds, drive_out, lane_beside
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
 from laneweave.protocol.wire.messages import Name, OffLattice
-from laneweave.sim_bridge.bodies.motion_controller import BESIDE_M, STANDING_MPS
-from laneweave.sim_bridge.bodies.motion_controller import OffLattice as Progress
+from laneweave.sim_bridge.bodies.motion_controller import (
+    BESIDE_M,
+    STANDING_MPS,
+    OffLatticePhase,
+)
 from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
@@ -63,13 +66,16 @@ class LaneEndControl:
         self._meter = meter
         self._lattice = scenario.lattice
         self._ends = tuple(LaneEnds(scenario))
-        self._beside = {end: lane_beside(scenario, end) or 0 for end in self._ends}
-        self._columns = drive_out(scenario).columns if self._ends else 0
+        self._beside = {end: lane_beside(scenario, end) for end in self._ends}
+        needed = drive_out(scenario) if self._ends else None
+        self._columns = needed.columns if needed is not None else 0
+        self._distance_m = needed.distance_m if needed is not None else 0.0
+        """Distance behind a slow vehicle that is needed for driving out."""
         self._length_m = scenario.vehicle.length_m
         self._queue_m = scenario.vehicle.length_m + scenario.tracking.min_gap_m
         """Distance between the fronts of vehicles that stand in a queue."""
         self._gaps: dict[DeadEnd, list[Gap]] = {end: [] for end in self._ends}
-        self._last_gap: list[float] = [math.inf] * scenario.road.lanes
+        self._last_gap_column: list[float] = [math.inf] * scenario.road.lanes
         """Rearmost column of the last gap of each lane."""
         self._end_of: dict[Name, DeadEnd] = {}
         """Dead end at which each vehicle without cells waits or waited."""
@@ -90,11 +96,14 @@ class LaneEndControl:
             self._forget(name)
         for name, vehicle in vehicles.items():
             if vehicle.controller.has_lost_cell(t_s):
+                # A vehicle that has driven out behind others may come to another dead end.
+                self._forget(name)
                 yield self._take_off(name, vehicle)
         for end, gaps in self._gaps.items():
             waiting = self._waiting(end, vehicles)
             if waiting:
                 yield from self._start(waiting[0], gaps, t_s)
+                waiting = self._waiting(end, vehicles)
             yield from self._arrive(gaps, vehicles, t_s)
             gaps[:] = [gap for gap in gaps if gap.vehicle or not self._is_over(gap, end, t_s)]
             coming = sum(gap.vehicle is None for gap in gaps)
@@ -112,18 +121,22 @@ class LaneEndControl:
                 stands_m = end.line_m - number * self._queue_m
                 rear_m = max(vehicle.state[0], stands_m) - self._length_m
                 found[vehicle.name] = OffLattice(end.lane, rear_m)
-        for name, end in self._end_of.items():
+        for name in self._end_of:
             if name in vehicles and name not in found:
-                found[name] = OffLattice(end.lane, vehicles[name].state[0] - self._length_m)
+                s_m, _, _, y_m, _, _ = vehicles[name].state
+                lane = int(y_m // self._lattice.lane_width_m)
+                found[name] = OffLattice(lane, s_m - self._length_m)
         return found
 
-    def _request(self, lane: int, gaps: list[Gap]) -> None:
+    def _request(self, lane: int | None, gaps: list[Gap]) -> None:
         """Keep the next columns of a lane free, unless the last gap was too close ahead."""
+        if lane is None:
+            return  # `cross_checks` refuses such roads
         crowded = any(arrival.lane == lane for arrival in self._meter.waiting)
         between = (CROWDED_GAPS if crowded else OPEN_GAPS) * self._columns
-        if self._meter.closed_column(lane) <= self._last_gap[lane] - between:
+        if self._meter.closed_column(lane) <= self._last_gap_column[lane] - between:
             columns = self._meter.keep_free(lane, self._columns)
-            self._last_gap[lane] = columns[0]
+            self._last_gap_column[lane] = columns[0]
             gaps.append(Gap(lane, columns))
 
     def _take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
@@ -139,7 +152,9 @@ class LaneEndControl:
         waiting = [
             vehicles[name]
             for name, its_end in self._end_of.items()
-            if its_end == end and vehicles[name].controller.off_lattice is Progress.WAITING
+            if its_end == end
+            and name in vehicles
+            and vehicles[name].controller.off_lattice is OffLatticePhase.WAITING
         ]
         return sorted(waiting, key=lambda vehicle: -vehicle.state[0])
 
@@ -163,8 +178,11 @@ class LaneEndControl:
         neighbours = vehicle.controller.neighbours
         # The vehicle behind is a column behind the rearmost of the gap.
         behind_m = (len(gap.columns) - 1) * self._lattice.pitch_m - self._length_m
+        slow_mps = 0.5 * self._lattice.speed_mps
         return all(
-            other.gap_m > BESIDE_M for other in neighbours.ahead if other.lane == gap.lane
+            other.gap_m > (BESIDE_M if other.speed_mps > slow_mps else self._distance_m)
+            for other in neighbours.ahead
+            if other.lane == gap.lane
         ) and all(other.gap_m > behind_m for other in neighbours.behind if other.lane == gap.lane)
 
     def _arrive(
@@ -185,6 +203,7 @@ class LaneEndControl:
         return t_s > self._lattice.passing_time_s(gap.columns[-1], end.line_m) + START_S
 
     def _forget(self, name: Name) -> None:
-        """Forget a vehicle that has left the road."""
-        gaps = self._gaps[self._end_of.pop(name)]
-        gaps[:] = [gap for gap in gaps if gap.vehicle != name]
+        """Forget a vehicle, and the gap into which it drives."""
+        end = self._end_of.pop(name, None)
+        if end is not None:
+            self._gaps[end][:] = [gap for gap in self._gaps[end] if gap.vehicle != name]

@@ -96,6 +96,7 @@ def test_cells_pass_the_line_with_the_lattice() -> None:
     assert not ends.has_passed((-10, 0), passing_s + 0.01)
     opens_s = lattice.passing_time_s(-10, 700.0)
     assert ends.has_passed((-10, 1), opens_s - 0.01)
+    assert ends.has_passed((-10, 1), opens_s + 0.01, passing_s)  # it was before the closed part
     assert not ends.has_passed((-10, 1), opens_s + 0.01)
 
 
@@ -218,11 +219,23 @@ def test_the_line_counts_for_a_lane_that_the_vehicle_is_about_to_enter() -> None
     (end,) = dead_ends(DROP)
     state = (end.line_m - 10.0, 15.0, 0.0, DROP.lattice.cell_y_m(1), 0.0, 0.0)
     controller = controller_in((0, 1), DROP, state=state)
-    assert controller._lines_ahead(state) == []
+    assert controller._lines_ahead(state, 493) == []
     controller.hold_cell = (0, 0)
-    (line,) = controller._lines_ahead(state)
+    (line,) = controller._lines_ahead(state, 493)
     assert (line.lane, line.speed_mps) == (0, 0.0)
     assert line.gap_m == pytest.approx(10.0)
+
+
+def test_a_body_that_must_stay_in_its_lane_does_not_stop_at_the_line_of_another() -> None:
+    """It had begun a move into a lane that ends, and fell behind: it drives on in its own."""
+    lattice = DROP.lattice
+    state = (500.0, 5.0, 0.0, lattice.cell_y_m(1), 0.0, 0.0)
+    controller = controller_in((0, 1), DROP, state=state)
+    controller.motion_origin, controller.hold_cell = (8, 1), (8, 0)
+    for tick in range(333, 700):
+        controller.step(tick)
+        assert controller.plant.state[3] - 0.5 * DROP.vehicle.width_m > lattice.lane_width_m
+    assert controller.plant.state[0] > DROP.road.length_m
 
 
 def test_a_vehicle_that_was_stopped_in_two_lanes_goes_on() -> None:
@@ -267,6 +280,9 @@ def test_closures_that_are_not_possible_are_refused_in_one_line() -> None:
     )
     assert "the end of a lane beside one that is open" in refused(
         [lane_0, {"lane": 1, "from_m": 800.0}]
+    )
+    assert "road.closures[0].to_m: got 999.0; allowed: at most 905" in refused(
+        [lane_0 | {"to_m": 999.0}]
     )
     assert "vehicle.max_accel_mps2: got 0.2" in refused(
         [lane_0], vehicle={"max_accel_mps2": 0.2}, formation={

@@ -13,7 +13,7 @@ from laneweave.protocol.scenario.fields import Closure, Demand, Scenario
 from laneweave.protocol.vehicle.lane_ends import DeadEnd, LaneEnds, dead_ends, drive_out
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
 from laneweave.protocol.wire.messages import Name
-from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLattice, Rung
+from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase, Rung
 from laneweave.sim_bridge.road import lane_end_control
 from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.lane_end_control import LaneEndControl
@@ -113,8 +113,8 @@ def test_the_census_tells_where_they_stand() -> None:
     assert len(bodies) >= 3
     assert {entry.vehicle for entry in census.on_lattice} == set(road.vehicles) - set(bodies)
     for name, body in bodies.items():
-        assert body.lane == end.lane
         if road.vehicles[name].state[1] < 0.1:
+            assert body.lane == end.lane
             rear_m = road.vehicles[name].state[0] - DROP.vehicle.length_m
             assert body.rear_m == pytest.approx(rear_m, abs=8.0)
 
@@ -133,6 +133,45 @@ def test_a_queue_that_reaches_the_entrance_keeps_vehicles_from_entering(
         longest = max(longest, sum(one.state[1] < 1.0 for one in road.vehicles.values()))
     assert (road.overlaps != []) == blind
     assert longest > 15
+
+
+def test_a_vehicle_may_leave_the_road_while_it_drives_out() -> None:
+    road = lonely_road(road_with(Closure(0, 590.0), s3_m=450.0), 20.0, 200.0)
+    while road.vehicles or not road.roadside.exhausted(road.t_s):
+        road.step()
+        assert road.t_s < MAX_S
+        # Also in the tick in which it has left.
+        road.roadside.census(road.t_s, road.vehicles.values())
+    assert DRIVES_OUT in {kind for _, kind, _ in road.events}
+
+
+def test_one_gap_for_each_vehicle() -> None:
+    road = lonely_road(DROP, 40.0, 100.0)
+    asked = []
+    keep_free = EntryMeter.keep_free
+    road.roadside._lane_ends._meter = meter = road.roadside._meter
+    meter.keep_free = lambda lane, count: asked.append(lane) or keep_free(meter, lane, count)  # type: ignore[method-assign, func-returns-value]
+    while road.vehicles or not road.roadside.exhausted(road.t_s):
+        road.step()
+    out = [one for _, kind, one in road.events if kind == DRIVES_OUT]
+    assert len(asked) == len(out) > 0
+
+
+def test_a_vehicle_that_cannot_drive_out_in_time_waits_at_the_next_end() -> None:
+    """Somebody stands in the next lane, which ends, too, when it drives out."""
+    road = lonely_road(road_with(Closure(0, 400.0), Closure(1, 700.0)), 40.0, 60.0)
+    while DRIVES_OUT not in {kind for _, kind, _ in road.events}:
+        road.step()
+    (name,) = {one for _, kind, one in road.events if kind == DRIVES_OUT}
+    controller = road.vehicles[name].controller
+    # As if it had been delayed: its cell is far ahead.
+    controller.hold_cell = (controller.hold_cell[0] + 12, 1)
+    while road.vehicles or not road.roadside.exhausted(road.t_s):
+        road.step()
+        assert road.overlaps == []
+        assert road.t_s < MAX_S
+    kinds = [kind for _, kind, one in road.events if one == name]
+    assert kinds.count(DRIVES_OUT) == 2
 
 
 # --- planted bugs -------------------------------------------------------------------------------
@@ -215,7 +254,7 @@ def drives_on(patch: pytest.MonkeyPatch) -> None:
 
     def leave(self: MotionController) -> None:
         leave_lattice(self)
-        self.off_lattice, self._past_line = OffLattice.DRIVING_OUT, True
+        self.off_lattice, self._past_line = OffLatticePhase.DRIVING_OUT, True
 
     patch.setattr(MotionController, "leave_lattice", leave)
 
