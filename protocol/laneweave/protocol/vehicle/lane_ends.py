@@ -165,8 +165,10 @@ def drive_out(scenario: Scenario) -> DriveOut:
         found = [_drive_out(scenario, columns, late_s) for late_s in (0.0, START_S)]
         possible = [each for each in found if each is not None]
         if len(possible) == len(found):
-            room_m, distance_m = (math.ceil(max(each)) for each in zip(*possible, strict=True))
-            return DriveOut(room_m, columns, distance_m)
+            room_m, distance_m = (max(each) for each in zip(*possible, strict=True))
+            # Settling takes up to a second longer for starts between the two.
+            distance_m += scenario.formation.speed_mps
+            return DriveOut(math.ceil(room_m), columns, math.ceil(distance_m))
     raise ValueError("vehicles that stand cannot get into the lattice within their limits")
 
 
