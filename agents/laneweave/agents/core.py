@@ -239,7 +239,7 @@ class AgentCore:
         It has left the lattice and entered it again while no SENSE arrived.
         """
         execution, move = self.execution, self._move
-        if execution is None or sense.hold_cell == execution.hold_cell:
+        if execution is None or not self._lane_ends or sense.hold_cell == execution.hold_cell:
             return False
         return move is None or sense.hold_cell != move[1]
 

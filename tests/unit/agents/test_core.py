@@ -8,10 +8,12 @@ import pytest
 from laneweave.agents.core import AgentCore
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime import node
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import ARRIVED_ACROSS_M, ARRIVED_ALONG_M
 from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.messages import Command, Name, Neighbour, Prepare, Report
 from support.agent_rig import HOME, ME, MOVE_TICKS, OTHER, SCENARIO, TICK_S, Rig, up_and_running
+from support.closed_lanes import DROP
 from support.states import BALLOT, holding, make_plan, sent
 
 BOTH: dict[Name, Cell] = {ME: HOME, OTHER: (0, 0)}
@@ -258,6 +260,7 @@ def test_without_a_cell_it_begins_anew_and_only_keeps_its_claim() -> None:
 def test_it_begins_anew_if_its_vehicle_has_entered_the_lattice_again_unseen() -> None:
     """No SENSE arrived while the vehicle was off the lattice."""
     rig = up_and_running()
+    rig.agent._lane_ends = LaneEnds(DROP)
     rig.accept((0, HOME, (-1, 2)))
     controller, there = rig.controller, (-5, 1)
     controller.leave_lattice()
