@@ -39,7 +39,7 @@ def test_vehicles_without_agents_stop_wait_and_get_on(lab: Lab) -> None:
     assert {event["vehicle"] for event in events(folder, DRIVES_OUT)} == stopped
     found = summary(folder)
     assert found["vehicles"]["left"] == found["vehicles"]["demanded"]
-    # Nobody leaves in the lane that ends, and all without a preference count as well sorted.
+    # No vehicle leaves in the lane that ends; those without a preference are in the right lane.
     assert {trip["final_lane"] for trip in trips(folder).values()} <= {1, 2}
     assert {trip["preferred_lane"] for trip in trips(folder).values()} == {-1}
     assert found["vehicles"]["on_preferred_lane"] == found["vehicles"]["left"]

@@ -243,7 +243,7 @@ def test_without_a_cell_it_begins_anew_and_only_keeps_its_claim() -> None:
         # What the earlier process has promised and accepted is void for this one.
         assert (command.incarnation, command.jerks, command.accepted) == (2, b"", None)
         assert rig.agent.wanted_motions == ()
-        # A plan or a promise that is asked for now moves nobody.
+        # Requests for promises and plans have no effect now.
         plan = make_plan({ME: HOME}, {ME: ((0, HOME, (-1, 2)),)})
         assert rig.hand(topics.PREPARE, Prepare(BALLOT, (0,), (ME,))) == []
         assert rig.hand(topics.PLAN, plan) == []

@@ -59,6 +59,6 @@ class StopLines:
         return gaps if latest is gaps.latest else evolve(gaps, latest=latest)
 
     def _ahead(self, s_m: float) -> list[DeadEnd]:
-        """Return the next dead end of each lane."""
+        """Return the dead end ahead of a position in each lane that has one."""
         lanes = range(self._lattice.lanes)
         return [end for lane in lanes if (end := self._ends.ahead(lane, s_m)) is not None]

@@ -36,7 +36,7 @@ def owned_cells(
         None: not known yet.
     """
     transfer = state.transfer
-    if transfer is None or transfer.open or transfer.withdrawn:
+    if transfer is None or not transfer.undecided:
         return frozenset(state.owned)
     before, after = frozenset(transfer.before), frozenset(transfer.after)
     signs = _signs(state, transfer, states, gone)
@@ -62,7 +62,7 @@ def certain_cells(
 def partners(state: VehicleState, states: States) -> frozenset[Name]:
     """Return the vehicles whose promises determine what a vehicle owns; none if that is known."""
     transfer = state.transfer
-    if transfer is None or transfer.open or transfer.withdrawn:
+    if transfer is None or not transfer.undecided:
         return frozenset()
     signs = _signs(state, transfer, states, ())
     if _Sign.OPEN in signs or _Sign.NEVER_READY in signs or signs == {_Sign.CLOSED}:

@@ -18,7 +18,7 @@ _MORE_LANES = (
     "#808080",
 )
 NEUTRAL = "#8a8f96"
-"""Colour of vehicles without a known preferred lane; `web/road.js` has the same."""
+"""Colour of vehicles whose preferred lane is unknown; `web/road.js` uses the same."""
 SPEED_SPAN_MPS = 5.0
 """Difference from the lattice speed at which the shade is darkest or lightest."""
 SHADE_STRENGTH = 0.45

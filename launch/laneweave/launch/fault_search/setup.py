@@ -260,7 +260,7 @@ class Setup:
         if self.road.rolling or self.road.roadside:
             room = [self.stretch_columns] * lanes
             if self.road.lane_0_ends_m is not None:
-                room[0] = 0  # nobody can leave the road in lane 0
+                room[0] = 0  # lane 0 does not reach the end of the road
             weights = [6.0 if self.crowded and lane == 0 else 1.0 for lane in range(lanes)]
             vehicles = [visit.vehicle for visit in self.visits]
             return _draw_lanes(vehicles, room, weights, rng)

@@ -213,7 +213,7 @@ def draw_path_map(driven: DrivenMap, out: Path, dpi: int) -> None:
 
 
 def _draw_row(axes: Axes, row: int, driven: DrivenMap) -> None:
-    """Draw a vehicle's row: its name with the colour of any preferred lane, then its cells."""
+    """Draw a vehicle's row: a mark in the colour of its preferred lane, its name, its cells."""
     from matplotlib.patches import FancyBboxPatch, Rectangle  # noqa: PLC0415 - lazily
 
     colours, arrived = lane_colours(driven.lanes), driven.arrived[row]

@@ -157,6 +157,7 @@ def _check_closures(scenario: Scenario) -> None:
     """Check that closed parts of lanes are on the road, apart, and can be passed."""
     road, operation = scenario.road, scenario.formation.operation
     open_m: dict[int, float] = {}
+    step_m = _step_m(scenario)
     for number, closure in enumerate(road.closures):
         name = f"road.closures[{number}]"
         allowed = "rolling, on a road with closures"
@@ -173,7 +174,6 @@ def _check_closures(scenario: Scenario) -> None:
             f"less than the length of the road, {road.length_m:g}, and more than {after_m:g}, "
             f"where lane {closure.lane} is open (again)",
         )
-        step_m = scenario.formation.speed_mps * scenario.cycles_s[0] + scenario.vehicle.length_m
         _require(
             closure.to_m >= road.length_m or closure.to_m + step_m <= road.length_m,
             f"{name}.to_m",
@@ -215,7 +215,7 @@ def _check_dead_ends(scenario: Scenario) -> None:
     except ValueError as error:
         limit = scenario.vehicle.max_accel_mps2
         raise BadInputError("vehicle.max_accel_mps2", limit, f"more: {error}") from error
-    step_m = scenario.formation.speed_mps * scenario.cycles_s[0] + scenario.vehicle.length_m
+    step_m = _step_m(scenario)
     for end in dead_ends(scenario):
         name = next(
             f"road.closures[{number}].from_m"
@@ -237,6 +237,11 @@ def _check_dead_ends(scenario: Scenario) -> None:
             f"the end of a lane beside one that is open from {end.line_m:g} m, its stop line, to "
             f"{needed.distance_m:g} m after it",
         )
+
+
+def _step_m(scenario: Scenario) -> float:
+    """Return the distance that a vehicle needs for one move, with the length of its body."""
+    return scenario.formation.speed_mps * scenario.cycles_s[0] + scenario.vehicle.length_m
 
 
 def _check_structures(scenario: Scenario) -> None:

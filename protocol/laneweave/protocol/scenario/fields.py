@@ -47,6 +47,7 @@ SLACK_S = 0.2
 HIGHEST_PACE = 1000.0
 """Upper bound of `runtime.max_pace`."""
 LONGEST_ROAD_M = 60_000.0
+"""Upper bound on positions on the road: the sum of those of its three segments."""
 MAX_HORIZON_TICKS = 200
 """Maximum horizon of the tracker."""
 
@@ -108,7 +109,7 @@ class Road:
     s2_m: float = field(default=350.0, validator=within(0.0, 20_000.0))
     s3_m: float = field(default=600.0, validator=within(0.0, 20_000.0, open_low=True))
     closures: tuple[Closure, ...] = ()
-    """Closed parts of lanes."""
+    """Parts of lanes in which no vehicle may drive."""
 
     @property
     def length_m(self) -> float:

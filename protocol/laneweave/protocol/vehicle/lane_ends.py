@@ -59,7 +59,7 @@ class DriveOut:
     room_m: float
     """Distance from the stop line to the end of the lane."""
     columns: int
-    """Number of columns of the neighbouring lane that it needs; it ends in the rearmost."""
+    """Number of free columns that it needs in the neighbouring lane; it settles in the rearmost."""
     distance_m: float
     """Distance in which it settles in its cell."""
 
@@ -80,7 +80,7 @@ class LaneEnds:
         return any(self._by_lane)
 
     def __iter__(self) -> Iterator[DeadEnd]:
-        """Yield all dead ends, by lane and position."""
+        """Yield the dead ends in order of lane, then of position."""
         for ends in self._by_lane:
             yield from ends
 
@@ -107,7 +107,7 @@ class LaneEnds:
 
 
 def dead_ends(scenario: Scenario) -> tuple[DeadEnd, ...]:
-    """Return the dead ends of a road, by lane and position."""
+    """Return the dead ends of a road in order of lane, then of position."""
     sections = scenario.road.sections
     if all(section.exit for section in sections):
         return ()
@@ -173,10 +173,15 @@ def drive_out(scenario: Scenario) -> DriveOut:
 
 
 def _drive_out(scenario: Scenario, columns: int, late_s: float) -> tuple[float, float] | None:
-    """Return room and distance [m] of the motion into the last of so many columns.
+    """Return the `room_m` and `distance_m` of one motion of `drive_out`, not rounded.
 
-    The vehicle starts some time after the front column has passed it. None: it falls behind the
-    columns, or does not settle.
+    Args:
+        scenario: the vehicle's limits, the lattice.
+        columns: number of free columns; the vehicle is to settle in the rearmost.
+        late_s: time between the foremost column passing the vehicle and the start.
+
+    Returns:
+        None: the vehicle falls behind the columns, or does not settle.
     """
     lattice, limits, tick_s = scenario.lattice, scenario.vehicle, scenario.runtime.tick_s
     goal: Cell = (1 - columns, 1)

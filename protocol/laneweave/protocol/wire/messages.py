@@ -86,6 +86,11 @@ class PendingTransfer:
         """
         return not self.open and not self.roster
 
+    @property
+    def undecided(self) -> bool:
+        """Whether the start gate still decides which of the cells the vehicle owns."""
+        return not self.open and not self.withdrawn
+
 
 @frozen
 class Prepare:

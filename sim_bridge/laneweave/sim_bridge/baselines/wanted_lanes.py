@@ -58,7 +58,7 @@ class WantedLanes:
         return WantedLane(wanted, own.to_m, dead_end=True)
 
     def may_enter(self, vehicle: ReferenceVehicle, lane: int) -> bool:
-        """Return whether a lane is open beside a vehicle, and not for less far than its own."""
+        """Return whether a lane is open beside a vehicle, and does not end before its own lane."""
         there, own = self._section(lane, vehicle.s_m), self._section(vehicle.lane, vehicle.s_m)
         return there is not None and (bool(there.exit) or own is None or there.to_m >= own.to_m)
 

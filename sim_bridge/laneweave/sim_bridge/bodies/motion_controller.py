@@ -198,7 +198,7 @@ class MotionController:
         self._stop_motion()
 
     def drive_out(self, cell: Cell) -> None:
-        """Begin to drive into the neighbouring lane, towards a cell that is kept free."""
+        """Start from standing towards a cell of the neighbouring lane, which is kept free."""
         self.off_lattice, self.hold_cell = OffLatticePhase.DRIVING_OUT, cell
         self._past_line = True
         self._stop_motion()
@@ -344,9 +344,7 @@ class MotionController:
     def complete_transfer(self, ballot: Ballot) -> None:
         """Complete the pending transfer of a plan whose start gate is open."""
         transfer = self.transfer
-        if transfer is None or transfer.ballot != ballot:
-            return
-        if not (transfer.open or transfer.withdrawn):
+        if transfer is not None and transfer.ballot == ballot and transfer.undecided:
             self.owned, self.transfer = transfer.after, PendingTransfer(ballot, open=True)
 
     def assign_cell(self, cell: Cell) -> None:
@@ -354,7 +352,7 @@ class MotionController:
         self._granted |= {cell}
         self.owned = tuple(sorted({*self.owned, cell}))
         transfer = self.transfer
-        if transfer is not None and not (transfer.open or transfer.withdrawn):
+        if transfer is not None and transfer.undecided:
             self.transfer = _with_cells(transfer, {cell})
 
     def join(self, blocks: Iterable[int]) -> None:

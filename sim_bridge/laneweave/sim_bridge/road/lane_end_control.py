@@ -96,7 +96,7 @@ class LaneEndControl:
             self._forget(name)
         for name, vehicle in vehicles.items():
             if vehicle.controller.has_lost_cell(t_s):
-                # A vehicle that has driven out behind others may come to another dead end.
+                # While it drives out, a vehicle may come to another dead end.
                 self._forget(name)
                 yield self._take_off(name, vehicle)
         for end, gaps in self._gaps.items():
@@ -189,7 +189,7 @@ class LaneEndControl:
         self, gaps: list[Gap], vehicles: Mapping[Name, RoadVehicle], t_s: float
     ) -> Iterator[LaneEndChange]:
         """Let vehicles that have arrived enter the lattice."""
-        for gap in [gap for gap in gaps if gap.vehicle is not None]:
+        for gap in list(gaps):
             name = gap.vehicle
             if name is None or not vehicles[name].controller.has_settled(t_s):
                 continue

@@ -31,6 +31,7 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 CENSUS_EVERY_TICKS = 10
 NO_VEHICLES: Mapping[Name, RoadVehicle] = MappingProxyType({})
+"""The empty road, as a default argument."""
 QUEUE_ROOM_M = 20.0
 """Spare distance behind a slow vehicle near the entrance, beyond that for the hardest braking."""
 MAX_EMPTY = 12

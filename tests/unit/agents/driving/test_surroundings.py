@@ -104,7 +104,7 @@ def test_they_go_on_at_constant_speed_as_long_as_that_may_be_believed() -> None:
     assert 0 < KNOWN.sum() < N
 
 
-def test_slow_neighbours_ahead_are_believed_longer() -> None:
+def test_slow_neighbours_ahead_are_predicted_for_longer() -> None:
     """So that a vehicle need not brake hard behind one that stands."""
     known = TIMES_S <= SLOW_S + 1e-9
     standing = Neighbour(1, 30.0, 0.0)

@@ -116,7 +116,7 @@ def test_a_single_member_of_a_plan_knows_what_it_owns() -> None:
 
 @pytest.mark.parametrize("ballot", [MID, BETWEEN, HIGH])
 def test_a_vehicle_that_has_left_the_lattice_is_gone_for_all_ballots_so_far(ballot: Ballot) -> None:
-    """Like one that has left the road: nobody knows whether it saw the gate open."""
+    """As if it had left the road: whether it saw the gate open is unknown."""
     withdrawn = state(C, HIGH, PendingTransfer(ballot), owned=())
     others = {B: state(B, HIGH, TRANSFER_OF_B), C: withdrawn}
     assert owned_cells(CLOSED, others) == SURE

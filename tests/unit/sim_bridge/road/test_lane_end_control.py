@@ -1,4 +1,4 @@
-"""Vehicles that nobody drives out of a lane that ends: they stop, wait and come back alone."""
+"""Vehicles without agents in a lane that ends: they stop, wait and enter the lattice again."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def lonely_road(scenario: Scenario, volume: float, duration_s: float, seed: int 
 
 
 def check(road: LonelyRoad) -> None:
-    """Drive until all have left, and check every tick."""
+    """Step until all vehicles have left the road; each tick is checked."""
     owners: dict[Cell, Name] = {}
     while not road.roadside.exhausted(road.t_s) or road.vehicles:
         road.step()
-        assert road.t_s < MAX_S, "somebody is left standing"
+        assert road.t_s < MAX_S, "a vehicle is still on the road"
         assert road.overlaps == []
         for name, vehicle in road.vehicles.items():
             controller = vehicle.controller
@@ -57,7 +57,7 @@ def check(road: LonelyRoad) -> None:
     ("scenario", "volume", "seed"), [(DROP, 300.0, 1), (DROP, 1800.0, 2), (BLOCKED, 1000.0, 1)],
     ids=["few", "many", "blocked lane"],
 )  # fmt: skip
-def test_all_of_them_leave_the_road_and_nobody_touches_anything(
+def test_all_vehicles_leave_the_road_and_none_overlaps_another_body(
     scenario: Scenario, volume: float, seed: int
 ) -> None:
     check(lonely_road(scenario, volume, 60.0, seed))
@@ -158,7 +158,7 @@ def test_one_gap_for_each_vehicle() -> None:
 
 
 def test_a_vehicle_that_cannot_drive_out_in_time_waits_at_the_next_end() -> None:
-    """Somebody stands in the next lane, which ends, too, when it drives out."""
+    """When it drives out, a vehicle stands in the next lane, which ends, too."""
     road = lonely_road(road_with(Closure(0, 400.0), Closure(1, 700.0)), 40.0, 60.0)
     while DRIVES_OUT not in {kind for _, kind, _ in road.events}:
         road.step()

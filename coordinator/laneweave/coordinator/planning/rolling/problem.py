@@ -17,7 +17,7 @@ ROUNDING_M = 1e-6
 """Tolerance for comparing positions."""
 
 NO_ENDS: Mapping[int, float] = MappingProxyType({})
-"""No section ends earlier than the road's description says."""
+"""No earlier ends: each section may be used up to its end on the road."""
 Section = tuple[float, float, int]
 """Begin and end of a lane section [m] for planning, and its index in `StreamRoad.sections`."""
 CellPath = tuple[Cell, ...]

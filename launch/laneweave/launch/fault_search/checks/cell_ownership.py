@@ -28,11 +28,9 @@ class Holding:
     def owned(self, opened: set[Ballot]) -> Cells:
         """Return the owned cells, given the ballots under which a vehicle has taken possession."""
         transfer = self.transfer
-        if transfer is None or transfer.open or transfer.withdrawn:
-            return self.cells
-        if transfer.ballot not in opened:
-            return self.cells
-        return frozenset(transfer.after)
+        if transfer is not None and transfer.undecided and transfer.ballot in opened:
+            return frozenset(transfer.after)
+        return self.cells
 
 
 class CellOwnership:
