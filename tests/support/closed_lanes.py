@@ -77,5 +77,5 @@ class LonelyRoad:
         neighbours = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels)
         for name, vehicle in self.vehicles.items():
             vehicle.perceive(neighbours[name])
-        pairs = [*bodies.overlapping_pairs(), *bodies.in_closed_lanes(road)]
+        pairs = [*bodies.overlapping_pairs(), *bodies.in_closed_lanes(self.scenario)]
         self.overlaps += [(self.t_s, *pair) for pair in pairs]

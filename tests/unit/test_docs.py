@@ -165,6 +165,9 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
             "tuple[str, ...]": "list of texts",
             "bool": "`true`, `false`",
             "tuple[Closure, ...]": "list of tables",
+            "tuple[DestinationShare, ...]": "list of tables",
+            "tuple[Entrance, ...]": "list of tables",
+            "tuple[Exit, ...]": "list of tables",
             "tuple[DrivingStructure, ...]": "list of tables",
         }
         return kinds[re.sub(r"[a-z]+\.", "", kind)]

@@ -2,20 +2,28 @@
 
 A lane consists of one or more *sections*, which are open without interruption. Lane 0 is the
 rightmost; positions are distances from the start of the road. A section ends at an exit, by which
-vehicles leave the road, or as a dead end: vehicles must change lanes before it.
+vehicles leave the road, or as a dead end: vehicles must change lanes before it. Each lane that
+reaches the end of the road has its own exit there; other exits have names.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from types import MappingProxyType
 
 from attrs import frozen
 
 ANY_LANE = -1
 """Preferred lane of vehicles that may leave the road in every lane that reaches its end."""
+END_OF_ROAD = "end"
+"""Destination of vehicles that leave at the end of the road."""
 ClosedPart = tuple[int, float, float]
 """(lane, from, to) [m] of a closed part of a lane."""
+LanePosition = tuple[int, float]
+"""(lane, position [m])."""
+_NO_EXITS: Mapping[LanePosition, str] = MappingProxyType({})
+_NO_RAMPS: Mapping[LanePosition, float] = MappingProxyType({})
 
 
 @frozen
@@ -28,39 +36,109 @@ class LaneSection:
     to_m: float = math.inf
     exit: str = ""
     """Name of the exit at its end; empty: a dead end."""
+    moves_from_m: float = -math.inf
+    """Where moves may begin in the section: before, it is a ramp, separate from the road."""
+
+    def serves(self, preferred_lane: int, destination: str = END_OF_ROAD) -> bool:
+        """Return whether a vehicle may leave the road by the end of the section.
+
+        Args:
+            preferred_lane: lane in which it wants to leave, or `ANY_LANE`.
+            destination: name of the exit, or `END_OF_ROAD`.
+        """
+        if destination != END_OF_ROAD:
+            return self.exit == destination
+        return self.exit == end_exit(self.lane) and preferred_lane in (self.lane, ANY_LANE)
+
+
+def end_exit(lane: int) -> str:
+    """Return the name of the exit of a lane at the end of the road."""
+    return f"lane-{lane}"
 
 
 def open_sections(
-    lanes: int, length_m: float, closed: Collection[ClosedPart] = ()
+    lanes: int,
+    length_m: float,
+    closed: Collection[ClosedPart] = (),
+    exits: Mapping[LanePosition, str] = _NO_EXITS,
+    ramps: Mapping[LanePosition, float] = _NO_RAMPS,
 ) -> tuple[LaneSection, ...]:
-    """Return the sections of all lanes, by lane and position; each lane has its own exit.
+    """Return the sections of all lanes, by lane and position.
+
+    Each lane that reaches the end of the road has its own exit there.
 
     Args:
         lanes: number of lanes.
         length_m: end of the road.
         closed: closed parts; those of one lane do not overlap.
+        exits: names of exits by the ends of sections.
+        ramps: where ramps join the road [m], by their beginnings.
     """
     return tuple(
-        section for lane in range(lanes) for section in _sections_of(lane, length_m, closed)
+        section
+        for lane in range(lanes)
+        for section in _sections_of(lane, length_m, closed, exits, ramps)
     )
 
 
 def _sections_of(
-    lane: int, length_m: float, closed: Collection[ClosedPart]
+    lane: int,
+    length_m: float,
+    closed: Collection[ClosedPart],
+    exits: Mapping[LanePosition, str],
+    ramps: Mapping[LanePosition, float],
 ) -> Iterator[LaneSection]:
     from_m = -math.inf
+
+    def section(to_m: float, name: str) -> LaneSection:
+        return LaneSection(lane, from_m, to_m, name, ramps.get((lane, from_m), -math.inf))
+
     for closed_lane, closed_m, open_m in sorted(closed):
         if closed_lane == lane:
-            yield LaneSection(lane, from_m, closed_m)
+            if closed_m > 0.0:
+                yield section(closed_m, exits.get((lane, closed_m), ""))
             from_m = open_m
     if from_m < length_m:
-        yield LaneSection(lane, from_m, length_m, exit=f"lane-{lane}")
+        yield section(length_m, end_exit(lane))
 
 
-def sections_for(sections: Sequence[LaneSection], preferred_lane: int) -> frozenset[int]:
-    """Return the numbers of the sections by whose ends a vehicle may leave the road."""
+def sections_for(
+    sections: Sequence[LaneSection], preferred_lane: int, destination: str = END_OF_ROAD
+) -> frozenset[int]:
+    """Return the numbers of the sections that serve a vehicle (`LaneSection.serves`)."""
     return frozenset(
         number
         for number, section in enumerate(sections)
-        if section.exit and preferred_lane in (section.lane, ANY_LANE)
+        if section.serves(preferred_lane, destination)
     )
+
+
+class Exits:
+    """The exits of a road: which vehicles have left it."""
+
+    def __init__(self, sections: Sequence[LaneSection], length_m: float) -> None:
+        """Read the sections of a road of this length."""
+        lanes = 1 + max(section.lane for section in sections)
+        self._by_lane = tuple(
+            tuple(section for section in sections if section.lane == lane) for lane in range(lanes)
+        )
+        self._length_m = length_m
+        self._first_m = min(section.to_m for section in sections if section.exit)
+        """Position before which no vehicle has left."""
+
+    def left_by(self, lane: int, s_m: float) -> LaneSection | None:
+        """Return the section by whose end a vehicle has left the road; None: it is on the road.
+
+        Args:
+            lane: the lane in which the centre of its body is.
+            s_m: position of its front.
+        """
+        if s_m < self._first_m:
+            return None
+        found = None
+        for section in self._by_lane[lane] if 0 <= lane < len(self._by_lane) else ():
+            if section.from_m <= s_m:
+                found = section
+        if found is not None and found.exit and s_m >= found.to_m:
+            return found
+        return None if s_m < self._length_m else LaneSection(lane, to_m=self._length_m)

@@ -33,8 +33,21 @@ class VehicleCounts:
     """Vehicles that left the road in their preferred lane."""
     peak: int
     """Maximum number of vehicles on the road at once."""
+    at_destination: int | None = None
+    """Vehicles that left by the exit that they wanted, and in their preferred lane if any."""
     left_off_lane: int | None = None
     left_unattended: int | None = None
+
+
+@frozen(kw_only=True)
+class TripTimes:
+    """Means of the counted vehicles of one entrance or one destination [s]."""
+
+    n: int
+    """Number of counted vehicles."""
+    mean: float
+    delay: float
+    """Excess over the time at v_F from the entrance to the destination."""
 
 
 @frozen(kw_only=True)
@@ -45,6 +58,12 @@ class TravelTime:
     p50: float | None
     p95: float | None
     max: float | None
+    n: int | None = None
+    """Number of counted vehicles."""
+    by_destination: dict[str, TripTimes] | None = None
+    """By the name of the exit by which they wanted to leave; `end`: the end of the road."""
+    by_entrance: dict[str, TripTimes] | None = None
+    """By the name of the entrance; `main`: the start of the road."""
 
 
 @frozen(kw_only=True)

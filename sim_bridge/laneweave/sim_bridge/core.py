@@ -19,6 +19,7 @@ import structlog
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.runtime.metrics import MetricsSnapshot, metric
 from laneweave.protocol.runtime.node import (
     Announce,
@@ -137,6 +138,7 @@ class BridgeCore:
         self._world = world
         self._record = record
         self._roadside = Roadside(scenario, incarnation)
+        self._exits = Exits(scenario.sections, scenario.road.length_m)
         runtime = scenario.runtime
         self._tick_duration_s = runtime.tick_s / (pace or runtime.max_pace)
         self._min_tick_duration_s = min(self._tick_duration_s, runtime.tick_s / runtime.max_pace)
@@ -398,12 +400,11 @@ class BridgeCore:
         return max(now_s, self._due_s, self._opened_s + self._min_tick_duration_s)
 
     def _remove_departed(self) -> Iterator[Effect]:
-        length_m = self.scenario.road.length_m
         for name, vehicle in list(self.vehicles.items()):
-            if vehicle.state[0] >= length_m:
+            if self._exits.left_by(vehicle.body_lane, vehicle.state[0]) is not None:
                 del self.vehicles[name]
                 self._world.remove(name)
-                self._roadside.count_left()
+                self._roadside.on_left(vehicle, self.vehicles, self.t_s)
                 self._departures.append((self.tick, name))
                 self._record.on_left(vehicle, self.t_s, attended=name not in self._attendance)
                 yield from self._attendance.leave(vehicle)

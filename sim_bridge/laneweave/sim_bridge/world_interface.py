@@ -59,7 +59,7 @@ def show_bodies(
     record.on_positions(
         t_s,
         vehicles.values(),
-        overlaps=[*bodies.overlapping_pairs(), *bodies.in_closed_lanes(road)],
+        overlaps=[*bodies.overlapping_pairs(), *bodies.in_closed_lanes(scenario)],
         collisions=world.collisions(),
         gaps=bodies.min_gaps(),
     )

@@ -23,7 +23,7 @@ from laneweave.coordinator.rolling.observed import ObservedRoad
 from laneweave.coordinator.rolling.ownership import certain_cells, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
-from laneweave.protocol.road_layout import sections_for
+from laneweave.protocol.road_layout import ANY_LANE, sections_for
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
@@ -35,7 +35,15 @@ from laneweave.protocol.wire.events import (
     STREAM_PLANNED,
     TRANSFER_ABORTED,
 )
-from laneweave.protocol.wire.messages import Ballot, Census, Name, Plan, Prepare, VehicleState
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Census,
+    CensusEntry,
+    Name,
+    Plan,
+    Prepare,
+    VehicleState,
+)
 
 SNAPSHOT_S = 0.5
 """Time into a slot at which all its moves have begun and been reported.
@@ -80,7 +88,7 @@ class RollingOperation:
         self._new_job = new_job
         self._planner = planner
         self._slot_s = scenario.cycles_s[0]
-        self._sections = scenario.road.sections
+        self._sections = scenario.sections
         self.observed = ObservedRoad()
         self.transfers: list[CellTransfer] = []
         self._transfer_of: dict[Name, CellTransfer] = {}
@@ -192,10 +200,11 @@ class RollingOperation:
             snapshot.census.on_lattice, key=lambda entry: entry.vehicle not in snapshot.states
         ):
             state = snapshot.states.get(entry.vehicle)
-            targets = sections_for(self._sections, entry.preferred_lane)
             column = entry.cell[0] if state is None else state.hold_cell[0]
-            if self._scenario.lattice.cell_s_m(column, (slot - 1) * self._slot_s) < far_m:
+            s_m = self._scenario.lattice.cell_s_m(column, (slot - 1) * self._slot_s)
+            if s_m < far_m:
                 continue
+            targets = self._targets(entry, s_m)
             if state is None:
                 unknown = StreamVehicle(entry.vehicle, entry.cell, targets, held=True)
                 vehicles.setdefault(entry.cell, unknown)
@@ -210,13 +219,35 @@ class RollingOperation:
             known = StreamVehicle(entry.vehicle, state.hold_cell, targets, held)
             vehicles.setdefault(state.hold_cell, known)
         columns = [column for column, _ in vehicles] or [0]
+        window = range(min(columns) - MARGIN_COLUMNS, max(columns) + MARGIN_COLUMNS + 1)
         blocked = frozenset(
             (column, lane)
-            for column in range(min(columns) - MARGIN_COLUMNS, max(columns) + MARGIN_COLUMNS + 1)
             for lane in range(self._scenario.road.lanes)
+            for column in self._assigned_columns(lane, window, snapshot_s)
             if (column, lane) not in owned or (column, lane) in reserved
         )
         return tuple(vehicles.values()), blocked, self._ends_m(snapshot.census)
+
+    def _assigned_columns(self, lane: int, columns: range, t_s: float) -> range:
+        """Return the columns whose cells may have been assigned to vehicles at a road time.
+
+        On a ramp, plans count on cells behind it: they will be assigned before moves begin there.
+        """
+        lattice, entry_m = self._scenario.lattice, self._scenario.entry_m[lane]
+        if entry_m <= 0.0:
+            return columns
+        first = math.ceil((entry_m - lattice.cell_s_m(0, t_s)) / lattice.pitch_m)
+        return range(max(columns.start, first), columns.stop)
+
+    def _targets(self, entry: CensusEntry, s_m: float) -> frozenset[int]:
+        """Return the sections by whose ends a vehicle at a position may leave the road.
+
+        A vehicle that has passed its exit drives to the end of the road.
+        """
+        sections = self._sections
+        wanted = sections_for(sections, entry.preferred_lane, entry.destination)
+        ahead = frozenset(number for number in wanted if sections[number].to_m > s_m)
+        return ahead or sections_for(sections, ANY_LANE)
 
     def _is_displaced(self, state: VehicleState) -> bool:
         """Return whether a body is farther from its cell than any move of one cell takes it.

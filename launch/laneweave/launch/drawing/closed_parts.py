@@ -23,8 +23,8 @@ class ClosedPart:
     lane: int
     from_m: float
     to_m: float
-    line_m: float
-    """The stop line before it."""
+    line_m: float | None
+    """The stop line before it; None: the lane begins behind it, or ends at an exit."""
 
 
 def closed_parts(scenario: Scenario) -> tuple[ClosedPart, ...]:
@@ -33,7 +33,10 @@ def closed_parts(scenario: Scenario) -> tuple[ClosedPart, ...]:
     line_m = {(end.lane, end.end_m): end.line_m for end in dead_ends(scenario)}
     return tuple(
         ClosedPart(
-            part.lane, part.from_m, min(part.to_m, road.length_m), line_m[part.lane, part.from_m]
+            part.lane,
+            part.from_m,
+            min(part.to_m, road.length_m),
+            line_m.get((part.lane, part.from_m)),
         )
         for part in sorted(road.closures, key=lambda part: (part.lane, part.from_m))
     )

@@ -26,7 +26,7 @@ def road_scene(scenario: Scenario) -> dict[str, Any]:
             "lane_width_m": road.lane_width_m,
             "sorting_start_m": road.sorting_start_m,
             "closed": [[part.lane, part.from_m, part.to_m] for part in closed],
-            "stop_lines": [[part.lane, part.line_m] for part in closed],
+            "stop_lines": [[part.lane, part.line_m] for part in closed if part.line_m is not None],
         },
         "body_m": [scenario.vehicle.length_m, scenario.vehicle.width_m],
         "lattice": {"speed_mps": formation.speed_mps, "pitch_m": formation.gap_m},

@@ -33,6 +33,8 @@ class Profile:
     """Whether vehicles enter one after another at the real roadside."""
     lane_ends: bool = False
     """Whether lane 0 ends before the road (rolling operation at the real roadside)."""
+    roads: bool = False
+    """Whether a lane ends, joins or leaves, as drawn (rolling operation at the real roadside)."""
     density: tuple[float, float] = (0.3, 0.7)
     """Occupied share of the cells in which vehicles may enter (rolling operation)."""
     vehicles: Span = (2, 16)

@@ -22,8 +22,15 @@ from laneweave.launch.fault_search.events.lasting_faults import (
 )
 from laneweave.launch.fault_search.profiles import Profile
 from laneweave.launch.fault_search.road.drawn_entrance import DrawnEntrance, Entrance, Grant
+from laneweave.launch.fault_search.road.drawn_roads import (
+    EXIT,
+    STRAIGHT_ROAD,
+    DrawnRoad,
+    draw_road,
+)
 from laneweave.launch.fault_search.road.stand_ins import Visit
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.deployment_fields import Network
 from laneweave.protocol.scenario.fields import Closure, FormationSettings, Road, Runtime, Scenario
 from laneweave.protocol.wire.messages import ClosedFormation, Name
@@ -66,6 +73,8 @@ BEFORE_COLUMNS = (3, 4, 6)
 """Lengths of the road before S3 to draw from at the real roadside, in columns."""
 LANE_ENDS_M = (150.0, 300.0)
 """Range of distances between the first position of moves and the end of lane 0."""
+LEAVING = 0.4
+"""Share of vehicles that leave by the exit of a drawn road."""
 STREAM_PLANNER = 0.05
 """Share of runs with the stream planner, which takes ten times as long as the rest of a run."""
 
@@ -91,8 +100,8 @@ class RoadSetup:
     seed: int = 0
     stream_planner: bool = False
     """Whether the stream planner replaces `LightPlanner` (rolling operation)."""
-    lane_0_ends_m: float | None = None
-    """Where lane 0 ends (rolling operation at the real roadside); None: with the road."""
+    drawn: DrawnRoad = STRAIGHT_ROAD
+    """Closed parts, ramps and exits (rolling operation at the real roadside)."""
 
     def make_scenario(self) -> Scenario:
         """Return the scenario of the road."""
@@ -120,10 +129,11 @@ class RoadSetup:
                 max_nodes=500,
             )
             s3_m = 20_000.0
-        ends_m = self.lane_0_ends_m
-        closures = () if ends_m is None else (Closure(0, ends_m),)
+        drawn = self.drawn
         return Scenario(
-            road=Road(lanes=self.lanes, s1_m=0.0, s2_m=self.before_m, s3_m=s3_m, closures=closures),
+            road=Road(self.lanes, s1_m=0.0, s2_m=self.before_m, s3_m=s3_m, closures=drawn.closures),
+            entrance=drawn.entrance,
+            exit=drawn.exit,
             formation=formation,
             network=Network(heartbeat_s=0.2, election_s=0.6, lease_s=LEASE_S),
             runtime=Runtime(tick_s=TICK_S, agent_silent_s=1.5),
@@ -146,6 +156,8 @@ class Setup:
     """Assignments of empty cells to owners on a drawn entrance (rolling operation)."""
     stretch_columns: int = 0
     """Number of columns in which vehicles enter (rolling operation)."""
+    leaving: frozenset[Name] = frozenset()
+    """Vehicles that leave by the exit of a drawn road."""
 
     @cached_property
     def scenario(self) -> Scenario:
@@ -214,7 +226,11 @@ class Setup:
         if profile.rolling:
             road = _draw_rolling_road(lanes, rng, before_columns=rng.choice(BEFORE_COLUMNS))
             if profile.lane_ends:
-                road = evolve(road, lane_0_ends_m=road.before_m + rng.uniform(*LANE_ENDS_M))
+                ends_m = road.before_m + rng.uniform(*LANE_ENDS_M)
+                road = evolve(road, drawn=DrawnRoad((Closure(0, ends_m),)))
+            elif profile.roads:
+                step_m = FormationSettings().speed_mps * road.slot_s
+                road = evolve(road, drawn=draw_road(lanes, road.before_m, step_m, rng))
         else:
             road = RoadSetup(
                 lanes=lanes,
@@ -227,23 +243,42 @@ class Setup:
         scenario = road.make_scenario()
         lasting = LastingFaults.drawn(profile, rng)
         mean_s = rng.uniform(*MEAN_HEADWAYS_S)
-        next_s = [rng.uniform(0.0, mean_s) for _ in range(lanes)]
+        entered = [lane for lane in range(lanes) if scenario.volume_veh_per_h(lane) > 0.0]
+        next_s = {lane: rng.uniform(0.0, mean_s) for lane in entered}
         visits = []
         for number in range(1, rng.randint(*profile.vehicles) + 1):
-            arrival_s, lane = min((t_s, lane) for lane, t_s in enumerate(next_s))
+            arrival_s, lane = min((t_s, lane) for lane, t_s in next_s.items())
             next_s[lane] += 1.0 + rng.expovariate(1.0 / mean_s)
             leaves = number > 1 and rng.random() < profile.leavers
             visit = _visit(number, (0, lane), leaves, scenario, lasting, rng)
             visits.append(evolve(visit, enters_s=arrival_s))
         crowded = rng.random() < profile.crowding
-        return cls(road, lasting, tuple(visits), crowded=crowded, stretch_columns=len(visits))
+        leaving = (
+            frozenset(visit.vehicle for visit in visits if rng.random() < LEAVING)
+            if road.drawn.exit
+            else frozenset[Name]()
+        )
+        return cls(
+            road,
+            lasting,
+            tuple(visits),
+            crowded=crowded,
+            stretch_columns=len(visits),
+            leaving=leaving,
+        )
 
     def make_entrance(self, preferred_lanes: Mapping[Name, int], bridge: int) -> Entrance:
         """Return the entrance of a road with preferred lanes and the incarnation of its bridge."""
         if not self.road.roadside:
             return DrawnEntrance(self.visits, preferred_lanes, self.formations, self.grants, bridge)
         stream = tuple(
-            Arrival(visit.vehicle, visit.cell[1], preferred_lanes[visit.vehicle], visit.enters_s)
+            Arrival(
+                visit.vehicle,
+                visit.cell[1],
+                preferred_lanes[visit.vehicle],
+                visit.enters_s,
+                EXIT if visit.vehicle in self.leaving else END_OF_ROAD,
+            )
             for visit in sorted(self.visits, key=lambda visit: visit.enters_s)
         )
         return Roadside(self.scenario, bridge, stream)
@@ -259,8 +294,10 @@ class Setup:
         columns = [len(one.columns(lattice)) for one in self.formations]
         if self.road.rolling or self.road.roadside:
             room = [self.stretch_columns] * lanes
-            if self.road.lane_0_ends_m is not None:
-                room[0] = 0  # lane 0 does not reach the end of the road
+            length_m = self.scenario.road.length_m
+            reaching = {one.lane for one in self.scenario.sections if one.to_m >= length_m}
+            for lane in {*range(lanes)} - reaching:
+                room[lane] = 0
             weights = [6.0 if self.crowded and lane == 0 else 1.0 for lane in range(lanes)]
             vehicles = [visit.vehicle for visit in self.visits]
             return _draw_lanes(vehicles, room, weights, rng)

@@ -155,7 +155,7 @@ def _arrived(
     scenario: Scenario, preferred_lane: int, cells: Sequence[Cell], rear: int, times_s: Floats
 ) -> tuple[bool, ...]:
     """Return whether each cell is in a section of a lane by which the vehicle may leave."""
-    lattice, sections = scenario.lattice, scenario.road.sections
+    lattice, sections = scenario.lattice, scenario.sections
     allowed = [sections[number] for number in sections_for(sections, preferred_lane)]
     places = [
         (lane, lattice.cell_s_m(rear + column, t_s))

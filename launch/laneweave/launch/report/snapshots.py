@@ -158,8 +158,9 @@ def _draw_closed_parts(axes: Axes, scenario: Scenario) -> None:
     for part in closed_parts(scenario):
         corner, length_m = (part.from_m, part.lane * width_m), part.to_m - part.from_m
         axes.add_patch(Rectangle(corner, length_m, width_m, zorder=1.5, **_CLOSED))
-        lane_m = (corner[1], corner[1] + width_m)
-        axes.plot([part.line_m] * 2, lane_m, color=INK, linewidth=1.6, zorder=2)
+        if part.line_m is not None:
+            lane_m = (corner[1], corner[1] + width_m)
+            axes.plot([part.line_m] * 2, lane_m, color=INK, linewidth=1.6, zorder=2)
 
 
 def _draw_formations(

@@ -7,10 +7,18 @@ from collections.abc import Iterable, Mapping
 from operator import attrgetter, ge, gt, le, lt
 from typing import Any
 
+import attrs
+
 from laneweave.protocol.config.participants import identities_of, max_vehicles
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import is_encrypted
-from laneweave.protocol.scenario.fields import MAX_HORIZON_TICKS, Scenario
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, end_exit
+from laneweave.protocol.scenario.fields import (
+    MAIN_ENTRANCE,
+    MAX_HORIZON_TICKS,
+    DestinationShare,
+    Scenario,
+)
 from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
 from laneweave.protocol.vehicle.lane_ends import dead_ends, drive_out, lane_beside
 from laneweave.protocol.wire.identities import MAX_COMMON_NAME
@@ -55,6 +63,10 @@ def check_scenario(scenario: Scenario) -> None:
         _check_lanes,
         _check_motion,
         _check_closures,
+        _check_entrances,
+        _check_exits,
+        _check_capacity,
+        _check_destinations,
         _check_structures,
         _check_timing,
         _check_braking,
@@ -115,12 +127,14 @@ def _check_lanes(scenario: Scenario) -> None:
     width_m = vehicle.width_m + MIN_SIDE_GAP_M
     what = f"vehicle.width_m and {MIN_SIDE_GAP_M:g} between bodies side by side"
     _compare(scenario, [("road.lane_width_m", "at least", width_m, what)])
-    _require(
-        3600.0 / demand.volume_veh_per_lane_h >= demand.min_headway_s,
-        "demand.volume_veh_per_lane_h",
-        demand.volume_veh_per_lane_h,
-        f"at most 3600 / demand.min_headway_s = {3600.0 / max(demand.min_headway_s, 1e-9):g}",
-    )
+    allowed = f"at most 3600 / demand.min_headway_s = {3600.0 / max(demand.min_headway_s, 1e-9):g}"
+    volumes = [("demand.volume_veh_per_lane_h", demand.volume_veh_per_lane_h)]
+    volumes += [
+        (f"entrance[{number}].volume_veh_per_h", entrance.volume_veh_per_h)
+        for number, entrance in enumerate(scenario.entrance)
+    ]
+    for name, volume in volumes:
+        _require(3600.0 / volume >= demand.min_headway_s, name, volume, allowed)
 
 
 def _check_motion(scenario: Scenario) -> None:
@@ -156,7 +170,7 @@ def _check_motion(scenario: Scenario) -> None:
 def _check_closures(scenario: Scenario) -> None:
     """Check that closed parts of lanes are on the road, apart, and can be passed."""
     road, operation = scenario.road, scenario.formation.operation
-    open_m: dict[int, float] = {}
+    open_m: dict[int, float] = dict.fromkeys(range(road.lanes), -math.inf)
     step_m = _step_m(scenario)
     for number, closure in enumerate(road.closures):
         name = f"road.closures[{number}]"
@@ -166,13 +180,14 @@ def _check_closures(scenario: Scenario) -> None:
         _require(closure.lane < road.lanes, f"{name}.lane", closure.lane, allowed)
         allowed = f"more than from_m, {closure.from_m:g}"
         _require(closure.to_m > closure.from_m, f"{name}.to_m", closure.to_m, allowed)
-        after_m = open_m.get(closure.lane, 0.0)
+        after_m = open_m[closure.lane]
+        again = f", and more than {after_m:g}, where lane {closure.lane} is open again"
         _require(
             after_m < closure.from_m < road.length_m,
             f"{name}.from_m",
             closure.from_m,
-            f"less than the length of the road, {road.length_m:g}, and more than {after_m:g}, "
-            f"where lane {closure.lane} is open (again)",
+            f"less than the length of the road, {road.length_m:g}"
+            + (again if after_m > 0.0 else ""),
         )
         _require(
             closure.to_m >= road.length_m or closure.to_m + step_m <= road.length_m,
@@ -182,10 +197,10 @@ def _check_closures(scenario: Scenario) -> None:
             "none",
         )
         open_m[closure.lane] = closure.to_m
-        _check_capacity(scenario, closure.from_m)
-    if road.closures:
-        _check_dead_ends(scenario)
-    reaching = sorted(section.lane for section in road.sections if section.exit)
+    reaching = sorted(lane for lane, to_m in open_m.items() if to_m < road.length_m)
+    for lanes, where in ((road.first_lanes, "start"), (reaching, "end")):
+        allowed = f"a lane that is open at the {where} of the road"
+        _require(bool(lanes), "road.closures", [*map(attrs.astuple, road.closures)], allowed)
     _require(
         all(lane in reaching or not share for lane, share in enumerate(scenario.lane_shares)),
         "demand.lane_shares",
@@ -194,18 +209,147 @@ def _check_closures(scenario: Scenario) -> None:
     )
 
 
-def _check_capacity(scenario: Scenario, s_m: float) -> None:
-    """Check that the lanes that are open at a position can carry the demand."""
-    road, volume = scenario.road, scenario.demand.volume_veh_per_lane_h
-    closed = {closure.lane for closure in road.closures if closure.from_m <= s_m < closure.to_m}
-    count = road.lanes - len(closed)
-    bound = scenario.formation.bound_veh_per_lane_h * count / road.lanes
-    _require(
-        volume <= bound,
-        "demand.volume_veh_per_lane_h",
-        volume,
-        f"at most {bound:g}, since {count} of {road.lanes} lanes are open at {s_m:g} m",
-    )
+def _check_entrances(scenario: Scenario) -> None:
+    """Check that ramps are where lanes open, and that they are long enough."""
+    road, names = scenario.road, {MAIN_ENTRANCE}
+    first_m = {one.lane: one.to_m for one in road.closures if one.from_m <= 0.0}
+    lanes = set[int]()
+    for number, entrance in enumerate(scenario.entrance):
+        name = f"entrance[{number}]"
+        allowed = f"a name of its own, other than {MAIN_ENTRANCE}"
+        _require(entrance.name not in names, f"{name}.name", entrance.name, allowed)
+        names.add(entrance.name)
+        allowed = "a lane that is closed from the start of the road to its only entrance"
+        is_ramp = entrance.lane in first_m and entrance.lane not in lanes
+        _require(is_ramp, f"{name}.lane", entrance.lane, allowed)
+        lanes.add(entrance.lane)
+        opens_m = first_m[entrance.lane]
+        allowed = f"{opens_m:g}, where lane {entrance.lane} opens"
+        _require(entrance.at_m == opens_m, f"{name}.at_m", entrance.at_m, allowed)
+        formation = scenario.formation
+        low_m = entrance.at_m + formation.speed_mps * formation.settle_s
+        high_m = next(one.to_m for one in scenario.sections if one.lane == entrance.lane)
+        high_m -= _step_m(scenario)
+        _require(
+            low_m <= entrance.merge_m <= high_m,
+            f"{name}.merge_m",
+            entrance.merge_m,
+            f"from {low_m:g}, formation.settle_s after entrance.at_m, to {high_m:g}, a step before "
+            "the end of the lane",
+        )
+
+
+def _check_exits(scenario: Scenario) -> None:
+    """Check that exits are at the ends of sections, and that vehicles can change lanes before."""
+    names, used = {END_OF_ROAD}, set[tuple[int, float]]()
+    ends = {(one.lane, one.from_m) for one in scenario.road.closures}
+    for number, exit_ in enumerate(scenario.exit):
+        name = f"exit[{number}]"
+        ok = exit_.name not in names and not exit_.name.startswith(end_exit(0)[:-1])
+        allowed = f"a name of its own, other than {END_OF_ROAD} or lane-N"
+        _require(ok, f"{name}.name", exit_.name, allowed)
+        names.add(exit_.name)
+        places = {(lane, exit_.at_m) for lane in exit_.lanes}
+        _require(
+            bool(places) and len(places) == len(exit_.lanes) and places <= ends - used,
+            f"{name}.lanes",
+            list(exit_.lanes),
+            f"lanes that are closed from exit.at_m = {exit_.at_m:g} on, without another exit",
+        )
+        used |= places
+        for section in scenario.sections:
+            first_m = max(section.from_m, section.moves_from_m, scenario.moves_from_m)
+            needed_m = first_m + _step_m(scenario) + drive_out(scenario).room_m
+            _require(
+                section.exit != exit_.name or exit_.at_m >= needed_m,
+                f"{name}.at_m",
+                exit_.at_m,
+                f"at least {needed_m:g}: a step for changing lanes in lane {section.lane}, and "
+                f"{drive_out(scenario).room_m:g} m for completing a change after stopping",
+            )
+    if scenario.road.closures:
+        _check_dead_ends(scenario)
+
+
+def _check_capacity(scenario: Scenario) -> None:
+    """Check that the lanes that are open can carry the demand everywhere."""
+    road, bound = scenario.road, scenario.formation.bound_veh_per_lane_h
+    if not road.closures:
+        return  # the bound of the entrance holds everywhere
+    exits_m = {one.name: one.at_m for one in scenario.exit}
+    parts = [
+        (scenario.entry_m[lane], volume * share, exits_m.get(name, math.inf))
+        for lane in range(road.lanes)
+        if (volume := scenario.volume_veh_per_h(lane)) > 0.0
+        for name, share in _shares(scenario, lane)
+    ]
+    volume = scenario.demand.volume_veh_per_lane_h
+    for s_m in sorted({0.0, *scenario.entry_m, *(one.from_m for one in road.closures)}):
+        flows = [(from_m, flow) for from_m, flow, to_m in parts if from_m <= s_m < to_m]
+        from_ramps = sum(flow for from_m, flow in flows if from_m > 0.0)
+        main_lanes = sum(flow for from_m, flow in flows if from_m <= 0.0) / volume
+        closed = {one.lane for one in road.closures if one.from_m <= s_m < one.to_m}
+        count = road.lanes - len(closed)
+        room = bound * count - from_ramps
+        ramps = f" and {from_ramps:g} vehicles per hour come from ramps" if from_ramps else ""
+        _require(
+            volume * main_lanes <= room,
+            "demand.volume_veh_per_lane_h",
+            volume,
+            f"at most {max(room, 0.0) / main_lanes if main_lanes else 0.0:g}, since {count} of "
+            f"{road.lanes} lanes are open at {s_m:g} m{ramps}",
+        )
+
+
+def _shares(scenario: Scenario, lane: int) -> list[tuple[str, float]]:
+    """Return the shares of all destinations of the vehicles that enter in a lane."""
+    shares = [(one.exit, one.share) for one in scenario.destinations_of(lane)]
+    return [*shares, (END_OF_ROAD, 1.0 - sum(share for _, share in shares))]
+
+
+def _check_destinations(scenario: Scenario) -> None:
+    """Check that destinations exist, and that the vehicles of each entrance can reach theirs."""
+    exits_m = {one.name: one.at_m for one in scenario.exit}
+    entrances = [("demand", scenario.road.first_lanes, scenario.demand.destinations)]
+    entrances += [
+        (f"entrance[{number}]", (one.lane,), one.destinations)
+        for number, one in enumerate(scenario.entrance)
+    ]
+    for name, lanes, shares in entrances:
+        total = sum(one.share for one in shares)
+        allowed = "shares whose sum is at most 1"
+        _require(
+            total <= 1.0 + 1e-9, f"{name}.destinations", [*map(attrs.astuple, shares)], allowed
+        )
+        wanted = [*shares] + ([DestinationShare(END_OF_ROAD, 1.0 - total)] if total < 1.0 else [])
+        for one in wanted:
+            if one.exit != END_OF_ROAD:
+                allowed = f"an exit: {', '.join(exits_m) or 'there is none'}"
+                _require(one.exit in exits_m, f"{name}.destinations.exit", one.exit, allowed)
+            if one.share > 0.0:
+                for lane in lanes:
+                    _check_reachable(scenario, f"{name}.destinations", lane, one.exit)
+
+
+def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str) -> None:
+    """Check that a vehicle from a lane has room for all lane changes to its destination."""
+    own = min((one for one in scenario.sections if one.lane == lane), key=lambda one: one.from_m)
+    from_m = max(own.from_m, own.moves_from_m, scenario.moves_from_m) + scenario.vehicle.length_m
+    advance_m = scenario.formation.speed_mps * scenario.cycles_s[0]
+    wanted = [lane for lane, share in enumerate(scenario.lane_shares) if share] or [ANY_LANE]
+    for preferred in wanted if destination == END_OF_ROAD else [ANY_LANE]:
+        room = [
+            section.to_m - (from_m + abs(section.lane - lane) * advance_m)
+            for section in scenario.sections
+            if section.serves(preferred, destination)
+        ]
+        _require(
+            max(room, default=-math.inf) >= 0.0,
+            name,
+            destination,
+            f"destinations with {advance_m:g} m for each lane change: from lane {lane}, where "
+            f"moves begin at {from_m:g} m, {destination} is too near",
+        )
 
 
 def _check_dead_ends(scenario: Scenario) -> None:
@@ -222,7 +366,7 @@ def _check_dead_ends(scenario: Scenario) -> None:
             for number, closure in enumerate(scenario.road.closures)
             if (closure.lane, closure.from_m) == (end.lane, end.end_m)
         )
-        first_m = max(end.from_m, scenario.moves_from_m) + step_m
+        first_m = max(end.from_m, end.moves_from_m, scenario.moves_from_m) + step_m
         _require(
             end.line_m >= first_m,
             name,

@@ -27,8 +27,10 @@ def max_vehicles(scenario: Scenario) -> int:
     mean by more than six standard deviations in fewer than one in 10^8 cases. In addition, each
     lane has at most one arrival per `demand.min_headway_s`.
     """
-    demand, lanes = scenario.demand, scenario.road.lanes
-    mean = lanes * demand.volume_veh_per_lane_h * demand.duration_s / 3600.0
+    demand = scenario.demand
+    volumes = [scenario.volume_veh_per_h(lane) for lane in range(scenario.road.lanes)]
+    lanes = sum(volume > 0.0 for volume in volumes)
+    mean = sum(volumes) * demand.duration_s / 3600.0
     likely = math.ceil(mean + 6.0 * math.sqrt(mean)) + 10
     if demand.min_headway_s <= 0.0:
         return likely

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -17,9 +18,9 @@ from attrs import field, frozen
 from attrs.validators import optional
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.field_validators import one_of, within
+from laneweave.protocol.field_validators import key_part, one_of, within
 from laneweave.protocol.lattice import Lattice
-from laneweave.protocol.road_layout import LaneSection, open_sections
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, open_sections
 from laneweave.protocol.scenario.deployment_fields import Network, Observation, Security, Service
 from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.events import STREAM_PLANNED
@@ -50,6 +51,8 @@ LONGEST_ROAD_M = 60_000.0
 """Upper bound on positions on the road: the sum of those of its three segments."""
 MAX_HORIZON_TICKS = 200
 """Maximum horizon of the tracker."""
+MAIN_ENTRANCE: Final = "main"
+"""Name of the entrance at the start of the road."""
 
 PAPERS_FORMATIONS: Mapping[str, object] = MappingProxyType(
     {"entry": "interlaced", "close": "columns", "cycle_s": 4.0}
@@ -92,7 +95,8 @@ class Closure:
     """A part of a lane that is closed."""
 
     lane: int = field(validator=within(0, 7))
-    from_m: float = field(validator=within(0.0, LONGEST_ROAD_M, open_low=True))
+    from_m: float = field(default=0.0, validator=within(0.0, LONGEST_ROAD_M))
+    """Where it begins; by default, the lane is closed from the start of the road."""
     to_m: float = field(
         default=LONGEST_ROAD_M, validator=within(0.0, LONGEST_ROAD_M, open_low=True)
     )
@@ -122,10 +126,47 @@ class Road:
         return self.s1_m + self.s2_m
 
     @property
-    def sections(self) -> tuple[LaneSection, ...]:
-        """The open sections of all lanes."""
-        closed = [(one.lane, one.from_m, one.to_m) for one in self.closures]
-        return open_sections(self.lanes, self.length_m, closed)
+    def first_lanes(self) -> tuple[int, ...]:
+        """Lanes that are open at the start of the road."""
+        closed = {closure.lane for closure in self.closures if closure.from_m <= 0.0}
+        return tuple(lane for lane in range(self.lanes) if lane not in closed)
+
+
+@frozen
+class DestinationShare:
+    """The share of an entrance's vehicles that leave by an exit."""
+
+    exit: str
+    share: float = field(validator=within(0.0, 1.0))
+
+
+@frozen
+class Exit:
+    """An exit before the end of the road, by which vehicles leave."""
+
+    name: str = field(validator=key_part)
+    lanes: tuple[int, ...]
+    """Lanes that end there, each of them closed from there on."""
+    at_m: float = field(validator=within(0.0, LONGEST_ROAD_M, open_low=True))
+
+
+@frozen
+class Entrance:
+    """An on-ramp: a lane in which vehicles enter the road behind its start.
+
+    The ramp is the part of the lane from `at_m` to `merge_m`. The demand's minimum headway applies.
+    """
+
+    name: str = field(validator=key_part)
+    lane: int = field(validator=within(0, 7))
+    at_m: float = field(validator=within(0.0, LONGEST_ROAD_M, open_low=True))
+    """Where vehicles enter with speed v_F, each in a cell of the lattice; the lane opens there."""
+    merge_m: float = field(validator=within(0.0, LONGEST_ROAD_M, open_low=True))
+    """Where the ramp joins the road: lane changes to and from its lane are possible from there."""
+    volume_veh_per_h: float = field(validator=within(0, 3600, open_low=True))
+    destinations: tuple[DestinationShare, ...] = ()
+    """Shares of vehicles that leave by exits; the others leave at the end of the road, with the
+    shares of `demand.lane_shares`."""
 
 
 @frozen
@@ -136,8 +177,10 @@ class Demand:
     duration_s: float = field(default=300.0, validator=within(0, 86_400, open_low=True))
     min_headway_s: float = field(default=1.0, validator=within(0.0, 60.0))
     lane_shares: tuple[float, ...] = ()
-    """Share of vehicles that prefer each lane; empty: equal shares, and on a road with closures no
-    preferences."""
+    """Share of vehicles that prefer each lane at the end of the road; empty: equal shares, and on a
+    road with closures no preferences."""
+    destinations: tuple[DestinationShare, ...] = ()
+    """Shares of vehicles that leave by exits before the end of the road; the others leave there."""
 
 
 @frozen
@@ -438,6 +481,10 @@ class Scenario:
     schema: str = field(default=SCHEMA, validator=one_of(SCHEMA))
     seed: int = field(default=1, validator=within(0, 2**63 - 1))
     road: Road = Road()
+    entrance: tuple[Entrance, ...] = ()
+    """Entrances other than the start of the road."""
+    exit: tuple[Exit, ...] = ()
+    """Exits other than the end of the road."""
     demand: Demand = Demand()
     formation: FormationSettings = FormationSettings()
     vehicle: Vehicle = Vehicle()
@@ -462,6 +509,74 @@ class Scenario:
             lanes=self.road.lanes,
             block_columns=self.formation.block_width,
         )
+
+    @cached_property
+    def sections(self) -> tuple[LaneSection, ...]:
+        """The open sections of all lanes."""
+        road = self.road
+        return open_sections(
+            road.lanes,
+            road.length_m,
+            [(one.lane, one.from_m, one.to_m) for one in road.closures],
+            {(lane, one.at_m): one.name for one in self.exit for lane in one.lanes},
+            {(one.lane, one.at_m): one.merge_m for one in self.entrance},
+        )
+
+    @cached_property
+    def entry_m(self) -> tuple[float, ...]:
+        """Where the cells of each lane are assigned and vehicles enter: at 0, or on a ramp."""
+        at_m = {entrance.lane: entrance.at_m for entrance in self.entrance}
+        return tuple(at_m.get(lane, 0.0) for lane in range(self.road.lanes))
+
+    @cached_property
+    def closed_to_bodies(self) -> tuple[Closure, ...]:
+        """Closed parts of lanes, which no body may touch.
+
+        Vehicles enter a ramp with their rears before it, and leave by an exit up to a tick behind.
+        """
+        entries = {(one.lane, one.at_m) for one in self.entrance}
+        exits = {(lane, one.at_m) for one in self.exit for lane in one.lanes}
+        tick_m = self.vehicle.max_speed_mps * self.runtime.tick_s
+        parts = []
+        for one in self.road.closures:
+            from_m, to_m = one.from_m, one.to_m
+            if (one.lane, from_m) in exits:
+                from_m += tick_m
+            if (one.lane, to_m) in entries:
+                to_m -= self.vehicle.length_m
+            if from_m < to_m:
+                parts.append(Closure(one.lane, from_m, to_m))
+        return tuple(parts)
+
+    def entrance_of(self, lane: int) -> str:
+        """Return the name of the entrance of vehicles that arrive in a lane."""
+        names = {entrance.lane: entrance.name for entrance in self.entrance}
+        return names.get(lane, MAIN_ENTRANCE)
+
+    def exit_lane(self, destination: str) -> int:
+        """Return the lane of an exit; `ANY_LANE` if it has several, or for `END_OF_ROAD`."""
+        lanes = next((one.lanes for one in self.exit if one.name == destination), ())
+        return lanes[0] if len(lanes) == 1 else ANY_LANE
+
+    def volume_veh_per_h(self, lane: int) -> float:
+        """Return the volume of vehicles that enter in a lane."""
+        for entrance in self.entrance:
+            if entrance.lane == lane:
+                return entrance.volume_veh_per_h
+        return self.demand.volume_veh_per_lane_h if lane in self.road.first_lanes else 0.0
+
+    def destinations_of(self, lane: int) -> tuple[DestinationShare, ...]:
+        """Return the shares of destinations, except the end, of vehicles that enter in a lane."""
+        for entrance in self.entrance:
+            if entrance.lane == lane:
+                return entrance.destinations
+        return self.demand.destinations
+
+    def free_flow_trip_s(self, lane: int, destination: str = END_OF_ROAD) -> float:
+        """Return the time [s] at v_F from the entrance of a lane to a destination."""
+        ends_m = {one.name: one.at_m for one in self.exit}
+        to_m = ends_m.get(destination, self.road.length_m)
+        return (to_m - self.entry_m[lane]) / self.formation.speed_mps
 
     @property
     def cycles_s(self) -> tuple[float, float]:

@@ -3,7 +3,10 @@
 Before each dead end there is a *stop line*, so far from the end that a vehicle standing at it can
 accelerate and change lanes before the end (`drive_out`). All cells of the lane beyond the line are
 useless: no plan leads there, and a vehicle whose cell has passed the line has left the lattice.
-docs/SAFETY.md derives the rules.
+
+An exit before the end of the road needs no stop line: a vehicle in its lane leaves the road. But
+lane changes end as far before it (`ExitLane.line_m`), so that a body that was stopped in one can
+complete it before the lanes part. docs/SAFETY.md derives the rules.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import math
 from collections.abc import Iterator
 from functools import lru_cache
 
-from attrs import frozen
+from attrs import evolve, frozen
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import LaneSection
@@ -29,6 +32,8 @@ from laneweave.protocol.vehicle.motion import (
 )
 from laneweave.protocol.wire.messages import Neighbour
 
+BEFORE_TOUCHING = 0.6
+"""Share of a move by which a body that changes lanes touches the other lane (by default 0.36)."""
 START_S = 0.3
 """Time after the front of a gap has passed in which a waiting vehicle may start into it."""
 _MAX_COLUMNS = 12
@@ -50,6 +55,23 @@ class DeadEnd:
     """Where the lane ends."""
     reopens_m: float
     """Where the lane is open again; inf: nowhere."""
+    moves_from_m: float = -math.inf
+    """Where moves may begin in the section; -inf: everywhere."""
+
+
+@frozen
+class ExitLane:
+    """A section of a lane that ends at an exit before the end of the road."""
+
+    lane: int
+    from_m: float
+    """Where the section begins; -inf: before the start of the road."""
+    line_m: float
+    """Where lane changes into and out of the section have ended."""
+    end_m: float
+    """Where vehicles in the lane leave the road."""
+    reopens_m: float
+    """Where the lane is open again; inf: nowhere."""
 
 
 @frozen
@@ -65,19 +87,20 @@ class DriveOut:
 
 
 class LaneEnds:
-    """The dead ends of a scenario's road."""
+    """The ends of lanes before the end of a scenario's road: dead ends and exits."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Derive the stop lines; a road without dead ends has none."""
+        """Derive the stop lines."""
         self._lattice = scenario.lattice
-        ends = dead_ends(scenario)
-        self._by_lane = tuple(
-            tuple(each for each in ends if each.lane == lane) for lane in range(scenario.road.lanes)
-        )
+        ends, exits, lanes = dead_ends(scenario), exit_lanes(scenario), range(scenario.road.lanes)
+        self._by_lane = tuple(tuple(each for each in ends if each.lane == lane) for lane in lanes)
+        self._exits = tuple(tuple(each for each in exits if each.lane == lane) for lane in lanes)
+        self._touching_s = (1.0 - BEFORE_TOUCHING) * scenario.move_s
+        self._any = bool(ends or exits)
 
     def __bool__(self) -> bool:
-        """Return whether there are any."""
-        return any(self._by_lane)
+        """Return whether any lane ends before the road."""
+        return self._any
 
     def __iter__(self) -> Iterator[DeadEnd]:
         """Yield the dead ends in order of lane, then of position."""
@@ -105,21 +128,60 @@ class LaneEnds:
         end = self.ahead(cell[1], cell_s_m(cell[0], t_s if since_s is None else since_s))
         return end is not None and cell_s_m(cell[0], t_s) > end.line_m
 
+    def exit_ahead(self, lane: int, s_m: float) -> ExitLane | None:
+        """Return the exit of the section in which a position is, or which it has passed."""
+        if not 0 <= lane < len(self._exits):
+            return None
+        for exit_lane in self._exits[lane]:
+            if exit_lane.from_m <= s_m < exit_lane.reopens_m:
+                return exit_lane
+        return None
+
+    def ends_changes(self, cell: Cell, t_s: float, since_s: float | None = None) -> bool:
+        """Return whether a cell is where lane changes have ended before an exit.
+
+        Args:
+            cell: the cell.
+            t_s: road time.
+            since_s: road time at which the cell is in the section; None: `t_s`.
+        """
+        cell_s_m = self._lattice.cell_s_m
+        exit_lane = self.exit_ahead(cell[1], cell_s_m(cell[0], t_s if since_s is None else since_s))
+        return exit_lane is not None and cell_s_m(cell[0], t_s) > exit_lane.line_m
+
+    def too_late_to_change(self, cell: Cell, t_s: float) -> bool:
+        """Return whether a body can no longer begin to enter or leave the lane of a cell."""
+        return self.ends_changes(cell, t_s + self._touching_s, t_s)
+
 
 def dead_ends(scenario: Scenario) -> tuple[DeadEnd, ...]:
     """Return the dead ends of a road in order of lane, then of position."""
-    sections = scenario.road.sections
-    if all(section.exit for section in sections):
-        return ()
-    room_m = drive_out(scenario).room_m
-    found = []
+    return tuple(
+        DeadEnd(section.lane, section.from_m, *ends_m, section.moves_from_m)
+        for section, ends_m in _ending_early(scenario)
+        if not section.exit
+    )
+
+
+def exit_lanes(scenario: Scenario) -> tuple[ExitLane, ...]:
+    """Return the lanes of exits before the end of a road in order of lane, then of position."""
+    return tuple(
+        ExitLane(section.lane, section.from_m, *ends_m)
+        for section, ends_m in _ending_early(scenario)
+        if section.exit
+    )
+
+
+def _ending_early(
+    scenario: Scenario,
+) -> Iterator[tuple[LaneSection, tuple[float, float, float]]]:
+    """Yield the sections that end before the road, and (line_m, end_m, reopens_m)."""
+    sections = scenario.sections
     for number, section in enumerate(sections):
-        if not section.exit:
+        if not section.exit or section.to_m < scenario.road.length_m:
             later = [each.from_m for each in sections[number + 1 :] if each.lane == section.lane]
-            reopens_m = min(later, default=math.inf)
-            line_m, end_m = section.to_m - room_m, section.to_m
-            found.append(DeadEnd(section.lane, section.from_m, line_m, end_m, reopens_m))
-    return tuple(found)
+            line_m = section.to_m - drive_out(scenario).room_m
+            yield section, (line_m, section.to_m, min(later, default=math.inf))
 
 
 def lane_beside(scenario: Scenario, end: DeadEnd) -> int | None:
@@ -134,19 +196,17 @@ def lane_beside(scenario: Scenario, end: DeadEnd) -> int | None:
     to_m = min(end.line_m + needed.distance_m, scenario.road.length_m)
     for lane in (end.lane + 1, end.lane - 1):
         for section in sections:
-            if section.lane == lane and section.from_m <= from_m and to_m <= section.to_m:
+            begins_m = max(section.from_m, section.moves_from_m)
+            if section.lane == lane and begins_m <= from_m and to_m <= section.to_m:
                 return lane
     return None
 
 
 def sections_to_lines(scenario: Scenario) -> tuple[LaneSection, ...]:
-    """Return the sections of a road, as far as plans may use them: dead ends at the stop lines."""
-    lines = {(each.lane, each.end_m): each.line_m for each in dead_ends(scenario)}
+    """Return the sections of a road as far as plans may use them, up to the lines before ends."""
+    lines_m = {section: line_m for section, (line_m, _, _) in _ending_early(scenario)}
     return tuple(
-        section
-        if section.exit
-        else LaneSection(section.lane, section.from_m, lines[section.lane, section.to_m])
-        for section in scenario.road.sections
+        evolve(section, to_m=lines_m.get(section, section.to_m)) for section in scenario.sections
     )
 
 

@@ -98,7 +98,7 @@ class PlanExecution:
     stored_transfer: PendingTransfer | None = None
     """Newest transfer that the controller has stored."""
     lane_ends: LaneEnds | None = None
-    """Dead ends of the road; None: there are none."""
+    """Ends of lanes before the end of the road; None: there are none."""
     rules: RuleBook = field(factory=lambda: VEHICLE_RULES)
 
     def __attrs_post_init__(self) -> None:
@@ -415,15 +415,18 @@ def move_is_due(execution: PlanExecution, _: object) -> bool:
 
 
 def ends_in_time(execution: PlanExecution, _: object) -> bool:
-    """The move, begun now, ends before the stop lines of both lanes."""
+    """The move, begun now, ends before the stop lines, or lines of exits, of both lanes."""
     plan, move, ends = execution.plan, execution.next_move, execution.lane_ends
     if plan is None or move is None or not ends:
         return True
     _, origin, target = move
     begin_s, front = execution.t_s, max(origin[0], target[0])
     end_s = begin_s + plan.slot_s - LATE_S
+    across = origin[1] != target[1]
     return not any(
-        ends.has_passed((front, lane), end_s, begin_s) for lane in (origin[1], target[1])
+        ends.has_passed((front, lane), end_s, begin_s)
+        or (across and ends.ends_changes((front, lane), end_s, begin_s))
+        for lane in (origin[1], target[1])
     )
 
 

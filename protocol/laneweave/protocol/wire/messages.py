@@ -14,6 +14,7 @@ from attrs import field, frozen
 from cattrs import override
 
 from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
+from laneweave.protocol.road_layout import END_OF_ROAD
 
 Name = NewType("Name", str)
 """Name of a vehicle, coordinator or role: letters, digits, `_`, `-`, `.`; at most 64."""
@@ -343,7 +344,7 @@ class OffLattice:
     """Body of a vehicle that has no cell; part of `CensusEntry`."""
 
     lane: int
-    """Lane whose dead end the vehicle has not left in time."""
+    """Lane in which it is; usually one that ends, which it has not left in time."""
     rear_m: float
     """Position of its rear bumper [m]."""
 
@@ -356,11 +357,13 @@ class CensusEntry:
     cell: Cell
     """Cell in which it entered the lattice last; its column determines the block."""
     preferred_lane: int
-    """Lane in which it wants to leave the road; -1: any lane that reaches the end."""
+    """Lane in which it wants to leave the road; -1: any lane that reaches its destination."""
     entered_s: float
     """Road time of its entry [s]."""
     off_lattice: OffLattice | None = None
     """None: the vehicle has cells, and takes part in plans."""
+    destination: Name = Name(END_OF_ROAD)
+    """Name of the exit by which it wants to leave the road; `end`: the end of the road."""
 
 
 @frozen
@@ -395,7 +398,7 @@ class Announcement:
     """Lane in which it arrives."""
     preferred_lane: int
     arrival_s: float
-    """Road time at which it would pass s = 0 without other vehicles [s]."""
+    """Road time at which it would pass its entrance without other vehicles [s]."""
 
 
 @frozen
@@ -419,7 +422,7 @@ class Census:
     on_road: tuple[CensusEntry, ...]
     """All vehicles on the road."""
     announced: tuple[Announcement, ...]
-    """Vehicles that wait at the entrance or arrive within `runtime.announce_s`."""
+    """Vehicles that wait at an entrance or arrive within `runtime.announce_s`."""
     formations: tuple[ClosedFormation, ...] = ()
     """Closed formations with a vehicle on the road, foremost first. Listed formations never change,
     and no block belongs to two of them. Empty in the rolling operation."""

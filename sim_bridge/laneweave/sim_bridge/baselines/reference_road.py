@@ -186,7 +186,7 @@ class ReferenceRoad:
         self._record.on_positions(
             self.t_s,
             self._traffic.vehicles,
-            overlaps=[*bodies.overlapping_pairs(), *bodies.in_closed_lanes(self._scenario.road)],
+            overlaps=[*bodies.overlapping_pairs(), *bodies.in_closed_lanes(self._scenario)],
             collisions=self._traffic.collisions(),
             gaps=bodies.min_gaps(),
         )

@@ -173,6 +173,31 @@ class MotionController:
             return False
         return self._lane_ends.has_passed((self.hold_cell[0], self._body_lane), t_s)
 
+    def has_missed_exit(self, t_s: float) -> bool:
+        """Return whether a move into or out of the lane of an exit did not begin in time.
+
+        The body is still in the lane in which the move began, and can no longer leave it.
+        """
+        lane = self._body_lane
+        if lane == self.hold_cell[1] or self.off_lattice is not None or not self._lane_ends:
+            return False
+        column = self.hold_cell[0]
+        return any(
+            self._lane_ends.too_late_to_change((column, each), t_s)
+            for each in (lane, self.hold_cell[1])
+        )
+
+    def return_to_origin(self) -> bool:
+        """Hold the cell in which the move began; return False if the vehicle does not own it.
+
+        It owns the cell until a later plan takes it, which no vehicle that moves takes part in.
+        """
+        if self.motion_origin not in self.owned or self.motion_origin[1] != self._body_lane:
+            return False
+        self.hold_cell = self.motion_origin
+        self._stop_motion()
+        return True
+
     @property
     def _body_lane(self) -> int:
         """Lane of the hold cell if the body touches it; otherwise the lane of the body's centre."""
@@ -233,6 +258,10 @@ class MotionController:
             (end.lane, (end.end_m if self._past_line and end.lane != goal else end.line_m) - s_m)
             for end in ends
         ]
+        if first != last:
+            # Where an exit lane parts from the road, a body must not be in both.
+            exits = [self._lane_ends.exit_ahead(lane, s_m) for lane in (first, last)]
+            lines += [(each.lane, each.end_m - s_m) for each in exits if each is not None]
         return [Neighbour(lane, gap_m, 0.0) for lane, gap_m in lines if gap_m < MAX_LINE_GAP_M]
 
     def accept_command(self, command: Command) -> bool:
@@ -355,6 +384,14 @@ class MotionController:
         if transfer is not None and transfer.undecided:
             self.transfer = _with_cells(transfer, {cell})
 
+    @property
+    def certain_cells(self) -> frozenset[Cell]:
+        """Cells that the vehicle owns whether or not the gate of its pending transfer opens."""
+        transfer = self.transfer
+        if transfer is None or not transfer.undecided:
+            return frozenset(self.owned)
+        return frozenset(transfer.before) & frozenset(transfer.after)
+
     def join(self, blocks: Iterable[int]) -> None:
         """Add joined blocks."""
         self.joined = tuple(sorted({*self.joined, *blocks}))
@@ -464,6 +501,8 @@ class MotionController:
         t_s = tick * self.tick_s
         if self._lane_ends.has_passed(self.hold_cell, t_s):
             return True  # the other lane has ended meanwhile
+        if self.has_missed_exit(t_s):
+            return True
         rear_m = self.lattice.cell_s_m(min(columns), t_s) - DISPLACED_ALONG_M
         front_m = self.lattice.cell_s_m(max(columns), t_s) + DISPLACED_ALONG_M
         # Only moves along the road change the speed.

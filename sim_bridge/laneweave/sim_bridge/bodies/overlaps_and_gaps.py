@@ -17,7 +17,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from laneweave.protocol.scenario.fields import Road
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Neighbour
 
 Pose = tuple[float, float, float, float]
@@ -119,15 +119,16 @@ class Bodies:
                     pairs.append((min(name, other_name), max(name, other_name)))
         return sorted(pairs)
 
-    def in_closed_lanes(self, road: Road) -> list[tuple[str, str]]:
+    def in_closed_lanes(self, scenario: Scenario) -> list[tuple[str, str]]:
         """Return (name of a closed part, vehicle) for each body that reaches into it.
 
         A closed part counts as a body of its lane's width; rotated bodies as their bounding boxes.
         """
         pairs = []
-        for number, closed in enumerate(road.closures):
-            low_m = closed.lane * road.lane_width_m + _TOUCH_M
-            high_m = low_m + road.lane_width_m - 2.0 * _TOUCH_M
+        lane_m = scenario.road.lane_width_m
+        for number, closed in enumerate(scenario.closed_to_bodies):
+            low_m = closed.lane * lane_m + _TOUCH_M
+            high_m = low_m + lane_m - 2.0 * _TOUCH_M
             for name, (rear, front, low, high) in zip(self._names, self._extents, strict=True):
                 along = rear < closed.to_m - _TOUCH_M and front > closed.from_m + _TOUCH_M
                 if along and low < high_m and high > low_m:

@@ -25,6 +25,7 @@ from typing import Protocol
 import pyarrow as pa
 from attrs import define, field
 
+from laneweave.protocol.road_layout import END_OF_ROAD, Exits, LaneSection
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import (
     SCHEMA,
@@ -55,7 +56,7 @@ from laneweave.sim_bridge.recording.events import Events
 from laneweave.sim_bridge.recording.reports import ReportTotals
 from laneweave.sim_bridge.recording.ticks import Ticks
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
-from laneweave.sim_bridge.recording.trips import Trips, metadata_of, throughput, travel_time
+from laneweave.sim_bridge.recording.trips import Trip, Trips, metadata_of, throughput, travel_time
 from laneweave.sim_bridge.road.demand import Arrival
 
 
@@ -138,6 +139,7 @@ class RunRecord:
         self._caretaker_takeovers = 0
         self._agent_takeovers = 0
         self._left_unattended = 0
+        self._exits = Exits(scenario.sections, scenario.road.length_m)
         self._closed = False
         self.missed_ticks = 0
         """Number of answers that were missing at their tick's deadline."""
@@ -150,7 +152,10 @@ class RunRecord:
 
     def on_demanded(self, arrival: Arrival) -> None:
         """Record the arrival of a vehicle."""
-        self._trips.add(arrival)
+        scenario = self._scenario
+        free_s = scenario.free_flow_trip_s(arrival.lane, arrival.destination)
+        entrance = scenario.entrance_of(arrival.lane)
+        self._trips.add(Trip(arrival, entrance=entrance, free_flow_s=round(free_s, 6)))
 
     def on_entered(self, vehicle: RecordedVehicle) -> None:
         """Record a vehicle that has entered the road."""
@@ -162,6 +167,7 @@ class RunRecord:
             vehicle=vehicle.name,
             lane=vehicle.arrival.lane,
             preferred_lane=vehicle.arrival.preferred_lane,
+            destination=vehicle.arrival.destination,
             formation=vehicle.formation,
         )
 
@@ -179,25 +185,32 @@ class RunRecord:
         )
 
     def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
-        """Record a vehicle that has passed the end of the road since the last tick.
+        """Record a vehicle that has left the road since the last tick, by its end or an exit.
 
         `attended`: whether the vehicle's agent was in charge, not a caretaker.
         """
         s_m, v_mps, _, y_m, _, _ = vehicle.state
-        beyond_m = s_m - self._scenario.road.length_m
-        left_s = t_s - beyond_m / v_mps if v_mps > 0 else t_s
-        lane = int(y_m // self._scenario.road.lane_width_m)
+        lane, arrival = int(y_m // self._scenario.road.lane_width_m), vehicle.arrival
+        section = self._exits.left_by(lane, s_m) or LaneSection(lane, to_m=s_m)
+        left_s = t_s - (s_m - section.to_m) / v_mps if v_mps > 0 else t_s
         trip = self._trips[Name(vehicle.name)]
         trip.left_s, trip.final_lane = left_s, lane
+        trip.exit = section.exit if section.to_m < self._scenario.road.length_m else END_OF_ROAD
+        at_destination = section.serves(arrival.preferred_lane, arrival.destination)
+        trip.at_destination = at_destination
         self._rung_ticks.update(vehicle.rung_ticks)
         self._left_unattended += not attended
-        preferred_lane = vehicle.arrival.preferred_lane
-        on_preferred_lane = vehicle.arrival.prefers(lane)
-        where = {"vehicle": vehicle.name, "lane": lane}
-        self.event(left_s, LEFT, **where, on_preferred_lane=on_preferred_lane)
-        if not on_preferred_lane:
-            lanes = {**where, "preferred_lane": preferred_lane}
-            self.event(left_s, LEFT_OFF_LANE, **lanes, attended=attended)
+        where = {"vehicle": vehicle.name, "lane": lane, "exit": trip.exit}
+        self.event(left_s, LEFT, **where, on_preferred_lane=at_destination)
+        if not at_destination:
+            self.event(
+                left_s,
+                LEFT_OFF_LANE,
+                **where,
+                preferred_lane=arrival.preferred_lane,
+                destination=arrival.destination,
+                attended=attended,
+            )
 
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Record that a vehicle has left the lattice at a dead end, or comes back; see `events`."""
@@ -297,6 +310,7 @@ class RunRecord:
                 entered=trips.num_rows - trips["entered_s"].null_count,
                 left=left,
                 on_preferred_lane=on_preferred_lane,
+                at_destination=on_preferred_lane,
                 peak=self._trajectories.peak,
                 left_off_lane=left - on_preferred_lane,
                 left_unattended=self._left_unattended,

@@ -17,8 +17,8 @@ from attrs import define
 from numpy.typing import NDArray
 
 from laneweave.protocol.config.scenario_files import to_tables
-from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.summary import TravelTime
+from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.summary import TravelTime, TripTimes
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 from laneweave.sim_bridge.road.demand import Arrival
@@ -44,6 +44,10 @@ _COLUMNS: list[pa.Field[Any]] = [
     pa.field("entry_delay_s", pa.float64()),
     pa.field("formation", pa.int32()),
     pa.field("counted", pa.bool_(), nullable=False),
+    pa.field("entrance", pa.string(), nullable=False),
+    pa.field("destination", pa.string(), nullable=False),
+    pa.field("exit", pa.string()),
+    pa.field("free_flow_s", pa.float64(), nullable=False),
 ]
 
 
@@ -56,6 +60,13 @@ class Trip:
     left_s: float | None = None
     formation: int | None = None
     final_lane: int | None = None
+    exit: str | None = None
+    """Name of the exit by which the vehicle has left, `END_OF_ROAD` at the end of the road."""
+    at_destination: bool | None = None
+    """None: it has not left."""
+    entrance: str = MAIN_ENTRANCE
+    free_flow_s: float = 0.0
+    """Time at v_F from the entrance to the destination."""
 
     def is_final(self, last_arrival_s: float) -> bool:
         """Return whether later arrivals do not change the row of the trip."""
@@ -66,13 +77,12 @@ class Trip:
         """Return the row of the trip; travel time includes waiting at the entrance."""
         demanded_s, entered_s, left_s = self.arrival.t_s, self.entered_s, self.left_s
         entered_in_time = entered_s is not None and WARM_UP_S <= entered_s <= last_arrival_s
-        lane = self.final_lane
         return {
             "vehicle": self.arrival.vehicle,
             "arrival_lane": self.arrival.lane,
             "preferred_lane": self.arrival.preferred_lane,
-            "final_lane": lane,
-            "on_preferred_lane": None if lane is None else self.arrival.prefers(lane),
+            "final_lane": self.final_lane,
+            "on_preferred_lane": self.at_destination,
             "demanded_s": demanded_s,
             "entered_s": entered_s,
             "left_s": left_s,
@@ -80,6 +90,10 @@ class Trip:
             "entry_delay_s": None if entered_s is None else entered_s - demanded_s,
             "formation": self.formation,
             "counted": left_s is not None and entered_in_time,
+            "entrance": self.entrance,
+            "destination": self.arrival.destination,
+            "exit": self.exit,
+            "free_flow_s": self.free_flow_s,
         }
 
 
@@ -110,10 +124,10 @@ class Trips:
         """Return the trip of a vehicle that is waiting or on the road."""
         return self._trips[vehicle]
 
-    def add(self, arrival: Arrival) -> None:
+    def add(self, trip: Trip) -> None:
         """Add the trip of a vehicle that arrives; write a row group if enough trips are final."""
-        self._trips[Name(arrival.vehicle)] = Trip(arrival)
-        self._last_arrival_s = max(self._last_arrival_s, arrival.t_s)
+        self._trips[Name(trip.arrival.vehicle)] = trip
+        self._last_arrival_s = max(self._last_arrival_s, trip.arrival.t_s)
         first = islice(self._trips.values(), ROWS_PER_GROUP)
         final = list(takewhile(lambda trip: trip.is_final(self._last_arrival_s), first))
         if len(final) == ROWS_PER_GROUP:
@@ -140,9 +154,30 @@ class Trips:
 
 def travel_time(trips: pa.Table) -> TravelTime:
     """Return statistics of the counted vehicles' travel times."""
-    times_s = trips.filter(pc.field("counted"))["travel_time_s"].to_numpy()
-    mean_s = finite(float(np.mean(times_s))) if len(times_s) else None
-    return TravelTime(mean=mean_s, **percentiles_of(times_s, 50, 95, largest=True))
+    counted = trips.filter(pc.field("counted"))
+    times_s = counted["travel_time_s"].to_numpy()
+    return TravelTime(
+        mean=finite(float(np.mean(times_s))) if len(times_s) else None,
+        **percentiles_of(times_s, 50, 95, largest=True),
+        n=len(times_s),
+        by_destination=_by(counted, "destination"),
+        by_entrance=_by(counted, "entrance"),
+    )
+
+
+def _by(counted: pa.Table, column: str) -> dict[str, TripTimes]:
+    """Return the times of counted trips by the values of a column."""
+    travel_s, free_s = (counted[name].to_numpy() for name in ("travel_time_s", "free_flow_s"))
+    values = np.array(counted[column].to_pylist(), dtype=object)
+    found = {}
+    for value in sorted(set(values)):
+        chosen = values == value
+        found[value] = TripTimes(
+            n=int(chosen.sum()),
+            mean=round(float(travel_s[chosen].mean()), 3),
+            delay=round(float((travel_s - free_s)[chosen].mean()), 3),
+        )
+    return found
 
 
 def throughput(trips: pa.Table, lanes: int) -> float | None:

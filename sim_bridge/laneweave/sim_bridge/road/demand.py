@@ -1,19 +1,20 @@
-"""Random arrivals at the start of the road.
+"""Random arrivals at the entrances of the road: its start, and ramps.
 
-In each lane the headway between two arrivals is
+In each lane in which vehicles enter, the headway between two arrivals is
 
     min_headway + Exp(3600 / volume - min_headway)      (mean 3600 / volume seconds),
 
-and the preferred lane of each vehicle is drawn from the scenario's lane shares, if there are any.
-Every lane has one random generator for headways and one for preferences, seeded with the scenario's
-seed. The same seed gives the same arrivals, arrivals in a lane do not depend on other lanes, and a
-longer duration only appends arrivals, without changing the names of earlier ones.
+and the destination of each vehicle, an exit or a preferred lane at the end of the road, is drawn
+from the scenario's shares. Every lane has one random generator for headways and one for
+destinations, seeded with the scenario's seed. The same seed gives the same arrivals, arrivals in a
+lane do not depend on other lanes, and a longer duration only appends arrivals, without changing the
+names of earlier ones.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import accumulate
 
 import numpy as np
@@ -21,7 +22,7 @@ from attrs import frozen
 from numpy.random import SeedSequence, default_rng
 
 from laneweave.protocol.config.participants import vehicle_name
-from laneweave.protocol.road_layout import ANY_LANE
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.scenario.fields import Scenario
 
 _HEADWAYS, _PREFERENCES = 0, 1
@@ -38,23 +39,22 @@ class Arrival:
     preferred_lane: int
     """Lane in which the vehicle wants to leave the road; `ANY_LANE`: no preference."""
     t_s: float
-    """Road time at which the vehicle would pass the start of an empty road."""
-
-    def prefers(self, lane: int) -> bool:
-        """Return whether the vehicle may leave the road in a lane."""
-        return self.preferred_lane in (lane, ANY_LANE)
+    """Road time at which the vehicle would pass its entrance on an empty road."""
+    destination: str = END_OF_ROAD
+    """Name of the exit by which the vehicle wants to leave the road, or `END_OF_ROAD`."""
 
 
 def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
     """Return the seeded arrivals in [0, demand.duration_s], sorted by time, then lane."""
     drawn = sorted(
-        (t_s, lane, preferred)
+        (t_s, lane, preferred, destination)
         for lane in range(scenario.road.lanes)
-        for t_s, preferred in _arrivals_in(lane, scenario)
+        if scenario.volume_veh_per_h(lane) > 0.0
+        for t_s, preferred, destination in _arrivals_in(lane, scenario)
     )
     return tuple(
-        Arrival(vehicle_name(number), lane, preferred, t_s)
-        for number, (t_s, lane, preferred) in enumerate(drawn, start=1)
+        Arrival(vehicle_name(number), lane, preferred, t_s, destination)
+        for number, (t_s, lane, preferred, destination) in enumerate(drawn, start=1)
     )
 
 
@@ -63,22 +63,36 @@ def count_until(stream: Sequence[Arrival], t_s: float) -> int:
     return bisect_right(stream, t_s, key=lambda arrival: arrival.t_s)
 
 
-def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int]]:
-    """Return (time [s], preferred lane) of each arrival in one lane."""
+def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int, str]]:
+    """Return (time [s], preferred lane, destination) of each arrival in one lane."""
     demand = scenario.demand
-    mean_excess_s = max(0.0, 3600.0 / demand.volume_veh_per_lane_h - demand.min_headway_s)
+    mean_excess_s = max(0.0, 3600.0 / scenario.volume_veh_per_h(lane) - demand.min_headway_s)
     headways, preferences = (
         default_rng(SeedSequence(scenario.seed, spawn_key=(purpose, lane)))
         for purpose in (_HEADWAYS, _PREFERENCES)
     )
-    shares = scenario.lane_shares
+    choices = list(_destinations(lane, scenario))
     # Drop the last bound: rounded to less than 1, it would exclude some draws in [0, 1).
-    bounds = np.array([*accumulate(shares)][:-1])
-    result: list[tuple[float, int]] = []
+    bounds = np.array([*accumulate(share for share, _, _ in choices)][:-1])
+    result: list[tuple[float, int, str]] = []
     t_s = 0.0
     while True:
         t_s += demand.min_headway_s + mean_excess_s * headways.standard_exponential()
         if t_s > demand.duration_s:
             return result
-        preferred = int(np.searchsorted(bounds, preferences.random(), side="right"))
-        result.append((float(t_s), preferred if shares else ANY_LANE))
+        number = int(np.searchsorted(bounds, preferences.random(), side="right"))
+        _, preferred, destination = choices[number]
+        result.append((float(t_s), preferred, destination))
+
+
+def _destinations(lane: int, scenario: Scenario) -> Iterator[tuple[float, int, str]]:
+    """Yield (share, preferred lane, destination) of the vehicles that enter in a lane."""
+    exits = scenario.destinations_of(lane)
+    to_end = 1.0 - sum(one.share for one in exits)
+    if scenario.lane_shares:
+        for preferred, share in enumerate(scenario.lane_shares):
+            yield to_end * share, preferred, END_OF_ROAD
+    else:
+        yield to_end, ANY_LANE, END_OF_ROAD
+    for one in exits:
+        yield one.share, scenario.exit_lane(one.exit), one.exit

@@ -1,9 +1,10 @@
-"""Entry metering at the start of the road.
+"""Entry metering at the start of the road and on ramps.
 
-A vehicle enters at s = 0 with the lattice speed v_F. Of the free cells of its lane behind its
-predecessor, it gets the first that passes s = 0 at most `spread_s` before or after the vehicle, and
-settles in this cell. With interlaced entry only every other cell may be entered, as in the paper's
-driving structure. Vehicles of a lane enter in order of arrival, at least one column's time apart.
+A vehicle enters with the lattice speed v_F, at s = 0 or at the beginning of a ramp. Of the free
+cells of its lane behind its predecessor, it gets the first that passes this position at most
+`spread_s` before or after the vehicle, and settles in this cell. With interlaced entry only every
+other cell may be entered, as in the paper's driving structure. Vehicles of a lane enter in order
+of arrival, at least one column's time apart.
 
 With formations, `formation_building` decides whether a formation admits a vehicle.
 
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 import math
 from bisect import insort
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 from attrs import frozen
 
@@ -30,12 +31,12 @@ TIME_TOLERANCE_S = 1e-9
 
 @frozen
 class Admission:
-    """Entry of a vehicle at s = 0 with speed v_F."""
+    """Entry of a vehicle at its entrance with speed v_F."""
 
     arrival: Arrival
     cell: Cell
     t_s: float
-    """Road time at which the vehicle passes s = 0."""
+    """Road time at which the vehicle passes the entrance."""
     offset_m: float = 0.0
     """Distance by which the vehicle is ahead of its cell."""
 
@@ -50,22 +51,25 @@ class EntryMeter:
         builder: FormationBuilder | None = None,
         *,
         interlaced: bool = False,
+        entry_m: Sequence[float] = (),
     ) -> None:
         """Start with an empty road at road time 0.
 
         Args:
             lattice: the lattice whose cells are assigned.
-            spread_s: maximum time between a vehicle and its cell at s = 0.
+            spread_s: maximum time between a vehicle and its cell at the entrance.
             builder: assigns entering vehicles to formations; None: no formations.
             interlaced: only every other cell may be entered.
+            entry_m: position of the entrance of each lane; empty: s = 0.
         """
+        self._entry_m = tuple(entry_m) or (0.0,) * lattice.lanes
         self._lattice = lattice
         self._builder = builder
         self._spread_s = spread_s
         self._interlaced = interlaced
         self._queues: list[list[Arrival]] = [[] for _ in range(lattice.lanes)]
         self._names: set[str] = set()
-        self._columns = [0] * lattice.lanes
+        self._columns = [int(s_m // lattice.pitch_m) for s_m in self._entry_m]
         """Next column of each lane that vehicles can enter."""
         self._free_s = [-math.inf] * lattice.lanes
         """Earliest time at which the next vehicle of each lane may enter."""
@@ -117,7 +121,7 @@ class EntryMeter:
             cell = (self._columns[lane], lane)
             arrival = self._dequeue(cell, t_s)
             if arrival is not None:
-                late_s = self._lattice.passing_time_s(cell[0]) - t_s
+                late_s = self._passing_time_s(cell[0], lane) - t_s
                 offset_m = late_s * self._lattice.speed_mps
                 admissions.append(Admission(arrival, cell, t_s, offset_m))
                 self._free_s[lane] = t_s + self._lattice.pitch_m / self._lattice.speed_mps
@@ -134,14 +138,18 @@ class EntryMeter:
             return math.inf
         ready_s = max(queue[0].t_s, self._free_s[lane])
         self._skip(lane, ready_s)
-        return max(ready_s, self._lattice.passing_time_s(self._columns[lane]) - self._spread_s)
+        return max(ready_s, self._passing_time_s(self._columns[lane], lane) - self._spread_s)
+
+    def _passing_time_s(self, column: int, lane: int) -> float:
+        """Return the road time at which a column passes the entrance of a lane."""
+        return self._lattice.passing_time_s(column, self._entry_m[lane])
 
     def _skip(self, lane: int, t_s: float) -> None:
         """Advance a lane to its first column that vehicles can enter at `t_s`."""
         lattice, column = self._lattice, self._columns[lane]
         if self._builder is not None:
             column = int(min(column, self._builder.first_open_column))
-        while lattice.passing_time_s(column) + self._spread_s < t_s or (
+        while self._passing_time_s(column, lane) + self._spread_s < t_s or (
             self._interlaced and not lattice.interlaced((column, lane))
         ):
             column -= 1

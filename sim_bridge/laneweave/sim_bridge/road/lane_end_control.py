@@ -17,7 +17,7 @@ from attrs import define, frozen
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import START_S, DeadEnd, LaneEnds, drive_out, lane_beside
-from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
+from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
 from laneweave.protocol.wire.messages import Name, OffLattice
 from laneweave.sim_bridge.bodies.motion_controller import (
     BESIDE_M,
@@ -50,11 +50,11 @@ class Gap:
 
 @frozen
 class LaneEndChange:
-    """A vehicle has left the lattice, begins to drive out, or has entered the lattice again."""
+    """What happens to a vehicle at the end of a lane."""
 
     vehicle: Name
     kind: str
-    """`LEFT_LATTICE`, `DRIVES_OUT` or `ENTERED_LATTICE`."""
+    """`LEFT_LATTICE`, `DRIVES_OUT`, `ENTERED_LATTICE` or `MISSED_EXIT`."""
     lane: int
 
 
@@ -65,6 +65,7 @@ class LaneEndControl:
         """Begin without vehicles."""
         self._meter = meter
         self._lattice = scenario.lattice
+        self._any = bool(LaneEnds(scenario))
         self._ends = tuple(LaneEnds(scenario))
         self._beside = {end: lane_beside(scenario, end) for end in self._ends}
         needed = drive_out(scenario) if self._ends else None
@@ -77,8 +78,8 @@ class LaneEndControl:
         self._gaps: dict[DeadEnd, list[Gap]] = {end: [] for end in self._ends}
         self._last_gap_column: list[float] = [math.inf] * scenario.road.lanes
         """Rearmost column of the last gap of each lane."""
-        self._end_of: dict[Name, DeadEnd] = {}
-        """Dead end at which each vehicle without cells waits or waited."""
+        self._end_of: dict[Name, DeadEnd | None] = {}
+        """Dead end at which each vehicle without cells waits or waited; None: its lane has none."""
 
     def is_kept_free(self, cell: Cell) -> bool:
         """Return whether a cell belongs to a gap."""
@@ -90,12 +91,16 @@ class LaneEndControl:
 
     def update(self, vehicles: Mapping[Name, RoadVehicle], t_s: float) -> Iterator[LaneEndChange]:
         """Advance to road time `t_s`; yield what has changed."""
-        if not self._ends:
+        if not self._any:
             return
         for name in [name for name in self._end_of if name not in vehicles]:
             self._forget(name)
         for name, vehicle in vehicles.items():
-            if vehicle.controller.has_lost_cell(t_s):
+            controller = vehicle.controller
+            missed = controller.has_missed_exit(t_s)
+            if missed and controller.return_to_origin():
+                yield LaneEndChange(name, MISSED_EXIT, controller.hold_cell[1])
+            elif missed or controller.has_lost_cell(t_s):
                 # While it drives out, a vehicle may come to another dead end.
                 self._forget(name)
                 yield self._take_off(name, vehicle)
@@ -144,7 +149,8 @@ class LaneEndControl:
         lane, s_m = vehicle.controller.hold_cell[1], vehicle.state[0]
         ends = [end for end in self._ends if end.lane == lane]
         # The first that the body has not passed.
-        self._end_of[name] = next((end for end in ends if s_m < end.reopens_m), ends[-1])
+        last = ends[-1] if ends else None
+        self._end_of[name] = next((end for end in ends if s_m < end.reopens_m), last)
         return LaneEndChange(name, LEFT_LATTICE, lane)
 
     def _waiting(self, end: DeadEnd, vehicles: Mapping[Name, RoadVehicle]) -> list[RoadVehicle]:

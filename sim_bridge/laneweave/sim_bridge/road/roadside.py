@@ -1,4 +1,4 @@
-"""The roadside at the entrance: admits vehicles, counts them, and publishes clock and census.
+"""The roadside at the entrances: admits vehicles, counts them, and publishes clock and census.
 
 The census is complete, so coordinators know all rosters.
 """
@@ -61,16 +61,18 @@ class Roadside:
         self._brake = EmergencyBrake(scenario)
         stopping_m = lattice.speed_mps**2 / -scenario.vehicle.min_accel_mps2
         self._room_m = scenario.vehicle.length_m + stopping_m + lattice.speed_mps + QUEUE_ROOM_M
-        """Distance from the entrance within which bodies may keep others from entering."""
+        """Distance from an entrance within which bodies may keep others from entering."""
         ahead_s = self._announce_s + self._tick_s
         self._announced_per_lane = math.ceil(ahead_s / formation.entry_spacing_s) + 1
         self._rolling = formation.rolling
+        self._length_m = scenario.road.length_m
         self._builder = formation_builder(scenario)
         self._meter = EntryMeter(
             lattice,
             formation.entry_spread_s,
             self._builder,
             interlaced=formation.interlaced,
+            entry_m=scenario.entry_m,
         )
         self._lane_ends = LaneEndControl(scenario, self._meter)
         self._closed: list[ClosedFormation] = []
@@ -83,7 +85,19 @@ class Roadside:
         with formations."""
         self._unassigned: list[Cell] = []
         """Empty cells without an owner."""
-        self._assigned_to = [1 + MAX_EMPTY] * self._lanes
+        self._entry_m = scenario.entry_m
+        """Where the cells of each lane are assigned."""
+        step_m = lattice.speed_mps * scenario.cycles_s[0] + scenario.vehicle.length_m
+        self._merging_m = {one.lane: one.merge_m + step_m for one in scenario.entrance}
+        """Where a queue on a ramp leaves room for merging, by lane."""
+        self._near_m = max(
+            self._room_m + max(self._entry_m),
+            scenario.vehicle.length_m + max(self._merging_m.values(), default=0.0),
+        )
+        """Position up to which bodies may keep others from entering."""
+        self._assigned_to = [
+            MAX_EMPTY + self._meter.closed_column(lane) for lane in range(self._lanes)
+        ]
         """Last column of each lane whose cells have been processed."""
         columns = int(scenario.moves_from_m / lattice.pitch_m)
         self._max_empty = max(0, min(MAX_EMPTY, columns - 2))
@@ -128,20 +142,31 @@ class Roadside:
         return admissions
 
     def _full_lanes(self, vehicles: Mapping[Name, RoadVehicle]) -> set[int]:
-        """Return the lanes in which a body at the entrance leaves too little room to brake."""
+        """Return the lanes in which a body at the entrance leaves too little room to brake.
+
+        A ramp is full, too, while a queue at its end leaves no room for merging.
+        """
         lattice, size = self._lattice, self._size
         entering = (0.0, lattice.speed_mps, 0.0, 0.0, 0.0, 0.0)
-        full = set()
+        full = set[int]()
         for vehicle in vehicles.values():
             s_m, speed_mps, accel_mps2, y_m, _, _ = vehicle.state
-            if s_m > self._room_m:
+            if s_m > self._near_m:
                 continue
-            body = Neighbour(0, s_m - size.length_m, speed_mps, accel_mps2)
-            spare_m = self._brake.spare_m(entering, 0.0, (0.0, 0.0), [body])
-            slow = speed_mps < 0.5 * lattice.speed_mps
-            if spare_m < (QUEUE_ROOM_M if slow else 0.0):
-                first, last = lattice.lanes_touched(y_m, size.width_m)
-                full |= {*range(first, last + 1)}
+            first, last = lattice.lanes_touched(y_m, size.width_m)
+            waits = vehicle.controller.off_lattice is not None
+            for lane in {*range(first, last + 1)} - full:
+                beyond_m = s_m - self._entry_m[lane]
+                if waits and s_m - size.length_m < self._merging_m.get(lane, -math.inf):
+                    full.add(lane)
+                    continue
+                if not 0.0 <= beyond_m <= self._room_m:
+                    continue
+                body = Neighbour(0, beyond_m - size.length_m, speed_mps, accel_mps2)
+                spare_m = self._brake.spare_m(entering, 0.0, (0.0, 0.0), [body])
+                slow = speed_mps < 0.5 * lattice.speed_mps
+                if spare_m < (QUEUE_ROOM_M if slow else 0.0):
+                    full.add(lane)
         return full
 
     def close_formations(self, t_s: float) -> list[ClosedFormation]:
@@ -176,7 +201,7 @@ class Roadside:
             self._assigned_to[lane] = closed
         unassigned, self._unassigned = self._unassigned, []
         for cell in unassigned:
-            if cell[0] <= max(self._assigned_to) + 2 * self._max_empty:
+            if cell[0] <= self._assigned_to[cell[1]] + 2 * self._max_empty:
                 self._assign(cell, vehicles)
 
     def _assign(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
@@ -186,7 +211,9 @@ class Roadside:
         near = [
             (entered < column, number != lane, abs(entered - column), name)
             for entered, number, name in self._recent
-            if first <= entered <= last and name in vehicles
+            if first <= entered <= last
+            and name in vehicles
+            and vehicles[name].controller.off_lattice is None
         ]
         if near:
             vehicles[min(near)[-1]].controller.assign_cell(cell)
@@ -195,7 +222,7 @@ class Roadside:
 
     def _store_recent(self, column: int, lane: int, name: Name) -> None:
         """Add an entered vehicle to the recent ones, and drop those far ahead of it."""
-        far = column + 2 * self._max_empty
+        far = max(self._assigned_to) + 2 * self._max_empty
         self._recent = [one for one in self._recent if one[0] <= far]
         self._recent.append((column, lane, name))
 
@@ -210,10 +237,34 @@ class Roadside:
         self._census_changed |= bool(changes)
         return changes
 
-    def count_left(self) -> None:
-        """Count a vehicle that has passed the end of the road."""
+    def on_left(
+        self, vehicle: RoadVehicle, vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> None:
+        """Count a vehicle that has left the road, and pass its cells on (rolling operation).
+
+        Args:
+            vehicle: the vehicle that has left. No later plan can contain it, so the cells that it
+                owns whichever way its pending transfer resolves can be assigned again.
+            vehicles: the vehicles on the road.
+            t_s: road time.
+        """
         self._left += 1
         self._census_changed = True
+        lattice = self._lattice
+        on_lattice = [one for one in vehicles.values() if one.controller.off_lattice is None]
+        if not self._rolling or not on_lattice:
+            return
+        for column, lane in sorted(vehicle.controller.certain_cells):
+            if lattice.cell_s_m(column, t_s) < self._length_m:
+                near = min(
+                    on_lattice,
+                    key=lambda one: (
+                        abs(one.controller.hold_cell[0] - column),
+                        abs(one.controller.hold_cell[1] - lane),
+                        one.name,
+                    ),
+                )
+                near.controller.assign_cell((column, lane))
 
     def publish(
         self, tick: int, t_s: float, on_road: Collection[RoadVehicle], *, ended: bool = False
@@ -269,6 +320,7 @@ class Roadside:
                     preferred_lane=vehicle.admission.arrival.preferred_lane,
                     entered_s=vehicle.admission.t_s,
                     off_lattice=off_lattice.get(vehicle.name),
+                    destination=Name(vehicle.admission.arrival.destination),
                 )
                 for vehicle in vehicles
             ),

@@ -63,6 +63,11 @@ class RoadVehicle:
         return self.controller.plant.state
 
     @property
+    def body_lane(self) -> int:
+        """Lane in which the centre of the body is."""
+        return int(self.state[3] // self.controller.lattice.lane_width_m)
+
+    @property
     def block(self) -> int:
         """Number of the block in which the vehicle entered."""
         return self.controller.lattice.block_of(self.admission.cell[0])
@@ -79,7 +84,7 @@ class RoadVehicle:
 
     @property
     def entered_s(self) -> float:
-        """Road time at which the front passed s = 0."""
+        """Road time at which the front passed the entrance."""
         return self.admission.t_s
 
     @property

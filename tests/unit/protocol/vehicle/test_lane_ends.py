@@ -40,7 +40,7 @@ def with_closures(*closures: Closure) -> Scenario:
 def test_a_road_without_closures_has_no_dead_ends() -> None:
     assert dead_ends(ROLLING) == ()
     assert not LaneEnds(ROLLING)
-    assert sections_to_lines(ROLLING) == ROLLING.road.sections
+    assert sections_to_lines(ROLLING) == ROLLING.sections
     assert open_sections(2, 500.0) == (
         LaneSection(0, -INF, 500.0, "lane-0"),
         LaneSection(1, -INF, 500.0, "lane-1"),

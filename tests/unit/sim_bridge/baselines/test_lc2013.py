@@ -59,7 +59,7 @@ def drive(scenario: Scenario, folder: Path) -> dict[ReferenceVehicle, float]:
             traffic.step(t_s, entrance)
             poses = traffic.poses()
             bodies = Bodies(poses, size.length_m, size.width_m)
-            assert bodies.overlapping_pairs() == bodies.in_closed_lanes(road) == []
+            assert bodies.overlapping_pairs() == bodies.in_closed_lanes(scenario) == []
             assert traffic.collisions() == []
             for name, pose in poses.items():
                 assert_continuous(before.get(name, pose), pose, scenario)

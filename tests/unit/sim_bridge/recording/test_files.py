@@ -10,7 +10,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from attrs import astuple
 
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import Safety, TravelTime
@@ -42,7 +41,10 @@ def trip(
     """Return one vehicle's trip; lanes: arrival, preferred, final."""
     arrival = Arrival(f"v{number:04d}", lanes[0], lanes[1], demanded_s)
     formation = None if entered_s is None else number // 6
-    return Trip(arrival, entered_s, left_s, formation, None if left_s is None else lanes[2])
+    if left_s is None:
+        return Trip(arrival, entered_s, None, formation)
+    at_destination = lanes[2] == lanes[1]
+    return Trip(arrival, entered_s, left_s, formation, lanes[2], "end", at_destination)
 
 
 def table(*trips: Trip) -> pa.Table:
@@ -101,6 +103,10 @@ def test_trips_have_every_state() -> None:
         "entry_delay_s": 2.5,
         "formation": 0,
         "counted": True,
+        "entrance": "main",
+        "destination": "end",
+        "exit": "end",
+        "free_flow_s": 0.0,
     }
     assert [row["counted"] for row in rows] == [False, True, False, False]
     assert [row["on_preferred_lane"] for row in rows] == [True, False, None, None]
@@ -117,14 +123,19 @@ def test_only_vehicles_between_warm_up_and_last_arrival_count() -> None:
     )
     times_s = [61.0 + number for number in range(2, 12)]
     expected = [np.mean(times_s), np.median(times_s), np.percentile(times_s, 95), 72.0]
-    assert astuple(travel_time(found)) == pytest.approx(tuple(expected))
+    times = travel_time(found)
+    assert (times.mean, times.p50, times.p95, times.max) == pytest.approx(tuple(expected))
+    assert times.n == 10
     # Ten counted vehicles leave at 122, 133, ... 221 s: one in 11 s, over three lanes.
     assert throughput(found, 3) == pytest.approx(3600 / 11 / 3, abs=1e-3)
 
 
 @pytest.mark.parametrize("trips", [(), (trip(1, 1.0, 2.0, 70.0),)], ids=["empty", "short"])
 def test_a_run_without_counted_vehicles_has_no_figures(trips: tuple[Trip, ...]) -> None:
-    assert travel_time(table(*trips)) == TravelTime(mean=None, p50=None, p95=None, max=None)
+    none = TravelTime(
+        mean=None, p50=None, p95=None, max=None, n=0, by_destination={}, by_entrance={}
+    )
+    assert travel_time(table(*trips)) == none
     assert throughput(table(*trips), 3) is None
 
 
@@ -136,19 +147,21 @@ def test_trips_are_written_in_order_of_arrival_as_soon_as_they_are_final(
     expected = [trip(n, 60.0 + n, 60.5 + n, 130.0 + n if n != 14 else None) for n in range(20)]
     with closing(Trips(path, METADATA)) as trips:
         for number, done in enumerate(expected):
-            trips.add(done.arrival)
+            trips.add(Trip(done.arrival))
             mine = trips[Name(done.arrival.vehicle)]
             mine.entered_s, mine.formation = done.entered_s, done.formation
             if number >= 2:
                 gone = expected[number - 2]
                 old = trips[Name(gone.arrival.vehicle)]
                 old.left_s, old.final_lane = gone.left_s, gone.final_lane
+                old.exit, old.at_destination = gone.exit, gone.at_destination
         # The vehicle that is still on the road delays the trips of those behind it.
         assert pq.read_table(path).num_rows == 12
         assert len(trips._trips) == 8
     rows = table(*expected).to_pylist()
     for row in rows[-2:]:
         row.update(dict.fromkeys(("left_s", "final_lane", "on_preferred_lane", "travel_time_s")))
+        row["exit"] = None
         row["counted"] = False
     assert trips.table().to_pylist() == rows
     assert rows[12]["counted"]

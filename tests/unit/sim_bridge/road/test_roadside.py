@@ -18,6 +18,7 @@ from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.paper import closing_time_s, paper
+from support.road_vehicles import vehicle_in
 
 
 def crowded(operation: str = "paper", **runtime: Any) -> Scenario:  # noqa: ANN401 (fields)
@@ -165,7 +166,7 @@ def test_the_census_lists_the_road_as_it_was_entered() -> None:
 
 def test_the_clock_has_the_counts() -> None:
     roadside = Roadside(Scenario())
-    roadside.count_left()
+    roadside.on_left(vehicle_in((0, 1)), {}, 1.0)
     clock = roadside.clock(5, 0.5, 7, ended=True)
     assert clock == RoadClock(5, 0.5, demanded=0, entered=0, on_road=7, left=1, ended=True)
 

@@ -227,7 +227,8 @@ def _sections(road: StreamRoad, at_m: Floats) -> tuple[NDArray[np.int16], Bools,
             begun = at_m >= from_m - ROUNDING_M
             section[:, lane][begun] = number
             left[:, lane][begun] = (at_m > to_m + ROUNDING_M)[begun]
-            rear = at_m[:-1] - road.body_m >= max(start_m, from_m) - ROUNDING_M
+            moves_m = max(start_m, from_m, road.sections[number].moves_from_m)
+            rear = at_m[:-1] - road.body_m >= moves_m - ROUNDING_M
             front = at_m[1:] <= min(end_m, to_m) + ROUNDING_M
             is_open[:, lane] |= rear & front
     return section, left, is_open

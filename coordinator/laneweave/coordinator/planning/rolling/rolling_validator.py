@@ -92,8 +92,9 @@ def _problems_of_move(
     for lane in {here[1], there[1]} & {*range(road.lanes)}:
         # A section must be open for the whole body and the whole slot.
         if not any(
-            from_m <= rear_m + ROUNDING_M and front_m <= to_m + ROUNDING_M
-            for from_m, to_m, _ in road.lane_sections[lane]
+            max(from_m, road.sections[number].moves_from_m) <= rear_m + ROUNDING_M
+            and front_m <= to_m + ROUNDING_M
+            for from_m, to_m, number in road.lane_sections[lane]
         ):
             yield f"{name} moves between {rear_m} m and {front_m} m, where lane {lane} is closed"
 

@@ -54,8 +54,10 @@ class Entrance(Protocol):
     ) -> Sequence[LaneEndChange]:
         """Take vehicles off the lattice whose lanes end, and bring them back."""
 
-    def count_left(self) -> None:
-        """Count a vehicle that has left the road."""
+    def on_left(
+        self, vehicle: RoadVehicle, vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> None:
+        """Count a vehicle that has left the road, and pass its cells on."""
 
     def publish(self, tick: int, t_s: float, on_road: Collection[RoadVehicle]) -> Iterator[Effect]:
         """Publish clock and census."""
@@ -126,8 +128,11 @@ class DrawnEntrance:
         del vehicles, t_s
         return ()
 
-    def count_left(self) -> None:
+    def on_left(
+        self, vehicle: RoadVehicle, vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> None:
         """Publish a census soon."""
+        del vehicle, vehicles, t_s
         self._census_due_tick = 0
 
     def publish(self, tick: int, t_s: float, on_road: Collection[RoadVehicle]) -> Iterator[Effect]:

@@ -17,6 +17,7 @@ from laneweave.launch.fault_search.checks.claims import Stored
 from laneweave.launch.fault_search.road.drawn_entrance import Entrance
 from laneweave.launch.fault_search.road.stand_ins import LightVehicle, Visit
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
@@ -32,7 +33,7 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.wire.bounds import check_ballot
-from laneweave.protocol.wire.events import DRIVES_OUT, LEFT_LATTICE
+from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare
 from laneweave.protocol.wire.topics import BRIDGE_ALIVE, COMMAND, SENSE, VEHICLE_ALIVE
 from laneweave.sim_bridge.road.attendance import Absence, Attendance
@@ -102,6 +103,7 @@ class LightRoad:
         self._attendance = Attendance(scenario, new_incarnation)
         self._bounds = scenario.runtime.bounds(bridge)
         self._lane_ends = LaneEnds(scenario)
+        self._exits = Exits(scenario.sections, scenario.road.length_m)
 
     @property
     def wakeup_s(self) -> float:
@@ -230,12 +232,17 @@ class LightRoad:
                 vehicle.body.stop_at(math.inf if end is None else end.line_m)
             elif change.kind == DRIVES_OUT:
                 vehicle.body.drive_out(cell, self.t_s, DRIVE_OUT_S)
-            else:
+            elif change.kind == ENTERED_LATTICE:
                 self._checker.enter(now_s, change.vehicle, cell, vehicle.block)
 
     def _check_lane(self, name: Name, vehicle: LightVehicle, now_s: float) -> None:
-        """Report a body in a lane that has ended."""
+        """Report a body in a lane that has ended, or in two lanes that have parted at an exit."""
         s_m, _, _, y_m, _, _ = vehicle.body.state
+        touched = self._scenario.lattice.lanes_touched(y_m, self._scenario.vehicle.width_m)
+        for lane in touched if touched[0] != touched[1] else ():
+            exit_lane = self._lane_ends.exit_ahead(lane, s_m)
+            if exit_lane is not None and s_m > exit_lane.end_m:
+                self._checker.beyond_end(now_s, name, f"in lanes {touched} at {s_m:.1f} m")
         end = self._lane_ends.ahead(int(y_m // self._scenario.road.lane_width_m), s_m)
         if end is not None and s_m > end.end_m:
             self._checker.beyond_end(
@@ -257,18 +264,18 @@ class LightRoad:
         self._checker.store(now_s, name, stored)
 
     def _let_leave(self, now_s: float) -> Iterator[Effect]:
-        length_m = self._scenario.road.length_m
         leaving = [
             name
             for name, each in self.vehicles.items()
-            if each.leaves_by(self.t_s) or each.body.state[0] > length_m
+            if each.leaves_by(self.t_s)
+            or self._exits.left_by(each.body_lane, each.body.state[0]) is not None
         ]
         for name in leaving:
             vehicle = self.vehicles.pop(name)
             yield from self._attendance.leave(vehicle)
             if vehicle.controller.off_lattice is None:
                 self._checker.leave(now_s, name)
-            self._entrance.count_left()
+            self._entrance.on_left(vehicle, self.vehicles, self.t_s)
         yield from self._attendance.notify_departed(self.tick)
 
     def _attend(self, now_s: float) -> Iterator[Effect]:

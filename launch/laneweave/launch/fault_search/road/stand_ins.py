@@ -222,6 +222,14 @@ class LightPlanner:
         self._lanes = road.lanes
         self._sections = road.sections
         self._some_end = any(not section.exit for section in road.sections)
+        self._edges = {
+            section.lane: section
+            for section in road.sections
+            if section.moves_from_m > -math.inf
+            or section.from_m > 0.0
+            or (section.exit and section.to_m < road.length_m)
+        }
+        """Lanes in which lane changes begin or end in the middle of the road."""
         self._steps = [step for step in displacements(road.mode) if step != (0, 0)]
         self._seed = scenario.seed
 
@@ -258,12 +266,22 @@ class LightPlanner:
             cell
             for cell in cells
             if 0 <= cell[1] < self._lanes
+            and all(self._is_open(slot, vehicle.cell, cell, each) for each in (lane, cell[1]))
             and not (self._some_end and self._road.has_left(slot + 1, cell))
             and taken.isdisjoint(footprint(vehicle.cell, cell) - {vehicle.cell})
         ]
         if not free:
             return None
         return min(free, key=lambda cell: (self._away(vehicle, cell), rng.random()))
+
+    def _is_open(self, slot: int, origin: Cell, target: Cell, lane: int) -> bool:
+        """Return whether a move stays where moves are possible in a lane, if it is an edge."""
+        section, road = self._edges.get(lane), self._road
+        if section is None:
+            return True
+        rear_m = road.position_m(slot, min(origin[0], target[0])) - road.body_m
+        front_m = road.position_m(slot + 1, max(origin[0], target[0]))
+        return max(section.from_m, section.moves_from_m) <= rear_m and front_m <= section.to_m
 
     def _away(self, vehicle: StreamVehicle, cell: Cell) -> int:
         """Return the number of lanes from a cell to the nearest target."""

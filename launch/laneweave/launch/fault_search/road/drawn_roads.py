@@ -1,0 +1,68 @@
+"""Roads whose lanes end, join or leave, drawn at random (rolling operation at the real roadside).
+
+One lane at an edge of the road is special: it ends, is blocked, comes from a ramp, leads to an
+exit, or both.
+"""
+
+from __future__ import annotations
+
+import random
+
+from attrs import frozen
+
+from laneweave.protocol.scenario.fields import Closure, Entrance, Exit
+
+KINDS = ("drop", "blocked", "on-ramp", "on-ramp", "off-ramp", "weaving", "weaving")
+"""Kinds to draw from."""
+RAMP_M = (30.0, 120.0)
+"""Range of the lengths of ramps. Bodies enter in their cells, so they need not settle."""
+WEAVING_STEPS = (2.0, 6.0)
+"""Range of the distances in which vehicles change to or from the special lane, in slots at v_F."""
+AFTER_M = 60.0
+"""Distance beyond, which plans do not use (`drive_out` needs 50 m)."""
+BLOCKED_M = (30.0, 120.0)
+VOLUME_VEH_PER_H = 800.0
+"""A volume for the fields of ramps; the arrivals are drawn elsewhere."""
+EXIT = "off-ramp"
+
+
+@frozen
+class DrawnRoad:
+    """Closed parts, ramps and exits of a road."""
+
+    closures: tuple[Closure, ...] = ()
+    entrance: tuple[Entrance, ...] = ()
+    exit: tuple[Exit, ...] = ()
+
+
+STRAIGHT_ROAD = DrawnRoad()
+
+
+def draw_road(lanes: int, moves_from_m: float, step_m: float, rng: random.Random) -> DrawnRoad:
+    """Draw a road.
+
+    Args:
+        lanes: number of lanes, at least 2.
+        moves_from_m: position from which vehicles move.
+        step_m: distance at v_F in a slot.
+        rng: source of all draws.
+    """
+    kind, lane = rng.choice(KINDS), rng.choice((0, lanes - 1))
+    length_m = rng.uniform(*WEAVING_STEPS) * step_m + AFTER_M
+    if kind in ("drop", "blocked"):
+        end_m = round(moves_from_m + length_m, 1)
+        if kind == "drop":
+            return DrawnRoad((Closure(lane, end_m),))
+        return DrawnRoad((Closure(lane, end_m, round(end_m + rng.uniform(*BLOCKED_M), 1)),))
+    if kind == "off-ramp":
+        opens_m = round(rng.uniform(0.5, 2.0) * moves_from_m, 1)
+        end_m = round(max(opens_m, moves_from_m) + length_m, 1)
+        closures = Closure(lane, 0.0, opens_m), Closure(lane, end_m)
+        return DrawnRoad(closures, exit=(Exit(EXIT, (lane,), end_m),))
+    at_m = round(rng.uniform(*RAMP_M), 1)
+    merge_m = round(at_m + rng.uniform(*RAMP_M), 1)
+    end_m = round(max(merge_m, moves_from_m) + length_m, 1)
+    closures = Closure(lane, 0.0, at_m), Closure(lane, end_m)
+    entrance = (Entrance("on-ramp", lane, at_m, merge_m, VOLUME_VEH_PER_H),)
+    exits = (Exit(EXIT, (lane,), end_m),) if kind == "weaving" else ()
+    return DrawnRoad(closures, entrance, exits)
