@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from attrs import define, evolve, field
 
-from laneweave.protocol.scenario.fields import Closure, Road, Scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.road_layout import Exits
+from laneweave.protocol.scenario.fields import Closure, DestinationShare, Road, Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose, pose_of
@@ -26,6 +28,39 @@ BLOCKED = road_with(Closure(1, 600.0, 700.0))
 """Lane 1 of three is closed from 600 to 700 m."""
 
 
+def ramp_road(
+    *, ends_m: float = 500.0, exit_name: str = "", share: float = 0.2, **more: dict[str, object]
+) -> Scenario:
+    """Return four lanes: lane 0 is a ramp from 50 to 200 m, and ends, by an exit if it has a name.
+
+    `share`: share of the other vehicles that leave by the exit.
+    """
+    data: dict[str, object] = {
+        "road": {
+            "lanes": 4,
+            "s1_m": 50.0,
+            "s2_m": 100.0,
+            "s3_m": 850.0,
+            "closures": [{"lane": 0, "to_m": 50.0}, {"lane": 0, "from_m": ends_m}],
+        },
+        "entrance": [
+            {"name": "on", "lane": 0, "at_m": 50.0, "merge_m": 200.0, "volume_veh_per_h": 600.0}
+        ],
+        "demand": {"volume_veh_per_lane_h": 900.0, "duration_s": 60.0},
+        "formation": {"operation": "rolling"},
+    }
+    if exit_name:
+        data["exit"] = [{"name": exit_name, "lanes": [0], "at_m": ends_m}]
+    scenario = parse_scenario(data)
+    if exit_name:
+        destinations = (DestinationShare(exit_name, share),)
+        demand = evolve(scenario.demand, destinations=destinations)
+        scenario = evolve(scenario, demand=demand)
+    for table, fields in more.items():
+        scenario = evolve(scenario, **{table: evolve(getattr(scenario, table), **fields)})
+    return scenario
+
+
 @define
 class LonelyRoad:
     """Vehicles at the real roadside that no agent drives: they hold, and nothing else happens."""
@@ -36,6 +71,8 @@ class LonelyRoad:
     tick: int = 0
     left: list[tuple[Name, float]] = field(factory=list)
     """Vehicles that have left the road, and when."""
+    exits: dict[Name, str] = field(factory=dict)
+    """Exits by which vehicles have left."""
     overlaps: list[tuple[float, str, str]] = field(factory=list)
     events: list[tuple[float, str, Name]] = field(factory=list)
     """Changes at the ends of lanes."""
@@ -61,10 +98,14 @@ class LonelyRoad:
         for vehicle in self.vehicles.values():
             vehicle.step(self.tick)
         self.tick += 1
+        exits = Exits(scenario.sections, scenario.road.length_m)
         for name, vehicle in list(self.vehicles.items()):
-            if vehicle.state[0] >= scenario.road.length_m:
+            section = exits.left_by(vehicle.body_lane, vehicle.state[0])
+            if section is not None:
                 self.left.append((name, self.t_s))
+                self.exits[name] = section.exit
                 del self.vehicles[name]
+                self.roadside.on_left(vehicle, self.vehicles, self.t_s)
         self.sense()
 
     def sense(self) -> None:

@@ -236,12 +236,18 @@ class AgentCore:
     def _has_lost_track(self, sense: Sense) -> bool:
         """Return whether the vehicle holds a cell to which this process has not moved it.
 
-        It has left the lattice and entered it again while no SENSE arrived.
+        It has left the lattice and entered it again while no SENSE arrived, or it is too late for
+        the move that this process has begun or may begin.
         """
         execution, move = self.execution, self._move
-        if execution is None or not self._lane_ends or sense.hold_cell == execution.hold_cell:
+        if execution is None or not self._lane_ends:
             return False
-        return move is None or sense.hold_cell != move[1]
+        if sense.hold_cell == execution.hold_cell:
+            # An open gate for a move that can no longer begin would keep leaders waiting.
+            move = execution.next_move if execution.go and not execution.moving else None
+        elif move is None or sense.hold_cell != move[1]:
+            return True
+        return move is not None and self._lane_ends.too_late_to_move(move[1], move[2], sense.t_s)
 
     def _wait(self, sense: Sense) -> list[Effect]:
         """Keep the claim on a vehicle without a cell, which its motion controller drives alone."""

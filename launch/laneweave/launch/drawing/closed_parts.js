@@ -1,15 +1,16 @@
 "use strict";
 // Closed parts of lanes, as a layer of the road (laneweave/launch/web/road.js). The road of the scene
-// has `closed` [[lane, from, to], ...] and `stop_lines` [[lane, s], ...], in m.
+// has `closed` [[lane, from, to], ...], `stop_lines` [[lane, s], ...] and `ramps` [[lane left of the
+// edge, from, to], ...], in m.
 
 const laneweaveClosed = (() => {
   const HATCH_PX = 7; // distance between the lines of the hatching
   const LINE_PX = 3; // width of stop lines
 
-  /** Draw closed parts with hatching, and the stop lines before them. */
+  /** Draw closed parts with hatching, the stop lines before them, and the edges of ramps. */
   function closedParts(painter) {
     const { pen, theme } = painter;
-    const { closed, stop_lines: stopLines, lane_width_m: width } = painter.scene.road;
+    const { closed, ramps, stop_lines: stopLines, lane_width_m: width } = painter.scene.road;
     const high = painter.y(0) - painter.y(width);
     for (const [lane, from, to] of closed) {
       if (painter.shows(from, to)) hatch(painter, from, to, painter.y((lane + 1) * width), high);
@@ -22,6 +23,10 @@ const laneweaveClosed = (() => {
       const x = Math.max(LINE_PX / 2, Math.min(painter.width - LINE_PX / 2, painter.x(s)));
       const top = painter.y((lane + 1) * width);
       laneweaveRoad.line(pen, x, top, x, top + high);
+    }
+    for (const [lane, from, to] of ramps ?? []) {
+      const y = painter.y(lane * width);
+      laneweaveRoad.line(pen, painter.x(from), y, painter.x(to), y);
     }
   }
 

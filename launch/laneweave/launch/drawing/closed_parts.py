@@ -42,6 +42,14 @@ def closed_parts(scenario: Scenario) -> tuple[ClosedPart, ...]:
     )
 
 
+def ramp_edges(scenario: Scenario) -> tuple[tuple[int, float, float], ...]:
+    """Return the edge of each ramp towards the road: (number of the lane left of it, from, to)."""
+    middle = scenario.road.lanes / 2
+    return tuple(
+        (one.lane + (one.lane < middle), one.at_m, one.merge_m) for one in scenario.entrance
+    )
+
+
 def describe_closed_parts(scenario: Scenario) -> str:
     """Return a sentence for each closed part of the road; empty: there is none."""
     lanes, length_m = scenario.road.lanes, scenario.road.length_m
@@ -52,4 +60,13 @@ def describe_closed_parts(scenario: Scenario) -> str:
             name = f"The {lane_names(lanes)[part.lane]} lane"
         end = f"{part.to_m:g} m" if part.to_m < length_m else "the end of the road"
         sentences.append(f"{name} is closed from {part.from_m:g} m to {end}.")
+    sentences += [
+        f"Vehicles enter by {one.name} in lane {one.lane} at {one.at_m:g} m; it joins the road at "
+        f"{one.merge_m:g} m."
+        for one in scenario.entrance
+    ]
+    sentences += [
+        f"They leave by {one.name} in lane {', '.join(map(str, one.lanes))} at {one.at_m:g} m."
+        for one in scenario.exit
+    ]
     return " ".join(sentences)

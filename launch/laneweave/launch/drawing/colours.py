@@ -52,8 +52,12 @@ def vehicle_colour(lanes: int, preferred_lane: int) -> str:
 
 def vehicle_legend(scenario: Scenario) -> tuple[tuple[str, str], ...]:
     """Return the colours of vehicles and their meanings, from the left lane."""
-    if not scenario.lane_shares:
-        return ((NEUTRAL, "no preferred lane"),)
     lanes = scenario.road.lanes
+    if not scenario.lane_shares:
+        exits = tuple(
+            (vehicle_colour(lanes, scenario.exit_lane(one.name)), f"leaves by {one.name}")
+            for one in scenario.exit
+        )
+        return (*exits, (NEUTRAL, "leaves at the end" if exits else "no preferred lane"))
     entries = zip(lane_colours(lanes), lane_names(lanes), strict=True)
     return tuple((colour, f"prefers {name}") for colour, name in entries)[::-1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from laneweave.launch.drawing.closed_parts import closed_parts
+from laneweave.launch.drawing.closed_parts import closed_parts, ramp_edges
 from laneweave.launch.drawing.colours import (
     NEUTRAL,
     SHADE_STRENGTH,
@@ -25,6 +25,7 @@ def road_scene(scenario: Scenario) -> dict[str, Any]:
             "lanes": road.lanes,
             "lane_width_m": road.lane_width_m,
             "sorting_start_m": road.sorting_start_m,
+            "ramps": [list(edge) for edge in ramp_edges(scenario)],
             "closed": [[part.lane, part.from_m, part.to_m] for part in closed],
             "stop_lines": [[part.lane, part.line_m] for part in closed if part.line_m is not None],
         },
@@ -33,7 +34,7 @@ def road_scene(scenario: Scenario) -> dict[str, Any]:
         "shade": {"span_mps": SPEED_SPAN_MPS, "strength": SHADE_STRENGTH},
         "colours": list(lane_colours(road.lanes)),
         "neutral": NEUTRAL,
-        "preferences": bool(scenario.lane_shares),
+        "preferences": bool(scenario.lane_shares or scenario.exit),
         "legend": [list(entry) for entry in vehicle_legend(scenario)],
     }
 

@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from laneweave.launch.drawing.closed_parts import CLOSED_FILL, CLOSED_HATCH, closed_parts
+from laneweave.launch.drawing.closed_parts import (
+    CLOSED_FILL,
+    CLOSED_HATCH,
+    closed_parts,
+    ramp_edges,
+)
 from laneweave.launch.drawing.colours import (
     NEUTRAL,
     SHADE_STRENGTH,
@@ -103,6 +108,14 @@ def default_stretch_m(scenario: Scenario) -> tuple[float, float]:
     beyond the beginning of the first one, and, if that is short, beyond its end.
     """
     road = scenario.road
+    places_m = [one.merge_m for one in scenario.entrance] + [one.at_m for one in scenario.exit]
+    if places_m:
+        edges_m = [edge_m for one in road.closures for edge_m in (one.from_m, one.to_m)]
+        inner_m = [edge_m for edge_m in edges_m if min(places_m) < edge_m < road.length_m]
+        opens_m = [edge_m for edge_m in edges_m if 0.0 < edge_m < min(places_m)]
+        first_m = min(places_m) if scenario.entrance or not opens_m else max(opens_m)
+        start_m, end_m = first_m - _BEYOND_M, max([*places_m, *inner_m]) + _BEYOND_M
+        return max(0.0, start_m, end_m - _MAX_STRETCH_M), min(road.length_m, end_m)
     start_m, length_m = max(0.0, road.sorting_start_m - 20.0), 320.0
     if closed := closed_parts(scenario):
         first = min(closed, key=lambda part: part.from_m)
@@ -151,7 +164,7 @@ def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -
 
 
 def _draw_closed_parts(axes: Axes, scenario: Scenario) -> None:
-    """Draw closed parts with hatching, and the stop lines before them."""
+    """Draw closed parts with hatching, the stop lines before them, ramps and exits."""
     from matplotlib.patches import Rectangle  # noqa: PLC0415 - lazily
 
     width_m = scenario.road.lane_width_m
@@ -161,6 +174,12 @@ def _draw_closed_parts(axes: Axes, scenario: Scenario) -> None:
         if part.line_m is not None:
             lane_m = (corner[1], corner[1] + width_m)
             axes.plot([part.line_m] * 2, lane_m, color=INK, linewidth=1.6, zorder=2)
+    for lane, from_m, to_m in ramp_edges(scenario):
+        axes.plot([from_m, to_m], [lane * width_m] * 2, color=INK, linewidth=1.6, zorder=2)
+    for one in scenario.exit:
+        for lane in one.lanes:
+            place = (one.at_m + 2.0, (lane + 0.5) * width_m)
+            axes.annotate(f"→ {one.name}", place, va="center", fontsize=8, zorder=3, clip_on=True)
 
 
 def _draw_formations(
@@ -231,6 +250,7 @@ def _draw_legend(figure: Figure, scenario: Scenario) -> None:
     ]
     if scenario.road.closures:
         handles.append(Patch(label="closed", **_CLOSED))
+    if any(part.line_m is not None for part in closed_parts(scenario)):
         style: dict[str, Any] = {"marker": "|", "markersize": 9, "markeredgewidth": 1.6}
         handles.append(Line2D([], [], color=INK, linewidth=0.0, label="stop line", **style))
     figure.legend(

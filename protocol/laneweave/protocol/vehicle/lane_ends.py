@@ -149,9 +149,11 @@ class LaneEnds:
         exit_lane = self.exit_ahead(cell[1], cell_s_m(cell[0], t_s if since_s is None else since_s))
         return exit_lane is not None and cell_s_m(cell[0], t_s) > exit_lane.line_m
 
-    def too_late_to_change(self, cell: Cell, t_s: float) -> bool:
-        """Return whether a body can no longer begin to enter or leave the lane of a cell."""
-        return self.ends_changes(cell, t_s + self._touching_s, t_s)
+    def too_late_to_move(self, origin: Cell, target: Cell, t_s: float) -> bool:
+        """Return whether a body in one lane can no longer begin to enter another, for an exit."""
+        return origin[1] != target[1] and any(
+            self.ends_changes(cell, t_s + self._touching_s, t_s) for cell in (origin, target)
+        )
 
 
 def dead_ends(scenario: Scenario) -> tuple[DeadEnd, ...]:

@@ -11,7 +11,11 @@ from collections.abc import Collection
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
+from laneweave.sim_bridge.baselines.reference_road import (
+    Entrance,
+    ReferenceVehicle,
+    check_no_ramps,
+)
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.sumo.road_edges import lane_end_m
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
@@ -108,6 +112,7 @@ def check_lc2013(scenario: Scenario) -> None:
     Raises:
         BadInputError: a field is unsuitable.
     """
+    check_no_ramps(scenario)
     headway_s, tick_s = scenario.lc2013.headway_s, scenario.runtime.tick_s
     if headway_s < tick_s:
         raise BadInputError(

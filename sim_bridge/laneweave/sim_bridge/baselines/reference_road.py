@@ -9,6 +9,7 @@ from typing import Protocol
 
 from attrs import define
 
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import RoadClock
@@ -63,6 +64,22 @@ class ReferenceVehicle:
     def rung_ticks(self) -> Mapping[Rung, int]:
         """Empty, since there is no motion controller."""
         return {}
+
+
+def check_no_ramps(scenario: Scenario) -> None:
+    """Check that all vehicles enter at the start of the road and leave at its end.
+
+    Raises:
+        BadInputError: the road has ramps or exits, which reference methods do not drive.
+    """
+    for name, places in (("entrance", scenario.entrance), ("exit", scenario.exit)):
+        if places:
+            names = [place.name for place in places]
+            raise BadInputError(name, names, "none with reference methods; use --method formation")
+    for number, closure in enumerate(scenario.road.closures):
+        if closure.from_m <= 0.0:
+            name = f"road.closures[{number}].from_m"
+            raise BadInputError(name, closure.from_m, "more than 0 with reference methods")
 
 
 class Entrance:

@@ -11,7 +11,11 @@ from collections.abc import Collection, Iterable
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
+from laneweave.sim_bridge.baselines.reference_road import (
+    Entrance,
+    ReferenceVehicle,
+    check_no_ramps,
+)
 from laneweave.sim_bridge.baselines.rules import Lanes, Rules, priority
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.world_interface import World
@@ -154,6 +158,7 @@ def check_rule(scenario: Scenario) -> None:
     Raises:
         BadInputError: a field is unsuitable.
     """
+    check_no_ramps(scenario)
     rule, road, speed_mps = scenario.rule, scenario.road, scenario.formation.speed_mps
     # Speed decreases in proportion to the remaining distance, once per tick.
     braking_m = speed_mps**2 / -scenario.vehicle.min_accel_mps2

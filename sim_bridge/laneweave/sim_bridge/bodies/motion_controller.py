@@ -178,30 +178,34 @@ class MotionController:
 
         The body is still in the lane in which the move began, and can no longer leave it.
         """
-        lane = self._body_lane
-        if lane == self.hold_cell[1] or self.off_lattice is not None or not self._lane_ends:
-            return False
-        column = self.hold_cell[0]
-        return any(
-            self._lane_ends.too_late_to_change((column, each), t_s)
-            for each in (lane, self.hold_cell[1])
-        )
+        return self.off_lattice is None and self._misses_exit(self.hold_cell, t_s)
 
-    def return_to_origin(self) -> bool:
+    def _misses_exit(self, goal: Cell, t_s: float) -> bool:
+        """Return whether it is too late to begin to leave the lane of the body for a cell."""
+        ends, lane = self._lane_ends, self._body_lane_for(goal[1])
+        return lane != goal[1] and ends.too_late_to_move((goal[0], lane), goal, t_s)
+
+    def return_to_origin(self, t_s: float) -> bool:
         """Hold the cell in which the move began; return False if the vehicle does not own it.
 
         It owns the cell until a later plan takes it, which no vehicle that moves takes part in.
+        Commands for earlier ticks, which may repeat the move, are no longer accepted.
         """
         if self.motion_origin not in self.owned or self.motion_origin[1] != self._body_lane:
             return False
         self.hold_cell = self.motion_origin
+        self.command_tick = max(self.command_tick, round(t_s / self.tick_s) - 1)
         self._stop_motion()
         return True
 
     @property
     def _body_lane(self) -> int:
         """Lane of the hold cell if the body touches it; otherwise the lane of the body's centre."""
-        y_m, goal = self.measured[3], self.hold_cell[1]
+        return self._body_lane_for(self.hold_cell[1])
+
+    def _body_lane_for(self, goal: int) -> int:
+        """Return a lane if the body touches it; otherwise the lane of the body's centre."""
+        y_m = self.measured[3]
         first, last = self.lattice.lanes_touched(y_m, self._scenario.vehicle.width_m)
         return goal if first <= goal <= last else int(y_m // self.lattice.lane_width_m)
 
@@ -269,10 +273,10 @@ class MotionController:
 
         A command is rejected if its incarnation is older than that of the process in charge, if its
         tick is not later than that of the last command, if the vehicle does not own its hold cell
-        (rolling operation), or if it changes lanes in an emergency or beside another body. A newer
-        incarnation takes charge. Its first command must keep the hold cell: no plan can allow a
-        process to move the vehicle before it is in charge. A rejected process may try again at the
-        next tick.
+        (rolling operation), or if it changes lanes in an emergency, beside another body, or too
+        late for an exit. A newer incarnation takes charge. Its first command must keep the hold
+        cell: no plan can allow a process to move the vehicle before it is in charge. A rejected
+        process may try again at the next tick.
 
         A command without jerks and with the current hold cell does not change the motion.
 
@@ -298,8 +302,11 @@ class MotionController:
         if self.rolling and leaves and command.hold_cell not in self.owned:
             return False
         lane = command.hold_cell[1]
-        unsafe = self.rung is Rung.EMERGENCY or self._is_beside(lane)
-        if lane != self.hold_cell[1] and unsafe:
+        if lane != self.hold_cell[1] and (
+            self.rung is Rung.EMERGENCY
+            or self._is_beside(lane)
+            or self._misses_exit(command.hold_cell, command.tick * self.tick_s)
+        ):
             return False
         if len(jerks) > 0 or leaves:
             self._jerks, self._jerks_tick = jerks, command.tick

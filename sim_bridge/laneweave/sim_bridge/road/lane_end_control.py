@@ -98,7 +98,7 @@ class LaneEndControl:
         for name, vehicle in vehicles.items():
             controller = vehicle.controller
             missed = controller.has_missed_exit(t_s)
-            if missed and controller.return_to_origin():
+            if missed and controller.return_to_origin(t_s):
                 yield LaneEndChange(name, MISSED_EXIT, controller.hold_cell[1])
             elif missed or controller.has_lost_cell(t_s):
                 # While it drives out, a vehicle may come to another dead end.

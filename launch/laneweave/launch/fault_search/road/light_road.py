@@ -33,7 +33,7 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.wire.bounds import check_ballot
-from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
+from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare
 from laneweave.protocol.wire.topics import BRIDGE_ALIVE, COMMAND, SENSE, VEHICLE_ALIVE
 from laneweave.sim_bridge.road.attendance import Absence, Attendance
@@ -104,6 +104,8 @@ class LightRoad:
         self._bounds = scenario.runtime.bounds(bridge)
         self._lane_ends = LaneEnds(scenario)
         self._exits = Exits(scenario.sections, scenario.road.length_m)
+        self._tick_m = 1.5 * scenario.lattice.speed_mps * self._tick_s
+        """Distance beyond an exit at which a vehicle has left the road."""
 
     @property
     def wakeup_s(self) -> float:
@@ -226,7 +228,12 @@ class LightRoad:
             vehicle = self.vehicles[change.vehicle]
             self._attendance.begin_anew(vehicle, self.tick)
             cell = vehicle.controller.hold_cell
-            if change.kind == LEFT_LATTICE:
+            if change.kind == MISSED_EXIT:
+                # For the checker, it leaves the road and enters it in the cell that it holds.
+                self._checker.leave(now_s, change.vehicle)
+                self._checker.enter(now_s, change.vehicle, cell, vehicle.block)
+                vehicle.body.go(cell, self.t_s, self._tick_s)
+            elif change.kind == LEFT_LATTICE:
                 self._checker.leave(now_s, change.vehicle)
                 end = self._lane_ends.ahead(change.lane, vehicle.body.state[0])
                 vehicle.body.stop_at(math.inf if end is None else end.line_m)
@@ -236,13 +243,15 @@ class LightRoad:
                 self._checker.enter(now_s, change.vehicle, cell, vehicle.block)
 
     def _check_lane(self, name: Name, vehicle: LightVehicle, now_s: float) -> None:
-        """Report a body in a lane that has ended, or in two lanes that have parted at an exit."""
+        """Report a body in a lane that has ended, also partly at an exit."""
         s_m, _, _, y_m, _, _ = vehicle.body.state
         touched = self._scenario.lattice.lanes_touched(y_m, self._scenario.vehicle.width_m)
-        for lane in touched if touched[0] != touched[1] else ():
+        for lane in {*touched}:
             exit_lane = self._lane_ends.exit_ahead(lane, s_m)
-            if exit_lane is not None and s_m > exit_lane.end_m:
-                self._checker.beyond_end(now_s, name, f"in lanes {touched} at {s_m:.1f} m")
+            if exit_lane is not None and s_m > exit_lane.end_m + self._tick_m:
+                self._checker.beyond_end(
+                    now_s, name, f"in lanes {touched} at {s_m:.1f} m, exit at {exit_lane.end_m:g} m"
+                )
         end = self._lane_ends.ahead(int(y_m // self._scenario.road.lane_width_m), s_m)
         if end is not None and s_m > end.end_m:
             self._checker.beyond_end(

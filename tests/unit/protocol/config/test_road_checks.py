@@ -1,0 +1,135 @@
+"""Ramps, exits and destinations that are not possible are refused in one line."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, sections_for
+from laneweave.sim_bridge.baselines.lc2013 import check_lc2013
+from laneweave.sim_bridge.baselines.rule_based import check_rule
+
+Tables = dict[str, Any]
+WEAVING: Tables = {
+    "road": {
+        "lanes": 4,
+        "s1_m": 50.0,
+        "s2_m": 100.0,
+        "s3_m": 850.0,
+        "closures": [{"lane": 0, "to_m": 250.0}, {"lane": 0, "from_m": 700.0}],
+    },
+    "entrance": [
+        {"name": "on", "lane": 0, "at_m": 250.0, "merge_m": 400.0, "volume_veh_per_h": 600.0}
+    ],
+    "exit": [{"name": "off", "lanes": [0], "at_m": 700.0}],
+    "demand": {"destinations": [{"exit": "off", "share": 0.2}]},
+    "formation": {"operation": "rolling"},
+}
+
+
+def entrance(**fields: object) -> Callable[[Tables], object]:
+    return lambda tables: tables["entrance"][0].update(fields)
+
+
+def exit_(**fields: object) -> Callable[[Tables], object]:
+    return lambda tables: tables["exit"][0].update(fields)
+
+
+def to(*shares: tuple[str, float]) -> Callable[[Tables], object]:
+    listed = [{"exit": name, "share": share} for name, share in shares]
+    return lambda tables: tables["demand"].update(destinations=listed)
+
+
+def twice(table: str) -> Callable[[Tables], object]:
+    return lambda tables: tables[table].append(tables[table][0])
+
+
+def ends_at(end_m: float) -> Callable[[Tables], object]:
+    def change(tables: Tables) -> None:
+        tables["road"]["closures"][1]["from_m"] = end_m
+        tables["exit"][0]["at_m"] = end_m
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (entrance(lane=1), "entrance[0].lane: got 1"),
+        (entrance(at_m=300.0), "entrance[0].at_m: got 300.0; allowed: 250"),
+        (entrance(merge_m=300.0), "entrance[0].merge_m: got 300.0; allowed: from 400"),
+        (entrance(merge_m=650.0), "entrance[0].merge_m: got 650.0"),
+        (entrance(name="main"), "entrance[0].name: got 'main'"),
+        (entrance(volume_veh_per_h=4000.0), "entrance[0].volume_veh_per_h"),
+        (twice("entrance"), "entrance[1].name: got 'on'"),
+        (exit_(lanes=[1]), "exit[0].lanes: got [1]"),
+        (exit_(lanes=[]), "exit[0].lanes: got []"),
+        (exit_(at_m=650.0), "exit[0].lanes: got [0]"),
+        (exit_(name="end"), "exit[0].name: got 'end'"),
+        (exit_(name="lane-1"), "exit[0].name: got 'lane-1'"),
+        (twice("exit"), "exit[1].name: got 'off'"),
+        (ends_at(530.0), "exit[0].at_m: got 530.0; allowed: at least 545"),
+        (to(("nowhere", 0.5)), "demand.destinations.exit: got 'nowhere'; allowed: an exit: off"),
+        (to(("off", 0.7), ("off", 0.6)), "demand.destinations"),
+        (
+            lambda tables: tables.update(exit=[], demand={"volume_veh_per_lane_h": 3590.0}),
+            "demand.volume_veh_per_lane_h: got 3590.0; allowed: at most 3400",
+        ),
+        (
+            lambda tables: tables["road"].update(s2_m=450.0, s3_m=500.0),
+            "demand.destinations: got 'off'",
+        ),
+        (
+            lambda tables: tables["road"].update(
+                closures=[{"lane": lane} for lane in range(4)]
+            ),
+            "road.closures",
+        ),
+        (lambda tables: tables.update(formation={}), "formation.operation: got 'formations'"),
+    ],
+)  # fmt: skip
+def test_roads_that_are_not_possible_are_refused_in_one_line(
+    change: Callable[[Tables], object], line: str
+) -> None:
+    tables = copy.deepcopy(WEAVING)
+    change(tables)
+    with pytest.raises(BadInputError) as caught:
+        parse_scenario(tables)
+    (text,) = str(caught.value).splitlines()
+    assert line in text
+
+
+def test_sections_begin_at_ramps_and_end_at_exits() -> None:
+    sections = parse_scenario(WEAVING).sections
+    first = sections[0]
+    assert (first.lane, first.from_m, first.to_m, first.exit) == (0, 250.0, 700.0, "off")
+    assert first.moves_from_m == 400.0
+    assert [section.exit for section in sections[1:]] == ["lane-1", "lane-2", "lane-3"]
+    assert sections_for(sections, 0, "off") == {0}
+    assert sections_for(sections, ANY_LANE, END_OF_ROAD) == {1, 2, 3}
+    assert sections_for(sections, 2, END_OF_ROAD) == {2}
+
+
+def test_the_time_at_v_f_counts_from_the_entrance_to_the_destination() -> None:
+    scenario = parse_scenario(WEAVING)
+    assert scenario.free_flow_trip_s(0) == pytest.approx(50.0)
+    assert scenario.free_flow_trip_s(1, "off") == pytest.approx(700.0 / 15.0)
+    assert [scenario.entrance_of(lane) for lane in (0, 1)] == ["on", "main"]
+
+
+@pytest.mark.parametrize("name", ["on-ramp", "off-ramp", "weaving", "motorway"])
+def test_the_example_scenarios_are_valid(name: str) -> None:
+    folder = Path(__file__).parents[4] / "scenarios"
+    assert load_scenario(folder / f"{name}.toml").formation.rolling
+
+
+@pytest.mark.parametrize("check", [check_rule, check_lc2013])
+def test_reference_methods_refuse_roads_with_ramps(check: Callable[..., None]) -> None:
+    with pytest.raises(BadInputError, match="entrance: got"):
+        check(parse_scenario(WEAVING))
