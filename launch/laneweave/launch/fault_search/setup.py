@@ -156,7 +156,7 @@ class Setup:
     """Assignments of empty cells to owners on a drawn entrance (rolling operation)."""
     stretch_columns: int = 0
     """Number of columns in which vehicles enter (rolling operation)."""
-    leaving: frozenset[Name] = frozenset()
+    leaving: tuple[Name, ...] = ()
     """Vehicles that leave by the exit of a drawn road."""
 
     @cached_property
@@ -253,10 +253,8 @@ class Setup:
             visit = _visit(number, (0, lane), leaves, scenario, lasting, rng)
             visits.append(evolve(visit, enters_s=arrival_s))
         crowded = rng.random() < profile.crowding
-        leaving = (
-            frozenset(visit.vehicle for visit in visits if rng.random() < LEAVING)
-            if road.drawn.exit
-            else frozenset[Name]()
+        leaving = tuple(
+            visit.vehicle for visit in visits if road.drawn.exit and rng.random() < LEAVING
         )
         return cls(
             road,

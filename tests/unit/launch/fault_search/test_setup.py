@@ -129,7 +129,8 @@ def test_a_stretch_of_the_rolling_operation_has_one_owner_for_each_cell(name: st
 @ROADSIDE
 def test_the_roadside_admits_all_vehicles_in_turn(name: str) -> None:
     for setup, rng in draw(name, 20):
-        check_scenario(setup.scenario)
+        if not setup.road.drawn.entrance:  # drawn ramps are shorter: bodies need not settle there
+            check_scenario(setup.scenario)
         lanes = setup.preferences(rng, last=False)
         entrance = setup.make_entrance(lanes, bridge=1)
         entered = [each for tick in range(1000) for each in entrance.admit(tick * 0.1)]
