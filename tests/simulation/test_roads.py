@@ -1,4 +1,4 @@
-"""Roads with ramps and exits in the fault search: it passes, and notices broken rules."""
+"""Lanes that end, ramps and exits in the fault search: it passes, and notices broken rules."""
 
 from __future__ import annotations
 
@@ -9,23 +9,32 @@ import pytest
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.search import run_story
 from laneweave.launch.fault_search.story import Story
-from support import broken_roads as broken
+from support import broken_lane_ends, broken_roads
 
 Bug = Callable[[pytest.MonkeyPatch], None]
-BUGS: list[tuple[Bug, int]] = [
-    (broken.ramps_are_issued_at_the_start, 0),
-    (broken.cells_are_passed_on_twice, 0),
-    (broken.exits_are_closed, 1),
-    (broken.late_commands_repeat_moves, 386),
-    (broken.gates_stay_open, 337),
-    (broken.agents_insist, 337),
+LANE_ENDS, ROADS = "lane-ends", "roads"
+BUGS: list[tuple[str, Bug, int]] = [
+    (LANE_ENDS, broken_lane_ends.never_leaves, 4),
+    (LANE_ENDS, broken_lane_ends.agents_move_vehicles_without_cells, 6),
+    (LANE_ENDS, broken_lane_ends.agent_remembers, 6),
+    (LANE_ENDS, broken_lane_ends.gaps_are_given_away, 3),
+    (LANE_ENDS, broken_lane_ends.still_listed, 49),
+    (LANE_ENDS, broken_lane_ends.gap_taken_too_early, 3),
+    (ROADS, broken_roads.ramps_are_issued_at_the_start, 0),
+    (ROADS, broken_roads.cells_are_passed_on_twice, 0),
+    (ROADS, broken_roads.exits_are_closed, 1),
+    (ROADS, broken_roads.late_commands_repeat_moves, 386),
+    (ROADS, broken_roads.gates_stay_open, 337),
+    (ROADS, broken_roads.agents_insist, 337),
 ]
-"""Bugs, and a seed of the profile `roads` that catches each."""
+"""Profiles, bugs, and a seed that catches each."""
 
 
-@pytest.mark.parametrize(("bug", "seed"), BUGS)
-def test_planted_bugs_are_noticed(bug: Bug, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    story = Story.drawn(seed, PROFILES["roads"])
+@pytest.mark.parametrize(("profile", "bug", "seed"), BUGS)
+def test_planted_bugs_are_noticed(
+    profile: str, bug: Bug, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    story = Story.drawn(seed, PROFILES[profile])
     assert run_story(story).violations == ()
     bug(monkeypatch)
     assert run_story(story).violations != ()
@@ -33,10 +42,13 @@ def test_planted_bugs_are_noticed(bug: Bug, seed: int, monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("seed", range(20))
 def test_runs_without_violations(seed: int) -> None:
-    assert run_story(Story.drawn(seed, PROFILES["roads"])).violations == ()
+    assert run_story(Story.drawn(seed, PROFILES[ROADS])).violations == ()
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("seed", range(1000, 1200))
-def test_more_runs_without_violations(seed: int) -> None:
-    assert run_story(Story.drawn(seed, PROFILES["roads"])).violations == ()
+@pytest.mark.parametrize(
+    ("profile", "seed"),
+    [*((LANE_ENDS, seed) for seed in range(1000, 1100)), *((ROADS, n) for n in range(1000, 1200))],
+)
+def test_more_runs_without_violations(profile: str, seed: int) -> None:
+    assert run_story(Story.drawn(seed, PROFILES[profile])).violations == ()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from laneweave.agents.driving.tracking_problem import Gaps
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.lane_ends import DeadEnd, LaneEnds
+from laneweave.protocol.vehicle.lane_ends import LaneEnd, LaneEnds
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ class StopLines:
             latest = limit if latest is None else np.minimum(latest, limit)
         return gaps if latest is gaps.latest else evolve(gaps, latest=latest)
 
-    def _ahead(self, s_m: float) -> list[DeadEnd]:
+    def _ahead(self, s_m: float) -> list[LaneEnd]:
         """Return the dead end ahead of a position in each lane that has one."""
         lanes = range(self._lattice.lanes)
         return [end for lane in lanes if (end := self._ends.ahead(lane, s_m)) is not None]

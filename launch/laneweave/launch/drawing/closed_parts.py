@@ -43,7 +43,7 @@ def closed_parts(scenario: Scenario) -> tuple[ClosedPart, ...]:
 
 
 def ramp_edges(scenario: Scenario) -> tuple[tuple[int, float, float], ...]:
-    """Return the edge of each ramp towards the road: (number of the lane left of it, from, to)."""
+    """Return the line between each ramp and the road: (lane to its left, from [m], to [m])."""
     middle = scenario.road.lanes / 2
     return tuple(
         (one.lane + (one.lane < middle), one.at_m, one.merge_m) for one in scenario.entrance

@@ -16,7 +16,6 @@ from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, end_exit
 from laneweave.protocol.scenario.fields import (
     MAIN_ENTRANCE,
     MAX_HORIZON_TICKS,
-    DestinationShare,
     Scenario,
 )
 from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
@@ -64,6 +63,7 @@ def check_scenario(scenario: Scenario) -> None:
         _check_motion,
         _check_closures,
         _check_entrances,
+        _check_dead_ends,
         _check_exits,
         _check_capacity,
         _check_destinations,
@@ -228,8 +228,8 @@ def _check_entrances(scenario: Scenario) -> None:
         _require(entrance.at_m == opens_m, f"{name}.at_m", entrance.at_m, allowed)
         formation = scenario.formation
         low_m = entrance.at_m + formation.speed_mps * formation.settle_s
-        high_m = next(one.to_m for one in scenario.sections if one.lane == entrance.lane)
-        high_m -= _step_m(scenario)
+        ends_m = [one.to_m for one in scenario.sections if one.lane == entrance.lane]
+        high_m = min(ends_m, default=road.length_m) - _step_m(scenario)
         _require(
             low_m <= entrance.merge_m <= high_m,
             f"{name}.merge_m",
@@ -240,7 +240,7 @@ def _check_entrances(scenario: Scenario) -> None:
 
 
 def _check_exits(scenario: Scenario) -> None:
-    """Check that exits are at the ends of sections, and that vehicles can change lanes before."""
+    """Check that exits are at the ends of sections, with room for lane changes before them."""
     names, used = {END_OF_ROAD}, set[tuple[int, float]]()
     ends = {(one.lane, one.from_m) for one in scenario.road.closures}
     for number, exit_ in enumerate(scenario.exit):
@@ -267,8 +267,6 @@ def _check_exits(scenario: Scenario) -> None:
                 f"at least {needed_m:g}: a step for changing lanes in lane {section.lane}, and "
                 f"{drive_out(scenario).room_m:g} m for completing a change after stopping",
             )
-    if scenario.road.closures:
-        _check_dead_ends(scenario)
 
 
 def _check_capacity(scenario: Scenario) -> None:
@@ -302,33 +300,30 @@ def _check_capacity(scenario: Scenario) -> None:
 
 
 def _shares(scenario: Scenario, lane: int) -> list[tuple[str, float]]:
-    """Return the shares of all destinations of the vehicles that enter in a lane."""
+    """Return (destination, share) of vehicles that enter in a lane; the end of the road last."""
     shares = [(one.exit, one.share) for one in scenario.destinations_of(lane)]
     return [*shares, (END_OF_ROAD, 1.0 - sum(share for _, share in shares))]
 
 
 def _check_destinations(scenario: Scenario) -> None:
     """Check that destinations exist, and that the vehicles of each entrance can reach theirs."""
-    exits_m = {one.name: one.at_m for one in scenario.exit}
-    entrances = [("demand", scenario.road.first_lanes, scenario.demand.destinations)]
+    names = [one.name for one in scenario.exit]
+    entrances = [("demand", scenario.road.first_lanes)]
     entrances += [
-        (f"entrance[{number}]", (one.lane,), one.destinations)
-        for number, one in enumerate(scenario.entrance)
+        (f"entrance[{number}]", (one.lane,)) for number, one in enumerate(scenario.entrance)
     ]
-    for name, lanes, shares in entrances:
-        total = sum(one.share for one in shares)
-        allowed = "shares whose sum is at most 1"
-        _require(
-            total <= 1.0 + 1e-9, f"{name}.destinations", [*map(attrs.astuple, shares)], allowed
-        )
-        wanted = [*shares] + ([DestinationShare(END_OF_ROAD, 1.0 - total)] if total < 1.0 else [])
-        for one in wanted:
-            if one.exit != END_OF_ROAD:
-                allowed = f"an exit: {', '.join(exits_m) or 'there is none'}"
-                _require(one.exit in exits_m, f"{name}.destinations.exit", one.exit, allowed)
-            if one.share > 0.0:
+    for entrance, lanes in entrances:
+        name, given = f"{entrance}.destinations", scenario.destinations_of(lanes[0])
+        shares = _shares(scenario, lanes[0])
+        listed, allowed = [*map(attrs.astuple, given)], "shares whose sum is at most 1"
+        _require(shares[-1][1] >= -1e-9, name, listed, allowed)
+        for destination, share in shares:
+            if destination != END_OF_ROAD:
+                allowed = f"an exit: {', '.join(names) or 'there is none'}"
+                _require(destination in names, f"{name}.exit", destination, allowed)
+            if share > 0.0:
                 for lane in lanes:
-                    _check_reachable(scenario, f"{name}.destinations", lane, one.exit)
+                    _check_reachable(scenario, name, lane, destination)
 
 
 def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str) -> None:
@@ -354,6 +349,8 @@ def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str)
 
 def _check_dead_ends(scenario: Scenario) -> None:
     """Check that vehicles can change lanes before each dead end, and drive on after stopping."""
+    if not scenario.road.closures:
+        return
     try:
         needed = drive_out(scenario)
     except ValueError as error:

@@ -566,7 +566,7 @@ class Scenario:
         return self.demand.volume_veh_per_lane_h if lane in self.road.first_lanes else 0.0
 
     def destinations_of(self, lane: int) -> tuple[DestinationShare, ...]:
-        """Return the shares of destinations, except the end, of vehicles that enter in a lane."""
+        """Return the shares of exits among the vehicles that enter in a lane."""
         for entrance in self.entrance:
             if entrance.lane == lane:
                 return entrance.destinations

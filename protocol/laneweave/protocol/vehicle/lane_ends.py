@@ -5,14 +5,14 @@ accelerate and change lanes before the end (`drive_out`). All cells of the lane 
 useless: no plan leads there, and a vehicle whose cell has passed the line has left the lattice.
 
 An exit before the end of the road needs no stop line: a vehicle in its lane leaves the road. But
-lane changes end as far before it (`ExitLane.line_m`), so that a body that was stopped in one can
+lane changes end as far before it (`LaneEnd.line_m`), so that a body that was stopped in one can
 complete it before the lanes part. docs/SAFETY.md derives the rules.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
 
 from attrs import evolve, frozen
@@ -43,35 +43,20 @@ _FAR_M = 1000.0
 
 
 @frozen
-class DeadEnd:
-    """The dead end of a section of a lane."""
+class LaneEnd:
+    """The end of a section of a lane before the end of the road: a dead end or an exit."""
 
     lane: int
     from_m: float
     """Where the section begins; -inf: before the start of the road."""
     line_m: float
-    """The stop line."""
+    """Dead end: the stop line. Exit: where lane changes into and out of the section have ended."""
     end_m: float
-    """Where the lane ends."""
+    """Where the lane ends; at an exit, where vehicles leave the road."""
     reopens_m: float
     """Where the lane is open again; inf: nowhere."""
     moves_from_m: float = -math.inf
     """Where moves may begin in the section; -inf: everywhere."""
-
-
-@frozen
-class ExitLane:
-    """A section of a lane that ends at an exit before the end of the road."""
-
-    lane: int
-    from_m: float
-    """Where the section begins; -inf: before the start of the road."""
-    line_m: float
-    """Where lane changes into and out of the section have ended."""
-    end_m: float
-    """Where vehicles in the lane leave the road."""
-    reopens_m: float
-    """Where the lane is open again; inf: nowhere."""
 
 
 @frozen
@@ -92,29 +77,28 @@ class LaneEnds:
     def __init__(self, scenario: Scenario) -> None:
         """Derive the stop lines."""
         self._lattice = scenario.lattice
-        ends, exits, lanes = dead_ends(scenario), exit_lanes(scenario), range(scenario.road.lanes)
-        self._by_lane = tuple(tuple(each for each in ends if each.lane == lane) for lane in lanes)
-        self._exits = tuple(tuple(each for each in exits if each.lane == lane) for lane in lanes)
+        lanes = range(scenario.road.lanes)
+        self._dead_ends = _by_lane(dead_ends(scenario), lanes)
+        self._exits = _by_lane(exit_lanes(scenario), lanes)
         self._touching_s = (1.0 - BEFORE_TOUCHING) * scenario.move_s
-        self._any = bool(ends or exits)
+        self._any = any(self._dead_ends) or any(self._exits)
 
     def __bool__(self) -> bool:
         """Return whether any lane ends before the road."""
         return self._any
 
-    def __iter__(self) -> Iterator[DeadEnd]:
+    def __iter__(self) -> Iterator[LaneEnd]:
         """Yield the dead ends in order of lane, then of position."""
-        for ends in self._by_lane:
+        for ends in self._dead_ends:
             yield from ends
 
-    def ahead(self, lane: int, s_m: float) -> DeadEnd | None:
+    def ahead(self, lane: int, s_m: float) -> LaneEnd | None:
         """Return the dead end of the section in which a position is, or which it has passed."""
-        if not 0 <= lane < len(self._by_lane):
-            return None
-        for end in self._by_lane[lane]:
-            if end.from_m <= s_m < end.reopens_m:
-                return end
-        return None
+        return _end_ahead(self._dead_ends, lane, s_m)
+
+    def exit_ahead(self, lane: int, s_m: float) -> LaneEnd | None:
+        """Return the exit of the section in which a position is, or which it has passed."""
+        return _end_ahead(self._exits, lane, s_m)
 
     def has_passed(self, cell: Cell, t_s: float, since_s: float | None = None) -> bool:
         """Return whether a cell has passed the stop line of its section.
@@ -124,30 +108,26 @@ class LaneEnds:
             t_s: road time.
             since_s: road time at which the cell is in the section; None: `t_s`.
         """
-        cell_s_m = self._lattice.cell_s_m
-        end = self.ahead(cell[1], cell_s_m(cell[0], t_s if since_s is None else since_s))
-        return end is not None and cell_s_m(cell[0], t_s) > end.line_m
-
-    def exit_ahead(self, lane: int, s_m: float) -> ExitLane | None:
-        """Return the exit of the section in which a position is, or which it has passed."""
-        if not 0 <= lane < len(self._exits):
-            return None
-        for exit_lane in self._exits[lane]:
-            if exit_lane.from_m <= s_m < exit_lane.reopens_m:
-                return exit_lane
-        return None
+        return self._has_passed_line(self.ahead, cell, t_s, since_s)
 
     def ends_changes(self, cell: Cell, t_s: float, since_s: float | None = None) -> bool:
         """Return whether a cell is where lane changes have ended before an exit.
 
-        Args:
-            cell: the cell.
-            t_s: road time.
-            since_s: road time at which the cell is in the section; None: `t_s`.
+        The arguments are those of `has_passed`.
         """
-        cell_s_m = self._lattice.cell_s_m
-        exit_lane = self.exit_ahead(cell[1], cell_s_m(cell[0], t_s if since_s is None else since_s))
-        return exit_lane is not None and cell_s_m(cell[0], t_s) > exit_lane.line_m
+        return self._has_passed_line(self.exit_ahead, cell, t_s, since_s)
+
+    def _has_passed_line(
+        self,
+        find: Callable[[int, float], LaneEnd | None],
+        cell: Cell,
+        t_s: float,
+        since_s: float | None,
+    ) -> bool:
+        """Return whether a cell has passed the line of the end that is found for its section."""
+        (column, lane), cell_s_m = cell, self._lattice.cell_s_m
+        end = find(lane, cell_s_m(column, t_s if since_s is None else since_s))
+        return end is not None and cell_s_m(column, t_s) > end.line_m
 
     def too_late_to_move(self, origin: Cell, target: Cell, t_s: float) -> bool:
         """Return whether a body in one lane can no longer begin to enter another, for an exit."""
@@ -156,37 +136,51 @@ class LaneEnds:
         )
 
 
-def dead_ends(scenario: Scenario) -> tuple[DeadEnd, ...]:
+def dead_ends(scenario: Scenario) -> tuple[LaneEnd, ...]:
     """Return the dead ends of a road in order of lane, then of position."""
-    return tuple(
-        DeadEnd(section.lane, section.from_m, *ends_m, section.moves_from_m)
-        for section, ends_m in _ending_early(scenario)
-        if not section.exit
-    )
+    return tuple(end for section, end in _ends(scenario) if not section.exit)
 
 
-def exit_lanes(scenario: Scenario) -> tuple[ExitLane, ...]:
+def exit_lanes(scenario: Scenario) -> tuple[LaneEnd, ...]:
     """Return the lanes of exits before the end of a road in order of lane, then of position."""
-    return tuple(
-        ExitLane(section.lane, section.from_m, *ends_m)
-        for section, ends_m in _ending_early(scenario)
-        if section.exit
-    )
+    return tuple(end for section, end in _ends(scenario) if section.exit)
 
 
-def _ending_early(
-    scenario: Scenario,
-) -> Iterator[tuple[LaneSection, tuple[float, float, float]]]:
-    """Yield the sections that end before the road, and (line_m, end_m, reopens_m)."""
+def _ends(scenario: Scenario) -> Iterator[tuple[LaneSection, LaneEnd]]:
+    """Yield the sections that end before the road, and their ends."""
     sections = scenario.sections
     for number, section in enumerate(sections):
         if not section.exit or section.to_m < scenario.road.length_m:
             later = [each.from_m for each in sections[number + 1 :] if each.lane == section.lane]
-            line_m = section.to_m - drive_out(scenario).room_m
-            yield section, (line_m, section.to_m, min(later, default=math.inf))
+            yield (
+                section,
+                LaneEnd(
+                    lane=section.lane,
+                    from_m=section.from_m,
+                    line_m=section.to_m - drive_out(scenario).room_m,
+                    end_m=section.to_m,
+                    reopens_m=min(later, default=math.inf),
+                    moves_from_m=section.moves_from_m,
+                ),
+            )
 
 
-def lane_beside(scenario: Scenario, end: DeadEnd) -> int | None:
+def _by_lane(ends: Iterable[LaneEnd], lanes: range) -> tuple[tuple[LaneEnd, ...], ...]:
+    listed = tuple(ends)
+    return tuple(tuple(end for end in listed if end.lane == lane) for lane in lanes)
+
+
+def _end_ahead(by_lane: Sequence[Sequence[LaneEnd]], lane: int, s_m: float) -> LaneEnd | None:
+    """Return the end of the section in which a position is, or which it has passed."""
+    if not 0 <= lane < len(by_lane):
+        return None
+    for end in by_lane[lane]:
+        if end.from_m <= s_m < end.reopens_m:
+            return end
+    return None
+
+
+def lane_beside(scenario: Scenario, end: LaneEnd) -> int | None:
     """Return the lane into which vehicles drive out at a dead end; None: there is none.
 
     It is open from before the stop line until a vehicle that drives out has arrived in its cell.
@@ -206,7 +200,7 @@ def lane_beside(scenario: Scenario, end: DeadEnd) -> int | None:
 
 def sections_to_lines(scenario: Scenario) -> tuple[LaneSection, ...]:
     """Return the sections of a road as far as plans may use them, up to the lines before ends."""
-    lines_m = {section: line_m for section, (line_m, _, _) in _ending_early(scenario)}
+    lines_m = {section: end.line_m for section, end in _ends(scenario)}
     return tuple(
         evolve(section, to_m=lines_m.get(section, section.to_m)) for section in scenario.sections
     )

@@ -16,7 +16,7 @@ from attrs import define, frozen
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.lane_ends import START_S, DeadEnd, LaneEnds, drive_out, lane_beside
+from laneweave.protocol.vehicle.lane_ends import START_S, LaneEnd, LaneEnds, drive_out, lane_beside
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
 from laneweave.protocol.wire.messages import Name, OffLattice
 from laneweave.sim_bridge.bodies.motion_controller import (
@@ -65,8 +65,9 @@ class LaneEndControl:
         """Begin without vehicles."""
         self._meter = meter
         self._lattice = scenario.lattice
-        self._any = bool(LaneEnds(scenario))
-        self._ends = tuple(LaneEnds(scenario))
+        ends = LaneEnds(scenario)
+        self._any = bool(ends)
+        self._ends = tuple(ends)
         self._beside = {end: lane_beside(scenario, end) for end in self._ends}
         needed = drive_out(scenario) if self._ends else None
         self._columns = needed.columns if needed is not None else 0
@@ -75,10 +76,10 @@ class LaneEndControl:
         self._length_m = scenario.vehicle.length_m
         self._queue_m = scenario.vehicle.length_m + scenario.tracking.min_gap_m
         """Distance between the fronts of vehicles that stand in a queue."""
-        self._gaps: dict[DeadEnd, list[Gap]] = {end: [] for end in self._ends}
+        self._gaps: dict[LaneEnd, list[Gap]] = {end: [] for end in self._ends}
         self._last_gap_column: list[float] = [math.inf] * scenario.road.lanes
         """Rearmost column of the last gap of each lane."""
-        self._end_of: dict[Name, DeadEnd | None] = {}
+        self._end_of: dict[Name, LaneEnd | None] = {}
         """Dead end at which each vehicle without cells waits or waited; None: its lane has none."""
 
     def is_kept_free(self, cell: Cell) -> bool:
@@ -153,7 +154,7 @@ class LaneEndControl:
         self._end_of[name] = next((end for end in ends if s_m < end.reopens_m), last)
         return LaneEndChange(name, LEFT_LATTICE, lane)
 
-    def _waiting(self, end: DeadEnd, vehicles: Mapping[Name, RoadVehicle]) -> list[RoadVehicle]:
+    def _waiting(self, end: LaneEnd, vehicles: Mapping[Name, RoadVehicle]) -> list[RoadVehicle]:
         """Return the vehicles that wait at a dead end, foremost first."""
         waiting = [
             vehicles[name]
@@ -204,7 +205,7 @@ class LaneEndControl:
             del self._end_of[name]
             yield LaneEndChange(name, ENTERED_LATTICE, gap.lane)
 
-    def _is_over(self, gap: Gap, end: DeadEnd, t_s: float) -> bool:
+    def _is_over(self, gap: Gap, end: LaneEnd, t_s: float) -> bool:
         """Return whether all of a gap has passed the stop line."""
         return t_s > self._lattice.passing_time_s(gap.columns[-1], end.line_m) + START_S
 

@@ -74,6 +74,18 @@ def ends_at(end_m: float) -> Callable[[Tables], object]:
         (exit_(name="end"), "exit[0].name: got 'end'"),
         (exit_(name="lane-1"), "exit[0].name: got 'lane-1'"),
         (twice("exit"), "exit[1].name: got 'off'"),
+        (
+            lambda tables: tables.update(vehicle={"max_accel_mps2": 0.2}),
+            "vehicle.max_accel_mps2: got 0.2",
+        ),
+        (
+            lambda tables: (
+                tables["road"].update(closures=[{"lane": 0}]),
+                tables.update(exit=[], demand={}),
+                tables["entrance"][0].update(at_m=60_000.0, merge_m=60_000.0),
+            ),
+            "entrance[0].merge_m: got 60000.0",
+        ),
         (ends_at(530.0), "exit[0].at_m: got 530.0; allowed: at least 545"),
         (to(("nowhere", 0.5)), "demand.destinations.exit: got 'nowhere'; allowed: an exit: off"),
         (to(("off", 0.7), ("off", 0.6)), "demand.destinations"),

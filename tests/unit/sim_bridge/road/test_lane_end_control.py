@@ -10,7 +10,7 @@ from attrs import evolve
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Closure, Demand, Scenario
-from laneweave.protocol.vehicle.lane_ends import DeadEnd, LaneEnds, dead_ends, drive_out
+from laneweave.protocol.vehicle.lane_ends import LaneEnd, LaneEnds, dead_ends, drive_out
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase, Rung
@@ -188,10 +188,10 @@ def line_at_the_end(patch: pytest.MonkeyPatch) -> None:
     """There is no room to accelerate before the end of the lane."""
     ahead, ends_of = LaneEnds.ahead, LaneEnds.__iter__
 
-    def at_the_end(end: DeadEnd) -> DeadEnd:
+    def at_the_end(end: LaneEnd) -> LaneEnd:
         return evolve(end, line_m=end.end_m)
 
-    def ahead_of(self: LaneEnds, lane: int, s_m: float) -> DeadEnd | None:
+    def ahead_of(self: LaneEnds, lane: int, s_m: float) -> LaneEnd | None:
         end = ahead(self, lane, s_m)
         return None if end is None else at_the_end(end)
 

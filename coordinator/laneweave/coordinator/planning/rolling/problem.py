@@ -111,6 +111,14 @@ class StreamRoad:
             begun = section
         return begun
 
+    def is_open(self, lane: int, rear_m: float, front_m: float) -> bool:
+        """Return whether moves are possible in a lane everywhere between two positions."""
+        return any(
+            max(from_m, self.sections[number].moves_from_m) <= rear_m + ROUNDING_M
+            and front_m <= to_m + ROUNDING_M
+            for from_m, to_m, number in self.lane_sections[lane]
+        )
+
     def has_left(self, slot: int, cell: Cell) -> bool:
         """Return whether a cell is beyond the end of its section when a slot begins."""
         section = self.section_at(slot, cell)

@@ -91,11 +91,7 @@ def _problems_of_move(
         return
     for lane in {here[1], there[1]} & {*range(road.lanes)}:
         # A section must be open for the whole body and the whole slot.
-        if not any(
-            max(from_m, road.sections[number].moves_from_m) <= rear_m + ROUNDING_M
-            and front_m <= to_m + ROUNDING_M
-            for from_m, to_m, number in road.lane_sections[lane]
-        ):
+        if not road.is_open(lane, rear_m, front_m):
             yield f"{name} moves between {rear_m} m and {front_m} m, where lane {lane} is closed"
 
 

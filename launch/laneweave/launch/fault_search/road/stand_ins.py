@@ -223,7 +223,7 @@ class LightPlanner:
         self._sections = road.sections
         self._some_end = any(not section.exit for section in road.sections)
         self._edges = {
-            section.lane: section
+            section.lane
             for section in road.sections
             if section.moves_from_m > -math.inf
             or section.from_m > 0.0
@@ -276,12 +276,11 @@ class LightPlanner:
 
     def _is_open(self, slot: int, origin: Cell, target: Cell, lane: int) -> bool:
         """Return whether a move stays where moves are possible in a lane, if it is an edge."""
-        section, road = self._edges.get(lane), self._road
-        if section is None:
+        if lane not in self._edges:
             return True
+        road = self._road
         rear_m = road.position_m(slot, min(origin[0], target[0])) - road.body_m
-        front_m = road.position_m(slot + 1, max(origin[0], target[0]))
-        return max(section.from_m, section.moves_from_m) <= rear_m and front_m <= section.to_m
+        return road.is_open(lane, rear_m, road.position_m(slot + 1, max(origin[0], target[0])))
 
     def _away(self, vehicle: StreamVehicle, cell: Cell) -> int:
         """Return the number of lanes from a cell to the nearest target."""
