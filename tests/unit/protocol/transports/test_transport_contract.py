@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 import subprocess
 import sys
 import threading
@@ -654,6 +655,26 @@ def test_without_the_link_all_tokens_vanish_and_come_back(breakable_bed: Bed) ->
 
 
 # --- what Zenoh alone has ---------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_own_token_vanishes_with_the_link_before_the_router_knew_it(tmp_path: Path) -> None:
+    router = Router(tmp_path / "s")
+    router.start()
+    with contextlib.ExitStack() as stack:
+        stack.callback(router.kill)
+        bed = stack.enter_context(contextlib.closing(ZenohBed(router)))
+        party = bed.join("a")
+        router.process.send_signal(signal.SIGSTOP)
+        party.transport.announce(token_key("a"))
+        party.transport.watch(TOKENS)
+        bed.until(lambda: party.tokens() == ["+a"])
+        router.kill()
+        bed.until(lambda: party.tokens() == ["+a", "-a"])
+        router.start()
+        bed.until(lambda: party.tokens() == ["+a", "-a", "+a"])
+        bed.quiet()
+        assert party.tokens() == ["+a", "-a", "+a"]
 
 
 @pytest.mark.slow

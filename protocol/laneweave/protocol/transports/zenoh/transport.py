@@ -132,6 +132,8 @@ class ZenohTransport:
         self._watched: dict[str, Any] = {}
         self._seen: dict[str, None] = {}
         """Keys of the tokens that the node has been notified of."""
+        self._own_lost: list[str] = []
+        """Those of `_seen` that were tokens of this process when the link was lost."""
         self._seen_lock = threading.Lock()
         self._served: dict[str, Any] = {}
         self._queries: OpenQueries[zenoh.Query] = OpenQueries()
@@ -259,7 +261,20 @@ class ZenohTransport:
                 self._deliver(event)
 
     def _on_link(self, event: zenoh.TransportEvent) -> None:
-        self._deliver(LinkUp() if event.kind == zenoh.SampleKind.PUT else LinkDown())
+        link_up = event.kind == zenoh.SampleKind.PUT
+        self._deliver(LinkUp() if link_up else LinkDown())
+        # The session reports its own tokens with the link only if the router had already reported
+        # them back.
+        with self._seen_lock:
+            if link_up:
+                changes = [TokenUp(key) for key in self._own_lost if key in self._tokens]
+                self._own_lost = []
+            else:
+                changes = [TokenDown(key) for key in self._seen if key in self._tokens]
+                self._own_lost += [change.key for change in changes]
+            for change in changes:
+                if update_tokens(self._seen, change):
+                    self._deliver(change)
 
     def _on_query(self, key: str, query: zenoh.Query) -> None:
         sender = self._sender_of(query)
