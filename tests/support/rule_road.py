@@ -6,9 +6,10 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from attrs import define, field
+from attrs import define, evolve, field
 
 from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.road_layout import END_OF_ROAD, Exits
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
 from laneweave.sim_bridge.baselines.rule_based import RuleTraffic
@@ -24,11 +25,16 @@ def rule_scenario(**rule: Any) -> Scenario:  # noqa: ANN401 (fields)
 
 
 def vehicle(
-    name: str, s_m: float, lane: int = 0, preferred_lane: int | None = None, speed_mps: float = 15.0
+    name: str,
+    s_m: float,
+    lane: int = 0,
+    preferred_lane: int | None = None,
+    speed_mps: float = 15.0,
+    destination: str = END_OF_ROAD,
 ) -> ReferenceVehicle:
     wanted = lane if preferred_lane is None else preferred_lane
     return ReferenceVehicle(
-        arrival=arrival(name, 0.0, lane, wanted),
+        arrival=evolve(arrival(name, 0.0, lane, wanted), destination=destination),
         entered_s=0.0,
         s_m=s_m,
         speed_mps=speed_mps,
@@ -47,10 +53,12 @@ class RuleRoad:
     traffic: RuleTraffic = field(init=False)
     left: list[ReferenceVehicle] = field(factory=list)
     tick: int = 0
+    _exits: Exits = field(init=False)
 
     def __attrs_post_init__(self) -> None:
         """Put the vehicles on the road."""
         world = PlainWorld()
+        self._exits = Exits(self.scenario.sections, self.scenario.road.length_m)
         self.entrance = Entrance(self.scenario)
         self.traffic = RuleTraffic(self.scenario, world)
         for one in self.vehicles:
@@ -71,7 +79,7 @@ class RuleRoad:
         for one in list(self.traffic.vehicles):
             assert 0.0 <= one.speed_mps <= self.scenario.formation.speed_mps
             assert limits.min_accel_mps2 - 1e-9 <= one.accel_mps2 <= limits.max_accel_mps2 + 1e-9
-            if one.s_m >= self.scenario.road.length_m:
+            if self._exits.left_by(int(one.y_m // PAPER.road.lane_width_m), one.s_m) is not None:
                 self.traffic.remove(one)
                 self.left.append(one)
         poses = self.traffic.poses()

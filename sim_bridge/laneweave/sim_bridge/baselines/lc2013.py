@@ -1,8 +1,8 @@
 """SUMO's own lane changing (LC2013) and car following (Krauss), for automated vehicles.
 
 Headway and desired speed are those of the other methods; vehicles are identical, with no driver
-imperfection. A vehicle's route leads to the exit of its preferred lane, if it has one. In S1 and
-S2, lane changes are disabled unless the scenario allows them everywhere.
+imperfection. A vehicle's route leads to its exit, or to that of its preferred lane. In S1 and S2,
+lane changes are disabled unless the scenario allows them everywhere.
 """
 
 from __future__ import annotations
@@ -11,11 +11,7 @@ from collections.abc import Collection
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.baselines.reference_road import (
-    Entrance,
-    ReferenceVehicle,
-    check_no_ramps,
-)
+from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.sumo.road_edges import lane_end_m
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
@@ -35,7 +31,6 @@ class Lc2013Traffic:
         self._poses: dict[str, Pose] = {}
         self._road = scenario.road
         self._everywhere = scenario.lc2013.lane_changes == "everywhere"
-        self._speed_mps = scenario.formation.speed_mps
         self._tick_s = scenario.runtime.tick_s
 
     @property
@@ -76,8 +71,7 @@ class Lc2013Traffic:
         for lane in range(self._road.lanes):
             arrival = entrance.next_in(lane)
             if arrival is not None and arrival.vehicle not in self._offered:
-                s_m = entrance.max_entry_m(arrival, t_s)
-                self._sumo.offer(arrival.vehicle, arrival.lane, arrival.preferred_lane, s_m)
+                self._sumo.offer(arrival, entrance.max_entry_m(arrival, t_s))
                 if not self._everywhere:
                     self._sumo.allow_lane_changes(arrival.vehicle, allowed=False)
                 self._offered[arrival.vehicle] = arrival.lane
@@ -85,9 +79,10 @@ class Lc2013Traffic:
     def _entered(self, name: str, t_s: float, entrance: Entrance) -> ReferenceVehicle:
         s_m, y_m, _, speed_mps = self._poses[name]
         lane = self._offered.pop(name)
+        arrival = entrance.take(lane)
         vehicle = ReferenceVehicle(
-            arrival=entrance.take(lane),
-            entered_s=t_s - s_m / self._speed_mps,
+            arrival=arrival,
+            entered_s=entrance.entered_s(arrival, s_m, t_s),
             s_m=s_m,
             speed_mps=speed_mps,
             y_m=y_m,
@@ -112,7 +107,6 @@ def check_lc2013(scenario: Scenario) -> None:
     Raises:
         BadInputError: a field is unsuitable.
     """
-    check_no_ramps(scenario)
     headway_s, tick_s = scenario.lc2013.headway_s, scenario.runtime.tick_s
     if headway_s < tick_s:
         raise BadInputError(
@@ -134,15 +128,21 @@ def check_lc2013(scenario: Scenario) -> None:
 
 def _check_closures(scenario: Scenario) -> None:
     """Check that vehicles can leave lanes before they end, and use them again."""
-    road, settings = scenario.road, scenario.lc2013
-    start_m = 0.0 if settings.lane_changes == "everywhere" else road.sorting_start_m
-    for number, closure in enumerate(road.closures):
-        name = f"road.closures[{number}]"
-        min_m = start_m + closure.from_m - lane_end_m(scenario, closure.from_m)
-        if closure.from_m <= min_m:
+    road = scenario.road
+    numbers = {(one.lane, one.from_m): number for number, one in enumerate(road.closures)}
+    sorting_m = 0.0 if scenario.lc2013.lane_changes == "everywhere" else road.sorting_start_m
+    for section in scenario.sections:
+        if section.exit:
+            continue
+        changes_from_m = max(sorting_m, section.from_m, section.moves_from_m)
+        min_m = changes_from_m + section.to_m - lane_end_m(scenario, section.to_m)
+        if section.to_m <= min_m:
+            name = f"road.closures[{numbers[section.lane, section.to_m]}].from_m"
             allowed = f"more than {min_m:g}, so that vehicles can change lanes before"
-            raise BadInputError(f"{name}.from_m", closure.from_m, allowed)
-        max_m = road.length_m - scenario.vehicle.length_m
+            raise BadInputError(name, section.to_m, allowed)
+    max_m = road.length_m - scenario.vehicle.length_m
+    for number, closure in enumerate(road.closures):
         if max_m <= closure.to_m < road.length_m:
+            name = f"road.closures[{number}].to_m"
             allowed = f"less than {max_m:g}, or at least {road.length_m:g}: a vehicle must fit in"
-            raise BadInputError(f"{name}.to_m", closure.to_m, allowed)
+            raise BadInputError(name, closure.to_m, allowed)

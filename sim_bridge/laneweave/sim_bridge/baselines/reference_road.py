@@ -1,4 +1,4 @@
-"""The road of a reference method: demand, entrance, traffic, measurement and recording."""
+"""The road of a reference method: demand, entrances, traffic, measurement and recording."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Protocol
 
 from attrs import define
 
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import RoadClock
@@ -26,7 +26,7 @@ class ReferenceVehicle:
 
     arrival: Arrival
     entered_s: float
-    """Road time at which its front passed s = 0."""
+    """Road time at which its front passed the entrance."""
     s_m: float
     """Position of the front bumper along the road."""
     speed_mps: float
@@ -51,6 +51,11 @@ class ReferenceVehicle:
         return self.arrival.preferred_lane
 
     @property
+    def destination(self) -> str:
+        """Name of the exit by which the vehicle wants to leave, or `END_OF_ROAD`."""
+        return self.arrival.destination
+
+    @property
     def state(self) -> State:
         """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""
         return self.s_m, self.speed_mps, self.accel_mps2, self.y_m, self.lateral_speed_mps, 0.0
@@ -66,28 +71,13 @@ class ReferenceVehicle:
         return {}
 
 
-def check_no_ramps(scenario: Scenario) -> None:
-    """Check that all vehicles enter at the start of the road and leave at its end.
-
-    Raises:
-        BadInputError: the road has ramps or exits, which reference methods do not drive.
-    """
-    for name, places in (("entrance", scenario.entrance), ("exit", scenario.exit)):
-        if places:
-            names = [place.name for place in places]
-            raise BadInputError(name, names, "none with reference methods; use --method formation")
-    for number, closure in enumerate(scenario.road.closures):
-        if closure.from_m <= 0.0:
-            name = f"road.closures[{number}].from_m"
-            raise BadInputError(name, closure.from_m, "more than 0 with reference methods")
-
-
 class Entrance:
-    """Queue of waiting vehicles for each lane, in order of arrival."""
+    """Queue of waiting vehicles for each lane, at the start of the road or of a ramp."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Create empty queues."""
         self._queues: list[deque[Arrival]] = [deque() for _ in range(scenario.road.lanes)]
+        self._entry_m = scenario.entry_m
         self._speed_mps = scenario.formation.speed_mps
         self._tick_s = scenario.runtime.tick_s
 
@@ -108,7 +98,12 @@ class Entrance:
 
         A vehicle that arrived between two ticks and did not wait has driven at v_F since then.
         """
-        return self._speed_mps * min(max(t_s - arrival.t_s, 0.0), self._tick_s)
+        driven_s = min(max(t_s - arrival.t_s, 0.0), self._tick_s)
+        return self._entry_m[arrival.lane] + self._speed_mps * driven_s
+
+    def entered_s(self, arrival: Arrival, s_m: float, t_s: float) -> float:
+        """Return when a vehicle that is at `s_m` at `t_s` passed its entrance at v_F."""
+        return t_s - (s_m - self._entry_m[arrival.lane]) / self._speed_mps
 
     def take(self, lane: int) -> Arrival:
         """Remove and return the next vehicle in the queue of a lane."""
@@ -148,6 +143,7 @@ class ReferenceRoad:
         self._demanded = 0
         self._left = 0
         self._entrance = Entrance(scenario)
+        self._exits = Exits(scenario.sections, scenario.road.length_m)
 
     @property
     def t_s(self) -> float:
@@ -209,8 +205,9 @@ class ReferenceRoad:
         )
 
     def _remove_departed(self) -> None:
-        length_m = self._scenario.road.length_m
-        for vehicle in [each for each in self._traffic.vehicles if each.s_m >= length_m]:
-            self._traffic.remove(vehicle)
-            self._left += 1
-            self._record.on_left(vehicle, self.t_s, attended=True)
+        lane_m = self._scenario.road.lane_width_m
+        for vehicle in list(self._traffic.vehicles):
+            if self._exits.left_by(int(vehicle.y_m // lane_m), vehicle.s_m) is not None:
+                self._traffic.remove(vehicle)
+                self._left += 1
+                self._record.on_left(vehicle, self.t_s, attended=True)

@@ -11,13 +11,10 @@ from collections.abc import Collection, Iterable
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.baselines.reference_road import (
-    Entrance,
-    ReferenceVehicle,
-    check_no_ramps,
-)
+from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
 from laneweave.sim_bridge.baselines.rules import Lanes, Rules, priority
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
+from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.world_interface import World
 
 _ROUNDING_M = 1e-9
@@ -35,6 +32,7 @@ class RuleTraffic:
         self._limits = scenario.vehicle
         self._rule = scenario.rule
         self._road = scenario.road
+        self._entry_m = scenario.entry_m
         self._centre_m = scenario.lattice.cell_y_m
         self._speed_mps = scenario.formation.speed_mps
         self._tick_s = scenario.runtime.tick_s
@@ -122,13 +120,13 @@ class RuleTraffic:
         entered = []
         for lane in range(self._road.lanes):
             while (arrival := entrance.next_in(lane)) is not None:
-                s_m = self._room_m(lane, entrance.max_entry_m(arrival, t_s))
+                s_m = self._room_m(arrival, entrance.max_entry_m(arrival, t_s))
                 if s_m is None:
                     break
                 entrance.take(lane)
                 vehicle = ReferenceVehicle(
                     arrival=arrival,
-                    entered_s=t_s - s_m / self._speed_mps,
+                    entered_s=entrance.entered_s(arrival, s_m, t_s),
                     s_m=s_m,
                     speed_mps=self._speed_mps,
                     y_m=self._centre_m(lane),
@@ -140,14 +138,15 @@ class RuleTraffic:
                 entered.append(vehicle)
         return entered
 
-    def _room_m(self, lane: int, max_entry_m: float) -> float | None:
-        """Return the position at which a vehicle can enter a lane at v_F; None if it cannot."""
-        if not self._lanes[lane]:
+    def _room_m(self, arrival: Arrival, max_entry_m: float) -> float | None:
+        """Return the position at which a vehicle can enter its lane at v_F; None if it cannot."""
+        entry_m, speed_mps = self._entry_m[arrival.lane], self._speed_mps
+        beyond = [one for one in self._lanes[arrival.lane] if one.s_m >= entry_m]
+        if not beyond:
             return max_entry_m
-        ahead, speed_mps = self._lanes[lane][-1], self._speed_mps
-        following = self._rules.following
+        ahead, following = beyond[-1], self._rules.following
         s_m = min(max_entry_m, ahead.s_m - following.gap_m(speed_mps) - _ROUNDING_M)
-        if s_m < 0.0 or not following.is_safe(s_m, speed_mps, ahead.s_m, ahead.speed_mps):
+        if s_m < entry_m or not following.is_safe(s_m, speed_mps, ahead.s_m, ahead.speed_mps):
             return None
         return s_m
 
@@ -158,14 +157,13 @@ def check_rule(scenario: Scenario) -> None:
     Raises:
         BadInputError: a field is unsuitable.
     """
-    check_no_ramps(scenario)
     rule, road, speed_mps = scenario.rule, scenario.road, scenario.formation.speed_mps
     # Speed decreases in proportion to the remaining distance, once per tick.
     braking_m = speed_mps**2 / -scenario.vehicle.min_accel_mps2
     min_m = braking_m + 3.0 * speed_mps * scenario.runtime.tick_s
     sorting_m, sorting = road.s3_m, f"road.s3_m = {road.s3_m:g}"
     for number, closure in enumerate(road.closures):
-        if closure.from_m - road.sorting_start_m < sorting_m:
+        if 0.0 < closure.from_m < road.sorting_start_m + sorting_m:
             sorting_m = closure.from_m - road.sorting_start_m
             sorting = f"{sorting_m:g}, the part of S3 before road.closures[{number}]"
     if not min_m <= rule.stop_distance_m < sorting_m:

@@ -6,8 +6,9 @@ Rule 2. A vehicle changes to the next lane towards the preferred one when the ga
 Rule 3. If a gap is too small, the vehicle with lower priority slows down. Its speed decreases
         towards the end of the road.
 
-On roads with closed parts of lanes, `wanted_lanes` defines the preferred lane, and a dead end
-counts as the end of the road for vehicles that must leave a lane before it.
+On roads with closed parts of lanes, ramps and exits, `wanted_lanes` defines the preferred lane. The
+end of a lane, or the exit of a vehicle, counts as the end of the road for vehicles that must change
+lanes before it.
 
 Lane changes and speeds are pure functions of the positions.
 """
@@ -170,8 +171,8 @@ class Rules:
         self._all_yield = rule.yielding == "all"
         self._change_m = self._speed_mps * rule.lane_change_s
         slip_m = road.lane_width_m / scenario.vehicle.max_slip_ratio
-        self._dead_end_change_m = max(self._change_m, slip_m) if self._change_m else 0.0
-        """Length of a lane change before a dead end, which no vehicle may pass."""
+        self._safe_change_m = max(self._change_m, slip_m) if self._change_m else 0.0
+        """Length of a lane change at any speed, for those that must be complete in time."""
 
     def sort(self, lanes: Lanes) -> dict[ReferenceVehicle, float]:
         """Apply rules 2 and 3 to all vehicles off the lane that they want, by priority.
@@ -252,8 +253,8 @@ class Rules:
         """
         wanted = self._wanted.of(vehicle)
         remaining = abs(wanted.lane - vehicle.lane)
-        if remaining == 0 and not wanted.dead_end:
+        if remaining == 0 and not wanted.stops:
             return self._speed_mps
-        change_m = self._dead_end_change_m if wanted.dead_end else self._change_m
+        change_m = self._safe_change_m if wanted.stops else self._change_m
         left_m = wanted.end_m - vehicle.s_m - remaining * change_m
         return self._speed_mps * min(max(left_m / self._stop_m, 0.0), 1.0)

@@ -39,13 +39,13 @@ class SumoSession:
 
     _open: SumoSession | None = None
 
-    def __init__(self, scenario: Scenario, folder: Path, *, exits: bool = False) -> None:
+    def __init__(self, scenario: Scenario, folder: Path, *, sumo_drives: bool = False) -> None:
         """Load libsumo, write the network and start SUMO.
 
         Args:
             scenario: road, vehicles and tick.
             folder: folder for SUMO's input files.
-            exits: whether SUMO drives; see `write_network`.
+            sumo_drives: whether SUMO drives; see `write_network`.
 
         Raises:
             SumoUnavailableError: libsumo cannot be loaded.
@@ -54,7 +54,7 @@ class SumoSession:
         if SumoSession._open is not None:
             raise RuntimeError("libsumo supports one simulation per process, and one is open")
         self._sumo: Any = _load_libsumo()
-        self._sumo.start([*write_network(scenario, folder, exits=exits)])
+        self._sumo.start([*write_network(scenario, folder, sumo_drives=sumo_drives)])
         self._half_body_m = 0.5 * scenario.vehicle.length_m
         SumoSession._open = self
 

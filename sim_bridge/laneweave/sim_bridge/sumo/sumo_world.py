@@ -15,12 +15,15 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.road_layout import END_OF_ROAD
+from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, pose_of
-from laneweave.sim_bridge.sumo.network import ROUTE, VEHICLE_TYPE
-from laneweave.sim_bridge.sumo.road_edges import EDGE, margin_m
+from laneweave.sim_bridge.sumo.network import VEHICLE_TYPE
+from laneweave.sim_bridge.sumo.road_edges import ROAD, margin_m, route_name
 from laneweave.sim_bridge.sumo.simulation import SumoSession
+
+_ROUTE = route_name(MAIN_ENTRANCE, END_OF_ROAD)
 
 
 class SumoWorld(SumoSession):
@@ -48,7 +51,7 @@ class SumoWorld(SumoSession):
             raise ValueError(f"{vehicle} is already on the road")
         self._check(vehicle, state)  # before the vehicle is added to SUMO
         api = self.vehicle
-        api.add(vehicle, ROUTE, typeID=VEHICLE_TYPE, depart="now", departPos="0", departSpeed="0")
+        api.add(vehicle, _ROUTE, typeID=VEHICLE_TYPE, depart="now", departPos="0", departSpeed="0")
         api.setSpeedMode(vehicle, 0)
         api.setLaneChangeMode(vehicle, 0)
         self._states[vehicle] = state
@@ -120,5 +123,5 @@ class SumoWorld(SumoSession):
             front_y_m += self._half_body_m * math.sin(heading)
             degrees -= math.degrees(heading)
         lane = min(max(int(front_y_m // self._lane_width_m), 0), self._lanes - 1)
-        self.vehicle.moveToXY(vehicle, EDGE, lane, s_m, front_y_m, degrees, 2)
+        self.vehicle.moveToXY(vehicle, ROAD, lane, s_m, front_y_m, degrees, 2)
         self._placed.add(vehicle)

@@ -5,9 +5,9 @@ The calls in each tick are
     offer() waiting vehicles  ->  advance(), which returns those that entered  ->  positions()
 
 An offered vehicle waits in SUMO until there is room at its entry position. Its route, which SUMO's
-lane changing follows, leads to the exit of its preferred lane, if it has one; a vehicle that does
-not reach this lane stops at the end of the road. A vehicle that does not leave a lane before it
-ends stops there.
+lane changing follows, leads to its exit, or to that of its preferred lane; a vehicle that does not
+reach a lane of its exit stops before it. A vehicle that does not leave a lane before it ends stops
+there.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from pathlib import Path
 
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
-from laneweave.sim_bridge.sumo.network import VEHICLE_TYPE, exit_route
-from laneweave.sim_bridge.sumo.road_edges import margin_m
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.sumo.network import VEHICLE_TYPE
+from laneweave.sim_bridge.sumo.road_edges import road_edges, route_of
 from laneweave.sim_bridge.sumo.simulation import SumoSession
 
 _NO_LANE_CHANGES = 0
@@ -30,27 +31,27 @@ class SumoTraffic(SumoSession):
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         """Start SUMO with an empty road; see `SumoSession`."""
-        super().__init__(scenario, folder, exits=True)
-        self._margin_m = margin_m(scenario)
+        super().__init__(scenario, folder, sumo_drives=True)
+        self._scenario = scenario
+        self._edges = road_edges(scenario)
         self._speed_mps = scenario.formation.speed_mps
         self._on_road: dict[str, None] = {}
 
-    def offer(self, vehicle: str, lane: int, preferred_lane: int, s_m: float) -> None:
+    def offer(self, arrival: Arrival, s_m: float) -> None:
         """Let SUMO insert a vehicle at v_F in the first step with sufficient room.
 
         Args:
-            vehicle: name of the vehicle.
-            lane: entry lane.
-            preferred_lane: lane of the exit, or `ANY_LANE`.
+            arrival: the vehicle.
             s_m: entry position of the front bumper.
         """
+        edge = self._edges.entry(self._scenario.entrance_of(arrival.lane))
         self.vehicle.add(
-            vehicle,
-            exit_route(preferred_lane),
+            arrival.vehicle,
+            route_of(self._scenario, arrival),
             typeID=VEHICLE_TYPE,
             depart="now",
-            departLane=str(lane),
-            departPos=f"{self._margin_m + s_m:.9f}",
+            departLane=str(edge.index(arrival.lane)),
+            departPos=f"{s_m - edge.from_m:.9f}",
             departSpeed=f"{self._speed_mps:.9f}",
         )
 

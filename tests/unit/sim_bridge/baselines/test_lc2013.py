@@ -1,4 +1,4 @@
-"""SUMO drives on roads with closed parts of lanes: all vehicles leave, and none is in the way."""
+"""SUMO drives on roads with closed lanes, ramps and exits: all vehicles leave where they want."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from attrs import evolve
 
 from laneweave.launch.run_methods import LC2013, METHODS
 from laneweave.protocol.config.scenario_files import parse_scenario
-from laneweave.protocol.road_layout import ANY_LANE
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.road_layout import ANY_LANE, Exits
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.lc2013 import Lc2013Traffic, check_lc2013
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose
 from laneweave.sim_bridge.road.demand import arrivals, count_until
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
+from support.closed_lanes import ramp_road
 
 LABELS = [name for name, one in METHODS.items() if one.method == LC2013]
 DROP = [{"lane": 0, "from_m": 800.0}]
@@ -47,6 +50,7 @@ def drive(scenario: Scenario, folder: Path) -> dict[ReferenceVehicle, float]:
     left: dict[ReferenceVehicle, float] = {}
     before: dict[str, Pose] = {}
     queued = tick = 0
+    exits = Exits(scenario.sections, road.length_m)
     with SumoTraffic(scenario, folder / "sumo") as sumo:
         traffic = Lc2013Traffic(scenario, sumo)
         while len(left) < len(demand):
@@ -64,9 +68,12 @@ def drive(scenario: Scenario, folder: Path) -> dict[ReferenceVehicle, float]:
             for name, pose in poses.items():
                 assert_continuous(before.get(name, pose), pose, scenario)
             before = poses
-            for one in [one for one in traffic.vehicles if one.s_m >= road.length_m]:
-                traffic.remove(one)
-                left[one] = t_s - one.arrival.t_s
+            for one in list(traffic.vehicles):
+                section = exits.left_by(one.lane, one.s_m)
+                if section is not None:
+                    assert section.serves(one.preferred_lane, one.destination)
+                    traffic.remove(one)
+                    left[one] = t_s - one.arrival.t_s
     return left
 
 
@@ -117,3 +124,48 @@ def test_vehicles_leave_on_their_preferred_lanes(
 def test_a_queue_before_a_lane_drop_dissolves(label: str, tmp_path: Path) -> None:
     scenario = METHODS[label].settings(closed_road(DROP, volume=2400.0))
     assert max(drive(scenario, tmp_path).values()) > 70.0
+
+
+# --- ramps and exits --------------------------------------------------------------------------
+
+SHORT_DEMAND: dict[str, object] = {"duration_s": 30.0}
+RAMP = ramp_road(demand=SHORT_DEMAND)
+WEAVING = ramp_road(ends_m=700.0, exit_name="off", demand=SHORT_DEMAND)
+PREFERENCES = evolve(WEAVING, demand=evolve(WEAVING.demand, lane_shares=(0.0, 1.0, 1.0, 1.0)))
+
+
+@pytest.mark.parametrize(
+    ("label", "scenario"),
+    [
+        ("lc2013", RAMP),
+        ("lc2013", WEAVING),
+        ("lc2013", PREFERENCES),
+        ("lc2013-human", RAMP),
+        ("lc2013-human", WEAVING),
+        ("lc2013-cooperative-4s", RAMP),
+        ("lc2013-cooperative-4s", WEAVING),
+    ],
+)
+def test_vehicles_enter_by_ramps_and_leave_by_their_exits(
+    label: str, scenario: Scenario, tmp_path: Path
+) -> None:
+    scenario = METHODS[label].settings(scenario)
+    left = drive(scenario, tmp_path)
+    for vehicle, travel_s in left.items():
+        free_s = scenario.free_flow_trip_s(vehicle.arrival.lane, vehicle.destination)
+        assert free_s - 0.1 <= travel_s < 1.4 * free_s
+    ways = {(one.arrival.lane == 0, one.destination) for one in left}
+    assert ways >= {(True, "end"), (False, "end")}
+    assert not scenario.exit or (False, "off") in ways
+
+
+@pytest.mark.parametrize("merge_m", [465.0, 475.0])
+def test_a_ramp_that_leaves_no_room_for_lane_changes_is_refused(merge_m: float) -> None:
+    scenario = ramp_road(lc2013={"lane_change_s": 4.0})
+    (ramp,) = scenario.entrance
+    scenario = evolve(scenario, entrance=(evolve(ramp, merge_m=merge_m),))
+    if merge_m < 470.0:
+        check_lc2013(scenario)
+    else:
+        with pytest.raises(BadInputError, match=r"road\.closures\[1\]\.from_m.*more than 505"):
+            check_lc2013(scenario)

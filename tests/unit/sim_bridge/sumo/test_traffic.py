@@ -17,13 +17,15 @@ from laneweave.sim_bridge.baselines.lc2013 import check_lc2013
 from laneweave.sim_bridge.sumo.network import write_network
 from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
+from support.bridge_bench import arrival
+from support.closed_lanes import ramp_road
 
 
 def written(
     folder: Path, **tables: dict[str, Any]
 ) -> tuple[tuple[str, ...], ET.Element, ET.Element]:
     """Return SUMO's options, the network and the routes."""
-    options = write_network(parse_scenario(tables), folder, exits=True)
+    options = write_network(parse_scenario(tables), folder, sumo_drives=True)
     network, routes = (
         ET.parse(folder / name).getroot()  # noqa: S314 (our own)
         for name in ("road.net.xml", "road.rou.xml")
@@ -40,7 +42,7 @@ def test_each_lane_leads_to_an_exit_of_its_own(tmp_path: Path, lanes: int) -> No
     connections = {(one.attrib["fromLane"], one.attrib["to"]) for one in network.iter("connection")}
     assert connections == {(str(lane), f"exit{lane}") for lane in range(lanes)}
     edges = {one.attrib["id"]: one.attrib["edges"] for one in routes.iter("route")}
-    assert edges == {f"road-{lane}": f"road exit{lane}" for lane in range(lanes)}
+    assert edges == {f"main-lane-{lane}": f"road exit{lane}" for lane in range(lanes)}
 
 
 def test_lanes_go_on_where_they_were_and_the_road_ends_where_it_should(tmp_path: Path) -> None:
@@ -94,7 +96,7 @@ def test_drivers_are_as_the_scenario_says(tmp_path: Path) -> None:
 def test_sumo_drives_every_named_set_of_parameters(tmp_path: Path, label: str) -> None:
     scenario = METHODS[label].settings(Scenario())
     with SumoTraffic(scenario, tmp_path / "sumo") as traffic:
-        traffic.offer("v1", 2, 0, 0.0)
+        traffic.offer(arrival("v1", 0.0, 2, 0), 0.0)
         for _ in range(800):
             traffic.advance()
             ((s_m, y_m, _, _),) = traffic.positions().values()
@@ -180,7 +182,7 @@ def test_a_lane_that_ends_has_no_connection(tmp_path: Path) -> None:
         "road1": (800.0, 1030.0, {5.25: OPEN, 8.75: OPEN}),
     }
     assert connected_positions(network) == {("road", "road1", 5.25), ("road", "road1", 8.75)}
-    assert routes_by_name(routes) == {"road": "road road1"}
+    assert routes_by_name(routes) == {"main-end": "road road1"}
 
 
 def test_a_lane_opens_again_behind_its_closed_part_and_a_body(tmp_path: Path) -> None:
@@ -193,7 +195,7 @@ def test_a_lane_opens_again_behind_its_closed_part_and_a_body(tmp_path: Path) ->
     }
     at_ends = [one for one in connected_positions(network) if one[2] == 1.75]
     assert at_ends == [("road2", "road3", 1.75)]
-    assert routes_by_name(routes) == {"road": "road road1 road2 road3"}
+    assert routes_by_name(routes) == {"main-end": "road road1 road2 road3"}
 
 
 def test_a_closed_lane_between_open_ones_keeps_them_apart(tmp_path: Path) -> None:
@@ -209,7 +211,9 @@ def test_lanes_that_reach_the_end_lead_to_exits_if_vehicles_prefer_lanes(tmp_pat
     edges = lanes_by_edge(network)
     assert edges["road1"] == (800.0, 1000.0, {1.75: OPEN, 5.25: OPEN})
     assert edges["exit1"] == (1000.0, 1030.0, {5.25: OPEN})
-    assert routes_by_name(routes) == {f"road-{lane}": f"road road1 exit{lane}" for lane in range(2)}
+    assert routes_by_name(routes) == {
+        f"main-lane-{lane}": f"road road1 exit{lane}" for lane in range(2)
+    }
 
 
 @pytest.mark.parametrize(
@@ -242,6 +246,97 @@ def test_a_closed_part_that_leaves_no_room_is_refused(
         check_lc2013(parse_scenario(tables))
 
 
+# --- ramps and exits --------------------------------------------------------------------------
+
+
+def ramp_files(folder: Path, scenario: Scenario) -> tuple[ET.Element, ET.Element]:
+    """Return the network and the routes of a road with ramps and exits."""
+    write_network(scenario, folder, sumo_drives=True)
+    network, routes = (
+        ET.parse(folder / name).getroot()  # noqa: S314 (our own)
+        for name in ("road.net.xml", "road.rou.xml")
+    )
+    return network, routes
+
+
+def test_a_ramp_is_an_edge_beside_the_road_until_it_joins(tmp_path: Path) -> None:
+    network, routes = ramp_files(tmp_path, ramp_road())
+    assert lanes_by_edge(network) == {
+        "road": (-30.0, 200.0, {5.25: OPEN, 8.75: OPEN, 12.25: OPEN}),
+        "road1": (200.0, 205.0, {1.75: OPEN, 5.25: OPEN, 8.75: OPEN, 12.25: OPEN}),
+        "road2": (205.0, 500.0, {1.75: OPEN, 5.25: OPEN, 8.75: OPEN, 12.25: OPEN}),
+        "road3": (500.0, 1030.0, {5.25: OPEN, 8.75: OPEN, 12.25: OPEN}),
+        "ramp-on": (20.0, 200.0, {1.75: OPEN}),
+    }
+    rightmost = {one for one in connected_positions(network) if one[2] == 1.75}
+    assert rightmost == {("ramp-on", "road1", 1.75), ("road1", "road2", 1.75)}
+    assert routes_by_name(routes) == {
+        "main-end": "road road1 road2 road3",
+        "on-end": "ramp-on road1 road2 road3",
+    }
+    # No body turns while its rear is on another edge.
+    forbidden = {
+        (lane.attrib["id"], side)
+        for lane in network.iter("lane")
+        for side in ("changeLeft", "changeRight")
+        if side in lane.attrib
+    }
+    assert {one for one in forbidden if one != ("road1_0", "changeRight")} == {
+        ("road1_0", "changeLeft"),
+        ("road1_1", "changeRight"),
+    }
+
+
+def test_an_exit_is_an_edge_behind_the_lane_that_it_ends(tmp_path: Path) -> None:
+    # A lane change that takes time does not shorten the lane of an exit.
+    scenario = ramp_road(ends_m=700.0, exit_name="off", lc2013={"lane_change_s": 4.0})
+    network, routes = ramp_files(tmp_path, scenario)
+    edges = lanes_by_edge(network)
+    assert edges["road2"][:2] == (205.0, 700.0)
+    assert edges["exit-off"] == (700.0, 730.0, {1.75: OPEN})
+    behind = {one for one in connected_positions(network) if one[0] == "road2"}
+    assert behind == {
+        ("road2", "exit-off", 1.75),
+        *(("road2", "road3", y_m) for y_m in (5.25, 8.75, 12.25)),
+    }
+    assert routes_by_name(routes) == {
+        "main-end": "road road1 road2 road3",
+        "main-off": "road road1 road2 exit-off",
+        "on-end": "ramp-on road1 road2 road3",
+        "on-off": "ramp-on road1 road2 exit-off",
+    }
+
+
+def test_each_junction_knows_all_lanes_that_lead_to_it(tmp_path: Path) -> None:
+    network, _ = ramp_files(tmp_path, ramp_road(ends_m=700.0, exit_name="off"))
+    names = [one.attrib["id"] for one in network.iter("junction")]
+    assert len(names) == len(set(names))
+    for junction in network.iter("junction"):
+        before = [
+            edge for edge in network.iter("edge") if edge.attrib["to"] == junction.attrib["id"]
+        ]
+        incoming = [lane.attrib["id"] for edge in before for lane in edge.iter("lane")]
+        assert junction.attrib["incLanes"].split() == incoming
+        ids = {edge.attrib["id"] for edge in before}
+        count = sum(one.attrib["from"] in ids for one in network.iter("connection"))
+        assert len(list(junction.iter("request"))) == count
+
+
+def test_a_lane_between_two_lanes_of_an_exit_does_not_lead_there(tmp_path: Path) -> None:
+    closures = [{"lane": lane, "from_m": 800.0} for lane in (0, 2)]
+    scenario = parse_scenario(
+        {
+            "road": {**SHORT, "closures": closures},
+            "exit": [{"name": "off", "lanes": [0, 2], "at_m": 800.0}],
+            "demand": {"volume_veh_per_lane_h": 300.0},
+            "formation": {"operation": "rolling"},
+        }
+    )
+    network, _ = ramp_files(tmp_path, scenario)
+    leading = {one for one in connected_positions(network) if one[1] == "exit-off"}
+    assert leading == {("road", "exit-off", 1.75), ("road", "exit-off", 8.75)}
+
+
 # --- SUMO -------------------------------------------------------------------------------------
 
 
@@ -252,7 +347,7 @@ def traffic(tmp_path: Path) -> Iterator[SumoTraffic]:
 
 
 def test_an_offered_vehicle_enters_where_it_was_offered(traffic: SumoTraffic) -> None:
-    traffic.offer("v1", 2, 0, 0.6)
+    traffic.offer(arrival("v1", 0.0, 2, 0), 0.6)
     assert traffic.advance() == ("v1",)
     assert traffic.positions()["v1"] == pytest.approx((0.6, 8.75, 0.0, 15.0), abs=1e-6)
     assert traffic.advance() == ()
@@ -260,9 +355,9 @@ def test_an_offered_vehicle_enters_where_it_was_offered(traffic: SumoTraffic) ->
 
 
 def test_a_vehicle_without_room_waits(traffic: SumoTraffic) -> None:
-    traffic.offer("v1", 0, 0, 0.0)
+    traffic.offer(arrival("v1", 0.0, 0, 0), 0.0)
     traffic.advance()
-    traffic.offer("v2", 0, 0, 0.0)
+    traffic.offer(arrival("v2", 0.0, 0, 0), 0.0)
     ticks = 1
     while "v2" not in traffic.advance():
         ticks += 1
@@ -271,7 +366,7 @@ def test_a_vehicle_without_room_waits(traffic: SumoTraffic) -> None:
 
 
 def test_a_vehicle_that_may_not_change_lanes_waits_at_the_end(traffic: SumoTraffic) -> None:
-    traffic.offer("v1", 0, 1, 0.0)
+    traffic.offer(arrival("v1", 0.0, 0, 1), 0.0)
     traffic.allow_lane_changes("v1", allowed=False)
     for _ in range(900):
         traffic.advance()

@@ -267,7 +267,9 @@ class ZenohTransport:
         # them back.
         with self._seen_lock:
             if link_up:
-                changes = [TokenUp(key) for key in self._own_lost if key in self._tokens]
+                changes: list[TokenUp | TokenDown] = [
+                    TokenUp(key) for key in self._own_lost if key in self._tokens
+                ]
                 self._own_lost = []
             else:
                 changes = [TokenDown(key) for key in self._seen if key in self._tokens]

@@ -1,22 +1,24 @@
-"""The rule-based method on roads with closed parts of lanes: vehicles leave lanes in time."""
+"""The rule-based method on roads with closed lanes, ramps and exits: vehicles leave in time."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import pytest
+from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.road_layout import ANY_LANE
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, Exits
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.rule_based import check_rule
 from laneweave.sim_bridge.baselines.rules import Lanes, Rules
-from laneweave.sim_bridge.baselines.wanted_lanes import WantedLanes
+from laneweave.sim_bridge.baselines.wanted_lanes import WantedLane, WantedLanes
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies
 from laneweave.sim_bridge.road.demand import arrivals
+from support.closed_lanes import ramp_road
 from support.rule_road import RuleRoad, vehicle
 
 
@@ -175,6 +177,125 @@ def test_all_vehicles_pass_closed_parts(
         left_s += [road.t_s - one.arrival.t_s for one in road.left[len(left_s) :]]
     assert all(one.arrival.preferred_lane in (one.lane, ANY_LANE) for one in road.left)
     assert sum(left_s) / len(left_s) < 1.1 * scenario.free_flow_s
+
+
+# --- ramps and exits --------------------------------------------------------------------------
+
+ON_RAMP = ramp_road()
+WEAVING = ramp_road(ends_m=700.0, exit_name="off")
+
+
+@pytest.mark.parametrize(
+    ("s_m", "lane", "destination", "wanted"),
+    [
+        (100.0, 3, "off", WantedLane(0, 700.0, stops=True)),
+        (300.0, 1, "off", WantedLane(0, 700.0, stops=True)),
+        (300.0, 0, "off", WantedLane(0, 700.0, stops=False)),
+        (52.0, 0, "off", WantedLane(0, 700.0, stops=False)),
+        (100.0, 0, END_OF_ROAD, WantedLane(1, 700.0, stops=True)),
+        (300.0, 1, END_OF_ROAD, WantedLane(1, 1000.0, stops=False)),
+    ],
+)
+def test_a_vehicle_wants_the_lane_of_its_exit_and_leaves_that_of_others(
+    s_m: float, lane: int, destination: str, wanted: WantedLane
+) -> None:
+    one = vehicle("a", s_m, lane, ANY_LANE, destination=destination)
+    assert WantedLanes(WEAVING).of(one) == wanted
+
+
+def test_a_vehicle_wants_the_nearest_lane_of_its_exit() -> None:
+    closures = [{"lane": lane, "from_m": 800.0} for lane in (0, 1)]
+    scenario = parse_scenario(
+        {
+            "road": {"lanes": 4, "s1_m": 50.0, "s2_m": 100.0, "s3_m": 850.0, "closures": closures},
+            "exit": [{"name": "off", "lanes": [0, 1], "at_m": 800.0}],
+            "demand": {"volume_veh_per_lane_h": 600.0},
+            "formation": {"operation": "rolling"},
+        }
+    )
+    wanted = [
+        WantedLanes(scenario).of(vehicle("a", 300.0, lane, ANY_LANE, destination="off")).lane
+        for lane in range(4)
+    ]
+    assert wanted == [0, 1, 1, 1]
+    # For the others both lanes end.
+    assert WantedLanes(scenario).of(vehicle("a", 300.0, 0, ANY_LANE)).lane == 2
+
+
+@pytest.mark.parametrize(
+    ("lane", "destination", "s_m", "changes"),
+    [
+        (0, END_OF_ROAD, 204.0, False),
+        (0, END_OF_ROAD, 205.0, True),
+        (1, "off", 204.0, False),
+        (1, "off", 205.0, True),
+        (1, "off", 699.0, True),
+        (1, END_OF_ROAD, 300.0, False),
+    ],
+)
+def test_nobody_changes_lanes_beside_a_ramp(
+    lane: int, destination: str, s_m: float, *, changes: bool
+) -> None:
+    one, lanes = vehicle("a", s_m, lane, ANY_LANE, destination=destination), Lanes(4)
+    lanes.enter(one, lane)
+    assert Rules(WEAVING).sort(lanes) == {}
+    assert (one.lane != lane) == changes
+
+
+def test_a_vehicle_that_cannot_reach_its_exit_lane_waits_before_it() -> None:
+    waiting = vehicle("a", 600.0, 1, ANY_LANE, destination="off")
+    beside = vehicle("b", 600.0, 0, ANY_LANE, destination="off")
+    road = RuleRoad(
+        evolve(WEAVING, rule=evolve(WEAVING.rule, lane_change_s=4.0)), [waiting, beside]
+    )
+    for _ in range(600):
+        beside.s_m, beside.speed_mps = waiting.s_m, waiting.speed_mps
+        step(road)
+    assert (waiting.lane, road.left) == (1, [])
+    assert waiting.s_m < 700.0
+    for _ in range(300):
+        step(road)
+    assert [one.lane for one in road.left] == [0, 0]
+
+
+def test_a_vehicle_enters_a_ramp_behind_those_in_its_lane_ahead_of_it() -> None:
+    passed, ahead = vehicle("a", 40.0, 0, ANY_LANE), vehicle("b", 70.0, 0, ANY_LANE)
+    road = RuleRoad(ON_RAMP, [passed, ahead])
+    arriving = next(one for one in arrivals(ON_RAMP) if one.lane == 0)
+    road.entrance.queue(evolve(arriving, t_s=0.0))
+    (entered,) = road.step()
+    # 1.5 m in a tick, from the beginning of the ramp.
+    assert [entered.s_m, entered.entered_s] == pytest.approx([51.5, 0.0])
+    road = RuleRoad(ON_RAMP, [vehicle("b", 60.0, 0, ANY_LANE)])
+    road.entrance.queue(evolve(arriving, t_s=0.0))
+    assert road.step() == []
+
+
+@pytest.mark.parametrize("rule", [{}, {"yielding": "all"}, {"lane_change_s": 4.0}], ids=str)
+@pytest.mark.parametrize("scenario", [ON_RAMP, WEAVING], ids=["on-ramp", "weaving"])
+def test_all_vehicles_leave_at_their_destinations(scenario: Scenario, rule: dict[str, Any]) -> None:
+    demand = evolve(scenario.demand, duration_s=30.0, volume_veh_per_lane_h=1000.0)
+    scenario = evolve(scenario, rule=evolve(scenario.rule, **rule), demand=demand)
+    check_rule(scenario)
+    road, exits = RuleRoad(scenario), Exits(scenario.sections, scenario.road.length_m)
+    waiting = list(arrivals(scenario))
+    count, delays_s = len(waiting), list[float]()
+    while len(delays_s) < count:
+        assert road.t_s < 200.0
+        while waiting and waiting[0].t_s <= road.t_s + scenario.runtime.tick_s:
+            road.entrance.queue(waiting.pop(0))
+        step(road)
+        for one in road.left[len(delays_s) :]:
+            section = exits.left_by(one.lane, one.s_m)
+            assert section is not None
+            assert section.serves(one.preferred_lane, one.destination)
+            free_s = scenario.free_flow_trip_s(one.arrival.lane, one.destination)
+            delays_s.append(road.t_s - one.arrival.t_s - free_s)
+    assert min(delays_s) > -0.2
+    assert sum(delays_s) / count < 7.0
+
+
+# --- crowds -----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
