@@ -132,7 +132,10 @@ class BodyStore:
         """Set the state of a vehicle."""
         self.at[vehicle] = state
 
-    add = place
+    def add(self, vehicle: str, state: State, vehicle_type: str = "car") -> None:
+        """Add a vehicle."""
+        del vehicle_type
+        self.at[vehicle] = state
 
     def step(self) -> None:
         """Do nothing."""

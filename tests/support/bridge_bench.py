@@ -75,7 +75,8 @@ class PlainWorld:
         """After each tick."""
         self.at: dict[str, State] = {}
 
-    def add(self, vehicle: str, state: State) -> None:
+    def add(self, vehicle: str, state: State, vehicle_type: str = "car") -> None:
+        del vehicle_type
         assert vehicle not in self.at
         self.at[vehicle] = state
 

@@ -168,6 +168,7 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
             "tuple[DestinationShare, ...]": "list of tables",
             "tuple[Entrance, ...]": "list of tables",
             "tuple[Exit, ...]": "list of tables",
+            "tuple[VehicleType, ...]": "list of tables",
             "tuple[DrivingStructure, ...]": "list of tables",
         }
         return kinds[re.sub(r"[a-z]+\.", "", kind)]

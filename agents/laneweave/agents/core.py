@@ -25,7 +25,7 @@ from attrs import evolve
 
 from laneweave.agents.driving.driver import Driver, SolverStats, TrackingDriver
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.lattice import PlannedMove, stretch_of
+from laneweave.protocol.lattice import Cell, PlannedMove, stretch_of
 from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
@@ -47,6 +47,7 @@ from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecuti
 from laneweave.protocol.wire.bounds import check_ballot
 from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import (
+    CAR,
     Command,
     Motion,
     Name,
@@ -101,7 +102,10 @@ class AgentCore:
         runtime = scenario.runtime
         self._bounds = runtime.bounds(self._incarnation)
         self._road = NewestRoad(runtime.max_pace)
-        self._driver = make_driver(scenario)
+        self._make_driver = make_driver
+        self._vehicle_type: str = CAR
+        self._driver = make_driver(scenario.types[CAR])
+        self._drivable: frozenset[Cell] | None = None
         self._lane_ends = LaneEnds(scenario)
         self._rules = rules
         self.wanted_motions: tuple[int, ...] = ()
@@ -219,6 +223,8 @@ class AgentCore:
             if sense.tick == self._sense.tick and self._command is not None:
                 return [*self._on_confirmation(sense), Send(COMMAND, self._command, self._own)]
             return []
+        if self._sense is None:
+            self._set_type(sense.vehicle_type)
         drove = self.in_charge and self._sense is not None and not self._sense.off_lattice
         self._sense = sense
         # Clocks of different machines may give a caretaker the same incarnation.
@@ -232,6 +238,19 @@ class AgentCore:
             # The attendant of an earlier SENSE may have been wrong, and the claim too high.
             self._claim_above(sense.attendant)
         return self._act(sense, in_charge=self.in_charge, drove=drove)
+
+    def _set_type(self, vehicle_type: str) -> None:
+        """Drive a vehicle of a type; it is known from the first SENSE of a road on."""
+        if vehicle_type == self._vehicle_type:
+            return
+        types = self._scenario.types
+        if vehicle_type not in types:
+            allowed = f"one of the scenario's types: {', '.join(types)}"
+            raise BadInputError("vehicle_type", vehicle_type, allowed)
+        own = types[vehicle_type]
+        self._vehicle_type = vehicle_type
+        self._drivable = None if vehicle_type == CAR else own.drivable_moves
+        self._driver = self._make_driver(own)
 
     def _has_lost_track(self, sense: Sense) -> bool:
         """Return whether the vehicle holds a cell to which this process has not moved it.
@@ -361,6 +380,7 @@ class AgentCore:
             rules=self._rules,
             owned=frozenset(sense.owned) if self._scenario.formation.rolling else None,
             lane_ends=self._lane_ends,
+            drivable=self._drivable,
         )
 
     def _decide(self, sense: Sense, execution: PlanExecution) -> None:

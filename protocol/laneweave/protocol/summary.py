@@ -64,6 +64,8 @@ class TravelTime:
     """By the name of the exit by which they wanted to leave; `end`: the end of the road."""
     by_entrance: dict[str, TripTimes] | None = None
     """By the name of the entrance; `main`: the start of the road."""
+    by_type: dict[str, TripTimes] | None = None
+    """By the type of vehicle; `car`: those that the scenario's table `vehicle` describes."""
 
 
 @frozen(kw_only=True)

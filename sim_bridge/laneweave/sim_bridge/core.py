@@ -339,7 +339,7 @@ class BridgeCore:
     def _enter(self) -> None:
         for vehicle in self._at_entrance:
             self.vehicles[vehicle.name] = vehicle
-            self._world.add(vehicle.name, vehicle.state)
+            self._world.add(vehicle.name, vehicle.state, vehicle.arrival.vehicle_type)
             self._record.on_entered(vehicle)
             if vehicle.name in self._answers.up:
                 self._unreported.add(vehicle.name)

@@ -7,8 +7,8 @@ from typing import Protocol
 
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
-from laneweave.protocol.wire.messages import Name
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose
+from laneweave.protocol.wire.messages import CAR, Name
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose, Size
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
@@ -16,7 +16,7 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 class World(Protocol):
     """Display of bodies: `SumoWorld`, or a substitute in tests."""
 
-    def add(self, vehicle: str, state: State) -> None:
+    def add(self, vehicle: str, state: State, vehicle_type: str = CAR) -> None:
         """Add a vehicle to the road."""
 
     def place(self, vehicle: str, state: State) -> None:
@@ -50,8 +50,11 @@ def show_bodies(
     for name, state in states.items():
         world.place(name, state)
     world.step()
-    road, size = scenario.road, scenario.vehicle
-    bodies = Bodies(world.positions(), size.length_m, size.width_m)
+    road, car = scenario.road, (scenario.vehicle.length_m, scenario.vehicle.width_m)
+    sizes: dict[str, Size] = {
+        name: vehicle.size for name, vehicle in vehicles.items() if vehicle.size != car
+    }
+    bodies = Bodies(world.positions(), *car, sizes)
     accels_mps2: dict[str, float] = {name: state[2] for name, state in states.items()}
     neighbours = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels_mps2)
     for name, vehicle in vehicles.items():

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from itertools import count
+
 import attrs
 import pytest
 
 from laneweave.agents.core import AgentCore
+from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime import node
+from laneweave.protocol.scenario.fields import Scenario, VehicleType
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import ARRIVED_ACROSS_M, ARRIVED_ALONG_M
+from laneweave.protocol.vehicle.plan_execution import drives_its_moves
 from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.messages import Command, Name, Neighbour, Prepare, Report
 from support.agent_rig import HOME, ME, MOVE_TICKS, OTHER, SCENARIO, TICK_S, Rig, up_and_running
@@ -274,3 +279,39 @@ def test_it_begins_anew_if_its_vehicle_has_entered_the_lattice_again_unseen() ->
         rig.coast(1)
     assert rig.agent.in_charge
     assert rig.shown[-1].hold_cell == there
+
+
+def test_an_agent_drives_its_type_and_takes_no_plan_that_the_type_cannot_drive() -> None:
+    truck = VehicleType("truck", 0.5, length_m=12.0, max_accel_mps2=1.3)
+    scenario = attrs.evolve(
+        SCENARIO,
+        formation=attrs.evolve(SCENARIO.formation, operation="rolling", gap_m=20.0),
+        vehicle_type=(truck,),
+    )
+    made: list[Scenario] = []
+
+    def make_driver(own: Scenario) -> TrackingDriver:
+        made.append(own)
+        return TrackingDriver(own)
+
+    agent = AgentCore(ME, count(1).__next__, scenario, make_driver)
+    sense = attrs.evolve(Rig().sense(), vehicle_type=Name("truck"))
+    agent.handle(node.Arrived(topics.SENSE, {"vehicle": ME}, sense), 0.0)
+    assert [own.vehicle.length_m for own in made] == [5.0, 12.0]
+    assert agent.execution is not None
+    assert agent.execution.drivable == frozenset({(0, 1), (0, -1)})
+    for (dx, dy), taken in (((0, 1), True), ((1, 0), False), ((-1, 0), False)):
+        target = HOME[0] + dx, HOME[1] + dy
+        plan = make_plan({ME: HOME}, {ME: ((0, HOME, target),)})
+        assert drives_its_moves(agent.execution, plan) == taken
+    # A type is that of the first SENSE, and a type of the scenario.
+    other = attrs.evolve(sense, tick=1, t_s=TICK_S, vehicle_type=Name("car"))
+    agent.handle(node.Arrived(topics.SENSE, {"vehicle": ME}, other), 0.1)
+    assert len(made) == 2
+    agent = AgentCore(ME, count(1).__next__, scenario, make_driver)
+    unknown = attrs.evolve(sense, vehicle_type=Name("tank"))
+    (refused,) = agent.handle(node.Arrived(topics.SENSE, {"vehicle": ME}, unknown), 0.0)
+    assert isinstance(refused, node.Refuse)
+    assert "vehicle_type: got 'tank'; allowed: one of the scenario's types: car, truck" in str(
+        refused.error
+    )

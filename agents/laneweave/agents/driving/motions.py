@@ -54,7 +54,7 @@ class _MoveTable:
         along = np.concatenate([states[:, 0], np.full(n, states[-1, 0])])
         starts = np.arange(ticks)[:, None]
         advance_m = scenario.formation.speed_mps * scenario.runtime.tick_s
-        reach_m = scenario.vehicle.width_m / 2.0 + TURNED_M
+        reach_m = scenario.widest_body_m / 2.0 + TURNED_M
         aside, half_m = np.abs(states[:, 3]), scenario.road.lane_width_m / 2.0
         # Without a lane change, the lane of origin is the target lane throughout.
         return cls(
@@ -119,7 +119,10 @@ class Motions:
             return  # not a move of this scenario
         table = self._tables.get((dx, dy, ticks))
         if table is None:
-            table = self._tables[dx, dy, ticks] = _MoveTable.of(self._scenario, dx, dy, ticks)
+            # Cars come first, and drive every move.
+            types = self._scenario.types.values()
+            mover = next(one for one in types if (dx, dy) in one.drivable_moves)
+            table = self._tables[dx, dy, ticks] = _MoveTable.of(mover, dx, dy, ticks)
         start_m, end_m = column * self._pitch_m, to_column * self._pitch_m
         low_m, high_m = min(start_m, end_m) - NEAR_M, max(start_m, end_m) + NEAR_M
         self.known[motion.vehicle] = _Known(motion, table, motion.tick, start_m, low_m, high_m)

@@ -60,6 +60,8 @@ class Surroundings:
         self._lattice = scenario.lattice
         self._width_m = limits.width_m
         self._length_m = limits.length_m
+        self._lengths_m = sorted({one.vehicle.length_m for one in scenario.types.values()})
+        """Lengths of the bodies of all types, since sensors do not report types."""
         self._lag_s = limits.actuator_lag_s
         self._speed_mps = scenario.formation.speed_mps
         self._min_gap_m = scenario.tracking.min_gap_m
@@ -168,11 +170,13 @@ class Surroundings:
             side: direction of the neighbours.
             lanes: the first and the last relevant lane.
         """
-        apart_m = side.sign * (self._length_m + self._min_gap_m)
+        lengths_m = self._lengths_m if side is _AHEAD else [self._length_m]
         for lane, front_m, speed_mps in others:
-            fronts = self._motions.fronts(lane, front_m + apart_m, speed_mps, lanes, side.free)
-            if fronts is None:
-                continue
-            fronts -= apart_m
-            positions = fronts if positions is None else side.nearest(positions, fronts)
+            for length_m in lengths_m:
+                apart_m = side.sign * (length_m + self._min_gap_m)
+                fronts = self._motions.fronts(lane, front_m + apart_m, speed_mps, lanes, side.free)
+                if fronts is None:
+                    continue
+                fronts -= apart_m
+                positions = fronts if positions is None else side.nearest(positions, fronts)
         return positions

@@ -46,6 +46,7 @@ from laneweave.protocol.vehicle.emergency_brake import (
     own_braking_mps2,
     spare_error_m,
 )
+from laneweave.protocol.wire.messages import CAR
 
 Array = NDArray[np.float64]
 
@@ -134,7 +135,7 @@ def move_profile(scenario: Scenario, dx: int, dy: int, ticks: int | None = None)
         raise ValueError(f"({dx}, {dy}) does not lead to a neighbouring cell")
     if ticks is None:
         ticks = scenario.move_ticks(scenario.cycles_s[0])
-    beyond_m = 2.0 * scenario.formation.gap_m - scenario.vehicle.length_m
+    beyond_m = 2.0 * scenario.formation.gap_m - scenario.longest_body_m
     return plan_trajectory(
         scenario.vehicle,
         scenario.formation.speed_mps,
@@ -147,22 +148,29 @@ def move_profile(scenario: Scenario, dx: int, dy: int, ticks: int | None = None)
 
 
 def check_moves(scenario: Scenario) -> None:
-    """Check that all moves of a scenario, for all T_F, can be driven within the vehicle's limits.
+    """Check that all moves of a scenario, for all T_F, can be driven within the types' limits.
 
     Raises:
         BadInputError: a move cannot be driven.
     """
-    for slot_s in scenario.slots_s:
-        for dx, dy in displacements(scenario.formation.mode)[1:]:
-            try:
-                move_profile(scenario, dx, dy, scenario.move_ticks(slot_s))
-            except InfeasibleTrajectoryError as error:
-                raise BadInputError(
-                    "formation.move_s",
-                    slot_s - scenario.formation.slack_s,
-                    f"long enough for a move by {dx} columns and {dy} lanes ({error}), or change "
-                    + ("formation.gap_m or the table braking" if dx > 0 else "the table vehicle"),
-                ) from error
+    for name, own in scenario.types.items():
+        whose = "vehicle" if name == CAR else f"vehicle_type of {name}"
+        for slot_s in scenario.slots_s:
+            for dx, dy in displacements(own.formation.mode)[1:]:
+                if (dx, dy) not in own.drivable_moves:
+                    continue
+                try:
+                    move_profile(own, dx, dy, own.move_ticks(slot_s))
+                except InfeasibleTrajectoryError as error:
+                    change = f"the table {whose}"
+                    if dx > 0:
+                        change = "formation.gap_m or the table braking"
+                    raise BadInputError(
+                        "formation.move_s",
+                        slot_s - scenario.formation.slack_s,
+                        f"long enough for a move of a {name} by {dx} columns and {dy} lanes "
+                        f"({error}), or change {change}",
+                    ) from error
 
 
 @lru_cache(maxsize=256)

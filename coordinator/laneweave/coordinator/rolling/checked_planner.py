@@ -67,7 +67,7 @@ def stream_road(scenario: Scenario) -> StreamRoad:
         advance_m=formation.speed_mps * scenario.cycles_s[0],
         sorting_m=(scenario.moves_from_m, road.length_m),
         length_m=road.length_m,
-        body_m=scenario.vehicle.length_m,
+        body_m=scenario.longest_body_m,
         mode=mode,
         model=ConflictModel(formation.conflict_kinds),
         sections=sections_to_lines(scenario),

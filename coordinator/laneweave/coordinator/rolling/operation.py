@@ -36,6 +36,7 @@ from laneweave.protocol.wire.events import (
     TRANSFER_ABORTED,
 )
 from laneweave.protocol.wire.messages import (
+    CAR,
     Ballot,
     Census,
     CensusEntry,
@@ -58,6 +59,8 @@ MAX_DELAY_S = 1.0
 LOOKAHEAD_M = 600.0
 """Distance before the first moves at which planning for a vehicle begins: the length of S3, so that
 all vehicles that can interact there are included in time."""
+NO_MOVES: frozenset[Cell] = frozenset()
+"""Moves of a vehicle of a type that this scenario does not have."""
 MARGIN_COLUMNS = 10
 """Columns ahead of the foremost and behind the rearmost vehicle that plans may use."""
 
@@ -89,6 +92,10 @@ class RollingOperation:
         self._planner = planner
         self._slot_s = scenario.cycles_s[0]
         self._sections = scenario.sections
+        self._moves = {
+            name: None if name == CAR else one.drivable_moves
+            for name, one in scenario.types.items()
+        }
         self.observed = ObservedRoad()
         self.transfers: list[CellTransfer] = []
         self._transfer_of: dict[Name, CellTransfer] = {}
@@ -204,7 +211,10 @@ class RollingOperation:
             s_m = self._scenario.lattice.cell_s_m(column, (slot - 1) * self._slot_s)
             if s_m < far_m:
                 continue
-            targets = self._targets(entry, s_m)
+            targets, moves = (
+                self._targets(entry, s_m),
+                self._moves.get(entry.vehicle_type, NO_MOVES),
+            )
             if state is None:
                 unknown = StreamVehicle(entry.vehicle, entry.cell, targets, held=True)
                 vehicles.setdefault(entry.cell, unknown)
@@ -216,7 +226,7 @@ class RollingOperation:
             if late:
                 reserved |= {*state.owned} - {state.hold_cell}
             held = late or not state.attended or state.t_s < since_s or self._is_displaced(state)
-            known = StreamVehicle(entry.vehicle, state.hold_cell, targets, held)
+            known = StreamVehicle(entry.vehicle, state.hold_cell, targets, held, moves)
             vehicles.setdefault(state.hold_cell, known)
         columns = [column for column, _ in vehicles] or [0]
         window = range(min(columns) - MARGIN_COLUMNS, max(columns) + MARGIN_COLUMNS + 1)

@@ -21,6 +21,7 @@ from laneweave.launch.recordings.formations import closed_formations
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import Floats, Tracks, read_trips
 from laneweave.protocol.road_layout import ANY_LANE
+from laneweave.protocol.wire.messages import CAR
 
 FORMAT: Final = "laneweave.animation/1"
 KINDS: Final = {"s_m": "<u2", "y_m": "<u2", "speed_mps": "u1"}
@@ -96,6 +97,7 @@ def _sample(run: Run, tracks: Tracks, formations: Formations) -> _Samples:
             {
                 "name": tracks.names[number],
                 "lane": int(trip.get("preferred_lane", ANY_LANE)),
+                "type": trip.get("vehicle_type", CAR),
                 "formation": trip["formation"] if trip.get("formation") in known else None,
                 "first": first,
                 "count": count,

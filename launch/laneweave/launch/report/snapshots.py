@@ -29,6 +29,7 @@ from laneweave.launch.recordings.trajectories import Floats, Tracks, read_tracks
 from laneweave.launch.report.style import picture
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.wire.messages import CAR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -81,6 +82,7 @@ def road_snapshots(
         times = _instants(tracks, scenario, stretch_m)
     trips = read_trips(folder)
     formations = closed_formations(folder, scenario)
+    beyond_m = 2.0 * scenario.longest_body_m
     width_in, road_m = 9.6, road.lanes * road.lane_width_m + _HEADROOM_M
     length_m = stretch_m[1] - stretch_m[0]
     across = _ACROSS_SCALE if length_m <= _LONG_M else _LONG_ACROSS_SCALE
@@ -93,9 +95,11 @@ def road_snapshots(
             axes.set_ylabel(f"{t_s:g} s", rotation=0, ha="right", va="center", fontsize=10)
             for number, name in enumerate(tracks.names):
                 pose = _pose(tracks, number, t_s)
-                if pose is not None and stretch_m[0] <= pose[0] <= stretch_m[1] + 10.0:
-                    preferred = trips[name]["preferred_lane"] if name in trips else ANY_LANE
-                    _draw_vehicle(axes, pose, preferred, scenario)
+                if pose is not None and stretch_m[0] <= pose[0] <= stretch_m[1] + beyond_m:
+                    trip = trips.get(name, {})
+                    preferred = trip.get("preferred_lane", ANY_LANE)
+                    own = scenario.types[trip.get("vehicle_type", CAR)]
+                    _draw_vehicle(axes, pose, preferred, own)
         strips[-1].tick_params(axis="x", bottom=True, labelbottom=True)
         strips[-1].set_xlabel("position on the road (m)")
         _draw_legend(figure, scenario)
@@ -215,7 +219,7 @@ def _draw_formations(
 def _draw_vehicle(
     axes: Axes, pose: tuple[float, float, float, float], preferred: int, scenario: Scenario
 ) -> None:
-    """Draw the body of a vehicle with a pale windscreen."""
+    """Draw the body of a vehicle, of the type that a scenario describes, with a pale windscreen."""
     from matplotlib.patches import Polygon  # noqa: PLC0415 - lazily
 
     s_m, y_m, heading, speed_mps = pose

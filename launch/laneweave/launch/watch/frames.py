@@ -13,7 +13,7 @@ depend on earlier frames, so any frame may be skipped.
 | `session` | unique identifier of the server; frames of other sessions are unrelated |
 | `step_s` | time between two frames: wall-clock time if live, road time if recorded |
 | `first`, `last` | numbers of the available frames; `last` < `first`: none |
-| `road`, `body_m`, `lattice`, `shade`, `colours`, `neutral` | parameters for drawing the road |
+| `road`, `body_m`, `bodies_m`, `lattice`, `shade`, `colours`, `neutral` | parameters for drawing |
 | `preferences` | whether vehicles have preferred lanes |
 | `legend` | colours of vehicles: list of [colour, meaning] |
 | `rolling` | whether there are no formations: rolling operation or a reference method |
@@ -42,8 +42,9 @@ live frames are sent on request.
 **Row** of a vehicle: `[name, s, y, speed, lane, formation, hold, target, flags, owned]`: s of the
 front bumper, y of the body centre, preferred lane (-1: none, or unknown), number of the closed
 formation (-1: none), hold cell and target cell as [column, lane] or 0, sum of flags (1 moves, 2 has
-no agent, 4 not heard from, 8 overdue), and the other owned cells as column, lane, column, lane, ...
-The target is the last cell of the plan that the vehicle has accepted but not completed.
+no agent, 4 not heard from, 8 overdue), the other owned cells as column, lane, column, lane, ...,
+and the type if it is not a car. The target is the last cell of the plan that the vehicle has
+accepted but not completed.
 
 **Request** from the page: `{"want": [from, to]}`, at most `MAX_REQUESTED` frame numbers. The
 response has the available frames: `{"reel": [from, to], "first": n, "last": n, "frames": [...]}`.
@@ -68,6 +69,7 @@ from laneweave.protocol.wire.events import (
     PLAN_EVENTS,
     PLAN_IN_FORCE,
 )
+from laneweave.protocol.wire.messages import CAR
 
 FORMAT: Final = "laneweave.watch/1"
 MAX_REQUESTED: Final = 50
@@ -215,6 +217,7 @@ class Row:
     target: Cell | None
     flags: int
     owned: Sequence[Cell] = ()
+    vehicle_type: str = CAR
 
     def compact(self) -> list[Any]:
         """Return the row as a JSON array."""
@@ -229,6 +232,7 @@ class Row:
             self.target or 0,
             self.flags,
             [part for cell in self.owned for part in cell],
+            *([self.vehicle_type] if self.vehicle_type != CAR else []),
         ]
 
 

@@ -27,6 +27,7 @@ from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.wire.messages import (
+    CAR,
     Ballot,
     CensusEntry,
     LogEvent,
@@ -191,6 +192,7 @@ class LiveRoad:
             owner = formations.at(lattice.block_range(state.formation).start)
         formation = -1 if owner is None else owner.number
         preferred = entry.preferred_lane if entry is not None else ANY_LANE
+        vehicle_type = entry.vehicle_type if entry is not None else CAR
         if state is not None and abs(t_s - state.t_s) <= UNHEARD_S:
             flags = MOVING * state.moving | UNATTENDED * (not state.attended)
             return Row(
@@ -204,6 +206,7 @@ class LiveRoad:
                 target=self._target_of(state),
                 flags=flags | OVERDUE * state.overdue,
                 owned=[cell for cell in state.owned if cell != state.hold_cell],
+                vehicle_type=vehicle_type,
             )
         cell = state.hold_cell if state is not None else entry.cell if entry is not None else (0, 0)
         s_m, off_lattice = lattice.cell_s_m(cell[0], t_s), self._lane_ends.has_passed(cell, t_s)
@@ -219,6 +222,7 @@ class LiveRoad:
             hold=None if off_lattice else cell,
             target=None,
             flags=UNHEARD,
+            vehicle_type=vehicle_type,
         )
 
     def _target_of(self, state: VehicleState) -> Cell | None:

@@ -26,6 +26,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.wire.events import ENTERED, FORMATIONS_JOINED, LEADER, LEFT
+from laneweave.protocol.wire.messages import CAR
 
 STEP_S = 0.2
 """Road time between two frames; the page interpolates."""
@@ -141,6 +142,7 @@ class Recording:
                 hold=cell,
                 target=None,
                 flags=MOVING * moving,
+                vehicle_type=str(trip.get("vehicle_type", CAR)),
             )
 
 

@@ -1,9 +1,10 @@
 "use strict";
 // Draws a road on a canvas, in reports and on the live page. Lengths in m, speeds in m/s.
 //
-// A scene has `road` {length_m, lanes, lane_width_m, sorting_start_m}, `body_m` [length, width],
-// `lattice` {speed_mps, pitch_m}, `shade` {span_mps, strength}, and `colours`, one per lane. A body has
-// `name`, `lane` (index of its colour; -1: unknown), `s`, `y`, `v`, `slope`, `faint` (draw an outline).
+// A scene has `road` {length_m, lanes, lane_width_m, sorting_start_m}, `body_m` [length, width] of cars,
+// `bodies_m`, the same of each type, `lattice` {speed_mps, pitch_m}, `shade` {span_mps, strength}, and
+// `colours`, one per lane. A body has `name`, `lane` (index of its colour; -1: unknown), `s`, `y`, `v`,
+// `slope`, `faint` (draw an outline), and `type` (undefined: a car).
 
 const laneweaveRoad = (() => {
   const ACROSS = 1.8; // scale across the road relative to the scale along it
@@ -51,6 +52,11 @@ const laneweaveRoad = (() => {
     const half = Math.min(size, length) / 2;
     const middle = Math.max(half, Math.min(length - half, centre));
     return [middle - half, middle + half];
+  }
+
+  /** Return [length, width] of a body. */
+  function sizeOf(scene, body) {
+    return scene.bodies_m?.[body.type] ?? scene.body_m;
   }
 
   /** Return [rear, front] of a range of columns at a time, with half of the gaps around it. */
@@ -150,7 +156,7 @@ const laneweaveRoad = (() => {
       pen.clip();
       for (const layer of layers) layer(this);
       for (const body of bodies) {
-        if (this.shows(body.s - this.scene.body_m[0], body.s)) this.body(body);
+        if (this.shows(body.s - sizeOf(this.scene, body)[0], body.s)) this.body(body);
       }
     }
 
@@ -203,7 +209,7 @@ const laneweaveRoad = (() => {
 
     body(body) {
       const { pen, theme, scale } = this;
-      const [length, width] = this.scene.body_m;
+      const [length, width] = sizeOf(this.scene, body);
       const heading = Math.atan(body.slope);
       const [along, across] = [Math.cos(heading), Math.sin(heading)];
       const [centreS, centreY] = [body.s - 0.5 * length * along, body.y];
@@ -238,5 +244,5 @@ const laneweaveRoad = (() => {
     }
   }
 
-  return { ACROSS, LIGHT, DARK, shade, wholeRoad, windowAround, columnsAt, line, Painter };
+  return { ACROSS, LIGHT, DARK, shade, wholeRoad, windowAround, columnsAt, sizeOf, line, Painter };
 })();

@@ -21,6 +21,7 @@ from laneweave.protocol.scenario.fields import (
 from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
 from laneweave.protocol.vehicle.lane_ends import dead_ends, drive_out, lane_beside
 from laneweave.protocol.wire.identities import MAX_COMMON_NAME
+from laneweave.protocol.wire.messages import CAR
 
 MIN_GAP_M = 1.0
 """Minimum gap between bumpers in neighbouring cells; covers rotation and tracking errors."""
@@ -59,6 +60,7 @@ def check_scenario(scenario: Scenario) -> None:
         BadInputError: a field violates a rule; the error names the first such field.
     """
     for check in (
+        _check_types,
         _check_lanes,
         _check_motion,
         _check_closures,
@@ -110,7 +112,7 @@ def _compare(scenario: Scenario, comparisons: Iterable[_Comparison]) -> None:
 
 
 def _check_lanes(scenario: Scenario) -> None:
-    road, demand, vehicle = scenario.road, scenario.demand, scenario.vehicle
+    road, demand = scenario.road, scenario.demand
     shares = demand.lane_shares
     _require(
         len(shares) in (0, road.lanes),
@@ -124,8 +126,8 @@ def _check_lanes(scenario: Scenario) -> None:
         list(shares),
         "numbers >= 0, not all 0, with a finite sum",
     )
-    width_m = vehicle.width_m + MIN_SIDE_GAP_M
-    what = f"vehicle.width_m and {MIN_SIDE_GAP_M:g} between bodies side by side"
+    width_m = scenario.widest_body_m + MIN_SIDE_GAP_M
+    what = f"the largest width_m and {MIN_SIDE_GAP_M:g} between bodies side by side"
     _compare(scenario, [("road.lane_width_m", "at least", width_m, what)])
     allowed = f"at most 3600 / demand.min_headway_s = {3600.0 / max(demand.min_headway_s, 1e-9):g}"
     volumes = [("demand.volume_veh_per_lane_h", demand.volume_veh_per_lane_h)]
@@ -137,11 +139,32 @@ def _check_lanes(scenario: Scenario) -> None:
         _require(3600.0 / volume >= demand.min_headway_s, name, volume, allowed)
 
 
+def _check_types(scenario: Scenario) -> None:
+    """Check that types of vehicles have names of their own, and shares of the demand."""
+    types = scenario.vehicle_type
+    names = [one.name for one in types]
+    for number, name in enumerate(names):
+        is_new = name != CAR and name not in names[:number]
+        allowed = f"a name that no other type has; {CAR} is the type of table vehicle"
+        _require(is_new, f"vehicle_type[{number}].name", name, allowed)
+    shares = [one.share for one in types]
+    _require(
+        sum(shares) <= 1.0 + 1e-9, "vehicle_type.share", shares, "shares with a sum of at most 1"
+    )
+    _require(
+        not types or scenario.formation.rolling,
+        "vehicle_type",
+        names,
+        'none, unless formation.operation is "rolling"',
+    )
+
+
 def _check_motion(scenario: Scenario) -> None:
     formation, vehicle = scenario.formation, scenario.vehicle
     gap_m = max(scenario.tracking.min_gap_m, MIN_GAP_M)
-    what = f"vehicle.length_m, and tracking.min_gap_m between bumpers, at least {MIN_GAP_M:g}"
-    _compare(scenario, [("formation.gap_m", "at least", vehicle.length_m + gap_m, what)])
+    what = f"the longest length_m, and tracking.min_gap_m between bumpers, at least {MIN_GAP_M:g}"
+    min_gap_m = scenario.longest_body_m + gap_m
+    _compare(scenario, [("formation.gap_m", "at least", min_gap_m, what)])
     cycle_s, move_s = formation.cycle_s, formation.move_s
     if move_s is not None:
         allowed = "none without" if cycle_s is None else f"at most {cycle_s:g},"
@@ -156,7 +179,7 @@ def _check_motion(scenario: Scenario) -> None:
         "at most 1 in mode 2 (an oblique edge is one step), at most 2 in mode 1",
     )
     block_m = (formation.max_length - 1) * formation.gap_m
-    needed_m = block_m + vehicle.length_m + formation.speed_mps * scenario.cycles_s[0]
+    needed_m = block_m + scenario.longest_body_m + formation.speed_mps * scenario.cycles_s[0]
     _compare(scenario, [("road.s3_m", "at least", needed_m, "a whole formation and one step")])
     _require(
         formation.executable,
@@ -329,7 +352,7 @@ def _check_destinations(scenario: Scenario) -> None:
 def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str) -> None:
     """Check that a vehicle from a lane has room for all lane changes to its destination."""
     own = min((one for one in scenario.sections if one.lane == lane), key=lambda one: one.from_m)
-    from_m = max(own.from_m, own.moves_from_m, scenario.moves_from_m) + scenario.vehicle.length_m
+    from_m = max(own.from_m, own.moves_from_m, scenario.moves_from_m) + scenario.longest_body_m
     advance_m = scenario.formation.speed_mps * scenario.cycles_s[0]
     wanted = [lane for lane, share in enumerate(scenario.lane_shares) if share] or [ANY_LANE]
     for preferred in wanted if destination == END_OF_ROAD else [ANY_LANE]:
@@ -354,8 +377,10 @@ def _check_dead_ends(scenario: Scenario) -> None:
     try:
         needed = drive_out(scenario)
     except ValueError as error:
-        limit = scenario.vehicle.max_accel_mps2
-        raise BadInputError("vehicle.max_accel_mps2", limit, f"more: {error}") from error
+        limits = {name: one.vehicle.max_accel_mps2 for name, one in scenario.types.items()}
+        weakest = min(limits, key=lambda name: limits[name])
+        name = _limit_of(scenario, weakest, "max_accel_mps2")
+        raise BadInputError(name, limits[weakest], f"more: {error}") from error
     step_m = _step_m(scenario)
     for end in dead_ends(scenario):
         name = next(
@@ -382,7 +407,15 @@ def _check_dead_ends(scenario: Scenario) -> None:
 
 def _step_m(scenario: Scenario) -> float:
     """Return the distance that a vehicle needs for one move, with the length of its body."""
-    return scenario.formation.speed_mps * scenario.cycles_s[0] + scenario.vehicle.length_m
+    return scenario.formation.speed_mps * scenario.cycles_s[0] + scenario.longest_body_m
+
+
+def _limit_of(scenario: Scenario, vehicle_type: str, name: str) -> str:
+    """Return the name of the field with a limit of a type of vehicle."""
+    if vehicle_type == CAR:
+        return f"vehicle.{name}"
+    number = [one.name for one in scenario.vehicle_type].index(vehicle_type)
+    return f"vehicle_type[{number}].{name}"
 
 
 def _check_structures(scenario: Scenario) -> None:
@@ -462,15 +495,18 @@ def _check_braking(scenario: Scenario) -> None:
         f"a multiple of runtime.tick_s = {scenario.runtime.tick_s:g}: sensors measure each tick"
     )
     _require(_in_ticks(scenario, reaction_s, 1), "braking.reaction_s", reaction_s, allowed)
-    gap_m, min_m = scenario.formation.gap_m, min_pitch_m(scenario)
-    _require(
-        gap_m >= min_m,
-        "formation.gap_m",
-        gap_m,
-        f"at least {math.ceil(1000.0 * min_m) / 1000.0:g}: a vehicle that holds behind another at "
-        f"formation.speed_mps = {scenario.formation.speed_mps:g} must not need emergency braking "
-        "(vehicle.length_m, the tables braking and sensing)",
-    )
+    gap_m = scenario.formation.gap_m
+    for name, own in scenario.types.items():
+        min_m = min_pitch_m(own)
+        _require(
+            gap_m >= min_m,
+            "formation.gap_m",
+            gap_m,
+            f"at least {math.ceil(1000.0 * min_m) / 1000.0:g}: a {name} that holds behind another "
+            f"vehicle at formation.speed_mps = {scenario.formation.speed_mps:g} must not need "
+            "emergency braking (length_m and min_accel_mps2 of each type, the tables braking and "
+            "sensing)",
+        )
 
 
 def _check_settling(scenario: Scenario) -> None:
@@ -479,14 +515,17 @@ def _check_settling(scenario: Scenario) -> None:
     The minimum-jerk motion from rest to rest over d in T has a peak speed of 15/8 d/T, a peak
     acceleration of 10/sqrt(3) d/T^2 and a peak jerk of 60 d/T^3.
     """
-    formation, vehicle = scenario.formation, scenario.vehicle
+    formation = scenario.formation
+    limits = [one.vehicle for one in scenario.types.values()]
     offset_m = formation.entry_spread_s * formation.speed_mps
-    speed_mps = min(vehicle.max_speed_mps - formation.speed_mps, formation.speed_mps)
-    accel_mps2 = min(vehicle.max_accel_mps2, -vehicle.min_accel_mps2)
+    max_mps = min(one.max_speed_mps for one in limits)
+    speed_mps = min(max_mps - formation.speed_mps, formation.speed_mps)
+    accel_mps2 = min(min(one.max_accel_mps2, -one.min_accel_mps2) for one in limits)
+    jerk_mps3 = min(one.max_jerk_mps3 for one in limits)
     min_s = max(
         15.0 / 8.0 * offset_m / speed_mps,
         math.sqrt(10.0 / math.sqrt(3.0) * offset_m / accel_mps2),
-        math.cbrt(60.0 * offset_m / vehicle.max_jerk_mps3),
+        math.cbrt(60.0 * offset_m / jerk_mps3),
     )
     _require(
         formation.settle_s >= min_s,

@@ -19,11 +19,12 @@ from attrs.validators import optional
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import key_part, one_of, within
-from laneweave.protocol.lattice import Lattice
+from laneweave.protocol.lattice import Cell, Lattice, displacements
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, open_sections
 from laneweave.protocol.scenario.deployment_fields import Network, Observation, Security, Service
 from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.events import STREAM_PLANNED
+from laneweave.protocol.wire.messages import CAR
 
 SCHEMA = "laneweave.scenario/1"
 
@@ -37,6 +38,10 @@ SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 COMFORT_MPS2 = 3.0
 """Maximum comfortable acceleration, along and across the road."""
 ROLLING_CYCLE_S = 6.0
+MIN_MERGING_SLOTS = 4
+"""Number of slots that the rolling operation needs between a ramp, or the beginning of the lane of
+an exit, and the end of this lane; with three, 1 % of the vehicles of a ramp or an exit did not
+change lanes in time at 2000 vehicles/(lane h)."""
 COMFORTABLE_VOLUME_VEH_PER_LANE_H = 2000.0
 """Maximum volume at which T_F of the rolling operation is the comfortable `ROLLING_CYCLE_S`. Denser
 traffic needs more steps on the same road: at 2400, 1 % of the vehicles miss their lanes with 6 s,
@@ -210,7 +215,8 @@ class FormationSettings:
     """Column pitch d_F."""
     cycle_s: float | None = field(default=None, validator=optional(within(0.5, 60.0)))
     """T_F, the time slot of a step. None: in formations the longest from 4 to 7 s for which the
-    road suffices, in the rolling operation a value by volume (`Scenario.cycles_s`)."""
+    road suffices, in the rolling operation a value by volume and by the length of ramps and lanes
+    of exits (`Scenario.cycles_s`)."""
     move_s: float | None = field(default=None, validator=optional(within(0.5, 60.0)))
     """Duration of a move within its slot; the rest is slack for lost messages. None: 0.2 s less
     than T_F."""
@@ -331,7 +337,7 @@ class FormationSettings:
 
 @frozen
 class Vehicle:
-    """Size and limits of every vehicle."""
+    """Size and limits of a car, and of other types of vehicles where they have no own values."""
 
     length_m: float = field(default=5.0, validator=within(1.0, 30.0))
     width_m: float = field(default=1.8, validator=within(0.5, 4.0))
@@ -346,6 +352,42 @@ class Vehicle:
     actuator_lag_s: float = field(default=0.2, validator=within(0.0, 2.0))
     """Time constant of the first-order lag from the acceleration set-point to the acceleration."""
     lateral_actuator_lag_s: float = field(default=0.1, validator=within(0.0, 2.0))
+
+
+@frozen
+class VehicleType:
+    """A type of vehicle other than cars; for values that are not set, those of cars apply."""
+
+    name: str = field(validator=key_part)
+    share: float = field(validator=within(0.0, 1.0))
+    """Share of vehicles of this type at each entrance."""
+    length_m: float | None = field(default=None, validator=optional(within(1.0, 30.0)))
+    width_m: float | None = field(default=None, validator=optional(within(0.5, 4.0)))
+    min_accel_mps2: float | None = field(default=None, validator=optional(within(-20.0, -0.1)))
+    max_accel_mps2: float | None = field(default=None, validator=optional(within(0.1, 20.0)))
+    """A move by a column that needs more is not planned for the type."""
+    max_jerk_mps3: float | None = field(default=None, validator=optional(within(0.1, 100.0)))
+    max_lateral_accel_mps2: float | None = field(
+        default=None, validator=optional(within(0.1, 20.0))
+    )
+    max_lateral_jerk_mps3: float | None = field(
+        default=None, validator=optional(within(0.1, 100.0))
+    )
+
+    def resolved(self, cars: Vehicle) -> VehicleType:
+        """Return the type with a value for every limit, given the limits of cars."""
+        missing = {
+            one.name: getattr(cars, one.name)
+            for one in attrs.fields(VehicleType)
+            if getattr(self, one.name) is None
+        }
+        return attrs.evolve(self, **missing)
+
+    def limits(self, cars: Vehicle) -> Vehicle:
+        """Return size and limits of the type, given those of cars."""
+        own = attrs.asdict(self.resolved(cars))
+        del own["name"], own["share"]
+        return attrs.evolve(cars, **own)
 
 
 @frozen
@@ -488,6 +530,8 @@ class Scenario:
     demand: Demand = Demand()
     formation: FormationSettings = FormationSettings()
     vehicle: Vehicle = Vehicle()
+    vehicle_type: tuple[VehicleType, ...] = ()
+    """Types of vehicles other than cars."""
     sensing: Sensing = Sensing()
     braking: Braking = Braking()
     tracking: Tracking = Tracking()
@@ -548,6 +592,60 @@ class Scenario:
                 parts.append(Closure(one.lane, from_m, to_m))
         return tuple(parts)
 
+    @cached_property
+    def types(self) -> Mapping[str, Scenario]:
+        """The scenario of each type of vehicle by its name, cars first.
+
+        In the scenario of a type, table `vehicle` describes this type; `types` is the same.
+        """
+        types = self.vehicle_type
+        if not types:
+            return MappingProxyType({CAR: self})
+        if types[0].name != CAR:
+            shares = sum(one.share for one in types)
+            types = (VehicleType(CAR, max(1.0 - shares, 0.0)), *types)
+        # With explicit values, since types without a value would inherit another type's.
+        types = tuple(one.resolved(self.vehicle) for one in types)
+        return MappingProxyType(
+            {
+                one.name: attrs.evolve(self, vehicle=one.limits(self.vehicle), vehicle_type=types)
+                for one in types
+            }
+        )
+
+    @cached_property
+    def drivable_moves(self) -> frozenset[Cell]:
+        """The moves (columns, lanes) that are planned for the type that `vehicle` describes.
+
+        Cars drive every move of the mode. Other types do not change columns if a minimum-jerk move
+        in the shortest T_F exceeds their limits along the road: its peaks over d in T are
+        10 / sqrt(3) d / T^2 and, for the jerk, 60 d / T^3.
+        """
+        moves = frozenset(displacements(self.formation.mode)[1:])
+        limits, d_m, move_s = self.vehicle, self.formation.gap_m, self.move_s
+        accel_mps2 = min(limits.max_accel_mps2, -limits.min_accel_mps2)
+        if limits == self.types[CAR].vehicle or (
+            10.0 / math.sqrt(3.0) * d_m / move_s**2 <= accel_mps2
+            and 60.0 * d_m / move_s**3 <= limits.max_jerk_mps3
+        ):
+            return moves
+        return frozenset((columns, lanes) for columns, lanes in moves if columns == 0)
+
+    @property
+    def longest_body_m(self) -> float:
+        """Length of the longest type of vehicle."""
+        return max(one.vehicle.length_m for one in self.types.values())
+
+    @property
+    def widest_body_m(self) -> float:
+        """Width of the widest type of vehicle."""
+        return max(one.vehicle.width_m for one in self.types.values())
+
+    @property
+    def weakest_braking_mps2(self) -> float:
+        """Deceleration (> 0) that every type of vehicle reaches."""
+        return min(-one.vehicle.min_accel_mps2 for one in self.types.values())
+
     def entrance_of(self, lane: int) -> str:
         """Return the name of the entrance of vehicles that arrive in a lane."""
         names = {entrance.lane: entrance.name for entrance in self.entrance}
@@ -585,10 +683,25 @@ class Scenario:
         if cycle_s is not None:
             return cycle_s, cycle_s
         if self.formation.rolling:
-            dense = self.demand.volume_veh_per_lane_h > COMFORTABLE_VOLUME_VEH_PER_LANE_H
-            cycle_s = SHORTEST_CYCLE_S if dense else ROLLING_CYCLE_S
+            cycle_s = ROLLING_CYCLE_S
+            if self.demand.volume_veh_per_lane_h > COMFORTABLE_VOLUME_VEH_PER_LANE_H:
+                cycle_s = SHORTEST_CYCLE_S
+            merging_s = self._shortest_merging_s
+            if cycle_s * MIN_MERGING_SLOTS > merging_s:
+                steps = math.floor(merging_s / MIN_MERGING_SLOTS / CYCLE_STEP_S + 1e-9)
+                cycle_s = max(SHORTEST_CYCLE_S, CYCLE_STEP_S * steps)
             return cycle_s, cycle_s
         return SHORTEST_CYCLE_S, LONGEST_CYCLE_S
+
+    @property
+    def _shortest_merging_s(self) -> float:
+        """Shortest time at v_F in a section that begins and ends on the road."""
+        sections_m = (
+            section.to_m - max(section.from_m, section.moves_from_m)
+            for section in self.sections
+            if section.from_m > 0.0 and section.to_m < self.road.length_m
+        )
+        return min(sections_m, default=math.inf) / self.formation.speed_mps
 
     @property
     def slots_s(self) -> tuple[float, ...]:

@@ -153,12 +153,13 @@ class EmergencyBrake:
 
 
 def min_pitch_m(scenario: Scenario) -> float:
-    """Return the minimum column pitch at which vehicles that hold in adjacent cells do not brake.
+    """Return the minimum column pitch at which a vehicle that holds behind another does not brake.
 
+    The vehicle is of the type that the table `vehicle` describes, the other of the longest type.
     The pitch allows for measurement errors up to `ERROR_SIGMAS`.
     """
     speed_mps, pitch_m = scenario.formation.speed_mps, scenario.formation.gap_m
-    ahead = Neighbour(0, pitch_m - scenario.vehicle.length_m, speed_mps)
+    ahead = Neighbour(0, pitch_m - scenario.longest_body_m, speed_mps)
     holding = (0.0, speed_mps, 0.0, 0.0, 0.0, 0.0)
     spare_m = EmergencyBrake(scenario).spare_m(holding, 0.0, (0.0, 0.0), [ahead])
     return pitch_m - spare_m + ERROR_SIGMAS * spare_error_m(scenario, speed_mps)

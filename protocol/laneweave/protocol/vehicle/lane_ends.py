@@ -188,7 +188,7 @@ def lane_beside(scenario: Scenario, end: LaneEnd) -> int | None:
     needed = drive_out(scenario)
     pitch_m = scenario.lattice.pitch_m
     sections = sections_to_lines(scenario)
-    from_m = end.line_m - needed.columns * pitch_m - scenario.vehicle.length_m
+    from_m = end.line_m - needed.columns * pitch_m - scenario.longest_body_m
     to_m = min(end.line_m + needed.distance_m, scenario.road.length_m)
     for lane in (end.lane + 1, end.lane - 1):
         for section in sections:
@@ -208,7 +208,7 @@ def sections_to_lines(scenario: Scenario) -> tuple[LaneSection, ...]:
 
 @lru_cache(maxsize=64)
 def drive_out(scenario: Scenario) -> DriveOut:
-    """Return what a vehicle needs to drive from standing into the neighbouring lane.
+    """Return what every type of vehicle needs to drive from standing into the neighbouring lane.
 
     The motion controller drives with its hold law towards a cell of the neighbouring lane behind
     the one that passes the vehicle when it starts. Until the body has left its lane, it must be
@@ -218,7 +218,11 @@ def drive_out(scenario: Scenario) -> DriveOut:
         ValueError: the vehicle does not arrive in a cell (its limits are too low).
     """
     for columns in range(2, _MAX_COLUMNS + 1):
-        found = [_drive_out(scenario, columns, late_s) for late_s in (0.0, START_S)]
+        found = [
+            _drive_out(one, columns, late_s)
+            for one in scenario.types.values()
+            for late_s in (0.0, START_S)
+        ]
         possible = [each for each in found if each is not None]
         if len(possible) == len(found):
             room_m, distance_m = (max(each) for each in zip(*possible, strict=True))

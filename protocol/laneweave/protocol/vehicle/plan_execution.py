@@ -99,6 +99,8 @@ class PlanExecution:
     """Newest transfer that the controller has stored."""
     lane_ends: LaneEnds | None = None
     """Ends of lanes before the end of the road; None: there are none."""
+    drivable: frozenset[Cell] | None = None
+    """Moves (columns, lanes) that the type of the vehicle drives; None: all."""
     rules: RuleBook = field(factory=lambda: VEHICLE_RULES)
 
     def __attrs_post_init__(self) -> None:
@@ -319,6 +321,14 @@ def is_executable(_: PlanExecution, plan: Plan) -> bool:
     return not plan_problems(plan)
 
 
+def drives_its_moves(execution: PlanExecution, plan: Plan) -> bool:
+    """The vehicle's type drives its moves."""
+    return execution.drivable is None or all(
+        (target[0] - origin[0], target[1] - origin[1]) in execution.drivable
+        for _, origin, target in plan.moves[execution.vehicle]
+    )
+
+
 def stays_in_its_blocks(execution: PlanExecution, plan: Plan) -> bool:
     """The territory lies in the blocks of the plan."""
     if execution.owned is not None:
@@ -495,6 +505,7 @@ VEHICLE_RULES: RuleBook = RuleBook(
                 names_own_incarnation,
                 starts_in_hold_cell,
                 is_executable,
+                drives_its_moves,
                 stays_in_its_blocks,
                 has_joined,
                 transfers_only_owned_cells,

@@ -8,7 +8,7 @@ docs/PROTOCOL.md on messages are generated from the docstrings of this module.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, NamedTuple, NewType
+from typing import Annotated, Any, Final, NamedTuple, NewType
 
 from attrs import field, frozen
 from cattrs import override
@@ -18,6 +18,8 @@ from laneweave.protocol.road_layout import END_OF_ROAD
 
 Name = NewType("Name", str)
 """Name of a vehicle, coordinator or role: letters, digits, `_`, `-`, `.`; at most 64."""
+CAR: Final = "car"
+"""Name of the type of vehicle that the scenario's table `vehicle` describes."""
 
 
 class Ballot(NamedTuple):
@@ -296,6 +298,8 @@ class Sense:
     off_lattice: bool = False
     """Whether the vehicle has no cell: it has stopped before the end of its lane, or drives back
     into the lattice. Its motion controller drives alone."""
+    vehicle_type: Name = Name(CAR)
+    """Type of the vehicle, which determines its limits."""
 
 
 @frozen
@@ -364,6 +368,8 @@ class CensusEntry:
     """None: the vehicle has cells, and takes part in plans."""
     destination: Name = Name(END_OF_ROAD)
     """Name of the exit by which it wants to leave the road; `end`: the end of the road."""
+    vehicle_type: Name = Name(CAR)
+    """Type of the vehicle, which determines the moves that it can drive."""
 
 
 @frozen

@@ -1,6 +1,6 @@
 """Overlaps and gaps between bodies; exact states of each vehicle's neighbours.
 
-A vehicle's body is a rectangle of length L and width W. Its pose consists of
+A vehicle's body is a rectangle of the length L and width W of its type. Its pose consists of
 
     s        position of the middle of its front bumper along the road,
     y        position of its centre across the road,
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 from laneweave.protocol.scenario.fields import Scenario
@@ -23,6 +24,9 @@ from laneweave.protocol.wire.messages import Neighbour
 Pose = tuple[float, float, float, float]
 """(s [m], y [m], heading [rad], speed [m/s])."""
 
+Size = tuple[float, float]
+"""(length [m], width [m])."""
+NO_SIZES: Mapping[str, Size] = MappingProxyType({})
 _Point = tuple[float, float]
 
 _TOUCH_M = 1e-9
@@ -79,30 +83,42 @@ def corners(pose: Pose, length_m: float, width_m: float) -> tuple[_Point, _Point
 
 
 class Bodies:
-    """All bodies on the road at one time, all of the same size, sorted once for all queries."""
+    """All bodies on the road at one time, sorted once for all queries."""
 
-    def __init__(self, poses: Mapping[str, Pose], length_m: float, width_m: float) -> None:
+    def __init__(
+        self,
+        poses: Mapping[str, Pose],
+        length_m: float,
+        width_m: float,
+        sizes: Mapping[str, Size] = NO_SIZES,
+    ) -> None:
         """Sort the bodies along the road.
 
         Args:
             poses: pose of each vehicle.
-            length_m: length of every body.
-            width_m: width of every body.
+            length_m: length of bodies that are not in `sizes`.
+            width_m: width of bodies that are not in `sizes`.
+            sizes: sizes of other bodies, by vehicle.
         """
-        self._length_m, self._width_m = length_m, width_m
         order = sorted([(pose[0], name, pose) for name, pose in poses.items()])
         self._names = [name for _, name, _ in order]
         self._poses = [pose for _, _, pose in order]
-        self._extents = [_extent(pose, length_m, width_m) for pose in self._poses]
+        self._sizes = [(length_m, width_m)] * len(order)
+        if sizes:
+            self._sizes = [sizes.get(name, (length_m, width_m)) for name in self._names]
+        self._reach_m = max((length + width for length, width in self._sizes), default=0.0)
+        """Maximum distance between the fronts of overlapping bodies."""
+        self._extents = [
+            _extent(pose, *size) for pose, size in zip(self._poses, self._sizes, strict=True)
+        ]
 
     def overlapping_pairs(self) -> list[tuple[str, str]]:
         """Return all pairs of vehicles whose bodies overlap, as sorted pairs of names.
 
         Bodies that only touch are not included.
         """
-        names, poses, extents = self._names, self._poses, self._extents
-        length_m, width_m = self._length_m, self._width_m
-        reach_m = length_m + width_m
+        names, poses, extents, sizes = self._names, self._poses, self._extents, self._sizes
+        reach_m = self._reach_m
         count = len(poses)
         pairs = []
         for index, one in enumerate(poses):
@@ -114,7 +130,7 @@ class Bodies:
                 _, _, other_low, other_high = extents[ahead]
                 if other_low >= high or other_high <= low:
                     continue  # side by side, like most near pairs
-                if _intersect(one, other, length_m, width_m):
+                if _intersect(one, other, sizes[index], sizes[ahead]):
                     name, other_name = names[index], names[ahead]
                     pairs.append((min(name, other_name), max(name, other_name)))
         return sorted(pairs)
@@ -143,21 +159,21 @@ class Bodies:
         until it touches the other vehicle: exact for rotated bodies, negative for overlapping
         bodies.
         """
-        length_m, width_m = self._length_m, self._width_m
         # Sorted by pose, so that ties between fronts do not depend on names.
-        bodies = sorted(zip(self._poses, self._extents, strict=True))
+        bodies = sorted(zip(self._poses, self._extents, self._sizes, strict=True))
         # A vehicle farther ahead can have the smaller gap only if its front is closer than rotation
         # can extend a body.
-        slack_m = length_m + width_m
+        slack_m = self._reach_m
         count = len(bodies)
         rotated = []
         """(lower bound of the gap [m], indices) of pairs with a rotated body."""
         min_gap = min_headway = math.inf
-        for index, ((s_m, _, heading, speed_mps), (rear, front, low, high)) in enumerate(bodies):
-            low, high = low + _TOUCH_M, high - _TOUCH_M  # noqa: PLW2901
+        for index, body in enumerate(bodies):
+            (s_m, _, heading, speed_mps), (rear, front, low, high), _ = body
+            low, high = low + _TOUCH_M, high - _TOUCH_M
             horizon_m = math.inf
             for ahead in range(index + 1, count):
-                other, (other_rear, other_front, other_low, other_high) = bodies[ahead]
+                other, (other_rear, other_front, other_low, other_high), _ = bodies[ahead]
                 distance_m = other[0] - s_m
                 if distance_m > horizon_m:
                     break
@@ -175,7 +191,8 @@ class Bodies:
         for bound_m, index, ahead in sorted(rotated):
             if bound_m >= min_gap:
                 break
-            gap_m = _gap_m(bodies[index][0], bodies[ahead][0], length_m, width_m)
+            (one, _, size), (other, _, other_size) = bodies[index], bodies[ahead]
+            gap_m = _gap_m(corners(one, *size), corners(other, *other_size))
             min_gap = min(min_gap, gap_m)
         return MinGaps(min_gap, min_headway)
 
@@ -200,7 +217,7 @@ class Bodies:
             first = min(max(int((low + _TOUCH_M) // lane_width_m), 0), lanes - 1)
             last = min(max(int((high - _TOUCH_M) // lane_width_m), first), lanes - 1)
             touched.append((first, last))
-        names, poses, length_m = self._names, self._poses, self._length_m
+        names, poses, sizes = self._names, self._poses, self._sizes
         accels = [accels_mps2.get(name, 0.0) for name in names]
 
         def nearest(order: Iterable[int], sign: float) -> list[list[ExactNeighbour]]:
@@ -215,6 +232,7 @@ class Bodies:
                     other = last_seen[lane]
                     if other >= 0:
                         other_s_m, _, _, speed_mps = poses[other]
+                        length_m, _ = sizes[other if sign > 0.0 else index]
                         gap_m = sign * (other_s_m - s_m) - length_m
                         found.append((lane, gap_m, speed_mps, accels[other]))
                 seen[index] = found
@@ -238,20 +256,25 @@ def _extent(pose: Pose, length_m: float, width_m: float) -> tuple[float, float, 
     return s_m - length_m * cosine - swing_m, s_m + swing_m, y_m - half_m, y_m + half_m
 
 
-def _intersect(one: Pose, other: Pose, length_m: float, width_m: float) -> bool:
+def _intersect(one: Pose, other: Pose, size: Size, other_size: Size) -> bool:
     """Return whether two bodies overlap, by the separating axis theorem."""
     if one[2] == 0.0 == other[2]:
-        aside_m = abs(other[1] - one[1])
-        return abs(other[0] - one[0]) < length_m - _TOUCH_M and aside_m < width_m - _TOUCH_M
-    half_length, half_width = 0.5 * length_m, 0.5 * width_m
+        aside_m, width_m = abs(other[1] - one[1]), 0.5 * (size[1] + other_size[1])
+        apart_m = other[0] - one[0]
+        along = -size[0] + _TOUCH_M < apart_m < other_size[0] - _TOUCH_M
+        return along and aside_m < width_m - _TOUCH_M
     turn = other[2] - one[2]
-    half_along = half_length + half_length * abs(math.cos(turn)) + half_width * abs(math.sin(turn))
-    half_across = half_width + half_length * abs(math.sin(turn)) + half_width * abs(math.cos(turn))
-    between_x = (other[0] - half_length * math.cos(other[2])) - (
-        one[0] - half_length * math.cos(one[2])
+    cosine_turn, sine_turn = abs(math.cos(turn)), abs(math.sin(turn))
+    between_x = (other[0] - 0.5 * other_size[0] * math.cos(other[2])) - (
+        one[0] - 0.5 * size[0] * math.cos(one[2])
     )
     between_y = other[1] - one[1]
-    for pose in (one, other):
+    for pose, (length, width), (other_length, other_width) in (
+        (one, size, other_size),
+        (other, other_size, size),
+    ):
+        half_along = 0.5 * (length + other_length * cosine_turn + other_width * sine_turn)
+        half_across = 0.5 * (width + other_length * sine_turn + other_width * cosine_turn)
         cosine, sine = math.cos(pose[2]), math.sin(pose[2])
         if abs(between_x * cosine + between_y * sine) >= half_along - _TOUCH_M:
             return False
@@ -260,13 +283,12 @@ def _intersect(one: Pose, other: Pose, length_m: float, width_m: float) -> bool:
     return True
 
 
-def _gap_m(behind: Pose, ahead: Pose, length_m: float, width_m: float) -> float:
-    """Return the distance along the road between two bodies that overlap laterally.
+def _gap_m(one: Sequence[_Point], other: Sequence[_Point]) -> float:
+    """Return the distance along the road from a body to one ahead that it overlaps laterally.
 
     As functions of y, rear boundaries are convex and front boundaries are concave, with kinks at
     corners, so their minimum difference is at a corner or at an end of the common range of y.
     """
-    one, other = corners(behind, length_m, width_m), corners(ahead, length_m, width_m)
     low = max(min(y for _, y in one), min(y for _, y in other))
     high = min(max(y for _, y in one), max(y for _, y in other))
     levels = (low, *(y for _, y in (*one, *other) if low < y < high), high)

@@ -48,6 +48,7 @@ _COLUMNS: list[pa.Field[Any]] = [
     pa.field("destination", pa.string(), nullable=False),
     pa.field("exit", pa.string()),
     pa.field("free_flow_s", pa.float64(), nullable=False),
+    pa.field("vehicle_type", pa.string(), nullable=False),
 ]
 
 
@@ -94,6 +95,7 @@ class Trip:
             "destination": self.arrival.destination,
             "exit": self.exit,
             "free_flow_s": self.free_flow_s,
+            "vehicle_type": self.arrival.vehicle_type,
         }
 
 
@@ -162,6 +164,7 @@ def travel_time(trips: pa.Table) -> TravelTime:
         n=len(times_s),
         by_destination=_by(counted, "destination"),
         by_entrance=_by(counted, "entrance"),
+        by_type=_by(counted, "vehicle_type"),
     )
 
 

@@ -5,10 +5,10 @@ In each lane in which vehicles enter, the headway between two arrivals is
     min_headway + Exp(3600 / volume - min_headway)      (mean 3600 / volume seconds),
 
 and the destination of each vehicle, an exit or a preferred lane at the end of the road, is drawn
-from the scenario's shares. Every lane has one random generator for headways and one for
-destinations, seeded with the scenario's seed. The same seed gives the same arrivals, arrivals in a
-lane do not depend on other lanes, and a longer duration only appends arrivals, without changing the
-names of earlier ones.
+from the scenario's shares, as is its type. Every lane has one random generator for headways, one
+for destinations and one for types, seeded with the scenario's seed. The same seed gives the same
+arrivals, arrivals in a lane do not depend on other lanes, and a longer duration only appends
+arrivals, without changing the names of earlier ones.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from numpy.random import SeedSequence, default_rng
 from laneweave.protocol.config.participants import vehicle_name
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.wire.messages import CAR
 
-_HEADWAYS, _PREFERENCES = 0, 1
+_HEADWAYS, _PREFERENCES, _TYPES = 0, 1, 2
 
 
 @frozen
@@ -42,19 +43,20 @@ class Arrival:
     """Road time at which the vehicle would pass its entrance on an empty road."""
     destination: str = END_OF_ROAD
     """Name of the exit by which the vehicle wants to leave the road, or `END_OF_ROAD`."""
+    vehicle_type: str = CAR
 
 
 def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
     """Return the seeded arrivals in [0, demand.duration_s], sorted by time, then lane."""
     drawn = sorted(
-        (t_s, lane, preferred, destination)
+        (t_s, lane, preferred, destination, vehicle_type)
         for lane in range(scenario.road.lanes)
         if scenario.volume_veh_per_h(lane) > 0.0
-        for t_s, preferred, destination in _arrivals_in(lane, scenario)
+        for t_s, preferred, destination, vehicle_type in _arrivals_in(lane, scenario)
     )
     return tuple(
-        Arrival(vehicle_name(number), lane, preferred, t_s, destination)
-        for number, (t_s, lane, preferred, destination) in enumerate(drawn, start=1)
+        Arrival(vehicle_name(number), lane, preferred, t_s, destination, vehicle_type)
+        for number, (t_s, lane, preferred, destination, vehicle_type) in enumerate(drawn, start=1)
     )
 
 
@@ -63,18 +65,21 @@ def count_until(stream: Sequence[Arrival], t_s: float) -> int:
     return bisect_right(stream, t_s, key=lambda arrival: arrival.t_s)
 
 
-def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int, str]]:
-    """Return (time [s], preferred lane, destination) of each arrival in one lane."""
+def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int, str, str]]:
+    """Return (time [s], preferred lane, destination, type) of each arrival in one lane."""
     demand = scenario.demand
     mean_excess_s = max(0.0, 3600.0 / scenario.volume_veh_per_h(lane) - demand.min_headway_s)
-    headways, preferences = (
+    headways, preferences, types = (
         default_rng(SeedSequence(scenario.seed, spawn_key=(purpose, lane)))
-        for purpose in (_HEADWAYS, _PREFERENCES)
+        for purpose in (_HEADWAYS, _PREFERENCES, _TYPES)
     )
     choices = list(_destinations(lane, scenario))
     # Drop the last bound: rounded to less than 1, it would exclude some draws in [0, 1).
     bounds = np.array([*accumulate(share for share, _, _ in choices)][:-1])
-    result: list[tuple[float, int, str]] = []
+    others = scenario.vehicle_type
+    type_bounds = np.array([*accumulate(one.share for one in others)])
+    names = [*(one.name for one in others), CAR]
+    result: list[tuple[float, int, str, str]] = []
     t_s = 0.0
     while True:
         t_s += demand.min_headway_s + mean_excess_s * headways.standard_exponential()
@@ -82,7 +87,8 @@ def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int, str]]:
             return result
         number = int(np.searchsorted(bounds, preferences.random(), side="right"))
         _, preferred, destination = choices[number]
-        result.append((float(t_s), preferred, destination))
+        kind = names[int(np.searchsorted(type_bounds, types.random(), side="right"))]
+        result.append((float(t_s), preferred, destination, kind))
 
 
 def _destinations(lane: int, scenario: Scenario) -> Iterator[tuple[float, int, str]]:

@@ -8,6 +8,10 @@ of arrival, at least one column's time apart.
 
 With formations, `formation_building` decides whether a formation admits a vehicle.
 
+Vehicles of some types (trucks) do not change columns (`Scenario.drivable_moves`). Two of them in a
+column could not pass each other, so they enter the same column only if their lanes and their goals
+are in the same order.
+
 Decisions do not depend on later arrivals: they are made in order of time and, at equal times, from
 the rightmost lane to the leftmost.
 """
@@ -25,6 +29,8 @@ from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.formation_building import FormationBuilder
 
+_MAX_BOUND_COLUMNS = 4096
+"""Number of columns, more than there are on a road, whose vehicles are remembered."""
 TIME_TOLERANCE_S = 1e-9
 """Rounding tolerance for comparing ticks with passing times."""
 
@@ -52,6 +58,7 @@ class EntryMeter:
         *,
         interlaced: bool = False,
         entry_m: Sequence[float] = (),
+        column_bound: Collection[str] = (),
     ) -> None:
         """Start with an empty road at road time 0.
 
@@ -61,7 +68,11 @@ class EntryMeter:
             builder: assigns entering vehicles to formations; None: no formations.
             interlaced: only every other cell may be entered.
             entry_m: position of the entrance of each lane; empty: s = 0.
+            column_bound: types of vehicles that do not change columns.
         """
+        self._column_bound = frozenset(column_bound)
+        self._bound: dict[int, list[tuple[int, int]]] = {}
+        """(lane, preferred lane) of the vehicles of these types, by their column."""
         self._entry_m = tuple(entry_m) or (0.0,) * lattice.lanes
         self._lattice = lattice
         self._builder = builder
@@ -160,5 +171,22 @@ class EntryMeter:
         builder, queue = self._builder, self._queues[cell[1]]
         if builder is not None and not builder.try_add(cell, queue[0].preferred_lane, t_s):
             return None
+        if queue[0].vehicle_type in self._column_bound and not self._try_bind(cell, queue[0]):
+            return None
         self._names.discard(queue[0].vehicle)
         return queue.pop(0)
+
+    def _try_bind(self, cell: Cell, arrival: Arrival) -> bool:
+        """Add a vehicle that does not change columns to a column, unless it would be in the way."""
+        (column, lane), goal = cell, arrival.preferred_lane
+        if goal == ANY_LANE:
+            return True
+        others = self._bound.setdefault(column, [])
+        if any(
+            (lane < other) != (goal < its_goal) or goal == its_goal for other, its_goal in others
+        ):
+            return False
+        others.append((lane, goal))
+        while len(self._bound) > _MAX_BOUND_COLUMNS:
+            del self._bound[next(iter(self._bound))]
+        return True

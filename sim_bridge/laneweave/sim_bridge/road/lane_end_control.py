@@ -73,8 +73,7 @@ class LaneEndControl:
         self._columns = needed.columns if needed is not None else 0
         self._distance_m = needed.distance_m if needed is not None else 0.0
         """Distance behind a slow vehicle that is needed for driving out."""
-        self._length_m = scenario.vehicle.length_m
-        self._queue_m = scenario.vehicle.length_m + scenario.tracking.min_gap_m
+        self._queue_m = scenario.longest_body_m + scenario.tracking.min_gap_m
         """Distance between the fronts of vehicles that stand in a queue."""
         self._gaps: dict[LaneEnd, list[Gap]] = {end: [] for end in self._ends}
         self._last_gap_column: list[float] = [math.inf] * scenario.road.lanes
@@ -125,13 +124,13 @@ class LaneEndControl:
         for end in self._ends:
             for number, vehicle in enumerate(self._waiting(end, vehicles)):
                 stands_m = end.line_m - number * self._queue_m
-                rear_m = max(vehicle.state[0], stands_m) - self._length_m
+                rear_m = max(vehicle.state[0], stands_m) - vehicle.size[0]
                 found[vehicle.name] = OffLattice(end.lane, rear_m)
         for name in self._end_of:
             if name in vehicles and name not in found:
                 s_m, _, _, y_m, _, _ = vehicles[name].state
                 lane = int(y_m // self._lattice.lane_width_m)
-                found[name] = OffLattice(lane, s_m - self._length_m)
+                found[name] = OffLattice(lane, s_m - vehicles[name].size[0])
         return found
 
     def _request(self, lane: int | None, gaps: list[Gap]) -> None:
@@ -184,7 +183,7 @@ class LaneEndControl:
         """Return whether the sensors of a vehicle show that a gap is free."""
         neighbours = vehicle.controller.neighbours
         # The vehicle behind is a column behind the rearmost of the gap.
-        behind_m = (len(gap.columns) - 1) * self._lattice.pitch_m - self._length_m
+        behind_m = (len(gap.columns) - 1) * self._lattice.pitch_m - vehicle.size[0]
         slow_mps = 0.5 * self._lattice.speed_mps
         return all(
             other.gap_m > (BESIDE_M if other.speed_mps > slow_mps else self._distance_m)

@@ -57,10 +57,12 @@ class Roadside:
         self._tick_s = scenario.runtime.tick_s
         self._lanes = scenario.road.lanes
         lattice, formation = scenario.lattice, scenario.formation
-        self._lattice, self._size = lattice, scenario.vehicle
-        self._brake = EmergencyBrake(scenario)
-        stopping_m = lattice.speed_mps**2 / -scenario.vehicle.min_accel_mps2
-        self._room_m = scenario.vehicle.length_m + stopping_m + lattice.speed_mps + QUEUE_ROOM_M
+        self._lattice = lattice
+        weakest = min(scenario.types.values(), key=lambda one: -one.vehicle.min_accel_mps2)
+        self._brake = EmergencyBrake(weakest)
+        longest_m = scenario.longest_body_m
+        stopping_m = lattice.speed_mps**2 / scenario.weakest_braking_mps2
+        self._room_m = longest_m + stopping_m + lattice.speed_mps + QUEUE_ROOM_M
         """Distance from an entrance within which bodies may keep others from entering."""
         ahead_s = self._announce_s + self._tick_s
         self._announced_per_lane = math.ceil(ahead_s / formation.entry_spacing_s) + 1
@@ -73,6 +75,11 @@ class Roadside:
             self._builder,
             interlaced=formation.interlaced,
             entry_m=scenario.entry_m,
+            column_bound=[
+                name
+                for name, one in scenario.types.items()
+                if all(columns == 0 for columns, _ in one.drivable_moves)
+            ],
         )
         self._lane_ends = LaneEndControl(scenario, self._meter)
         self._closed: list[ClosedFormation] = []
@@ -87,12 +94,12 @@ class Roadside:
         """Empty cells without an owner."""
         self._entry_m = scenario.entry_m
         """Where the cells of each lane are assigned."""
-        step_m = lattice.speed_mps * scenario.cycles_s[0] + scenario.vehicle.length_m
+        step_m = lattice.speed_mps * scenario.cycles_s[0] + longest_m
         self._merging_m = {one.lane: one.merge_m + step_m for one in scenario.entrance}
         """Where a queue on a ramp leaves room for merging, by lane."""
         self._near_m = max(
             self._room_m + max(self._entry_m),
-            scenario.vehicle.length_m + max(self._merging_m.values(), default=0.0),
+            longest_m + max(self._merging_m.values(), default=0.0),
         )
         """Position up to which bodies may keep others from entering."""
         self._assigned_to = [
@@ -146,23 +153,24 @@ class Roadside:
 
         A ramp is full, too, while a queue at its end leaves no room for merging.
         """
-        lattice, size = self._lattice, self._size
+        lattice = self._lattice
         entering = (0.0, lattice.speed_mps, 0.0, 0.0, 0.0, 0.0)
         full = set[int]()
         for vehicle in vehicles.values():
             s_m, speed_mps, accel_mps2, y_m, _, _ = vehicle.state
             if s_m > self._near_m:
                 continue
-            first, last = lattice.lanes_touched(y_m, size.width_m)
+            length_m, width_m = vehicle.size
+            first, last = lattice.lanes_touched(y_m, width_m)
             waits = vehicle.controller.off_lattice is not None
             for lane in {*range(first, last + 1)} - full:
                 beyond_m = s_m - self._entry_m[lane]
-                if waits and s_m - size.length_m < self._merging_m.get(lane, -math.inf):
+                if waits and s_m - length_m < self._merging_m.get(lane, -math.inf):
                     full.add(lane)
                     continue
                 if not 0.0 <= beyond_m <= self._room_m:
                     continue
-                body = Neighbour(0, beyond_m - size.length_m, speed_mps, accel_mps2)
+                body = Neighbour(0, beyond_m - length_m, speed_mps, accel_mps2)
                 spare_m = self._brake.spare_m(entering, 0.0, (0.0, 0.0), [body])
                 slow = speed_mps < 0.5 * lattice.speed_mps
                 if spare_m < (QUEUE_ROOM_M if slow else 0.0):
@@ -321,6 +329,7 @@ class Roadside:
                     entered_s=vehicle.admission.t_s,
                     off_lattice=off_lattice.get(vehicle.name),
                     destination=Name(vehicle.admission.arrival.destination),
+                    vehicle_type=Name(vehicle.admission.arrival.vehicle_type),
                 )
                 for vehicle in vehicles
             ),

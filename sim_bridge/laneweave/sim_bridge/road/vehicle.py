@@ -11,7 +11,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import ClosedFormation, Name, Sense
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import ExactNeighbours
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import ExactNeighbours, Size
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.sensors import Sensors
 from laneweave.sim_bridge.road.demand import Arrival
@@ -47,8 +47,9 @@ class RoadVehicle:
         rest = cell_state(lattice, admission.cell, t_s)
         s_m = rest[0] + admission.offset_m
         name = Name(admission.arrival.vehicle)
+        own = scenario.types[admission.arrival.vehicle_type]
         controller = MotionController(
-            Plant((s_m, *rest[1:]), scenario.vehicle, tick_s), scenario, admission.cell
+            Plant((s_m, *rest[1:]), own.vehicle, tick_s), own, admission.cell
         )
         if abs(admission.offset_m) > NEAR_M:
             controller.motion_end_tick = round((t_s + scenario.formation.settle_s) / tick_s)
@@ -61,6 +62,11 @@ class RoadVehicle:
     def state(self) -> State:
         """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""
         return self.controller.plant.state
+
+    @property
+    def size(self) -> Size:
+        """Length and width of the body [m]."""
+        return self.controller.plant.size
 
     @property
     def body_lane(self) -> int:
@@ -131,6 +137,7 @@ class RoadVehicle:
             transfer=controller.transfer,
             bridge=self.bridge,
             off_lattice=controller.off_lattice is not None,
+            vehicle_type=Name(self.arrival.vehicle_type),
         )
 
     def enter_lattice(self, cells: Sequence[Cell]) -> None:

@@ -24,7 +24,6 @@ from laneweave.sim_bridge.sumo.road_edges import (
     single_edge,
 )
 
-VEHICLE_TYPE = "vehicle"
 _NO_VEHICLES = "authority"
 """A class of vehicles that do not occur, for rights that nobody has."""
 SUBLANE_M = 0.8
@@ -133,7 +132,20 @@ def _junctions(
 
 
 def _routes(scenario: Scenario, edges: RoadEdges, *, sumo_drives: bool) -> Iterator[str]:
-    """Yield the lines of the route file: the vehicle type, and routes from entrances to exits.
+    """Yield the lines of the route file: types of vehicles, and routes from entrances to exits."""
+    yield "<routes>"
+    for name, own in scenario.types.items():
+        yield f'<vType id="{name}"'
+        for key, value in _vehicle_type(own, sumo_drives=sumo_drives).items():
+            yield f'{key}="{value}"' if isinstance(value, str) else f'{key}="{value:.6f}"'
+        yield "/>"
+    for name, route in edges.routes().items():
+        yield f'<route id="{name}" edges="{" ".join(edge.name for edge in route)}"/>'
+    yield "</routes>"
+
+
+def _vehicle_type(scenario: Scenario, *, sumo_drives: bool) -> dict[str, float | str]:
+    """Return the attributes of the type of vehicle that a scenario describes.
 
     Drivers have the same desired speed (speedDev). If SUMO does not drive, `tau` and `minGap` are
     close to zero; the defaults would delay insertions.
@@ -153,14 +165,10 @@ def _routes(scenario: Scenario, edges: RoadEdges, *, sumo_drives: bool) -> Itera
     }
     if sumo_drives:
         kind |= _driver(scenario.lc2013)
-    yield "<routes>"
-    yield f'<vType id="{VEHICLE_TYPE}"'
-    for name, value in kind.items():
-        yield f'{name}="{value}"' if isinstance(value, str) else f'{name}="{value:.6f}"'
-    yield "/>"
-    for name, route in edges.routes().items():
-        yield f'<route id="{name}" edges="{" ".join(edge.name for edge in route)}"/>'
-    yield "</routes>"
+        # A driver does not exceed the limits of the vehicle.
+        kind["accel"] = min(float(kind["accel"]), limits.max_accel_mps2)
+        kind["decel"] = min(float(kind["decel"]), -limits.min_accel_mps2)
+    return kind
 
 
 def _driver(settings: Lc2013Settings) -> dict[str, float | str]:

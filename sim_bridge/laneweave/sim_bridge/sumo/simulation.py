@@ -55,13 +55,27 @@ class SumoSession:
             raise RuntimeError("libsumo supports one simulation per process, and one is open")
         self._sumo: Any = _load_libsumo()
         self._sumo.start([*write_network(scenario, folder, sumo_drives=sumo_drives)])
-        self._half_body_m = 0.5 * scenario.vehicle.length_m
+        self._types = scenario.types
+        self._half_bodies_m: dict[str, float] = {}
         SumoSession._open = self
 
     @property
     def vehicle(self) -> Any:  # noqa: ANN401 - libsumo has no types
         """Interface to SUMO's vehicles in libsumo."""
         return self._sumo.vehicle
+
+    def set_type(self, vehicle: str, vehicle_type: str) -> None:
+        """Set the type of a vehicle that is about to be added."""
+        self._half_bodies_m[vehicle] = 0.5 * self._types[vehicle_type].vehicle.length_m
+
+    def forget(self, vehicle: str) -> None:
+        """Remove a vehicle from SUMO."""
+        del self._half_bodies_m[vehicle]
+        self.vehicle.remove(vehicle)
+
+    def half_body_m(self, vehicle: str) -> float:
+        """Return half of the length of a vehicle's body."""
+        return self._half_bodies_m[vehicle]
 
     def step(self) -> None:
         """Advance SUMO by one tick."""
@@ -87,7 +101,7 @@ class SumoSession:
         for vehicle in vehicles:
             s_m, front_y_m = position(vehicle)
             heading = math.radians(90.0 - angle(vehicle))
-            y_m = front_y_m - self._half_body_m * math.sin(heading)
+            y_m = front_y_m - self._half_bodies_m[vehicle] * math.sin(heading)
             poses[vehicle] = (s_m, y_m, heading, speed(vehicle))
         return poses
 

@@ -18,8 +18,8 @@ from pathlib import Path
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, pose_of
-from laneweave.sim_bridge.sumo.network import VEHICLE_TYPE
 from laneweave.sim_bridge.sumo.road_edges import ROAD, margin_m, route_name
 from laneweave.sim_bridge.sumo.simulation import SumoSession
 
@@ -41,7 +41,7 @@ class SumoWorld(SumoSession):
         self._placed: set[str] = set()
         self._shown: list[str] = []
 
-    def add(self, vehicle: str, state: State) -> None:
+    def add(self, vehicle: str, state: State, vehicle_type: str = CAR) -> None:
         """Add a vehicle to the road; SUMO displays it from the next step on.
 
         Raises:
@@ -51,7 +51,8 @@ class SumoWorld(SumoSession):
             raise ValueError(f"{vehicle} is already on the road")
         self._check(vehicle, state)  # before the vehicle is added to SUMO
         api = self.vehicle
-        api.add(vehicle, _ROUTE, typeID=VEHICLE_TYPE, depart="now", departPos="0", departSpeed="0")
+        self.set_type(vehicle, vehicle_type)
+        api.add(vehicle, _ROUTE, typeID=vehicle_type, depart="now", departPos="0", departSpeed="0")
         api.setSpeedMode(vehicle, 0)
         api.setLaneChangeMode(vehicle, 0)
         self._states[vehicle] = state
@@ -103,7 +104,7 @@ class SumoWorld(SumoSession):
             raise ValueError(f"{vehicle} is not on the road")
         self._placed.discard(vehicle)
         self._shown = [other for other in self._shown if other != vehicle]
-        self.vehicle.remove(vehicle)
+        self.forget(vehicle)
 
     def _check(self, vehicle: str, state: State) -> None:
         """Reject a state that SUMO would display elsewhere."""
@@ -120,7 +121,7 @@ class SumoWorld(SumoSession):
         s_m, front_y_m, heading, _ = pose_of(state)
         degrees = 90.0
         if heading != 0.0:
-            front_y_m += self._half_body_m * math.sin(heading)
+            front_y_m += self.half_body_m(vehicle) * math.sin(heading)
             degrees -= math.degrees(heading)
         lane = min(max(int(front_y_m // self._lane_width_m), 0), self._lanes - 1)
         self.vehicle.moveToXY(vehicle, ROAD, lane, s_m, front_y_m, degrees, 2)

@@ -17,7 +17,6 @@ from pathlib import Path
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.road.demand import Arrival
-from laneweave.sim_bridge.sumo.network import VEHICLE_TYPE
 from laneweave.sim_bridge.sumo.road_edges import road_edges, route_of
 from laneweave.sim_bridge.sumo.simulation import SumoSession
 
@@ -44,11 +43,12 @@ class SumoTraffic(SumoSession):
             arrival: the vehicle.
             s_m: entry position of the front bumper.
         """
+        self.set_type(arrival.vehicle, arrival.vehicle_type)
         edge = self._edges.entry(self._scenario.entrance_of(arrival.lane))
         self.vehicle.add(
             arrival.vehicle,
             route_of(self._scenario, arrival),
-            typeID=VEHICLE_TYPE,
+            typeID=arrival.vehicle_type,
             depart="now",
             departLane=str(edge.index(arrival.lane)),
             departPos=f"{s_m - edge.from_m:.9f}",
@@ -74,4 +74,4 @@ class SumoTraffic(SumoSession):
     def remove(self, vehicle: str) -> None:
         """Remove a vehicle from the road."""
         del self._on_road[vehicle]
-        self.vehicle.remove(vehicle)
+        self.forget(vehicle)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import attrs
 import pytest
 
-from laneweave.launch.watch.frames import scene_of
+from laneweave.launch.watch.frames import Row, scene_of
 from laneweave.launch.web import road_script, text_of
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.fields import Scenario, VehicleType
 from support.javascript import needs_node, printed_json
 
 pytestmark = needs_node
@@ -111,6 +112,23 @@ def test_formations_that_plan_together_are_one() -> None:
         ([3], -6, -4),
         ([7, 12], -15, -7),
     ]
+
+
+def test_bodies_have_the_sizes_of_their_types() -> None:
+    truck = VehicleType("truck", 0.2, length_m=12.0, width_m=2.5)
+    scenario = attrs.evolve(Scenario(), vehicle_type=(truck,))
+    rows = [
+        Row("a", 1.0, 2.0, 15.0, -1, -1, None, None, 0).compact(),
+        Row("b", 1.0, 2.0, 15.0, -1, -1, None, None, 0, vehicle_type="truck").compact(),
+    ]
+    data = {"scene": scene_of(scenario, "live", "here", 0.1), "frame": json.loads(frame(1))}
+    data["frame"]["vehicles"] = rows
+    found = in_node(
+        "const shown = laneweaveFrames.between(data.frame, null, 0).bodies;"
+        "return shown.map((body) => laneweaveRoad.sizeOf(data.scene, body));",
+        data,
+    )
+    assert found == [[5.0, 1.8], [12.0, 2.5]]
 
 
 def test_numbers_beside_the_road() -> None:

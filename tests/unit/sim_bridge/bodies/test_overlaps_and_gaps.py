@@ -21,41 +21,62 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import (
     MinGaps,
     Neighbours,
     Pose,
+    Size,
     corners,
     pose_of,
 )
 
 LENGTH_M, WIDTH_M, LANE_M = 5.0, 1.8, 3.5
+TRUCK: Size = (12.0, 2.5)
 
 HEADINGS = st.one_of(st.just(0.0), st.floats(-math.pi / 4, math.pi / 4))
 POSES: st.SearchStrategy[Pose] = st.tuples(
     st.floats(0.0, 30.0), st.floats(0.9, 9.6), HEADINGS, st.floats(0.0, 25.0)
 )
-ROADS = st.lists(POSES, min_size=2, max_size=8).map(
-    lambda poses: {f"v{number}": pose for number, pose in enumerate(poses)}
-)
+
+
+def named(poses: list[Pose], trucks: list[bool]) -> dict[str, Pose]:
+    """Return poses by name; names of trucks begin with a t."""
+    return {
+        f"{'t' if truck else 'v'}{number}": pose
+        for number, (pose, truck) in enumerate(zip(poses, trucks, strict=False))
+    }
+
+
+TRUCKS = st.lists(st.booleans(), min_size=8, max_size=8)
+ROADS = st.builds(named, st.lists(POSES, min_size=2, max_size=8), TRUCKS)
+
+
+def size_of(name: str) -> Size:
+    return TRUCK if name.startswith("t") else (LENGTH_M, WIDTH_M)
 
 
 def bodies(road: dict[str, Pose]) -> Bodies:
-    return Bodies(road, LENGTH_M, WIDTH_M)
+    trucks = {name: TRUCK for name in road if name.startswith("t")}
+    return Bodies(road, LENGTH_M, WIDTH_M, trucks)
 
 
-def grid_in(pose: Pose, points: int = 41) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def grid_in(
+    pose: Pose, size: Size, points: int = 61
+) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """Points of a body, its border included, shape (points^2, 2)."""
-    front_right, front_left, _, rear_right = (np.array(p) for p in corners(pose, LENGTH_M, WIDTH_M))
+    front_right, front_left, _, rear_right = (np.array(p) for p in corners(pose, *size))
     shares = np.linspace(0.0, 1.0, points)
     along = (front_right - rear_right)[None, None, :] * shares[:, None, None]
     across = (front_left - front_right)[None, None, :] * shares[None, :, None]
     return np.asarray((rear_right + along + across).reshape(-1, 2))
 
 
-def depth(pose: Pose, points: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> float:
+def depth(
+    pose: Pose, size: Size, points: np.ndarray[tuple[int, int], np.dtype[np.float64]]
+) -> float:
     """Depth of the deepest of some points in a body in m, negative if none is inside."""
     s, y, heading, _ = pose
-    x, z = points[:, 0] - (s - LENGTH_M / 2 * math.cos(heading)), points[:, 1] - y
+    length_m, width_m = size
+    x, z = points[:, 0] - (s - length_m / 2 * math.cos(heading)), points[:, 1] - y
     along = np.abs(x * math.cos(heading) + z * math.sin(heading))
     across = np.abs(z * math.cos(heading) - x * math.sin(heading))
-    return float(np.minimum(LENGTH_M / 2 - along, WIDTH_M / 2 - across).max())
+    return float(np.minimum(length_m / 2 - along, width_m / 2 - across).max())
 
 
 @pytest.mark.slow
@@ -64,14 +85,16 @@ def depth(pose: Pose, points: np.ndarray[tuple[int, int], np.dtype[np.float64]])
 def test_overlaps_agree_with_point_sampling(road: dict[str, Pose]) -> None:
     found = set(bodies(road).overlapping_pairs())
     for one, other in itertools.combinations(sorted(road), 2):
+        size, other_size = size_of(one), size_of(other)
         deepest = max(
-            depth(road[one], grid_in(road[other])), depth(road[other], grid_in(road[one]))
+            depth(road[one], size, grid_in(road[other], other_size)),
+            depth(road[other], other_size, grid_in(road[one], size)),
         )
         if deepest > 1e-6:
             assert (one, other) in found
         if (one, other) in found:
-            # A grid of 41 x 41 points misses at most slivers thinner than its mesh.
-            assert deepest > -0.15
+            # A grid of 61 x 61 points misses at most slivers thinner than its mesh.
+            assert deepest > -0.2
 
 
 def test_touching_is_not_overlapping() -> None:
@@ -97,9 +120,9 @@ def test_corners_of_a_rotated_body_match_its_pose() -> None:
 def brute_gap(road: dict[str, Pose]) -> float:
     """The least shift along the road that makes two bodies touch, from slices across the road."""
     least = math.inf
-    for one, other in itertools.combinations(road.values(), 2):
+    for pair in itertools.combinations(road, 2):
         slices = []
-        shapes = [np.array(corners(pose, LENGTH_M, WIDTH_M)) for pose in (one, other)]
+        shapes = [np.array(corners(road[name], *size_of(name))) for name in pair]
         low = max(shape[:, 1].min() for shape in shapes)
         high = min(shape[:, 1].max() for shape in shapes)
         if high - low < 1e-6:
@@ -120,11 +143,11 @@ def brute_gap(road: dict[str, Pose]) -> float:
 
 
 @pytest.mark.slow
-@given(st.lists(POSES, min_size=2, max_size=4))
+@given(st.lists(POSES, min_size=2, max_size=4), TRUCKS)
 @settings(max_examples=60)
-def test_least_gap_agrees_with_slices(poses: list[Pose]) -> None:
+def test_least_gap_agrees_with_slices(poses: list[Pose], trucks: list[bool]) -> None:
     poses = [(s, y, 0.0 if abs(heading) < 1e-3 else heading, v) for s, y, heading, v in poses]
-    road = {str(number): pose for number, pose in enumerate(poses)}
+    road = named(poses, trucks)
     gap = bodies(road).min_gaps().gap_m
     expected = brute_gap(road)
     if math.isinf(expected):
@@ -166,6 +189,21 @@ def sense(
     }
 
 
+def test_bodies_of_different_sizes_touch_where_they_do() -> None:
+    def pairs(car: Pose, truck: Pose) -> list[tuple[str, str]]:
+        return bodies({"v": car, "t": truck}).overlapping_pairs()
+
+    car = (20.0, 1.75, 0.0, 15.0)
+    assert pairs(car, (32.0, 1.75, 0.0, 15.0)) == []
+    assert pairs(car, (31.999, 1.75, 0.0, 15.0)) == [("t", "v")]
+    assert pairs(car, (15.0, 1.75, 0.0, 15.0)) == []
+    assert pairs(car, (15.001, 1.75, 0.0, 15.0)) == [("t", "v")]
+    assert pairs(car, (20.0, 1.75 + 2.15, 0.0, 15.0)) == []
+    assert pairs(car, (20.0, 1.749 + 2.15, 0.0, 15.0)) == [("t", "v")]
+    assert bodies({"v": car, "t": (40.0, 1.75, 0.0, 15.0)}).min_gaps().gap_m == 8.0
+    assert bodies({"v": car, "t": (10.0, 1.75, 0.0, 15.0)}).min_gaps().gap_m == 5.0
+
+
 def test_sensing_sees_how_others_accelerate() -> None:
     road = {"first": (120.0, 1.75, 0.0, 14.0), "ego": (100.0, 1.75, 0.0, 15.0)}
     seen = sense(road, {"first": -2.5, "ego": 1.5})
@@ -180,7 +218,7 @@ def test_sensing_agrees_with_brute_force(road: dict[str, Pose]) -> None:
     seen = sense(road)
     lanes_of = {}
     for name, pose in road.items():
-        ys = [y for _, y in corners(pose, LENGTH_M, WIDTH_M)]
+        ys = [y for _, y in corners(pose, *size_of(name))]
         low, high = int((min(ys) + 1e-9) // LANE_M), int((max(ys) - 1e-9) // LANE_M)
         low = min(max(low, 0), 2)
         lanes_of[name] = range(low, min(max(high, low), 2) + 1)
@@ -193,10 +231,10 @@ def test_sensing_agrees_with_brute_force(road: dict[str, Pose]) -> None:
             back = [each for each in there if each < own]
             if front:
                 nearest_m, other = min(front)
-                ahead[lane] = (nearest_m - LENGTH_M - own[0], road[other][3])
+                ahead[lane] = (nearest_m - size_of(other)[0] - own[0], road[other][3])
             if back:
                 nearest_m, other = max(back)
-                behind[lane] = (own[0] - LENGTH_M - nearest_m, road[other][3])
+                behind[lane] = (own[0] - size_of(name)[0] - nearest_m, road[other][3])
         for found, expected in ((seen[name].ahead, ahead), (seen[name].behind, behind)):
             assert [other.lane for other in found] == sorted(expected)
             assert {other.lane: other.gap_m for other in found} == pytest.approx(

@@ -107,6 +107,7 @@ def test_trips_have_every_state() -> None:
         "destination": "end",
         "exit": "end",
         "free_flow_s": 0.0,
+        "vehicle_type": "car",
     }
     assert [row["counted"] for row in rows] == [False, True, False, False]
     assert [row["on_preferred_lane"] for row in rows] == [True, False, None, None]
@@ -133,7 +134,7 @@ def test_only_vehicles_between_warm_up_and_last_arrival_count() -> None:
 @pytest.mark.parametrize("trips", [(), (trip(1, 1.0, 2.0, 70.0),)], ids=["empty", "short"])
 def test_a_run_without_counted_vehicles_has_no_figures(trips: tuple[Trip, ...]) -> None:
     none = TravelTime(
-        mean=None, p50=None, p95=None, max=None, n=0, by_destination={}, by_entrance={}
+        mean=None, p50=None, p95=None, max=None, n=0, by_destination={}, by_entrance={}, by_type={}
     )
     assert travel_time(table(*trips)) == none
     assert throughput(table(*trips), 3) is None

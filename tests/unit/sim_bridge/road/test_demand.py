@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -87,3 +88,17 @@ def test_a_volume_at_the_least_headway_is_regular() -> None:
     stream = arrivals(scenario(1, lanes=1, volume_veh_per_lane_h=3600.0, duration_s=10.5))
     assert [arrival.t_s for arrival in stream] == pytest.approx(range(1, 11))
     assert {arrival.preferred_lane for arrival in stream} == {0}
+
+
+def test_types_have_their_shares_and_change_nothing_else() -> None:
+    base = {
+        "demand": {"volume_veh_per_lane_h": 2000.0, "duration_s": 3000.0},
+        "formation": {"operation": "rolling", "gap_m": 20.0},
+    }
+    types = [{"name": "truck", "share": 0.15}, {"name": "van", "share": 0.3}]
+    drawn = arrivals(parse_scenario({**base, "vehicle_type": types}))
+    counts = {name: sum(one.vehicle_type == name for one in drawn) for name in ("truck", "van")}
+    assert counts["truck"] / len(drawn) == pytest.approx(0.15, abs=0.02)
+    assert counts["van"] / len(drawn) == pytest.approx(0.3, abs=0.02)
+    cars = tuple(evolve(one, vehicle_type="car") for one in drawn)
+    assert cars == arrivals(parse_scenario(base))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Lattice
+from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.sim_bridge.road.demand import Arrival, arrivals
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
 from laneweave.sim_bridge.road.formation_building import ColumnBlocks
@@ -171,3 +172,29 @@ def test_delay_stays_small_below_capacity(volume: float, most_s: float) -> None:
     delays = [entry.t_s - entry.arrival.t_s for entry in meter.admit(700.0)]
     assert len(delays) == len(stream)
     assert sum(delays) / len(delays) < most_s
+
+
+def truck(name: str, t_s: float, lane: int, preferred: int) -> Arrival:
+    return Arrival(name, lane, preferred, t_s, vehicle_type="truck")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "together"),
+    [
+        ((0, 2), (2, 0), False),
+        ((0, 1), (2, 1), False),
+        ((0, 0), (2, 2), True),
+        ((0, 1), (2, 2), True),
+        ((0, ANY_LANE), (2, 0), True),
+    ],
+)
+def test_trucks_that_would_have_to_pass_each_other_enter_in_different_columns(
+    first: tuple[int, int], second: tuple[int, int], *, together: bool
+) -> None:
+    for types, bound in (({"truck"}, True), ({"bus"}, False)):
+        meter = EntryMeter(lattice(), 0.5, column_bound=types)
+        meter.demand(truck("a", 10.0, *first))
+        meter.demand(truck("b", 10.0, *second))
+        one, other = meter.admit(20.0)
+        assert (one.cell[0] == other.cell[0]) == (together or not bound)
+        assert other.cell[0] >= one.cell[0] - 1

@@ -83,6 +83,8 @@ class Paths(NamedTuple):
     target: Bools
     """Whether each section is a target, and False for no section; (vehicles, sections + 1)."""
     held: Bools
+    drives: Bools
+    """Whether the vehicle can drive each displacement; (vehicles, displacements)."""
     missing_cost: Floats
     """Cost of ending elsewhere than at a target."""
     min_cost: Floats
@@ -267,6 +269,7 @@ def _paths(
     target = np.zeros((count, len(road.sections) + 1), dtype=np.bool_)
     for v, vehicle in enumerate(vehicles):
         target[v, list(vehicle.targets)] = True
+    steps = displacements(road.mode)
     held = np.array([vehicle.held for vehicle in vehicles], dtype=np.bool_)
     # Number of slots in which each vehicle may change lanes, ignoring others.
     begin, end = table.moving_columns.T[:, :, None]
@@ -286,6 +289,7 @@ def _paths(
         np.zeros(count, dtype=np.int64),
         target,
         held,
+        np.array([[one.drives(*step) for step in steps] for one in vehicles], dtype=np.bool_),
         costs.missing * (1.0 + 1.0 / (1.0 + chances)),
         min_cost,
         ~held & (chances >= away),

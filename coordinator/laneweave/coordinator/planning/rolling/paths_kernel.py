@@ -105,7 +105,7 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
                 off = costs.off_lane
             for d in range(fan if moves else 1):
                 to_lane, to = lane + steps[d, 1], low + steps[d, 0]
-                if 0 <= to_lane < lanes:
+                if 0 <= to_lane < lanes and paths.drives[v, d]:
                     base = off + of_move[d] + (scratch.delay[s] if d > 0 else np.float32(0.0))
                     there = value[s + 1, to_lane, to : to + high + 1 - low]
                     loads = load[s, d, lane, low + shift : high + shift + 1]
@@ -131,6 +131,8 @@ def _trace(table, paths, costs, v, scale, slots, lane, offset, scratch):
         for d in range(fan):
             before, from_lane = offset - steps[d, 0], lane - steps[d, 1]
             if not (0 <= from_lane < lanes and 1 <= before < value.shape[2] - 1):
+                continue
+            if not paths.drives[v, d]:
                 continue
             if table.left[s, from_lane, before + shift]:
                 continue
@@ -178,7 +180,7 @@ def follow(table, paths, costs, v, cells):
             step = table.steps[d]
             if cells[s + 1, 0] == column + step[0] and cells[s + 1, 1] == lane + step[1]:
                 move = d
-        if move < 0 or table.load[s, move, lane, column] > 0.0:
+        if move < 0 or not paths.drives[v, move] or table.load[s, move, lane, column] > 0.0:
             return False
         paths.move[v, s] = move
         paths.column[v, s + 1], paths.lane[v, s + 1] = cells[s + 1, 0], cells[s + 1, 1]

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from attrs import Attribute, Factory, evolve, field, frozen
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
-from laneweave.protocol.lattice import Cell, Mode
+from laneweave.protocol.lattice import WAIT, Cell, Mode
 from laneweave.protocol.road_layout import LaneSection, open_sections
 
 ROUNDING_M = 1e-6
@@ -159,6 +159,13 @@ class StreamVehicle:
     """Sections by whose ends the vehicle may leave the road; on a straight road, target lanes."""
     held: bool = False
     """Whether the vehicle must stay in its cell."""
+    moves: frozenset[Cell] | None = None
+    """Moves (columns, lanes) that the vehicle can drive; None: all of the mode."""
+
+    def drives(self, columns: int, lanes: int) -> bool:
+        """Return whether the vehicle can drive a move."""
+        move = columns, lanes
+        return self.moves is None or move == WAIT or move in self.moves
 
 
 @frozen

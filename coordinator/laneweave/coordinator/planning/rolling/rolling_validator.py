@@ -60,6 +60,8 @@ def _problems_of_path(
     for s, there in enumerate(path[1:], start=slot):
         if there != here:
             yield from _problems_of_move(road, s, name, here, there, blocked)
+            if not vehicle.drives(there[0] - here[0], there[1] - here[1]):
+                yield f"{name} cannot drive from {here} to {there} in slot {s}"
             if vehicle.held:
                 yield f"{name} is held, but moves in slot {s}"
             here = there

@@ -61,7 +61,7 @@ class Player {
   draw() {
     const { run } = this;
     const present = laneweave.allAt(run, this.t);
-    const bodies = present.map(([vehicle, state]) => ({ ...state, name: vehicle.name, lane: vehicle.lane }));
+    const bodies = present.map(([vehicle, state]) => ({ ...state, name: vehicle.name, lane: vehicle.lane, type: vehicle.type }));
     const stretches = laneweave.stretches(run, this.follow, this.t, WINDOW_M);
     this.painter.paint(stretches, bodies, [laneweaveClosed.closedParts]);
     this.slider.value = this.t;

@@ -88,11 +88,11 @@ const laneweaveFrames = (() => {
     }
   }
 
-  function body([name, s, y, v, lane, formation, hold, target, flags, owned]) {
+  function body([name, s, y, v, lane, formation, hold, target, flags, owned, type]) {
     const cells = [];
     for (let i = 0; i + 1 < owned.length; i += 2) cells.push([owned[i], owned[i + 1]]);
     return {
-      name, s, y, v, lane, formation, flags, slope: 0,
+      name, s, y, v, lane, formation, flags, type, slope: 0,
       hold: hold || null,
       target: target || null,
       owned: cells,

@@ -108,8 +108,9 @@ const laneweaveLayers = (() => {
         if (!target || body.faint) continue;
         const [s, y] = [speed * t + target[0] * pitch, (target[1] + 0.5) * width];
         if (Math.abs(s - body.s) < 0.4 * pitch && Math.abs(y - body.y) < 0.25 * width) continue;
-        if (!painter.shows(Math.min(s, body.s) - scene.body_m[0], Math.max(s, body.s))) continue;
-        const half = scene.body_m[0] / 2;
+        const [length] = laneweaveRoad.sizeOf(scene, body);
+        if (!painter.shows(Math.min(s, body.s) - length, Math.max(s, body.s))) continue;
+        const half = length / 2;
         const [x1, y1] = [painter.x(s - half), painter.y(y)];
         pen.strokeStyle = pen.fillStyle = ownColour(painter, body);
         laneweaveRoad.line(pen, painter.x(body.s - half), painter.y(body.y), x1, y1);
@@ -130,10 +131,11 @@ const laneweaveLayers = (() => {
       pen.strokeStyle = "#e08b27";
       pen.lineWidth = 2;
       for (const body of bodies) {
-        if (!(body.flags & odd) || !painter.shows(body.s - scene.body_m[0], body.s)) continue;
-        const radius = Math.max(7, 0.75 * scene.body_m[0] * painter.scale);
+        const [length] = laneweaveRoad.sizeOf(scene, body);
+        if (!(body.flags & odd) || !painter.shows(body.s - length, body.s)) continue;
+        const radius = Math.max(7, 0.75 * length * painter.scale);
         pen.beginPath();
-        pen.arc(painter.x(body.s - scene.body_m[0] / 2), painter.y(body.y), radius, 0, 2 * Math.PI);
+        pen.arc(painter.x(body.s - length / 2), painter.y(body.y), radius, 0, 2 * Math.PI);
         pen.stroke();
       }
     };

@@ -183,10 +183,10 @@ class Watch {
   followAt(event) {
     const place = this.painter?.placeAt(event.offsetX, event.offsetY);
     if (!place || !this.picture) return;
-    const [length, width] = this.store.scene.body_m;
-    const hit = this.picture.bodies.find(
-      (body) => Math.abs(place.s - body.s + length / 2) < length && Math.abs(place.y - body.y) < width,
-    );
+    const hit = this.picture.bodies.find((body) => {
+      const [length, width] = laneweaveRoad.sizeOf(this.store.scene, body);
+      return Math.abs(place.s - body.s + length / 2) < length && Math.abs(place.y - body.y) < width;
+    });
     if (hit) this.setFollowed(hit.name);
   }
 

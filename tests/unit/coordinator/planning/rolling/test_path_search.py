@@ -148,6 +148,43 @@ def test_held_vehicles_stay_and_others_drive_around_them() -> None:
     assert plan.missed == ("held",)
 
 
+LATERAL = frozenset({(0, 1), (0, -1)})
+
+
+@pytest.mark.slow
+@settings(max_examples=60)
+@given(streams())
+def test_vehicles_that_do_not_change_columns_stay_in_theirs(stream: Stream) -> None:
+    road, slot, drawn, blocked = stream
+    vehicles = [
+        attrs.evolve(vehicle, moves=LATERAL) if number % 3 == 0 else vehicle
+        for number, vehicle in enumerate(drawn)
+    ]
+    planner = StreamPlanner(road)
+    plan = planner.plan(slot, vehicles, None, blocked)
+    assert problems_of_plan(road, plan, vehicles, blocked) == []
+    for vehicle in vehicles[::3]:
+        assert {column for column, _ in plan.paths[vehicle.vehicle]} == {vehicle.cell[0]}
+    # Nor on earlier paths, which were planned for other types.
+    free = planner.plan(slot, drawn, None, blocked)
+    plan = planner.plan(slot, vehicles, free, blocked)
+    assert problems_of_plan(road, plan, vehicles, blocked) == []
+
+
+def test_others_make_room_for_a_vehicle_that_does_not_change_columns() -> None:
+    vehicles = [
+        StreamVehicle("truck", (25, 0), 2, moves=LATERAL),
+        StreamVehicle("a", (25, 1), 1),
+        StreamVehicle("b", (25, 2), 2),
+    ]
+    plan = StreamPlanner(ROAD).plan(0, vehicles)
+    assert plan.missed == ()
+    assert problems_of_plan(ROAD, plan, vehicles) == []
+    # Two that must pass each other in one column cannot.
+    vehicles[2] = StreamVehicle("b", (25, 2), 0, moves=LATERAL)
+    assert StreamPlanner(ROAD).plan(0, vehicles).missed == ("truck", "b")
+
+
 def test_a_path_blocked_by_a_held_vehicle_is_replaced() -> None:
     planner = StreamPlanner(ROAD)
     vehicles = [StreamVehicle("a", (30, 0), 2), StreamVehicle("b", (31, 1), 1)]

@@ -73,6 +73,14 @@ def test_held_vehicles_do_not_move() -> None:
     assert problems_of_plan(ROAD, standing_still, [vehicle]) == []
 
 
+def test_vehicles_make_only_moves_that_they_can_drive() -> None:
+    vehicle = Vehicle("v", (50, 0), 1, moves=frozenset({(0, 1), (0, -1)}))
+    way = to_the_end((50, 0), (50, 1), (51, 1))
+    assert "cannot drive from (50, 1) to (51, 1)" in only_problem([vehicle], {"v": way})
+    lateral = StreamPlan(0, {"v": to_the_end((50, 0), (50, 1))}, ())
+    assert problems_of_plan(ROAD, lateral, [vehicle]) == []
+
+
 def test_moves_begin_in_s3() -> None:
     vehicle = Vehicle("v", (26, 0), 0)
     way = to_the_end((26, 0), (27, 0))

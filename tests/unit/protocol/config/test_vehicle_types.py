@@ -1,0 +1,143 @@
+"""Types of vehicles: what each inherits, which moves it drives, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import attrs
+import pytest
+
+from laneweave.agents.driving.trajectory import check_moves, move_profile
+from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import displacements
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
+from laneweave.protocol.vehicle.lane_ends import drive_out
+
+ROLLING = {"operation": "rolling", "gap_m": 20.0}
+TRUCK: dict[str, Any] = {
+    "name": "truck",
+    "share": 0.15,
+    "length_m": 12.0,
+    "width_m": 2.5,
+    "max_accel_mps2": 1.3,
+    "min_accel_mps2": -7.0,
+}
+SPORTS_CAR = {"name": "sports-car", "share": 0.1, "max_accel_mps2": 9.0}
+
+
+def scenario(*types: dict[str, Any], **tables: dict[str, Any]) -> Scenario:
+    return parse_scenario({"formation": ROLLING, "vehicle_type": list(types), **tables})
+
+
+def test_without_other_types_all_vehicles_are_cars() -> None:
+    only = Scenario()
+    assert dict(only.types) == {"car": only}
+    assert only.drivable_moves == frozenset(displacements(1)[1:])
+
+
+def test_a_type_has_the_limits_of_cars_except_its_own() -> None:
+    cars = {"max_slip_ratio": 0.2, "max_jerk_mps3": 12.0}
+    found = scenario(TRUCK, SPORTS_CAR, vehicle=cars)
+    assert list(found.types) == ["car", "truck", "sports-car"]
+    truck = found.types["truck"].vehicle
+    own = {name: value for name, value in TRUCK.items() if name not in ("name", "share")}
+    assert truck == attrs.evolve(found.vehicle, **own)
+    assert found.types["sports-car"].vehicle == attrs.evolve(found.vehicle, max_accel_mps2=9.0)
+    assert found.types["car"].vehicle == found.vehicle
+    assert (found.longest_body_m, found.widest_body_m) == (12.0, 2.5)
+    assert found.weakest_braking_mps2 == 7.0
+
+
+@pytest.mark.parametrize("name", ["car", "truck", "sports-car"])
+def test_the_scenario_of_a_type_knows_the_same_types(name: str) -> None:
+    found = scenario(TRUCK, SPORTS_CAR)
+    own = found.types[name]
+    assert dict(own.types) == dict(found.types)
+    assert own.types[name] == own
+    # What all vehicles must agree on is the same for all.
+    assert drive_out(own) == drive_out(found)
+    assert own.longest_body_m == 12.0
+
+
+@pytest.mark.parametrize(
+    ("limits", "all_moves"),
+    [
+        ({"max_accel_mps2": 3.5}, True),
+        ({"max_accel_mps2": 3.4}, False),
+        ({"min_accel_mps2": -3.4}, False),
+        ({"max_jerk_mps3": 6.1}, False),
+        ({"length_m": 8.0}, True),
+    ],
+)
+def test_a_type_changes_columns_if_its_limits_allow(
+    limits: dict[str, float], *, all_moves: bool
+) -> None:
+    # 20 m in 5.8 s need 3.43 m/s2 and 6.15 m/s3.
+    found = scenario({"name": "other", "share": 0.1, **limits}, braking={"lead_brake_mps2": 3.0})
+    lateral = frozenset({(0, 1), (0, -1)})
+    every = frozenset(displacements(1)[1:])
+    assert found.types["other"].drivable_moves == (every if all_moves else lateral)
+    assert found.types["car"].drivable_moves == every
+
+
+def test_the_moves_that_are_planned_for_a_type_can_be_driven() -> None:
+    found = scenario(TRUCK)
+    check_moves(found)
+    truck = found.types["truck"]
+    for dx, dy in truck.drivable_moves:
+        states = move_profile(truck, dx, dy).states
+        assert abs(states[:, 5]).max() <= truck.vehicle.max_lateral_accel_mps2
+    weak = scenario({**TRUCK, "max_lateral_accel_mps2": 0.3})
+    with pytest.raises(BadInputError, match="a move of a truck by 0 columns and 1 lanes"):
+        check_moves(weak)
+
+
+def test_the_pitch_suits_every_pair_of_types() -> None:
+    found = scenario(TRUCK)
+    needed = {name: min_pitch_m(own) for name, own in found.types.items()}
+    # A truck brakes less than the vehicle ahead may.
+    assert needed["truck"] > needed["car"] + 3.0
+    # Behind a truck, a car needs the length of its body more.
+    assert needed["car"] == pytest.approx(min_pitch_m(Scenario()) + 7.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("types", "tables", "line"),
+    [
+        ([{**TRUCK, "name": "car"}], {}, "vehicle_type[0].name: got 'car'"),
+        ([TRUCK, TRUCK], {}, "vehicle_type[1].name: got 'truck'"),
+        ([TRUCK, {**SPORTS_CAR, "share": 0.9}], {}, "vehicle_type.share: got [0.15, 0.9]"),
+        ([{**TRUCK, "share": 1.5}], {}, "vehicle_type[0].share: got 1.5"),
+        ([{**TRUCK, "length_m": 60.0}], {}, "vehicle_type[0].length_m: got 60.0"),
+        ([{**TRUCK, "wheels": 6}], {}, "vehicle_type[0].wheels"),
+        ([{"share": 0.1}], {}, "vehicle_type[0].name"),
+        ([TRUCK], {"formation": {}}, "vehicle_type: got ['truck']"),
+        (
+            [TRUCK],
+            {"formation": {**ROLLING, "gap_m": 18.0}},
+            "formation.gap_m: got 18.0; allowed: at least 19.338",
+        ),
+        ([{**TRUCK, "width_m": 3.2}], {}, "road.lane_width_m: got 3.5; allowed: at least 3.7"),
+        (
+            [{**TRUCK, "max_accel_mps2": 0.2}],
+            {"road": {"closures": [{"lane": 0, "from_m": 900.0}]}},
+            "vehicle_type[0].max_accel_mps2: got 0.2; allowed: more",
+        ),
+        ([{**TRUCK, "max_accel_mps2": 0.2}], {}, "formation.settle_s: got 10.0"),
+    ],
+)
+def test_types_that_do_not_fit_are_refused_in_one_line(
+    types: list[dict[str, Any]], tables: dict[str, Any], line: str
+) -> None:
+    with pytest.raises(BadInputError) as refused:
+        scenario(*types, **tables)
+    assert str(refused.value).startswith(line)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_the_example_scenario_is_valid() -> None:
+    folder = Path(__file__).parents[4] / "scenarios"
+    check_moves(load_scenario(folder / "trucks.toml"))
