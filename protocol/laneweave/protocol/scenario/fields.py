@@ -587,7 +587,7 @@ class Scenario:
             if (one.lane, from_m) in exits:
                 from_m += tick_m
             if (one.lane, to_m) in entries:
-                to_m -= self.vehicle.length_m
+                to_m -= self.longest_body_m
             if from_m < to_m:
                 parts.append(Closure(one.lane, from_m, to_m))
         return tuple(parts)

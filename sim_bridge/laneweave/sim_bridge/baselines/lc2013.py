@@ -140,7 +140,7 @@ def _check_closures(scenario: Scenario) -> None:
             name = f"road.closures[{numbers[section.lane, section.to_m]}].from_m"
             allowed = f"more than {min_m:g}, so that vehicles can change lanes before"
             raise BadInputError(name, section.to_m, allowed)
-    max_m = road.length_m - scenario.vehicle.length_m
+    max_m = road.length_m - scenario.longest_body_m
     for number, closure in enumerate(road.closures):
         if max_m <= closure.to_m < road.length_m:
             name = f"road.closures[{number}].to_m"

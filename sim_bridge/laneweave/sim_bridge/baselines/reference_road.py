@@ -12,7 +12,7 @@ from attrs import define
 from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
-from laneweave.protocol.wire.messages import RoadClock
+from laneweave.protocol.wire.messages import CAR, RoadClock
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
@@ -194,8 +194,13 @@ class ReferenceRoad:
 
     def _measure(self) -> None:
         """Record positions, overlaps and gaps."""
-        size = self._scenario.vehicle
-        bodies = Bodies(self._traffic.poses(), size.length_m, size.width_m)
+        types, car = self._scenario.types, self._scenario.vehicle
+        sizes = {
+            one.name: (types[kind].vehicle.length_m, types[kind].vehicle.width_m)
+            for one in self._traffic.vehicles
+            if (kind := one.arrival.vehicle_type) != CAR
+        }
+        bodies = Bodies(self._traffic.poses(), car.length_m, car.width_m, sizes)
         self._record.on_positions(
             self.t_s,
             self._traffic.vehicles,

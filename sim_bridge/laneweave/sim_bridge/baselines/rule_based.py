@@ -157,6 +157,11 @@ def check_rule(scenario: Scenario) -> None:
     Raises:
         BadInputError: a field is unsuitable.
     """
+    if scenario.vehicle_type:
+        names = [one.name for one in scenario.vehicle_type]
+        raise BadInputError(
+            "vehicle_type", names, "none with --method rule, which drives cars only"
+        )
     rule, road, speed_mps = scenario.rule, scenario.road, scenario.formation.speed_mps
     # Speed decreases in proportion to the remaining distance, once per tick.
     braking_m = speed_mps**2 / -scenario.vehicle.min_accel_mps2

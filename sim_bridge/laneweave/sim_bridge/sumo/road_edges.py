@@ -112,9 +112,8 @@ def margin_m(scenario: Scenario) -> float:
 
     Vehicles are removed up to one tick's travel beyond the end of the road.
     """
-    vehicle = scenario.vehicle
-    tick_m = vehicle.max_speed_mps * scenario.runtime.tick_s
-    return max(MIN_MARGIN_M, tick_m + vehicle.length_m)
+    tick_m = scenario.vehicle.max_speed_mps * scenario.runtime.tick_s
+    return max(MIN_MARGIN_M, tick_m + scenario.longest_body_m)
 
 
 def single_edge(scenario: Scenario) -> RoadEdges:
@@ -130,7 +129,7 @@ def road_edges(scenario: Scenario) -> RoadEdges:
     by_lane = bool(scenario.lane_shares)
     closed = [*_closed_parts(scenario)]
     bounds = [at_m for part in closed for at_m in (part.from_m, part.to_m, part.opens_m)]
-    bounds += [ramp.merge_m + scenario.vehicle.length_m for ramp in scenario.entrance]
+    bounds += [ramp.merge_m + scenario.longest_body_m for ramp in scenario.entrance]
     inner_m = {at_m for at_m in bounds if 0.0 < at_m < end_m}
     bounds_m = [-margin, *sorted(inner_m), end_m if by_lane else end_m + margin]
     road = tuple(_parts_of_road(scenario, bounds_m, closed, "end" if by_lane else "east"))
@@ -235,7 +234,7 @@ def _closed_parts(scenario: Scenario) -> Iterator[_ClosedPart]:
         if (one.lane, to_m) in merges_m:
             to_m = opens_m = merges_m[one.lane, to_m]
         else:
-            opens_m = to_m + scenario.vehicle.length_m
+            opens_m = to_m + scenario.longest_body_m
         yield _ClosedPart(one.lane, from_m, to_m, opens_m)
 
 
@@ -265,7 +264,7 @@ def _parts_of_road(
             separate=frozenset(
                 ramp.lane
                 for ramp in scenario.entrance
-                if ramp.merge_m <= from_m < ramp.merge_m + scenario.vehicle.length_m
+                if ramp.merge_m <= from_m < ramp.merge_m + scenario.longest_body_m
             ),
         )
         origin = destination

@@ -12,9 +12,10 @@ from laneweave.launch.run_methods import LC2013, METHODS
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import ANY_LANE, Exits
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.fields import Demand, Scenario, VehicleType
 from laneweave.sim_bridge.baselines.lc2013 import Lc2013Traffic, check_lc2013
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
+from laneweave.sim_bridge.baselines.rule_based import check_rule
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose
 from laneweave.sim_bridge.road.demand import arrivals, count_until
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
@@ -51,6 +52,9 @@ def drive(scenario: Scenario, folder: Path) -> dict[ReferenceVehicle, float]:
     before: dict[str, Pose] = {}
     queued = tick = 0
     exits = Exits(scenario.sections, road.length_m)
+    sizes_m = {
+        name: (own.vehicle.length_m, own.vehicle.width_m) for name, own in scenario.types.items()
+    }
     with SumoTraffic(scenario, folder / "sumo") as sumo:
         traffic = Lc2013Traffic(scenario, sumo)
         while len(left) < len(demand):
@@ -62,7 +66,8 @@ def drive(scenario: Scenario, folder: Path) -> dict[ReferenceVehicle, float]:
                 entrance.queue(arrival)
             traffic.step(t_s, entrance)
             poses = traffic.poses()
-            bodies = Bodies(poses, size.length_m, size.width_m)
+            sizes = {one.name: sizes_m[one.arrival.vehicle_type] for one in traffic.vehicles}
+            bodies = Bodies(poses, size.length_m, size.width_m, sizes)
             assert bodies.overlapping_pairs() == bodies.in_closed_lanes(scenario) == []
             assert traffic.collisions() == []
             for name, pose in poses.items():
@@ -169,3 +174,14 @@ def test_a_ramp_that_leaves_no_room_for_lane_changes_is_refused(merge_m: float) 
     else:
         with pytest.raises(BadInputError, match=r"road\.closures\[1\]\.from_m.*more than 505"):
             check_lc2013(scenario)
+
+
+def test_trucks_drive_among_cars_within_their_limits(tmp_path: Path) -> None:
+    truck = VehicleType("truck", 0.3, length_m=12.0, width_m=2.5, max_accel_mps2=1.3)
+    demand = Demand(volume_veh_per_lane_h=1000.0, duration_s=30.0)
+    scenario = Scenario(vehicle_type=(truck,), demand=demand)
+    left = drive(scenario, tmp_path)
+    assert all(one.lane == one.preferred_lane for one in left)
+    assert {one.arrival.vehicle_type for one in left} == {"car", "truck"}
+    with pytest.raises(BadInputError, match="vehicle_type: got .'truck'.; allowed: none with"):
+        check_rule(scenario)
