@@ -183,5 +183,5 @@ def test_trucks_drive_among_cars_within_their_limits(tmp_path: Path) -> None:
     left = drive(scenario, tmp_path)
     assert all(one.lane == one.preferred_lane for one in left)
     assert {one.arrival.vehicle_type for one in left} == {"car", "truck"}
-    with pytest.raises(BadInputError, match="vehicle_type: got .'truck'.; allowed: none with"):
+    with pytest.raises(BadInputError, match=r"vehicle_type: got ..truck..; allowed: none with"):
         check_rule(scenario)
