@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import pytest
 
 from laneweave.agents.core import AgentCore
+from laneweave.coordinator.planning.rolling.problem import StreamVehicle
 from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.wire.messages import Name
@@ -75,3 +76,9 @@ def gates_stay_open(patch: pytest.MonkeyPatch) -> None:
 def agents_insist(patch: pytest.MonkeyPatch) -> None:
     """An agent does not notice that its move was taken back."""
     patch.setattr(AgentCore, "_has_lost_track", lambda *_: False)
+
+
+def types_are_ignored(patch: pytest.MonkeyPatch) -> None:
+    """Leaders move trucks like cars, and their agents take such plans."""
+    patch.setattr(StreamVehicle, "drives", lambda _self, _columns, _lanes: True)
+    patch.setattr(AgentCore, "_set_type", lambda _self, _type: None)

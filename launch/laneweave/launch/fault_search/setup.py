@@ -32,8 +32,15 @@ from laneweave.launch.fault_search.road.stand_ins import Visit
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.deployment_fields import Network
-from laneweave.protocol.scenario.fields import Closure, FormationSettings, Road, Runtime, Scenario
-from laneweave.protocol.wire.messages import ClosedFormation, Name
+from laneweave.protocol.scenario.fields import (
+    Closure,
+    FormationSettings,
+    Road,
+    Runtime,
+    Scenario,
+    VehicleType,
+)
+from laneweave.protocol.wire.messages import CAR, ClosedFormation, Name
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.roadside import Roadside
 
@@ -73,6 +80,10 @@ BEFORE_COLUMNS = (3, 4, 6)
 """Lengths of the road before S3 to draw from at the real roadside, in columns."""
 LANE_ENDS_M = (150.0, 300.0)
 """Range of distances between the first position of moves and the end of lane 0."""
+WITH_TRUCKS = 0.3
+"""Share of drawn roads with trucks."""
+TRUCK = VehicleType("truck", 0.3, max_accel_mps2=4.0)
+"""A type that cannot change columns in the short slots of the fault search."""
 LEAVING = 0.4
 """Share of vehicles that leave by the exit of a drawn road."""
 STREAM_PLANNER = 0.05
@@ -100,6 +111,8 @@ class RoadSetup:
     seed: int = 0
     stream_planner: bool = False
     """Whether the stream planner replaces `LightPlanner` (rolling operation)."""
+    trucks: bool = False
+    """Whether there are vehicles that do not change columns (rolling operation at the roadside)."""
     drawn: DrawnRoad = STRAIGHT_ROAD
     """Closed parts, ramps and exits (rolling operation at the real roadside)."""
 
@@ -134,6 +147,7 @@ class RoadSetup:
             road=Road(self.lanes, s1_m=0.0, s2_m=self.before_m, s3_m=s3_m, closures=drawn.closures),
             entrance=drawn.entrance,
             exit=drawn.exit,
+            vehicle_type=(TRUCK,) if self.trucks else (),
             formation=formation,
             network=Network(heartbeat_s=0.2, election_s=0.6, lease_s=LEASE_S),
             runtime=Runtime(tick_s=TICK_S, agent_silent_s=1.5),
@@ -230,7 +244,9 @@ class Setup:
                 road = evolve(road, drawn=DrawnRoad((Closure(0, ends_m),)))
             elif profile.roads:
                 step_m = FormationSettings().speed_mps * road.slot_s
-                road = evolve(road, drawn=draw_road(lanes, road.before_m, step_m, rng))
+                drawn = draw_road(lanes, road.before_m, step_m, rng)
+                trucks = _types_rng(road).random() < WITH_TRUCKS
+                road = evolve(road, drawn=drawn, trucks=trucks)
         else:
             road = RoadSetup(
                 lanes=lanes,
@@ -245,13 +261,15 @@ class Setup:
         mean_s = rng.uniform(*MEAN_HEADWAYS_S)
         entered = [lane for lane in range(lanes) if scenario.volume_veh_per_h(lane) > 0.0]
         next_s = {lane: rng.uniform(0.0, mean_s) for lane in entered}
-        visits = []
+        visits, types_rng = [], _types_rng(road)
         for number in range(1, rng.randint(*profile.vehicles) + 1):
             arrival_s, lane = min((t_s, lane) for lane, t_s in next_s.items())
             next_s[lane] += 1.0 + rng.expovariate(1.0 / mean_s)
             leaves = number > 1 and rng.random() < profile.leavers
             visit = _visit(number, (0, lane), leaves, scenario, lasting, rng)
-            visits.append(evolve(visit, enters_s=arrival_s))
+            is_truck = road.trucks and types_rng.random() < TRUCK.share
+            vehicle_type = TRUCK.name if is_truck else CAR
+            visits.append(evolve(visit, enters_s=arrival_s, vehicle_type=vehicle_type))
         crowded = rng.random() < profile.crowding
         leaving = tuple(
             visit.vehicle for visit in visits if road.drawn.exit and rng.random() < LEAVING
@@ -276,6 +294,7 @@ class Setup:
                 preferred_lanes[visit.vehicle],
                 visit.enters_s,
                 EXIT if visit.vehicle in self.leaving else END_OF_ROAD,
+                visit.vehicle_type,
             )
             for visit in sorted(self.visits, key=lambda visit: visit.enters_s)
         )
@@ -330,6 +349,11 @@ def _draw_rolling_road(lanes: int, rng: random.Random, before_columns: int = 0) 
         stream_planner=rng.random() < STREAM_PLANNER,
     )
     return evolve(road, before_m=before_columns * road.make_scenario().lattice.pitch_m)
+
+
+def _types_rng(road: RoadSetup) -> random.Random:
+    """Return the source of draws of types, so that they change no other draws."""
+    return random.Random(f"types/{road.seed}")  # noqa: S311 (simulation, no secrets)
 
 
 def _draw_lanes(

@@ -10,7 +10,8 @@ With formations, `formation_building` decides whether a formation admits a vehic
 
 Vehicles of some types (trucks) do not change columns (`Scenario.drivable_moves`). Two of them in a
 column could not pass each other, so they enter the same column only if their lanes and their goals
-are in the same order.
+are in the same order. They enter exactly in their cells: a weak vehicle would take long to settle,
+and a long one behind another has little room to approach it.
 
 Decisions do not depend on later arrivals: they are made in order of time and, at equal times, from
 the rightmost lane to the leftmost.
@@ -149,7 +150,13 @@ class EntryMeter:
             return math.inf
         ready_s = max(queue[0].t_s, self._free_s[lane])
         self._skip(lane, ready_s)
-        return max(ready_s, self._passing_time_s(self._columns[lane], lane) - self._spread_s)
+        passing_s = self._passing_time_s(self._columns[lane], lane)
+        return max(ready_s, passing_s - self._spread_in(lane))
+
+    def _spread_in(self, lane: int) -> float:
+        """Return the maximum time between the first vehicle of a queue and its cell [s]."""
+        queue = self._queues[lane]
+        return 0.0 if queue and queue[0].vehicle_type in self._column_bound else self._spread_s
 
     def _passing_time_s(self, column: int, lane: int) -> float:
         """Return the road time at which a column passes the entrance of a lane."""
@@ -160,7 +167,8 @@ class EntryMeter:
         lattice, column = self._lattice, self._columns[lane]
         if self._builder is not None:
             column = int(min(column, self._builder.first_open_column))
-        while self._passing_time_s(column, lane) + self._spread_s < t_s or (
+        spread_s = self._spread_in(lane)
+        while self._passing_time_s(column, lane) + spread_s < t_s or (
             self._interlaced and not lattice.interlaced((column, lane))
         ):
             column -= 1

@@ -198,3 +198,17 @@ def test_trucks_that_would_have_to_pass_each_other_enter_in_different_columns(
         one, other = meter.admit(20.0)
         assert (one.cell[0] == other.cell[0]) == (together or not bound)
         assert other.cell[0] >= one.cell[0] - 1
+
+
+@given(st.lists(st.floats(0.0, 60.0), min_size=1, max_size=30), st.integers(0, 2**20))
+@settings(max_examples=60)
+def test_trucks_enter_exactly_in_their_cells(times_s: list[float], bits: int) -> None:
+    meter = EntryMeter(lattice(), 0.5, column_bound={"truck"})
+    for number, t_s in enumerate(sorted(times_s)):
+        kind = "truck" if bits >> number & 1 else "car"
+        meter.demand(Arrival(f"v{number}", 0, 0, t_s, vehicle_type=kind))
+    admissions = meter.admit(1000.0)
+    check(lattice(), 0.5, admissions)
+    assert len(admissions) == len(times_s)
+    trucks = [one for one in admissions if one.arrival.vehicle_type == "truck"]
+    assert all(one.offset_m == pytest.approx(0.0, abs=1e-6) for one in trucks)

@@ -186,6 +186,11 @@ class Checker:
             self._ownership.move(t_s, vehicle, ballot)
             self._check_members(t_s, vehicle, ballot)
 
+    def undrivable(self, t_s: float, vehicle: str, move: tuple[Cell, Cell]) -> None:
+        """Report a move that the type of a vehicle does not drive."""
+        text = f"its type does not drive from {move[0]} to {move[1]}"
+        self._report("motion", t_s, [vehicle], text)
+
     def advance(self, t_s: float) -> None:
         """Check for overlaps since the last call, and close completed motions."""
         from_s = self._checked_s

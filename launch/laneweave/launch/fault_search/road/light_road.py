@@ -175,6 +175,9 @@ class LightRoad:
             lasts_s = self._move_lasts_s()
             move = (held, controller.hold_cell)
             self._checker.begin(now_s, name, command.incarnation, move, lasts_s, vehicle.latest_s)
+            (column, lane), (to_column, to_lane) = move
+            if (to_column - column, to_lane - lane) not in vehicle.drivable:
+                self._checker.undrivable(now_s, name, move)
             vehicle.body.go(controller.hold_cell, now_s - self.began_s, lasts_s)
 
     # --- the tick -----------------------------------------------------------------------------

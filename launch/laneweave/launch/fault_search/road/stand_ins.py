@@ -23,7 +23,7 @@ from laneweave.coordinator.rolling.checked_planner import stream_road
 from laneweave.protocol.lattice import Cell, PlannedMove, displacements, footprint
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, at_rest_in_cell
-from laneweave.protocol.wire.messages import Motion, Name, Sense
+from laneweave.protocol.wire.messages import CAR, Motion, Name, Sense
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.entry import Admission
@@ -49,6 +49,7 @@ class Visit:
     clock_offset_s: float = 0.0
     clock_drift: float = 0.0
     """Error of the clock rate: seconds gained per second."""
+    vehicle_type: str = CAR
 
 
 class LightBody(Plant):
@@ -112,11 +113,14 @@ class LightVehicle(RoadVehicle):
         self, visit: Visit, admission: Admission, scenario: Scenario, bridge: int = 0
     ) -> None:
         """Start at rest in the cell of the admission."""
-        self.body = LightBody(scenario, admission.cell)
+        own = scenario.types[admission.arrival.vehicle_type]
+        self.drivable = own.drivable_moves
+        """Moves (columns, lanes) that the type of the vehicle drives."""
+        self.body = LightBody(own, admission.cell)
         super().__init__(
             visit.vehicle,
             admission,
-            MotionController(self.body, scenario, admission.cell),
+            MotionController(self.body, own, admission.cell),
             bridge=bridge,
         )
         if scenario.formation.rolling:
@@ -266,6 +270,7 @@ class LightPlanner:
             cell
             for cell in cells
             if 0 <= cell[1] < self._lanes
+            and vehicle.drives(cell[0] - column, cell[1] - lane)
             and all(self._is_open(slot, vehicle.cell, cell, each) for each in (lane, cell[1]))
             and not (self._some_end and self._road.has_left(slot + 1, cell))
             and taken.isdisjoint(footprint(vehicle.cell, cell) - {vehicle.cell})
