@@ -26,6 +26,7 @@ BUGS: list[tuple[str, Bug, int]] = [
     (ROADS, broken_roads.late_commands_repeat_moves, 386),
     (ROADS, broken_roads.gates_stay_open, 337),
     (ROADS, broken_roads.agents_insist, 337),
+    (ROADS, broken_roads.types_are_ignored, 2),
 ]
 """Profiles, bugs, and a seed that catches each."""
 

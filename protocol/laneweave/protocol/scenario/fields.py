@@ -686,12 +686,26 @@ class Scenario:
             cycle_s = ROLLING_CYCLE_S
             if self.demand.volume_veh_per_lane_h > COMFORTABLE_VOLUME_VEH_PER_LANE_H:
                 cycle_s = SHORTEST_CYCLE_S
-            merging_s = self._shortest_merging_s
-            if cycle_s * MIN_MERGING_SLOTS > merging_s:
-                steps = math.floor(merging_s / MIN_MERGING_SLOTS / CYCLE_STEP_S + 1e-9)
-                cycle_s = max(SHORTEST_CYCLE_S, CYCLE_STEP_S * steps)
+            longest_s = self._shortest_merging_s / MIN_MERGING_SLOTS
+            if cycle_s > longest_s:
+                steps = math.floor(longest_s / CYCLE_STEP_S + 1e-9)
+                cycle_s = min(cycle_s, max(CYCLE_STEP_S * steps, self._shortest_cycle_s))
             return cycle_s, cycle_s
         return SHORTEST_CYCLE_S, LONGEST_CYCLE_S
+
+    @property
+    def _shortest_cycle_s(self) -> float:
+        """Shortest T_F for which moves are likely to be possible, at least `SHORTEST_CYCLE_S`.
+
+        A minimum-jerk move over d in T closes up with at most 15/8 d/T and accelerates with
+        10 / sqrt(3) d / T^2 at most. Moves are possible if these do not exceed v_F / 2 and 1.2
+        times the limit (which a trajectory within the limit can replace), in nearly all cases.
+        """
+        d_m, accel_mps2 = self.formation.gap_m, self.vehicle.max_accel_mps2
+        by_speed_s = 15.0 / 4.0 * d_m / self.formation.speed_mps
+        by_accel_s = math.sqrt(10.0 / math.sqrt(3.0) * d_m / (1.2 * accel_mps2))
+        slot_s = max(by_speed_s, by_accel_s) + self.formation.slack_s
+        return max(SHORTEST_CYCLE_S, CYCLE_STEP_S * math.ceil(slot_s / CYCLE_STEP_S - 1e-9))
 
     @property
     def _shortest_merging_s(self) -> float:

@@ -137,3 +137,25 @@ def test_the_time_at_v_f_counts_from_the_entrance_to_the_destination() -> None:
 def test_the_example_scenarios_are_valid(name: str) -> None:
     folder = Path(__file__).parents[4] / "scenarios"
     assert load_scenario(folder / f"{name}.toml").formation.rolling
+
+
+@pytest.mark.parametrize(
+    ("merge_m", "formation", "volume", "slot_s"),
+    [
+        (400.0, {}, 1600.0, 5.0),  # 300 m take 20 s
+        (300.0, {}, 1600.0, 6.0),
+        (520.0, {}, 1600.0, 4.0),
+        (520.0, {"gap_m": 20.0}, 1600.0, 5.2),
+        (400.0, {}, 2100.0, 4.0),
+        (400.0, {"cycle_s": 6.0}, 1600.0, 6.0),
+    ],
+)
+def test_slots_are_short_enough_for_the_lanes_of_ramps(
+    merge_m: float, formation: dict[str, float], volume: float, slot_s: float
+) -> None:
+    tables = copy.deepcopy(WEAVING)
+    tables["entrance"][0].update(at_m=100.0, merge_m=merge_m, volume_veh_per_h=100.0)
+    tables["road"]["closures"][0].update(to_m=100.0)
+    tables["formation"].update(formation)
+    tables["demand"] = {"volume_veh_per_lane_h": volume}
+    assert parse_scenario(tables).cycles_s == pytest.approx((slot_s, slot_s))

@@ -1,0 +1,54 @@
+"""A ramp, an exit and trucks, with real processes: everybody leaves where it wants."""
+
+from __future__ import annotations
+
+from support.harness import Lab, check_safe_and_complete, summary, trips
+
+ROAD = """schema = "laneweave.scenario/1"
+seed = 3
+[road]
+s1_m = 50.0
+s2_m = 50.0
+s3_m = 500.0
+lanes = 3
+closures = [{ lane = 0, to_m = 50.0 }, { lane = 0, from_m = 500.0 }]
+[[entrance]]
+name = "on"
+lane = 0
+at_m = 50.0
+merge_m = 220.0
+volume_veh_per_h = 900.0
+destinations = [{ exit = "off", share = 0.3 }]
+[[exit]]
+name = "off"
+lanes = [0]
+at_m = 500.0
+[demand]
+volume_veh_per_lane_h = 900.0
+duration_s = 30.0
+destinations = [{ exit = "off", share = 0.3 }]
+[[vehicle_type]]
+name = "truck"
+share = 0.3
+length_m = 12.0
+width_m = 2.5
+max_accel_mps2 = 2.0
+[formation]
+operation = "rolling"
+gap_m = 20.0
+[runtime]
+vehicles_per_process = 1
+"""
+
+
+def test_cars_and_trucks_enter_by_a_ramp_and_leave_by_their_exits(lab: Lab) -> None:
+    folder = lab.folder / "run"
+    ended = lab.run("run", lab.path("road.toml", ROAD), "--out", folder)
+    assert (ended.status, ended.complaints) == (0, []), ended
+    check_safe_and_complete(folder)
+    found, driven = summary(folder)["vehicles"], list(trips(folder).values())
+    assert found["at_destination"] == found["left"] == found["demanded"] == len(driven)
+    assert {trip["entrance"] for trip in driven} == {"main", "on"}
+    assert {trip["exit"] for trip in driven} == {"end", "off"}
+    assert {trip["vehicle_type"] for trip in driven} == {"car", "truck"}
+    assert summary(folder)["tracking"]["emergency_ticks"] == 0
