@@ -1,4 +1,4 @@
-"""A ramp, an exit and trucks, with real processes: everybody leaves where it wants."""
+"""A ramp, an exit and trucks, with real processes: all vehicles leave at their destinations."""
 
 from __future__ import annotations
 

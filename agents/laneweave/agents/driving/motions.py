@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from laneweave.agents.driving.trajectory import move_profile
 from laneweave.protocol.lattice import Cell, displacements
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.wire.messages import Motion, Name
+from laneweave.protocol.wire.messages import CAR, Motion, Name
 
 Array = NDArray[np.float64]
 
@@ -119,10 +119,9 @@ class Motions:
             return  # not a move of this scenario
         table = self._tables.get((dx, dy, ticks))
         if table is None:
-            # Cars come first, and drive every move.
-            types = self._scenario.types.values()
-            mover = next(one for one in types if (dx, dy) in one.drivable_moves)
-            table = self._tables[dx, dy, ticks] = _MoveTable.of(mover, dx, dy, ticks)
+            # A motion does not name the type. Cars drive every move; others drive it much alike.
+            cars = self._scenario.types[CAR]
+            table = self._tables[dx, dy, ticks] = _MoveTable.of(cars, dx, dy, ticks)
         start_m, end_m = column * self._pitch_m, to_column * self._pitch_m
         low_m, high_m = min(start_m, end_m) - NEAR_M, max(start_m, end_m) + NEAR_M
         self.known[motion.vehicle] = _Known(motion, table, motion.tick, start_m, low_m, high_m)

@@ -211,10 +211,8 @@ class RollingOperation:
             s_m = self._scenario.lattice.cell_s_m(column, (slot - 1) * self._slot_s)
             if s_m < far_m:
                 continue
-            targets, moves = (
-                self._targets(entry, s_m),
-                self._moves.get(entry.vehicle_type, NO_MOVES),
-            )
+            targets = self._targets(entry, s_m)
+            moves = self._moves.get(entry.vehicle_type, NO_MOVES)
             if state is None:
                 unknown = StreamVehicle(entry.vehicle, entry.cell, targets, held=True)
                 vehicles.setdefault(entry.cell, unknown)

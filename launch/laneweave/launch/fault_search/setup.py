@@ -83,7 +83,8 @@ LANE_ENDS_M = (150.0, 300.0)
 WITH_TRUCKS = 0.3
 """Share of drawn roads with trucks."""
 TRUCK = VehicleType("truck", 0.3, max_accel_mps2=4.0)
-"""A type that cannot change columns in the short slots of the fault search."""
+"""A type that cannot change columns in the short slots of the fault search. It has the size of
+cars, since sizes and brakes do not matter to light bodies."""
 LEAVING = 0.4
 """Share of vehicles that leave by the exit of a drawn road."""
 STREAM_PLANNER = 0.05
@@ -245,7 +246,7 @@ class Setup:
             elif profile.roads:
                 step_m = FormationSettings().speed_mps * road.slot_s
                 drawn = draw_road(lanes, road.before_m, step_m, rng)
-                trucks = _types_rng(road).random() < WITH_TRUCKS
+                trucks = _types_rng(road, "road").random() < WITH_TRUCKS
                 road = evolve(road, drawn=drawn, trucks=trucks)
         else:
             road = RoadSetup(
@@ -261,7 +262,7 @@ class Setup:
         mean_s = rng.uniform(*MEAN_HEADWAYS_S)
         entered = [lane for lane in range(lanes) if scenario.volume_veh_per_h(lane) > 0.0]
         next_s = {lane: rng.uniform(0.0, mean_s) for lane in entered}
-        visits, types_rng = [], _types_rng(road)
+        visits, types_rng = [], _types_rng(road, "vehicles")
         for number in range(1, rng.randint(*profile.vehicles) + 1):
             arrival_s, lane = min((t_s, lane) for lane, t_s in next_s.items())
             next_s[lane] += 1.0 + rng.expovariate(1.0 / mean_s)
@@ -351,9 +352,9 @@ def _draw_rolling_road(lanes: int, rng: random.Random, before_columns: int = 0) 
     return evolve(road, before_m=before_columns * road.make_scenario().lattice.pitch_m)
 
 
-def _types_rng(road: RoadSetup) -> random.Random:
-    """Return the source of draws of types, so that they change no other draws."""
-    return random.Random(f"types/{road.seed}")  # noqa: S311 (simulation, no secrets)
+def _types_rng(road: RoadSetup, purpose: str) -> random.Random:
+    """Return a source of draws of types, so that they change no other draws."""
+    return random.Random(f"types/{purpose}/{road.seed}")  # noqa: S311 (simulation, no secrets)
 
 
 def _draw_lanes(

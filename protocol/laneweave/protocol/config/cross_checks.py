@@ -496,6 +496,16 @@ def _check_braking(scenario: Scenario) -> None:
     )
     _require(_in_ticks(scenario, reaction_s, 1), "braking.reaction_s", reaction_s, allowed)
     gap_m = scenario.formation.gap_m
+    hardest_mps2 = max(scenario.braking.lead_brake_mps2, -scenario.vehicle.min_accel_mps2)
+    for number, vehicle_type in enumerate(scenario.vehicle_type):
+        if vehicle_type.min_accel_mps2 is not None:
+            _require(
+                -vehicle_type.min_accel_mps2 <= hardest_mps2,
+                f"vehicle_type[{number}].min_accel_mps2",
+                vehicle_type.min_accel_mps2,
+                f"at least {-hardest_mps2:g}: vehicles behind expect no harder braking "
+                "(braking.lead_brake_mps2)",
+            )
     for name, own in scenario.types.items():
         min_m = min_pitch_m(own)
         _require(
@@ -516,7 +526,8 @@ def _check_settling(scenario: Scenario) -> None:
     acceleration of 10/sqrt(3) d/T^2 and a peak jerk of 60 d/T^3.
     """
     formation = scenario.formation
-    limits = [one.vehicle for one in scenario.types.values()]
+    # Types that do not change columns enter in their cells.
+    limits = [one.vehicle for one in scenario.types.values() if one.changes_columns]
     offset_m = formation.entry_spread_s * formation.speed_mps
     max_mps = min(one.max_speed_mps for one in limits)
     speed_mps = min(max_mps - formation.speed_mps, formation.speed_mps)

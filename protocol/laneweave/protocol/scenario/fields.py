@@ -39,9 +39,9 @@ COMFORT_MPS2 = 3.0
 """Maximum comfortable acceleration, along and across the road."""
 ROLLING_CYCLE_S = 6.0
 MIN_MERGING_SLOTS = 4
-"""Number of slots that the rolling operation needs between a ramp, or the beginning of the lane of
-an exit, and the end of this lane; with three, 1 % of the vehicles of a ramp or an exit did not
-change lanes in time at 2000 vehicles/(lane h)."""
+"""Number of slots that the rolling operation should have in a lane that begins and ends on the
+road, as that of a ramp; with three, up to 1 % of the vehicles did not change lanes in time at 2000
+vehicles/(lane h)."""
 COMFORTABLE_VOLUME_VEH_PER_LANE_H = 2000.0
 """Maximum volume at which T_F of the rolling operation is the comfortable `ROLLING_CYCLE_S`. Denser
 traffic needs more steps on the same road: at 2400, 1 % of the vehicles miss their lanes with 6 s,
@@ -215,8 +215,8 @@ class FormationSettings:
     """Column pitch d_F."""
     cycle_s: float | None = field(default=None, validator=optional(within(0.5, 60.0)))
     """T_F, the time slot of a step. None: in formations the longest from 4 to 7 s for which the
-    road suffices, in the rolling operation a value by volume and by the length of ramps and lanes
-    of exits (`Scenario.cycles_s`)."""
+    road suffices, in the rolling operation a value by volume, and by the length of lanes that
+    begin and end on the road, within limits (`Scenario.cycles_s`)."""
     move_s: float | None = field(default=None, validator=optional(within(0.5, 60.0)))
     """Duration of a move within its slot; the rest is slack for lost messages. None: 0.2 s less
     than T_F."""
@@ -531,7 +531,7 @@ class Scenario:
     formation: FormationSettings = FormationSettings()
     vehicle: Vehicle = Vehicle()
     vehicle_type: tuple[VehicleType, ...] = ()
-    """Types of vehicles other than cars."""
+    """Types of vehicles other than cars; in the scenario of a type (`types`) all types."""
     sensing: Sensing = Sensing()
     braking: Braking = Braking()
     tracking: Tracking = Tracking()
@@ -632,6 +632,11 @@ class Scenario:
         return frozenset((columns, lanes) for columns, lanes in moves if columns == 0)
 
     @property
+    def changes_columns(self) -> bool:
+        """Whether the type that `vehicle` describes moves between columns."""
+        return any(columns for columns, _ in self.drivable_moves)
+
+    @property
     def longest_body_m(self) -> float:
         """Length of the longest type of vehicle."""
         return max(one.vehicle.length_m for one in self.types.values())
@@ -640,11 +645,6 @@ class Scenario:
     def widest_body_m(self) -> float:
         """Width of the widest type of vehicle."""
         return max(one.vehicle.width_m for one in self.types.values())
-
-    @property
-    def weakest_braking_mps2(self) -> float:
-        """Deceleration (> 0) that every type of vehicle reaches."""
-        return min(-one.vehicle.min_accel_mps2 for one in self.types.values())
 
     def entrance_of(self, lane: int) -> str:
         """Return the name of the entrance of vehicles that arrive in a lane."""
@@ -701,7 +701,8 @@ class Scenario:
         10 / sqrt(3) d / T^2 at most. Moves are possible if these do not exceed v_F / 2 and 1.2
         times the limit (which a trajectory within the limit can replace), in nearly all cases.
         """
-        d_m, accel_mps2 = self.formation.gap_m, self.vehicle.max_accel_mps2
+        # T_F is the same for all types; those that are weaker drive fewer moves.
+        d_m, accel_mps2 = self.formation.gap_m, self.types[CAR].vehicle.max_accel_mps2
         by_speed_s = 15.0 / 4.0 * d_m / self.formation.speed_mps
         by_accel_s = math.sqrt(10.0 / math.sqrt(3.0) * d_m / (1.2 * accel_mps2))
         slot_s = max(by_speed_s, by_accel_s) + self.formation.slack_s

@@ -30,7 +30,7 @@ from laneweave.protocol.vehicle.motion import (
     hold_law,
     integrate,
 )
-from laneweave.protocol.wire.messages import Neighbour
+from laneweave.protocol.wire.messages import CAR, Neighbour
 
 BEFORE_TOUCHING = 0.6
 """Share of a move by which a body that changes lanes touches the other lane (by default 0.36)."""
@@ -206,7 +206,6 @@ def sections_to_lines(scenario: Scenario) -> tuple[LaneSection, ...]:
     )
 
 
-@lru_cache(maxsize=64)
 def drive_out(scenario: Scenario) -> DriveOut:
     """Return what every type of vehicle needs to drive from standing into the neighbouring lane.
 
@@ -217,6 +216,12 @@ def drive_out(scenario: Scenario) -> DriveOut:
     Raises:
         ValueError: the vehicle does not arrive in a cell (its limits are too low).
     """
+    # The scenarios of all types share a key.
+    return _drive_out_of_all(scenario.types[CAR])
+
+
+@lru_cache(maxsize=64)
+def _drive_out_of_all(scenario: Scenario) -> DriveOut:
     for columns in range(2, _MAX_COLUMNS + 1):
         found = [
             _drive_out(one, columns, late_s)

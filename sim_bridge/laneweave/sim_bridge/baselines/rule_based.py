@@ -178,6 +178,17 @@ def check_rule(scenario: Scenario) -> None:
             f"at least {min_m:g}, to stop there from formation.speed_mps = {speed_mps:g}, and "
             f"less than {sorting}",
         )
+    slip_m = road.lane_width_m / scenario.vehicle.max_slip_ratio
+    change_m = max(speed_mps * rule.lane_change_s, slip_m) if rule.lane_change_s else 0.0
+    for section in scenario.sections:
+        begins_m = max(section.from_m, section.moves_from_m) + scenario.vehicle.length_m
+        if section.to_m < road.length_m and section.to_m - begins_m <= change_m:
+            raise BadInputError(
+                "rule.lane_change_s",
+                rule.lane_change_s,
+                f"so short that a lane change of {change_m:g} m fits into lane {section.lane} from "
+                f"{begins_m:g} to {section.to_m:g} m",
+            )
     changes_m = (road.lanes - 1) * speed_mps * rule.lane_change_s
     if rule.stop_distance_m + changes_m > sorting_m:
         raise BadInputError(

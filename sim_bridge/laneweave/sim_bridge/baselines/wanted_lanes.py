@@ -3,7 +3,7 @@
 A vehicle wants a lane of its exit, its preferred lane at the end of the road, or its own lane if it
 has no preference. If its lane ends before that, as a dead end or at the exit of others, it wants
 the nearest lane that is open beyond; of two, the one towards its goal, otherwise the left one. The
-checks of scenarios ensure that it is a neighbouring lane, open long enough before the end.
+checks of scenarios ensure that it is open long enough before the end.
 """
 
 from __future__ import annotations

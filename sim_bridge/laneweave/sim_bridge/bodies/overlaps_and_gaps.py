@@ -202,9 +202,10 @@ class Bodies:
         """Return the neighbours of each vehicle without measurement errors.
 
         Neighbours are the nearest vehicles ahead and behind in each lane that the body touches and
-        in the adjacent lanes. A vehicle that straddles two lanes is in both. The
-        bumper-to-bumper gap ignores rotation and is negative for vehicles side by side. The vehicle
-        whose front is farther ahead counts as ahead; ties go to the vehicle with the later name.
+        in the adjacent lanes: of those whose fronts are ahead, the one with the rearmost rear, and
+        of the others the one with the foremost front. A vehicle that straddles two lanes is in
+        both. The bumper-to-bumper gap ignores rotation and is negative for vehicles side by side.
+        Between vehicles with equal fronts, the one with the later name counts as ahead.
 
         Args:
             lanes: number of lanes.
@@ -219,6 +220,9 @@ class Bodies:
             touched.append((first, last))
         names, poses, sizes = self._names, self._poses, self._sizes
         accels = [accels_mps2.get(name, 0.0) for name in names]
+
+        def rear_m(index: int) -> float:
+            return poses[index][0] - sizes[index][0]
 
         def nearest(order: Iterable[int], sign: float) -> list[list[ExactNeighbour]]:
             """Return the neighbours of each vehicle among the vehicles before it in `order`."""
@@ -237,7 +241,10 @@ class Bodies:
                         found.append((lane, gap_m, speed_mps, accels[other]))
                 seen[index] = found
                 for lane in range(first, last + 1):
-                    last_seen[lane] = index
+                    before = last_seen[lane]
+                    # A long body ahead of another one, beside it, may reach farther back.
+                    if sign < 0.0 or before < 0 or rear_m(index) <= rear_m(before):
+                        last_seen[lane] = index
             return seen
 
         ahead = nearest(range(len(names) - 1, -1, -1), 1.0)

@@ -129,7 +129,10 @@ class RunRecord:
         metadata = metadata_of(scenario)
         self._events = Events(folder / "events.jsonl")
         self._trajectories = Trajectories(
-            folder / "trajectories.parquet", metadata, scenario.vehicle.min_accel_mps2
+            folder / "trajectories.parquet",
+            metadata,
+            max(own.vehicle.min_accel_mps2 for own in scenario.types.values()),
+            self._min_accel_of if scenario.vehicle_type else None,
         )
         self._trips = Trips(folder / "trips.parquet", metadata)
         self._ticks = Ticks(folder / "ticks.parquet")
@@ -183,6 +186,11 @@ class RunRecord:
             vehicles=list(members),
             columns=[columns[0], columns[-1]],
         )
+
+    def _min_accel_of(self, vehicle: str) -> float:
+        """Return the braking limit of a vehicle on the road [m/s2]."""
+        arrival = self._trips[Name(vehicle)].arrival
+        return self._scenario.types[arrival.vehicle_type].vehicle.min_accel_mps2
 
     def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
         """Record a vehicle that has left the road since the last tick, by its end or an exit.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +42,21 @@ s: front bumper; y: centre of the body from the right road edge; column and lane
 class Trajectories:
     """Writes trajectories and computes their extreme values."""
 
-    def __init__(self, path: Path, metadata: Metadata, min_accel_mps2: float) -> None:
-        """Open the file; `min_accel_mps2` is the braking limit."""
+    def __init__(
+        self,
+        path: Path,
+        metadata: Metadata,
+        min_accel_mps2: float,
+        min_accel_of: Callable[[str], float] | None = None,
+    ) -> None:
+        """Open the file.
+
+        Args:
+            path: the file.
+            metadata: its metadata.
+            min_accel_mps2: braking limit of the type that brakes least.
+            min_accel_of: returns the braking limit of a vehicle; None: it is that of all.
+        """
         self.peak = 0
         """Maximum number of vehicles on the road at a tick."""
         self._file = GrowingParquet(
@@ -57,6 +70,7 @@ class Trajectories:
         """Buffered rows; `_times` contains their times."""
         self._buffered_ticks = 0
         self._brake_mps2 = EMERGENCY_SHARE * min_accel_mps2
+        self._min_accel_of = min_accel_of
         self._last_s, self._last_accels = -math.inf, dict[str, float]()
         """Time of the last tick, and accelerations of all vehicles at that tick."""
         self._overlaps: set[tuple[str, str]] = set()
@@ -74,8 +88,12 @@ class Trajectories:
             last = last_accels.get(vehicle)
             if last is not None and dt_s > 0.0:
                 self._max_jerk_mps3 = max(self._max_jerk_mps3, abs(accel - last) / dt_s)
-            if accel < brake_mps2 and (last is None or last >= brake_mps2):
-                self._emergency_brakes += 1
+            if accel < brake_mps2:
+                own_mps2 = brake_mps2
+                if self._min_accel_of is not None:
+                    own_mps2 = EMERGENCY_SHARE * self._min_accel_of(vehicle)
+                if accel < own_mps2 and (last is None or last >= own_mps2):
+                    self._emergency_brakes += 1
         self._last_s, self._last_accels = t_s, accels
         self._min_accel_mps2 = min(self._min_accel_mps2, *accels.values(), math.inf)
         self._max_accel_mps2 = max(self._max_accel_mps2, *accels.values(), -math.inf)

@@ -9,9 +9,9 @@ of arrival, at least one column's time apart.
 With formations, `formation_building` decides whether a formation admits a vehicle.
 
 Vehicles of some types (trucks) do not change columns (`Scenario.drivable_moves`). Two of them in a
-column could not pass each other, so they enter the same column only if their lanes and their goals
-are in the same order. They enter exactly in their cells: a weak vehicle would take long to settle,
-and a long one behind another has little room to approach it.
+column could not pass each other, so they enter the same column only if they can leave the road in
+lanes of the same order. They enter exactly in their cells: a weak vehicle would take long to
+settle, and a long one behind another has little room to approach it.
 
 Decisions do not depend on later arrivals: they are made in order of time and, at equal times, from
 the rightmost lane to the leftmost.
@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from bisect import insort
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from attrs import frozen
 
@@ -60,6 +60,7 @@ class EntryMeter:
         interlaced: bool = False,
         entry_m: Sequence[float] = (),
         column_bound: Collection[str] = (),
+        lanes_of: Callable[[Arrival], Collection[int]] | None = None,
     ) -> None:
         """Start with an empty road at road time 0.
 
@@ -70,10 +71,13 @@ class EntryMeter:
             interlaced: only every other cell may be entered.
             entry_m: position of the entrance of each lane; empty: s = 0.
             column_bound: types of vehicles that do not change columns.
+            lanes_of: returns the lanes in which a vehicle may leave the road; None: its preferred
+                lane, if it has one.
         """
+        self._lanes_of = lanes_of or self._preferred_lanes
         self._column_bound = frozenset(column_bound)
-        self._bound: dict[int, list[tuple[int, int]]] = {}
-        """(lane, preferred lane) of the vehicles of these types, by their column."""
+        self._bound: dict[int, dict[int, Collection[int]]] = {}
+        """Lanes in which the vehicles of these types may leave, by their column and lane."""
         self._entry_m = tuple(entry_m) or (0.0,) * lattice.lanes
         self._lattice = lattice
         self._builder = builder
@@ -168,7 +172,7 @@ class EntryMeter:
         if self._builder is not None:
             column = int(min(column, self._builder.first_open_column))
         spread_s = self._spread_in(lane)
-        while self._passing_time_s(column, lane) + spread_s < t_s or (
+        while self._passing_time_s(column, lane) + spread_s < t_s - TIME_TOLERANCE_S or (
             self._interlaced and not lattice.interlaced((column, lane))
         ):
             column -= 1
@@ -184,17 +188,21 @@ class EntryMeter:
         self._names.discard(queue[0].vehicle)
         return queue.pop(0)
 
+    def _preferred_lanes(self, arrival: Arrival) -> Collection[int]:
+        preferred = arrival.preferred_lane
+        return range(self._lattice.lanes) if preferred == ANY_LANE else (preferred,)
+
     def _try_bind(self, cell: Cell, arrival: Arrival) -> bool:
         """Add a vehicle that does not change columns to a column, unless it would be in the way."""
-        (column, lane), goal = cell, arrival.preferred_lane
-        if goal == ANY_LANE:
-            return True
-        others = self._bound.setdefault(column, [])
-        if any(
-            (lane < other) != (goal < its_goal) or goal == its_goal for other, its_goal in others
-        ):
+        column, lane = cell
+        bound = {**self._bound.get(column, {}), lane: self._lanes_of(arrival)}
+        leaves_in: float = -1
+        for here in sorted(bound):
+            # The rightmost lane that leaves the most room for those on its left.
+            leaves_in = min((goal for goal in bound[here] if goal > leaves_in), default=math.inf)
+        if leaves_in == math.inf and len(bound) > 1:
             return False
-        others.append((lane, goal))
+        self._bound[column] = bound
         while len(self._bound) > _MAX_BOUND_COLUMNS:
             del self._bound[next(iter(self._bound))]
         return True

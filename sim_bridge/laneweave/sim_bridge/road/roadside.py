@@ -6,10 +6,12 @@ The census is complete, so coordinators know all rosters.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import LaneSection, sections_for
 from laneweave.protocol.runtime.node import Effect, Send
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
@@ -61,7 +63,7 @@ class Roadside:
         weakest = min(scenario.types.values(), key=lambda one: -one.vehicle.min_accel_mps2)
         self._brake = EmergencyBrake(weakest)
         longest_m = scenario.longest_body_m
-        stopping_m = lattice.speed_mps**2 / scenario.weakest_braking_mps2
+        stopping_m = lattice.speed_mps**2 / -weakest.vehicle.min_accel_mps2
         self._room_m = longest_m + stopping_m + lattice.speed_mps + QUEUE_ROOM_M
         """Distance from an entrance within which bodies may keep others from entering."""
         ahead_s = self._announce_s + self._tick_s
@@ -75,11 +77,8 @@ class Roadside:
             self._builder,
             interlaced=formation.interlaced,
             entry_m=scenario.entry_m,
-            column_bound=[
-                name
-                for name, one in scenario.types.items()
-                if all(columns == 0 for columns, _ in one.drivable_moves)
-            ],
+            column_bound=[name for name, one in scenario.types.items() if not one.changes_columns],
+            lanes_of=partial(_goal_lanes, scenario.sections),
         )
         self._lane_ends = LaneEndControl(scenario, self._meter)
         self._closed: list[ClosedFormation] = []
@@ -357,3 +356,9 @@ class Roadside:
             )
             for arrival in sorted(coming, key=lambda arrival: (arrival.t_s, arrival.vehicle))
         )
+
+
+def _goal_lanes(sections: Sequence[LaneSection], arrival: Arrival) -> frozenset[int]:
+    """Return the lanes in which a vehicle may leave the road."""
+    numbers = sections_for(sections, arrival.preferred_lane, arrival.destination)
+    return frozenset(sections[number].lane for number in numbers)

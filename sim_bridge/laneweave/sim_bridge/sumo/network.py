@@ -25,7 +25,7 @@ from laneweave.sim_bridge.sumo.road_edges import (
 )
 
 _NO_VEHICLES = "authority"
-"""A class of vehicles that do not occur, for rights that nobody has."""
+"""A class of vehicles that do not occur, for lanes that no vehicle may enter or leave sideways."""
 SUBLANE_M = 0.8
 """Lateral resolution of SUMO's sublane model."""
 

@@ -95,8 +95,11 @@ class RoadEdges:
 
 
 def route_name(entrance: str, end: str) -> str:
-    """Return the name of the route from an entrance to an exit or `END_OF_ROAD`."""
-    return f"{entrance}-{end}"
+    """Return the name of the route from an entrance to an exit or `END_OF_ROAD`.
+
+    The separator does not occur in names.
+    """
+    return f"{entrance}/{end}"
 
 
 def route_of(scenario: Scenario, arrival: Arrival) -> str:

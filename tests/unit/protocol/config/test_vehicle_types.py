@@ -28,7 +28,7 @@ TRUCK: dict[str, Any] = {
 SPORTS_CAR = {"name": "sports-car", "share": 0.1, "max_accel_mps2": 9.0}
 
 
-def scenario(*types: dict[str, Any], **tables: dict[str, Any]) -> Scenario:
+def scenario(*types: dict[str, Any], **tables: Any) -> Scenario:  # noqa: ANN401 (tables)
     return parse_scenario({"formation": ROLLING, "vehicle_type": list(types), **tables})
 
 
@@ -48,17 +48,31 @@ def test_a_type_has_the_limits_of_cars_except_its_own() -> None:
     assert found.types["sports-car"].vehicle == attrs.evolve(found.vehicle, max_accel_mps2=9.0)
     assert found.types["car"].vehicle == found.vehicle
     assert (found.longest_body_m, found.widest_body_m) == (12.0, 2.5)
-    assert found.weakest_braking_mps2 == 7.0
 
 
 @pytest.mark.parametrize("name", ["car", "truck", "sports-car"])
 def test_the_scenario_of_a_type_knows_the_same_types(name: str) -> None:
-    found = scenario(TRUCK, SPORTS_CAR)
+    # On this road, T_F follows from the ramp and from what cars can drive.
+    found = scenario(
+        TRUCK,
+        SPORTS_CAR,
+        road={
+            "s1_m": 50.0,
+            "s2_m": 50.0,
+            "s3_m": 600.0,
+            "closures": [{"lane": 0, "to_m": 50.0}, {"lane": 0, "from_m": 550.0}],
+        },
+        entrance=[
+            {"name": "on", "lane": 0, "at_m": 50.0, "merge_m": 250.0, "volume_veh_per_h": 300.0}
+        ],
+    )
+    assert found.cycles_s == pytest.approx((5.2, 5.2))
     own = found.types[name]
     assert dict(own.types) == dict(found.types)
     assert own.types[name] == own
     # What all vehicles must agree on is the same for all.
     assert drive_out(own) == drive_out(found)
+    assert own.cycles_s == found.cycles_s
     assert own.longest_body_m == 12.0
 
 
@@ -126,7 +140,16 @@ def test_the_pitch_suits_every_pair_of_types() -> None:
             {"road": {"closures": [{"lane": 0, "from_m": 900.0}]}},
             "vehicle_type[0].max_accel_mps2: got 0.2; allowed: more",
         ),
-        ([{**TRUCK, "max_accel_mps2": 0.2}], {}, "formation.settle_s: got 10.0"),
+        (
+            [{**TRUCK, "min_accel_mps2": -10.5}],
+            {},
+            "vehicle_type[0].min_accel_mps2: got -10.5; allowed: at least -10: ",
+        ),
+        (
+            [{**SPORTS_CAR, "max_jerk_mps3": 0.4}],
+            {"formation": {**ROLLING, "cycle_s": 16.0}},
+            "formation.settle_s: got 10.0",
+        ),
     ],
 )
 def test_types_that_do_not_fit_are_refused_in_one_line(

@@ -230,8 +230,10 @@ def test_sensing_agrees_with_brute_force(road: dict[str, Pose]) -> None:
             front = [each for each in there if each > own]
             back = [each for each in there if each < own]
             if front:
-                nearest_m, other = min(front)
-                ahead[lane] = (nearest_m - size_of(other)[0] - own[0], road[other][3])
+                rear_m, _, other = min(
+                    (front_m - size_of(other)[0], front_m, other) for front_m, other in front
+                )
+                ahead[lane] = (rear_m - own[0], road[other][3])
             if back:
                 nearest_m, other = max(back)
                 behind[lane] = (own[0] - size_of(name)[0] - nearest_m, road[other][3])

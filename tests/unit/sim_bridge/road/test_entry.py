@@ -185,7 +185,9 @@ def truck(name: str, t_s: float, lane: int, preferred: int) -> Arrival:
         ((0, 1), (2, 1), False),
         ((0, 0), (2, 2), True),
         ((0, 1), (2, 2), True),
-        ((0, ANY_LANE), (2, 0), True),
+        ((0, ANY_LANE), (2, 0), False),
+        ((0, ANY_LANE), (2, 1), True),
+        ((0, ANY_LANE), (2, ANY_LANE), True),
     ],
 )
 def test_trucks_that_would_have_to_pass_each_other_enter_in_different_columns(
@@ -198,6 +200,29 @@ def test_trucks_that_would_have_to_pass_each_other_enter_in_different_columns(
         one, other = meter.admit(20.0)
         assert (one.cell[0] == other.cell[0]) == (together or not bound)
         assert other.cell[0] >= one.cell[0] - 1
+
+
+def test_trucks_enter_a_column_only_if_the_road_has_lanes_for_all_of_them() -> None:
+    # Lane 0 ends: three trucks side by side could not drive on in two lanes.
+    meter = EntryMeter(lattice(), 0.5, column_bound={"truck"}, lanes_of=lambda _: {1, 2})
+    for lane in range(3):
+        meter.demand(truck(f"v{lane}", 10.0, lane, ANY_LANE))
+    columns = [one.cell[0] for one in meter.admit(20.0)]
+    assert sorted(columns, reverse=True) == [columns[0], columns[0], columns[0] - 1]
+    # Whatever is asked of a single one, it enters.
+    meter = EntryMeter(lattice(), 0.5, column_bound={"truck"}, lanes_of=lambda _: set())
+    meter.demand(truck("a", 10.0, 0, 0))
+    assert len(meter.admit(20.0)) == 1
+
+
+@pytest.mark.parametrize("pitch_m", [15.0, 19.3, 20.0])
+def test_a_queue_of_trucks_uses_every_cell(pitch_m: float) -> None:
+    grid = Lattice(pitch_m, 15.0, 3.5, 1, 4)
+    meter = EntryMeter(grid, 0.5, column_bound={"truck"})
+    for number in range(200):
+        meter.demand(truck(f"v{number}", 0.0, 0, 0))
+    columns = [one.cell[0] for one in meter.admit(1000.0)]
+    assert columns == list(range(columns[0], columns[0] - 200, -1))
 
 
 @given(st.lists(st.floats(0.0, 60.0), min_size=1, max_size=30), st.integers(0, 2**20))

@@ -42,7 +42,7 @@ def test_each_lane_leads_to_an_exit_of_its_own(tmp_path: Path, lanes: int) -> No
     connections = {(one.attrib["fromLane"], one.attrib["to"]) for one in network.iter("connection")}
     assert connections == {(str(lane), f"exit{lane}") for lane in range(lanes)}
     edges = {one.attrib["id"]: one.attrib["edges"] for one in routes.iter("route")}
-    assert edges == {f"main-lane-{lane}": f"road exit{lane}" for lane in range(lanes)}
+    assert edges == {f"main/lane-{lane}": f"road exit{lane}" for lane in range(lanes)}
 
 
 def test_lanes_go_on_where_they_were_and_the_road_ends_where_it_should(tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_a_lane_that_ends_has_no_connection(tmp_path: Path) -> None:
         "road1": (800.0, 1030.0, {5.25: OPEN, 8.75: OPEN}),
     }
     assert connected_positions(network) == {("road", "road1", 5.25), ("road", "road1", 8.75)}
-    assert routes_by_name(routes) == {"main-end": "road road1"}
+    assert routes_by_name(routes) == {"main/end": "road road1"}
 
 
 def test_a_lane_opens_again_behind_its_closed_part_and_a_body(tmp_path: Path) -> None:
@@ -195,7 +195,7 @@ def test_a_lane_opens_again_behind_its_closed_part_and_a_body(tmp_path: Path) ->
     }
     at_ends = [one for one in connected_positions(network) if one[2] == 1.75]
     assert at_ends == [("road2", "road3", 1.75)]
-    assert routes_by_name(routes) == {"main-end": "road road1 road2 road3"}
+    assert routes_by_name(routes) == {"main/end": "road road1 road2 road3"}
 
 
 def test_a_closed_lane_between_open_ones_keeps_them_apart(tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_lanes_that_reach_the_end_lead_to_exits_if_vehicles_prefer_lanes(tmp_pat
     assert edges["road1"] == (800.0, 1000.0, {1.75: OPEN, 5.25: OPEN})
     assert edges["exit1"] == (1000.0, 1030.0, {5.25: OPEN})
     assert routes_by_name(routes) == {
-        f"main-lane-{lane}": f"road road1 exit{lane}" for lane in range(2)
+        f"main/lane-{lane}": f"road road1 exit{lane}" for lane in range(2)
     }
 
 
@@ -271,8 +271,8 @@ def test_a_ramp_is_an_edge_beside_the_road_until_it_joins(tmp_path: Path) -> Non
     rightmost = {one for one in connected_positions(network) if one[2] == 1.75}
     assert rightmost == {("ramp-on", "road1", 1.75), ("road1", "road2", 1.75)}
     assert routes_by_name(routes) == {
-        "main-end": "road road1 road2 road3",
-        "on-end": "ramp-on road1 road2 road3",
+        "main/end": "road road1 road2 road3",
+        "on/end": "ramp-on road1 road2 road3",
     }
     # No body turns while its rear is on another edge.
     forbidden = {
@@ -300,10 +300,10 @@ def test_an_exit_is_an_edge_behind_the_lane_that_it_ends(tmp_path: Path) -> None
         *(("road2", "road3", y_m) for y_m in (5.25, 8.75, 12.25)),
     }
     assert routes_by_name(routes) == {
-        "main-end": "road road1 road2 road3",
-        "main-off": "road road1 road2 exit-off",
-        "on-end": "ramp-on road1 road2 road3",
-        "on-off": "ramp-on road1 road2 exit-off",
+        "main/end": "road road1 road2 road3",
+        "main/off": "road road1 road2 exit-off",
+        "on/end": "ramp-on road1 road2 road3",
+        "on/off": "ramp-on road1 road2 exit-off",
     }
 
 
