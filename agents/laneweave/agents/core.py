@@ -43,7 +43,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import displaced
-from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
+from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution, ends_in_time
 from laneweave.protocol.wire.bounds import check_ballot
 from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import (
@@ -263,10 +263,10 @@ class AgentCore:
             return False
         if sense.hold_cell == execution.hold_cell:
             # An open gate for a move that can no longer begin would keep leaders waiting.
-            move = execution.next_move if execution.go and not execution.moving else None
-        elif move is None or sense.hold_cell != move[1]:
+            return execution.go and not execution.moving and not ends_in_time(execution, None)
+        if move is None or sense.hold_cell != move[1]:
             return True
-        return move is not None and self._lane_ends.too_late_to_move(move[1], move[2], sense.t_s)
+        return self._lane_ends.too_late_to_move(move[1], move[2], sense.t_s)
 
     def _wait(self, sense: Sense) -> list[Effect]:
         """Keep the claim on a vehicle without a cell, which its motion controller drives alone."""
