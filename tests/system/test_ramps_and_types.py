@@ -5,7 +5,7 @@ from __future__ import annotations
 from support.harness import Lab, check_safe_and_complete, summary, trips
 
 ROAD = """schema = "laneweave.scenario/1"
-seed = 3
+seed = 5
 [road]
 s1_m = 50.0
 s2_m = 50.0
@@ -25,7 +25,7 @@ lanes = [0]
 at_m = 500.0
 [demand]
 volume_veh_per_lane_h = 900.0
-duration_s = 30.0
+duration_s = 16.0
 destinations = [{ exit = "off", share = 0.3 }]
 [[vehicle_type]]
 name = "truck"
