@@ -119,7 +119,7 @@ class Motions:
             return  # not a move of this scenario
         table = self._tables.get((dx, dy, ticks))
         if table is None:
-            # A motion does not name the type. Cars drive every move; others drive it much alike.
+            # A motion does not name the type. Cars drive every move; profiles differ little.
             cars = self._scenario.types[CAR]
             table = self._tables[dx, dy, ticks] = _MoveTable.of(cars, dx, dy, ticks)
         start_m, end_m = column * self._pitch_m, to_column * self._pitch_m

@@ -29,11 +29,8 @@ def road_scene(scenario: Scenario) -> dict[str, Any]:
             "closed": [[part.lane, part.from_m, part.to_m] for part in closed],
             "stop_lines": [[part.lane, part.line_m] for part in closed if part.line_m is not None],
         },
-        "body_m": [scenario.vehicle.length_m, scenario.vehicle.width_m],
-        "bodies_m": {
-            name: [own.vehicle.length_m, own.vehicle.width_m]
-            for name, own in scenario.types.items()
-        },
+        "body_m": list(scenario.vehicle.size_m),
+        "bodies_m": {name: list(own.vehicle.size_m) for name, own in scenario.types.items()},
         "lattice": {"speed_mps": formation.speed_mps, "pitch_m": formation.gap_m},
         "shade": {"span_mps": SPEED_SPAN_MPS, "strength": SHADE_STRENGTH},
         "colours": list(lane_colours(road.lanes)),

@@ -353,7 +353,7 @@ def _draw_rolling_road(lanes: int, rng: random.Random, before_columns: int = 0) 
 
 
 def _types_rng(road: RoadSetup, purpose: str) -> random.Random:
-    """Return a source of draws of types, so that they change no other draws."""
+    """Return a random generator for types alone: no other draw depends on them."""
     return random.Random(f"types/{purpose}/{road.seed}")  # noqa: S311 (simulation, no secrets)
 
 

@@ -353,6 +353,11 @@ class Vehicle:
     """Time constant of the first-order lag from the acceleration set-point to the acceleration."""
     lateral_actuator_lag_s: float = field(default=0.1, validator=within(0.0, 2.0))
 
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Length and width."""
+        return self.length_m, self.width_m
+
 
 @frozen
 class VehicleType:

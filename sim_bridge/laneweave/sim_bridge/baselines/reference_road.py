@@ -12,12 +12,13 @@ from attrs import define
 from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
-from laneweave.protocol.wire.messages import CAR, RoadClock
+from laneweave.protocol.wire.messages import RoadClock
 from laneweave.sim_bridge.bodies.motion_controller import Rung
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road.demand import Arrival, arrivals, count_until
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S
+from laneweave.sim_bridge.world_interface import bodies_of
 
 
 @define(eq=False)
@@ -194,16 +195,11 @@ class ReferenceRoad:
 
     def _measure(self) -> None:
         """Record positions, overlaps and gaps."""
-        types, car = self._scenario.types, self._scenario.vehicle
-        sizes = {
-            one.name: (types[kind].vehicle.length_m, types[kind].vehicle.width_m)
-            for one in self._traffic.vehicles
-            if (kind := one.arrival.vehicle_type) != CAR
-        }
-        bodies = Bodies(self._traffic.poses(), car.length_m, car.width_m, sizes)
+        vehicles = self._traffic.vehicles
+        bodies = bodies_of(self._traffic.poses(), vehicles, self._scenario)
         self._record.on_positions(
             self.t_s,
-            self._traffic.vehicles,
+            vehicles,
             overlaps=[*bodies.overlapping_pairs(), *bodies.in_closed_lanes(self._scenario)],
             collisions=self._traffic.collisions(),
             gaps=bodies.min_gaps(),

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
-from laneweave.sim_bridge.baselines.rules import Lanes, Rules, priority
+from laneweave.sim_bridge.baselines.rules import Lanes, Rules, priority, safe_change_m
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.world_interface import World
@@ -178,8 +178,7 @@ def check_rule(scenario: Scenario) -> None:
             f"at least {min_m:g}, to stop there from formation.speed_mps = {speed_mps:g}, and "
             f"less than {sorting}",
         )
-    slip_m = road.lane_width_m / scenario.vehicle.max_slip_ratio
-    change_m = max(speed_mps * rule.lane_change_s, slip_m) if rule.lane_change_s else 0.0
+    change_m = safe_change_m(scenario)
     for section in scenario.sections:
         begins_m = max(section.from_m, section.moves_from_m) + scenario.vehicle.length_m
         if section.to_m < road.length_m and section.to_m - begins_m <= change_m:

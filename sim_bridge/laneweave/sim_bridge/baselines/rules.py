@@ -34,6 +34,13 @@ def priority(vehicle: ReferenceVehicle) -> tuple[float, str]:
     return -vehicle.s_m, vehicle.name
 
 
+def safe_change_m(scenario: Scenario) -> float:
+    """Return the length of a lane change at any speed, for those that must be complete in time."""
+    change_m = scenario.formation.speed_mps * scenario.rule.lane_change_s
+    slip_m = scenario.road.lane_width_m / scenario.vehicle.max_slip_ratio
+    return max(change_m, slip_m) if change_m else 0.0
+
+
 class Following:
     """Car following: gaps and speeds behind a vehicle ahead.
 
@@ -170,9 +177,7 @@ class Rules:
         self._speed_mps = scenario.formation.speed_mps
         self._all_yield = rule.yielding == "all"
         self._change_m = self._speed_mps * rule.lane_change_s
-        slip_m = road.lane_width_m / scenario.vehicle.max_slip_ratio
-        self._safe_change_m = max(self._change_m, slip_m) if self._change_m else 0.0
-        """Length of a lane change at any speed, for those that must be complete in time."""
+        self._safe_change_m = safe_change_m(scenario)
 
     def sort(self, lanes: Lanes) -> dict[ReferenceVehicle, float]:
         """Apply rules 2 and 3 to all vehicles off the lane that they want, by priority.

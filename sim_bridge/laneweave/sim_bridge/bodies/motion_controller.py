@@ -199,6 +199,11 @@ class MotionController:
         return True
 
     @property
+    def size_m(self) -> tuple[float, float]:
+        """Length and width of the body."""
+        return self._scenario.vehicle.size_m
+
+    @property
     def _body_lane(self) -> int:
         """Lane of the hold cell if the body touches it; otherwise the lane of the body's centre."""
         return self._body_lane_for(self.hold_cell[1])

@@ -38,11 +38,6 @@ class Plant:
         return self._state
 
     @property
-    def size(self) -> tuple[float, float]:
-        """Length and width of the body [m]."""
-        return self._limits.length_m, self._limits.width_m
-
-    @property
     def setpoint(self) -> tuple[float, float]:
         """Acceleration set-points, along and across [m/s2]."""
         return self._setpoint

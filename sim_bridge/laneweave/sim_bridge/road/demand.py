@@ -49,10 +49,10 @@ class Arrival:
 def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
     """Return the seeded arrivals in [0, demand.duration_s], sorted by time, then lane."""
     drawn = sorted(
-        (t_s, lane, preferred, destination, vehicle_type)
+        one
         for lane in range(scenario.road.lanes)
         if scenario.volume_veh_per_h(lane) > 0.0
-        for t_s, preferred, destination, vehicle_type in _arrivals_in(lane, scenario)
+        for one in _arrivals_in(lane, scenario)
     )
     return tuple(
         Arrival(vehicle_name(number), lane, preferred, t_s, destination, vehicle_type)
@@ -65,8 +65,8 @@ def count_until(stream: Sequence[Arrival], t_s: float) -> int:
     return bisect_right(stream, t_s, key=lambda arrival: arrival.t_s)
 
 
-def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int, str, str]]:
-    """Return (time [s], preferred lane, destination, type) of each arrival in one lane."""
+def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int, int, str, str]]:
+    """Return (time [s], lane, preferred lane, destination, type) of each arrival in one lane."""
     demand = scenario.demand
     mean_excess_s = max(0.0, 3600.0 / scenario.volume_veh_per_h(lane) - demand.min_headway_s)
     headways, preferences, types = (
@@ -79,7 +79,7 @@ def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int, str, s
     others = scenario.vehicle_type
     type_bounds = np.array([*accumulate(one.share for one in others)])
     names = [*(one.name for one in others), CAR]
-    result: list[tuple[float, int, str, str]] = []
+    result: list[tuple[float, int, int, str, str]] = []
     t_s = 0.0
     while True:
         t_s += demand.min_headway_s + mean_excess_s * headways.standard_exponential()
@@ -88,7 +88,7 @@ def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int, str, s
         number = int(np.searchsorted(bounds, preferences.random(), side="right"))
         _, preferred, destination = choices[number]
         kind = names[int(np.searchsorted(type_bounds, types.random(), side="right"))]
-        result.append((float(t_s), preferred, destination, kind))
+        result.append((float(t_s), lane, preferred, destination, kind))
 
 
 def _destinations(lane: int, scenario: Scenario) -> Iterator[tuple[float, int, str]]:

@@ -193,7 +193,11 @@ class EntryMeter:
         return range(self._lattice.lanes) if preferred == ANY_LANE else (preferred,)
 
     def _try_bind(self, cell: Cell, arrival: Arrival) -> bool:
-        """Add a vehicle that does not change columns to a column, unless it would be in the way."""
+        """Add a vehicle to the vehicles of its column that do not change columns.
+
+        Returns:
+            False: they could not all leave the road in the order of their lanes.
+        """
         column, lane = cell
         bound = {**self._bound.get(column, {}), lane: self._lanes_of(arrival)}
         leaves_in: float = -1

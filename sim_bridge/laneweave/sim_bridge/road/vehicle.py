@@ -66,7 +66,7 @@ class RoadVehicle:
     @property
     def size(self) -> Size:
         """Length and width of the body [m]."""
-        return self.controller.plant.size
+        return self.controller.size_m
 
     @property
     def body_lane(self) -> int:

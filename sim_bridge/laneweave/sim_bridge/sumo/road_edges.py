@@ -149,28 +149,22 @@ def road_edges(scenario: Scenario) -> RoadEdges:
         )
         for one in scenario.entrance
     }
+    ways_out = [(one.name, f"exit-{one.name}", one.lanes, one.at_m) for one in scenario.exit]
+    if by_lane:
+        reaching = sorted(road[-1].open_lanes)
+        ways_out += [(end_exit(lane), f"exit{lane}", (lane,), end_m) for lane in reaching]
     exits = {
-        one.name: Edge(
-            name=f"exit-{one.name}",
-            origin=junctions[one.at_m],
-            destination=f"exit-{one.name}-end",
-            from_m=one.at_m,
-            to_m=one.at_m + margin,
-            lanes=tuple(range(min(one.lanes), max(one.lanes) + 1)),
-            open_lanes=frozenset(one.lanes),
+        key: Edge(
+            name=name,
+            origin=junctions[at_m],
+            destination=f"{name}-end",
+            from_m=at_m,
+            to_m=at_m + margin,
+            lanes=tuple(range(min(lanes), max(lanes) + 1)),
+            open_lanes=frozenset(lanes),
         )
-        for one in scenario.exit
+        for key, name, lanes, at_m in ways_out
     }
-    for lane in sorted(road[-1].open_lanes) if by_lane else ():
-        exits[end_exit(lane)] = Edge(
-            name=f"exit{lane}",
-            origin="end",
-            destination=f"east{lane}",
-            from_m=end_m,
-            to_m=end_m + margin,
-            lanes=(lane,),
-            open_lanes=frozenset({lane}),
-        )
     return RoadEdges(road, ramps, exits)
 
 

@@ -16,9 +16,10 @@ from laneweave.protocol.scenario.fields import Demand, Scenario, VehicleType
 from laneweave.sim_bridge.baselines.lc2013 import Lc2013Traffic, check_lc2013
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
 from laneweave.sim_bridge.baselines.rule_based import check_rule
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.road.demand import arrivals, count_until
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
+from laneweave.sim_bridge.world_interface import bodies_of
 from support.closed_lanes import ramp_road
 
 LABELS = [name for name, one in METHODS.items() if one.method == LC2013]
@@ -47,14 +48,11 @@ def drive(scenario: Scenario, folder: Path) -> dict[ReferenceVehicle, float]:
     """Let SUMO drive all vehicles, check every tick, and return their travel times [s]."""
     check_lc2013(scenario)
     demand, entrance = arrivals(scenario), Entrance(scenario)
-    road, size, tick_s = scenario.road, scenario.vehicle, scenario.runtime.tick_s
+    road, tick_s = scenario.road, scenario.runtime.tick_s
     left: dict[ReferenceVehicle, float] = {}
     before: dict[str, Pose] = {}
     queued = tick = 0
     exits = Exits(scenario.sections, road.length_m)
-    sizes_m = {
-        name: (own.vehicle.length_m, own.vehicle.width_m) for name, own in scenario.types.items()
-    }
     with SumoTraffic(scenario, folder / "sumo") as sumo:
         traffic = Lc2013Traffic(scenario, sumo)
         while len(left) < len(demand):
@@ -66,8 +64,7 @@ def drive(scenario: Scenario, folder: Path) -> dict[ReferenceVehicle, float]:
                 entrance.queue(arrival)
             traffic.step(t_s, entrance)
             poses = traffic.poses()
-            sizes = {one.name: sizes_m[one.arrival.vehicle_type] for one in traffic.vehicles}
-            bodies = Bodies(poses, size.length_m, size.width_m, sizes)
+            bodies = bodies_of(poses, traffic.vehicles, scenario)
             assert bodies.overlapping_pairs() == bodies.in_closed_lanes(scenario) == []
             assert traffic.collisions() == []
             for name, pose in poses.items():

@@ -233,7 +233,7 @@ def test_a_vehicle_wants_the_nearest_lane_of_its_exit() -> None:
         (1, END_OF_ROAD, 300.0, False),
     ],
 )
-def test_nobody_changes_lanes_beside_a_ramp(
+def test_no_vehicle_changes_lanes_beside_a_ramp(
     lane: int, destination: str, s_m: float, *, changes: bool
 ) -> None:
     one, lanes = vehicle("a", s_m, lane, ANY_LANE, destination=destination), Lanes(4)

@@ -209,7 +209,7 @@ def test_trucks_enter_a_column_only_if_the_road_has_lanes_for_all_of_them() -> N
         meter.demand(truck(f"v{lane}", 10.0, lane, ANY_LANE))
     columns = [one.cell[0] for one in meter.admit(20.0)]
     assert sorted(columns, reverse=True) == [columns[0], columns[0], columns[0] - 1]
-    # Whatever is asked of a single one, it enters.
+    # A single truck enters in any case.
     meter = EntryMeter(lattice(), 0.5, column_bound={"truck"}, lanes_of=lambda _: set())
     meter.demand(truck("a", 10.0, 0, 0))
     assert len(meter.admit(20.0)) == 1

@@ -274,7 +274,7 @@ def test_a_ramp_is_an_edge_beside_the_road_until_it_joins(tmp_path: Path) -> Non
         "main/end": "road road1 road2 road3",
         "on/end": "ramp-on road1 road2 road3",
     }
-    # No body turns while its rear is on another edge.
+    # SUMO would turn a body that changes lanes with its rear on another edge.
     forbidden = {
         (lane.attrib["id"], side)
         for lane in network.iter("lane")
