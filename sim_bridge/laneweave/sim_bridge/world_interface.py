@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Protocol
 
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR, Name
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.recording.run_record import RunRecord
-from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.sized_bodies import bodies_of
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 
@@ -36,25 +36,6 @@ class World(Protocol):
         """Remove a vehicle from the road."""
 
 
-class Arrived(Protocol):
-    """A vehicle with its arrival, under any method."""
-
-    @property
-    def arrival(self) -> Arrival:
-        """Arrival at the entrance."""
-
-
-def bodies_of(poses: Mapping[str, Pose], vehicles: Iterable[Arrived], scenario: Scenario) -> Bodies:
-    """Return the bodies of vehicles, each with the size of its type."""
-    types = scenario.types
-    sizes = {
-        one.arrival.vehicle: types[one.arrival.vehicle_type].vehicle.size_m
-        for one in vehicles
-        if one.arrival.vehicle_type != CAR
-    }
-    return Bodies(poses, *types[CAR].vehicle.size_m, sizes)
-
-
 def show_bodies(
     world: World,
     vehicles: Mapping[Name, RoadVehicle],
@@ -71,7 +52,7 @@ def show_bodies(
         world.place(name, state)
     world.step()
     road = scenario.road
-    bodies = bodies_of(world.positions(), vehicles.values(), scenario)
+    bodies = bodies_of(world.positions(), (one.arrival for one in vehicles.values()), scenario)
     accels_mps2: dict[str, float] = {name: state[2] for name, state in states.items()}
     neighbours = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels_mps2)
     for name, vehicle in vehicles.items():

@@ -18,7 +18,7 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road.demand import Arrival, arrivals, count_until
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S
-from laneweave.sim_bridge.world_interface import bodies_of
+from laneweave.sim_bridge.road.sized_bodies import bodies_of
 
 
 @define(eq=False)
@@ -196,7 +196,8 @@ class ReferenceRoad:
     def _measure(self) -> None:
         """Record positions, overlaps and gaps."""
         vehicles = self._traffic.vehicles
-        bodies = bodies_of(self._traffic.poses(), vehicles, self._scenario)
+        present = (one.arrival for one in vehicles)
+        bodies = bodies_of(self._traffic.poses(), present, self._scenario)
         self._record.on_positions(
             self.t_s,
             vehicles,

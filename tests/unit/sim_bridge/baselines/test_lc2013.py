@@ -18,8 +18,8 @@ from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVeh
 from laneweave.sim_bridge.baselines.rule_based import check_rule
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.road.demand import arrivals, count_until
+from laneweave.sim_bridge.road.sized_bodies import bodies_of
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
-from laneweave.sim_bridge.world_interface import bodies_of
 from support.closed_lanes import ramp_road
 
 LABELS = [name for name, one in METHODS.items() if one.method == LC2013]
@@ -64,7 +64,7 @@ def drive(scenario: Scenario, folder: Path) -> dict[ReferenceVehicle, float]:
                 entrance.queue(arrival)
             traffic.step(t_s, entrance)
             poses = traffic.poses()
-            bodies = bodies_of(poses, traffic.vehicles, scenario)
+            bodies = bodies_of(poses, (one.arrival for one in traffic.vehicles), scenario)
             assert bodies.overlapping_pairs() == bodies.in_closed_lanes(scenario) == []
             assert traffic.collisions() == []
             for name, pose in poses.items():
