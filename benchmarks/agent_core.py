@@ -294,11 +294,12 @@ class Road:
             name: rig.vehicle for name, rig in self.rigs.items() if rig.vehicle.formation == block
         }
         cells = {name: vehicle.controller.hold_cell for name, vehicle in members.items()}
-        preferred_lanes = {
-            name: each.admission.arrival.preferred_lane for name, each in members.items()
+        goal_lanes = {
+            name: frozenset({each.admission.arrival.preferred_lane})
+            for name, each in members.items()
         }
         start_s = start_time_s(cells.values(), self.tick * scenario.runtime.tick_s, scenario)
-        task = SortingTask((block,), cells, preferred_lanes, (), scenario, LONGEST_DEADLINE_S)
+        task = SortingTask((block,), cells, goal_lanes, (), scenario, LONGEST_DEADLINE_S)
         moves = sort_lanes(task, scenario.formation.max_nodes, plan).moves
         every = [move for each in moves.values() for move in each]
         slot_s = scenario.cycles_s[0]

@@ -195,7 +195,8 @@ def formation_of(vehicles: Mapping[str, Vehicle], roster: str) -> Formation:
     members = tuple(entry_of(vehicles[name]) for name in sorted(roster.split()))
     lattice = SCENARIO.lattice
     numbers = tuple(sorted({lattice.block_of(member.cell[0]) for member in members}))
-    return Formation(numbers, members)
+    goals = tuple(frozenset({member.preferred_lane}) for member in members)
+    return Formation(numbers, members, goals=goals)
 
 
 def written_plan(text: str, control: FormationLeader, ballot: messages.Ballot) -> messages.Plan:

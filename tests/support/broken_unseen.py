@@ -398,12 +398,12 @@ def list_by_block(patch: Patch) -> None:
 
 
 def begin_behind_last_vehicle(patch: Patch) -> None:
-    close = GrowingFormations._close
+    complete = GrowingFormations._complete_open
 
     def mutant(self: GrowingFormations, last_column: int, t_s: float) -> None:
-        was_open, rear = self._front is not None, self._rear
-        close(self, last_column, t_s)
-        if was_open:
+        rear = None if self._open is None else self._open.rear
+        complete(self, last_column, t_s)
+        if rear is not None:
             self.first_open_column = rear - 1
 
-    patch.setattr(GrowingFormations, "_close", mutant)
+    patch.setattr(GrowingFormations, "_complete_open", mutant)

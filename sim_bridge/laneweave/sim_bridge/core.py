@@ -322,10 +322,10 @@ class BridgeCore:
 
     def _begin_tick(self, now_s: float) -> Iterator[Effect]:
         self._enter()
-        self._close_formations()
         for change in self._roadside.control_lane_ends(self.vehicles, self.t_s):
             self._attendance.begin_anew(self.vehicles[change.vehicle], self.tick)
             self._record.on_lane_end(self.t_s, change.vehicle, change.lane, change.kind)
+        self._close_formations()
         self._roadside.assign_empty_cells(self.vehicles)
         yield from self._roadside.publish(self.tick, self.t_s, self.vehicles.values())
         yield from self._start_caretakers(now_s)

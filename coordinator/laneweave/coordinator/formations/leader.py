@@ -208,7 +208,7 @@ def stalls(_: FormationLeader, state: VehicleState) -> bool:
 
 
 def is_off_lane(leader: FormationLeader, state: VehicleState) -> bool:
-    """The vehicle has completed the plan outside its preferred lane, which is within reach.
+    """The vehicle has completed the plan outside its goal lanes, which are within reach.
 
     An adopted plan may have been made for other targets.
     """
@@ -217,10 +217,7 @@ def is_off_lane(leader: FormationLeader, state: VehicleState) -> bool:
         and state.done
         and state.attended
         and state.vehicle not in leader.out_of_reach
-        and any(
-            member.vehicle == state.vehicle and member.preferred_lane != state.hold_cell[1]
-            for member in leader.formation.members
-        )
+        and state.hold_cell[1] not in leader.formation.goal_lanes[state.vehicle]
     )
 
 

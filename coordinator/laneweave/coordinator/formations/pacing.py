@@ -45,7 +45,12 @@ def comfortable_steps(start_s: float, end_s: float, scenario: Scenario) -> int:
 
 
 def paced(
-    plan: Plan, others: Sequence[Plan], not_before_s: float, end_s: float, scenario: Scenario
+    plan: Plan,
+    others: Sequence[Plan],
+    not_before_s: float,
+    end_s: float,
+    scenario: Scenario,
+    from_m: float | None = None,
 ) -> Plan:
     """Return a plan with the longest slots with which it ends in time, otherwise the shortest.
 
@@ -57,6 +62,7 @@ def paced(
         not_before_s: earliest start (road time).
         end_s: road time by which the plan should be complete.
         scenario: road, lattice, T_F.
+        from_m: position from which vehicles may change lanes; None: the start of S3.
     """
     slots_s, slack_s = scenario.slots_s[::-1], scenario.formation.slack_s
     comfortable = [slot_s for slot_s in slots_s if slot_s >= scenario.comfortable_cycle_s]
@@ -68,7 +74,7 @@ def paced(
     ):
         t0_s = plan.t0_s
         if len(slots_s) > 1:
-            t0_s = _start_s(plan, slot_s, not_before_s, scenario)
+            t0_s = _start_s(plan, slot_s, not_before_s, scenario, from_m)
         max_steps = max(0, int((end_s - t0_s) / slot_s))
         best = with_pauses(evolve(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, max_steps)
         if t0_s + steps_of(best) * slot_s <= end_s - reserve_s:
@@ -76,10 +82,12 @@ def paced(
     return best
 
 
-def _start_s(plan: Plan, slot_s: float, not_before_s: float, scenario: Scenario) -> float:
-    """Return the earliest start of a plan that allows no lane change before S3."""
+def _start_s(
+    plan: Plan, slot_s: float, not_before_s: float, scenario: Scenario, from_m: float | None
+) -> float:
+    """Return the earliest start of a plan that allows no lane change before `from_m`."""
     in_time = [
-        start_time_s([origin], 0.0, scenario) - step * slot_s
+        start_time_s([origin], 0.0, scenario, from_m) - step * slot_s
         for moves in plan.moves.values()
         for step, origin, target in moves
         if origin[1] != target[1]

@@ -15,17 +15,18 @@ from laneweave.coordinator.ballots.ballot_round import FAILED, TOO_LATE, BallotP
 from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.pacing import comfortable_steps, paced, steps_of
 from laneweave.coordinator.formations.roster import (
-    STAGE_LEAD_S,
     Formation,
     Groups,
     Numbers,
     exit_time_s,
     on_tick,
     stage_begin_s,
+    stage_end_s,
     start_time_s,
     steps_left,
 )
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
+from laneweave.coordinator.formations.stages import stages
 from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.response import PlanFunction
@@ -146,8 +147,11 @@ class FormationPlanner:
         # Hold cells outside the blocks make planning fail later; they do not affect the time left.
         cells = [cell for cell in leader.hold_cells.values() if block_of(cell[0]) in numbers]
         cells = cells or self._block_cells(numbers)
-        start_s, end_s = self._start_s(formation, cells, t_s), self._end_s(formation)
-        if not formation.sorts and end_s < start_s + scenario.cycles_s[0]:
+        every = stages(scenario)
+        stage = every[formation.stage]
+        start_s = self._start_s(formation, cells, t_s)
+        end_s = stage_end_s(numbers, formation.stage, scenario)
+        if stage is not every[-1] and end_s < start_s + scenario.cycles_s[0]:
             leader.take(FAILED, now_s)
             yield LogEntry(STRUCTURE_TOO_LATE, {"formation": numbers[0], "stage": formation.stage})
             return
@@ -158,13 +162,14 @@ class FormationPlanner:
         task = SortingTask(
             numbers,
             leader.hold_cells,
-            {member.vehicle: member.preferred_lane for member in formation.members},
+            formation.goal_lanes if formation.sorts else {},
             leader.unattended,
             scenario,
             deadline_s=self._deadline_s(start_s, t_s),
             steps=comfortable_steps(start_s, end_s, scenario),
             deserted=formation.deserted,
-            structure=None if formation.sorts else scenario.formation.structures[formation.stage],
+            structure=stage.structure,
+            stage=stage if formation.sorts else None,
         )
         nodes = scenario.formation.max_nodes * 2 ** min(leader.failures, MAX_DOUBLINGS)
         # Replaces a request under an earlier ballot, at the end of the queue.
@@ -190,17 +195,6 @@ class FormationPlanner:
             and (leader.ballot, leader.phase) == (ballot, BallotPhase.PLANNING)
             and leader.formation.numbers == self._groups.of(number)
         )
-
-    def _end_s(self, formation: Formation) -> float:
-        """Return the road time by which a formation's plan should be complete.
-
-        At this time the formation is planned again or, if it sorts, its front leaves the road.
-        """
-        if not formation.sorts:
-            next_s = stage_begin_s(formation.numbers, formation.stage + 1, self._scenario)
-            return next_s - STAGE_LEAD_S
-        front = self._scenario.lattice.block_range(formation.numbers[0])[-1]
-        return exit_time_s([(front, 0)], self._scenario)
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[Compute | LogEntry]:
         """Handle a result, unless it is no longer needed, and start the next request."""
@@ -287,12 +281,14 @@ class FormationPlanner:
     def _paced(self, plan: Plan, leader: FormationLeader, t_s: float) -> Plan:
         """Choose a plan's start and slots so that its vehicles settle before they move."""
         formation, cells = leader.formation, plan.start_cells.values()
-        others = self._neighbouring_plans(plan)
+        others, scenario = self._neighbouring_plans(plan), self._scenario
         if not formation.sorts:
-            return paced(plan, others, plan.t0_s, self._end_s(formation), self._scenario)
-        end_s = exit_time_s({*cells, *plan.territory}, self._scenario)
+            end_s = stage_end_s(formation.numbers, formation.stage, scenario)
+            return paced(plan, others, plan.t0_s, end_s, scenario)
+        stage = stages(scenario)[formation.stage]
+        end_s = exit_time_s({*cells, *plan.territory}, scenario, stage.to_m)
         not_before_s = max(self._settled_s(cells), t_s + START_MARGIN_S)
-        return paced(plan, others, not_before_s, end_s, self._scenario)
+        return paced(plan, others, not_before_s, end_s, scenario, stage.from_m)
 
     def _neighbouring_plans(self, plan: Plan) -> list[Plan]:
         """Return the neighbours' plans that this leader has made and that may be executed."""
@@ -310,7 +306,8 @@ class FormationPlanner:
     def _start_s(self, formation: Formation, cells: Collection[Cell], t_s: float) -> float:
         """Return the earliest road time at which a formation may begin to move."""
         if formation.sorts:
-            return start_time_s(cells, t_s + START_MARGIN_S, self._scenario)
+            from_m = stages(self._scenario)[formation.stage].from_m
+            return start_time_s(cells, t_s + START_MARGIN_S, self._scenario, from_m)
         begin_s = stage_begin_s(formation.numbers, formation.stage, self._scenario)
         return on_tick(max(begin_s, self._settled_s(cells), t_s + START_MARGIN_S), self._scenario)
 
@@ -318,7 +315,8 @@ class FormationPlanner:
         """Return the road time by which vehicles that entered in these cells have settled."""
         formation, lattice = self._scenario.formation, self._scenario.lattice
         rear = min(column for column, _ in cells)
-        return lattice.passing_time_s(rear) + formation.entry_spread_s + formation.settle_s
+        entered_s = lattice.passing_time_s(rear, max(self._scenario.entry_m))
+        return entered_s + formation.entry_spread_s + formation.settle_s
 
 
 def _log_entries(

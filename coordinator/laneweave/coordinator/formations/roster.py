@@ -19,6 +19,7 @@ from itertools import pairwise
 
 from attrs import define, field, frozen
 
+from laneweave.coordinator.formations.stages import stages
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name
@@ -47,9 +48,19 @@ class Formation:
     """Blocks of joined formations whose vehicles have all left the road. Plans avoid them, since
     vehicles of formations joined under another leader may be there."""
     stage: int = 0
-    """Index of the scenario's structure to form next."""
-    sorts: bool = True
-    """Whether all structures are done and the formation sorts its lanes."""
+    """Index of the stage to plan (`stages`)."""
+    goals: tuple[frozenset[int], ...] = ()
+    """Goal lanes of each member; empty: it forms a structure, with any member in any place."""
+
+    @property
+    def sorts(self) -> bool:
+        """Whether the formation sorts its lanes."""
+        return bool(self.goals)
+
+    @property
+    def goal_lanes(self) -> dict[Name, frozenset[int]]:
+        """Goal lanes of the members of a formation that sorts."""
+        return dict(zip(self.roster, self.goals, strict=True))
 
     @property
     def roster(self) -> tuple[Name, ...]:
@@ -106,7 +117,7 @@ def closed_formations(
     """Return the closed formations on the road by their lowest block number.
 
     Formations with a block that is not closed in the census are left out, since a member could be
-    missing.
+    missing. Vehicles without cells, which wait at the end of a lane, have left their formations.
 
     Args:
         census: vehicles on the road, and the blocks of each formation.
@@ -122,44 +133,65 @@ def closed_formations(
         closed_s.setdefault(groups.of(closed.first_block)[0], []).append(closed.closed_s)
     members: dict[int, list[CensusEntry]] = {}
     for entry in census.on_road:
-        first = groups.of(lattice.block_of(entry.cell[0]))[0]
-        members.setdefault(first, []).append(entry)
+        if entry.off_lattice is None:
+            first = groups.of(lattice.block_of(entry.cell[0]))[0]
+            members.setdefault(first, []).append(entry)
     listed_blocks = {block for closed in census.formations for block in closed.blocks}
     formations: dict[int, Formation] = {}
     for first, each in sorted(members.items()):
         numbers, times_s = groups.of(first), closed_s.get(first, [0.0])
         if numbers[-1] <= census.closed_to:
-            stage = stage_at(numbers, t_s, scenario)
+            number = stage_at(numbers, t_s, scenario)
+            stage = stages(scenario)[number]
+            each.sort(key=lambda entry: entry.vehicle)
+            goals = (stage.goal_lanes(entry.preferred_lane, entry.destination) for entry in each)
             formations[first] = Formation(
                 numbers,
-                tuple(sorted(each, key=lambda entry: entry.vehicle)),
+                tuple(each),
                 closed_s=max(times_s),
                 joined=len(times_s),
                 deserted=tuple(block for block in numbers if block not in listed_blocks),
-                stage=stage,
-                sorts=stage == len(scenario.formation.structures),
+                stage=number,
+                goals=tuple(goals) if stage.structure is None else (),
             )
     return formations
 
 
 def stage_at(numbers: Numbers, t_s: float, scenario: Scenario) -> int:
-    """Return the index of the structure that a formation should plan at a road time.
+    """Return the index of the stage that a formation should plan at a road time.
 
-    The first structure is planned at once. Each later structure, and lane sorting after the last
-    one, is planned `STAGE_LEAD_S` before the rear of the formation reaches that stage.
+    The first stage is planned at once. Each later one is planned `STAGE_LEAD_S` before the rear of
+    the formation reaches it, but not while the formation sorts its lanes in the stage before.
     """
-    structures = scenario.formation.structures
-    later = range(1, len(structures) + 1)
-    return sum(stage_begin_s(numbers, stage, scenario) - STAGE_LEAD_S <= t_s for stage in later)
+    later = range(1, len(stages(scenario)))
+    return sum(
+        max(
+            stage_begin_s(numbers, stage, scenario) - STAGE_LEAD_S,
+            stage_end_s(numbers, stage - 1, scenario),
+        )
+        <= t_s
+        for stage in later
+    )
 
 
 def stage_begin_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
     """Return the road time at which all bodies in some blocks have passed the start of a stage."""
-    structures, lattice = scenario.formation.structures, scenario.lattice
-    sorts = stage == len(structures)
-    from_m = scenario.road.sorting_start_m if sorts else structures[stage].from_m
+    lattice, from_m = scenario.lattice, stages(scenario)[stage].from_m
     rear = lattice.block_range(numbers[-1])[0]
     return lattice.passing_time_s(rear, from_m + scenario.vehicle.length_m)
+
+
+def stage_end_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
+    """Return the road time by which the plan of a stage should be complete.
+
+    At this time the next stage is planned or, if the formation sorts its lanes, its front reaches
+    the end of the stage.
+    """
+    its = stages(scenario)[stage]
+    if its.structure is not None:
+        return stage_begin_s(numbers, stage + 1, scenario) - STAGE_LEAD_S
+    front = scenario.lattice.block_range(numbers[0])[-1]
+    return scenario.lattice.passing_time_s(front, its.to_m)
 
 
 def joinable(
@@ -186,16 +218,19 @@ def joinable(
             yield (*front.numbers, *rear.numbers)
 
 
-def start_time_s(cells: Collection[Cell], not_before_s: float, scenario: Scenario) -> float:
+def start_time_s(
+    cells: Collection[Cell], not_before_s: float, scenario: Scenario, from_m: float | None = None
+) -> float:
     """Return the tick [s] from which vehicles in these cells may change lanes.
 
-    The rearmost body is in S3 by then; the tick is >= `not_before_s`.
+    The rearmost body has passed `from_m` by then, by default the start of S3; the tick is
+    >= `not_before_s`.
     """
-    lattice, road = scenario.lattice, scenario.road
-    in_sorting_s = lattice.passing_time_s(
-        min(column for column, _ in cells), road.sorting_start_m + scenario.vehicle.length_m
-    )
-    return on_tick(max(in_sorting_s, not_before_s), scenario)
+    if from_m is None:
+        from_m = scenario.road.sorting_start_m
+    rear = min(column for column, _ in cells)
+    begin_s = scenario.lattice.passing_time_s(rear, from_m + scenario.vehicle.length_m)
+    return on_tick(max(begin_s, not_before_s), scenario)
 
 
 def on_tick(t_s: float, scenario: Scenario) -> float:
@@ -204,12 +239,18 @@ def on_tick(t_s: float, scenario: Scenario) -> float:
     return math.ceil(t_s / tick_s - 1e-6) * tick_s
 
 
-def exit_time_s(cells: Collection[Cell], scenario: Scenario) -> float:
-    """Return the road time at which the foremost cell reaches the end of the road."""
+def exit_time_s(cells: Collection[Cell], scenario: Scenario, to_m: float | None = None) -> float:
+    """Return the road time at which the foremost cell reaches `to_m`, by default the road's end."""
     front = max(column for column, _ in cells)
-    return scenario.lattice.passing_time_s(front, scenario.road.length_m)
+    return scenario.lattice.passing_time_s(front, scenario.road.length_m if to_m is None else to_m)
 
 
-def steps_left(cells: Collection[Cell], t_s: float, slot_s: float, scenario: Scenario) -> int:
-    """Return the number of whole steps until the foremost cell reaches the end of the road."""
-    return max(0, math.floor((exit_time_s(cells, scenario) - t_s) / slot_s + 1e-6))
+def steps_left(
+    cells: Collection[Cell],
+    t_s: float,
+    slot_s: float,
+    scenario: Scenario,
+    to_m: float | None = None,
+) -> int:
+    """Return how many whole steps fit until the foremost cell reaches `to_m` (`exit_time_s`)."""
+    return max(0, math.floor((exit_time_s(cells, scenario, to_m) - t_s) / slot_s + 1e-6))

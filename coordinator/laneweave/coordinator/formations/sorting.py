@@ -1,9 +1,11 @@
 """Lane sorting of one formation, or of joined ones: from promises to moves.
 
-The grid consists of the blocks of the formations. Vehicles without an agent block their cells. If
-complete sorting is infeasible, one vehicle is exempted from reaching its lane, so that a single
-blocked vehicle does not prevent all others from sorting; the vehicles are tried one by one. Before
-sorting, a formation may form other structures, in which every vehicle may take any place.
+The grid consists of the blocks of the formations, in the lanes that are open. Vehicles without an
+agent block their cells. If every vehicle has one goal lane, they form the parallel structure;
+otherwise they take any cells of their goal lanes. If complete sorting is infeasible, one vehicle is
+exempted from reaching its lane, so that a single blocked vehicle does not prevent all others from
+sorting; the vehicles are tried one by one. Before sorting, a formation may form other structures,
+in which every vehicle may take any place.
 """
 
 from __future__ import annotations
@@ -17,11 +19,12 @@ from itertools import islice
 from attrs import evolve, frozen
 
 from laneweave.coordinator.formations.roster import Numbers
+from laneweave.coordinator.formations.stages import Stage
 from laneweave.coordinator.planning.budget import Clock
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
-from laneweave.coordinator.planning.targets import placements
+from laneweave.coordinator.planning.targets import choose_lanes, placements
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import DrivingStructure, Scenario
@@ -41,7 +44,7 @@ class SortingTask:
     """Blocks that may be used, ascending."""
     hold_cells: Mapping[Name, Cell]
     """Lattice cell of each member, in the order of the result."""
-    preferred_lanes: Mapping[Name, int]
+    goal_lanes: Mapping[Name, frozenset[int]]
     unattended: Collection[Name]
     """Members without an agent; they only hold."""
     scenario: Scenario
@@ -54,6 +57,8 @@ class SortingTask:
     """Blocks of `numbers` in which only the members' hold cells may be used."""
     structure: DrivingStructure | None = None
     """Structure to form, with any vehicle in any place; None: sort by lanes."""
+    stage: Stage | None = None
+    """Stage of the way; its closed lanes are not used. None: all lanes are open."""
 
     @property
     def columns(self) -> range:
@@ -70,25 +75,33 @@ class SortingTask:
         return {
             name: (column - first, lane)
             for name, (column, lane) in self.hold_cells.items()
-            if name not in self.unattended
+            if name not in self.unattended and lane in self.open_lanes
         }
+
+    @property
+    def open_lanes(self) -> frozenset[int]:
+        """Lanes that plans may use; vehicles in other lanes hold."""
+        every = frozenset(range(self.scenario.road.lanes))
+        return every if self.stage is None else self.stage.lanes
 
     @property
     def blocked(self) -> tuple[Cell, ...]:
         """Grid cells that paths must avoid.
 
-        These are the cells of members without an agent, the cells between the blocks, and the cells
-        of deserted blocks.
+        These are the cells of members that only hold, the cells between the blocks, the cells of
+        deserted blocks, and those of closed lanes.
         """
         first, lattice = self.columns.start, self.scenario.lattice
-        usable = {*self.numbers} - {*self.deserted}
+        usable, open_lanes = {*self.numbers} - {*self.deserted}, self.open_lanes
         foreign = {
             (column, lane)
             for column in self.columns
-            if lattice.block_of(column) not in usable
             for lane in range(lattice.lanes)
+            if lane not in open_lanes or lattice.block_of(column) not in usable
         } - {*self.hold_cells.values()}
-        cells = foreign | {self.hold_cells[name] for name in self.unattended}
+        movers = self.movers
+        held = {cell for name, cell in self.hold_cells.items() if name not in movers}
+        cells = foreign | held
         return tuple(sorted((column - first, lane) for column, lane in cells))
 
 
@@ -114,17 +127,29 @@ class Sorting:
 
 
 def plan_requests(task: SortingTask, exempt: Name | None = None) -> Iterator[PlanRequest]:
-    """Yield one plan request for each placement of the targets, best placement first.
+    """Yield one plan request for each choice of the targets, best choice first.
 
     Args:
         task: a task with at least one vehicle that can move.
         exempt: a vehicle that need not reach its lane.
     """
-    scenario = task.scenario
     wanted = {
-        name: cell[1] if name == exempt else task.preferred_lanes[name]
+        name: frozenset({cell[1]}) if name == exempt else task.goal_lanes[name]
         for name, cell in task.movers.items()
     }
+    if all(len(lanes) == 1 for lanes in wanted.values()):
+        yield from _into_parallel_structure(
+            task, {name: min(each) for name, each in wanted.items()}
+        )
+    else:
+        yield _into_lanes(task, wanted)
+
+
+def _into_parallel_structure(
+    task: SortingTask, wanted: Mapping[Name, int]
+) -> Iterator[PlanRequest]:
+    """Yield one plan request for each placement of the parallel structure."""
+    scenario = task.scenario
     for targets in placements(
         task.movers,
         wanted,
@@ -141,6 +166,33 @@ def plan_requests(task: SortingTask, exempt: Name | None = None) -> Iterator[Pla
             for name, cell in task.movers.items()
         ]
         yield _plan_request(task, vehicles, targets.cells)
+
+
+def _into_lanes(task: SortingTask, wanted: Mapping[Name, frozenset[int]]) -> PlanRequest:
+    """Return the request in which each vehicle may take any free cell of its goal lanes.
+
+    Vehicles for which these have too few cells may take any cell of the lanes that go on.
+    """
+    free = [
+        (column, lane)
+        for lane in range(task.scenario.road.lanes)
+        for column in range(len(task.columns))
+        if (column, lane) not in task.blocked
+    ]
+    through = task.open_lanes if task.stage is None else task.stage.through_lanes
+    chosen = choose_lanes(task.movers, wanted, through, free)
+    targets = tuple(cell for cell in free if any(cell[1] in lanes for lanes in chosen.values()))
+    vehicles = [
+        VehicleRequest(
+            name,
+            cell,
+            eligible=tuple(
+                number for number, target in enumerate(targets) if target[1] in chosen[name]
+            ),
+        )
+        for name, cell in task.movers.items()
+    ]
+    return _plan_request(task, vehicles, targets)
 
 
 def _plan_request(
@@ -234,7 +286,7 @@ def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:
         ends[name] = cells[-1]
     missed: tuple[Name, ...] = ()
     if task.structure is None:
-        missed = tuple(name for name, cell in ends.items() if cell[1] != task.preferred_lanes[name])
+        missed = tuple(name for name, cell in ends.items() if cell[1] not in task.goal_lanes[name])
     # After a timeout it is unknown whether there is room, and planning more blocks takes longer.
     known = response is not None and response.status != "timeout"
     short_of_room = known and any(name not in task.unattended for name in missed)

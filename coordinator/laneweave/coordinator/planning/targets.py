@@ -1,4 +1,6 @@
-"""Targets of a formation: the parallel structure after lane sorting (paper, Section 5.2.1).
+"""Targets of a formation that sorts its lanes.
+
+After lane sorting, a formation has the parallel structure (paper, Section 5.2.1).
 
 Each lane provides neighbouring cells, one per vehicle that prefers the lane, where paths are
 shortest. Vehicles without an agent keep their cells, which are blocked for others. If more vehicles
@@ -11,7 +13,9 @@ import heapq
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import product
 
+import numpy as np
 from attrs import frozen
+from scipy.optimize import linear_sum_assignment
 
 from laneweave.coordinator.planning.formation_structures import ranked_runs
 from laneweave.protocol.lattice import Cell
@@ -67,6 +71,48 @@ def placements(
             off_lane[name] = _nearest_free(cells[name], columns, lanes, {*blocked, *targets})
             targets.append(off_lane[name])
         yield Targets(tuple(targets), off_lane)
+
+
+def choose_lanes(
+    cells: Mapping[Name, Cell],
+    goal_lanes: Mapping[Name, Collection[int]],
+    through_lanes: Collection[int],
+    free: Sequence[Cell],
+) -> dict[Name, frozenset[int]]:
+    """Return the lanes in which each vehicle may have its target, so that all have one.
+
+    These are its goal lanes. If they have too few free cells, the vehicles furthest from them get
+    the lanes that go on, and if these have too few, too, all lanes.
+
+    Args:
+        cells: current cell of each vehicle.
+        goal_lanes: goal lanes of each vehicle.
+        through_lanes: lanes that go on behind the stage.
+        free: cells that can be targets, at least as many as there are vehicles.
+    """
+    choices = {
+        name: [frozenset(goal_lanes[name]), frozenset(through_lanes) | frozenset(goal_lanes[name])]
+        for name in cells
+    }
+    every = frozenset(lane for _, lane in free)
+    # A worse choice costs more than all distances together.
+    penalty = 1 + len(cells) * sum(max(cell) + 1 for cell in (*cells.values(), *free))
+    costs = np.array(
+        [
+            [
+                abs(column - other[0])
+                + abs(lane - other[1])
+                + penalty * sum(other[1] not in lanes for lanes in choices[name])
+                for other in free
+            ]
+            for name, (column, lane) in cells.items()
+        ]
+    ).reshape(len(cells), len(free))
+    chosen: dict[Name, frozenset[int]] = {}
+    for name, index in zip(cells, linear_sum_assignment(costs)[1], strict=True):
+        lane = free[index][1]
+        chosen[name] = next((lanes for lanes in choices[name] if lane in lanes), every)
+    return chosen
 
 
 def _combinations(choices: Sequence[Sequence[tuple[float, list[Cell]]]]) -> Iterator[list[Cell]]:

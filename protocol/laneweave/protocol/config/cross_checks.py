@@ -192,13 +192,11 @@ def _check_motion(scenario: Scenario) -> None:
 
 def _check_closures(scenario: Scenario) -> None:
     """Check that closed parts of lanes are on the road, apart, and can be passed."""
-    road, operation = scenario.road, scenario.formation.operation
+    road = scenario.road
     open_m: dict[int, float] = dict.fromkeys(range(road.lanes), -math.inf)
     step_m = _step_m(scenario)
     for number, closure in enumerate(road.closures):
         name = f"road.closures[{number}]"
-        allowed = "rolling, on a road with closures"
-        _require(scenario.formation.rolling, "formation.operation", operation, allowed)
         allowed = f"a lane from 0 to {road.lanes - 1}"
         _require(closure.lane < road.lanes, f"{name}.lane", closure.lane, allowed)
         allowed = f"more than from_m, {closure.from_m:g}"
@@ -281,13 +279,14 @@ def _check_exits(scenario: Scenario) -> None:
         )
         used |= places
         for section in scenario.sections:
-            first_m = max(section.from_m, section.moves_from_m, scenario.moves_from_m)
-            needed_m = first_m + _step_m(scenario) + drive_out(scenario).room_m
+            begins_m = max(section.from_m, section.moves_from_m)
+            needed_m = _first_step_m(scenario, begins_m) + drive_out(scenario).room_m
             _require(
                 section.exit != exit_.name or exit_.at_m >= needed_m,
                 f"{name}.at_m",
                 exit_.at_m,
-                f"at least {needed_m:g}: a step for changing lanes in lane {section.lane}, and "
+                f"at least {needed_m:g}: {_FIRST_STEP[scenario.formation.rolling]}, in lane "
+                f"{section.lane}, and "
                 f"{drive_out(scenario).room_m:g} m for completing a change after stopping",
             )
 
@@ -305,12 +304,20 @@ def _check_capacity(scenario: Scenario) -> None:
         for name, share in _shares(scenario, lane)
     ]
     volume = scenario.demand.volume_veh_per_lane_h
+    if not scenario.formation.rolling:
+        formations = math.floor(scenario.formation_bound_veh_per_lane_h)
+        _require(
+            volume <= formations,
+            "demand.volume_veh_per_lane_h",
+            volume,
+            f"at most {formations}: where {scenario.narrowest_lanes} lanes are open, formations of "
+            f"{scenario.formation.max_vehicles} (formation.max_vehicles) need more columns",
+        )
     for s_m in sorted({0.0, *scenario.entry_m, *(one.from_m for one in road.closures)}):
         flows = [(from_m, flow) for from_m, flow, to_m in parts if from_m <= s_m < to_m]
         from_ramps = sum(flow for from_m, flow in flows if from_m > 0.0)
         main_lanes = sum(flow for from_m, flow in flows if from_m <= 0.0) / volume
-        closed = {one.lane for one in road.closures if one.from_m <= s_m < one.to_m}
-        count = road.lanes - len(closed)
+        count = scenario.open_lanes_at(s_m)
         room = bound * count - from_ramps
         ramps = f" and {from_ramps:g} vehicles per hour come from ramps" if from_ramps else ""
         _require(
@@ -381,19 +388,18 @@ def _check_dead_ends(scenario: Scenario) -> None:
         weakest = min(limits, key=lambda name: limits[name])
         name = _limit_of(scenario, weakest, "max_accel_mps2")
         raise BadInputError(name, limits[weakest], f"more: {error}") from error
-    step_m = _step_m(scenario)
     for end in dead_ends(scenario):
         name = next(
             f"road.closures[{number}].from_m"
             for number, closure in enumerate(scenario.road.closures)
             if (closure.lane, closure.from_m) == (end.lane, end.end_m)
         )
-        first_m = max(end.from_m, end.moves_from_m, scenario.moves_from_m) + step_m
+        first_m = _first_step_m(scenario, max(end.from_m, end.moves_from_m))
         _require(
             end.line_m >= first_m,
             name,
             end.end_m,
-            f"at least {first_m + needed.room_m:g}: a step for changing lanes, and "
+            f"at least {first_m + needed.room_m:g}: {_FIRST_STEP[scenario.formation.rolling]}, and "
             f"{needed.room_m:g} m for driving on after stopping at the end of the lane",
         )
         _require(
@@ -410,6 +416,25 @@ def _step_m(scenario: Scenario) -> float:
     return scenario.formation.speed_mps * scenario.cycles_s[0] + scenario.longest_body_m
 
 
+_FIRST_STEP = {
+    True: "a step for changing lanes",
+    False: "a formation that has passed all entrances, and a step for changing lanes",
+}
+"""What must fit before the end of a lane, in the rolling operation and with formations."""
+
+
+def _first_step_m(scenario: Scenario, from_m: float) -> float:
+    """Return where the first move ends in a section in which moves may begin at a position.
+
+    The vehicles of a formation are known once it has passed all entrances, and it moves once all of
+    it is in the section.
+    """
+    from_m, formation = max(from_m, scenario.moves_from_m), scenario.formation
+    if not formation.rolling:
+        from_m = max(from_m, *scenario.entry_m) + (formation.max_length - 1) * formation.gap_m
+    return from_m + _step_m(scenario)
+
+
 def _limit_of(scenario: Scenario, vehicle_type: str, name: str) -> str:
     """Return the name of the field with a limit of a type of vehicle."""
     if vehicle_type == CAR:
@@ -421,6 +446,12 @@ def _limit_of(scenario: Scenario, vehicle_type: str, name: str) -> str:
 def _check_structures(scenario: Scenario) -> None:
     """Check that structures ascend along the road, begin before S3 and use existing lanes."""
     road, before_m = scenario.road, -1.0
+    _require(
+        not (scenario.formation.structures and road.closures),
+        "formation.structures",
+        [one.structure for one in scenario.formation.structures],
+        "none, on a road with closures: formations change to the open lanes by themselves",
+    )
     for number, structure in enumerate(scenario.formation.structures):
         name = f"formation.structures[{number}]"
         _require(

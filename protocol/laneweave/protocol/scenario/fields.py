@@ -335,6 +335,18 @@ class FormationSettings:
         return "geometric" in kinds or (self.mode == 1 and set(BASE_CONFLICTS) <= kinds)
 
 
+def formation_columns(vehicles: int, lanes: int) -> int:
+    """Return the minimum number of columns of a formation.
+
+    With several lanes, at least as many cells as there are lanes stay free.
+
+    Args:
+        vehicles: number of vehicles.
+        lanes: number of lanes; where some end, those that remain.
+    """
+    return math.ceil((vehicles + lanes) / lanes) if lanes > 1 else vehicles
+
+
 @frozen
 class Vehicle:
     """Size and limits of a car, and of other types of vehicles where they have no own values."""
@@ -570,6 +582,45 @@ class Scenario:
             {(lane, one.at_m): one.name for one in self.exit for lane in one.lanes},
             {(one.lane, one.at_m): one.merge_m for one in self.entrance},
         )
+
+    @cached_property
+    def narrowest_lanes(self) -> int:
+        """Smallest number of lanes that are open anywhere."""
+        starts_m = {0.0, *(one.from_m for one in self.road.closures)}
+        return min(self.open_lanes_at(s_m) for s_m in starts_m)
+
+    def open_lanes_at(self, s_m: float) -> int:
+        """Return the number of lanes that are open at a position."""
+        closed = {one.lane for one in self.road.closures if one.from_m <= s_m < one.to_m}
+        return self.road.lanes - len(closed)
+
+    @property
+    def ramp_share(self) -> float:
+        """Vehicles from ramps for each one that enters at the start of the road."""
+        from_ramps = sum(one.volume_veh_per_h for one in self.entrance)
+        return from_ramps / (self.demand.volume_veh_per_lane_h * len(self.road.first_lanes))
+
+    @property
+    def formation_bound_veh_per_lane_h(self) -> float:
+        """Maximum volume at the start of the road at which formations have room where lanes end.
+
+        A full formation has as many columns as its vehicles, and those expected from ramps, need.
+        """
+        formation = self.formation
+        most, per_column_s = formation.max_vehicles, formation.gap_m / formation.speed_mps
+        vehicles = most + math.ceil(most * self.ramp_share - 1e-9)
+        columns = formation_columns(vehicles, self.narrowest_lanes)
+        if not formation.closes_by_vehicles:
+            columns, most = formation.block_columns, self.block_vehicles
+        return 3600.0 * most / (columns * per_column_s * len(self.road.first_lanes))
+
+    @property
+    def block_vehicles(self) -> int:
+        """Maximum number of vehicles in a formation whose length is fixed."""
+        lanes, formation = self.narrowest_lanes, self.formation
+        if lanes == self.road.lanes:
+            return formation.max_vehicles
+        return min(formation.max_vehicles, max((formation.block_columns - 1) * lanes, 1))
 
     @cached_property
     def entry_m(self) -> tuple[float, ...]:

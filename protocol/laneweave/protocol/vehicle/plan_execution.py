@@ -267,8 +267,11 @@ class PlanExecution:
 
 
 def is_in_roster(execution: PlanExecution, prepare: Prepare) -> bool:
-    """The vehicle is in the roster."""
-    return execution.vehicle in prepare.roster
+    """The vehicle is in the roster, and in one of the formations."""
+    # A vehicle that waited at the end of a lane belongs to another formation than before.
+    return execution.vehicle in prepare.roster and (
+        execution.owned is not None or not {*prepare.formations}.isdisjoint(execution.joined)
+    )
 
 
 def is_above_promise(execution: PlanExecution, prepare: Prepare) -> bool:

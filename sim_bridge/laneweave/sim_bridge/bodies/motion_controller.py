@@ -96,7 +96,7 @@ class MotionController:
     attendant: int = 0
     """Incarnation of the process in charge; 0: none."""
     joined: tuple[int, ...] = field(init=False)
-    """Blocks that the vehicle's plans must cover, ascending; never shrinks."""
+    """Blocks that the vehicle's plans must cover, ascending; grows until it leaves the lattice."""
     accepted: Ballot | None = None
     """Newest plan that the process in charge has accepted."""
     promised: Ballot | None = None
@@ -165,13 +165,24 @@ class MotionController:
         """Return whether the hold cell has passed the stop line of the lane in which the body is.
 
         A body that is partly in the lane of its hold cell continues its move. One that has driven
-        out of another lane may come to a line, too, if it could not settle before.
+        out of another lane may come to a line, too, if it could not settle before. In formations a
+        body that drives partly in another lane keeps its cell, since the others of its formation
+        take up cells that are given up.
         """
         if self.off_lattice is OffLatticePhase.WAITING or not self._lane_ends:
             return False
         if self.off_lattice is OffLatticePhase.DRIVING_OUT and self._past_line:
             return False
+        if not self.rolling and self._straddles and self.measured[1] > STANDING_MPS:
+            return False
         return self._lane_ends.has_passed((self.hold_cell[0], self._body_lane), t_s)
+
+    @property
+    def _straddles(self) -> bool:
+        """Whether the body touches two lanes."""
+        width_m = self._scenario.vehicle.width_m
+        first, last = self.lattice.lanes_touched(self.measured[3], width_m)
+        return first != last
 
     def has_missed_exit(self, t_s: float) -> bool:
         """Return whether a move into or out of the lane of an exit did not begin in time.
@@ -188,10 +199,13 @@ class MotionController:
     def return_to_origin(self, t_s: float) -> bool:
         """Hold the cell in which the move began; return False if the vehicle does not own it.
 
-        It owns the cell until a later plan takes it, which no vehicle that moves takes part in.
-        Commands for earlier ticks, which may repeat the move, are no longer accepted.
+        It owns the cell until a later plan takes it, which no vehicle that moves takes part in. In
+        a formation, no other vehicle is led into the cell before the move is complete. Commands
+        for earlier ticks, which may repeat the move, are no longer accepted.
         """
-        if self.motion_origin not in self.owned or self.motion_origin[1] != self._body_lane:
+        if self.rolling and self.motion_origin not in self.owned:
+            return False
+        if self.motion_origin[1] != self._body_lane:
             return False
         self.hold_cell = self.motion_origin
         self.command_tick = max(self.command_tick, round(t_s / self.tick_s) - 1)
@@ -226,7 +240,7 @@ class MotionController:
         ballots = [ballot for ballot in (self.promised, self.accepted) if ballot is not None]
         if self.transfer is not None:
             ballots.append(self.transfer.ballot)
-        if ballots:
+        if ballots and self.rolling:
             self.transfer = PendingTransfer(max(ballots))
         self.accepted = None
         self._stop_motion()
@@ -238,9 +252,13 @@ class MotionController:
         self._stop_motion()
 
     def enter_lattice(self, cells: Iterable[Cell]) -> None:
-        """Take cells, among them the hold cell, in which the vehicle is."""
+        """Take cells, among them the hold cell, in which the vehicle is.
+
+        In formations the vehicle leaves those to which it belonged.
+        """
         self.off_lattice = None
-        for cell in cells:
+        self.joined = (self.lattice.block_of(self.hold_cell[0]),)
+        for cell in cells if self.rolling else ():
             self.assign_cell(cell)
 
     def _stop_motion(self) -> None:
@@ -338,7 +356,7 @@ class MotionController:
         Commands from processes other than the one in charge are ignored. Returns whether anything
         has changed.
         """
-        if command.incarnation != self.attendant:
+        if command.incarnation != self.attendant or self.off_lattice is not None:
             return False
         requested = command.joined, command.accepted, command.promised, command.transfer
         if requested == (self.joined, self.accepted, self.promised, self.transfer):

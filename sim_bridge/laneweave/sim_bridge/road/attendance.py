@@ -73,6 +73,8 @@ class Caretaker:
             The state to publish at once; None if the message has no effect.
         """
         execution, controller = self._execution, self._vehicle.controller
+        if not self.has_cells:
+            return None
         if isinstance(message, Prepare):
             accepted = execution.on_prepare(message)
             controller.join(execution.wanted_joined)

@@ -95,8 +95,18 @@ class EntryMeter:
         """Queued vehicles, ordered by lane."""
         return tuple(arrival for queue in self._queues for arrival in queue)
 
-    def keep_free(self, lane: int, count: int) -> range:
-        """Return the next columns of a lane, which no vehicle may enter any more."""
+    def keep_free(self, lane: int, count: int, t_s: float) -> range:
+        """Return the next columns of a lane, which no vehicle may enter any more.
+
+        With formations, no vehicle may enter them in any lane.
+        """
+        if self._builder is not None:
+            first = min(
+                column
+                for column, entry_m in zip(self._columns, self._entry_m, strict=True)
+                if entry_m <= 0.0
+            )
+            return self._builder.reserve(first, count, t_s)
         first = self._columns[lane]
         self._columns[lane] = first - count
         return range(first - count + 1, first + 1)
@@ -169,7 +179,7 @@ class EntryMeter:
     def _skip(self, lane: int, t_s: float) -> None:
         """Advance a lane to its first column that vehicles can enter at `t_s`."""
         lattice, column = self._lattice, self._columns[lane]
-        if self._builder is not None:
+        if self._builder is not None and self._entry_m[lane] <= 0.0:
             column = int(min(column, self._builder.first_open_column))
         spread_s = self._spread_in(lane)
         while self._passing_time_s(column, lane) + spread_s < t_s - TIME_TOLERANCE_S or (

@@ -5,6 +5,9 @@ lane free (a *gap*): no vehicle enters them, and no vehicle owns their cells, so
 them. When the gap passes the waiting vehicle, its motion controller drives into it, and takes its
 cells once it has arrived in the rearmost column. This needs neither agent nor leader nor message:
 it is how a vehicle enters at the start of the road.
+
+With formations, the columns are free in all lanes and belong to no formation. The vehicle that
+enters them is a formation of its own.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import START_S, LaneEnd, LaneEnds, drive_out, lane_beside
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
-from laneweave.protocol.wire.messages import Name, OffLattice
+from laneweave.protocol.wire.messages import ClosedFormation, Name, OffLattice
 from laneweave.sim_bridge.bodies.motion_controller import (
     BESIDE_M,
     STANDING_MPS,
@@ -78,6 +81,9 @@ class LaneEndControl:
         self._gaps: dict[LaneEnd, list[Gap]] = {end: [] for end in self._ends}
         self._last_gap_column: list[float] = [math.inf] * scenario.road.lanes
         """Rearmost column of the last gap of each lane."""
+        self.formations: list[ClosedFormation] = []
+        """Formations of vehicles that have entered the lattice; the reader removes them."""
+        self._rolling = scenario.formation.rolling
         self._end_of: dict[Name, LaneEnd | None] = {}
         """Dead end at which each vehicle without cells waits or waited; None: its lane has none."""
 
@@ -100,7 +106,7 @@ class LaneEndControl:
             missed = controller.has_missed_exit(t_s)
             if missed and controller.return_to_origin(t_s):
                 yield LaneEndChange(name, MISSED_EXIT, controller.hold_cell[1])
-            elif missed or controller.has_lost_cell(t_s):
+            elif (missed and self._rolling) or controller.has_lost_cell(t_s):
                 # While it drives out, a vehicle may come to another dead end.
                 self._forget(name)
                 yield self._take_off(name, vehicle)
@@ -113,7 +119,7 @@ class LaneEndControl:
             gaps[:] = [gap for gap in gaps if gap.vehicle or not self._is_over(gap, end, t_s)]
             coming = sum(gap.vehicle is None for gap in gaps)
             if len(waiting) > coming:
-                self._request(self._beside[end], gaps)
+                self._request(self._beside[end], gaps, t_s)
 
     def bodies(self, vehicles: Mapping[Name, RoadVehicle]) -> dict[Name, OffLattice]:
         """Return the lane and the rear of each vehicle without cells.
@@ -133,15 +139,20 @@ class LaneEndControl:
                 found[name] = OffLattice(lane, s_m - vehicles[name].size[0])
         return found
 
-    def _request(self, lane: int | None, gaps: list[Gap]) -> None:
+    def _request(self, lane: int | None, gaps: list[Gap], t_s: float) -> None:
         """Keep the next columns of a lane free, unless the last gap was too close ahead."""
         if lane is None:
             return  # `cross_checks` refuses such roads
-        crowded = any(arrival.lane == lane for arrival in self._meter.waiting)
+        waiting = self._meter.waiting
+        if self._rolling:
+            crowded, taken = any(arrival.lane == lane for arrival in waiting), {lane}
+        else:
+            crowded, taken = bool(waiting), {*range(self._lattice.lanes)}
         between = (CROWDED_GAPS if crowded else OPEN_GAPS) * self._columns
         if self._meter.closed_column(lane) <= self._last_gap_column[lane] - between:
-            columns = self._meter.keep_free(lane, self._columns)
-            self._last_gap_column[lane] = columns[0]
+            columns = self._meter.keep_free(lane, self._columns, t_s)
+            for each in taken:
+                self._last_gap_column[each] = columns[0]
             gaps.append(Gap(lane, columns))
 
     def _take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
@@ -202,6 +213,9 @@ class LaneEndControl:
             vehicles[name].enter_lattice(gap.cells)
             gaps.remove(gap)
             del self._end_of[name]
+            if not self._rolling:
+                first, last = map(self._lattice.block_of, (gap.columns[-1], gap.columns[0]))
+                self.formations.append(ClosedFormation(first, last, t_s))
             yield LaneEndChange(name, ENTERED_LATTICE, gap.lane)
 
     def _is_over(self, gap: Gap, end: LaneEnd, t_s: float) -> bool:

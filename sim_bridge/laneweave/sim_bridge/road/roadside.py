@@ -179,11 +179,12 @@ class Roadside:
     def close_formations(self, t_s: float) -> list[ClosedFormation]:
         """Return the formations closed since the last call.
 
-        Must be called after `admit`, which determines their members.
+        Must be called after `admit` and `control_lane_ends`, which determine their members.
         """
         if self._builder is None:
             return []
-        closed = self._builder.closed(t_s)
+        closed = self._builder.closed(t_s) + self._lane_ends.formations
+        self._lane_ends.formations.clear()
         self._closed += closed
         if self._builder.closed_to > self._closed_to:
             self._closed_to = self._builder.closed_to
@@ -236,7 +237,7 @@ class Roadside:
     def control_lane_ends(
         self, vehicles: Mapping[Name, RoadVehicle], t_s: float
     ) -> list[LaneEndChange]:
-        """Take vehicles off the lattice whose lanes end, and bring them back (rolling operation).
+        """Take vehicles off the lattice whose lanes end, and bring them back.
 
         Must be called before `assign_empty_cells`, from which gaps are excluded.
         """
@@ -316,7 +317,8 @@ class Roadside:
         """Return the census: vehicles on the road, announcements and closed formations."""
         vehicles = tuple(on_road)
         off_lattice = self._lane_ends.bodies({vehicle.name: vehicle for vehicle in vehicles})
-        present = {vehicle.formation for vehicle in vehicles}
+        # Without members on the lattice, its blocks are deserted: they may be joined with others.
+        present = {one.formation for one in vehicles if one.controller.off_lattice is None}
         self._closed = [closed for closed in self._closed if closed.first_block in present]
         return Census(
             t_s=t_s,

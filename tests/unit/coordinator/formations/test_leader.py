@@ -40,7 +40,8 @@ Reach = Callable[..., tuple[FormationLeader, Ballot]]
 
 
 def formation(*names: Name, lane: int = 1, numbers: tuple[int, ...] = (0,)) -> Formation:
-    return Formation(numbers, tuple(CensusEntry(name, (0, 0), lane, 0.0) for name in names))
+    members = tuple(CensusEntry(name, (0, 0), lane, 0.0) for name in names)
+    return Formation(numbers, members, goals=(frozenset({lane}),) * len(members))
 
 
 class Ballots:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from laneweave.coordinator.formations.roster import (
     Formation,
     Groups,
+    Numbers,
     closed_formations,
     exit_time_s,
     start_time_s,
@@ -33,6 +34,18 @@ def entries_of(**cells: Cell) -> tuple[CensusEntry, ...]:
     return tuple(CensusEntry(Name(name), cell, 0, 0.0) for name, cell in cells.items())
 
 
+def formation_of(
+    numbers: Numbers,
+    members: tuple[CensusEntry, ...],
+    closed_s: float,
+    joined: int = 1,
+    deserted: Numbers = (),
+) -> Formation:
+    """Return a formation whose members all prefer lane 0, on a road with one stage."""
+    goals = (frozenset({0}),) * len(members)
+    return Formation(numbers, members, closed_s, joined, deserted, goals=goals)
+
+
 def census(t_s: float, **cells: Cell) -> Census:
     """Return what the roadside of the paper's operation tells."""
     entries = entries_of(**cells)
@@ -53,7 +66,7 @@ def test_a_formation_closes_when_no_vehicle_can_enter_its_block() -> None:
     assert CLOSES_S == 4.5
     assert closed(census(CLOSES_S - 0.1, a=(0, 0))) == {}
     (formation,) = closed(census(CLOSES_S, a=(0, 0))).values()
-    assert formation == Formation((0,), entries_of(a=(0, 0)), CLOSES_S)
+    assert formation == formation_of((0,), entries_of(a=(0, 0)), CLOSES_S)
 
 
 def test_members_are_grouped_by_the_block_of_their_entry_and_sorted() -> None:
@@ -91,8 +104,8 @@ def test_a_formation_has_all_of_its_blocks_and_is_planned_only_as_a_whole() -> N
     formations = (ClosedFormation(0, 3, 3.0), ClosedFormation(4, 6, 9.0))
     seen = Census(9.0, entries_of(d=(-6, 1), a=(0, 0), c=(-4, 2), b=(-2, 2)), (), formations, 6)
     assert closed_formations(seen, NOW_S, GROWING, Groups()) == {
-        0: Formation((0, 1, 2, 3), entries_of(a=(0, 0), b=(-2, 2)), 3.0),
-        4: Formation((4, 5, 6), entries_of(c=(-4, 2), d=(-6, 1)), 9.0),
+        0: formation_of((0, 1, 2, 3), entries_of(a=(0, 0), b=(-2, 2)), 3.0),
+        4: formation_of((4, 5, 6), entries_of(c=(-4, 2), d=(-6, 1)), 9.0),
     }
     assert list(closed_formations(evolve(seen, closed_to=5), NOW_S, GROWING, Groups())) == [0]
 
@@ -102,7 +115,7 @@ def test_joined_formations_have_the_blocks_of_all_and_the_latest_closing() -> No
     formations = (ClosedFormation(0, 3, 3.0), ClosedFormation(4, 6, 9.0))
     seen = Census(9.0, entries_of(a=(0, 0), c=(-4, 2)), (), formations, 6)
     assert closed_formations(seen, NOW_S, GROWING, joined(3, 4)) == {
-        0: Formation(tuple(range(7)), entries_of(a=(0, 0), c=(-4, 2)), 9.0, joined=2)
+        0: formation_of(tuple(range(7)), entries_of(a=(0, 0), c=(-4, 2)), 9.0, joined=2)
     }
     assert closed_formations(evolve(seen, closed_to=5), NOW_S, GROWING, joined(3, 4)) == {}
 
@@ -116,7 +129,7 @@ def test_what_the_census_has_told_of_a_formation_is_remembered() -> None:
     groups.join((1, 2))
     later = Census(50.0, entries_of(b=(-2, 0)), (), both[1:], 3)
     assert closed_formations(later, NOW_S, GROWING, groups) == {
-        0: Formation((0, 1, 2, 3), entries_of(b=(-2, 0)), 5.0, deserted=(0, 1))
+        0: formation_of((0, 1, 2, 3), entries_of(b=(-2, 0)), 5.0, deserted=(0, 1))
     }
 
 

@@ -34,7 +34,8 @@ def task(
     scenario: Scenario = SCENARIO,
 ) -> SortingTask:
     deadline_s = scenario.formation.planning_deadline_s
-    return SortingTask(numbers, cells, lanes, unattended, scenario, deadline_s or DEADLINE_S)
+    goals = {name: frozenset({lane}) for name, lane in lanes.items()}
+    return SortingTask(numbers, cells, goals, unattended, scenario, deadline_s or DEADLINE_S)
 
 
 def sort(order: SortingTask) -> Sorting:
@@ -272,7 +273,7 @@ def test_sortings_stay_inside_and_name_vehicles_off_their_lanes(order: SortingTa
             cell = target
     final = ends(order, sorting)
     assert len(set(final.values())) == len(final)
-    missed = {name for name, cell in final.items() if cell[1] != order.preferred_lanes[name]}
+    missed = {name for name, cell in final.items() if cell[1] not in order.goal_lanes[name]}
     assert set(sorting.out_of_reach) == missed
     if sorting.solved:
         assert sorting.short_of_room == bool(missed - set(order.unattended))

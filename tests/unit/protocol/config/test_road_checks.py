@@ -101,7 +101,10 @@ def ends_at(end_m: float) -> Callable[[Tables], object]:
             ),
             "road.closures",
         ),
-        (lambda tables: tables.update(formation={}), "formation.operation: got 'formations'"),
+        (
+            lambda tables: tables.update(formation={"max_columns": 14}),
+            "exit[0].at_m: got 700.0; allowed: at least 710: a formation that has passed",
+        ),
     ],
 )  # fmt: skip
 def test_roads_that_are_not_possible_are_refused_in_one_line(

@@ -268,7 +268,15 @@ def test_closures_that_are_not_possible_are_refused_in_one_line() -> None:
     assert "demand.lane_shares: got [1.0, 1.0, 1.0]" in refused(
         [lane_0], demand={"lane_shares": [1, 1, 1]}
     )
-    assert "formation.operation: got 'formations'" in refused([lane_0], formation={})
+    # A formation of seven columns needs more room than a vehicle.
+    assert "road.closures[0].from_m: got 550.0; allowed: at least 605: a formation" in refused(
+        [lane_0 | {"from_m": 550.0}], formation={}
+    )
+    assert "demand.volume_veh_per_lane_h: got 1900.0; allowed: at most 1800" in refused(
+        [lane_0], formation={}, demand={"volume_veh_per_lane_h": 1900.0}
+    )
+    structures = [{"from_m": 100.0, "structure": "parallel"}]
+    assert "formation.structures" in refused([lane_0], formation={"structures": structures})
     assert "road.closures[0].lane: got 3" in refused([{"lane": 3, "from_m": 800.0}])
     assert "road.closures[0].to_m: got 700.0" in refused([lane_0 | {"to_m": 700.0}])
     assert "road.closures[0].from_m: got 1800.0" in refused([lane_0 | {"from_m": 1800.0}])

@@ -14,7 +14,7 @@ from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.sim_bridge.road.demand import Arrival, arrivals
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
-from laneweave.sim_bridge.road.formation_building import ColumnBlocks
+from laneweave.sim_bridge.road.formation_building import ColumnBlocks, Entrances
 
 COLUMN_S, SMALL_S = 1.0, 1e-6
 
@@ -43,7 +43,8 @@ def demands(draw: st.DrawFn) -> tuple[Lattice, int, list[Arrival]]:
 
 def interlaced_meter(grid: Lattice, most: int = 6, spread_s: float = 0.0) -> EntryMeter:
     """Return the meter of the paper's operation."""
-    return EntryMeter(grid, spread_s, ColumnBlocks(grid, most, spread_s), interlaced=True)
+    builder = ColumnBlocks(grid, most, spread_s, Entrances(grid.lanes))
+    return EntryMeter(grid, spread_s, builder, interlaced=True)
 
 
 def check(grid: Lattice, spread_s: float, admissions: list[Admission]) -> None:

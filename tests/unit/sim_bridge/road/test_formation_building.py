@@ -18,6 +18,7 @@ from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
 from laneweave.sim_bridge.road.formation_building import (
     ColumnBlocks,
+    Entrances,
     FormationBuilder,
     GrowingFormations,
     formation_builder,
@@ -35,7 +36,7 @@ def lattice(lanes: int = 3, block_columns: int = 1) -> Lattice:
 
 
 def growing(lanes: int = 3, vehicles: int = 6, columns: int = 7) -> GrowingFormations:
-    return GrowingFormations(lattice(lanes), vehicles, columns, SPREAD_S)
+    return GrowingFormations(lattice(lanes), vehicles, columns, SPREAD_S, Entrances(lanes))
 
 
 # --- an entrance ------------------------------------------------------------------------------
@@ -150,9 +151,11 @@ def test_every_vehicle_is_in_one_formation_that_has_room_for_all_of_its_wishes(
 ) -> None:
     grid = lattice(case.lanes, 1 if grows else BLOCK_COLUMNS)
     builder: FormationBuilder = (
-        GrowingFormations(grid, case.most_vehicles, case.most_columns, case.spread_s)
+        GrowingFormations(
+            grid, case.most_vehicles, case.most_columns, case.spread_s, Entrances(case.lanes)
+        )
         if grows
-        else ColumnBlocks(grid, case.most_vehicles, case.spread_s)
+        else ColumnBlocks(grid, case.most_vehicles, case.spread_s, Entrances(case.lanes))
     )
     entrance = Entrance(grid, builder, case.spread_s, case.interlaced)
     entrance.run(list(case.stream))
@@ -163,7 +166,7 @@ def test_every_vehicle_is_in_one_formation_that_has_room_for_all_of_its_wishes(
 @pytest.mark.parametrize("bug", ["column-given-twice", "closed-too-early", "columns-forgotten"])
 def test_the_check_notices_a_roadside_that_is_wrong(bug: str) -> None:
     """It gives a column to two formations, closes one too early, or leaves columns out."""
-    builder = BUGS[bug](lattice(), 6, 7, SPREAD_S)
+    builder = BUGS[bug](lattice(), 6, 7, SPREAD_S, Entrances(3))
     entrance = Entrance(builder.lattice, builder, SPREAD_S)
     stream = [
         Arrival(f"v{number:04d}", number % 3, number % 2, 0.6 * number) for number in range(60)
@@ -181,8 +184,8 @@ def run_and_check(entrance: Entrance, stream: list[Arrival]) -> None:
 class GivesAColumnTwice(GrowingFormations):
     """The last column of a formation is the first one of the next, too."""
 
-    def _close(self, last_column: int, t_s: float) -> None:
-        super()._close(last_column, t_s)
+    def _complete_open(self, last_column: int, t_s: float) -> None:
+        super()._complete_open(last_column, t_s)
         self.first_open_column += 1
 
 
@@ -192,7 +195,8 @@ class ClosesTooEarly(GrowingFormations):
     @property
     def closed_to(self) -> int:
         """All blocks up to the rear of the open formation."""
-        return max(super().closed_to, self.lattice.block_of(self._rear))
+        rear = 0 if self._open is None else self._open.rear
+        return max(super().closed_to, self.lattice.block_of(rear))
 
 
 class ForgetsColumns(GrowingFormations):
@@ -307,7 +311,7 @@ def test_on_one_lane_a_formation_needs_no_free_column() -> None:
 
 def test_a_block_is_closed_when_its_last_column_has_passed() -> None:
     grid = lattice(block_columns=BLOCK_COLUMNS)
-    builder = ColumnBlocks(grid, 6, 1.5)
+    builder = ColumnBlocks(grid, 6, 1.5, Entrances(3))
     assert builder.try_add((-1, 1), 0, 1.0)
     assert builder.try_add((-9, 1), 0, 9.0)
     assert builder.closed(4.4) == []
@@ -316,7 +320,7 @@ def test_a_block_is_closed_when_its_last_column_has_passed() -> None:
     assert builder.closed(8.5) == []  # block 1 is empty
     assert builder.closed_to == 1
     assert builder.closed(13.0) == [ClosedFormation(2, 2, 12.5)]
-    assert not builder._preferring
+    assert not builder._vehicles
 
 
 # --- which one a scenario has -----------------------------------------------------------------

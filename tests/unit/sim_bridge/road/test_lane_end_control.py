@@ -150,7 +150,7 @@ def test_one_gap_for_each_vehicle() -> None:
     asked = []
     keep_free = EntryMeter.keep_free
     road.roadside._lane_ends._meter = meter = road.roadside._meter
-    meter.keep_free = lambda lane, count: asked.append(lane) or keep_free(meter, lane, count)  # type: ignore[method-assign, func-returns-value]
+    meter.keep_free = lambda lane, *more: asked.append(lane) or keep_free(meter, lane, *more)  # type: ignore[method-assign, func-returns-value]
     while road.vehicles or not road.roadside.exhausted(road.t_s):
         road.step()
     out = [one for _, kind, one in road.events if kind == DRIVES_OUT]
@@ -218,7 +218,9 @@ def gap_is_entered(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(
         EntryMeter,
         "keep_free",
-        lambda self, lane, count: range(self._columns[lane] - count + 1, self._columns[lane] + 1),
+        lambda self, lane, count, _: range(
+            self._columns[lane] - count + 1, self._columns[lane] + 1
+        ),
     )
 
 

@@ -187,8 +187,8 @@ class LightRoad:
         t_s = self.t_s
         self._checker.advance(now_s)
         self._let_enter(now_s)
-        self._close_formations()
         self._control_lane_ends(now_s)
+        self._close_formations()
         self._entrance.assign_empty_cells(self.vehicles)
         yield from self._let_leave(now_s)
         for name, vehicle in self.vehicles.items():
