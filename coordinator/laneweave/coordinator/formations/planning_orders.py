@@ -26,7 +26,7 @@ from laneweave.coordinator.formations.roster import (
     steps_left,
 )
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
-from laneweave.coordinator.formations.stages import stages
+from laneweave.coordinator.formations.stages import Stage, stages
 from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.response import PlanFunction
@@ -227,7 +227,8 @@ class FormationPlanner:
                 if not problems:
                     leader.on_plan(plan, now_s, result.out_of_reach)
                     pauses = steps_of(plan) - steps_of(planned)
-                    yield from _log_entries(leader.formation, result, pauses, plan)
+                    stage = stages(self._scenario)[leader.formation.stage]
+                    yield from _log_entries(leader.formation, stage, result, pauses, plan)
                     return
                 error = "; ".join(problems)
         leader.take(FAILED, now_s)
@@ -320,7 +321,7 @@ class FormationPlanner:
 
 
 def _log_entries(
-    formation: Formation, sorting: Sorting, pauses: int, plan: Plan
+    formation: Formation, stage: Stage, sorting: Sorting, pauses: int, plan: Plan
 ) -> Iterator[LogEntry]:
     number = formation.numbers[0]
     if sorting.impossible:
@@ -332,6 +333,11 @@ def _log_entries(
         yield LogEntry(PLAN_MADE, data | {"t0_s": plan.t0_s, "slot_s": plan.slot_s})
     if pauses:
         yield LogEntry(NEIGHBOURS_AWAITED, {"formation": number, "slots": pauses})
-    if sorting.out_of_reach:
-        vehicles = [str(name) for name in sorting.out_of_reach]
-        yield LogEntry(LANE_OUT_OF_REACH, {"formation": number, "vehicles": vehicles})
+    missed = [
+        str(member.vehicle)
+        for member in formation.members
+        if member.vehicle in sorting.out_of_reach
+        and stage.is_last_for(member.preferred_lane, member.destination)
+    ]
+    if missed:
+        yield LogEntry(LANE_OUT_OF_REACH, {"formation": number, "vehicles": missed})

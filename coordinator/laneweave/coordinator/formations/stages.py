@@ -65,11 +65,7 @@ class Stage:
         A vehicle that can no longer change to the lane of its exit drives to the end of the road,
         unless it is in that lane.
         """
-        serving = [
-            (one, line_m)
-            for one, line_m in zip(self.road, self.lines_m, strict=True)
-            if one.to_m > self.from_m and one.serves(preferred_lane, destination)
-        ]
+        serving = self._serving(preferred_lane, destination)
         wanted = [one for one, line_m in serving if line_m > self.from_m]
         if not wanted:
             leaving = frozenset(one.lane for one, _ in serving)
@@ -83,6 +79,18 @@ class Stage:
         }
         nearest = min(distance.values())
         return frozenset(lane for lane, lanes in distance.items() if lanes == nearest)
+
+    def is_last_for(self, preferred_lane: int, destination: str = END_OF_ROAD) -> bool:
+        """Return whether a vehicle cannot reach its destination in a later stage any more."""
+        return all(line_m <= self.to_m for _, line_m in self._serving(preferred_lane, destination))
+
+    def _serving(self, preferred_lane: int, destination: str) -> list[tuple[LaneSection, float]]:
+        """Return the sections ahead that lead to a destination, with their lines."""
+        return [
+            (one, line_m)
+            for one, line_m in zip(self.road, self.lines_m, strict=True)
+            if one.to_m > self.from_m and one.serves(preferred_lane, destination)
+        ]
 
 
 @lru_cache(maxsize=16)

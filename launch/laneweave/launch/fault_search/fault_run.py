@@ -438,7 +438,7 @@ class FaultRun:
         if self._rolling:
             healthy_s = self.network.now_s - self.story.fault_s
             return healthy_s >= self._healthy_s and not self._standing
-        return self.faults.healed and not self._not_arrived()
+        return self.faults.healed and not self._under_way and not self._not_arrived()
 
     @property
     def _rolling(self) -> bool:
@@ -446,7 +446,9 @@ class FaultRun:
 
     @property
     def _patience_s(self) -> float:
-        return self._healthy_s + STANDING_S if self._rolling else PATIENCE_S
+        if self._rolling:
+            return self._healthy_s + STANDING_S
+        return PATIENCE_S + STANDING_S if self._last_change_m else PATIENCE_S
 
     @property
     def _healthy_s(self) -> float:
@@ -458,6 +460,29 @@ class FaultRun:
         """Vehicles that have stopped before the end of their lane."""
         vehicles = self.road.vehicles.items()
         return [name for name, one in vehicles if one.controller.off_lattice is not None]
+
+    @property
+    def _last_change_m(self) -> float:
+        """Position behind which the lanes of the road do not change any more; 0: they never do."""
+        scenario = self.setup.scenario
+        changes_m = {
+            position_m
+            for section in scenario.sections
+            for position_m in (section.from_m, section.to_m)
+            if 0.0 < position_m < scenario.road.length_m
+        }
+        return max(changes_m, default=0.0)
+
+    @property
+    def _under_way(self) -> bool:
+        """Whether vehicles have not passed all places where lanes change (formations)."""
+        last_m = self._last_change_m
+        return any(each.body.state[0] < last_m for each in self.road.vehicles.values())
+
+    @property
+    def _free(self) -> Collection[Name]:
+        """Vehicles without a preferred lane: they have missed their exit (formations)."""
+        return () if self._rolling else self.setup.leaving
 
     def _record_moves(self) -> None:
         """Record which vehicles have moved since the fault phase (rolling operation)."""
@@ -488,7 +513,10 @@ class FaultRun:
             for name, vehicle in self.road.vehicles.items()
             if vehicle.controller.off_lattice is None
             and (
-                vehicle.controller.hold_cell[1] != vehicle.preferred_lane
+                (
+                    vehicle.controller.hold_cell[1] != vehicle.preferred_lane
+                    and name not in self._free
+                )
                 or not vehicle.body.has_arrived(road_s)
             )
         ]

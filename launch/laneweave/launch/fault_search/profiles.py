@@ -34,7 +34,7 @@ class Profile:
     lane_ends: bool = False
     """Whether lane 0 ends before the road (rolling operation at the real roadside)."""
     roads: bool = False
-    """Whether a lane ends, joins or leaves, as drawn (rolling operation at the real roadside)."""
+    """Whether a lane ends, joins or leaves, as drawn (at the real roadside)."""
     density: tuple[float, float] = (0.3, 0.7)
     """Occupied share of the cells in which vehicles may enter (rolling operation)."""
     vehicles: Span = (2, 16)

@@ -115,7 +115,7 @@ class RoadSetup:
     trucks: bool = False
     """Whether there are vehicles that do not change columns (rolling operation at the roadside)."""
     drawn: DrawnRoad = STRAIGHT_ROAD
-    """Closed parts, ramps and exits (rolling operation at the real roadside)."""
+    """Closed parts, ramps and exits (at the real roadside)."""
 
     def make_scenario(self) -> Scenario:
         """Return the scenario of the road."""
@@ -257,6 +257,13 @@ class Setup:
                 max_vehicles=rng.randint(2, MAX_SIZE),
                 mode=rng.choice(MODES),
             )
+            if profile.roads:
+                formation = road.make_scenario().formation
+                before_m = rng.choice(BEFORE_COLUMNS) * formation.gap_m
+                formation_m = (formation.max_length - 1) * formation.gap_m
+                step_m = formation.speed_mps * road.slot_s
+                drawn = draw_road(lanes, before_m, step_m, rng, formation_m)
+                road = evolve(road, before_m=before_m, drawn=drawn)
         scenario = road.make_scenario()
         lasting = LastingFaults.drawn(profile, rng)
         mean_s = rng.uniform(*MEAN_HEADWAYS_S)

@@ -54,6 +54,10 @@ class Entrances:
         ramps = frozenset(one.lane for one in scenario.entrance)
         return cls(scenario.narrowest_lanes, ramps, max(scenario.entry_m), scenario.ramp_share)
 
+    def first_column(self, lattice: Lattice) -> int:
+        """Return the foremost column that vehicles can enter, which a ramp does at road time 0."""
+        return int(self.last_m // lattice.pitch_m)
+
 
 @define
 class Vehicles:
@@ -96,8 +100,12 @@ class ColumnBlocks:
     """Vehicles of each block that is not closed."""
     _reserved: set[int] = field(factory=set)
     """Blocks that nobody may enter and that are not closed."""
-    _next: int = 0
+    _next: int = field(init=False)
     """Next block to be closed."""
+
+    @_next.default
+    def _first_block(self) -> int:
+        return self.lattice.block_of(self.entrances.first_column(self.lattice))
 
     def try_add(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
         """Add a vehicle that would enter in a cell; return False if it needs a later cell."""
@@ -178,7 +186,7 @@ class GrowingFormations:
     spread_s: float
     """Maximum time between a vehicle and its cell at its entrance."""
     entrances: Entrances
-    first_open_column: float = 0
+    first_open_column: float = field(init=False)
     """Foremost column that can still be entered at the start of the road."""
     _open: Shape | None = None
     """The formation that vehicles enter at the start of the road."""
@@ -189,6 +197,7 @@ class GrowingFormations:
 
     def __attrs_post_init__(self) -> None:
         """Begin at road time 0."""
+        self.first_open_column = self.entrances.first_column(self.lattice)
         self._pass_ramps(0.0)
 
     @property

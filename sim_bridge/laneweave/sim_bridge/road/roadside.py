@@ -83,7 +83,7 @@ class Roadside:
         self._lane_ends = LaneEndControl(scenario, self._meter)
         self._closed: list[ClosedFormation] = []
         """Closed formations with vehicles on the road."""
-        self._closed_to = -1
+        self._closed_to = -1 if self._builder is None else self._builder.closed_to
         self._recent: list[tuple[int, int, Name]] = []
         """(column, lane, name) of recently entered vehicles."""
         self._next: list[list[tuple[int, Name]]] = [[] for _ in range(self._lanes)]

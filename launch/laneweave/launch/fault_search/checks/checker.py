@@ -118,8 +118,14 @@ class Checker:
             self._ownership = CellOwnership(self._report)
 
     def enter(self, t_s: float, vehicle: str, cell: Cell, block: int) -> None:
-        """Record that a vehicle has entered the road in a cell of a block."""
+        """Record that a vehicle has entered the road or the lattice in a cell of a block.
+
+        If it was on the lattice before, it belongs to another formation now.
+        """
         self._log(t_s, f"{vehicle} enters in {cell}")
+        self._states.pop(vehicle, None)
+        if vehicle in self._charge:
+            self._charge[vehicle] = self._charge[vehicle][0], frozenset()
         self.advance(t_s)
         self._bodies[vehicle] = Body.standing(self._geometry, cell, t_s)
         self._check_cells(t_s, vehicle)
@@ -133,7 +139,7 @@ class Checker:
             self._ownership.update(t_s, vehicle, stored.owned, stored.transfer)
 
     def leave(self, t_s: float, vehicle: str) -> None:
-        """Record that a vehicle has left the road."""
+        """Record that a vehicle has left the road or the lattice."""
         self._log(t_s, f"{vehicle} leaves the road")
         self.advance(t_s)
         self._end_motion(vehicle)

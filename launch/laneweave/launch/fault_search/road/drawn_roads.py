@@ -1,4 +1,4 @@
-"""Roads whose lanes end, join or leave, drawn at random (rolling operation at the real roadside).
+"""Roads whose lanes end, join or leave, drawn at random (at the real roadside).
 
 One lane at an edge of the road is special: it ends, is blocked, comes from a ramp, leads to an
 exit, or both.
@@ -38,7 +38,9 @@ class DrawnRoad:
 STRAIGHT_ROAD = DrawnRoad()
 
 
-def draw_road(lanes: int, moves_from_m: float, step_m: float, rng: random.Random) -> DrawnRoad:
+def draw_road(
+    lanes: int, moves_from_m: float, step_m: float, rng: random.Random, formation_m: float = 0.0
+) -> DrawnRoad:
     """Draw a road.
 
     Args:
@@ -46,9 +48,10 @@ def draw_road(lanes: int, moves_from_m: float, step_m: float, rng: random.Random
         moves_from_m: position from which vehicles move.
         step_m: distance at v_F in a slot.
         rng: source of all draws.
+        formation_m: distance between the first and the last vehicle of the longest formation.
     """
     kind, lane = rng.choice(KINDS), rng.choice((0, lanes - 1))
-    length_m = rng.uniform(*WEAVING_STEPS) * step_m + AFTER_M
+    length_m = rng.uniform(*WEAVING_STEPS) * step_m + AFTER_M + formation_m
     if kind in ("drop", "blocked"):
         end_m = round(moves_from_m + length_m, 1)
         if kind == "drop":
