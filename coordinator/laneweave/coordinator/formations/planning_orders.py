@@ -18,7 +18,7 @@ from laneweave.coordinator.formations.roster import (
     Formation,
     Groups,
     Numbers,
-    exit_time_s,
+    deadline_s,
     on_tick,
     stage_begin_s,
     stage_end_s,
@@ -151,6 +151,8 @@ class FormationPlanner:
         stage = every[formation.stage]
         start_s = self._start_s(formation, cells, t_s)
         end_s = stage_end_s(numbers, formation.stage, scenario)
+        if formation.sorts and stage is not every[-1]:
+            end_s = deadline_s(cells, numbers, formation.stage, scenario)
         if stage is not every[-1] and end_s < start_s + scenario.cycles_s[0]:
             leader.take(FAILED, now_s)
             yield LogEntry(STRUCTURE_TOO_LATE, {"formation": numbers[0], "stage": formation.stage})
@@ -287,7 +289,8 @@ class FormationPlanner:
             end_s = stage_end_s(formation.numbers, formation.stage, scenario)
             return paced(plan, others, plan.t0_s, end_s, scenario)
         stage = stages(scenario)[formation.stage]
-        end_s = exit_time_s({*cells, *plan.territory}, scenario, stage.to_m)
+        used = {*cells, *plan.territory}
+        end_s = deadline_s(used, formation.numbers, formation.stage, scenario)
         not_before_s = max(self._settled_s(cells), t_s + START_MARGIN_S)
         return paced(plan, others, not_before_s, end_s, scenario, stage.from_m)
 

@@ -161,7 +161,7 @@ def stage_at(numbers: Numbers, t_s: float, scenario: Scenario) -> int:
     """Return the index of the stage that a formation should plan at a road time.
 
     The first stage is planned at once. Each later one is planned `STAGE_LEAD_S` before the rear of
-    the formation reaches it, but not while the formation sorts its lanes in the stage before.
+    the formation reaches it, but not before the rear has passed a stage in which lanes are sorted.
     """
     later = range(1, len(stages(scenario)))
     return sum(
@@ -184,14 +184,28 @@ def stage_begin_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
 def stage_end_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
     """Return the road time by which the plan of a stage should be complete.
 
-    At this time the next stage is planned or, if the formation sorts its lanes, its front reaches
-    the end of the stage.
+    At this time the next stage is planned or, in the last one, the front of the formation leaves
+    the road. In lanes that end with the stage, moves must be complete before (`deadline_s`).
     """
-    its = stages(scenario)[stage]
+    every, lattice = stages(scenario), scenario.lattice
+    its = every[stage]
     if its.structure is not None:
         return stage_begin_s(numbers, stage + 1, scenario) - STAGE_LEAD_S
-    front = scenario.lattice.block_range(numbers[0])[-1]
-    return scenario.lattice.passing_time_s(front, its.to_m)
+    blocks = lattice.block_range(numbers[-1])[0], lattice.block_range(numbers[0])[-1]
+    return lattice.passing_time_s(blocks[its is every[-1]], its.to_m)
+
+
+def deadline_s(cells: Collection[Cell], numbers: Numbers, stage: int, scenario: Scenario) -> float:
+    """Return the road time by which moves from and to some cells should be complete.
+
+    A cell of a lane that ends passes the end of the stage then; in the last stage, any cell.
+    """
+    every = stages(scenario)
+    its, ends_s = every[stage], stage_end_s(numbers, stage, scenario)
+    ending = [cell for cell in cells if cell[1] in its.ending_lanes]
+    if its is every[-1]:
+        return exit_time_s(cells, scenario, its.to_m)
+    return min(ends_s, exit_time_s(ending, scenario, its.to_m)) if ending else ends_s
 
 
 def joinable(

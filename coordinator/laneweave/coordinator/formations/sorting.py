@@ -24,7 +24,7 @@ from laneweave.coordinator.planning.budget import Clock
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
-from laneweave.coordinator.planning.targets import choose_lanes, placements
+from laneweave.coordinator.planning.targets import assign_nearby, choose_lanes, placements
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import DrivingStructure, Scenario
@@ -142,7 +142,7 @@ def plan_requests(task: SortingTask, exempt: Name | None = None) -> Iterator[Pla
             task, {name: min(each) for name, each in wanted.items()}
         )
     else:
-        yield _into_lanes(task, wanted)
+        yield from _into_lanes(task, wanted)
 
 
 def _into_parallel_structure(
@@ -168,10 +168,12 @@ def _into_parallel_structure(
         yield _plan_request(task, vehicles, targets.cells)
 
 
-def _into_lanes(task: SortingTask, wanted: Mapping[Name, frozenset[int]]) -> PlanRequest:
-    """Return the request in which each vehicle may take any free cell of its goal lanes.
+def _into_lanes(task: SortingTask, wanted: Mapping[Name, frozenset[int]]) -> Iterator[PlanRequest]:
+    """Yield the request in which each vehicle may take any free cell of its goal lanes.
 
-    Vehicles for which these have too few cells may take any cell of the lanes that go on.
+    Vehicles for which these have too few cells may take any cell of the lanes that go on. In the
+    second request every vehicle has one target, so that no vehicle has a long way: such plans may
+    have fewer steps.
     """
     free = [
         (column, lane)
@@ -182,17 +184,16 @@ def _into_lanes(task: SortingTask, wanted: Mapping[Name, frozenset[int]]) -> Pla
     through = task.open_lanes if task.stage is None else task.stage.through_lanes
     chosen = choose_lanes(task.movers, wanted, through, free)
     targets = tuple(cell for cell in free if any(cell[1] in lanes for lanes in chosen.values()))
-    vehicles = [
-        VehicleRequest(
-            name,
-            cell,
-            eligible=tuple(
-                number for number, target in enumerate(targets) if target[1] in chosen[name]
-            ),
-        )
-        for name, cell in task.movers.items()
-    ]
-    return _plan_request(task, vehicles, targets)
+    eligible = {
+        name: tuple(number for number, cell in enumerate(targets) if cell[1] in lanes)
+        for name, lanes in chosen.items()
+    }
+    nearby = assign_nearby(task.movers, eligible, targets)
+    for each in eligible, {name: (number,) for name, number in nearby.items()}:
+        vehicles = [
+            VehicleRequest(name, cell, eligible=each[name]) for name, cell in task.movers.items()
+        ]
+        yield _plan_request(task, vehicles, targets)
 
 
 def _plan_request(

@@ -31,7 +31,7 @@ class Stage:
     from_m: float
     """A formation begins once its rear has passed this position."""
     to_m: float
-    """Where its front should have completed the plan; for a structure, where its rear should."""
+    """Where the plan should be complete: in lanes that end there, before each vehicle passes it."""
     structure: DrivingStructure | None = None
     """Structure to form, with any vehicle in any place; None: sort by goal lanes."""
     road: tuple[LaneSection, ...] = ()
@@ -58,6 +58,11 @@ class Stage:
         """Those of them that go on behind the stage, or else all."""
         through = {one.lane for one, line_m in self.open_sections if line_m > self.to_m}
         return frozenset(through) or self.lanes
+
+    @property
+    def ending_lanes(self) -> frozenset[int]:
+        """Those of them that end with the stage, although others go on."""
+        return self.lanes - self.through_lanes
 
     def goal_lanes(self, preferred_lane: int, destination: str = END_OF_ROAD) -> frozenset[int]:
         """Return the lanes in one of which a vehicle should be at the end of the stage.
@@ -93,6 +98,13 @@ class Stage:
         ]
 
 
+def shortest_stage_m(scenario: Scenario) -> float:
+    """Return the distance in which the longest formation can begin and complete a step."""
+    formation = scenario.formation
+    length_m = (formation.max_length - 1) * formation.gap_m + scenario.longest_body_m
+    return length_m + formation.speed_mps * scenario.cycles_s[0]
+
+
 @lru_cache(maxsize=16)
 def stages(scenario: Scenario) -> tuple[Stage, ...]:
     """Return the stages of formations, from the start of the road to its end."""
@@ -105,7 +117,16 @@ def stages(scenario: Scenario) -> tuple[Stage, ...]:
         for position_m in (max(one.from_m, one.moves_from_m), line_m)
         if start_m < position_m < end_m
     }
-    bounds_m = [*(one.from_m for one in structures), start_m, *sorted(changes_m), end_m]
+    ends_m = {*lines_m, end_m}
+    bounds_m = [start_m]
+    for position_m in sorted({*changes_m, end_m}):
+        # Where lanes only begin, a stage before is left out that is too short for a formation.
+        known_m = max(bounds_m[-1], *scenario.entry_m)
+        if position_m not in ends_m and position_m < known_m + shortest_stage_m(scenario):
+            bounds_m[-1] = position_m
+        else:
+            bounds_m.append(position_m)
+    bounds_m = [*(one.from_m for one in structures), *bounds_m]
     return tuple(
         Stage(
             from_m,

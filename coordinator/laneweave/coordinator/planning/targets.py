@@ -115,6 +115,26 @@ def choose_lanes(
     return chosen
 
 
+def assign_nearby(
+    cells: Mapping[Name, Cell], eligible: Mapping[Name, Sequence[int]], targets: Sequence[Cell]
+) -> dict[Name, int]:
+    """Return one target for each vehicle with the smallest sum of squared distances.
+
+    Args:
+        cells: current cell of each vehicle.
+        eligible: indices of the targets that each vehicle may have.
+        targets: the target cells.
+    """
+    longest = sum(max(cell) + 1 for cell in (*cells.values(), *targets))
+    costs = np.full((len(cells), len(targets)), 1 + len(cells) * longest**2)
+    for row, (name, (column, lane)) in enumerate(cells.items()):
+        for number in eligible[name]:
+            distance = abs(column - targets[number][0]) + abs(lane - targets[number][1])
+            costs[row, number] = distance**2
+    found = linear_sum_assignment(costs)[1]
+    return {name: int(number) for name, number in zip(cells, found, strict=True)}
+
+
 def _combinations(choices: Sequence[Sequence[tuple[float, list[Cell]]]]) -> Iterator[list[Cell]]:
     """Yield the cells of one choice per lane, in ascending order of the sum of ranks."""
 

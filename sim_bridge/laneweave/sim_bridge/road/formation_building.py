@@ -267,7 +267,9 @@ class GrowingFormations:
     @property
     def closed_to(self) -> int:
         """Block up to which all blocks are closed; -1: none."""
-        return self.lattice.block_of(int(max(self.first_open_column, self._ramp_column))) - 1
+        waiting = [shape.front for shape in self._complete]
+        foremost = max(self.first_open_column, self._ramp_column, *waiting)
+        return self.lattice.block_of(int(foremost)) - 1
 
     def closed(self, t_s: float) -> list[ClosedFormation]:
         """Return the formations that have been closed since the last call."""
