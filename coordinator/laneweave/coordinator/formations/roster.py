@@ -132,10 +132,9 @@ def closed_formations(
     for closed in census.formations:
         closed_s.setdefault(groups.of(closed.first_block)[0], []).append(closed.closed_s)
     members: dict[int, list[CensusEntry]] = {}
-    for entry in census.on_road:
-        if entry.off_lattice is None:
-            first = groups.of(lattice.block_of(entry.cell[0]))[0]
-            members.setdefault(first, []).append(entry)
+    for entry in census.on_lattice:
+        first = groups.of(lattice.block_of(entry.cell[0]))[0]
+        members.setdefault(first, []).append(entry)
     listed_blocks = {block for closed in census.formations for block in closed.blocks}
     formations: dict[int, Formation] = {}
     for first, each in sorted(members.items()):

@@ -118,22 +118,20 @@ def stages(scenario: Scenario) -> tuple[Stage, ...]:
         if start_m < position_m < end_m
     }
     ends_m = {*lines_m, end_m}
-    bounds_m = [start_m]
+    parts_m, from_m = [*pairwise([*(one.from_m for one in structures), start_m])], start_m
     for position_m in sorted({*changes_m, end_m}):
-        # Where lanes only begin, a stage before is left out that is too short for a formation.
-        known_m = max(bounds_m[-1], *scenario.entry_m)
-        if position_m not in ends_m and position_m < known_m + shortest_stage_m(scenario):
-            bounds_m[-1] = position_m
-        else:
-            bounds_m.append(position_m)
-    bounds_m = [*(one.from_m for one in structures), *bounds_m]
+        known_m = max(from_m, *scenario.entry_m)
+        # Before a lane that begins, a stage is left out that is too short for a formation.
+        if position_m in ends_m or position_m >= known_m + shortest_stage_m(scenario):
+            parts_m.append((from_m, position_m))
+        from_m = position_m
     return tuple(
         Stage(
-            from_m,
+            begins_m,
             to_m,
             structures[number] if number < len(structures) else None,
             scenario.sections,
             lines_m,
         )
-        for number, (from_m, to_m) in enumerate(pairwise(bounds_m))
+        for number, (begins_m, to_m) in enumerate(parts_m)
     )

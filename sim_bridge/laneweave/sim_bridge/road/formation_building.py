@@ -127,7 +127,7 @@ class ColumnBlocks:
     def reserve(self, column: int, count: int, t_s: float) -> range:
         """Reserve columns from the first block behind a column on; return the foremost `count`."""
         del t_s
-        first = self.lattice.block_of(column) + 1
+        first = max(self.lattice.block_of(column), *self._reserved, self._next) + 1
         self._reserved |= {
             first + number for number in range(math.ceil(count / self.lattice.block_columns))
         }

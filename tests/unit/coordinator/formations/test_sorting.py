@@ -11,11 +11,13 @@ from hypothesis import strategies as st
 
 from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, plan_requests, sort_lanes
+from laneweave.coordinator.formations.stages import stages
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.lattice import Cell, footprint
-from laneweave.protocol.scenario.fields import DrivingStructure, Scenario
+from laneweave.protocol.road_layout import ANY_LANE
+from laneweave.protocol.scenario.fields import Closure, DrivingStructure, Road, Scenario
 from laneweave.protocol.wire.messages import Name
 from support.paper import FORMATIONS, PAPER
 
@@ -283,3 +285,80 @@ def test_a_sorting_without_paths_is_not_solved() -> None:
     response = sort(task({A: (0, 0)}, {A: 1})).response
     assert isinstance(response, PlanResponse)
     assert not Sorting(evolve(response, paths=()), {}, (), short_of_room=False).solved
+
+
+# --- roads whose lanes end --------------------------------------------------------------------
+
+DROP = evolve(SCENARIO, road=Road(s1_m=50.0, s2_m=100.0, s3_m=850.0, closures=(Closure(0, 800.0),)))
+
+
+@st.composite
+def tasks_on_roads(draw: st.DrawFn) -> SortingTask:
+    """Vehicles anywhere in a block, in one of the two stages of a lane drop."""
+    number = draw(st.integers(0, 1))
+    stage = stages(DROP)[number]
+    every = sorted(LATTICE.block_cells(0))
+    cells = draw(st.lists(st.sampled_from(every), min_size=1, max_size=6, unique=True))
+    names = [Name(f"v{index}") for index in range(len(cells))]
+    goals = {
+        name: stage.goal_lanes(draw(st.sampled_from([ANY_LANE, ANY_LANE, 1, 2]))) for name in names
+    }
+    unattended = draw(st.lists(st.sampled_from(names), max_size=1))
+    hold_cells = dict(zip(names, cells, strict=True))
+    return SortingTask((0,), hold_cells, goals, unattended, DROP, DEADLINE_S, stage=stage)
+
+
+@given(order=tasks_on_roads())
+@settings(max_examples=60)
+def test_closed_lanes_are_not_used_and_all_find_a_cell_in_lanes_that_go_on(
+    order: SortingTask,
+) -> None:
+    sorting = sort(order)
+    final = ends(order, sorting)
+    stage = order.stage
+    assert stage is not None
+    assert len(set(final.values())) == len(final)
+    for name, moves in sorting.moves.items():
+        assert not moves or order.hold_cells[name][1] in stage.lanes
+        assert all(target[1] in stage.lanes for _, _, target in moves)
+        assert not moves or name not in order.unattended
+    assert set(sorting.out_of_reach) == {
+        name for name, cell in final.items() if cell[1] not in order.goal_lanes[name]
+    }
+    if sorting.solved and not order.unattended and len(order.movers) == len(final):
+        assert all(cell[1] in stage.through_lanes for cell in final.values())
+
+
+def test_of_the_vehicles_that_need_a_full_lane_the_furthest_take_another_that_goes_on() -> None:
+    stage = stages(DROP)[0]
+    cells = {Name(f"v{number}"): (-number, number % 2) for number in range(4)}
+    cells |= {E: (-1, 2), F: (-3, 2)}
+    goals = {name: frozenset({2}) for name in cells}
+    sorting = sort(SortingTask((0,), cells, goals, (), DROP, DEADLINE_S, stage=stage))
+    assert sorting.solved
+    final = ends(SortingTask((0,), cells, goals, (), DROP, DEADLINE_S, stage=stage), sorting)
+    in_lane = [name for name, cell in final.items() if cell[1] == 2]
+    assert len(in_lane) == 4
+    assert {E, F} < {*in_lane}
+
+
+def test_a_plan_with_long_ways_is_made_again_with_near_targets() -> None:
+    stage = stages(DROP)[0]
+    cells = {A: (0, 0), B: (0, 1), C: (-1, 0), D: (-1, 1), E: (-2, 0), F: (-3, 2)}
+    order = SortingTask(
+        (0,), cells, dict.fromkeys(cells, frozenset({1, 2})), (), DROP, DEADLINE_S, stage=stage
+    )
+    asked: list[PlanRequest] = []
+
+    def slow(request: PlanRequest, *, max_nodes: int, max_memory_mb: int) -> PlanResponse:
+        asked.append(request)
+        response = plan(request, max_nodes=max_nodes, max_memory_mb=max_memory_mb)
+        return evolve(response, steps=9) if len(asked) == 1 else response
+
+    in_time = evolve(order, steps=3)
+    found = sort_lanes(in_time, NODES, slow)
+    assert len(asked) == 2
+    assert all(len(vehicle.eligible or ()) == 1 for vehicle in asked[1].vehicles)
+    assert found.response is not None
+    assert found.response.steps is not None
+    assert found.response.steps <= 3

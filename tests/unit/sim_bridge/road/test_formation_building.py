@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.protocol.lattice import Lattice
-from laneweave.protocol.scenario.fields import FormationSettings, Scenario
+from laneweave.protocol.scenario.fields import FormationSettings, Scenario, formation_columns
 from laneweave.protocol.wire.messages import ClosedFormation
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
@@ -50,6 +50,10 @@ class Entrance:
     builder: FormationBuilder
     spread_s: float
     interlaced: bool = False
+    entry_m: tuple[float, ...] = ()
+    reserve_s: tuple[float, ...] = ()
+    """Times at which columns are reserved."""
+    reserved: list[range] = field(factory=list)
     admissions: list[Admission] = field(factory=list)
     formations: list[ClosedFormation] = field(factory=list)
 
@@ -60,7 +64,13 @@ class Entrance:
 
     def run(self, stream: list[Arrival]) -> None:
         """Run until all vehicles have entered and the last formation is closed."""
-        meter = EntryMeter(self.grid, self.spread_s, self.builder, interlaced=self.interlaced)
+        meter = EntryMeter(
+            self.grid,
+            self.spread_s,
+            self.builder,
+            interlaced=self.interlaced,
+            entry_m=self.entry_m,
+        )
         pending, tick, rest = list(stream), 0, 0
         while rest < 400:
             t_s = TICK_S * tick
@@ -77,6 +87,8 @@ class Entrance:
         blocks = [self.grid.block_of(admission.cell[0]) for admission in entered]
         assert all(block > closed_to for block in blocks), "a vehicle enters a closed column"
         self.admissions += entered
+        if any(t_s - TICK_S < reserve_s <= t_s for reserve_s in self.reserve_s):
+            self.reserved.append(meter.keep_free(self.grid.lanes - 1, GAP, t_s))
         for closed in self.builder.closed(t_s):
             assert closed.closed_s <= t_s + 1e-9
             assert closed.first_block > closed_to, "a column has two formations"
@@ -211,6 +223,74 @@ BUGS = {
     "closed-too-early": ClosesTooEarly,
     "columns-forgotten": ForgetsColumns,
 }
+
+
+# --- ramps and reserved columns ---------------------------------------------------------------
+
+GAP = 4
+RAMP_M = 52.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("grows", [True, False], ids=["growing", "blocks of columns"])
+@given(case=cases(), reserve_s=st.lists(st.floats(0.0, 60.0), max_size=3), on_ramp=st.booleans())
+@settings(max_examples=150)
+def test_ramps_and_reserved_columns_leave_every_vehicle_in_one_formation(
+    case: Case, reserve_s: list[float], *, on_ramp: bool, grows: bool
+) -> None:
+    """A formation is closed when its columns have passed the ramp; nobody enters a gap."""
+    lanes = case.lanes + 1
+    entry_m = (RAMP_M if on_ramp else 0.0, *(0.0,) * case.lanes)
+    ramps = frozenset({0}) if on_ramp else frozenset[int]()
+    entrances = Entrances(case.lanes, ramps, max(entry_m), 0.3 if on_ramp else 0.0)
+    grid = lattice(lanes, 1 if grows else BLOCK_COLUMNS)
+    most = case.most_vehicles if grows else min(case.most_vehicles, max(3 * case.lanes, 1))
+    builder: FormationBuilder = (
+        GrowingFormations(grid, most, case.most_columns, case.spread_s, entrances)
+        if grows
+        else ColumnBlocks(grid, most, case.spread_s, entrances)
+    )
+    entrance = Entrance(
+        grid, builder, case.spread_s, case.interlaced, entry_m, tuple(sorted(reserve_s))
+    )
+    entrance.run(list(case.stream))
+    assert {each.arrival for each in entrance.admissions} == set(case.stream)
+    columns = Counter(
+        column for closed in entrance.formations for column in closed.columns(grid)
+    ) + Counter(column for gap in entrance.reserved for column in gap)
+    assert max(columns.values(), default=1) == 1, "a column belongs to two"
+    for admission in entrance.admissions:
+        assert columns[admission.cell[0]] == 1
+        assert not any(admission.cell[0] in gap for gap in entrance.reserved)
+    for closed in entrance.formations:
+        count, length = len(entrance.members(closed)), len(closed.columns(grid))
+        assert count >= 1
+        assert not grows or length >= formation_columns(count, case.lanes)
+        assert grows or count <= max(most, (length - 1) * case.lanes)
+
+
+def test_a_formation_keeps_room_for_vehicles_from_a_ramp() -> None:
+    entrances = Entrances(3, frozenset({0}), 45.0, 0.25)
+    builder = GrowingFormations(lattice(4), 6, 7, SPREAD_S, entrances)
+    assert builder.shortest_length == 4  # 6 and 2 vehicles, 3 free cells, in 3 lanes
+    taken = take(builder, *((column, lane, -1) for column in (0, -1) for lane in (1, 2, 3)))
+    assert all(taken)
+    assert builder.closed(1.0) == [], "the ramp has not passed"
+    # With a fourth one, fewer cells than lanes would be free.
+    coming = [(column, 0, -1) for column in (1, 0, -1, -2)]
+    assert take(builder, *coming) == [True, True, True, False]
+    rear_s = builder.lattice.passing_time_s(-2, 45.0) + SPREAD_S
+    assert builder.closed(rear_s - 0.1) == []
+    (closed,) = builder.closed(rear_s + 0.1)
+    assert (closed.first_block, closed.last_block) == (-1, 2)
+
+
+def test_a_vehicle_from_a_ramp_begins_a_formation_where_there_is_none() -> None:
+    entrances = Entrances(3, frozenset({0}), 45.0, 0.25)
+    builder = GrowingFormations(lattice(4), 6, 7, SPREAD_S, entrances)
+    assert take(builder, (2, 0, -1), (-1, 1, -1)) == [True, True]
+    (closed,) = builder.closed(60.0)
+    assert (closed.first_block, closed.last_block) == (-3, 3)
 
 
 # --- lengths that follow the traffic ----------------------------------------------------------
