@@ -10,10 +10,10 @@ import pytest
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.search import run_story
 from laneweave.launch.fault_search.story import Story
-from support import broken_lane_ends, broken_roads
+from support import broken_formations_on_roads, broken_lane_ends, broken_roads
 
 Bug = Callable[[pytest.MonkeyPatch], None]
-LANE_ENDS, ROADS = "lane-ends", "roads"
+LANE_ENDS, ROADS, FORMATIONS = "lane-ends", "roads", "entry-roads"
 BUGS: list[tuple[str, Bug, int]] = [
     (LANE_ENDS, broken_lane_ends.never_leaves, 4),
     (LANE_ENDS, broken_lane_ends.agents_move_vehicles_without_cells, 17),
@@ -27,6 +27,9 @@ BUGS: list[tuple[str, Bug, int]] = [
     (ROADS, broken_roads.late_commands_repeat_moves, 386),
     (ROADS, broken_roads.agents_insist, 337),
     (ROADS, broken_roads.types_are_ignored, 2),
+    (FORMATIONS, broken_formations_on_roads.columns_are_not_reserved, 17),
+    (FORMATIONS, broken_formations_on_roads.ramps_are_forgotten, 2),
+    (FORMATIONS, broken_formations_on_roads.columns_ahead_are_closed, 2),
 ]
 """Profiles, bugs, and a seed that catches each."""
 
@@ -50,15 +53,21 @@ def test_an_agent_gives_up_a_move_that_its_lane_end_does_not_allow_any_more(
     assert [one.kind for one in run_story(story).violations] == ["stuck"]
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_runs_without_violations(seed: int) -> None:
-    assert run_story(Story.drawn(seed, PROFILES[ROADS])).violations == ()
+@pytest.mark.parametrize(
+    ("profile", "seed"), [*((ROADS, n) for n in range(20)), *((FORMATIONS, n) for n in range(12))]
+)
+def test_runs_without_violations(profile: str, seed: int) -> None:
+    assert run_story(Story.drawn(seed, PROFILES[profile])).violations == ()
 
 
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("profile", "seed"),
-    [*((LANE_ENDS, seed) for seed in range(1000, 1100)), *((ROADS, n) for n in range(1000, 1200))],
+    [
+        (profile, seed)
+        for profile, count in ((LANE_ENDS, 100), (ROADS, 200), (FORMATIONS, 200))
+        for seed in range(1000, 1000 + count)
+    ],
 )
 def test_more_runs_without_violations(profile: str, seed: int) -> None:
     assert run_story(Story.drawn(seed, PROFILES[profile])).violations == ()

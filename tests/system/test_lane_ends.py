@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from laneweave.protocol.wire.events import DRIVES_OUT, LEFT_LATTICE
 from support.harness import Lab, check_safe_and_complete, events, summary, trips
 
@@ -16,7 +18,7 @@ closures = [{ lane = 0, from_m = 400.0 }]
 volume_veh_per_lane_h = 1200.0
 duration_s = 30.0
 [formation]
-operation = "rolling"
+operation = "OPERATION"
 cycle_s = 4.0
 [runtime]
 vehicles_per_process = 1
@@ -28,8 +30,10 @@ between_s = [8.0, 20.0]
 """
 
 
-def test_vehicles_without_agents_stop_wait_and_get_on(lab: Lab) -> None:
-    road, faults = lab.path("road.toml", ROAD), lab.path("faults.toml", KILLS)
+@pytest.mark.parametrize("operation", ["rolling", "formations"])
+def test_vehicles_without_agents_stop_wait_and_get_on(lab: Lab, operation: str) -> None:
+    road = lab.path("road.toml", ROAD.replace("OPERATION", operation))
+    faults = lab.path("faults.toml", KILLS)
     folder = lab.folder / "run"
     ended = lab.run("run", road, "--faults", faults, "--out", folder)
     assert (ended.status, ended.complaints) == (0, []), ended

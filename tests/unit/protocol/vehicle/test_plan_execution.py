@@ -131,6 +131,15 @@ def test_v2_not_in_the_roster() -> None:
     assert execution.wanted_joined == (0,)
 
 
+def test_v2_ignores_formations_to_which_it_does_not_belong_any_more() -> None:
+    """A late ballot may name a vehicle that has left the lattice and entered it elsewhere."""
+    execution = vehicle(joined=(7, 8))
+    assert not execution.on_prepare(prepare(HIGH, formations=(0, 1)))
+    assert (execution.promised, execution.wanted_joined) == (None, (7, 8))
+    assert execution.on_prepare(prepare(LOW, formations=(6, 7)))
+    assert execution.promised == LOW
+
+
 @pytest.mark.parametrize("ballot", [LOW, MID])
 @pytest.mark.parametrize("reach", [taken, accepted, going])
 def test_v2_a_repeat_or_a_lower_ballot_changes_nothing(
