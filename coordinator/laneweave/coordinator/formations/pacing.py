@@ -1,9 +1,10 @@
 """Timing of a plan: start, slot length, pauses for neighbouring formations.
 
-When sorting, vehicles change lanes in S3 only (paper, Section 5.2.1). If the scenario does not fix
-T_F, a plan gets the longest slots with which it ends in time, and begins as early as possible
-without any lane change before S3. Before the rear of the formation is in S3, vehicles may
-already move along the road, and those in S3 may change lanes.
+When sorting, vehicles change lanes in S3 only (paper, Section 5.2.1), or in a later stage of the
+road (`stages`). If the scenario does not fix T_F, a plan gets the longest slots with which it ends
+in time, and begins as early as possible without any lane change before the stage. Before the rear
+of the formation is in the stage, vehicles may already move along the road, and those in it may
+change lanes.
 
 Plans stay in the blocks of their formations, so their footprints never intersect. But two moves
 towards each other across the border between formations (conflict kind `closing`) would trigger the
@@ -57,7 +58,7 @@ def paced(
     The plan pauses where its moves would have `closing` conflicts with those of its neighbours.
 
     Args:
-        plan: plan with the latest start: when all of its vehicles are in S3.
+        plan: plan with the latest start: when all of its vehicles are in the stage.
         others: plans of neighbouring formations; not changed.
         not_before_s: earliest start (road time).
         end_s: road time by which the plan should be complete.

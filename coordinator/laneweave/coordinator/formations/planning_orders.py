@@ -18,7 +18,7 @@ from laneweave.coordinator.formations.roster import (
     Formation,
     Groups,
     Numbers,
-    deadline_s,
+    moves_end_s,
     on_tick,
     stage_begin_s,
     stage_end_s,
@@ -45,7 +45,7 @@ from laneweave.protocol.wire.events import (
     STRUCTURE_IMPOSSIBLE,
     STRUCTURE_TOO_LATE,
 )
-from laneweave.protocol.wire.messages import Ballot, Plan
+from laneweave.protocol.wire.messages import Ballot, Name, Plan
 
 START_MARGIN_S = 0.5
 """Minimum road time from the end of planning to the start of the plan."""
@@ -151,11 +151,18 @@ class FormationPlanner:
         stage = every[formation.stage]
         start_s = self._start_s(formation, cells, t_s)
         end_s = stage_end_s(numbers, formation.stage, scenario)
+        too_late: frozenset[Name] = frozenset()
         if formation.sorts and stage is not every[-1]:
-            end_s = deadline_s(cells, numbers, formation.stage, scenario)
+            ends_s = self._ends_s(leader)
+            soonest_s = start_s + scenario.cycles_s[0]
+            too_late = frozenset(name for name, each_s in ends_s.items() if each_s < soonest_s)
+            in_time = [each_s for name, each_s in ends_s.items() if name not in too_late]
+            end_s = min([end_s, *in_time]) if in_time or not too_late else max(ends_s.values())
         if stage is not every[-1] and end_s < start_s + scenario.cycles_s[0]:
+            if not leader.failures:
+                data = {"formation": numbers[0], "stage": formation.stage}
+                yield LogEntry(STRUCTURE_TOO_LATE, data)
             leader.take(FAILED, now_s)
-            yield LogEntry(STRUCTURE_TOO_LATE, {"formation": numbers[0], "stage": formation.stage})
             return
         if steps_left(cells, start_s, scenario.cycles_s[0], scenario) == 0:
             leader.take(TOO_LATE, now_s)
@@ -165,7 +172,7 @@ class FormationPlanner:
             numbers,
             leader.hold_cells,
             formation.goal_lanes if formation.sorts else {},
-            leader.unattended,
+            leader.unattended | too_late,
             scenario,
             deadline_s=self._deadline_s(start_s, t_s),
             steps=comfortable_steps(start_s, end_s, scenario),
@@ -179,6 +186,18 @@ class FormationPlanner:
         # The job detects invalid promises; they are handled like any planning failure.
         self._waiting[numbers[0]] = ballot, partial(sort_lanes, task, nodes, self._make_plan)
         yield from self._begin()
+
+    def _ends_s(self, leader: FormationLeader) -> dict[Name, float]:
+        """Return until when the members that have to change lanes can do so (road time)."""
+        formation, scenario = leader.formation, self._scenario
+        block_of, goals = scenario.lattice.block_of, formation.goal_lanes
+        return {
+            name: moves_end_s([cell], formation.numbers, formation.stage, scenario)
+            for name, cell in leader.hold_cells.items()
+            if name not in leader.unattended
+            and cell[1] not in goals[name]
+            and block_of(cell[0]) in formation.numbers
+        }
 
     def _begin(self) -> Iterator[Compute]:
         """Start the oldest request that is still needed, unless a computation is running."""
@@ -246,15 +265,17 @@ class FormationPlanner:
             if leader.formation.joined + other.formation.joined > max_joined:
                 continue
             union = (*numbers, *other.formation.numbers)
-            if self._steps_left_in(union, t_s) > 0:
+            if self._steps_left_in(union, leader.formation.stage, t_s) > 0:
                 return self._groups.join(union)
         return False
 
-    def _steps_left_in(self, numbers: Numbers, t_s: float) -> int:
-        """Return the number of steps left for vehicles anywhere in these blocks."""
-        cells, scenario = self._block_cells(numbers), self._scenario
-        start_s = start_time_s(cells, t_s + START_MARGIN_S, scenario)
-        return steps_left(cells, start_s, scenario.cycles_s[0], scenario)
+    def _steps_left_in(self, numbers: Numbers, stage: int, t_s: float) -> int:
+        """Return the number of steps left in a stage for vehicles anywhere in these blocks."""
+        cells, scenario = self._block_cells(tuple(sorted(numbers))), self._scenario
+        from_m = stages(scenario)[stage].from_m
+        start_s = start_time_s(cells, t_s + START_MARGIN_S, scenario, from_m)
+        end_s = moves_end_s(cells, tuple(sorted(numbers)), stage, scenario)
+        return int((end_s - start_s) / scenario.cycles_s[0] + 1e-6)
 
     def _block_cells(self, numbers: Numbers) -> list[Cell]:
         lattice = self._scenario.lattice
@@ -273,7 +294,8 @@ class FormationPlanner:
         if formation.closes_by_vehicles or len(numbers) >= formation.max_joined:
             return False
         rear = lattice.block_range(numbers[-1] + 1)[0]
-        closes_s = lattice.passing_time_s(rear) + formation.entry_spread_s
+        entered_s = lattice.passing_time_s(rear, max(self._scenario.entry_m))
+        closes_s = entered_s + formation.entry_spread_s
         return closes_s - ROOM_S < t_s <= closes_s + START_MARGIN_S
 
     def _plan(self, leader: FormationLeader, sorting: Sorting, t_s: float) -> Plan:
@@ -289,8 +311,10 @@ class FormationPlanner:
             end_s = stage_end_s(formation.numbers, formation.stage, scenario)
             return paced(plan, others, plan.t0_s, end_s, scenario)
         stage = stages(scenario)[formation.stage]
-        used = {*cells, *plan.territory}
-        end_s = deadline_s(used, formation.numbers, formation.stage, scenario)
+        moved = {cell for moves in plan.moves.values() for _, *each in moves for cell in each}
+        if stage is stages(scenario)[-1] or not moved:
+            moved = {*cells, *plan.territory}
+        end_s = moves_end_s(moved, formation.numbers, formation.stage, scenario)
         not_before_s = max(self._settled_s(cells), t_s + START_MARGIN_S)
         return paced(plan, others, not_before_s, end_s, scenario, stage.from_m)
 

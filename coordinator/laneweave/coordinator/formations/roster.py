@@ -184,27 +184,27 @@ def stage_end_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
     """Return the road time by which the plan of a stage should be complete.
 
     At this time the next stage is planned or, in the last one, the front of the formation leaves
-    the road. In lanes that end with the stage, moves must be complete before (`deadline_s`).
+    the road. In lanes that end with the stage, moves must be complete before (`moves_end_s`).
     """
-    every, lattice = stages(scenario), scenario.lattice
-    its = every[stage]
-    if its.structure is not None:
+    lattice, of_road = scenario.lattice, stages(scenario)
+    if of_road[stage].structure is not None:
         return stage_begin_s(numbers, stage + 1, scenario) - STAGE_LEAD_S
-    blocks = lattice.block_range(numbers[-1])[0], lattice.block_range(numbers[0])[-1]
-    return lattice.passing_time_s(blocks[its is every[-1]], its.to_m)
+    rear, front = lattice.block_range(numbers[-1])[0], lattice.block_range(numbers[0])[-1]
+    is_last = stage == len(of_road) - 1
+    return lattice.passing_time_s(front if is_last else rear, of_road[stage].to_m)
 
 
-def deadline_s(cells: Collection[Cell], numbers: Numbers, stage: int, scenario: Scenario) -> float:
+def moves_end_s(cells: Collection[Cell], numbers: Numbers, stage: int, scenario: Scenario) -> float:
     """Return the road time by which moves from and to some cells should be complete.
 
     A cell of a lane that ends passes the end of the stage then; in the last stage, any cell.
     """
-    every = stages(scenario)
-    its, ends_s = every[stage], stage_end_s(numbers, stage, scenario)
-    ending = [cell for cell in cells if cell[1] in its.ending_lanes]
-    if its is every[-1]:
-        return exit_time_s(cells, scenario, its.to_m)
-    return min(ends_s, exit_time_s(ending, scenario, its.to_m)) if ending else ends_s
+    of_road = stages(scenario)
+    to_m, ends_s = of_road[stage].to_m, stage_end_s(numbers, stage, scenario)
+    if stage == len(of_road) - 1:
+        return exit_time_s(cells, scenario, to_m)
+    ending = [cell for cell in cells if cell[1] in of_road[stage].ending_lanes]
+    return min(ends_s, exit_time_s(ending, scenario, to_m)) if ending else ends_s
 
 
 def joinable(

@@ -1,11 +1,11 @@
 """Lane sorting of one formation, or of joined ones: from promises to moves.
 
 The grid consists of the blocks of the formations, in the lanes that are open. Vehicles without an
-agent block their cells. If every vehicle has one goal lane, they form the parallel structure;
-otherwise they take any cells of their goal lanes. If complete sorting is infeasible, one vehicle is
-exempted from reaching its lane, so that a single blocked vehicle does not prevent all others from
-sorting; the vehicles are tried one by one. Before sorting, a formation may form other structures,
-in which every vehicle may take any place.
+agent block their cells. If every vehicle has one goal lane and no lane ends, they form the parallel
+structure; otherwise they take any cells of their goal lanes. If complete sorting is infeasible, one
+vehicle is exempted from reaching its lane, so that a single blocked vehicle does not prevent all
+others from sorting; the vehicles are tried one by one. Before sorting, a formation may form other
+structures, in which every vehicle may take any place.
 """
 
 from __future__ import annotations
@@ -137,7 +137,8 @@ def plan_requests(task: SortingTask, exempt: Name | None = None) -> Iterator[Pla
         name: frozenset({cell[1]}) if name == exempt else task.goal_lanes[name]
         for name, cell in task.movers.items()
     }
-    if all(len(lanes) == 1 for lanes in wanted.values()):
+    lanes_end = task.stage is not None and bool(task.stage.ending_lanes)
+    if not lanes_end and all(len(lanes) == 1 for lanes in wanted.values()):
         yield from _into_parallel_structure(
             task, {name: min(each) for name, each in wanted.items()}
         )

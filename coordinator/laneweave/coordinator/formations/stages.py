@@ -1,4 +1,4 @@
-"""Stages of the way of a formation: where its lanes change, and which lanes its vehicles need.
+"""Stages of a road for formations: where lanes change, and which lanes vehicles need.
 
 Before S3, the structures of the scenario are the stages (paper, Section 2.2). From the start of S3
 on, a stage ends wherever lanes end, begin or leave the road. On a road whose lanes are the same
@@ -10,7 +10,7 @@ destination. If none of them is open yet, it needs the nearest lane that goes on
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 
 from attrs import frozen
@@ -39,7 +39,7 @@ class Stage:
     lines_m: tuple[float, ...] = ()
     """Where moves must have ended in each of them."""
 
-    @property
+    @cached_property
     def open_sections(self) -> list[tuple[LaneSection, float]]:
         """Sections in which vehicles may move throughout the stage, with their lines."""
         return [
@@ -48,12 +48,12 @@ class Stage:
             if max(section.from_m, section.moves_from_m) <= self.from_m and self.to_m <= line_m
         ]
 
-    @property
+    @cached_property
     def lanes(self) -> frozenset[int]:
         """Lanes whose cells plans may use."""
         return frozenset(section.lane for section, _ in self.open_sections)
 
-    @property
+    @cached_property
     def through_lanes(self) -> frozenset[int]:
         """Those of them that go on behind the stage, or else all."""
         through = {one.lane for one, line_m in self.open_sections if line_m > self.to_m}

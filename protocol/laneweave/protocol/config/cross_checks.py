@@ -17,6 +17,7 @@ from laneweave.protocol.scenario.fields import (
     MAIN_ENTRANCE,
     MAX_HORIZON_TICKS,
     Scenario,
+    formation_columns,
 )
 from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
 from laneweave.protocol.vehicle.lane_ends import dead_ends, drive_out, lane_beside
@@ -178,8 +179,9 @@ def _check_motion(scenario: Scenario) -> None:
         formation.weight_oblique,
         "at most 1 in mode 2 (an oblique edge is one step), at most 2 in mode 1",
     )
-    block_m = (formation.max_length - 1) * formation.gap_m
-    needed_m = block_m + scenario.longest_body_m + formation.speed_mps * scenario.cycles_s[0]
+    needed_m = (
+        _block_m(scenario) + scenario.longest_body_m + formation.speed_mps * scenario.cycles_s[0]
+    )
     _compare(scenario, [("road.s3_m", "at least", needed_m, "a whole formation and one step")])
     _require(
         formation.executable,
@@ -305,6 +307,15 @@ def _check_capacity(scenario: Scenario) -> None:
     ]
     volume = scenario.demand.volume_veh_per_lane_h
     if not scenario.formation.rolling:
+        formation = scenario.formation
+        columns = formation_columns(formation.max_vehicles, scenario.narrowest_lanes)
+        _require(
+            not formation.closes_by_vehicles or columns <= formation.max_columns,
+            "formation.max_columns",
+            formation.max_columns,
+            f"at least {columns}, for formation.max_vehicles = {formation.max_vehicles} where "
+            f"{scenario.narrowest_lanes} lanes are open",
+        )
         formations = math.floor(scenario.formation_bound_veh_per_lane_h)
         _require(
             volume <= formations,
@@ -359,12 +370,17 @@ def _check_destinations(scenario: Scenario) -> None:
 def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str) -> None:
     """Check that a vehicle from a lane has room for all lane changes to its destination."""
     own = min((one for one in scenario.sections if one.lane == lane), key=lambda one: one.from_m)
-    from_m = max(own.from_m, own.moves_from_m, scenario.moves_from_m) + scenario.longest_body_m
+    from_m, room_m = max(own.from_m, own.moves_from_m, scenario.moves_from_m), 0.0
+    if scenario.road.closures and not scenario.formation.rolling:
+        from_m = max(from_m, *scenario.entry_m) + _block_m(scenario)
+        room_m = drive_out(scenario).room_m
+    from_m += scenario.longest_body_m
     advance_m = scenario.formation.speed_mps * scenario.cycles_s[0]
     wanted = [lane for lane, share in enumerate(scenario.lane_shares) if share] or [ANY_LANE]
     for preferred in wanted if destination == END_OF_ROAD else [ANY_LANE]:
         room = [
-            section.to_m - (from_m + abs(section.lane - lane) * advance_m)
+            (section.to_m - room_m if section.to_m < scenario.road.length_m else section.to_m)
+            - (from_m + abs(section.lane - lane) * advance_m)
             for section in scenario.sections
             if section.serves(preferred, destination)
         ]
@@ -409,6 +425,18 @@ def _check_dead_ends(scenario: Scenario) -> None:
             f"the end of a lane beside one that is open from {end.line_m:g} m, its stop line, to "
             f"{needed.distance_m:g} m after it",
         )
+        before_m = end.line_m - _block_m(scenario) - _step_m(scenario)
+        _require(
+            scenario.formation.rolling
+            or any(
+                max(one.from_m, one.moves_from_m) <= before_m and one.to_m > end.end_m
+                for one in scenario.sections
+            ),
+            name,
+            end.end_m,
+            f"the end of a lane beside one that is open from {before_m:g} m on, so that a whole "
+            "formation can change lanes",
+        )
 
 
 def _step_m(scenario: Scenario) -> float:
@@ -429,10 +457,15 @@ def _first_step_m(scenario: Scenario, from_m: float) -> float:
     The vehicles of a formation are known once it has passed all entrances, and it moves once all of
     it is in the section.
     """
-    from_m, formation = max(from_m, scenario.moves_from_m), scenario.formation
-    if not formation.rolling:
-        from_m = max(from_m, *scenario.entry_m) + (formation.max_length - 1) * formation.gap_m
+    from_m = max(from_m, scenario.moves_from_m)
+    if not scenario.formation.rolling:
+        from_m = max(from_m, *scenario.entry_m) + _block_m(scenario)
     return from_m + _step_m(scenario)
+
+
+def _block_m(scenario: Scenario) -> float:
+    """Return the distance between the first and the last vehicle of the longest formation."""
+    return (scenario.formation.max_length - 1) * scenario.formation.gap_m
 
 
 def _limit_of(scenario: Scenario, vehicle_type: str, name: str) -> str:

@@ -601,6 +601,15 @@ class Scenario:
         return from_ramps / (self.demand.volume_veh_per_lane_h * len(self.road.first_lanes))
 
     @property
+    def vehicles_from_ramps(self) -> int:
+        """Vehicles from ramps for which a full formation has room, within its maximum length."""
+        formation, lanes = self.formation, self.narrowest_lanes
+        expected = math.ceil(formation.max_vehicles * self.ramp_share - 1e-9)
+        free = lanes if lanes > 1 else 0
+        room = formation.max_columns * lanes - free - formation.max_vehicles
+        return max(0, min(expected, room))
+
+    @property
     def formation_bound_veh_per_lane_h(self) -> float:
         """Maximum volume at the start of the road at which formations have room where lanes end.
 
@@ -608,8 +617,7 @@ class Scenario:
         """
         formation = self.formation
         most, per_column_s = formation.max_vehicles, formation.gap_m / formation.speed_mps
-        vehicles = most + math.ceil(most * self.ramp_share - 1e-9)
-        columns = formation_columns(vehicles, self.narrowest_lanes)
+        columns = formation_columns(most + self.vehicles_from_ramps, self.narrowest_lanes)
         if not formation.closes_by_vehicles:
             columns, most = formation.block_columns, self.block_vehicles
         return 3600.0 * most / (columns * per_column_s * len(self.road.first_lanes))
@@ -620,7 +628,8 @@ class Scenario:
         lanes, formation = self.narrowest_lanes, self.formation
         if lanes == self.road.lanes:
             return formation.max_vehicles
-        return min(formation.max_vehicles, max((formation.block_columns - 1) * lanes, 1))
+        room = (formation.block_columns - 1) * lanes / (1.0 + self.ramp_share)
+        return min(formation.max_vehicles, max(math.floor(room), 1))
 
     @cached_property
     def entry_m(self) -> tuple[float, ...]:

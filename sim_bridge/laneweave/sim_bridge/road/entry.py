@@ -95,19 +95,27 @@ class EntryMeter:
         """Queued vehicles, ordered by lane."""
         return tuple(arrival for queue in self._queues for arrival in queue)
 
+    def next_column(self, lane: int) -> int:
+        """Return the next column of a lane that vehicles can enter.
+
+        With formations, that of all lanes at the start of the road.
+        """
+        if self._builder is None:
+            return self._columns[lane]
+        return min(
+            column
+            for column, entry_m in zip(self._columns, self._entry_m, strict=True)
+            if entry_m <= 0.0
+        )
+
     def keep_free(self, lane: int, count: int, t_s: float) -> range:
         """Return the next columns of a lane, which no vehicle may enter any more.
 
         With formations, no vehicle may enter them in any lane.
         """
+        first = self.next_column(lane)
         if self._builder is not None:
-            first = min(
-                column
-                for column, entry_m in zip(self._columns, self._entry_m, strict=True)
-                if entry_m <= 0.0
-            )
             return self._builder.reserve(first, count, t_s)
-        first = self._columns[lane]
         self._columns[lane] = first - count
         return range(first - count + 1, first + 1)
 

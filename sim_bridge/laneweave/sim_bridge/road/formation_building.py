@@ -45,14 +45,15 @@ class Entrances:
     """Lanes of ramps."""
     last_m: float = 0.0
     """Position of the last entrance."""
-    ramp_share: float = 0.0
-    """Vehicles from ramps for each one that enters at the start of the road."""
+    from_ramps: int = 0
+    """Vehicles from ramps for which a full formation has room."""
 
     @classmethod
     def of(cls, scenario: Scenario) -> Entrances:
         """Return the entrances of a scenario."""
         ramps = frozenset(one.lane for one in scenario.entrance)
-        return cls(scenario.narrowest_lanes, ramps, max(scenario.entry_m), scenario.ramp_share)
+        from_ramps = scenario.vehicles_from_ramps
+        return cls(scenario.narrowest_lanes, ramps, max(scenario.entry_m), from_ramps)
 
     def first_column(self, lattice: Lattice) -> int:
         """Return the foremost column that vehicles can enter, which a ramp does at road time 0."""
@@ -147,7 +148,7 @@ class ColumnBlocks:
 
     @property
     def closed_to(self) -> int:
-        """Block up to which all blocks are closed; -1: none."""
+        """Block up to which all blocks are closed."""
         return self._next - 1
 
     def _closing_s(self, block: int) -> float:
@@ -202,7 +203,7 @@ class GrowingFormations:
 
     @property
     def shortest_length(self) -> int:
-        """Minimum number of columns of a full formation."""
+        """Minimum number of columns of a full formation, with the vehicles expected from ramps."""
         return self._length_for(self.max_vehicles + self._coming(0))
 
     def _length_for(self, vehicles: int) -> int:
@@ -211,8 +212,7 @@ class GrowingFormations:
 
     def _coming(self, entered: int) -> int:
         """Return how many more vehicles from ramps are expected in a full formation."""
-        expected = math.ceil(self.max_vehicles * self.entrances.ramp_share - 1e-9)
-        return max(expected - entered, 0)
+        return max(self.entrances.from_ramps - entered, 0)
 
     def try_add(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
         """Add a vehicle that would enter in a cell; return False if it needs a later cell."""
@@ -266,7 +266,7 @@ class GrowingFormations:
 
     @property
     def closed_to(self) -> int:
-        """Block up to which all blocks are closed; -1: none."""
+        """Block up to which all blocks are closed."""
         waiting = [shape.front for shape in self._complete]
         foremost = max(self.first_open_column, self._ramp_column, *waiting)
         return self.lattice.block_of(int(foremost)) - 1

@@ -149,7 +149,7 @@ class LaneEndControl:
         else:
             crowded, taken = bool(waiting), {*range(self._lattice.lanes)}
         between = (CROWDED_GAPS if crowded else OPEN_GAPS) * self._columns
-        if self._meter.closed_column(lane) <= self._last_gap_column[lane] - between:
+        if self._meter.next_column(lane) < self._last_gap_column[lane] - between:
             columns = self._meter.keep_free(lane, self._columns, t_s)
             for each in taken:
                 self._last_gap_column[each] = columns[0]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from laneweave.coordinator.formations.roster import (
     STAGE_LEAD_S,
-    deadline_s,
+    moves_end_s,
     stage_at,
     stage_begin_s,
     stage_end_s,
@@ -151,8 +151,8 @@ def test_stages_follow_each_other_as_the_formation_passes_them(scenario: Scenari
 def test_moves_out_of_a_lane_are_complete_before_each_vehicle_passes_its_line() -> None:
     lattice, numbers, line_m = DROP.lattice, (0, 1, 2), 800.0 - ROOM_M
     for cells, column in (([(0, 1), (-1, 0)], -1), ([(0, 0), (-1, 0)], 0), ([(0, 1), (-1, 2)], -2)):
-        assert deadline_s(cells, numbers, 0, DROP) == lattice.passing_time_s(column, line_m)
+        assert moves_end_s(cells, numbers, 0, DROP) == lattice.passing_time_s(column, line_m)
     # In the last stage nobody may still move at the end of the road.
-    assert deadline_s([(-1, 1)], numbers, 1, DROP) == lattice.passing_time_s(-1, 1000.0)
+    assert moves_end_s([(-1, 1)], numbers, 1, DROP) == lattice.passing_time_s(-1, 1000.0)
     assert stage_end_s(numbers, 0, DROP) == lattice.passing_time_s(-2, line_m)
     assert stage_end_s(numbers, 1, DROP) == lattice.passing_time_s(0, 1000.0)

@@ -5,12 +5,14 @@ from collections import Counter
 from itertools import pairwise
 
 import pytest
+from attrs import evolve
 
 from laneweave.launch.fault_search.profiles import PROFILES, profiles_named
 from laneweave.launch.fault_search.road.stand_ins import Visit
 from laneweave.launch.fault_search.setup import BLOCK_COLUMNS, Setup
 from laneweave.protocol.config.cross_checks import check_scenario
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.fields import Demand
 from laneweave.protocol.wire.messages import ClosedFormation, Name
 
 EVERY = pytest.mark.parametrize(
@@ -130,7 +132,8 @@ def test_a_stretch_of_the_rolling_operation_has_one_owner_for_each_cell(name: st
 def test_the_roadside_admits_all_vehicles_in_turn(name: str) -> None:
     for setup, rng in draw(name, 20):
         if not setup.road.drawn.entrance:  # drawn ramps are shorter: bodies need not settle there
-            check_scenario(setup.scenario)
+            # The volume has no effect: arrivals are drawn elsewhere.
+            check_scenario(evolve(setup.scenario, demand=Demand(100.0)))
         lanes = setup.preferences(rng, last=False)
         entrance = setup.make_entrance(lanes, bridge=1)
         entered = [each for tick in range(1000) for each in entrance.admit(tick * 0.1)]

@@ -242,7 +242,7 @@ def test_ramps_and_reserved_columns_leave_every_vehicle_in_one_formation(
     lanes = case.lanes + 1
     entry_m = (RAMP_M if on_ramp else 0.0, *(0.0,) * case.lanes)
     ramps = frozenset({0}) if on_ramp else frozenset[int]()
-    entrances = Entrances(case.lanes, ramps, max(entry_m), 0.3 if on_ramp else 0.0)
+    entrances = Entrances(case.lanes, ramps, max(entry_m), 2 if on_ramp else 0)
     grid = lattice(lanes, 1 if grows else BLOCK_COLUMNS)
     most = case.most_vehicles if grows else min(case.most_vehicles, max(3 * case.lanes, 1))
     builder: FormationBuilder = (
@@ -270,7 +270,7 @@ def test_ramps_and_reserved_columns_leave_every_vehicle_in_one_formation(
 
 
 def test_a_formation_keeps_room_for_vehicles_from_a_ramp() -> None:
-    entrances = Entrances(3, frozenset({0}), 45.0, 0.25)
+    entrances = Entrances(3, frozenset({0}), 45.0, 2)
     builder = GrowingFormations(lattice(4), 6, 7, SPREAD_S, entrances)
     assert builder.shortest_length == 4  # 6 and 2 vehicles, 3 free cells, in 3 lanes
     taken = take(builder, *((column, lane, -1) for column in (0, -1) for lane in (1, 2, 3)))
@@ -286,7 +286,7 @@ def test_a_formation_keeps_room_for_vehicles_from_a_ramp() -> None:
 
 
 def test_a_vehicle_from_a_ramp_begins_a_formation_where_there_is_none() -> None:
-    entrances = Entrances(3, frozenset({0}), 45.0, 0.25)
+    entrances = Entrances(3, frozenset({0}), 45.0, 2)
     builder = GrowingFormations(lattice(4), 6, 7, SPREAD_S, entrances)
     assert take(builder, (2, 0, -1), (-1, 1, -1)) == [True, True]
     (closed,) = builder.closed(60.0)

@@ -148,6 +148,14 @@ class Checker:
         if self._ownership is not None:
             self._ownership.leave(vehicle)
 
+    def give_up_move(self, t_s: float, vehicle: str, cell: Cell) -> None:
+        """Record that a vehicle holds the cell again in which its last move began."""
+        self._log(t_s, f"{vehicle} holds {cell} again")
+        self.advance(t_s)
+        self._end_motion(vehicle)
+        self._bodies[vehicle] = Body.standing(self._geometry, cell, t_s)
+        self._check_cells(t_s, vehicle)
+
     def begin(
         self,
         t_s: float,

@@ -232,9 +232,7 @@ class LightRoad:
             self._attendance.begin_anew(vehicle, self.tick)
             cell = vehicle.controller.hold_cell
             if change.kind == MISSED_EXIT:
-                # For the checker, it leaves the road and enters it in the cell that it holds.
-                self._checker.leave(now_s, change.vehicle)
-                self._checker.enter(now_s, change.vehicle, cell, vehicle.block)
+                self._checker.give_up_move(now_s, change.vehicle, cell)
                 vehicle.body.go(cell, self.t_s, self._tick_s)
             elif change.kind == LEFT_LATTICE:
                 self._checker.leave(now_s, change.vehicle)
