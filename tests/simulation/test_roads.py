@@ -56,7 +56,7 @@ def test_an_agent_gives_up_a_move_that_its_lane_end_does_not_allow_any_more(
 
 
 @pytest.mark.parametrize(
-    ("profile", "seed"), [*((ROADS, n) for n in range(20)), *((FORMATIONS, n) for n in range(12))]
+    ("profile", "seed"), [*((ROADS, n) for n in range(20)), *((FORMATIONS, n) for n in range(6))]
 )
 def test_runs_without_violations(profile: str, seed: int) -> None:
     assert run_story(Story.drawn(seed, PROFILES[profile])).violations == ()

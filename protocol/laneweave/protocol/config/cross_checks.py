@@ -372,7 +372,11 @@ def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str)
     own = min((one for one in scenario.sections if one.lane == lane), key=lambda one: one.from_m)
     from_m, room_m = max(own.from_m, own.moves_from_m, scenario.moves_from_m), 0.0
     if scenario.road.closures and not scenario.formation.rolling:
-        from_m = max(from_m, *scenario.entry_m) + _block_m(scenario)
+        # At the volumes at which vehicles must cross lanes one after another, formations are full.
+        formation = scenario.formation
+        vehicles = formation.max_vehicles + scenario.vehicles_from_ramps
+        columns = formation_columns(vehicles, scenario.narrowest_lanes)
+        from_m = max(from_m, *scenario.entry_m) + (columns - 1) * formation.gap_m
         room_m = drive_out(scenario).room_m
     from_m += scenario.longest_body_m
     advance_m = scenario.formation.speed_mps * scenario.cycles_s[0]

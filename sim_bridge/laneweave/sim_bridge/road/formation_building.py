@@ -239,9 +239,10 @@ class GrowingFormations:
         if shape is None:
             if column > self.first_open_column:
                 return False
-            shape = self._opened(column)
-            if not shape.front - self.max_columns < column <= shape.front:
+            begun = self._open
+            if begun is not None and not begun.front - self.max_columns < column <= begun.front:
                 return False
+            shape = self._opened(column)
             shape.rear = min(shape.rear, column)
             columns = self.shortest_length
         else:

@@ -234,7 +234,7 @@ RAMP_M = 52.0
 @pytest.mark.slow
 @pytest.mark.parametrize("grows", [True, False], ids=["growing", "blocks of columns"])
 @given(case=cases(), reserve_s=st.lists(st.floats(0.0, 60.0), max_size=3), on_ramp=st.booleans())
-@settings(max_examples=150)
+@settings(max_examples=60)
 def test_ramps_and_reserved_columns_leave_every_vehicle_in_one_formation(
     case: Case, reserve_s: list[float], *, on_ramp: bool, grows: bool
 ) -> None:
@@ -283,6 +283,12 @@ def test_a_formation_keeps_room_for_vehicles_from_a_ramp() -> None:
     assert builder.closed(rear_s - 0.1) == []
     (closed,) = builder.closed(rear_s + 0.1)
     assert (closed.first_block, closed.last_block) == (-1, 2)
+
+
+def test_a_vehicle_from_a_ramp_enters_also_if_formations_are_short() -> None:
+    builder = GrowingFormations(lattice(2), 1, 1, 1.5, Entrances(1, frozenset({0}), 45.0, 0))
+    assert take(builder, (-2, 0, -1)) == [True]
+    assert sum(len(each.columns(builder.lattice)) for each in builder.closed(60.0)) >= 1
 
 
 def test_a_vehicle_from_a_ramp_begins_a_formation_where_there_is_none() -> None:
