@@ -147,18 +147,15 @@ class FormationPlanner:
         # Hold cells outside the blocks make planning fail later; they do not affect the time left.
         cells = [cell for cell in leader.hold_cells.values() if block_of(cell[0]) in numbers]
         cells = cells or self._block_cells(numbers)
-        every = stages(scenario)
-        stage = every[formation.stage]
+        of_road = stages(scenario)
+        stage, is_last = of_road[formation.stage], formation.stage == len(of_road) - 1
         start_s = self._start_s(formation, cells, t_s)
-        end_s = stage_end_s(numbers, formation.stage, scenario)
-        too_late: frozenset[Name] = frozenset()
-        if formation.sorts and stage is not every[-1]:
-            ends_s = self._ends_s(leader)
-            soonest_s = start_s + scenario.cycles_s[0]
-            too_late = frozenset(name for name, each_s in ends_s.items() if each_s < soonest_s)
-            in_time = [each_s for name, each_s in ends_s.items() if name not in too_late]
-            end_s = min([end_s, *in_time]) if in_time or not too_late else max(ends_s.values())
-        if stage is not every[-1] and end_s < start_s + scenario.cycles_s[0]:
+        soonest_s = start_s + scenario.cycles_s[0]
+        stage_s = stage_end_s(numbers, formation.stage, scenario)
+        ends_s = {} if is_last else self._ends_s(leader)
+        too_late = frozenset(name for name, each_s in ends_s.items() if each_s < soonest_s)
+        end_s = min([stage_s, *(each_s for each_s in ends_s.values() if each_s >= soonest_s)])
+        if not is_last and (end_s < soonest_s or (too_late and len(too_late) == len(ends_s))):
             if not leader.failures:
                 data = {"formation": numbers[0], "stage": formation.stage}
                 yield LogEntry(STRUCTURE_TOO_LATE, data)
@@ -171,7 +168,7 @@ class FormationPlanner:
         task = SortingTask(
             numbers,
             leader.hold_cells,
-            formation.goal_lanes if formation.sorts else {},
+            formation.goal_lanes,
             leader.unattended | too_late,
             scenario,
             deadline_s=self._deadline_s(start_s, t_s),
@@ -194,7 +191,8 @@ class FormationPlanner:
         return {
             name: moves_end_s([cell], formation.numbers, formation.stage, scenario)
             for name, cell in leader.hold_cells.items()
-            if name not in leader.unattended
+            if formation.sorts
+            and name not in leader.unattended
             and cell[1] not in goals[name]
             and block_of(cell[0]) in formation.numbers
         }

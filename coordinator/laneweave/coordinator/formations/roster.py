@@ -59,8 +59,8 @@ class Formation:
 
     @property
     def goal_lanes(self) -> dict[Name, frozenset[int]]:
-        """Goal lanes of the members of a formation that sorts."""
-        return dict(zip(self.roster, self.goals, strict=True))
+        """Goal lanes of the members; empty if the formation forms a structure."""
+        return dict(zip(self.roster, self.goals, strict=self.sorts))
 
     @property
     def roster(self) -> tuple[Name, ...]:
@@ -258,12 +258,6 @@ def exit_time_s(cells: Collection[Cell], scenario: Scenario, to_m: float | None 
     return scenario.lattice.passing_time_s(front, scenario.road.length_m if to_m is None else to_m)
 
 
-def steps_left(
-    cells: Collection[Cell],
-    t_s: float,
-    slot_s: float,
-    scenario: Scenario,
-    to_m: float | None = None,
-) -> int:
-    """Return how many whole steps fit until the foremost cell reaches `to_m` (`exit_time_s`)."""
-    return max(0, math.floor((exit_time_s(cells, scenario, to_m) - t_s) / slot_s + 1e-6))
+def steps_left(cells: Collection[Cell], t_s: float, slot_s: float, scenario: Scenario) -> int:
+    """Return the number of whole steps until the foremost cell reaches the end of the road."""
+    return max(0, math.floor((exit_time_s(cells, scenario) - t_s) / slot_s + 1e-6))

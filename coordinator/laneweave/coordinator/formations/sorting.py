@@ -45,8 +45,9 @@ class SortingTask:
     hold_cells: Mapping[Name, Cell]
     """Lattice cell of each member, in the order of the result."""
     goal_lanes: Mapping[Name, frozenset[int]]
+    """Lanes in one of which each member should be at the end; not used with a structure."""
     unattended: Collection[Name]
-    """Members without an agent; they only hold."""
+    """Members without an agent, or too late for the stage; they only hold."""
     scenario: Scenario
     """Mode, conflict kinds, lattice."""
     deadline_s: float
@@ -58,7 +59,7 @@ class SortingTask:
     structure: DrivingStructure | None = None
     """Structure to form, with any vehicle in any place; None: sort by lanes."""
     stage: Stage | None = None
-    """Stage of the way; its closed lanes are not used. None: all lanes are open."""
+    """Stage of the road; its closed lanes are not used. None: all lanes are open."""
 
     @property
     def columns(self) -> range:
@@ -173,8 +174,8 @@ def _into_lanes(task: SortingTask, wanted: Mapping[Name, frozenset[int]]) -> Ite
     """Yield the request in which each vehicle may take any free cell of its goal lanes.
 
     Vehicles for which these have too few cells may take any cell of the lanes that go on. In the
-    second request every vehicle has one target, so that no vehicle has a long way: such plans may
-    have fewer steps.
+    second request every vehicle has one target, so that no path is long: such plans may have fewer
+    steps.
     """
     free = [
         (column, lane)

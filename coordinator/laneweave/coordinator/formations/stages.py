@@ -15,11 +15,7 @@ from itertools import pairwise
 
 from attrs import frozen
 
-from laneweave.protocol.road_layout import (
-    ANY_LANE,
-    END_OF_ROAD,
-    LaneSection,
-)
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection
 from laneweave.protocol.scenario.fields import DrivingStructure, Scenario
 from laneweave.protocol.vehicle.lane_ends import sections_to_lines
 
@@ -55,13 +51,13 @@ class Stage:
 
     @cached_property
     def through_lanes(self) -> frozenset[int]:
-        """Those of them that go on behind the stage, or else all."""
+        """Open lanes that continue beyond the stage; all open lanes, if none does."""
         through = {one.lane for one, line_m in self.open_sections if line_m > self.to_m}
         return frozenset(through) or self.lanes
 
     @property
     def ending_lanes(self) -> frozenset[int]:
-        """Those of them that end with the stage, although others go on."""
+        """Open lanes that end with the stage while others continue."""
         return self.lanes - self.through_lanes
 
     def goal_lanes(self, preferred_lane: int, destination: str = END_OF_ROAD) -> frozenset[int]:
@@ -98,13 +94,6 @@ class Stage:
         ]
 
 
-def shortest_stage_m(scenario: Scenario) -> float:
-    """Return the distance in which the longest formation can begin and complete a step."""
-    formation = scenario.formation
-    length_m = (formation.max_length - 1) * formation.gap_m + scenario.longest_body_m
-    return length_m + formation.speed_mps * scenario.cycles_s[0]
-
-
 @lru_cache(maxsize=16)
 def stages(scenario: Scenario) -> tuple[Stage, ...]:
     """Return the stages of formations, from the start of the road to its end."""
@@ -117,12 +106,12 @@ def stages(scenario: Scenario) -> tuple[Stage, ...]:
         for position_m in (max(one.from_m, one.moves_from_m), line_m)
         if start_m < position_m < end_m
     }
-    ends_m = {*lines_m, end_m}
+    ends_m, shortest_m = {*lines_m, end_m}, scenario.longest_formation_m + scenario.step_m
     parts_m, from_m = [*pairwise([*(one.from_m for one in structures), start_m])], start_m
     for position_m in sorted({*changes_m, end_m}):
         known_m = max(from_m, *scenario.entry_m)
         # Before a lane that begins, a stage is left out that is too short for a formation.
-        if position_m in ends_m or position_m >= known_m + shortest_stage_m(scenario):
+        if position_m in ends_m or position_m >= known_m + shortest_m:
             parts_m.append((from_m, position_m))
         from_m = position_m
     return tuple(

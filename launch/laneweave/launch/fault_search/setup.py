@@ -258,11 +258,10 @@ class Setup:
                 mode=rng.choice(MODES),
             )
             if profile.roads:
-                formation = road.make_scenario().formation
-                before_m = rng.choice(BEFORE_COLUMNS) * formation.gap_m
-                formation_m = (formation.max_length - 1) * formation.gap_m
-                step_m = formation.speed_mps * road.slot_s
-                drawn = draw_road(lanes, before_m, step_m, rng, formation_m)
+                straight = road.make_scenario()
+                before_m = rng.choice(BEFORE_COLUMNS) * straight.formation.gap_m
+                step_m = straight.formation.speed_mps * road.slot_s
+                drawn = draw_road(lanes, before_m, step_m, rng, straight.longest_formation_m)
                 road = evolve(road, before_m=before_m, drawn=drawn)
         scenario = road.make_scenario()
         lasting = LastingFaults.drawn(profile, rng)

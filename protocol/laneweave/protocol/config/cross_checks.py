@@ -179,9 +179,7 @@ def _check_motion(scenario: Scenario) -> None:
         formation.weight_oblique,
         "at most 1 in mode 2 (an oblique edge is one step), at most 2 in mode 1",
     )
-    needed_m = (
-        _block_m(scenario) + scenario.longest_body_m + formation.speed_mps * scenario.cycles_s[0]
-    )
+    needed_m = scenario.longest_formation_m + scenario.step_m
     _compare(scenario, [("road.s3_m", "at least", needed_m, "a whole formation and one step")])
     _require(
         formation.executable,
@@ -196,7 +194,7 @@ def _check_closures(scenario: Scenario) -> None:
     """Check that closed parts of lanes are on the road, apart, and can be passed."""
     road = scenario.road
     open_m: dict[int, float] = dict.fromkeys(range(road.lanes), -math.inf)
-    step_m = _step_m(scenario)
+    step_m = scenario.step_m
     for number, closure in enumerate(road.closures):
         name = f"road.closures[{number}]"
         allowed = f"a lane from 0 to {road.lanes - 1}"
@@ -252,7 +250,7 @@ def _check_entrances(scenario: Scenario) -> None:
         formation = scenario.formation
         low_m = entrance.at_m + formation.speed_mps * formation.settle_s
         ends_m = [one.to_m for one in scenario.sections if one.lane == entrance.lane]
-        high_m = min(ends_m, default=road.length_m) - _step_m(scenario)
+        high_m = min(ends_m, default=road.length_m) - scenario.step_m
         _require(
             low_m <= entrance.merge_m <= high_m,
             f"{name}.merge_m",
@@ -429,7 +427,7 @@ def _check_dead_ends(scenario: Scenario) -> None:
             f"the end of a lane beside one that is open from {end.line_m:g} m, its stop line, to "
             f"{needed.distance_m:g} m after it",
         )
-        before_m = end.line_m - _block_m(scenario) - _step_m(scenario)
+        before_m = end.line_m - scenario.longest_formation_m - scenario.step_m
         _require(
             scenario.formation.rolling
             or any(
@@ -441,11 +439,6 @@ def _check_dead_ends(scenario: Scenario) -> None:
             f"the end of a lane beside one that is open from {before_m:g} m on, so that a whole "
             "formation can change lanes",
         )
-
-
-def _step_m(scenario: Scenario) -> float:
-    """Return the distance that a vehicle needs for one move, with the length of its body."""
-    return scenario.formation.speed_mps * scenario.cycles_s[0] + scenario.longest_body_m
 
 
 _FIRST_STEP = {
@@ -463,13 +456,8 @@ def _first_step_m(scenario: Scenario, from_m: float) -> float:
     """
     from_m = max(from_m, scenario.moves_from_m)
     if not scenario.formation.rolling:
-        from_m = max(from_m, *scenario.entry_m) + _block_m(scenario)
-    return from_m + _step_m(scenario)
-
-
-def _block_m(scenario: Scenario) -> float:
-    """Return the distance between the first and the last vehicle of the longest formation."""
-    return (scenario.formation.max_length - 1) * scenario.formation.gap_m
+        from_m = max(from_m, *scenario.entry_m) + scenario.longest_formation_m
+    return from_m + scenario.step_m
 
 
 def _limit_of(scenario: Scenario, vehicle_type: str, name: str) -> str:

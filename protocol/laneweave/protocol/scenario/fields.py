@@ -583,6 +583,16 @@ class Scenario:
             {(one.lane, one.at_m): one.merge_m for one in self.entrance},
         )
 
+    @property
+    def step_m(self) -> float:
+        """Distance that a vehicle needs for one move, with the length of the longest body."""
+        return self.formation.speed_mps * self.cycles_s[0] + self.longest_body_m
+
+    @property
+    def longest_formation_m(self) -> float:
+        """Distance between the first and the last vehicle of the longest formation."""
+        return (self.formation.max_length - 1) * self.formation.gap_m
+
     @cached_property
     def narrowest_lanes(self) -> int:
         """Smallest number of lanes that are open anywhere."""

@@ -37,7 +37,7 @@ from laneweave.protocol.wire.messages import ClosedFormation
 
 @frozen
 class Entrances:
-    """What formations need to know of a road: where vehicles enter, and how many lanes remain."""
+    """Data of a road for formation building: its entrances, and the number of lanes that remain."""
 
     narrowest: int
     """Smallest number of lanes that are open anywhere."""
@@ -56,7 +56,7 @@ class Entrances:
         return cls(scenario.narrowest_lanes, ramps, max(scenario.entry_m), from_ramps)
 
     def first_column(self, lattice: Lattice) -> int:
-        """Return the foremost column that vehicles can enter, which a ramp does at road time 0."""
+        """Return the foremost column that vehicles can enter: the next to pass the last ramp."""
         return int(self.last_m // lattice.pitch_m)
 
 
@@ -207,7 +207,7 @@ class GrowingFormations:
         return self._length_for(self.max_vehicles + self._coming(0))
 
     def _length_for(self, vehicles: int) -> int:
-        """Return the minimum number of columns."""
+        """Return the minimum number of columns for some vehicles."""
         return formation_columns(vehicles, self.entrances.narrowest)
 
     def _coming(self, entered: int) -> int:
@@ -257,7 +257,7 @@ class GrowingFormations:
     def reserve(self, column: int, count: int, t_s: float) -> range:
         """Reserve columns that can still be entered, from a column on or behind it.
 
-        The formation that vehicles enter is complete.
+        The open formation is completed.
         """
         if self._open is not None:
             self._complete_open(self._open.rear, t_s)

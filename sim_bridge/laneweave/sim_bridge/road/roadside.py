@@ -93,8 +93,7 @@ class Roadside:
         """Empty cells without an owner."""
         self._entry_m = scenario.entry_m
         """Where the cells of each lane are assigned."""
-        step_m = lattice.speed_mps * scenario.cycles_s[0] + longest_m
-        self._merging_m = {one.lane: one.merge_m + step_m for one in scenario.entrance}
+        self._merging_m = {one.lane: one.merge_m + scenario.step_m for one in scenario.entrance}
         """Where a queue on a ramp leaves room for merging, by lane."""
         self._near_m = max(
             self._room_m + max(self._entry_m),
@@ -317,7 +316,7 @@ class Roadside:
         """Return the census: vehicles on the road, announcements and closed formations."""
         vehicles = tuple(on_road)
         off_lattice = self._lane_ends.bodies({vehicle.name: vehicle for vehicle in vehicles})
-        # Without members on the lattice, its blocks are deserted: they may be joined with others.
+        # A formation without members on the lattice counts as deserted; others may have joined it.
         present = {one.formation for one in vehicles if one.controller.off_lattice is None}
         self._closed = [closed for closed in self._closed if closed.first_block in present]
         return Census(

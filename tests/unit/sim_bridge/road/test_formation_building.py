@@ -276,7 +276,7 @@ def test_a_formation_keeps_room_for_vehicles_from_a_ramp() -> None:
     taken = take(builder, *((column, lane, -1) for column in (0, -1) for lane in (1, 2, 3)))
     assert all(taken)
     assert builder.closed(1.0) == [], "the ramp has not passed"
-    # With a fourth one, fewer cells than lanes would be free.
+    # A fourth vehicle would leave fewer free cells than there are lanes.
     coming = [(column, 0, -1) for column in (1, 0, -1, -2)]
     assert take(builder, *coming) == [True, True, True, False]
     rear_s = builder.lattice.passing_time_s(-2, 45.0) + SPREAD_S
