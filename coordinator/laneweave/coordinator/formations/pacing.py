@@ -58,7 +58,8 @@ def paced(
     The plan pauses where its moves would have `closing` conflicts with those of its neighbours.
 
     Args:
-        plan: plan with the latest start: when all of its vehicles are in the stage.
+        plan: plan with the latest start: when all of its vehicles are in the stage, and those from
+            ramps have settled.
         others: plans of neighbouring formations; not changed.
         not_before_s: earliest start (road time).
         end_s: road time by which the plan should be complete.

@@ -20,9 +20,10 @@ from laneweave.coordinator.formations.roster import (
     Numbers,
     moves_end_s,
     on_tick,
+    settled_s,
+    sorting_start_s,
     stage_begin_s,
     stage_end_s,
-    start_time_s,
     steps_left,
 )
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
@@ -145,7 +146,8 @@ class FormationPlanner:
         assert ballot is not None  # noqa: S101 (set before planning begins)
         numbers, block_of = formation.numbers, scenario.lattice.block_of
         # Hold cells outside the blocks make planning fail later; they do not affect the time left.
-        cells = [cell for cell in leader.hold_cells.values() if block_of(cell[0]) in numbers]
+        lanes, possible = range(scenario.road.lanes), leader.hold_cells.values()
+        cells = [cell for cell in possible if block_of(cell[0]) in numbers and cell[1] in lanes]
         cells = cells or self._block_cells(numbers)
         of_road = stages(scenario)
         stage, is_last = of_road[formation.stage], formation.stage == len(of_road) - 1
@@ -271,7 +273,7 @@ class FormationPlanner:
         """Return the number of steps left in a stage for vehicles anywhere in these blocks."""
         cells, scenario = self._block_cells(tuple(sorted(numbers))), self._scenario
         from_m = stages(scenario)[stage].from_m
-        start_s = start_time_s(cells, t_s + START_MARGIN_S, scenario, from_m)
+        start_s = sorting_start_s(cells, t_s + START_MARGIN_S, scenario, from_m)
         end_s = moves_end_s(cells, tuple(sorted(numbers)), stage, scenario)
         return int((end_s - start_s) / scenario.cycles_s[0] + 1e-6)
 
@@ -313,7 +315,7 @@ class FormationPlanner:
         if stage is stages(scenario)[-1] or not moved:
             moved = {*cells, *plan.territory}
         end_s = moves_end_s(moved, formation.numbers, formation.stage, scenario)
-        not_before_s = max(self._settled_s(cells), t_s + START_MARGIN_S)
+        not_before_s = max(settled_s(cells, scenario), t_s + START_MARGIN_S)
         return paced(plan, others, not_before_s, end_s, scenario, stage.from_m)
 
     def _neighbouring_plans(self, plan: Plan) -> list[Plan]:
@@ -331,18 +333,12 @@ class FormationPlanner:
 
     def _start_s(self, formation: Formation, cells: Collection[Cell], t_s: float) -> float:
         """Return the earliest road time at which a formation may begin to move."""
+        scenario, not_before_s = self._scenario, t_s + START_MARGIN_S
         if formation.sorts:
-            from_m = stages(self._scenario)[formation.stage].from_m
-            return start_time_s(cells, t_s + START_MARGIN_S, self._scenario, from_m)
-        begin_s = stage_begin_s(formation.numbers, formation.stage, self._scenario)
-        return on_tick(max(begin_s, self._settled_s(cells), t_s + START_MARGIN_S), self._scenario)
-
-    def _settled_s(self, cells: Collection[Cell]) -> float:
-        """Return the road time by which vehicles that entered in these cells have settled."""
-        formation, lattice = self._scenario.formation, self._scenario.lattice
-        rear = min(column for column, _ in cells)
-        entered_s = lattice.passing_time_s(rear, max(self._scenario.entry_m))
-        return entered_s + formation.entry_spread_s + formation.settle_s
+            from_m = stages(scenario)[formation.stage].from_m
+            return sorting_start_s(cells, not_before_s, scenario, from_m)
+        begin_s = stage_begin_s(formation.numbers, formation.stage, scenario)
+        return on_tick(max(begin_s, settled_s(cells, scenario), not_before_s), scenario)
 
 
 def _log_entries(

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from laneweave.coordinator.formations.roster import (
     STAGE_LEAD_S,
     moves_end_s,
+    settled_s,
+    sorting_start_s,
     stage_at,
     stage_begin_s,
     stage_end_s,
@@ -156,3 +158,22 @@ def test_moves_out_of_a_lane_are_complete_before_each_vehicle_passes_its_line() 
     assert moves_end_s([(-1, 1)], numbers, 1, DROP) == lattice.passing_time_s(-1, 1000.0)
     assert stage_end_s(numbers, 0, DROP) == lattice.passing_time_s(-2, line_m)
     assert stage_end_s(numbers, 1, DROP) == lattice.passing_time_s(0, 1000.0)
+
+
+def test_vehicles_from_a_ramp_settle_later() -> None:
+    formation, lattice = WEAVING.formation, WEAVING.lattice
+    lasts_s = formation.entry_spread_s + formation.settle_s
+    main = [(-4, 1), (-6, 3)]
+    assert settled_s(main, WEAVING) == lattice.passing_time_s(-6, 0.0) + lasts_s
+    assert settled_s([*main, (-5, 0)], WEAVING) == lattice.passing_time_s(-5, 250.0) + lasts_s
+
+
+def test_formations_sort_when_vehicles_from_ramps_have_settled() -> None:
+    main, from_ramp = [(-4, 1), (-6, 3)], (-5, 0)
+    from_m, tick_s = 150.0, WEAVING.runtime.tick_s
+    rear_m = from_m + WEAVING.longest_body_m
+    in_stage_s = WEAVING.lattice.passing_time_s(-6, rear_m)
+    assert 0.0 <= sorting_start_s(main, 0.0, WEAVING, from_m) - in_stage_s < tick_s
+    settled = settled_s([from_ramp], WEAVING)
+    assert 0.0 <= sorting_start_s([*main, from_ramp], 0.0, WEAVING, from_m) - settled < tick_s
+    assert sorting_start_s([*main, from_ramp], 99.0, WEAVING, from_m) == pytest.approx(99.0)
