@@ -1,4 +1,4 @@
-"""A ramp, an exit and trucks, with real processes: all vehicles leave at their destinations."""
+"""Types of vehicles, with ramps and exits or in formations: all reach their destinations."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ lane = 0
 at_m = 50.0
 merge_m = 220.0
 volume_veh_per_h = 900.0
+vehicle_types = [{ type = "truck", share = 0.5 }]
 destinations = [{ exit = "off", share = 0.3 }]
 [[exit]]
 name = "off"
@@ -29,7 +30,7 @@ duration_s = 16.0
 destinations = [{ exit = "off", share = 0.3 }]
 [[vehicle_type]]
 name = "truck"
-share = 0.3
+share = 0.2
 length_m = 12.0
 width_m = 2.5
 max_accel_mps2 = 2.0
@@ -52,3 +53,31 @@ def test_cars_and_trucks_enter_by_a_ramp_and_leave_by_their_exits(lab: Lab) -> N
     assert {trip["exit"] for trip in driven} == {"end", "off"}
     assert {trip["vehicle_type"] for trip in driven} == {"car", "truck"}
     assert summary(folder)["tracking"]["emergency_ticks"] == 0
+
+
+VANS = """schema = "laneweave.scenario/1"
+[demand]
+volume_veh_per_lane_h = 1000.0
+duration_s = 20.0
+arrival_shares = [1, 2, 1]
+[[vehicle_type]]
+name = "van"
+share = 0.4
+length_m = 7.0
+max_accel_mps2 = 3.5
+[formation]
+cycle_s = 6.0
+gap_m = 18.0
+"""
+
+
+def test_vans_and_cars_sort_in_formations(lab: Lab) -> None:
+    folder = lab.folder / "run"
+    scenario = lab.path("vans.toml", VANS)
+    ended = lab.run("run", scenario, "--transport", "simulated", "--out", folder)
+    assert (ended.status, ended.complaints) == (0, []), ended
+    check_safe_and_complete(folder)
+    found, driven = summary(folder), list(trips(folder).values())
+    assert found["vehicles"]["on_preferred_lane"] == len(driven) >= 10
+    assert {trip["vehicle_type"] for trip in driven} == {"car", "van"}
+    assert found["tracking"]["emergency_ticks"] == 0

@@ -266,7 +266,7 @@ class Setup:
         scenario = road.make_scenario()
         lasting = LastingFaults.drawn(profile, rng)
         mean_s = rng.uniform(*MEAN_HEADWAYS_S)
-        entered = [lane for lane in range(lanes) if scenario.volume_veh_per_h(lane) > 0.0]
+        entered = [*scenario.inflows]
         next_s = {lane: rng.uniform(0.0, mean_s) for lane in entered}
         visits, types_rng = [], _types_rng(road, "vehicles")
         for number in range(1, rng.randint(*profile.vehicles) + 1):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from operator import attrgetter, ge, gt, le, lt
 from typing import Any
 
@@ -16,6 +16,7 @@ from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, end_exit
 from laneweave.protocol.scenario.fields import (
     MAIN_ENTRANCE,
     MAX_HORIZON_TICKS,
+    Inflow,
     Scenario,
     formation_columns,
 )
@@ -114,30 +115,57 @@ def _compare(scenario: Scenario, comparisons: Iterable[_Comparison]) -> None:
 
 def _check_lanes(scenario: Scenario) -> None:
     road, demand = scenario.road, scenario.demand
-    shares = demand.lane_shares
-    _require(
-        len(shares) in (0, road.lanes),
-        "demand.lane_shares",
-        list(shares),
-        f"one share for each of the {road.lanes} lanes of road.lanes, or none",
-    )
-    _require(
-        all(share >= 0 for share in shares) and (not shares or 0 < sum(shares) < math.inf),
-        "demand.lane_shares",
-        list(shares),
-        "numbers >= 0, not all 0, with a finite sum",
-    )
+    every = range(road.lanes)
+    _check_shares("demand.lane_shares", demand.lane_shares, every, road.lanes)
+    if road.first_lanes:  # otherwise, the closures are reported
+        _check_shares("demand.arrival_shares", demand.arrival_shares, road.first_lanes, road.lanes)
+    for number, entrance in enumerate(scenario.entrance):
+        name, shares = f"entrance[{number}].lane_shares", entrance.lane_shares
+        _check_shares(name, shares, every, road.lanes)
+        allowed = "none, unless demand.lane_shares is given"
+        _require(bool(demand.lane_shares) or not shares, name, list(shares), allowed)
     width_m = scenario.widest_body_m + MIN_SIDE_GAP_M
     what = f"the largest width_m and {MIN_SIDE_GAP_M:g} between bodies side by side"
     _compare(scenario, [("road.lane_width_m", "at least", width_m, what)])
-    allowed = f"at most 3600 / demand.min_headway_s = {3600.0 / max(demand.min_headway_s, 1e-9):g}"
-    volumes = [("demand.volume_veh_per_lane_h", demand.volume_veh_per_lane_h)]
-    volumes += [
-        (f"entrance[{number}].volume_veh_per_h", entrance.volume_veh_per_h)
-        for number, entrance in enumerate(scenario.entrance)
-    ]
-    for name, volume in volumes:
-        _require(3600.0 / volume >= demand.min_headway_s, name, volume, allowed)
+    ramps = {
+        one.lane: (f"entrance[{number}].volume_veh_per_h", one.volume_veh_per_h)
+        for number, one in enumerate(scenario.entrance)
+    }
+    most, because = min(3600.0 / max(demand.min_headway_s, 1e-9), 3600.0), "demand.min_headway_s"
+    if road.closures and scenario.formation.bound_veh_per_lane_h < most:
+        most, because = scenario.formation.bound_veh_per_lane_h, "one in each cell of the lattice"
+    main = ("demand.volume_veh_per_lane_h", demand.volume_veh_per_lane_h)
+    for lane, inflow in scenario.inflows.items():
+        name, value = ramps.get(lane, main)
+        volume, allowed = inflow.volume_veh_per_h, f"at most {most:g}"
+        if lane not in ramps and demand.arrival_shares:
+            allowed += f" vehicles per hour in each lane; lane {lane} has {volume:g}"
+        _require(volume <= most * (1.0 + 1e-9), name, value, f"{allowed} ({because})")
+
+
+def _check_shares(
+    name: str, shares: Sequence[float], possible: Collection[int], lanes: int
+) -> None:
+    """Check shares of lanes: none, or one for each lane, above 0 only in possible lanes."""
+    _require(
+        len(shares) in (0, lanes),
+        name,
+        list(shares),
+        f"one share for each of the {lanes} lanes of road.lanes, or none",
+    )
+    _require(
+        all(share >= 0 for share in shares) and sum(shares) < math.inf,
+        name,
+        list(shares),
+        "numbers >= 0, not all 0, with a finite sum",
+    )
+    _require(
+        not any(share for lane, share in enumerate(shares) if lane not in possible),
+        name,
+        list(shares),
+        f"0 for all lanes but {', '.join(map(str, sorted(possible)))}",
+    )
+    _require(not shares or sum(shares) > 0, name, list(shares), "numbers >= 0, not all 0")
 
 
 def _check_types(scenario: Scenario) -> None:
@@ -148,16 +176,38 @@ def _check_types(scenario: Scenario) -> None:
         is_new = name != CAR and name not in names[:number]
         allowed = f"a name that no other type has; {CAR} is the type of table vehicle"
         _require(is_new, f"vehicle_type[{number}].name", name, allowed)
-    shares = [one.share for one in types]
-    _require(
-        sum(shares) <= 1.0 + 1e-9, "vehicle_type.share", shares, "shares with a sum of at most 1"
-    )
-    _require(
-        not types or scenario.formation.rolling,
-        "vehicle_type",
-        names,
-        'none, unless formation.operation is "rolling"',
-    )
+    given = [("vehicle_type.share", [one.share for one in types])]
+    for number, entrance in enumerate(scenario.entrance):
+        name, own = f"entrance[{number}].vehicle_types", entrance.vehicle_types
+        for place, one in enumerate(own):
+            allowed = f"one of {', '.join(names)}" if names else "none: there is no vehicle_type"
+            is_new = one.type not in [other.type for other in own[:place]]
+            allowed += "" if is_new else ", each once"
+            _require(one.type in names and is_new, f"{name}[{place}].type", one.type, allowed)
+        given.append((name, [one.share for one in own]))
+    for name, shares in given:
+        _require(sum(shares) <= 1.0 + 1e-9, name, shares, "shares with a sum of at most 1")
+    _check_types_of_formations(scenario)
+
+
+def _check_types_of_formations(scenario: Scenario) -> None:
+    """Check that in formations all types drive all moves: a plan gives any path to any vehicle."""
+    accel_mps2, jerk_mps3 = scenario.column_move_peaks
+    for name, own in scenario.types.items():
+        limits = own.vehicle
+        for limit, value, needed in (
+            ("max_accel_mps2", limits.max_accel_mps2, accel_mps2),
+            ("min_accel_mps2", limits.min_accel_mps2, -accel_mps2),
+            ("max_jerk_mps3", limits.max_jerk_mps3, jerk_mps3),
+        ):
+            _require(
+                scenario.formation.rolling or own.changes_columns or abs(value) >= abs(needed),
+                _limit_of(scenario, name, limit),
+                value,
+                f"at {'most' if needed < 0.0 else 'least'} {needed:.3g} in formations, where each "
+                f"vehicle moves by a column of {scenario.formation.gap_m:g} m in T_F "
+                '(formation.cycle_s), or formation.operation = "rolling"',
+            )
 
 
 def _check_motion(scenario: Scenario) -> None:
@@ -222,12 +272,18 @@ def _check_closures(scenario: Scenario) -> None:
     for lanes, where in ((road.first_lanes, "start"), (reaching, "end")):
         allowed = f"a lane that is open at the {where} of the road"
         _require(bool(lanes), "road.closures", [*map(attrs.astuple, road.closures)], allowed)
-    _require(
-        all(lane in reaching or not share for lane, share in enumerate(scenario.lane_shares)),
-        "demand.lane_shares",
-        list(scenario.demand.lane_shares),
-        f"shares of lanes that reach the end of the road, {reaching}, and 0 for the others",
-    )
+    given = [("demand.lane_shares", scenario.demand.lane_shares)]
+    given += [
+        (f"entrance[{number}].lane_shares", one.lane_shares)
+        for number, one in enumerate(scenario.entrance)
+    ]
+    for name, shares in given:
+        _require(
+            all(lane in reaching or not share for lane, share in enumerate(shares)),
+            name,
+            list(shares),
+            f"shares of lanes that reach the end of the road, {reaching}, and 0 for the others",
+        )
 
 
 def _check_entrances(scenario: Scenario) -> None:
@@ -298,10 +354,9 @@ def _check_capacity(scenario: Scenario) -> None:
         return  # the bound of the entrance holds everywhere
     exits_m = {one.name: one.at_m for one in scenario.exit}
     parts = [
-        (scenario.entry_m[lane], volume * share, exits_m.get(name, math.inf))
-        for lane in range(road.lanes)
-        if (volume := scenario.volume_veh_per_h(lane)) > 0.0
-        for name, share in _shares(scenario, lane)
+        (scenario.entry_m[lane], inflow.volume_veh_per_h * share, exits_m.get(name, math.inf))
+        for lane, inflow in scenario.inflows.items()
+        for name, share in _shares(inflow)
     ]
     volume = scenario.demand.volume_veh_per_lane_h
     if not scenario.formation.rolling:
@@ -338,31 +393,26 @@ def _check_capacity(scenario: Scenario) -> None:
         )
 
 
-def _shares(scenario: Scenario, lane: int) -> list[tuple[str, float]]:
+def _shares(inflow: Inflow) -> list[tuple[str, float]]:
     """Return (destination, share) of vehicles that enter in a lane; the end of the road last."""
-    shares = [(one.exit, one.share) for one in scenario.destinations_of(lane)]
+    shares = [(one.exit, one.share) for one in inflow.destinations]
     return [*shares, (END_OF_ROAD, 1.0 - sum(share for _, share in shares))]
 
 
 def _check_destinations(scenario: Scenario) -> None:
     """Check that destinations exist, and that the vehicles of each entrance can reach theirs."""
     names = [one.name for one in scenario.exit]
-    entrances = [("demand", scenario.road.first_lanes)]
-    entrances += [
-        (f"entrance[{number}]", (one.lane,)) for number, one in enumerate(scenario.entrance)
-    ]
-    for entrance, lanes in entrances:
-        name, given = f"{entrance}.destinations", scenario.destinations_of(lanes[0])
-        shares = _shares(scenario, lanes[0])
-        listed, allowed = [*map(attrs.astuple, given)], "shares whose sum is at most 1"
-        _require(shares[-1][1] >= -1e-9, name, listed, allowed)
+    tables = {one.lane: f"entrance[{number}]" for number, one in enumerate(scenario.entrance)}
+    for lane, inflow in scenario.inflows.items():
+        name, shares = f"{tables.get(lane, 'demand')}.destinations", _shares(inflow)
+        listed = [*map(attrs.astuple, inflow.destinations)]
+        _require(shares[-1][1] >= -1e-9, name, listed, "shares whose sum is at most 1")
         for destination, share in shares:
             if destination != END_OF_ROAD:
                 allowed = f"an exit: {', '.join(names) or 'there is none'}"
                 _require(destination in names, f"{name}.exit", destination, allowed)
             if share > 0.0:
-                for lane in lanes:
-                    _check_reachable(scenario, name, lane, destination)
+                _check_reachable(scenario, name, lane, destination)
 
 
 def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str) -> None:
@@ -378,7 +428,8 @@ def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str)
         room_m = drive_out(scenario).room_m
     from_m += scenario.longest_body_m
     advance_m = scenario.formation.speed_mps * scenario.cycles_s[0]
-    wanted = [lane for lane, share in enumerate(scenario.lane_shares) if share] or [ANY_LANE]
+    preferring = scenario.inflows[lane].lane_shares
+    wanted = [lane for lane, share in enumerate(preferring) if share] or [ANY_LANE]
     for preferred in wanted if destination == END_OF_ROAD else [ANY_LANE]:
         room = [
             (section.to_m - room_m if section.to_m < scenario.road.length_m else section.to_m)

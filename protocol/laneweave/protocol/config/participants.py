@@ -28,8 +28,8 @@ def max_vehicles(scenario: Scenario) -> int:
     lane has at most one arrival per `demand.min_headway_s`.
     """
     demand = scenario.demand
-    volumes = [scenario.volume_veh_per_h(lane) for lane in range(scenario.road.lanes)]
-    lanes = sum(volume > 0.0 for volume in volumes)
+    volumes = [inflow.volume_veh_per_h for inflow in scenario.inflows.values()]
+    lanes = len(volumes)
     mean = sum(volumes) * demand.duration_s / 3600.0
     likely = math.ceil(mean + 6.0 * math.sqrt(mean)) + 10
     if demand.min_headway_s <= 0.0:

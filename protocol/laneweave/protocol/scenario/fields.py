@@ -8,7 +8,7 @@ fields.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Final
@@ -146,6 +146,14 @@ class DestinationShare:
 
 
 @frozen
+class TypeShare:
+    """The share of a type among the vehicles of an entrance."""
+
+    type: str
+    share: float = field(validator=within(0.0, 1.0))
+
+
+@frozen
 class Exit:
     """An exit before the end of the road, by which vehicles leave."""
 
@@ -170,8 +178,12 @@ class Entrance:
     """Where the ramp joins the road: lane changes to and from its lane are possible from there."""
     volume_veh_per_h: float = field(validator=within(0, 3600, open_low=True))
     destinations: tuple[DestinationShare, ...] = ()
-    """Shares of vehicles that leave by exits; the others leave at the end of the road, with the
-    shares of `demand.lane_shares`."""
+    """Shares of vehicles that leave by exits; the others leave at the end of the road."""
+    lane_shares: tuple[float, ...] = ()
+    """Shares of preferred lanes among the others; empty: `demand.lane_shares`, which must be given
+    if this is."""
+    vehicle_types: tuple[TypeShare, ...] = ()
+    """Shares of types, the others are cars; empty: those of `vehicle_type`."""
 
 
 @frozen
@@ -181,6 +193,9 @@ class Demand:
     volume_veh_per_lane_h: float = field(default=1000.0, validator=within(0, 3600, open_low=True))
     duration_s: float = field(default=300.0, validator=within(0, 86_400, open_low=True))
     min_headway_s: float = field(default=1.0, validator=within(0.0, 60.0))
+    arrival_shares: tuple[float, ...] = ()
+    """Share of the vehicles that arrive in each lane at the start of the road, on any scale; empty:
+    equal shares. Their mean volume is `volume_veh_per_lane_h`."""
     lane_shares: tuple[float, ...] = ()
     """Share of vehicles that prefer each lane at the end of the road; empty: equal shares, and on a
     road with closures no preferences."""
@@ -377,7 +392,7 @@ class VehicleType:
 
     name: str = field(validator=key_part)
     share: float = field(validator=within(0.0, 1.0))
-    """Share of vehicles of this type at each entrance."""
+    """Share of vehicles of this type, at entrances without shares of their own."""
     length_m: float | None = field(default=None, validator=optional(within(1.0, 30.0)))
     width_m: float | None = field(default=None, validator=optional(within(0.5, 4.0)))
     min_accel_mps2: float | None = field(default=None, validator=optional(within(-20.0, -0.1)))
@@ -531,6 +546,19 @@ class Runtime:
     def bounds(self, incarnation: int) -> Bounds:
         """Return the bounds of numbers that a process with this incarnation receives."""
         return Bounds(incarnation, self.tick_s, self.max_road_s)
+
+
+@frozen
+class Inflow:
+    """The vehicles that enter the road in one lane."""
+
+    volume_veh_per_h: float
+    destinations: tuple[DestinationShare, ...]
+    """Shares of vehicles that leave by exits; the others leave at the end of the road."""
+    lane_shares: tuple[float, ...]
+    """Share of these others that prefer each lane, with sum one; empty: no preferences."""
+    types: tuple[TypeShare, ...]
+    """Shares of types; the others are cars."""
 
 
 @frozen
@@ -692,19 +720,26 @@ class Scenario:
     def drivable_moves(self) -> frozenset[Cell]:
         """The moves (columns, lanes) that are planned for the type that `vehicle` describes.
 
-        Cars drive every move of the mode. Other types do not change columns if a minimum-jerk move
-        in the shortest T_F exceeds their limits along the road: its peaks over d in T are
-        10 / sqrt(3) d / T^2 and, for the jerk, 60 d / T^3.
+        Cars drive every move of the mode. Other types do not change columns if the peaks of such a
+        move (`column_move_peaks`) exceed their limits along the road.
         """
         moves = frozenset(displacements(self.formation.mode)[1:])
-        limits, d_m, move_s = self.vehicle, self.formation.gap_m, self.move_s
-        accel_mps2 = min(limits.max_accel_mps2, -limits.min_accel_mps2)
+        limits, (accel_mps2, jerk_mps3) = self.vehicle, self.column_move_peaks
         if limits == self.types[CAR].vehicle or (
-            10.0 / math.sqrt(3.0) * d_m / move_s**2 <= accel_mps2
-            and 60.0 * d_m / move_s**3 <= limits.max_jerk_mps3
+            accel_mps2 <= min(limits.max_accel_mps2, -limits.min_accel_mps2)
+            and jerk_mps3 <= limits.max_jerk_mps3
         ):
             return moves
         return frozenset((columns, lanes) for columns, lanes in moves if columns == 0)
+
+    @property
+    def column_move_peaks(self) -> tuple[float, float]:
+        """Peaks of a move by a column in the shortest T_F: acceleration [m/s^2], jerk [m/s^3].
+
+        For a minimum-jerk move over d in T these are 10 / sqrt(3) d / T^2 and 60 d / T^3.
+        """
+        d_m, move_s = self.formation.gap_m, self.move_s
+        return 10.0 / math.sqrt(3.0) * d_m / move_s**2, 60.0 * d_m / move_s**3
 
     @property
     def changes_columns(self) -> bool:
@@ -731,19 +766,34 @@ class Scenario:
         lanes = next((one.lanes for one in self.exit if one.name == destination), ())
         return lanes[0] if len(lanes) == 1 else ANY_LANE
 
-    def volume_veh_per_h(self, lane: int) -> float:
-        """Return the volume of vehicles that enter in a lane."""
-        for entrance in self.entrance:
-            if entrance.lane == lane:
-                return entrance.volume_veh_per_h
-        return self.demand.volume_veh_per_lane_h if lane in self.road.first_lanes else 0.0
+    @cached_property
+    def inflows(self) -> Mapping[int, Inflow]:
+        """The vehicles that enter in each lane, by lane; lanes in which none enter are left out."""
+        demand, first, types = self.demand, self.road.first_lanes, self._type_shares
+        arriving = _normalised(demand.arrival_shares or (1.0,) * self.road.lanes, first)
+        volumes = {
+            lane: demand.volume_veh_per_lane_h * (len(first) * arriving[lane]) for lane in first
+        }
+        found = {
+            lane: Inflow(volume, demand.destinations, self.lane_shares, types)
+            for lane, volume in volumes.items()
+            if volume > 0.0
+        }
+        every = range(self.road.lanes)
+        for one in self.entrance:
+            preferring = _normalised(one.lane_shares, every) if one.lane_shares else ()
+            found[one.lane] = Inflow(
+                one.volume_veh_per_h,
+                one.destinations,
+                preferring or self.lane_shares,
+                one.vehicle_types or types,
+            )
+        return MappingProxyType(dict(sorted(found.items())))
 
-    def destinations_of(self, lane: int) -> tuple[DestinationShare, ...]:
-        """Return the shares of exits among the vehicles that enter in a lane."""
-        for entrance in self.entrance:
-            if entrance.lane == lane:
-                return entrance.destinations
-        return self.demand.destinations
+    @property
+    def _type_shares(self) -> tuple[TypeShare, ...]:
+        """The shares of all types but cars."""
+        return tuple(TypeShare(one.name, one.share) for one in self.vehicle_type if one.name != CAR)
 
     def free_flow_trip_s(self, lane: int, destination: str = END_OF_ROAD) -> float:
         """Return the time [s] at v_F from the entrance of a lane to a destination."""
@@ -849,6 +899,11 @@ class Scenario:
         """Share of vehicles that prefer each lane; the sum is one. Empty: no preferences."""
         if self.road.closures and not self.demand.lane_shares:
             return ()
-        shares = self.demand.lane_shares or (1.0,) * self.road.lanes
-        total = sum(shares)
-        return tuple(share / total for share in shares)
+        lanes = range(self.road.lanes)
+        return _normalised(self.demand.lane_shares or (1.0,) * len(lanes), lanes)
+
+
+def _normalised(shares: Sequence[float], lanes: Collection[int]) -> tuple[float, ...]:
+    """Return the shares of some lanes divided by their sum, and 0 for the others."""
+    total = sum(shares[lane] for lane in lanes)
+    return tuple(share / total if lane in lanes else 0.0 for lane, share in enumerate(shares))

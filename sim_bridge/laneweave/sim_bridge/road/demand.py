@@ -5,9 +5,9 @@ In each lane in which vehicles enter, the headway between two arrivals is
     min_headway + Exp(3600 / volume - min_headway)      (mean 3600 / volume seconds),
 
 and the destination of each vehicle, an exit or a preferred lane at the end of the road, is drawn
-from the scenario's shares, as is its type. Every lane has one random generator for headways, one
-for destinations and one for types, seeded with the scenario's seed. The same seed gives the same
-arrivals, arrivals in a lane do not depend on other lanes, and a longer duration only appends
+from the shares of its entrance, as is its type. Every lane has one random generator for headways,
+one for destinations and one for types, seeded with the scenario's seed. The same seed gives the
+same arrivals, arrivals in a lane do not depend on other lanes, and a longer duration only appends
 arrivals, without changing the names of earlier ones.
 """
 
@@ -23,7 +23,7 @@ from numpy.random import SeedSequence, default_rng
 
 from laneweave.protocol.config.participants import vehicle_name
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.fields import Inflow, Scenario
 from laneweave.protocol.wire.messages import CAR
 
 _HEADWAYS, _PREFERENCES, _TYPES = 0, 1, 2
@@ -50,9 +50,8 @@ def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
     """Return the seeded arrivals in [0, demand.duration_s], sorted by time, then lane."""
     drawn = sorted(
         one
-        for lane in range(scenario.road.lanes)
-        if scenario.volume_veh_per_h(lane) > 0.0
-        for one in _arrivals_in(lane, scenario)
+        for lane, inflow in scenario.inflows.items()
+        for one in _arrivals_in(lane, inflow, scenario)
     )
     return tuple(
         Arrival(vehicle_name(number), lane, preferred, t_s, destination, vehicle_type)
@@ -65,20 +64,21 @@ def count_until(stream: Sequence[Arrival], t_s: float) -> int:
     return bisect_right(stream, t_s, key=lambda arrival: arrival.t_s)
 
 
-def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int, int, str, str]]:
+def _arrivals_in(
+    lane: int, inflow: Inflow, scenario: Scenario
+) -> list[tuple[float, int, int, str, str]]:
     """Return (time [s], lane, preferred lane, destination, type) of each arrival in one lane."""
     demand = scenario.demand
-    mean_excess_s = max(0.0, 3600.0 / scenario.volume_veh_per_h(lane) - demand.min_headway_s)
+    mean_excess_s = max(0.0, 3600.0 / inflow.volume_veh_per_h - demand.min_headway_s)
     headways, preferences, types = (
         default_rng(SeedSequence(scenario.seed, spawn_key=(purpose, lane)))
         for purpose in (_HEADWAYS, _PREFERENCES, _TYPES)
     )
-    choices = list(_destinations(lane, scenario))
+    choices = list(_destinations(inflow, scenario))
     # Drop the last bound: rounded to less than 1, it would exclude some draws in [0, 1).
     bounds = np.array([*accumulate(share for share, _, _ in choices)][:-1])
-    others = scenario.vehicle_type
-    type_bounds = np.array([*accumulate(one.share for one in others)])
-    names = [*(one.name for one in others), CAR]
+    type_bounds = np.array([*accumulate(one.share for one in inflow.types)])
+    names = [*(one.type for one in inflow.types), CAR]
     result: list[tuple[float, int, int, str, str]] = []
     t_s = 0.0
     while True:
@@ -91,12 +91,12 @@ def _arrivals_in(lane: int, scenario: Scenario) -> list[tuple[float, int, int, s
         result.append((float(t_s), lane, preferred, destination, kind))
 
 
-def _destinations(lane: int, scenario: Scenario) -> Iterator[tuple[float, int, str]]:
+def _destinations(inflow: Inflow, scenario: Scenario) -> Iterator[tuple[float, int, str]]:
     """Yield (share, preferred lane, destination) of the vehicles that enter in a lane."""
-    exits = scenario.destinations_of(lane)
+    exits = inflow.destinations
     to_end = 1.0 - sum(one.share for one in exits)
-    if scenario.lane_shares:
-        for preferred, share in enumerate(scenario.lane_shares):
+    if inflow.lane_shares:
+        for preferred, share in enumerate(inflow.lane_shares):
             yield to_end * share, preferred, END_OF_ROAD
     else:
         yield to_end, ANY_LANE, END_OF_ROAD

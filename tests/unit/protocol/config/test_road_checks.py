@@ -44,6 +44,10 @@ def to(*shares: tuple[str, float]) -> Callable[[Tables], object]:
     return lambda tables: tables["demand"].update(destinations=listed)
 
 
+def shares(**fields: object) -> Callable[[Tables], object]:
+    return lambda tables: tables["demand"].update(fields)
+
+
 def twice(table: str) -> Callable[[Tables], object]:
     return lambda tables: tables[table].append(tables[table][0])
 
@@ -83,6 +87,25 @@ def ends_at(end_m: float) -> Callable[[Tables], object]:
                 tables["entrance"][0].update(at_m=60_000.0, merge_m=60_000.0),
             ),
             "entrance[0].merge_m: got 60000.0",
+        ),
+        (entrance(lane_shares=[0, 1, 1, 1]), "entrance[0].lane_shares: got [0.0, 1.0, 1.0, 1.0]"),
+        (shares(lane_shares=[0, 1, 1]), "demand.lane_shares: got [0.0, 1.0, 1.0]; allowed: one"),
+        (shares(arrival_shares=[1, 1, 1, 1]), "demand.arrival_shares: got [1.0, 1.0, 1.0, 1.0]"),
+        (shares(arrival_shares=[0, 0, 0, 0]), "demand.arrival_shares: got [0.0, 0.0, 0.0, 0.0]"),
+        (
+            shares(arrival_shares=[0, 0, 0, 1], volume_veh_per_lane_h=1300.0),
+            "demand.volume_veh_per_lane_h: got 1300.0; allowed: at most 3600 vehicles per hour in",
+        ),
+        (
+            lambda tables: (
+                tables["demand"].update(volume_veh_per_lane_h=1200.0, arrival_shares=[0, 1, 0, 0]),
+                tables["formation"].update(gap_m=20.0),
+            ),
+            "demand.volume_veh_per_lane_h: got 1200.0; allowed: at most 2700 vehicles per hour in",
+        ),
+        (
+            entrance(vehicle_types=[{"type": "truck", "share": 0.5}]),
+            "entrance[0].vehicle_types[0].type: got 'truck'; allowed: none",
         ),
         (ends_at(510.0), "exit[0].at_m: got 510.0; allowed: at least 515"),
         (to(("nowhere", 0.5)), "demand.destinations.exit: got 'nowhere'; allowed: an exit: off"),

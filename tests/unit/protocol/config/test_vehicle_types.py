@@ -25,6 +25,8 @@ TRUCK: dict[str, Any] = {
     "max_accel_mps2": 1.3,
     "min_accel_mps2": -7.0,
 }
+VAN = {"name": "van", "share": 0.2, "length_m": 7.0, "max_accel_mps2": 3.5}
+FORMATIONS = {"cycle_s": 6.0, "gap_m": 18.0}
 SPORTS_CAR = {"name": "sports-car", "share": 0.1, "max_accel_mps2": 9.0}
 
 
@@ -109,6 +111,12 @@ def test_the_moves_that_are_planned_for_a_type_can_be_driven() -> None:
         check_moves(weak)
 
 
+def test_formations_have_types_that_drive_all_moves() -> None:
+    found = scenario(VAN, formation=FORMATIONS)
+    assert found.types["van"].drivable_moves == found.types["car"].drivable_moves
+    check_moves(found)
+
+
 def test_the_pitch_suits_every_pair_of_types() -> None:
     found = scenario(TRUCK)
     needed = {name: min_pitch_m(own) for name, own in found.types.items()}
@@ -128,7 +136,21 @@ def test_the_pitch_suits_every_pair_of_types() -> None:
         ([{**TRUCK, "length_m": 60.0}], {}, "vehicle_type[0].length_m: got 60.0"),
         ([{**TRUCK, "wheels": 6}], {}, "vehicle_type[0].wheels"),
         ([{"share": 0.1}], {}, "vehicle_type[0].name"),
-        ([TRUCK], {"formation": {}}, "vehicle_type: got ['truck']"),
+        (
+            [TRUCK],
+            {"formation": {"gap_m": 20.0}},
+            "vehicle_type[0].max_accel_mps2: got 1.3; allowed: at least 8 in formations",
+        ),
+        (
+            [{**VAN, "min_accel_mps2": -3.0}],
+            {"formation": FORMATIONS, "braking": {"lead_brake_mps2": 3.0}},
+            "vehicle_type[0].min_accel_mps2: got -3.0; allowed: at most -3.09 in formations",
+        ),
+        (
+            [{**VAN, "max_jerk_mps3": 5.0}],
+            {"formation": FORMATIONS},
+            "vehicle_type[0].max_jerk_mps3: got 5.0; allowed: at least 5.54 in formations",
+        ),
         (
             [TRUCK],
             {"formation": {**ROLLING, "gap_m": 18.0}},

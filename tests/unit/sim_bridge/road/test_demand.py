@@ -102,3 +102,62 @@ def test_types_have_their_shares_and_change_nothing_else() -> None:
     assert counts["van"] / len(drawn) == pytest.approx(0.3, abs=0.02)
     cars = tuple(evolve(one, vehicle_type="car") for one in drawn)
     assert cars == arrivals(parse_scenario(base))
+
+
+RAMP = {
+    "name": "on-ramp",
+    "lane": 0,
+    "at_m": 50.0,
+    "merge_m": 200.0,
+    "volume_veh_per_h": 900.0,
+}
+
+
+def road_with_ramp(demand: dict[str, object], **ramp: object) -> Scenario:
+    """Return a long demand on a road with an on-ramp in lane 0 and three lanes."""
+    return parse_scenario(
+        {
+            "road": {
+                "lanes": 4,
+                "s2_m": 100.0,
+                "s3_m": 850.0,
+                "closures": [{"lane": 0, "to_m": 50.0}, {"lane": 0, "from_m": 500.0}],
+            },
+            "demand": {"duration_s": 20_000.0, **demand},
+            "formation": {"operation": "rolling", "gap_m": 20.0},
+            "vehicle_type": [{"name": "truck", "share": 0.1}],
+            "entrance": [RAMP | ramp],
+        }
+    )
+
+
+def test_vehicles_arrive_in_lanes_by_their_shares() -> None:
+    volume = 600.0
+    chosen = road_with_ramp({"volume_veh_per_lane_h": volume, "arrival_shares": [0, 1, 2, 0]})
+    assert list(chosen.inflows) == [0, 1, 2]
+    stream = arrivals(chosen)
+    for lane, of_mean in ((0, 1.5), (1, 1.0), (2, 2.0), (3, 0.0)):
+        count = sum(one.lane == lane for one in stream)
+        expected = of_mean * volume * chosen.demand.duration_s / 3600.0
+        assert count == pytest.approx(expected, rel=0.05)
+
+
+def test_an_entrance_has_shares_of_its_own() -> None:
+    same = road_with_ramp({"lane_shares": [0, 1, 1, 2]})
+    own = road_with_ramp(
+        {"lane_shares": [0, 1, 1, 2]},
+        lane_shares=[0, 4, 0, 1],
+        vehicle_types=[{"type": "truck", "share": 0.4}],
+    )
+    before, after = arrivals(same), arrivals(own)
+    assert [one for one in before if one.lane] == [one for one in after if one.lane]
+    for stream, preferring, trucks in (
+        (before, (0, 0.25, 0.25, 0.5), 0.1),
+        (after, (0, 0.8, 0, 0.2), 0.4),
+    ):
+        ramp = [one for one in stream if one.lane == 0]
+        for lane, share in enumerate(preferring):
+            count = sum(one.preferred_lane == lane for one in ramp)
+            assert count / len(ramp) == pytest.approx(share, abs=0.03)
+        count = sum(one.vehicle_type == "truck" for one in ramp)
+        assert count / len(ramp) == pytest.approx(trucks, abs=0.03)
