@@ -15,7 +15,9 @@ import sys
 from collections.abc import Iterable, Iterator
 from enum import Enum
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
+from statistics import fmean
 from types import ModuleType
 from typing import Any
 
@@ -24,6 +26,7 @@ if __name__ == "__main__":  # same paths as `pythonpath` in pyproject.toml
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 
+import roads
 from conflict_drawing import counts, draw_conflicts
 from evaluation.evidence import read_evidence
 from evaluation.tables import document_parts
@@ -69,6 +72,8 @@ CLOSING = DOCS / "evidence" / "closing.json"
 """Output of `benchmarks/closing.py`."""
 STREAM = DOCS / "evidence" / "stream.json"
 """Output of `benchmarks/stream.py`."""
+ROADS = DOCS / "evidence" / roads.RECORD
+"""Output of `benchmarks/roads.py`."""
 HOSTS = DOCS / "evidence" / "hosts.json"
 LINKS = DOCS / "evidence" / "links.json"
 """Output of `benchmarks/hosts.py`."""
@@ -429,6 +434,109 @@ def _stream() -> str:
     return "\n".join(lines)
 
 
+@cache
+def _road_runs() -> list[tuple[roads.Point, list[dict[str, Any]]]]:
+    """Return the measured points of `benchmarks/roads.py`, each with its runs by seed."""
+    rows = json.loads(ROADS.read_text(encoding="utf-8")).values()
+    runs = {
+        point: sorted((row for row in rows if row["point"] == point.name), key=itemgetter("seed"))
+        for point in roads.POINTS
+    }
+    return [(point, each) for point, each in runs.items() if each]
+
+
+def _road_results(*, faults: bool) -> str:
+    """Return the table of both operations on roads, undisturbed or with faults."""
+    lines = [
+        (
+            f"| road | veh/(lane h) | operation |{' faults |' if faults else ''} runs "
+            "| at their destinations | travel time / time at v_F | goal | delay from ramps "
+            "| net gap | acceleration | stopped | emergency braking |"
+        ),
+        "|---" * (13 if faults else 12) + "|",
+    ]
+    for point, runs in _road_runs():
+        if point.label in roads.REFERENCES or point.processes or bool(point.faults) != faults:
+            continue
+        arrived, left, demanded = (
+            sum(run[key] for run in runs) for key in ("at_destination", "left", "demanded")
+        )
+        reached = f"{arrived:,} of {demanded:,}"
+        if left < demanded:
+            reached += f", {demanded - left} still on the road"
+        goal = "" if point.goal is None else f"{point.goal:g}"
+        goal += "" if point.ramp_goal_s is None else f"; {point.ramp_goal_s:g} s"
+        low, high = (
+            worst(accel[end] for run in runs for accel in run["accel_mps2"].values())
+            for end, worst in ((0, min), (1, max))
+        )
+        ramp_s = _delay_from_ramps_s(runs)
+        ramp = "" if ramp_s is None else f"{ramp_s:z.1f} s"
+        kind = f" {str(point.faults).removesuffix('.toml')} |" if faults else ""
+        lines.append(
+            f"| {point.scenario} | {point.volume} | {point.label} |{kind} {len(runs)} "
+            f"| {reached} | {fmean(run['ratio'] for run in runs):.3f} | {goal} | {ramp} "
+            f"| {min(run['min_gap_m'] for run in runs):.1f} m | {low:.1f} to {high:.1f} m/s2 "
+            f"| {sum(run['stopped'] for run in runs)} "
+            f"| {sum(run['emergency_ticks'] for run in runs)} ticks |"
+        )
+    return "\n".join(lines)
+
+
+def _road_processes() -> str:
+    """Return the table of runs over Zenoh, with a process for each vehicle."""
+    lines = [
+        (
+            "| road | veh/(lane h) | processes at once | at their destinations | delay "
+            "| net gap | stopped | emergency braking | real-time factor |"
+        ),
+        "|---" * 9 + "|",
+    ]
+    for point, (run, *_) in _road_runs():
+        if point.processes:
+            lines.append(
+                f"| {point.scenario} | {point.volume} | {run['processes']} "
+                f"| {run['at_destination']} of {run['demanded']} "
+                f"| {run['delay_by_entrance_s']['main']:z.2f} s "
+                f"| {run['min_gap_m']:.1f} m | {run['stopped']} "
+                f"| {run['emergency_ticks']} ticks | {run['real_time_factor']:.2f} |"
+            )
+    return "\n".join(lines)
+
+
+def _road_references() -> str:
+    """Return the table of the delays of all methods on the same roads, with the first seed."""
+    labels = ("rolling", "formations", *roads.REFERENCES)
+    lines = [
+        f"| road | veh/(lane h) | {' | '.join(labels)} |",
+        "|---" * (2 + len(labels)) + "|",
+    ]
+    cells: dict[tuple[str, int], dict[str, str]] = {}
+    for point, (run, *_) in _road_runs():
+        if point.faults is None and not point.processes:
+            delays_s = [run["delay_by_entrance_s"]["main"], _delay_from_ramps_s([run])]
+            text = "; ".join(f"{delay_s:z.1f}" for delay_s in delays_s if delay_s is not None)
+            if run["overlaps"]:
+                text += f" (overlaps: {run['overlaps']})"
+            cells.setdefault((point.scenario, point.volume), {})[point.label] = text
+    for (scenario, volume), texts in cells.items():
+        if not texts.keys().isdisjoint(roads.REFERENCES):
+            row = " | ".join(texts.get(label, "") for label in labels)
+            lines.append(f"| {scenario} | {volume} | {row} |")
+    return "\n".join(lines)
+
+
+def _delay_from_ramps_s(runs: list[dict[str, Any]]) -> float | None:
+    """Return the mean delay of vehicles from ramps; None if the road has no ramp."""
+    delays_s = [
+        delay_s
+        for run in runs
+        for name, delay_s in run["delay_by_entrance_s"].items()
+        if name != "main"
+    ]
+    return fmean(delays_s) if delays_s else None
+
+
 def _metrics() -> str:
     """Return the table of all metrics with their Prometheus names."""
     lines = [
@@ -642,6 +750,10 @@ def parts() -> dict[str, str]:
         "service": _service(),
         "stability": _stability(),
         "stream": _stream(),
+        "roads": _road_results(faults=False),
+        "roads under faults": _road_results(faults=True),
+        "roads over Zenoh": _road_processes(),
+        "roads with reference methods": _road_references(),
         "metrics": _metrics(),
         "rights": rights_table(),
         "hosts": _hosts(),

@@ -1,0 +1,384 @@
+"""Results on roads with lane drops, ramps, exits, weaving sections and trucks.
+
+    python benchmarks/roads.py [--only TEXT ...] [--seeds N] [--again]
+
+Each run drives a file of `scenarios/` with the volumes of a point, 600 s of arrivals over the
+simulated network, where results repeat exactly. The results are in docs/evidence/roads.json;
+finished runs are not repeated unless `--again` is given.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any, Final
+
+import attrs
+import numpy as np
+from attrs import field, frozen
+
+from evaluation.lattice_points import lattice_spacing
+from laneweave.launch.faults.specification import FaultSpec, load_faults
+from laneweave.launch.recordings.trajectories import Tracks, read_tracks, read_trips
+from laneweave.launch.run.reference_run import ReferenceRun
+from laneweave.launch.run.simulated_run import SimulatedRun
+from laneweave.launch.run_methods import FORMATION, METHODS
+from laneweave.protocol.config.participants import coordinator_names
+from laneweave.protocol.config.scenario_files import load_scenario, read_toml
+from laneweave.protocol.files import write_atomically
+from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.summary import read_summary
+
+HERE: Final = Path(__file__).resolve().parent
+SCENARIOS: Final = HERE.parent / "scenarios"
+TIMEOUT_S: Final = 1800.0
+OUT: Final = HERE.parent / "docs" / "evidence"
+RECORD: Final = "roads.json"
+DURATION_S: Final = 600.0
+FILES: Final = (
+    "lane-drop",
+    "blocked-lane",
+    "on-ramp",
+    "off-ramp",
+    "weaving",
+    "motorway",
+    "trucks",
+)
+STOPPED_MPS: Final = 0.5
+"""A vehicle slower than this has stopped."""
+REFERENCES: Final = (
+    "rule",
+    "lc2013-human",
+    "lc2013-ideal",
+    "lc2013-cooperative",
+    "lc2013-cooperative-4s",
+    "sl2015-cooperative",
+)
+
+
+@frozen(eq=False)
+class Point:
+    """A road with a demand, a method, and faults."""
+
+    scenario: str
+    """Name of a file in `scenarios/`."""
+    volume: int
+    """Vehicles/(lane h) on the main road."""
+    label: str = "rolling"
+    """Key of `METHODS`."""
+    overrides: Mapping[str, object] = field(factory=dict)
+    """See `load_scenario`."""
+    faults: str | None = None
+    """A preset, or a file in `benchmarks/faults` or `scenarios/faults`."""
+    goal: float | None = None
+    """Permitted ratio of the mean travel time to the time at v_F, from the start of the road."""
+    ramp_goal_s: float | None = None
+    """Permitted mean delay of vehicles from ramps."""
+    seeds: int = 5
+    duration_s: float = DURATION_S
+    processes: bool = False
+    """Whether real processes drive the file as it is, one for each vehicle, over Zenoh."""
+
+    @property
+    def name(self) -> str:
+        """Name of the point in the record."""
+        zenoh = "zenoh" if self.processes else ""
+        words = (self.scenario, f"{self.volume}", self.label, zenoh, self.faults or "")
+        return " ".join(filter(None, words))
+
+    def settings(self, seed: int) -> Scenario:
+        """Return the scenario of a run."""
+        base = load_scenario(
+            SCENARIOS / f"{self.scenario}.toml",
+            seed=seed,
+            demand__volume_veh_per_lane_h=float(self.volume),
+            demand__duration_s=self.duration_s,
+            **self.overrides,
+        )
+        return METHODS[self.label].settings(base)
+
+
+def _leaving(share: float) -> dict[str, object]:
+    """Return the overrides for the share of vehicles that leave by the off-ramp."""
+    return {"demand__destinations": [{"exit": "off-ramp", "share": share}]}
+
+
+def _weaving(ramp_veh_per_h: float, volume: int) -> dict[str, object]:
+    """Return the overrides for equal flows from the on-ramp and to the off-ramp of weaving.toml."""
+    (ramp,) = read_toml(SCENARIOS / "weaving.toml")["entrance"]
+    return {
+        "entrance": [ramp | {"volume_veh_per_h": ramp_veh_per_h}],
+        **_leaving(ramp_veh_per_h / (3 * volume)),
+    }
+
+
+def _lane_ends() -> Iterator[Point]:
+    """Yield the points of roads whose lanes end."""
+    for volume, goal in ((1000, 1.01), (1500, 1.02), (2000, 1.03), (2200, 1.05)):
+        yield Point("lane-drop", volume, goal=goal)
+        yield from _with_references(Point("lane-drop", volume))
+    for volume in (1000, 1500, 1700):
+        yield Point("lane-drop", volume, "formations", goal=1.05)
+    for volume in (1000, 1450):
+        yield Point("blocked-lane", volume, goal=1.03)
+        yield Point("blocked-lane", volume, "formations", goal=1.03)
+
+
+def _ramps() -> Iterator[Point]:
+    """Yield the points of roads with ramps and exits."""
+    for volume, goal, ramp_goal_s in ((1600, 1.01, 3.0), (2000, 1.02, 5.0), (2300, 1.03, 8.0)):
+        yield Point("on-ramp", volume, goal=goal, ramp_goal_s=ramp_goal_s)
+        yield from _with_references(Point("on-ramp", volume))
+    yield Point("on-ramp", 1300, "formations", goal=1.05)
+    leaving = _leaving(0.2)
+    yield Point("off-ramp", 2000, overrides=leaving, goal=1.02)
+    yield from _with_references(Point("off-ramp", 2000, overrides=leaving))
+    yield Point("off-ramp", 1700, "formations", overrides=leaving, goal=1.05)
+    for ramp, volume, goal in ((600, 1600, 1.02), (600, 2000, 1.03), (800, 2400, 1.05)):
+        flows = _weaving(ramp, volume)
+        yield Point("weaving", volume, overrides=flows, goal=goal)
+        yield from _with_references(Point("weaving", volume, overrides=flows))
+    yield Point("weaving", 1300, "formations", overrides=_weaving(600, 1300), goal=1.05)
+
+
+def _faulty() -> Iterator[Point]:
+    """Yield the points with faults."""
+    for faults in ("loss-30.toml", "lossy50", "agents-killed.toml", "leader-killed.toml"):
+        for volume, label in ((1600, "rolling"), (1200, "formations")):
+            for scenario in ("lane-drop", "on-ramp"):
+                yield Point(scenario, volume, label, faults=faults, seeds=1, duration_s=300.0)
+
+
+def _with_references(point: Point) -> Iterator[Point]:
+    """Yield the reference methods at the same point."""
+    for label in REFERENCES:
+        yield attrs.evolve(point, label=label, seeds=1)
+
+
+def _with_processes() -> Iterator[Point]:
+    """Yield a point of each road over Zenoh."""
+    for scenario in FILES:
+        volume = load_scenario(SCENARIOS / f"{scenario}.toml").demand.volume_veh_per_lane_h
+        yield Point(scenario, round(volume), seeds=1, duration_s=120.0, processes=True)
+
+
+POINTS: Final = (
+    *_lane_ends(),
+    *_ramps(),
+    *(Point("motorway", volume, goal=1.03) for volume in (1600, 2400)),
+    Point("trucks", 1450, goal=1.03),
+    *_faulty(),
+    *_with_processes(),
+)
+
+
+@frozen
+class Job:
+    """One run of a point."""
+
+    point: Point
+    seed: int
+
+    @property
+    def key(self) -> str:
+        """Name of the run in the record."""
+        return f"{self.point.name} seed {self.seed}"
+
+
+def drive(job: Job) -> dict[str, Any]:
+    """Drive one run, and return its results."""
+    scenario, method = job.point.settings(job.seed), METHODS[job.point.label].method
+    with tempfile.TemporaryDirectory(prefix="laneweave-roads-") as name, _silence():
+        folder, began_s = Path(name), time.process_time()
+        if job.point.processes:
+            problems: Sequence[str] = _run_processes(job, folder)
+        elif method == FORMATION:
+            faults = _faults(job.point.faults, scenario)
+            problems = SimulatedRun(scenario, folder, faults, show_progress=False).run().problems
+        else:
+            problems = ReferenceRun(scenario, folder, method, show_progress=False).run().problems
+        cpu_s = time.process_time() - began_s
+        return metrics(folder, scenario, method) | {
+            "point": job.point.name,
+            "seed": job.seed,
+            "cpu_s": round(cpu_s, 1),
+            "problems": list(problems),
+        }
+
+
+def _run_processes(job: Job, folder: Path) -> list[str]:
+    """Run a scenario file with real processes; return the errors of the command."""
+    command = [str(Path(sys.executable).parent / "laneweave"), "run", "--no-progress"]
+    command += [str(SCENARIOS / f"{job.point.scenario}.toml"), "--vehicles-per-process", "1"]
+    command += ["--seed", f"{job.seed}", "--duration", f"{job.point.duration_s}"]
+    command += ["--operation", job.point.label, "--out", str(folder / "run")]
+    ended = subprocess.run(  # noqa: S603 (the command consists of constants)
+        command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+    )
+    for file in (folder / "run").iterdir():
+        file.rename(folder / file.name)
+    return [] if ended.returncode == 0 else ended.stderr.splitlines()[-5:]
+
+
+def metrics(folder: Path, scenario: Scenario, method: str) -> dict[str, Any]:
+    """Return the results of a finished run."""
+    summary, trips = read_summary(folder), read_trips(folder)
+    if summary is None:
+        raise RuntimeError(f"{folder}: no summary")
+    tracks = read_tracks(folder)
+    counted = [trip for trip in trips.values() if trip["counted"]]
+    vehicles, safety, tracking = summary.vehicles, summary.safety, summary.tracking
+    result = {
+        "ending": summary.ending,
+        "demanded": vehicles.demanded,
+        "left": vehicles.left,
+        "at_destination": vehicles.at_destination,
+        "travel_s": summary.travel_time_s.mean,
+        "ratio": _ratio([trip for trip in counted if trip["entrance"] == MAIN_ENTRANCE]),
+        "delay_by_entrance_s": _delays(summary.travel_time_s.by_entrance),
+        "delay_by_destination_s": _delays(summary.travel_time_s.by_destination),
+        "throughput_veh_per_lane_h": summary.throughput_veh_per_lane_h,
+        "overlaps": safety.overlaps,
+        "min_gap_m": safety.min_gap_m,
+        "accel_mps2": _extremes(tracks, trips),
+        "beyond_limits": _beyond_limits(tracks, trips, scenario),
+        "stopped": _stopped(tracks),
+        "emergency_brakes": safety.emergency_brakes,
+        "emergency_ticks": tracking.emergency_ticks,
+        "caretakers": tracking.caretaker_takeovers,
+        "plans": summary.planning.plans,
+        "optimal": summary.planning.optimal,
+        "processes": summary.runtime.processes,
+        "real_time_factor": summary.runtime.real_time_factor,
+    }
+    if method == FORMATION:
+        spacing = lattice_spacing(tracks, scenario)
+        result["min_spacing_m"] = spacing.least_m
+        result["keeps_pitch"] = spacing.keeps(scenario.lattice.pitch_m)
+    return result
+
+
+def _ratio(trips: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return the mean travel time divided by the mean time at v_F."""
+    if not trips:
+        return None
+    free_s = sum(trip["free_flow_s"] for trip in trips)
+    return round(float(sum(trip["travel_time_s"] for trip in trips) / free_s), 4)
+
+
+def _delays(groups: Mapping[str, Any] | None) -> dict[str, float]:
+    return {name: times.delay for name, times in (groups or {}).items()}
+
+
+def _by_type(tracks: Tracks, trips: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the accelerations of all vehicles of each type."""
+    types = np.array([trips[name]["vehicle_type"] for name in tracks.names])[tracks.vehicle]
+    for one in np.unique(types):
+        yield str(one), tracks.accel_mps2[types == one]
+
+
+def _extremes(tracks: Tracks, trips: Mapping[str, Any]) -> dict[str, list[float]]:
+    """Return the lowest and the highest acceleration of each type [m/s^2]."""
+    return {
+        name: [round(float(accel.min()), 2), round(float(accel.max()), 2)]
+        for name, accel in _by_type(tracks, trips)
+    }
+
+
+def _beyond_limits(tracks: Tracks, trips: Mapping[str, Any], scenario: Scenario) -> int:
+    """Return the number of rows in which a vehicle exceeds the limits of its type."""
+    count = 0
+    for name, accel in _by_type(tracks, trips):
+        vehicle = scenario.types[name].vehicle
+        low, high = vehicle.min_accel_mps2 - 1e-3, vehicle.max_accel_mps2 + 1e-3
+        count += int(np.sum((accel < low) | (accel > high)))
+    return count
+
+
+def _stopped(tracks: Tracks) -> int:
+    """Return the number of vehicles that have stopped."""
+    return len(np.unique(tracks.vehicle[tracks.speed_mps < STOPPED_MPS]))
+
+
+def _faults(name: str | None, scenario: Scenario) -> FaultSpec:
+    """Return the faults of a preset or of a file in one of the two folders."""
+    files = [folder / str(name) for folder in (HERE / "faults", SCENARIOS / "faults")]
+    choice = next((file for file in files if name and file.is_file()), name)
+    return load_faults(choice, coordinator_names(scenario))
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Discard the log of a run."""
+    with Path(os.devnull).open("w", encoding="utf-8") as sink, contextlib.redirect_stdout(sink):
+        yield
+
+
+def jobs_of(only: Sequence[str], seeds: int | None) -> list[Job]:
+    """Return the runs of the points whose names contain one of the texts, seed by seed."""
+    chosen = [one for one in POINTS if not only or any(text in one.name for text in only)]
+    counts = {one: one.seeds if seeds is None else min(seeds, one.seeds) for one in chosen}
+    last = max(counts.values(), default=0)
+    return [Job(one, n) for n in range(1, last + 1) for one in chosen if n <= counts[one]]
+
+
+def main() -> int:
+    """Run the missing points and record their results."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="+", default=(), help="points whose names contain a text")
+    parser.add_argument("--again", action="store_true", help="repeat finished runs")
+    parser.add_argument("--seeds", type=int, help="number of seeds; default: that of the point")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="parallel runs")
+    parser.add_argument("--out", type=Path, default=OUT, help="folder of roads.json")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    record, failed = options.out / RECORD, False
+    known = json.loads(record.read_text(encoding="utf-8")) if record.exists() else {}
+    jobs = jobs_of(options.only, options.seeds)
+    jobs = [job for job in jobs if options.again or job.key not in known]
+    # Real processes use both cores, so that these runs follow each other.
+    for part, workers in ((False, options.jobs), (True, 1)):
+        # libsumo runs one simulation per process.
+        with ProcessPoolExecutor(
+            workers, multiprocessing.get_context("spawn"), max_tasks_per_child=1
+        ) as pool:
+            chosen = [job for job in jobs if job.point.processes == part]
+            waiting = {pool.submit(drive, job): job for job in chosen}
+            for done in as_completed(waiting):
+                job = waiting[done]
+                if (error := done.exception()) is not None:
+                    sys.stderr.write(f"{job.key}: {error}\n")
+                    failed = True
+                    continue
+                known[job.key] = done.result()
+                _record(record, known)
+                line = shown(known[job.key])
+                sys.stderr.write(f"{time.strftime('%H:%M:%S')} {job.key} {line}\n")
+    return int(failed)
+
+
+def _record(record: Path, known: Mapping[str, Any]) -> None:
+    """Write all results, in the order of the points."""
+    order = [one.key for one in jobs_of((), None)]
+    rows = {key: known[key] for key in [*order, *known] if key in known}
+    write_atomically(record, json.dumps(rows, indent=1) + "\n")
+
+
+def shown(row: Mapping[str, Any]) -> str:
+    """Return the results of a run in a line."""
+    hidden = ("point", "seed", "ending", "delay_by_destination_s", "throughput_veh_per_lane_h")
+    return " ".join(f"{key}={value}" for key, value in row.items() if key not in hidden)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
