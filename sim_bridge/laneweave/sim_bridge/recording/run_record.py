@@ -97,6 +97,7 @@ class _Leadership:
     """Leadership as reported by heartbeats."""
 
     leader: tuple[Name, int] | None = None
+    term: int = 0
     last_heartbeat_s: float = 0.0
     changes: int = 0
     recovery_s: list[float] = field(factory=list)
@@ -275,18 +276,26 @@ class RunRecord:
         self._reports.add(report)
 
     def on_heartbeat(self, heartbeat: Heartbeat, t_s: float, now_s: float) -> None:
-        """Record leader changes and leaderless periods; `now_s` is the node's clock."""
+        """Record leader changes and leaderless periods; `now_s` is the node's clock.
+
+        A leader that was paused claims to lead until it hears of its successor, which has a higher
+        term: this is no change.
+        """
         leadership = self._leadership
         sender = (heartbeat.coordinator, heartbeat.incarnation)
         if not heartbeat.leading:
             return
+        silence_s = now_s - leadership.last_heartbeat_s
+        if leadership.leader is not None and sender != leadership.leader:
+            outdated = heartbeat.term <= leadership.term
+            if outdated and silence_s < self._scenario.network.election_s:
+                return
+            leadership.changes += 1
+            leadership.recovery_s.append(round(silence_s, 4))
         if sender != leadership.leader:
-            if leadership.leader is not None:
-                leadership.changes += 1
-                leadership.recovery_s.append(round(now_s - leadership.last_heartbeat_s, 4))
             leadership.leader = sender
             self.event(t_s, LEADER, coordinator=heartbeat.coordinator, term=heartbeat.term)
-        leadership.last_heartbeat_s = now_s
+        leadership.term, leadership.last_heartbeat_s = heartbeat.term, now_s
 
     # --- the end ------------------------------------------------------------------------------
 

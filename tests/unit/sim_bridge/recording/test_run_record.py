@@ -150,19 +150,36 @@ def test_plans_are_counted_from_events(record: RunRecord, tmp_path: Path) -> Non
 def test_recovery_is_the_time_without_a_heartbeat_of_a_leader(
     record: RunRecord, tmp_path: Path
 ) -> None:
-    def beat(name: str, incarnation: int = 1, *, leading: bool = True) -> Heartbeat:
-        return Heartbeat(Name(name), incarnation, 1, leading=leading, formations=0)
+    def beat(name: str, incarnation: int = 1, *, term: int = 1, leading: bool = True) -> Heartbeat:
+        return Heartbeat(Name(name), incarnation, term, leading=leading, formations=0)
 
     record.on_heartbeat(beat("c1", leading=False), 0.0, 1.0)
     record.on_heartbeat(beat("c0"), 0.1, 2.0)
     record.on_heartbeat(beat("c0"), 0.2, 3.0)
     record.on_heartbeat(beat("c1", leading=False), 0.3, 3.2)
-    record.on_heartbeat(beat("c1"), 0.4, 3.5)
+    record.on_heartbeat(beat("c1", term=2), 0.4, 3.5)
     record.on_heartbeat(beat("c1", incarnation=2), 0.5, 5.0)  # the same name, another process
     record.close(1.0, Ending.COMPLETE)
     assert read_summary(tmp_path)["failover"] == {"leader_changes": 2, "recovery_s": [0.5, 1.5]}
     leaders = [event["coordinator"] for event in read_events(tmp_path, "leader")]
     assert leaders == ["c0", "c1", "c1"]
+
+
+def test_a_leader_that_does_not_know_its_successor_yet_is_no_change(
+    record: RunRecord, tmp_path: Path
+) -> None:
+    """It was paused: it claims to lead until it receives a heartbeat of its successor."""
+    beats = [("c0", 1), ("c1", 2), ("c0", 1), ("c1", 2), ("c0", 1), ("c0", 3)]
+    for number, (name, term) in enumerate(beats):
+        beat = Heartbeat(Name(name), 1, term, leading=True, formations=0)
+        record.on_heartbeat(beat, 0.1 * number, 0.1 * number)
+    late_s = 0.5 + SCENARIO.network.election_s
+    # A partition ended that hid the newer leader; then that leader remains silent.
+    record.on_heartbeat(Heartbeat(Name("c2"), 1, 2, leading=True, formations=0), 1.0, late_s)
+    record.close(2.0, Ending.COMPLETE)
+    leaders = [(event["coordinator"], event["term"]) for event in read_events(tmp_path, "leader")]
+    assert leaders == [("c0", 1), ("c1", 2), ("c0", 3), ("c2", 2)]
+    assert read_summary(tmp_path)["failover"]["leader_changes"] == 3
 
 
 # --- the world --------------------------------------------------------------------------------
