@@ -177,6 +177,7 @@ POINTS: Final = (
     *_ramps(),
     *(Point("motorway", volume, goal=1.03) for volume in (1600, 2400)),
     Point("trucks", 1450, goal=1.03),
+    Point("trucks", 1200, "formations", goal=1.03),
     *_faulty(),
     *_with_processes(),
 )

@@ -57,9 +57,12 @@ def _joint_moves(
     if len(chosen) == len(state):
         yield chosen
         return
-    cell, stays = state[len(chosen)]
+    vehicle = len(chosen)
+    cell, stays = state[vehicle]
     for move in [(cell, cell)] if stays else problem.moves_from(cell):
-        if not any(problem.conflict(move, other) for other in chosen):
+        if problem.can_drive(vehicle, move) and not any(
+            problem.conflict(move, other) for other in chosen
+        ):
             yield from _joint_moves(problem, state, (*chosen, move))
 
 

@@ -59,6 +59,8 @@ def optimal_cost(request: dict[str, Any], horizon: int | None = None) -> int | N
 def optimal_solution(request: dict[str, Any], horizon: int | None = None) -> Solution | None:
     """A solution of least cost; `horizon` is only where the search for a proof begins."""
     problem = Problem.of(request)
+    if any(moves is not None for moves in problem.drivable):
+        raise UndecidedError("the programme has all moves for all vehicles")
     distance = _distances(problem)
     if _matching_cost(distance) >= FORBIDDEN:
         return None

@@ -176,6 +176,8 @@ class Problem:
     eligible: tuple[frozenset[int], ...]
     """For each vehicle the indices of the targets it may take."""
     bodies: Bodies | None = None
+    drivable: tuple[frozenset[Cell] | None, ...] = ()
+    """For each vehicle the displacements that it can drive; None: all of the mode."""
 
     @classmethod
     def of(cls, request: dict[str, Any]) -> "Problem":
@@ -199,6 +201,10 @@ class Problem:
             targets=targets,
             eligible=tuple(eligible),
             bodies=Bodies(**request["geometry"]) if "geometry" in request else None,
+            drivable=tuple(
+                frozenset(map(_cell, vehicle["moves"])) if "moves" in vehicle else None
+                for vehicle in request["vehicles"]
+            ),
         )
 
     def is_free(self, cell: Cell) -> bool:
@@ -213,6 +219,11 @@ class Problem:
         around = [(cell[0] + dc, cell[1] + dl) for dc in (-1, 0, 1) for dl in (-1, 0, 1)]
         candidates = [(cell, other) for other in around if self.is_free(other)]
         return [move for move in candidates if is_allowed(move, self.mode)]
+
+    def can_drive(self, vehicle: int, move: Move) -> bool:
+        drivable = self.drivable[vehicle]
+        (c0, l0), (c1, l1) = move
+        return drivable is None or not moves_away(move) or (c1 - c0, l1 - l0) in drivable
 
     def distances_from(self, cell: Cell) -> dict[Cell, int]:
         """Steps to every cell that a vehicle alone on the grid can reach."""
@@ -291,6 +302,8 @@ def _wrong_moves(problem: Problem, paths: list[Path]) -> list[str]:
         for step, move in enumerate(pairwise(path)):
             if not is_allowed(move, problem.mode):
                 found.append(f"vehicle {i}: step {step}: {move} is not a move")
+            elif not problem.can_drive(i, move):
+                found.append(f"vehicle {i}: step {step}: it cannot drive {move}")
     return found
 
 

@@ -28,10 +28,11 @@ BUGS: list[tuple[str, Bug, int]] = [
     (ROADS, broken_roads.agents_insist, 337),
     (ROADS, broken_roads.types_are_ignored, 2),
     (FORMATIONS, broken_formations_on_roads.columns_are_not_reserved, 17),
-    (FORMATIONS, broken_formations_on_roads.ramps_are_forgotten, 25),
-    (FORMATIONS, broken_formations_on_roads.columns_ahead_are_closed, 59),
-    (FORMATIONS, broken_lane_ends.never_leaves, 0),
-    (FORMATIONS, broken_roads.exits_are_closed, 10),
+    (FORMATIONS, broken_formations_on_roads.ramps_are_forgotten, 2),
+    (FORMATIONS, broken_formations_on_roads.columns_ahead_are_closed, 66),
+    (FORMATIONS, broken_lane_ends.never_leaves, 6),
+    (FORMATIONS, broken_roads.exits_are_closed, 8),
+    (FORMATIONS, broken_roads.types_are_ignored, 10),
 ]
 """Profiles, bugs, and a seed that catches each."""
 

@@ -8,8 +8,8 @@ import pytest
 
 from laneweave.agents import core
 from laneweave.agents.core import AgentCore
-from laneweave.coordinator.planning.rolling.problem import StreamVehicle
 from laneweave.protocol.road_layout import Exits
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.road.roadside import Roadside
@@ -80,5 +80,4 @@ def agents_insist(patch: pytest.MonkeyPatch) -> None:
 
 def types_are_ignored(patch: pytest.MonkeyPatch) -> None:
     """Leaders move trucks like cars, and their agents take such plans."""
-    patch.setattr(StreamVehicle, "drives", lambda _self, _columns, _lanes: True)
-    patch.setattr(AgentCore, "_set_type", lambda _self, _type: None)
+    patch.setattr(Scenario, "moves_of", lambda _self, _type: None)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from random import Random
 from typing import Any
 
-from attrs import define
+from attrs import define, evolve
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
@@ -16,7 +16,7 @@ from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import Bans, Path
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
-from laneweave.protocol.lattice import Mode
+from laneweave.protocol.lattice import Mode, displacements
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS, SOLVERS
 from oracles import joint_search
 from oracles.moving_bodies import Bodies, drive
@@ -111,9 +111,17 @@ MODES: st.SearchStrategy[Mode] = st.sampled_from((1, 2))
 
 @st.composite
 def requests(
-    draw: st.DrawFn, *, most_vehicles: int = 3, most_cells: int = 8, deadline_s: float = 60.0
+    draw: st.DrawFn,
+    *,
+    most_vehicles: int = 3,
+    most_cells: int = 8,
+    deadline_s: float = 60.0,
+    limited: bool = False,
 ) -> PlanRequest:
-    """Draw small requests over both modes, all sets of conflicts and some geometries."""
+    """Draw small requests over both modes, all sets of conflicts and some geometries.
+
+    With `limited`, at least one vehicle cannot drive all moves, and vehicles do not share cells.
+    """
     mode = draw(MODES)
     lanes = draw(st.integers(1, 3))
     columns = draw(st.integers(2, max(2, most_cells // lanes)))
@@ -131,10 +139,18 @@ def requests(
     preference = st.none() | st.lists(
         st.integers(0, len(targets) - 1), unique=True, min_size=1
     ).map(tuple)
+    possible = displacements(mode)[1:]
+    some_moves = st.sampled_from(
+        (None, None, tuple(move for move in possible if move[0] == 0))
+    ) | st.lists(st.sampled_from(possible), unique=True).map(tuple)
     vehicles = tuple(
-        VehicleRequest(f"v{i}", cell, eligible=draw(preference)) for i, cell in enumerate(starts)
+        VehicleRequest(f"v{i}", cell, eligible=draw(preference), moves=draw(some_moves))
+        for i, cell in enumerate(starts)
     )
-    kinds = draw(common | any_kinds)
+    if limited:
+        lanes_only = tuple(move for move in possible if move[0] == 0)
+        vehicles = (evolve(vehicles[0], moves=lanes_only), *vehicles[1:])
+    kinds = draw(common) if limited else draw(common | any_kinds)
     return PlanRequest(
         Grid(columns, lanes, blocked),
         mode,

@@ -55,7 +55,7 @@ def test_cars_and_trucks_enter_by_a_ramp_and_leave_by_their_exits(lab: Lab) -> N
     assert summary(folder)["tracking"]["emergency_ticks"] == 0
 
 
-VANS = """schema = "laneweave.scenario/1"
+MIXED = """schema = "laneweave.scenario/1"
 [demand]
 volume_veh_per_lane_h = 1000.0
 duration_s = 20.0
@@ -65,19 +65,26 @@ name = "van"
 share = 0.4
 length_m = 7.0
 max_accel_mps2 = 3.5
+[[vehicle_type]]
+name = "truck"
+share = 0.3
+length_m = 12.0
+width_m = 2.5
+max_accel_mps2 = 1.3
+min_accel_mps2 = -7.0
 [formation]
-cycle_s = 6.0
-gap_m = 18.0
+gap_m = 20.0
 """
 
 
-def test_vans_and_cars_sort_in_formations(lab: Lab) -> None:
+def test_cars_vans_and_trucks_sort_in_formations(lab: Lab) -> None:
+    """Trucks change lanes only, and others make room."""
     folder = lab.folder / "run"
-    scenario = lab.path("vans.toml", VANS)
+    scenario = lab.path("mixed.toml", MIXED)
     ended = lab.run("run", scenario, "--transport", "simulated", "--out", folder)
     assert (ended.status, ended.complaints) == (0, []), ended
     check_safe_and_complete(folder)
     found, driven = summary(folder), list(trips(folder).values())
     assert found["vehicles"]["on_preferred_lane"] == len(driven) >= 10
-    assert {trip["vehicle_type"] for trip in driven} == {"car", "van"}
+    assert {trip["vehicle_type"] for trip in driven} == {"car", "van", "truck"}
     assert found["tracking"]["emergency_ticks"] == 0

@@ -249,7 +249,7 @@ class AgentCore:
             raise BadInputError("vehicle_type", vehicle_type, allowed)
         own = types[vehicle_type]
         self._vehicle_type = vehicle_type
-        self._drivable = None if vehicle_type == CAR else own.drivable_moves
+        self._drivable = own.moves_of(vehicle_type)
         self._driver = self._make_driver(own)
 
     def _has_lost_track(self, sense: Sense) -> bool:

@@ -178,6 +178,11 @@ class FormationPlanner:
             deserted=formation.deserted,
             structure=stage.structure,
             stage=stage if formation.sorts else None,
+            moves={
+                member.vehicle: moves
+                for member in formation.members
+                if (moves := scenario.moves_of(member.vehicle_type)) is not None
+            },
         )
         nodes = scenario.formation.max_nodes * 2 ** min(leader.failures, MAX_DOUBLINGS)
         # Replaces a request under an earlier ballot, at the end of the queue.

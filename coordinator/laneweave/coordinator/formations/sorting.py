@@ -1,8 +1,9 @@
 """Lane sorting of one formation, or of joined ones: from promises to moves.
 
 The grid consists of the blocks of the formations, in the lanes that are open. Vehicles without an
-agent block their cells. If every vehicle has one goal lane and no lane ends, they form the parallel
-structure; otherwise they take any cells of their goal lanes. If complete sorting is infeasible, one
+agent block their cells. If every vehicle has one goal lane, all can change columns, and no lane
+ends, they form the parallel structure; otherwise they take any cells of their goal lanes, vehicles
+that cannot change columns those of their own columns. If complete sorting is infeasible, one
 vehicle is exempted from reaching its lane, so that a single blocked vehicle does not prevent all
 others from sorting; the vehicles are tried one by one. Before sorting, a formation may form other
 structures, in which every vehicle may take any place.
@@ -16,7 +17,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from itertools import islice
 
-from attrs import evolve, frozen
+from attrs import evolve, field, frozen
 
 from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.formations.stages import Stage
@@ -60,6 +61,8 @@ class SortingTask:
     """Structure to form, with any vehicle in any place; None: sort by lanes."""
     stage: Stage | None = None
     """Stage of the road; its closed lanes are not used. None: all lanes are open."""
+    moves: Mapping[Name, frozenset[Cell]] = field(factory=dict)
+    """Moves (columns, lanes) that members of some types can drive; others drive all."""
 
     @property
     def columns(self) -> range:
@@ -84,6 +87,13 @@ class SortingTask:
         """Lanes that plans may use; vehicles in other lanes hold."""
         every = frozenset(range(self.scenario.road.lanes))
         return every if self.stage is None else self.stage.lanes
+
+    @property
+    def column_bound(self) -> frozenset[Name]:
+        """Members that do not change columns."""
+        return frozenset(
+            name for name, moves in self.moves.items() if not any(columns for columns, _ in moves)
+        )
 
     @property
     def blocked(self) -> tuple[Cell, ...]:
@@ -139,7 +149,8 @@ def plan_requests(task: SortingTask, exempt: Name | None = None) -> Iterator[Pla
         for name, cell in task.movers.items()
     }
     lanes_end = task.stage is not None and bool(task.stage.ending_lanes)
-    if not lanes_end and all(len(lanes) == 1 for lanes in wanted.values()):
+    bound = not task.column_bound.isdisjoint(wanted)
+    if not lanes_end and not bound and all(len(lanes) == 1 for lanes in wanted.values()):
         yield from _into_parallel_structure(
             task, {name: min(each) for name, each in wanted.items()}
         )
@@ -184,10 +195,15 @@ def _into_lanes(task: SortingTask, wanted: Mapping[Name, frozenset[int]]) -> Ite
         if (column, lane) not in task.blocked
     ]
     through = task.open_lanes if task.stage is None else task.stage.through_lanes
-    chosen = choose_lanes(task.movers, wanted, through, free)
+    bound = task.column_bound
+    chosen = choose_lanes(task.movers, wanted, through, free, bound)
     targets = tuple(cell for cell in free if any(cell[1] in lanes for lanes in chosen.values()))
     eligible = {
-        name: tuple(number for number, cell in enumerate(targets) if cell[1] in lanes)
+        name: tuple(
+            number
+            for number, (column, lane) in enumerate(targets)
+            if lane in lanes and (name not in bound or column == task.movers[name][0])
+        )
         for name, lanes in chosen.items()
     }
     nearby = assign_nearby(task.movers, eligible, targets)
@@ -205,6 +221,12 @@ def _plan_request(
     structure: DrivingStructure | None = None,
 ) -> PlanRequest:
     formation = task.scenario.formation
+    vehicles = [
+        evolve(one, moves=tuple(sorted(moves)))
+        if (moves := task.moves.get(Name(one.id))) is not None
+        else one
+        for one in vehicles
+    ]
     return PlanRequest(
         Grid(len(task.columns), task.scenario.road.lanes, task.blocked),
         1 if formation.mode == 1 else 2,

@@ -92,6 +92,10 @@ def _problems_of_vehicle(
         lanes = abs(path[step][1] - path[step + 1][1])
         if (columns + lanes if request.mode == 1 else max(columns, lanes)) > 1:
             yield f"{name} jumps from {path[step]} to {path[step + 1]} in step {step}"
+        elif vehicle.moves is not None and columns + lanes > 0:
+            move = path[step + 1][0] - path[step][0], path[step + 1][1] - path[step][1]
+            if move not in vehicle.moves:
+                yield f"{name} cannot drive {path[step]} to {path[step + 1]} in step {step}"
     if not 0 <= target < len(request.targets):
         yield f"{name} is assigned to target {target}, which does not exist"
         return

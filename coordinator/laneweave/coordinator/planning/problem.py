@@ -11,7 +11,7 @@ bits of their waits. Ties go to the lowest bit.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Final
 
 import attrs
@@ -118,16 +118,25 @@ class MoveTable:
             cells |= part << shift if shift >= 0 else part >> -shift
         return cells
 
-    def distances(self, cells: int) -> dict[int, int]:
-        """Return the minimum number of steps between each cell and the nearest of these cells."""
+    def distances(self, cells: int, undrivable: int = 0) -> dict[int, int]:
+        """Return the minimum number of steps to each cell from the nearest of these cells.
+
+        Args:
+            cells: the cells to start from.
+            undrivable: moves that the vehicle cannot drive.
+        """
         found: dict[int, int] = {}
         reached, steps = cells, 0
         while cells:
             found.update(dict.fromkeys(bits(cells), steps))
-            cells = self.ends(self.starting_in(cells)) & ~reached
+            cells = self.ends(self.starting_in(cells) & ~undrivable) & ~reached
             reached |= cells
             steps += 1
         return found
+
+    def with_displacements(self, displaced: Iterable[int]) -> int:
+        """Return all moves with one of these displacements, given by index."""
+        return sum(self.cells << d for d in displaced) & self.valid
 
     def common_conflicts(self, moves: int) -> int:
         """Return the moves that conflict with every one of the given moves."""
@@ -245,6 +254,8 @@ class Problem:
     """Vehicles and targets on a grid.
 
     starts, targets: bit indices of the start cells and of the target cells.
+    excluded: the displacements that each vehicle cannot drive, by index.
+    undrivable: the moves that each vehicle cannot drive.
     free_paths: cache of `shortest_paths.free_paths`, shared by all constraint trees.
     """
 
@@ -255,11 +266,30 @@ class Problem:
         model: ConflictModel,
         starts: Sequence[Cell],
         targets: Sequence[Cell],
+        drivable: Sequence[Collection[Cell] | None] = (),
     ) -> None:
-        """Number the moves of the grid."""
+        """Number the moves of the grid.
+
+        Args:
+            grid: the grid.
+            mode: relative motion mode.
+            model: definition of conflicts.
+            starts: start cell of each vehicle.
+            targets: target cells.
+            drivable: moves (columns, lanes) that each vehicle can drive; None: all; empty: all
+                vehicles drive all moves.
+        """
         self.table = MoveTable(grid, mode, model)
         self.starts = tuple(self.table.bit(cell) for cell in starts)
         self.targets = tuple(self.table.bit(cell) for cell in targets)
+        limits = tuple(drivable) or (None,) * len(starts)
+        self.excluded = tuple(
+            frozenset(d for d, step in enumerate(self.table.steps) if d and step not in moves)
+            if moves is not None
+            else frozenset[int]()
+            for moves in limits
+        )
+        self.undrivable = tuple(map(self.table.with_displacements, self.excluded))
         self.free_paths: dict[tuple[int, int], Diagram | None] = {}
 
     def cells_of(self, solution: Solution) -> list[list[Cell]]:

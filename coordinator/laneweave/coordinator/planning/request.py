@@ -24,7 +24,7 @@ from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.protocol.errors import BadInputError, one_line
-from laneweave.protocol.lattice import Cell, Mode
+from laneweave.protocol.lattice import Cell, Mode, displacements
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS, DEFAULT_CONFLICTS, SOLVERS
 from laneweave.protocol.structuring import as_lists, structure
 
@@ -43,12 +43,16 @@ _NOT_BOTH: Final = "structure or targets, not both"
 
 @attrs.frozen
 class VehicleRequest:
-    """One vehicle: its start cell, and the lane or the targets (indices) it may be assigned to."""
+    """One vehicle: its start cell, and the lane or the targets (indices) it may be assigned to.
+
+    moves: moves (columns, lanes) that the vehicle can drive, besides waiting; None: all.
+    """
 
     id: str
     cell: Cell
     lane: int | None = None
     eligible: tuple[int, ...] | None = None
+    moves: tuple[Cell, ...] | None = None
 
     def choice(self, targets: Sequence[Cell]) -> frozenset[int]:
         """Return the indices of eligible targets: `eligible`, those in `lane`, or all."""
@@ -122,7 +126,8 @@ class PlanRequest:
     def problem(self) -> Problem:
         """Return the problem in the form that the searches use."""
         starts = [vehicle.cell for vehicle in self.vehicles]
-        return Problem(self.grid, self.mode, self.conflict_model, starts, self.targets)
+        drivable = [vehicle.moves for vehicle in self.vehicles]
+        return Problem(self.grid, self.mode, self.conflict_model, starts, self.targets, drivable)
 
     def choices(self) -> list[frozenset[int]]:
         """Return, per vehicle, the indices of the targets it may be assigned to."""
@@ -308,8 +313,18 @@ def _check_vehicles(request: PlanRequest) -> None:
         for k, target in enumerate(eligible if request.structure is None else ()):
             _check_range(f"{field}.eligible[{k}]", target, 0, len(request.targets) - 1)
         _check_unique(f"{field}.eligible", eligible, "each target once")
+        _check_moves(f"{field}.moves", vehicle.moves or (), request.mode)
     _check_unique("vehicles", [vehicle.id for vehicle in vehicles], "unique ids", ".id")
     _check_unique("vehicles", [vehicle.cell for vehicle in vehicles], "separate cells", ".cell")
+
+
+def _check_moves(field: str, moves: Sequence[Cell], mode: Mode) -> None:
+    possible = displacements(mode)[1:]
+    for k, move in enumerate(moves):
+        if move not in possible:
+            allowed = f"one of {', '.join(map(str, possible))}, a move of mode {mode}"
+            raise BadInputError(f"{field}[{k}]", move, allowed)
+    _check_unique(field, moves, "each move once")
 
 
 def _check_structure(request: PlanRequest) -> None:

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import attrs
+
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.problem import Bans, Diagram, MoveTable, Path, Problem, Solution
 
@@ -47,13 +49,19 @@ def shortest_paths(table: MoveTable, start: int, target: int, bans: Bans) -> Dia
     return Diagram(tuple(layers), target)
 
 
+def paths_of(problem: Problem, vehicle: int, target: int, bans: Bans) -> Diagram | None:
+    """Return a vehicle's shortest paths to a target cell with the moves that it can drive."""
+    if undrivable := problem.undrivable[vehicle]:
+        since = {**bans.since, 0: bans.since.get(0, 0) | undrivable}
+        bans = attrs.evolve(bans, since=since)
+    return shortest_paths(problem.table, problem.starts[vehicle], target, bans)
+
+
 def free_paths(problem: Problem, vehicle: int, target: int) -> Diagram | None:
     """Return a vehicle's unconstrained shortest paths to a target (an index)."""
     key = vehicle, target
     if key not in problem.free_paths:
-        problem.free_paths[key] = shortest_paths(
-            problem.table, problem.starts[vehicle], problem.targets[target], Bans()
-        )
+        problem.free_paths[key] = paths_of(problem, vehicle, problem.targets[target], Bans())
     return problem.free_paths[key]
 
 
@@ -132,7 +140,7 @@ def _reroute(problem: Problem, solution: Solution, vehicle: int) -> Solution:
         if other != vehicle:
             _ban_conflicts(problem, bans, path, problem.targets[solution.assignment[other]])
     target = problem.targets[solution.assignment[vehicle]]
-    diagram = shortest_paths(problem.table, problem.starts[vehicle], target, bans)
+    diagram = paths_of(problem, vehicle, target, bans)
     if diagram is None:
         return solution
     path = choose_path(problem.table, diagram, [0] * diagram.cost)

@@ -78,6 +78,7 @@ def choose_lanes(
     goal_lanes: Mapping[Name, Collection[int]],
     through_lanes: Collection[int],
     free: Sequence[Cell],
+    column_bound: Collection[Name] = (),
 ) -> dict[Name, frozenset[int]]:
     """Return the lanes in which each vehicle may have its target, so that all have one.
 
@@ -89,20 +90,23 @@ def choose_lanes(
         goal_lanes: goal lanes of each vehicle.
         through_lanes: lanes that go on behind the stage.
         free: cells that can be targets, at least as many as there are vehicles.
+        column_bound: vehicles whose targets are in their own columns.
     """
     choices = {
         name: [frozenset(goal_lanes[name]), frozenset(through_lanes) | frozenset(goal_lanes[name])]
         for name in cells
     }
     every = frozenset(lane for _, lane in free)
-    # A worse choice costs more than all distances together.
+    # A worse choice costs more than all distances together, another column than all choices.
     penalty = 1 + len(cells) * sum(max(cell) + 1 for cell in (*cells.values(), *free))
+    other_column = penalty * (1 + 2 * len(cells))
     costs = np.array(
         [
             [
                 abs(column - other[0])
                 + abs(lane - other[1])
                 + penalty * sum(other[1] not in lanes for lanes in choices[name])
+                + other_column * (name in column_bound and column != other[0])
                 for other in free
             ]
             for name, (column, lane) in cells.items()

@@ -36,7 +36,6 @@ from laneweave.protocol.wire.events import (
     TRANSFER_ABORTED,
 )
 from laneweave.protocol.wire.messages import (
-    CAR,
     Ballot,
     Census,
     CensusEntry,
@@ -59,8 +58,6 @@ MAX_DELAY_S = 1.0
 LOOKAHEAD_M = 600.0
 """Distance before the first moves at which planning for a vehicle begins: the length of S3, so that
 all vehicles that can interact there are included in time."""
-NO_MOVES: frozenset[Cell] = frozenset()
-"""Moves of a vehicle of a type that this scenario does not have."""
 MARGIN_COLUMNS = 10
 """Columns ahead of the foremost and behind the rearmost vehicle that plans may use."""
 
@@ -92,10 +89,6 @@ class RollingOperation:
         self._planner = planner
         self._slot_s = scenario.cycles_s[0]
         self._sections = scenario.sections
-        self._moves = {
-            name: None if name == CAR else one.drivable_moves
-            for name, one in scenario.types.items()
-        }
         self.observed = ObservedRoad()
         self.transfers: list[CellTransfer] = []
         self._transfer_of: dict[Name, CellTransfer] = {}
@@ -212,7 +205,7 @@ class RollingOperation:
             if s_m < far_m:
                 continue
             targets = self._targets(entry, s_m)
-            moves = self._moves.get(entry.vehicle_type, NO_MOVES)
+            moves = self._scenario.moves_of(entry.vehicle_type)
             if state is None:
                 unknown = StreamVehicle(entry.vehicle, entry.cell, targets, held=True)
                 vehicles.setdefault(entry.cell, unknown)

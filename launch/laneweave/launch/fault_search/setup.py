@@ -113,7 +113,7 @@ class RoadSetup:
     stream_planner: bool = False
     """Whether the stream planner replaces `LightPlanner` (rolling operation)."""
     trucks: bool = False
-    """Whether there are vehicles that do not change columns (rolling operation at the roadside)."""
+    """Whether there are vehicles that do not change columns (at the roadside)."""
     drawn: DrawnRoad = STRAIGHT_ROAD
     """Closed parts, ramps and exits (at the real roadside)."""
 
@@ -245,9 +245,7 @@ class Setup:
                 road = evolve(road, drawn=DrawnRoad((Closure(0, ends_m),)))
             elif profile.roads:
                 step_m = FormationSettings().speed_mps * road.slot_s
-                drawn = draw_road(lanes, road.before_m, step_m, rng)
-                trucks = _types_rng(road, "road").random() < WITH_TRUCKS
-                road = evolve(road, drawn=drawn, trucks=trucks)
+                road = evolve(road, drawn=draw_road(lanes, road.before_m, step_m, rng))
         else:
             road = RoadSetup(
                 lanes=lanes,
@@ -262,7 +260,10 @@ class Setup:
                 before_m = rng.choice(BEFORE_COLUMNS) * straight.formation.gap_m
                 step_m = straight.formation.speed_mps * road.slot_s
                 drawn = draw_road(lanes, before_m, step_m, rng, straight.longest_formation_m)
-                road = evolve(road, before_m=before_m, drawn=drawn)
+                seed = rng.randrange(2**31)
+                road = evolve(road, before_m=before_m, drawn=drawn, seed=seed)
+        if profile.roads:
+            road = evolve(road, trucks=_types_rng(road, "road").random() < WITH_TRUCKS)
         scenario = road.make_scenario()
         lasting = LastingFaults.drawn(profile, rng)
         mean_s = rng.uniform(*MEAN_HEADWAYS_S)

@@ -187,11 +187,11 @@ def _check_types(scenario: Scenario) -> None:
         given.append((name, [one.share for one in own]))
     for name, shares in given:
         _require(sum(shares) <= 1.0 + 1e-9, name, shares, "shares with a sum of at most 1")
-    _check_types_of_formations(scenario)
+    _check_types_of_structures(scenario)
 
 
-def _check_types_of_formations(scenario: Scenario) -> None:
-    """Check that in formations all types drive all moves: a plan gives any path to any vehicle."""
+def _check_types_of_structures(scenario: Scenario) -> None:
+    """Check that all types drive all moves if structures are given: any vehicle gets any place."""
     accel_mps2, jerk_mps3 = scenario.column_move_peaks
     for name, own in scenario.types.items():
         limits = own.vehicle
@@ -201,12 +201,14 @@ def _check_types_of_formations(scenario: Scenario) -> None:
             ("max_jerk_mps3", limits.max_jerk_mps3, jerk_mps3),
         ):
             _require(
-                scenario.formation.rolling or own.changes_columns or abs(value) >= abs(needed),
+                not scenario.formation.structures
+                or own.changes_columns
+                or abs(value) >= abs(needed),
                 _limit_of(scenario, name, limit),
                 value,
-                f"at {'most' if needed < 0.0 else 'least'} {needed:.3g} in formations, where each "
-                f"vehicle moves by a column of {scenario.formation.gap_m:g} m in T_F "
-                '(formation.cycle_s), or formation.operation = "rolling"',
+                f"at {'most' if needed < 0.0 else 'least'} {needed:.3g} with formation.structures, "
+                f"where each vehicle moves by a column of {scenario.formation.gap_m:g} m in T_F "
+                "(formation.cycle_s)",
             )
 
 

@@ -732,6 +732,16 @@ class Scenario:
             return moves
         return frozenset((columns, lanes) for columns, lanes in moves if columns == 0)
 
+    def moves_of(self, vehicle_type: str) -> frozenset[Cell] | None:
+        """Return the moves (columns, lanes) that are planned for a type; None: all.
+
+        There are none for a type that this scenario does not have.
+        """
+        if vehicle_type == CAR:
+            return None
+        own = self.types.get(vehicle_type)
+        return frozenset() if own is None else own.drivable_moves
+
     @property
     def column_move_peaks(self) -> tuple[float, float]:
         """Peaks of a move by a column in the shortest T_F: acceleration [m/s^2], jerk [m/s^3].
@@ -816,7 +826,7 @@ class Scenario:
                 steps = math.floor(longest_s / CYCLE_STEP_S + 1e-9)
                 cycle_s = min(cycle_s, max(CYCLE_STEP_S * steps, self._shortest_cycle_s))
             return cycle_s, cycle_s
-        return SHORTEST_CYCLE_S, LONGEST_CYCLE_S
+        return self._shortest_cycle_s, max(self._shortest_cycle_s, LONGEST_CYCLE_S)
 
     @property
     def _shortest_cycle_s(self) -> float:

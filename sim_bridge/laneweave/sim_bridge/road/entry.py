@@ -199,10 +199,13 @@ class EntryMeter:
     def _dequeue(self, cell: Cell, t_s: float) -> Arrival | None:
         """Remove and return the first vehicle of a queue, unless it needs a later cell."""
         builder, queue = self._builder, self._queues[cell[1]]
+        is_bound = queue[0].vehicle_type in self._column_bound
+        if is_bound and not self._can_bind(cell, queue[0]):
+            return None
         if builder is not None and not builder.try_add(cell, queue[0].preferred_lane, t_s):
             return None
-        if queue[0].vehicle_type in self._column_bound and not self._try_bind(cell, queue[0]):
-            return None
+        if is_bound:
+            self._bind(cell, queue[0])
         self._names.discard(queue[0].vehicle)
         return queue.pop(0)
 
@@ -210,11 +213,10 @@ class EntryMeter:
         preferred = arrival.preferred_lane
         return range(self._lattice.lanes) if preferred == ANY_LANE else (preferred,)
 
-    def _try_bind(self, cell: Cell, arrival: Arrival) -> bool:
-        """Add a vehicle to the vehicles of its column that do not change columns.
+    def _can_bind(self, cell: Cell, arrival: Arrival) -> bool:
+        """Return whether a vehicle, and those of its column, can leave in the order of their lanes.
 
-        Returns:
-            False: they could not all leave the road in the order of their lanes.
+        These are the vehicles that do not change columns.
         """
         column, lane = cell
         bound = {**self._bound.get(column, {}), lane: self._lanes_of(arrival)}
@@ -222,9 +224,11 @@ class EntryMeter:
         for here in sorted(bound):
             # The rightmost lane that leaves the most room for those on its left.
             leaves_in = min((goal for goal in bound[here] if goal > leaves_in), default=math.inf)
-        if leaves_in == math.inf and len(bound) > 1:
-            return False
-        self._bound[column] = bound
+        return leaves_in < math.inf or len(bound) == 1
+
+    def _bind(self, cell: Cell, arrival: Arrival) -> None:
+        """Add a vehicle to the vehicles of its column that do not change columns."""
+        column, lane = cell
+        self._bound.setdefault(column, {})[lane] = self._lanes_of(arrival)
         while len(self._bound) > _MAX_BOUND_COLUMNS:
             del self._bound[next(iter(self._bound))]
-        return True

@@ -75,7 +75,7 @@ def test_move_to_a_neighbouring_cell_is_planned_once_per_process() -> None:
 @pytest.mark.parametrize(
     "table",
     [
-        {"formation": {"gap_m": 30.0}},
+        {"formation": {"gap_m": 30.0, "cycle_s": 4.0}},
         {"formation": {"cycle_s": 4.0, "move_s": 2.0}},
         {"vehicle": {"max_jerk_mps3": 5.0}},
         {"vehicle": {"max_speed_mps": 16.0}, "formation": {"settle_s": 25.0}},

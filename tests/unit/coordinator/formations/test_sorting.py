@@ -247,6 +247,32 @@ def test_all_placements_share_one_deadline() -> None:
     assert asked == [5.0, 3.0, 1.0]
 
 
+LANES_ONLY = frozenset({(0, 1), (0, -1)})
+
+
+def test_cars_make_room_for_trucks_that_keep_their_columns() -> None:
+    """Two cars are in the way of a truck; without trucks the formation becomes parallel."""
+    cells: dict[Name, Cell] = {A: (-1, 0), B: (-1, 1), C: (-1, 2), D: (0, 0)}
+    order = task(cells, {A: 2, B: 0, C: 1, D: 2})
+    with_truck = evolve(order, moves={A: LANES_ONLY})
+    sorting = sort(with_truck)
+    final = ends(with_truck, sorting)
+    assert {name: lane for name, (_, lane) in final.items()} == {A: 2, B: 0, C: 1, D: 2}
+    assert final[A] == (-1, 2)
+    assert all(vehicle.eligible is None for vehicle in next(plan_requests(order)).vehicles)
+
+
+def test_trucks_that_would_have_to_pass_each_other_stay() -> None:
+    """Others sort nevertheless."""
+    cells: dict[Name, Cell] = {A: (-1, 0), B: (-1, 1), C: (-2, 0)}
+    order = evolve(task(cells, {A: 2, B: 0, C: 2}), moves=dict.fromkeys((A, B), LANES_ONLY))
+    sorting = sort(order)
+    final = ends(order, sorting)
+    assert sorting.solved
+    assert set(sorting.out_of_reach) == {A, B}
+    assert final == {A: (-1, 0), B: (-1, 1), C: (-2, 2)}
+
+
 @st.composite
 def tasks(draw: st.DrawFn) -> SortingTask:
     numbers = draw(st.sampled_from([(0,), (1,), (0, 1)]))
@@ -256,7 +282,9 @@ def tasks(draw: st.DrawFn) -> SortingTask:
     lanes = draw(st.lists(st.integers(0, 2), min_size=5, max_size=5))
     unattended = draw(st.lists(st.sampled_from(names), max_size=2, unique=True))
     held = dict(zip(names, cells, strict=True))
-    return task(held, dict(zip(names, lanes, strict=False)), *unattended, numbers=numbers)
+    trucks = draw(st.lists(st.sampled_from(names), max_size=2, unique=True))
+    order = task(held, dict(zip(names, lanes, strict=False)), *unattended, numbers=numbers)
+    return evolve(order, moves=dict.fromkeys(trucks, LANES_ONLY))
 
 
 @settings(max_examples=60)
@@ -272,6 +300,7 @@ def test_sortings_stay_inside_and_name_vehicles_off_their_lanes(order: SortingTa
             assert target != origin == cell
             assert name not in order.unattended
             assert footprint(origin, target) <= inside - held
+            assert name not in order.moves or target[0] == origin[0]
             cell = target
     final = ends(order, sorting)
     assert len(set(final.values())) == len(final)

@@ -10,6 +10,7 @@ from pathlib import Path
 import attrs
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import laneweave.coordinator
 import laneweave.protocol
@@ -22,8 +23,8 @@ from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import block_request, formation_request
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS
-from support.planning_oracles import CountingClock, cheapest_plan, requests
+from laneweave.protocol.scenario.fields import CONFLICT_KINDS, SOLVERS
+from support.planning_oracles import CountingClock, cheapest_plan, faults, requests
 
 
 def _corridor(*vehicles: tuple[Cell, int], columns: int = 4) -> PlanRequest:
@@ -48,6 +49,35 @@ def test_cost_is_optimal_or_infeasibility_is_proven(request: PlanRequest) -> Non
     assert response.cost == expected
     assert response.lower_bound == expected
     assert problems_of_response(request, response) == []
+
+
+@pytest.mark.slow
+@settings(max_examples=60)
+@given(requests(limited=True), st.sampled_from(SOLVERS))
+def test_vehicles_drive_only_their_moves(request: PlanRequest, solver: str) -> None:
+    """Both solvers find the optimum, alone, if vehicles cannot drive all moves."""
+    assert faults(request.to_dict(), cheapest_plan(request), solver) == []
+
+
+def test_a_vehicle_that_only_changes_lanes_stays_in_its_column() -> None:
+    lanes_only = ((0, 1), (0, -1))
+    request = PlanRequest(
+        Grid(4, 2),
+        1,
+        ("node", "edge", "special-1"),
+        (
+            VehicleRequest("truck", (1, 0), lane=1, moves=lanes_only),
+            VehicleRequest("car", (1, 1), lane=0),
+        ),
+        ((0, 0), (3, 0), (0, 1), (1, 1), (3, 1)),
+    )
+    for solver in SOLVERS:
+        response = plan(request, solver=solver, fallback=False)
+        truck, car = response.paths
+        assert {column for column, _ in truck} == {1}
+        assert (response.status, truck[-1], car[-1]) == ("optimal", (1, 1), (0, 0))
+    blocked = attrs.evolve(request, targets=((0, 0), (3, 0), (0, 1), (3, 1)))
+    assert [plan(blocked, solver=solver).status for solver in SOLVERS] == ["infeasible"] * 2
 
 
 def test_a_vehicle_at_its_target_stays() -> None:

@@ -81,6 +81,16 @@ def test_closing_moves_three_columns_apart_are_compared(mode: Mode, kinds: tuple
     assert problems_of_paths(free, (0, 1), paths) == []
 
 
+def test_vehicles_make_only_moves_that_they_can_drive() -> None:
+    def with_moves(*moves: Cell) -> PlanRequest:
+        limited = attrs.evolve(REQUEST.vehicles[1], moves=moves)
+        return attrs.evolve(REQUEST, vehicles=(REQUEST.vehicles[0], limited))
+
+    assert problems_of_paths(with_moves((0, 1)), ASSIGNMENT, GOOD) == []
+    found = problems_of_paths(with_moves((0, -1), (1, 0)), ASSIGNMENT, GOOD)
+    assert found == ["b cannot drive (1, 1) to (1, 2) in step 0"]
+
+
 def test_oblique_moves_belong_to_mode_2() -> None:
     paths = (((0, 0), (1, 0), (2, 0)), ((1, 1), (2, 2), (1, 2)))
     assert any("b jumps" in p for p in problems_of_paths(REQUEST, ASSIGNMENT, paths))

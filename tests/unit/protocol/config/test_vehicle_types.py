@@ -26,7 +26,11 @@ TRUCK: dict[str, Any] = {
     "min_accel_mps2": -7.0,
 }
 VAN = {"name": "van", "share": 0.2, "length_m": 7.0, "max_accel_mps2": 3.5}
-FORMATIONS = {"cycle_s": 6.0, "gap_m": 18.0}
+STRUCTURES = {
+    "cycle_s": 6.0,
+    "gap_m": 18.0,
+    "structures": [{"from_m": 200.0, "structure": "interlaced"}],
+}
 SPORTS_CAR = {"name": "sports-car", "share": 0.1, "max_accel_mps2": 9.0}
 
 
@@ -111,9 +115,16 @@ def test_the_moves_that_are_planned_for_a_type_can_be_driven() -> None:
         check_moves(weak)
 
 
-def test_formations_have_types_that_drive_all_moves() -> None:
-    found = scenario(VAN, formation=FORMATIONS)
-    assert found.types["van"].drivable_moves == found.types["car"].drivable_moves
+def test_moves_of_types() -> None:
+    found = scenario(TRUCK, VAN)
+    lateral, every = frozenset({(0, 1), (0, -1)}), frozenset(displacements(1)[1:])
+    moves = [found.moves_of(name) for name in ("car", "truck", "van", "bus")]
+    assert moves == [None, lateral, every, frozenset()]
+
+
+def test_formations_with_a_longer_pitch_have_a_longer_slot() -> None:
+    found = scenario(TRUCK, formation={"gap_m": 20.0})
+    assert found.cycles_s == pytest.approx((5.2, 7.0))
     check_moves(found)
 
 
@@ -138,18 +149,18 @@ def test_the_pitch_suits_every_pair_of_types() -> None:
         ([{"share": 0.1}], {}, "vehicle_type[0].name"),
         (
             [TRUCK],
-            {"formation": {"gap_m": 20.0}},
-            "vehicle_type[0].max_accel_mps2: got 1.3; allowed: at least 8 in formations",
+            {"formation": {**STRUCTURES, "gap_m": 20.0}},
+            "vehicle_type[0].max_accel_mps2: got 1.3; allowed: at least 3.43 with formation.",
         ),
         (
             [{**VAN, "min_accel_mps2": -3.0}],
-            {"formation": FORMATIONS, "braking": {"lead_brake_mps2": 3.0}},
-            "vehicle_type[0].min_accel_mps2: got -3.0; allowed: at most -3.09 in formations",
+            {"formation": STRUCTURES, "braking": {"lead_brake_mps2": 3.0}},
+            "vehicle_type[0].min_accel_mps2: got -3.0; allowed: at most -3.09 with formation.",
         ),
         (
             [{**VAN, "max_jerk_mps3": 5.0}],
-            {"formation": FORMATIONS},
-            "vehicle_type[0].max_jerk_mps3: got 5.0; allowed: at least 5.54 in formations",
+            {"formation": STRUCTURES},
+            "vehicle_type[0].max_jerk_mps3: got 5.0; allowed: at least 5.54 with formation.",
         ),
         (
             [TRUCK],

@@ -216,6 +216,17 @@ def test_trucks_enter_a_column_only_if_the_road_has_lanes_for_all_of_them() -> N
     assert len(meter.admit(20.0)) == 1
 
 
+def test_a_truck_that_enters_a_later_column_takes_one_place_in_its_formation() -> None:
+    grid = lattice(block_columns=4)
+    builder = ColumnBlocks(grid, 2, 0.5, Entrances(grid.lanes))
+    meter = EntryMeter(grid, 0.5, builder, column_bound={"truck"})
+    meter.demand(truck("a", 10.0, 0, 2))
+    meter.demand(truck("b", 10.0, 2, 0))
+    one, other = meter.admit(20.0)
+    assert one.cell[0] != other.cell[0]
+    assert grid.block_of(one.cell[0]) == grid.block_of(other.cell[0])
+
+
 @pytest.mark.parametrize("pitch_m", [15.0, 19.3, 20.0])
 def test_a_queue_of_trucks_uses_every_cell(pitch_m: float) -> None:
     grid = Lattice(pitch_m, 15.0, 3.5, 1, 4)

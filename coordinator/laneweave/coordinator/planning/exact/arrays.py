@@ -1,8 +1,8 @@
 """A planning problem as arrays, for the compiled parts of the planner.
 
 Cells are numbered column by column; `cell = column * lanes + lane`. A move is a displacement and a
-from-cell. Vehicles with the same eligible targets form a *team* and may exchange targets. A *pair*
-is a team and one of its eligible targets.
+from-cell. Vehicles with the same eligible targets that can drive the same moves form a *team* and
+may exchange targets. A *pair* is a team and one of its eligible targets.
 """
 
 from __future__ import annotations
@@ -52,6 +52,8 @@ class Teams(NamedTuple):
     """(N,) start cell of each vehicle."""
     team: Ints
     """(N,) team index of each vehicle."""
+    drives: Bools
+    """(K, D, X) whether the vehicles of a team can make a move, on free cells."""
     target: Ints
     """(J,) cell of each target."""
     pairs_from: Ints
@@ -119,27 +121,42 @@ def teams(
     starts: Sequence[Cell],
     targets: Sequence[Cell],
     choices: Sequence[frozenset[int]],
+    excluded: Sequence[frozenset[int]],
 ) -> Teams:
-    """Return vehicles and targets as arrays; teams are ordered by their first vehicles."""
-    numbers: dict[frozenset[int], int] = {}
-    team = [numbers.setdefault(choice, len(numbers)) for choice in choices]
-    pair_target = [j for choice in numbers for j in sorted(choice)]
-    pairs_from = np.cumsum([0, *map(len, numbers)])
+    """Return vehicles and targets as arrays; teams are ordered by their first vehicles.
+
+    Args:
+        arrays: moves of the grid.
+        starts: start cell of each vehicle.
+        targets: target cells.
+        choices: indices of the targets that each vehicle may be assigned to.
+        excluded: displacements that each vehicle cannot drive, by index.
+    """
+    numbers: dict[tuple[frozenset[int], frozenset[int]], int] = {}
+    members = zip(choices, excluded, strict=True)
+    team = [numbers.setdefault(member, len(numbers)) for member in members]
+    pair_target = [j for choice, _ in numbers for j in sorted(choice)]
+    pairs_from = np.cumsum([0, *(len(choice) for choice, _ in numbers)])
     pair = np.full((len(numbers), len(targets)), -1, dtype=np.int64)
-    for k in range(len(numbers)):
-        first, end = pairs_from[k : k + 2]
-        pair[k, pair_target[first:end]] = np.arange(first, end)
     target = _cells(targets, arrays)
     numbered = np.array(pair_target, dtype=np.int64)
+    drives = np.repeat(arrays.valid[None], len(numbers), axis=0)
+    distance = np.empty((arrays.valid.shape[1], len(numbered)))
+    for k, (_, missing) in enumerate(numbers):
+        first, end = pairs_from[k : k + 2]
+        pair[k, pair_target[first:end]] = np.arange(first, end)
+        drives[k, sorted(missing)] = False
+        distance[:, first:end] = min_steps(drives[k], arrays.step, target[numbered[first:end]])
     return Teams(
         start=_cells(starts, arrays),
         team=np.array(team, dtype=np.int64),
+        drives=drives,
         target=target,
         pairs_from=pairs_from.astype(np.int64),
         pair_target=numbered,
         pair_cell=target[numbered],
         pair=pair,
-        distance=min_steps(arrays.valid, arrays.step, target[numbered]),
+        distance=distance,
     )
 
 

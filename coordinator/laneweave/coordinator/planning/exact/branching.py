@@ -113,7 +113,7 @@ class Branching(Search):
         self._arrays = move_arrays(table.grid, table.mode, table.model)
         starts = [table.cell(start) for start in problem.starts]
         targets = [table.cell(target) for target in problem.targets]
-        self._teams = teams(self._arrays, starts, targets, choices)
+        self._teams = teams(self._arrays, starts, targets, choices, problem.excluded)
 
     def run(self) -> None:
         """Search until the optimum is proven or the budget is spent."""

@@ -150,7 +150,7 @@ class Relaxation:
         self.scratch = scratch(self.arrays, self.teams, len(multipliers))
         shape = len(self.teams.pair), len(multipliers), *self.arrays.valid.shape
         self.allowed = np.empty(shape, dtype=np.bool_)
-        self.allowed[:] = self.arrays.valid
+        self.allowed[:] = self.teams.drives[:, None]
         self.earliest = np.zeros(len(self.teams.pair_cell), dtype=np.int64)
         # Forbid moves from cells that no vehicle can reach in time.
         self._begin()

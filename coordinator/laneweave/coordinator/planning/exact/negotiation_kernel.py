@@ -27,7 +27,7 @@ _SWAP_SHARE = 60
 @njit(cache=True)
 def _find_path(arrays, teams, candidate, i):
     """Set one vehicle's cheapest path at the current clique costs, and the cost of the path."""
-    valid, step, clique = arrays.valid, arrays.step, arrays.clique
+    valid, step, clique = teams.drives[teams.team[i]], arrays.step, arrays.clique
     weight, cost_to_go, parked = candidate.weight, candidate.cost_to_go, candidate.parked
     pair = teams.pair[teams.team[i], candidate.target[i]]
     start, target, distance = teams.start[i], teams.pair_cell[pair], teams.distance[:, pair]

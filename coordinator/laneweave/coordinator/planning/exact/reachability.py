@@ -1,10 +1,10 @@
 """Joint search for small state spaces: find any path set, or prove that there is none.
 
 Branch and bound and conflict trees may not terminate if no path set exists. A joint search over the
-cells of all vehicles does: vehicles with the same eligible targets form a team and are
-interchangeable, so a state is the set of cells of each team. States whose vehicles are close to
-their targets come first, so a path set is found soon if one exists. After a given number of joint
-moves the search ends without a result.
+cells of all vehicles does: vehicles with the same eligible targets that can drive the same moves
+form a team and are interchangeable, so a state is the set of cells of each team. States whose
+vehicles are close to their targets come first, so a path set is found soon if one exists. After a
+given number of joint moves the search ends without a result.
 """
 
 from __future__ import annotations
@@ -52,10 +52,12 @@ def explore(
     problem: Problem, choices: Sequence[frozenset[int]], budget: Budget, max_moves: int
 ) -> Reachability:
     """Search the reachable joint states, up to `max_moves` joint moves."""
-    vehicles = sorted(range(len(choices)), key=lambda v: (sorted(choices[v]), v))
-    teams = [sorted(choices[v]) for v in vehicles]
+    members = [(sorted(choice), problem.undrivable[v]) for v, choice in enumerate(choices)]
+    vehicles = sorted(range(len(choices)), key=lambda v: (*members[v], v))
+    teams = [members[v] for v in vehicles]
     team = [teams.index(t) for t in teams]
-    goals = [frozenset(problem.targets[j] for j in t) for t in teams]
+    goals = [frozenset(problem.targets[j] for j in choice) for choice, _ in teams]
+    undrivable = [moves for _, moves in teams]
     one_at_a_time = can_be_made_one_after_another(problem.table.mode, problem.table.model)
 
     start, order = _sorted_by_team([problem.starts[v] for v in vehicles], team)
@@ -70,7 +72,7 @@ def explore(
         if arrived and len(set(state)) == len(state):
             return Reachability(solution=_solution(problem, found, state, vehicles))
         successors = _single_moves if one_at_a_time else _joint_moves
-        for moves in successors(problem.table, state):
+        for moves in successors(problem.table, state, undrivable):
             move_count += 1
             if move_count % _MOVES_PER_TIME_CHECK == 0:
                 budget.check_time()
@@ -106,10 +108,12 @@ def can_be_made_one_after_another(mode: Mode, model: ConflictModel) -> bool:
     return True
 
 
-def _single_moves(table: MoveTable, state: State) -> Iterator[tuple[int, ...]]:
+def _single_moves(
+    table: MoveTable, state: State, undrivable: Sequence[int]
+) -> Iterator[tuple[int, ...]]:
     """Yield the joint moves in which one vehicle moves."""
     for i, cell in enumerate(state):
-        options = table.starting_in(1 << cell) & ~(1 << cell)
+        options = table.starting_in(1 << cell) & ~(1 << cell | undrivable[i])
         for j, other in enumerate(state):
             if j != i:
                 options &= ~table.conflicts[other]
@@ -118,14 +122,20 @@ def _single_moves(table: MoveTable, state: State) -> Iterator[tuple[int, ...]]:
 
 
 def _joint_moves(
-    table: MoveTable, state: State, chosen: tuple[int, ...] = (), forbidden: int = 0
+    table: MoveTable,
+    state: State,
+    undrivable: Sequence[int],
+    chosen: tuple[int, ...] = (),
+    forbidden: int = 0,
 ) -> Iterator[tuple[int, ...]]:
     """Yield all conflict-free joint moves."""
     if len(chosen) == len(state):
         yield chosen
         return
-    for move in bits(table.starting_in(1 << state[len(chosen)]) & ~forbidden):
-        yield from _joint_moves(table, state, (*chosen, move), forbidden | table.conflicts[move])
+    number = len(chosen)
+    for move in bits(table.starting_in(1 << state[number]) & ~(forbidden | undrivable[number])):
+        conflicting = forbidden | table.conflicts[move]
+        yield from _joint_moves(table, state, undrivable, (*chosen, move), conflicting)
 
 
 def _sorted_by_team(cells: Sequence[int], team: Sequence[int]) -> tuple[State, tuple[int, ...]]:

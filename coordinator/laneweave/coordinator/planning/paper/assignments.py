@@ -100,16 +100,17 @@ def matrices(
 ) -> tuple[IntMatrix, BoolMatrix]:
     """Return the cost matrix C and the preference matrix P of a request.
 
-    Blocked cells may make a path longer than the formation relative distance, or impossible. Both
-    only improve the lower bound: C takes the longer distance, and P drops unreachable targets.
+    Blocked cells, or moves that a vehicle cannot drive, may make a path longer than the formation
+    relative distance, or impossible. Both only improve the lower bound: C takes the longer
+    distance, and P drops unreachable targets.
     """
     starts = [vehicle.cell for vehicle in request.vehicles]
     costs = cost_matrix(starts, request.targets, weights)
     allowed = preference_matrix(request.choices(), len(request.targets))
-    if request.grid.blocked:
-        for i, start in enumerate(problem.starts):
+    for i, (start, undrivable) in enumerate(zip(problem.starts, problem.undrivable, strict=True)):
+        if request.grid.blocked or undrivable:
             budget.check_time()
-            distances = problem.table.distances(1 << start)
+            distances = problem.table.distances(1 << start, undrivable)
             for j, target in enumerate(problem.targets):
                 if target in distances:
                     costs[i, j] = max(costs[i, j], distances[target])

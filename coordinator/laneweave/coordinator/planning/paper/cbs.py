@@ -34,7 +34,7 @@ from laneweave.coordinator.planning.shortest_paths import (
     choose_path,
     conflicting_moves,
     free_paths,
-    shortest_paths,
+    paths_of,
 )
 
 Limit = Callable[[], float]
@@ -230,7 +230,7 @@ class ConstraintTree:
                 continue
             self._budget.check_time()
             bans = bans_for(vehicle, constraints)
-            shortest = shortest_paths(table, problem.starts[vehicle], diagram.target, bans)
+            shortest = paths_of(problem, vehicle, diagram.target, bans)
             if shortest is None:
                 return None
             diagrams[vehicle] = shortest

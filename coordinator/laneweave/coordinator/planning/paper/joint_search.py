@@ -3,8 +3,9 @@
 Where there are few empty cells, most combinations of cheapest paths conflict, and constraint trees
 grow very large; without a solution they never end. All vehicles planned together (one meta-agent,
 in the terms of Sharon et al., AIJ 219, 2015, section 7) have a finite state space, which is small
-in these cases. Vehicles with the same eligible targets form a team and are interchangeable, so one
-search covers all assignments: its lower bound holds for every C'_k, and its path set is optimal.
+in these cases. Vehicles with the same eligible targets that can drive the same moves form a team
+and are interchangeable, so one search covers all assignments: its lower bound holds for every C'_k,
+and its path set is optimal.
 
 The search goes backwards from the targets. A vehicle is active in a state if it still has to move;
 each active vehicle costs one per step. Backwards, a vehicle becomes active with its first move and
@@ -36,9 +37,10 @@ _MAX_MOVES = 2_000_000
 _MOVES_BETWEEN = 1000
 """Joint moves between readings of the clock."""
 
-JointMove = tuple[Cells, Callable[[Labels], Labels]]
-"""The sorted cells before the move, and a function that returns their labels, given the labels
-after the move followed by the same labels with all vehicles active (for vehicles that move)."""
+JointMove = tuple[Cells, Callable[[Labels], Labels], tuple[int, ...]]
+"""The sorted cells before the move; a function that returns their labels, given the labels after
+the move followed by the same labels with all vehicles active (for vehicles that move); and the move
+of each vehicle as a set of one."""
 
 
 class JointSearch:
@@ -59,14 +61,19 @@ class JointSearch:
         self._share_cells = problem.table.model.vehicles_share_cells
         self._credit = 0
         self._move_count = 0
-        teams = sorted(set(choices), key=sorted)
-        labels = [2 * teams.index(choice) + 1 for choice in choices]
+        members = list(zip(choices, problem.undrivable, strict=True))
+        teams = sorted(set(members), key=lambda team: (sorted(team[0]), team[1]))
+        self._undrivable = [undrivable for _, undrivable in teams]
+        labels = [2 * teams.index(member) + 1 for member in members]
         self._vehicles = sorted(range(len(choices)), key=lambda v: (problem.starts[v], labels[v]))
         self._start = tuple(problem.starts[v] for v in self._vehicles)
         self._start_labels = tuple(labels[v] for v in self._vehicles)
         self._distance = [
             problem.table.distances(
-                sum(1 << s for s, label in zip(problem.starts, labels, strict=True) if label == own)
+                sum(
+                    1 << s for s, label in zip(problem.starts, labels, strict=True) if label == own
+                ),
+                self._undrivable[own >> 1],
             )
             for own in range(1, 2 * len(teams), 2)
         ]
@@ -77,7 +84,7 @@ class JointSearch:
         self._next: dict[State, tuple[State, Callable[[Labels], Labels]]] = {}
         self._open: list[tuple[int, int, State]] = []
         sizes = [labels.count(2 * k + 1) for k in range(len(teams))]
-        self._add_goals(teams, sizes)
+        self._add_goals([choice for choice, _ in teams], sizes)
 
     def work(self, moves: int) -> None:
         """Make about `moves` more joint moves; any excess is deducted from the next call."""
@@ -140,10 +147,12 @@ class JointSearch:
         active, known = self._active, self._cost
         moves = self._joint_moves_to(cells)
         self._move_count += len(moves)
-        for number, (cells_before, labels_before) in enumerate(moves):
+        for number, (cells_before, labels_before, made) in enumerate(moves):
             if number % _MOVES_BETWEEN == 0:
                 self._budget.check_time()
             before = labels_before(both)
+            if any(self._undrivable) and not self._can_drive(before, made):
+                continue
             if before not in active:
                 active[before] = sum(label & 1 for label in before)
             cost = active[before] - negative_cost
@@ -153,31 +162,39 @@ class JointSearch:
         if self._move_count > _MAX_MOVES:
             self.ended = True
 
+    def _can_drive(self, labels: Labels, moves: Sequence[int]) -> bool:
+        """Return whether all vehicles can drive their moves."""
+        undrivable = self._undrivable
+        return not any(
+            undrivable[label >> 1] & move for label, move in zip(labels, moves, strict=True)
+        )
+
     def _joint_moves_to(self, cells: Cells) -> list[JointMove]:
         """Return all conflict-free joint moves that end in these cells."""
         found = self._joint_moves.get(cells)
         if found is not None:
             return found
-        partial: list[tuple[Cells, int]] = [((), 0)]
+        partial: list[tuple[Cells, Cells, int]] = [((), (), 0)]
         for cell in cells:
             self._budget.check_time()
             partial = [
-                ((*starts, start), excluded | more)
-                for starts, excluded in partial
+                ((*starts, start), (*made, move), excluded | more)
+                for starts, made, excluded in partial
                 for move, start, more in self._moves_into_cell(cell)
                 if not excluded & move
             ]
         found = []
         count = len(cells)
-        for number, (starts, _) in enumerate(partial):
+        for number, (starts, made, _) in enumerate(partial):
             if number % _MOVES_BETWEEN == 0:
                 self._budget.check_time()
             origins = [
                 i if start == cell else i + count
                 for i, (start, cell) in enumerate(zip(starts, cells, strict=True))
             ]
-            before, picked = zip(*sorted(zip(starts, origins, strict=True)), strict=True)
-            found.append((before, _picker(picked)))
+            ordered = sorted(zip(starts, origins, made, strict=True))
+            before, picked, moves = zip(*ordered, strict=True)
+            found.append((before, _picker(picked), moves))
         self._move_count += len(found)
         self._joint_moves[cells] = found
         return found

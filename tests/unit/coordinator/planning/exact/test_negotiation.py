@@ -21,7 +21,8 @@ def no_limit() -> None:
 def arrays_of(request: PlanRequest) -> tuple[MoveArrays, Teams]:
     arrays = move_arrays(request.grid, request.mode, request.conflict_model)
     starts = [vehicle.cell for vehicle in request.vehicles]
-    return arrays, teams(arrays, starts, request.targets, request.choices())
+    every_move = [frozenset[int]()] * len(starts)
+    return arrays, teams(arrays, starts, request.targets, request.choices(), every_move)
 
 
 def negotiation_of(request: PlanRequest) -> Negotiation:

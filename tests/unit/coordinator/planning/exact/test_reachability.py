@@ -23,9 +23,7 @@ from support.planning_oracles import CountingClock, cheapest_plan, requests
 
 
 def _explore(request: PlanRequest, max_moves: int = 10**6) -> tuple[Problem, Reachability]:
-    cells = [vehicle.cell for vehicle in request.vehicles]
-    model = request.conflict_model
-    problem = Problem(request.grid, request.mode, model, cells, request.targets)
+    problem = request.problem()
     return problem, explore(problem, request.choices(), Budget(), max_moves)
 
 
@@ -61,9 +59,7 @@ def test_a_truncated_search_has_no_result() -> None:
 
 
 def test_time_is_checked() -> None:
-    cells = [vehicle.cell for vehicle in PUZZLE.vehicles]
-    model = PUZZLE.conflict_model
-    problem = Problem(PUZZLE.grid, 1, model, cells, PUZZLE.targets)
+    problem = PUZZLE.problem()
     budget = Budget(deadline=3.0, clock=CountingClock(1.0))
     with pytest.raises(BudgetSpentError):
         explore(problem, PUZZLE.choices(), budget, max_moves=10**9)
