@@ -60,7 +60,7 @@ def optimal_solution(request: dict[str, Any], horizon: int | None = None) -> Sol
     """A solution of least cost; `horizon` is only where the search for a proof begins."""
     problem = Problem.of(request)
     if any(moves is not None for moves in problem.drivable):
-        raise UndecidedError("the programme has all moves for all vehicles")
+        raise UndecidedError("the programme assumes that every vehicle drives all moves")
     distance = _distances(problem)
     if _matching_cost(distance) >= FORBIDDEN:
         return None

@@ -120,7 +120,8 @@ def requests(
 ) -> PlanRequest:
     """Draw small requests over both modes, all sets of conflicts and some geometries.
 
-    With `limited`, at least one vehicle cannot drive all moves, and vehicles do not share cells.
+    Some vehicles cannot drive all moves; with `limited` at least one cannot, and vehicles do not
+    share cells.
     """
     mode = draw(MODES)
     lanes = draw(st.integers(1, 3))

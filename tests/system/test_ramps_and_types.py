@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from laneweave.protocol.config.scenario_files import load_scenario
 from support.harness import Lab, check_safe_and_complete, summary, trips
 
 ROAD = """schema = "laneweave.scenario/1"
@@ -73,14 +74,17 @@ width_m = 2.5
 max_accel_mps2 = 1.3
 min_accel_mps2 = -7.0
 [formation]
+cycle_s = 6.0
 gap_m = 20.0
 """
 
 
 def test_cars_vans_and_trucks_sort_in_formations(lab: Lab) -> None:
-    """Trucks change lanes only, and others make room."""
+    """Vans drive all moves; trucks change lanes only, and others make room."""
     folder = lab.folder / "run"
     scenario = lab.path("mixed.toml", MIXED)
+    types = load_scenario(scenario).types
+    assert [name for name, one in types.items() if one.changes_columns] == ["car", "van"]
     ended = lab.run("run", scenario, "--transport", "simulated", "--out", folder)
     assert (ended.status, ended.complaints) == (0, []), ended
     check_safe_and_complete(folder)

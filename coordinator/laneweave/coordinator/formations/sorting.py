@@ -25,7 +25,12 @@ from laneweave.coordinator.planning.budget import Clock
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
-from laneweave.coordinator.planning.targets import assign_nearby, choose_lanes, placements
+from laneweave.coordinator.planning.targets import (
+    assign_nearby,
+    choose_lanes,
+    placements,
+    reachable_lanes,
+)
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import DrivingStructure, Scenario
@@ -149,8 +154,8 @@ def plan_requests(task: SortingTask, exempt: Name | None = None) -> Iterator[Pla
         for name, cell in task.movers.items()
     }
     lanes_end = task.stage is not None and bool(task.stage.ending_lanes)
-    bound = not task.column_bound.isdisjoint(wanted)
-    if not lanes_end and not bound and all(len(lanes) == 1 for lanes in wanted.values()):
+    all_free = task.column_bound.isdisjoint(wanted)
+    if not lanes_end and all_free and all(len(lanes) == 1 for lanes in wanted.values()):
         yield from _into_parallel_structure(
             task, {name: min(each) for name, each in wanted.items()}
         )
@@ -184,8 +189,9 @@ def _into_parallel_structure(
 def _into_lanes(task: SortingTask, wanted: Mapping[Name, frozenset[int]]) -> Iterator[PlanRequest]:
     """Yield the request in which each vehicle may take any free cell of its goal lanes.
 
-    Vehicles for which these have too few cells may take any cell of the lanes that go on. In the
-    second request every vehicle has one target, so that no path is long: such plans may have fewer
+    Vehicles for which these have too few cells may take any cell of the lanes that go on; those
+    that cannot change columns and reach no goal lane, any cell of their columns. In the second
+    request every vehicle has one target, so that no path is long: such plans may have fewer
     steps.
     """
     free = [
@@ -195,14 +201,15 @@ def _into_lanes(task: SortingTask, wanted: Mapping[Name, frozenset[int]]) -> Ite
         if (column, lane) not in task.blocked
     ]
     through = task.open_lanes if task.stage is None else task.stage.through_lanes
-    bound = task.column_bound
-    chosen = choose_lanes(task.movers, wanted, through, free, bound)
+    column_bound = task.column_bound.intersection(wanted)
+    possible = reachable_lanes(task.movers, wanted, column_bound, free)
+    chosen = choose_lanes(task.movers, possible, through, free, column_bound)
     targets = tuple(cell for cell in free if any(cell[1] in lanes for lanes in chosen.values()))
     eligible = {
         name: tuple(
             number
             for number, (column, lane) in enumerate(targets)
-            if lane in lanes and (name not in bound or column == task.movers[name][0])
+            if lane in lanes and (name not in column_bound or column == task.movers[name][0])
         )
         for name, lanes in chosen.items()
     }
@@ -314,5 +321,7 @@ def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:
         missed = tuple(name for name, cell in ends.items() if cell[1] not in task.goal_lanes[name])
     # After a timeout it is unknown whether there is room, and planning more blocks takes longer.
     known = response is not None and response.status != "timeout"
-    short_of_room = known and any(name not in task.unattended for name in missed)
+    # More columns do not help a vehicle that cannot change columns.
+    hold = task.column_bound.union(task.unattended)
+    short_of_room = known and not hold.issuperset(missed)
     return Sorting(response, moves, missed, short_of_room)

@@ -266,7 +266,7 @@ class Problem:
         model: ConflictModel,
         starts: Sequence[Cell],
         targets: Sequence[Cell],
-        drivable: Sequence[Collection[Cell] | None] = (),
+        drivable: Sequence[Collection[Cell] | None] | None = None,
     ) -> None:
         """Number the moves of the grid.
 
@@ -276,18 +276,18 @@ class Problem:
             model: definition of conflicts.
             starts: start cell of each vehicle.
             targets: target cells.
-            drivable: moves (columns, lanes) that each vehicle can drive; None: all; empty: all
-                vehicles drive all moves.
+            drivable: moves (columns, lanes) that each vehicle can drive; None, for a vehicle or
+                for all: all moves of the mode.
         """
         self.table = MoveTable(grid, mode, model)
         self.starts = tuple(self.table.bit(cell) for cell in starts)
         self.targets = tuple(self.table.bit(cell) for cell in targets)
-        limits = tuple(drivable) or (None,) * len(starts)
+        steps = self.table.steps
         self.excluded = tuple(
-            frozenset(d for d, step in enumerate(self.table.steps) if d and step not in moves)
-            if moves is not None
-            else frozenset[int]()
-            for moves in limits
+            frozenset(
+                d for d, step in enumerate(steps) if d and moves is not None and step not in moves
+            )
+            for moves in ((None,) * len(starts) if drivable is None else drivable)
         )
         self.undrivable = tuple(map(self.table.with_displacements, self.excluded))
         self.free_paths: dict[tuple[int, int], Diagram | None] = {}

@@ -345,6 +345,9 @@ def _check_structure(request: PlanRequest) -> None:
         if vehicle.eligible is not None:
             allowed = "lane, or neither: a structure's targets have no indices yet"
             raise BadInputError(f"vehicles[{i}].eligible", vehicle.eligible, allowed)
+        if vehicle.moves is not None:
+            allowed = "none: any vehicle may get any place of a structure"
+            raise BadInputError(f"vehicles[{i}].moves", vehicle.moves, allowed)
         if vehicle.lane is not None and vehicle.lane not in lanes:
             allowed = "one of the structure's lanes " + ", ".join(map(str, lanes))
             raise BadInputError(f"vehicles[{i}].lane", vehicle.lane, allowed)

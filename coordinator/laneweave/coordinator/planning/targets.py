@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 from attrs import frozen
@@ -117,6 +117,47 @@ def choose_lanes(
         lane = free[index][1]
         chosen[name] = next((lanes for lanes in choices[name] if lane in lanes), every)
     return chosen
+
+
+def reachable_lanes(
+    cells: Mapping[Name, Cell],
+    goal_lanes: Mapping[Name, Collection[int]],
+    column_bound: Collection[Name],
+    free: Collection[Cell],
+) -> dict[Name, frozenset[int]]:
+    """Return the goal lanes that each vehicle can reach, if some cannot change columns.
+
+    In a column these keep their order, and pass no cell that is not free. As many of them as
+    possible reach goal lanes; the others get all lanes.
+
+    Args:
+        cells: current cell of each vehicle.
+        goal_lanes: goal lanes of each vehicle.
+        column_bound: vehicles that cannot change columns.
+        free: cells that can be targets; includes the current cells.
+    """
+    found = {name: frozenset(goal_lanes[name]) for name in cells}
+    free = frozenset(free)
+    sections: dict[tuple[int, int], list[Name]] = {}
+    for name in sorted(column_bound, key=lambda name: cells[name]):
+        column, first = cells[name]
+        while (column, first - 1) in free:
+            first -= 1
+        sections.setdefault((column, first), []).append(name)
+    for (column, first), names in sections.items():
+        last = first
+        while (column, last + 1) in free:
+            last += 1
+        chosen = max(
+            combinations(range(first, last + 1), len(names)),
+            key=lambda lanes: sum(
+                lane in found[name] for name, lane in zip(names, lanes, strict=True)
+            ),
+        )
+        for name, lane in zip(names, chosen, strict=True):
+            within = found[name].intersection(range(first, last + 1))
+            found[name] = within if lane in within else frozenset(range(first, last + 1))
+    return found
 
 
 def assign_nearby(

@@ -121,7 +121,7 @@ def plan_figure(request: PlanRequest, response: PlanResponse) -> Figure:
 
 
 def team_colours(request: PlanRequest) -> dict[frozenset[int], str]:
-    """Return a colour for each set of eligible targets, that is, for each team."""
+    """Return a colour for each set of eligible targets."""
     teams = dict.fromkeys(request.choices())
     return {choice: _colour(number) for number, choice in enumerate(teams)}
 

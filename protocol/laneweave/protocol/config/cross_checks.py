@@ -201,7 +201,8 @@ def _check_types_of_structures(scenario: Scenario) -> None:
             ("max_jerk_mps3", limits.max_jerk_mps3, jerk_mps3),
         ):
             _require(
-                not scenario.formation.structures
+                scenario.formation.rolling
+                or not scenario.formation.structures
                 or own.changes_columns
                 or abs(value) >= abs(needed),
                 _limit_of(scenario, name, limit),

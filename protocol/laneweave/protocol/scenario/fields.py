@@ -48,6 +48,9 @@ traffic needs more steps on the same road: at 2400, 1 % of the vehicles miss the
 but less than 0.1 % with 4 s (`benchmarks/stream.py`)."""
 CYCLE_STEP_S = 0.2
 """Step between values of T_F; few values keep the number of planned trajectories low."""
+FORMATION_CLOSING_MPS = 8.0
+"""Speed at which a member of a formation may close up to another if T_F is not given; vehicles can
+brake from it in nearly all scenarios."""
 SLACK_S = 0.2
 """Part of T_F without motion if `formation.move_s` is not set."""
 HIGHEST_PACE = 1000.0
@@ -733,14 +736,14 @@ class Scenario:
         return frozenset((columns, lanes) for columns, lanes in moves if columns == 0)
 
     def moves_of(self, vehicle_type: str) -> frozenset[Cell] | None:
-        """Return the moves (columns, lanes) that are planned for a type; None: all.
+        """Return the moves (columns, lanes) that are planned for a type; None: all of the mode.
 
         There are none for a type that this scenario does not have.
         """
-        if vehicle_type == CAR:
-            return None
         own = self.types.get(vehicle_type)
-        return frozenset() if own is None else own.drivable_moves
+        if own is None:
+            return frozenset()
+        return None if own.drivable_moves == self.types[CAR].drivable_moves else own.drivable_moves
 
     @property
     def column_move_peaks(self) -> tuple[float, float]:
@@ -834,12 +837,18 @@ class Scenario:
 
         A minimum-jerk move over d in T closes up with at most 15/8 d/T and accelerates with
         10 / sqrt(3) d / T^2 at most. Moves are possible if these do not exceed v_F / 2 and 1.2
-        times the limit (which a trajectory within the limit can replace), in nearly all cases.
+        times the limit (which a trajectory within the limit can replace), in nearly all cases. For
+        formations, whose plans need short slots where many steps must fit, these are
+        `FORMATION_CLOSING_MPS` and 1.3 times the limit: the check of moves refuses a few scenarios
+        more, and asks for a longer T_F.
         """
         # T_F is the same for all types; those that are weaker drive fewer moves.
         d_m, accel_mps2 = self.formation.gap_m, self.types[CAR].vehicle.max_accel_mps2
-        by_speed_s = 15.0 / 4.0 * d_m / self.formation.speed_mps
-        by_accel_s = math.sqrt(10.0 / math.sqrt(3.0) * d_m / (1.2 * accel_mps2))
+        closing_mps, ratio = FORMATION_CLOSING_MPS, 1.3
+        if self.formation.rolling:
+            closing_mps, ratio = self.formation.speed_mps / 2.0, 1.2
+        by_speed_s = 15.0 / 8.0 * d_m / closing_mps
+        by_accel_s = math.sqrt(10.0 / math.sqrt(3.0) * d_m / (ratio * accel_mps2))
         slot_s = max(by_speed_s, by_accel_s) + self.formation.slack_s
         return max(SHORTEST_CYCLE_S, CYCLE_STEP_S * math.ceil(slot_s / CYCLE_STEP_S - 1e-9))
 

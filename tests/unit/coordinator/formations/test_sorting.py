@@ -273,6 +273,20 @@ def test_trucks_that_would_have_to_pass_each_other_stay() -> None:
     assert final == {A: (-1, 0), B: (-1, 1), C: (-2, 2)}
 
 
+def test_several_trucks_that_are_hindered_do_not_keep_others_from_sorting() -> None:
+    """Vehicles without agents are beside two trucks; a third one would have to pass a fourth."""
+    held: dict[Name, Cell] = {C: (-1, 1), D: (-2, 1)}
+    cells = {A: (-1, 0), B: (-2, 0), E: (-3, 0), F: (-3, 1), Name("G"): (0, 0)} | held
+    goals = {A: 2, B: 2, E: 2, F: 0, Name("G"): 1} | dict.fromkeys(held, 1)
+    order = evolve(task(cells, goals, *held), moves=dict.fromkeys((A, B, E, F), LANES_ONLY))
+    sorting = sort(order)
+    assert sorting.solved
+    assert {A, B} <= set(sorting.out_of_reach) <= {A, B, E, F}
+    assert ends(order, sorting)[Name("G")][1] == 1
+    # More columns would not help.
+    assert not sorting.short_of_room
+
+
 @st.composite
 def tasks(draw: st.DrawFn) -> SortingTask:
     numbers = draw(st.sampled_from([(0,), (1,), (0, 1)]))
@@ -307,7 +321,8 @@ def test_sortings_stay_inside_and_name_vehicles_off_their_lanes(order: SortingTa
     missed = {name for name, cell in final.items() if cell[1] not in order.goal_lanes[name]}
     assert set(sorting.out_of_reach) == missed
     if sorting.solved:
-        assert sorting.short_of_room == bool(missed - set(order.unattended))
+        hold = order.column_bound.union(order.unattended)
+        assert sorting.short_of_room == bool(missed - hold)
 
 
 def test_a_sorting_without_paths_is_not_solved() -> None:

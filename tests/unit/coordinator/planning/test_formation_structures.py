@@ -219,6 +219,10 @@ def test_targets_of_another_structure_are_detected() -> None:
             "vehicles[0].lane: got 2; allowed: one of the structure's lanes 0, 1",
         ),
         (
+            {"vehicles": [{"id": "a", "cell": [0, 0], "moves": [[0, 1]]}]},
+            "vehicles[0].moves: got ((0, 1),); allowed: none: any vehicle may get any place",
+        ),
+        (
             {"vehicles": [{"id": "a", "cell": [0, 0], "eligible": [0]}]},
             "vehicles[0].eligible: got (0,); allowed: lane, or neither",
         ),

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import permutations
+from itertools import combinations, permutations
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.targets import Targets, placements
+from laneweave.coordinator.planning.targets import Targets, placements, reachable_lanes
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Name
 
@@ -151,3 +151,64 @@ def test_only_free_columns_are_targets_and_none_between_is_left_out(
     assert len(columns) == min(len(cells), len(free))
     if columns:
         assert columns == [column for column in free if columns[0] <= column <= columns[-1]]
+
+
+# --- vehicles that cannot change columns ------------------------------------------------------
+
+A, B, C, D = (Name(letter) for letter in "ABCD")
+
+
+def test_vehicles_in_a_column_keep_their_order() -> None:
+    cells: dict[Name, Cell] = {A: (1, 0), B: (1, 1), C: (2, 0), D: (1, 2)}
+    goals = {A: {2}, B: {0, 2}, C: {2}, D: {0}}
+    found = reachable_lanes(cells, goals, {A, B, C}, GRID)
+    # A and B cannot both have their goals; B has one beside A, and D changes columns.
+    assert found == {A: {0, 1, 2}, B: {0, 2}, C: {2}, D: {0}}
+    assert reachable_lanes(cells, goals, (), GRID) == goals
+
+
+def test_vehicles_pass_no_cell_that_is_not_free() -> None:
+    free = [cell for cell in GRID if cell != (1, 1)]
+    found = reachable_lanes({A: (1, 0), B: (1, 2)}, {A: {1, 2}, B: {1, 2}}, {A, B}, free)
+    assert found == {A: {0}, B: {2}}
+
+
+@st.composite
+def columns(draw: st.DrawFn) -> tuple[dict[Name, Cell], dict[Name, set[int]], list[Cell]]:
+    """Draw vehicles in a column of five lanes, and free cells that include theirs."""
+    lanes = draw(st.lists(st.integers(0, 4), min_size=1, max_size=4, unique=True))
+    others = draw(st.sets(st.integers(0, 4)))
+    names = [Name(f"v{number}") for number in range(len(lanes))]
+    goals = {name: draw(st.sets(st.integers(0, 4), min_size=1)) for name in names}
+    cells: dict[Name, Cell] = {name: (3, lane) for name, lane in zip(names, lanes, strict=True)}
+    return cells, goals, sorted({(3, lane) for lane in {*lanes, *others}})
+
+
+@given(columns())
+def test_as_many_as_possible_reach_their_goals(
+    drawn: tuple[dict[Name, Cell], dict[Name, set[int]], list[Cell]],
+) -> None:
+    cells, goals, free = drawn
+    found = reachable_lanes(cells, goals, cells, free)
+    in_order = sorted(cells, key=lambda name: cells[name])
+
+    def is_possible(lanes: tuple[int, ...]) -> bool:
+        """Without passing each other, or a cell that is not free."""
+        between = (
+            range(min(lane, cells[name][1]), max(lane, cells[name][1]) + 1)
+            for name, lane in zip(in_order, lanes, strict=True)
+        )
+        return all((3, lane) in free for each in between for lane in each)
+
+    def satisfied(lanes: tuple[int, ...]) -> int:
+        return sum(lane in goals[name] for name, lane in zip(in_order, lanes, strict=True))
+
+    possible = [lanes for lanes in combinations(range(5), len(in_order)) if is_possible(lanes)]
+    allowed = [
+        lanes
+        for lanes in possible
+        if all(lane in found[name] for name, lane in zip(in_order, lanes, strict=True))
+    ]
+    assert max(map(satisfied, allowed)) == max(map(satisfied, possible))
+    reaching = sum(found[name] <= goals[name] for name in cells)
+    assert reaching >= max(map(satisfied, possible))

@@ -117,14 +117,25 @@ def test_the_moves_that_are_planned_for_a_type_can_be_driven() -> None:
 
 def test_moves_of_types() -> None:
     found = scenario(TRUCK, VAN)
-    lateral, every = frozenset({(0, 1), (0, -1)}), frozenset(displacements(1)[1:])
     moves = [found.moves_of(name) for name in ("car", "truck", "van", "bus")]
-    assert moves == [None, lateral, every, frozenset()]
+    assert moves == [None, frozenset({(0, 1), (0, -1)}), None, frozenset()]
 
 
-def test_formations_with_a_longer_pitch_have_a_longer_slot() -> None:
-    found = scenario(TRUCK, formation={"gap_m": 20.0})
-    assert found.cycles_s == pytest.approx((5.2, 7.0))
+@pytest.mark.parametrize(
+    ("tables", "shortest_s"),
+    [
+        ({}, 4.0),
+        ({"formation": {"gap_m": 16.0, "speed_mps": 12.0}}, 4.0),
+        ({"formation": {"speed_mps": 8.0}}, 4.0),
+        ({"formation": {"gap_m": 20.0}, "vehicle_type": [TRUCK]}, 5.0),
+        ({"vehicle": {"max_accel_mps2": 3.0}}, 5.0),
+    ],
+)
+def test_formations_have_longer_slots_only_where_moves_need_them(
+    tables: dict[str, Any], shortest_s: float
+) -> None:
+    found = parse_scenario(tables)
+    assert found.cycles_s == pytest.approx((shortest_s, 7.0))
     check_moves(found)
 
 

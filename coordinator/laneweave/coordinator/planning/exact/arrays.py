@@ -142,10 +142,10 @@ def teams(
     numbered = np.array(pair_target, dtype=np.int64)
     drives = np.repeat(arrays.valid[None], len(numbers), axis=0)
     distance = np.empty((arrays.valid.shape[1], len(numbered)))
-    for k, (_, missing) in enumerate(numbers):
+    for k, (_, excluded_of_team) in enumerate(numbers):
         first, end = pairs_from[k : k + 2]
         pair[k, pair_target[first:end]] = np.arange(first, end)
-        drives[k, sorted(missing)] = False
+        drives[k, sorted(excluded_of_team)] = False
         distance[:, first:end] = min_steps(drives[k], arrays.step, target[numbered[first:end]])
     return Teams(
         start=_cells(starts, arrays),

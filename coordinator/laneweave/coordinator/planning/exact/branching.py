@@ -106,7 +106,7 @@ class Branching(Search):
         self._stuck_at: int | None = None
         self._best_value = UNREACHABLE
         table = problem.table
-        pairs = sum(map(len, set(choices)))
+        pairs = sum(len(choice) for choice, _ in set(zip(choices, problem.excluded, strict=True)))
         if 8 * pairs * table.grid.columns * table.grid.lanes > budget.max_bytes:
             self.aborted = True
             return

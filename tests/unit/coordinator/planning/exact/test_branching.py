@@ -1,5 +1,7 @@
 """The solver `branching`, beyond the comparison with the oracle in `test_against_milp`."""
 
+from itertools import combinations
+
 import pytest
 from attrs import evolve
 
@@ -9,12 +11,11 @@ from laneweave.coordinator.planning.exact.lagrangian_bound import upper_bound_of
 from laneweave.coordinator.planning.exact.multipliers_kernel import PER_MOVE
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.plan_validator import problems_of_response
-from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import formation_request
-from laneweave.protocol.lattice import Cell, Mode
+from laneweave.protocol.lattice import Cell, Mode, displacements
 
 
 def solved(request: PlanRequest, max_nodes: int | None = None) -> PlanResponse:
@@ -137,10 +138,18 @@ def test_arrays_for_too_many_targets_are_not_allocated() -> None:
     )
     kinds = ("node", "edge", "special-1")
     request = PlanRequest(Grid(1000, 16), 1, kinds, vehicles, tuple(targets))
-    problem = Problem(request.grid, 1, request.conflict_model, [v.cell for v in vehicles], targets)
-    search = Branching(problem, request.choices(), Budget())
+    search = Branching(request.problem(), request.choices(), Budget())
     search.run()
     assert search.aborted
+
+
+def test_vehicles_that_drive_different_moves_are_different_teams() -> None:
+    """60 of them have the same 400 targets on 16,000 cells."""
+    targets = [(column, lane) for column in range(900, 925) for lane in range(16)]
+    moves = [subset for size in range(9) for subset in combinations(displacements(2)[1:], size)]
+    vehicles = tuple(VehicleRequest(f"v{i}", (i, 0), moves=moves[i]) for i in range(60))
+    request = PlanRequest(Grid(1000, 16), 2, ("geometric",), vehicles, tuple(targets))
+    assert Branching(request.problem(), request.choices(), Budget()).aborted
 
 
 def test_wide_roads_and_long_paths_are_planned() -> None:
