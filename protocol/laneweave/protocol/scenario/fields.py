@@ -654,11 +654,14 @@ class Scenario:
     def formation_bound_veh_per_lane_h(self) -> float:
         """Maximum volume at the start of the road at which formations have room where lanes end.
 
-        A full formation has as many columns as its vehicles, and those expected from ramps, need.
+        A full formation has as many columns as its vehicles, and those expected from ramps, need,
+        and one more if there are types that cannot change columns.
         """
         formation = self.formation
         most, per_column_s = formation.max_vehicles, formation.gap_m / formation.speed_mps
         columns = formation_columns(most + self.vehicles_from_ramps, self.narrowest_lanes)
+        if not all(one.changes_columns for one in self.types.values()):
+            columns = max(columns, min(columns + 1, formation.max_columns))
         if not formation.closes_by_vehicles:
             columns, most = formation.block_columns, self.block_vehicles
         return 3600.0 * most / (columns * per_column_s * len(self.road.first_lanes))

@@ -202,7 +202,9 @@ class EntryMeter:
         is_bound = queue[0].vehicle_type in self._column_bound
         if is_bound and not self._can_bind(cell, queue[0]):
             return None
-        if builder is not None and not builder.try_add(cell, queue[0].preferred_lane, t_s):
+        if builder is not None and not builder.try_add(
+            cell, queue[0].preferred_lane, t_s, column_bound=is_bound
+        ):
             return None
         if is_bound:
             self._bind(cell, queue[0])

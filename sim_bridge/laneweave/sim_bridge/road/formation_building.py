@@ -8,8 +8,9 @@ on this.
 - `GrowingFormations`, the default: the length depends on the traffic. A formation begins near the
   column of its first vehicle. It is complete at its maximum number of vehicles, at its maximum
   length, or before more vehicles prefer a lane than the shortest full formation has columns. Behind
-  the last vehicle it gets the columns that sorting needs: at least as many free cells as lanes, and
-  as many columns as there are vehicles that prefer the same lane.
+  the last vehicle it gets the columns that sorting needs: at least as many free cells as lanes, as
+  many columns as there are vehicles that prefer the same lane, and one more if it has vehicles that
+  cannot change columns, since others make room for these.
 
 In both, the number of vehicles that prefer the same lane is at most the number of columns, unlike
 in the paper, which groups vehicles regardless of their preferences. Where lanes end, the vehicles
@@ -108,9 +109,11 @@ class ColumnBlocks:
     def _first_block(self) -> int:
         return self.lattice.block_of(self.entrances.first_column(self.lattice))
 
-    def try_add(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
+    def try_add(
+        self, cell: Cell, preferred_lane: int, t_s: float, *, column_bound: bool = False
+    ) -> bool:
         """Add a vehicle that would enter in a cell; return False if it needs a later cell."""
-        del t_s
+        del t_s, column_bound  # all blocks have the same length
         block, columns = self.lattice.block_of(cell[0]), self.lattice.block_columns
         vehicles = self._vehicles.setdefault(block, Vehicles())
         room = self.max_vehicles
@@ -169,6 +172,8 @@ class Shape:
     """Number of its vehicles that came from ramps."""
     complete_s: float = 0.0
     """Road time at which it was completed."""
+    column_bound: bool = False
+    """Whether it has vehicles from the start of the road that cannot change columns."""
 
     @property
     def columns(self) -> range:
@@ -214,7 +219,9 @@ class GrowingFormations:
         """Return how many more vehicles from ramps are expected in a full formation."""
         return max(self.entrances.from_ramps - entered, 0)
 
-    def try_add(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
+    def try_add(
+        self, cell: Cell, preferred_lane: int, t_s: float, *, column_bound: bool = False
+    ) -> bool:
         """Add a vehicle that would enter in a cell; return False if it needs a later cell."""
         column, lane = cell
         if lane in self.entrances.ramps:
@@ -230,6 +237,7 @@ class GrowingFormations:
         shape = self._opened(column)
         shape.rear = min(shape.rear, column)
         shape.vehicles.add(preferred_lane)
+        shape.column_bound = shape.column_bound or column_bound
         if shape.vehicles.count - shape.from_ramps >= self.max_vehicles:
             self._complete_open(shape.rear, t_s)
         return True
@@ -314,9 +322,10 @@ class GrowingFormations:
         shape, self._open = self._open, None
         if shape is None:
             return
+        needed = self._length_for(shape.vehicles.count + self._coming(shape.from_ramps))
         length = max(
             shape.front - min(last_column, shape.rear) + 1,
-            self._length_for(shape.vehicles.count + self._coming(shape.from_ramps)),
+            min(needed + shape.column_bound, max(needed, self.max_columns)),
             shape.vehicles.most_preferring,
         )
         shape.rear, shape.complete_s = shape.front - length + 1, t_s

@@ -420,3 +420,17 @@ def test_the_scenario_selects_the_builder() -> None:
     assert isinstance(blocks, ColumnBlocks)
     assert (blocks.max_vehicles, blocks.lattice.block_columns, blocks.spread_s) == (6, 4, 1.5)
     assert formation_builder(Scenario(formation=FormationSettings(operation="rolling"))) is None
+
+
+@pytest.mark.parametrize(("max_columns", "length"), [(7, 4), (3, 3)])
+def test_vehicles_that_cannot_change_columns_get_one_more(max_columns: int, length: int) -> None:
+    """Six vehicles in three lanes need three columns."""
+    for truck, expected in ((None, 3), (2, length)):
+        builder = GrowingFormations(lattice(3), 6, max_columns, 0.0, Entrances(3))
+        for number in range(6):
+            column, lane = -(number // 3), number % 3
+            passing_s = builder.lattice.passing_time_s(column)
+            is_truck = number == truck
+            assert builder.try_add((column, lane), lane, passing_s, column_bound=is_truck)
+        (closed,) = builder.closed(60.0)
+        assert len(closed.columns(builder.lattice)) == expected
