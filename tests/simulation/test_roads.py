@@ -32,7 +32,7 @@ BUGS: list[tuple[str, Bug, int]] = [
     (FORMATIONS, broken_formations_on_roads.columns_ahead_are_closed, 66),
     (FORMATIONS, broken_lane_ends.never_leaves, 6),
     (FORMATIONS, broken_roads.exits_are_closed, 8),
-    (FORMATIONS, broken_roads.types_are_ignored, 10),
+    (FORMATIONS, broken_roads.types_are_ignored, 11),
 ]
 """Profiles, bugs, and a seed that catches each."""
 
