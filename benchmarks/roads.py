@@ -150,7 +150,8 @@ def _ramps() -> Iterator[Point]:
         flows = _weaving(ramp, volume)
         yield Point("weaving", volume, overrides=flows, goal=goal)
         yield from _with_references(Point("weaving", volume, overrides=flows))
-    yield Point("weaving", 1300, "formations", overrides=_weaving(600, 1300), goal=1.05)
+    flows = _weaving(600, 1300)
+    yield Point("weaving", 1300, "formations", flows, goal=1.05, reached_goal=0.998)
 
 
 def _faulty() -> Iterator[Point]:
@@ -178,10 +179,10 @@ POINTS: Final = (
     *_lane_ends(),
     *_ramps(),
     Point("motorway", 1600, goal=1.03),
-    Point("motorway", 2400, goal=1.03, reached_goal=0.999),
+    Point("motorway", 2400, goal=1.03, reached_goal=0.998),
     Point("trucks", 1450, goal=1.03),
     Point("trucks", 1000, "formations", goal=1.03),
-    Point("trucks", 1200, "formations", goal=1.03, reached_goal=0.99),
+    Point("trucks", 1200, "formations", goal=1.03),
     *_faulty(),
     *_with_processes(),
 )

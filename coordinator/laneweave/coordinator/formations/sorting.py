@@ -2,8 +2,8 @@
 
 The grid consists of the blocks of the formations, in the lanes that are open. Vehicles without an
 agent block their cells. If every vehicle has one goal lane, all can change columns, and no lane
-ends, they form the parallel structure; otherwise they take any cells of their goal lanes, vehicles
-that cannot change columns those of their own columns. If complete sorting is infeasible, one
+ends, they form the parallel structure. Otherwise they take any cells of their goal lanes; vehicles
+that cannot change columns take those in their own columns. If complete sorting is infeasible, one
 vehicle is exempted from reaching its lane, so that a single blocked vehicle does not prevent all
 others from sorting; the vehicles are tried one by one. Before sorting, a formation may form other
 structures, in which every vehicle may take any place.
@@ -15,7 +15,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
-from itertools import islice
+from itertools import islice, product
 
 from attrs import evolve, field, frozen
 
@@ -120,6 +120,21 @@ class SortingTask:
         cells = foreign | held
         return tuple(sorted((column - first, lane) for column, lane in cells))
 
+    @property
+    def free(self) -> tuple[Cell, ...]:
+        """Grid cells that are not blocked."""
+        blocked = {*self.blocked}
+        cells = product(range(self.scenario.road.lanes), range(len(self.columns)))
+        return tuple((column, lane) for lane, column in cells if (column, lane) not in blocked)
+
+    @property
+    def hindered(self) -> frozenset[Name]:
+        """Members that cannot reach a goal lane, whatever the others do."""
+        movers, bound = self.movers, self.column_bound
+        goals = {name: self.goal_lanes[name] for name in movers}
+        possible = reachable_lanes(movers, goals, bound.intersection(movers), self.free)
+        return frozenset(name for name, lanes in possible.items() if not lanes <= goals[name])
+
 
 @frozen
 class Sorting:
@@ -132,7 +147,8 @@ class Sorting:
     out_of_reach: tuple[Name, ...]
     """Members that do not reach their lanes."""
     short_of_room: bool
-    """Whether a member that can move does not reach its lane, so more blocks could help."""
+    """Whether a member that can move, and is not hindered, does not reach its lane, so more blocks
+    could help."""
     impossible: str = ""
     """Why the structure has too few cells, in which case no member moves; empty: it has enough."""
 
@@ -194,12 +210,7 @@ def _into_lanes(task: SortingTask, wanted: Mapping[Name, frozenset[int]]) -> Ite
     request every vehicle has one target, so that no path is long: such plans may have fewer
     steps.
     """
-    free = [
-        (column, lane)
-        for lane in range(task.scenario.road.lanes)
-        for column in range(len(task.columns))
-        if (column, lane) not in task.blocked
-    ]
+    free = task.free
     through = task.open_lanes if task.stage is None else task.stage.through_lanes
     column_bound = task.column_bound.intersection(wanted)
     possible = reachable_lanes(task.movers, wanted, column_bound, free)
@@ -321,7 +332,6 @@ def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:
         missed = tuple(name for name, cell in ends.items() if cell[1] not in task.goal_lanes[name])
     # After a timeout it is unknown whether there is room, and planning more blocks takes longer.
     known = response is not None and response.status != "timeout"
-    # More columns do not help a vehicle that cannot change columns.
-    hold = task.column_bound.union(task.unattended)
-    short_of_room = known and not hold.issuperset(missed)
+    short = {*missed}.difference(task.unattended)
+    short_of_room = known and bool(short) and not task.hindered.issuperset(short)
     return Sorting(response, moves, missed, short_of_room)

@@ -1,10 +1,12 @@
 """Targets of a formation that sorts its lanes.
 
-After lane sorting, a formation has the parallel structure (paper, Section 5.2.1).
+- `placements`: the parallel structure (paper, Section 5.2.1).
+- `choose_lanes`, `reachable_lanes`, `assign_nearby`: any cells of the goal lanes.
 
-Each lane provides neighbouring cells, one per vehicle that prefers the lane, where paths are
-shortest. Vehicles without an agent keep their cells, which are blocked for others. If more vehicles
-prefer a lane than it has free cells, the vehicles furthest from it get the nearest other cells.
+In the parallel structure each lane provides neighbouring cells, one per vehicle that prefers the
+lane, where paths are shortest. Vehicles without an agent keep their cells, which are blocked for
+others. If more vehicles prefer a lane than it has free cells, the vehicles furthest from it get the
+nearest other cells.
 """
 
 from __future__ import annotations
@@ -97,7 +99,8 @@ def choose_lanes(
         for name in cells
     }
     every = frozenset(lane for _, lane in free)
-    # A worse choice costs more than all distances together, another column than all choices.
+    # The penalty for a worse choice exceeds the sum of all distances, that for another column the
+    # sum of all penalties for choices.
     penalty = 1 + len(cells) * sum(max(cell) + 1 for cell in (*cells.values(), *free))
     other_column = penalty * (1 + 2 * len(cells))
     costs = np.array(
@@ -127,8 +130,8 @@ def reachable_lanes(
 ) -> dict[Name, frozenset[int]]:
     """Return the goal lanes that each vehicle can reach, if some cannot change columns.
 
-    In a column these keep their order, and pass no cell that is not free. As many of them as
-    possible reach goal lanes; the others get all lanes.
+    These keep their order in a column, and cannot pass a cell that is not free. As many of them as
+    possible reach a goal lane; each of the others gets all lanes that it can reach.
 
     Args:
         cells: current cell of each vehicle.
@@ -163,15 +166,17 @@ def reachable_lanes(
 def assign_nearby(
     cells: Mapping[Name, Cell], eligible: Mapping[Name, Sequence[int]], targets: Sequence[Cell]
 ) -> dict[Name, int]:
-    """Return one target for each vehicle with the smallest sum of squared distances.
+    """Return the index of a target for each vehicle, minimizing the sum of squared distances.
 
     Args:
         cells: current cell of each vehicle.
         eligible: indices of the targets that each vehicle may have.
         targets: the target cells.
     """
-    longest = sum(max(cell) + 1 for cell in (*cells.values(), *targets))
-    costs = np.full((len(cells), len(targets)), 1 + len(cells) * longest**2)
+    columns, lanes = (max(values) for values in zip(*cells.values(), *targets, strict=True))
+    # More than all permitted distances together.
+    penalty = 1 + len(cells) * (columns + lanes) ** 2
+    costs = np.full((len(cells), len(targets)), penalty)
     for row, (name, (column, lane)) in enumerate(cells.items()):
         for number in eligible[name]:
             distance = abs(column - targets[number][0]) + abs(lane - targets[number][1])

@@ -192,24 +192,19 @@ def _check_types(scenario: Scenario) -> None:
 
 def _check_types_of_structures(scenario: Scenario) -> None:
     """Check that all types drive all moves if structures are given: any vehicle gets any place."""
-    accel_mps2, jerk_mps3 = scenario.column_move_peaks
+    if scenario.formation.rolling or not scenario.formation.structures:
+        return
     for name, own in scenario.types.items():
-        limits = own.vehicle
-        for limit, value, needed in (
-            ("max_accel_mps2", limits.max_accel_mps2, accel_mps2),
-            ("min_accel_mps2", limits.min_accel_mps2, -accel_mps2),
-            ("max_jerk_mps3", limits.max_jerk_mps3, jerk_mps3),
-        ):
+        for limit, needed in scenario.column_move_limits.items():
+            value = getattr(own.vehicle, limit)
+            shown = math.ceil(100.0 * needed) / 100.0
             _require(
-                scenario.formation.rolling
-                or not scenario.formation.structures
-                or own.changes_columns
-                or abs(value) >= abs(needed),
+                abs(value) >= needed,
                 _limit_of(scenario, name, limit),
                 value,
-                f"at {'most' if needed < 0.0 else 'least'} {needed:.3g} with formation.structures, "
-                f"where each vehicle moves by a column of {scenario.formation.gap_m:g} m in T_F "
-                "(formation.cycle_s)",
+                (f"at most {-shown:g}" if value < 0.0 else f"at least {shown:g}")
+                + " with formation.structures, where each vehicle moves by a column of "
+                f"{scenario.formation.gap_m:g} m in T_F (formation.cycle_s)",
             )
 
 
@@ -378,7 +373,8 @@ def _check_capacity(scenario: Scenario) -> None:
             "demand.volume_veh_per_lane_h",
             volume,
             f"at most {formations}: where {scenario.narrowest_lanes} lanes are open, formations of "
-            f"{scenario.formation.max_vehicles} (formation.max_vehicles) need more columns",
+            f"{scenario.formation.max_vehicles} (formation.max_vehicles) need more columns"
+            + ("" if scenario.all_change_columns else ", and those with weaker types one more"),
         )
     for s_m in sorted({0.0, *scenario.entry_m, *(one.from_m for one in road.closures)}):
         flows = [(from_m, flow) for from_m, flow, to_m in parts if from_m <= s_m < to_m]

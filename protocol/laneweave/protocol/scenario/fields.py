@@ -660,7 +660,7 @@ class Scenario:
         formation = self.formation
         most, per_column_s = formation.max_vehicles, formation.gap_m / formation.speed_mps
         columns = formation_columns(most + self.vehicles_from_ramps, self.narrowest_lanes)
-        if not all(one.changes_columns for one in self.types.values()):
+        if not self.all_change_columns:
             columns = max(columns, min(columns + 1, formation.max_columns))
         if not formation.closes_by_vehicles:
             columns, most = formation.block_columns, self.block_vehicles
@@ -726,15 +726,12 @@ class Scenario:
     def drivable_moves(self) -> frozenset[Cell]:
         """The moves (columns, lanes) that are planned for the type that `vehicle` describes.
 
-        Cars drive every move of the mode. Other types do not change columns if the peaks of such a
-        move (`column_move_peaks`) exceed their limits along the road.
+        Cars drive every move of the mode. Other types do not change columns if their limits along
+        the road are lower than such a move needs (`column_move_limits`).
         """
         moves = frozenset(displacements(self.formation.mode)[1:])
-        limits, (accel_mps2, jerk_mps3) = self.vehicle, self.column_move_peaks
-        if limits == self.types[CAR].vehicle or (
-            accel_mps2 <= min(limits.max_accel_mps2, -limits.min_accel_mps2)
-            and jerk_mps3 <= limits.max_jerk_mps3
-        ):
+        needed = self.column_move_limits
+        if all(abs(getattr(self.vehicle, name)) >= limit for name, limit in needed.items()):
             return moves
         return frozenset((columns, lanes) for columns, lanes in moves if columns == 0)
 
@@ -749,18 +746,30 @@ class Scenario:
         return None if own.drivable_moves == self.types[CAR].drivable_moves else own.drivable_moves
 
     @property
-    def column_move_peaks(self) -> tuple[float, float]:
-        """Peaks of a move by a column in the shortest T_F: acceleration [m/s^2], jerk [m/s^3].
+    def column_move_limits(self) -> dict[str, float]:
+        """Limits along the road that suffice for a move by a column in the shortest T_F.
 
-        For a minimum-jerk move over d in T these are 10 / sqrt(3) d / T^2 and 60 d / T^3.
+        Keys are fields of table `vehicle`, values are absolute. They are the peaks of a
+        minimum-jerk move over d in T, 10 / sqrt(3) d / T^2 and 60 d / T^3, or those of cars, if
+        these are lower: the trajectory of a car keeps within its limits.
         """
-        d_m, move_s = self.formation.gap_m, self.move_s
-        return 10.0 / math.sqrt(3.0) * d_m / move_s**2, 60.0 * d_m / move_s**3
+        d_m, move_s, cars = self.formation.gap_m, self.move_s, self.types[CAR].vehicle
+        accel_mps2, jerk_mps3 = 10.0 / math.sqrt(3.0) * d_m / move_s**2, 60.0 * d_m / move_s**3
+        return {
+            "max_accel_mps2": min(accel_mps2, cars.max_accel_mps2),
+            "min_accel_mps2": min(accel_mps2, -cars.min_accel_mps2),
+            "max_jerk_mps3": min(jerk_mps3, cars.max_jerk_mps3),
+        }
 
     @property
     def changes_columns(self) -> bool:
         """Whether the type that `vehicle` describes moves between columns."""
         return any(columns for columns, _ in self.drivable_moves)
+
+    @property
+    def all_change_columns(self) -> bool:
+        """Whether all types move between columns."""
+        return all(one.changes_columns for one in self.types.values())
 
     @property
     def longest_body_m(self) -> float:

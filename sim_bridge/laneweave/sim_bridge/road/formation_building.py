@@ -9,8 +9,8 @@ on this.
   column of its first vehicle. It is complete at its maximum number of vehicles, at its maximum
   length, or before more vehicles prefer a lane than the shortest full formation has columns. Behind
   the last vehicle it gets the columns that sorting needs: at least as many free cells as lanes, as
-  many columns as there are vehicles that prefer the same lane, and one more if it has vehicles that
-  cannot change columns, since others make room for these.
+  many columns as there are vehicles that prefer the same lane, and one more if vehicles from the
+  start of the road cannot change columns, since others make room for these.
 
 In both, the number of vehicles that prefer the same lane is at most the number of columns, unlike
 in the paper, which groups vehicles regardless of their preferences. Where lanes end, the vehicles

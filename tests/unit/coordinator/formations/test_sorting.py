@@ -287,6 +287,17 @@ def test_several_trucks_that_are_hindered_do_not_keep_others_from_sorting() -> N
     assert not sorting.short_of_room
 
 
+def test_more_columns_help_a_truck_if_others_can_step_aside() -> None:
+    scenario = evolve(
+        SCENARIO, road=evolve(SCENARIO.road, lanes=2), formation=evolve(FORMATIONS, block_columns=1)
+    )
+    order = task({A: (0, 0), B: (0, 1)}, {A: 1, B: 1}, scenario=scenario)
+    order = evolve(order, moves={A: LANES_ONLY})
+    found = sort(order)
+    assert (found.out_of_reach, found.short_of_room) == ((A,), True)
+    assert sort(evolve(order, numbers=(0, 1))).out_of_reach == ()
+
+
 @st.composite
 def tasks(draw: st.DrawFn) -> SortingTask:
     numbers = draw(st.sampled_from([(0,), (1,), (0, 1)]))
@@ -321,8 +332,7 @@ def test_sortings_stay_inside_and_name_vehicles_off_their_lanes(order: SortingTa
     missed = {name for name, cell in final.items() if cell[1] not in order.goal_lanes[name]}
     assert set(sorting.out_of_reach) == missed
     if sorting.solved:
-        hold = order.column_bound.union(order.unattended)
-        assert sorting.short_of_room == bool(missed - hold)
+        assert sorting.short_of_room == bool(missed - order.hindered.union(order.unattended))
 
 
 def test_a_sorting_without_paths_is_not_solved() -> None:
