@@ -3,11 +3,29 @@
 from __future__ import annotations
 
 import reprlib
+from typing import Final
+
+from attrs import frozen
 
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel = 4
 _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 12
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 80
+
+
+@frozen(repr=False)
+class Described:
+    """A description in the place of a value, which a message shows without quotes."""
+
+    text: str
+
+    def __repr__(self) -> str:
+        """Return the text."""
+        return self.text
+
+
+NO_VALUE: Final = Described("no value")
+UNKNOWN_KEY: Final = Described("an unknown key")
 
 
 class BadInputError(ValueError):

@@ -23,7 +23,7 @@ from cattrs.errors import (
 )
 from cattrs.gen import make_dict_structure_fn
 
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import NO_VALUE, UNKNOWN_KEY, BadInputError, Described
 
 T = TypeVar("T")
 Hook = Callable[[Any, Any], Any]
@@ -198,14 +198,16 @@ def first_problem(error: Exception, path: str = "") -> BadInputError:
     if isinstance(error, ForbiddenExtraKeysError):
         allowed = sorted(attribute.alias for attribute in attrs.fields(error.cl))
         problem = BadInputError(
-            min(error.extra_fields), "an unknown key", "one of " + ", ".join(allowed)
+            min(error.extra_fields), UNKNOWN_KEY, "one of " + ", ".join(allowed)
         )
         return problem.within(path)
     if isinstance(error, BadInputError):
         return error.within(path)
     if isinstance(error, KeyError):
-        return BadInputError(path, "nothing", "a value; this field is required")
-    return BadInputError(path, "a value of another kind", str(error) or type(error).__name__)
+        return BadInputError(path, NO_VALUE, "a value; this field is required")
+    return BadInputError(
+        path, Described("a value of another kind"), str(error) or type(error).__name__
+    )
 
 
 def _step(error: BaseException, nested: bool) -> str:

@@ -120,7 +120,7 @@ def test_what_is_no_table_is_refused(data: Any) -> None:  # noqa: ANN401
 
 
 def test_a_missing_field_says_so() -> None:
-    with pytest.raises(BadInputError, match=r"^count: got 'nothing'; allowed: .*required$"):
+    with pytest.raises(BadInputError, match=r"^count: got no value; allowed: .*required$"):
         structure({}, Whole)
 
 

@@ -162,15 +162,23 @@ def check_moves(scenario: Scenario) -> None:
                 try:
                     move_profile(own, dx, dy, own.move_ticks(slot_s))
                 except InfeasibleTrajectoryError as error:
-                    change = f"the table {whose}"
+                    change = f"the lateral limits in table {whose}"
+                    if dx != 0:
+                        change = f"the limits in table {whose}"
                     if dx > 0:
                         change = "formation.gap_m or the table braking"
                     raise BadInputError(
                         "formation.move_s",
                         slot_s - scenario.formation.slack_s,
-                        f"long enough for a move of a {name} by {dx} columns and {dy} lanes "
+                        f"long enough for a move of a {name} by {_distance(dx, dy)} "
                         f"({error}), or change {change}",
                     ) from error
+
+
+def _distance(dx: int, dy: int) -> str:
+    """Return the distance of a move in words."""
+    parts = ((dx, "column"), (dy, "lane"))
+    return " and ".join(f"{n} {what}" for n, what in parts if n)
 
 
 @lru_cache(maxsize=256)
@@ -210,10 +218,9 @@ def plan_trajectory(
         what += ", with room to brake behind a vehicle that holds beyond the target"
     solution = program.solve()
     if not solution.usable:
-        out = solution.status == MAX_ITERATIONS
-        why = "out of iterations" if out else f"solver status {solution.status}"
+        why = " found in time" if solution.status == MAX_ITERATIONS else ""
         raise InfeasibleTrajectoryError(
-            f"{what}: no trajectory within {LIMIT_SHARE:.0%} of the vehicle's limits ({why})"
+            f"{what}: no trajectory within {LIMIT_SHARE:.0%} of the vehicle's limits{why}"
         )
     jerks = solution.x[6 * ticks :].reshape(2, ticks).T / unit_s**3
     trajectory = _integrated(jerks, tick_s)

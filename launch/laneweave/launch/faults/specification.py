@@ -19,7 +19,7 @@ from attrs import field, frozen
 from attrs.validators import optional
 
 from laneweave.protocol.config.scenario_files import read_toml
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import NO_VALUE, BadInputError
 from laneweave.protocol.field_validators import one_of, within
 from laneweave.protocol.runtime.message_faults import SENDERS, MessageRule
 from laneweave.protocol.structuring import NumberOrRange, structure
@@ -87,7 +87,7 @@ class RoleFault:
     def __attrs_post_init__(self) -> None:
         """Check that the fields do not contradict each other."""
         if self.at_s is None and self.between_s is None:
-            raise BadInputError("at_s", "nothing", "a road time, or between_s instead")
+            raise BadInputError("at_s", NO_VALUE, "a road time, or between_s instead")
         if self.at_s is not None and self.between_s is not None:
             raise BadInputError("between_s", self.between_s, "nothing if at_s is given")
         if self.every_s is not None and self.at_s is None:
@@ -218,7 +218,7 @@ class LinkFault(TimedFault):
         """Check that the fields do not contradict each other."""
         super().__attrs_post_init__()
         if not self.loss and not self.delays:
-            raise BadInputError("loss", "nothing", "a share of packets, or delay_s or jitter_s")
+            raise BadInputError("loss", NO_VALUE, "a share of packets, or delay_s or jitter_s")
         if self.burst > 1 and not self.loss:
             raise BadInputError("burst", self.burst, "1 without loss")
         if self.burst > 1 and self.loss > MAX_BURST_LOSS:

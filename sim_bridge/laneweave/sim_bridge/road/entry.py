@@ -30,7 +30,7 @@ from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.formation_building import FormationBuilder
 
-_MAX_BOUND_COLUMNS = 4096
+_MAX_KEEPING_COLUMNS = 4096
 """Number of columns, more than there are on a road, whose vehicles are remembered."""
 TIME_TOLERANCE_S = 1e-9
 """Rounding tolerance for comparing ticks with passing times."""
@@ -76,7 +76,7 @@ class EntryMeter:
         """
         self._lanes_of = lanes_of or self._preferred_lanes
         self._column_bound = frozenset(column_bound)
-        self._bound: dict[int, dict[int, Collection[int]]] = {}
+        self._keeping_columns: dict[int, dict[int, Collection[int]]] = {}
         """Lanes in which the vehicles of these types may leave, by their column and lane."""
         self._entry_m = tuple(entry_m) or (0.0,) * lattice.lanes
         self._lattice = lattice
@@ -199,15 +199,15 @@ class EntryMeter:
     def _dequeue(self, cell: Cell, t_s: float) -> Arrival | None:
         """Remove and return the first vehicle of a queue, unless it needs a later cell."""
         builder, queue = self._builder, self._queues[cell[1]]
-        is_bound = queue[0].vehicle_type in self._column_bound
-        if is_bound and not self._can_bind(cell, queue[0]):
+        keeps_column = queue[0].vehicle_type in self._column_bound
+        if keeps_column and not self._can_keep_column(cell, queue[0]):
             return None
         if builder is not None and not builder.try_add(
-            cell, queue[0].preferred_lane, t_s, column_bound=is_bound
+            cell, queue[0].preferred_lane, t_s, column_bound=keeps_column
         ):
             return None
-        if is_bound:
-            self._bind(cell, queue[0])
+        if keeps_column:
+            self._keep_column(cell, queue[0])
         self._names.discard(queue[0].vehicle)
         return queue.pop(0)
 
@@ -215,22 +215,22 @@ class EntryMeter:
         preferred = arrival.preferred_lane
         return range(self._lattice.lanes) if preferred == ANY_LANE else (preferred,)
 
-    def _can_bind(self, cell: Cell, arrival: Arrival) -> bool:
+    def _can_keep_column(self, cell: Cell, arrival: Arrival) -> bool:
         """Return whether a vehicle, and those of its column, can leave in the order of their lanes.
 
         These are the vehicles that do not change columns.
         """
         column, lane = cell
-        bound = {**self._bound.get(column, {}), lane: self._lanes_of(arrival)}
+        exits = {**self._keeping_columns.get(column, {}), lane: self._lanes_of(arrival)}
         leaves_in: float = -1
-        for here in sorted(bound):
+        for here in sorted(exits):
             # The rightmost lane that leaves the most room for those on its left.
-            leaves_in = min((goal for goal in bound[here] if goal > leaves_in), default=math.inf)
-        return leaves_in < math.inf or len(bound) == 1
+            leaves_in = min((goal for goal in exits[here] if goal > leaves_in), default=math.inf)
+        return leaves_in < math.inf or len(exits) == 1
 
-    def _bind(self, cell: Cell, arrival: Arrival) -> None:
+    def _keep_column(self, cell: Cell, arrival: Arrival) -> None:
         """Add a vehicle to the vehicles of its column that do not change columns."""
         column, lane = cell
-        self._bound.setdefault(column, {})[lane] = self._lanes_of(arrival)
-        while len(self._bound) > _MAX_BOUND_COLUMNS:
-            del self._bound[next(iter(self._bound))]
+        self._keeping_columns.setdefault(column, {})[lane] = self._lanes_of(arrival)
+        while len(self._keeping_columns) > _MAX_KEEPING_COLUMNS:
+            del self._keeping_columns[next(iter(self._keeping_columns))]

@@ -84,7 +84,7 @@ def test_command_lines(laneweave: Here, arguments: list[str], named: str) -> Non
     ("words", "text", "named"),
     [
         ("run FILE", "a = " + "[" * 5000, "valid TOML"),
-        ("run FILE", "[road]\nlane = 3", "road.lane: got 'an unknown key'"),
+        ("run FILE", "[road]\nlane = 3", "road.lane: got an unknown key"),
         ("run FILE", "[road]\nlane_width_m = 2.0\n[vehicle]\nwidth_m = 2.5", "road.lane_width_m"),
         ("run --faults FILE", "[[kill]]\ntarget = 'c9'\nat_s = 1.0", "kill[0].target: got 'c9'"),
         (
