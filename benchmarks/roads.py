@@ -179,7 +179,7 @@ POINTS: Final = (
     *_lane_ends(),
     *_ramps(),
     Point("motorway", 1600, goal=1.03),
-    Point("motorway", 2400, goal=1.03, reached_goal=0.998),
+    Point("motorway", 2400, goal=1.03, reached_goal=0.999),
     Point("trucks", 1450, goal=1.03),
     Point("trucks", 1000, "formations", goal=1.03),
     Point("trucks", 1200, "formations", goal=1.03),
