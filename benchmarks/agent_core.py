@@ -42,7 +42,7 @@ from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Prepare, Sense
 from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, Keys, Quality, matches_any
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, pose_of
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
@@ -147,6 +147,10 @@ class BodyStore:
     def collisions(self) -> list[tuple[str, str]]:
         """Return no collisions."""
         return []
+
+    def others(self) -> tuple[OtherBody, ...]:
+        """Return no bodies."""
+        return ()
 
     def remove(self, vehicle: str) -> None:
         """Remove a vehicle."""

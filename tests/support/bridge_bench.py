@@ -36,7 +36,7 @@ from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.messages import Command, Name, Prepare, Report, Sense
 from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, REPORT, VEHICLE_ALIVE, Keys
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, pose_of
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
 from laneweave.sim_bridge.core import BRIDGE, BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
@@ -92,6 +92,9 @@ class PlainWorld:
 
     def collisions(self) -> list[tuple[str, str]]:
         return []
+
+    def others(self) -> Sequence[OtherBody]:
+        return ()
 
     def remove(self, vehicle: str) -> None:
         del self.at[vehicle]

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR, Name
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import ExactNeighbour, OtherBody, Pose
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.sized_bodies import bodies_of
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
+
+EXIT_TOLERANCE_M = 10.0
+"""Distance behind an exit up to which a vehicle that has not left yet sees what is behind it."""
 
 
 class World(Protocol):
@@ -31,6 +34,9 @@ class World(Protocol):
 
     def collisions(self) -> list[tuple[str, str]]:
         """Return the pairs that the world itself reports as colliding."""
+
+    def others(self) -> Sequence[OtherBody]:
+        """Return the bodies behind the exits, the nearest ones first."""
 
     def remove(self, vehicle: str) -> None:
         """Remove a vehicle from the road."""
@@ -55,12 +61,46 @@ def show_bodies(
     bodies = bodies_of(world.positions(), (one.arrival for one in vehicles.values()), scenario)
     accels_mps2: dict[str, float] = {name: state[2] for name, state in states.items()}
     neighbours = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels_mps2)
+    touching = []
+    if others := world.others():
+        for name, vehicle in vehicles.items():
+            seen, touched = _behind_exits(vehicle, others, neighbours[name][0], scenario)
+            neighbours[name] = seen, neighbours[name][1]
+            touching += [(name, other) for other in touched]
     for name, vehicle in vehicles.items():
         vehicle.perceive(neighbours[name])
     record.on_positions(
         t_s,
         vehicles.values(),
-        overlaps=[*bodies.overlapping_pairs(), *bodies.in_closed_lanes(scenario)],
+        overlaps=[
+            *bodies.overlapping_pairs(),
+            *bodies.in_closed_lanes(scenario),
+            *touching,
+        ],
         collisions=world.collisions(),
         gaps=bodies.min_gaps(),
     )
+
+
+def _behind_exits(
+    vehicle: RoadVehicle,
+    others: Sequence[OtherBody],
+    ahead: Sequence[ExactNeighbour],
+    scenario: Scenario,
+) -> tuple[list[ExactNeighbour], list[str]]:
+    """Return what a vehicle sees ahead, and the names of the bodies behind exits that it touches.
+
+    The nearest body behind the exit of a lane is seen if there is none in the lane before.
+    """
+    s_m, _, _, y_m, _, _ = vehicle.state
+    first, last = scenario.lattice.lanes_touched(y_m, vehicle.size[1])
+    seen, touched = list(ahead), list[str]()
+    for other in others:
+        if not s_m <= other.exit_m + EXIT_TOLERANCE_M:
+            continue
+        gap_m = other.rear_m - s_m
+        if first <= other.lane <= last and gap_m < 0.0:
+            touched.append(other.name)
+        if all(lane != other.lane for lane, _, _, _ in seen):
+            seen.append((other.lane, gap_m, other.speed_mps, other.accel_mps2))
+    return seen, touched

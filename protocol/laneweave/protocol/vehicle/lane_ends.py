@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 from attrs import evolve, frozen
 
@@ -30,15 +30,15 @@ from laneweave.protocol.vehicle.motion import (
     hold_law,
     integrate,
 )
-from laneweave.protocol.wire.messages import CAR, Neighbour
+from laneweave.protocol.wire.messages import Neighbour
 
 BEFORE_TOUCHING = 0.6
 """Share of a move by which a body that changes lanes touches the other lane (by default 0.36)."""
 START_S = 0.3
 """Time after the front of a gap has passed in which a waiting vehicle may start into it."""
-_MAX_COLUMNS = 12
+_MAX_COLUMNS = 24
 """Upper bound on the columns that a vehicle needs to drive out."""
-_MAX_DRIVE_OUT_S = 60.0
+_MAX_DRIVE_OUT_S = 120.0
 _FAR_M = 1000.0
 
 
@@ -69,6 +69,14 @@ class DriveOut:
     """Number of free columns that it needs in the neighbouring lane; it settles in the rearmost."""
     distance_m: float
     """Distance in which it settles in its cell."""
+
+    def covering(self, other: DriveOut) -> DriveOut:
+        """Return what suffices for both."""
+        return DriveOut(
+            max(self.room_m, other.room_m),
+            max(self.columns, other.columns),
+            max(self.distance_m, other.distance_m),
+        )
 
 
 class LaneEnds:
@@ -206,6 +214,20 @@ def sections_to_lines(scenario: Scenario) -> tuple[LaneSection, ...]:
     )
 
 
+def early_start_m(scenario: Scenario) -> float:
+    """Return the distance driven in a lane change before any body touches the other lane.
+
+    A minimum-jerk motion from rest to rest has covered 10 x^3 - 15 x^4 + 6 x^5 of its way at the
+    share x of its time; a fifth of the distance is kept for tracking errors.
+    """
+    lane_m = scenario.road.lane_width_m
+    untouched = 0.5 * (lane_m - scenario.widest_body_m) / lane_m
+    ticks = scenario.move_ticks(scenario.cycles_s[0])
+    shares = (tick / ticks for tick in range(ticks + 1))
+    before = [x for x in shares if x**3 * (10.0 - 15.0 * x + 6.0 * x * x) <= untouched]
+    return 0.8 * max(before) * scenario.move_s * scenario.formation.speed_mps
+
+
 def drive_out(scenario: Scenario) -> DriveOut:
     """Return what every type of vehicle needs to drive from standing into the neighbouring lane.
 
@@ -216,18 +238,19 @@ def drive_out(scenario: Scenario) -> DriveOut:
     Raises:
         ValueError: the vehicle does not arrive in a cell (its limits are too low).
     """
-    # The scenarios of all types share a key.
-    return _drive_out_of_all(scenario.types[CAR])
+    first, *others = map(own_drive_out, scenario.types.values())
+    return reduce(DriveOut.covering, others, first)
 
 
-@lru_cache(maxsize=64)
-def _drive_out_of_all(scenario: Scenario) -> DriveOut:
+@lru_cache(maxsize=256)
+def own_drive_out(scenario: Scenario) -> DriveOut:
+    """Return what the type of vehicle that `vehicle` describes needs; see `drive_out`.
+
+    Raises:
+        ValueError: the vehicle does not arrive in a cell.
+    """
     for columns in range(2, _MAX_COLUMNS + 1):
-        found = [
-            _drive_out(one, columns, late_s)
-            for one in scenario.types.values()
-            for late_s in (0.0, START_S)
-        ]
+        found = [_drive_out(scenario, columns, late_s) for late_s in (0.0, START_S)]
         possible = [each for each in found if each is not None]
         if len(possible) == len(found):
             room_m, distance_m = (max(each) for each in zip(*possible, strict=True))

@@ -220,7 +220,9 @@ def hold_law(state: State, reference: State, limits: Vehicle, tick_s: float) -> 
     cell_s, cell_v, _, cell_y, _, _ = reference
     catch_up = _CATCH_UP_SHARE * cell_v
     headroom = _ACCEL_SHARE * (limits.max_speed_mps - cell_v)
-    wanted_v = cell_v + _clamp(_POSITION_GAIN * (cell_s - s), -catch_up, min(catch_up, headroom))
+    # A weak vehicle that falls back faster would fall behind its cell before it is as fast again.
+    fall_back = min(catch_up, _ACCEL_SHARE * limits.max_accel_mps2 / _POSITION_GAIN)
+    wanted_v = cell_v + _clamp(_POSITION_GAIN * (cell_s - s), -fall_back, min(catch_up, headroom))
     wanted_a = _clamp(
         _SPEED_GAIN * (wanted_v - v),
         _BRAKE_SHARE * limits.min_accel_mps2,

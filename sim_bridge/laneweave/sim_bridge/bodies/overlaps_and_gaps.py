@@ -18,6 +18,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
+from attrs import frozen
+
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Neighbour
 
@@ -29,8 +31,25 @@ Size = tuple[float, float]
 NO_SIZES: Mapping[str, Size] = MappingProxyType({})
 _Point = tuple[float, float]
 
+TURNING_MPS = 0.5
+"""Speed from which a body points in its direction of motion."""
 _TOUCH_M = 1e-9
 """Tolerance: touching bodies do not overlap; a body that touches a lane's border is inside."""
+
+
+@frozen
+class OtherBody:
+    """A body behind an exit or the end of the road, which the bridge does not drive."""
+
+    name: str
+    lane: int
+    """Lane that leads to it."""
+    exit_m: float
+    """Where this lane leaves the road; vehicles before see the body."""
+    rear_m: float
+    """Distance of its rear from the start of the road, along this lane."""
+    speed_mps: float
+    accel_mps2: float
 
 
 class MinGaps(NamedTuple):
@@ -59,9 +78,14 @@ ExactNeighbours = tuple[Sequence[ExactNeighbour], Sequence[ExactNeighbour]]
 
 
 def pose_of(state: Sequence[float]) -> Pose:
-    """Return the pose of a vehicle state (s, v, a, y, v_y, a_y)."""
+    """Return the pose of a vehicle state (s, v, a, y, v_y, a_y).
+
+    A body that stands does not turn, though the ratio of its speeds may be anything.
+    """
     s_m, v_mps, _, y_m, v_y_mps, _ = state
-    return s_m, y_m, math.atan2(v_y_mps, max(v_mps, 0.0)), v_mps
+    forward_mps = max(v_mps, 0.0)
+    turned = min(forward_mps / TURNING_MPS, 1.0)
+    return s_m, y_m, turned * math.atan2(v_y_mps, forward_mps), v_mps
 
 
 def corners(pose: Pose, length_m: float, width_m: float) -> tuple[_Point, _Point, _Point, _Point]:

@@ -3,8 +3,8 @@
 For each vehicle that waits at a stop line, the entry meter keeps some columns of the neighbouring
 lane free (a *gap*): no vehicle enters them, and no vehicle owns their cells, so no plan leads into
 them. When the gap passes the waiting vehicle, its motion controller drives into it, and takes its
-cells once it has arrived in the rearmost column. This needs neither agent nor leader nor message:
-it is how a vehicle enters at the start of the road.
+cells once it has arrived in one of the last columns. This needs neither agent nor leader nor
+message: it is how a vehicle enters at the start of the road.
 
 With formations, the columns are free in all lanes and belong to no formation. The vehicle that
 enters them is a formation of its own.
@@ -19,7 +19,14 @@ from attrs import define, frozen
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.lane_ends import START_S, LaneEnd, LaneEnds, drive_out, lane_beside
+from laneweave.protocol.vehicle.lane_ends import (
+    START_S,
+    LaneEnd,
+    LaneEnds,
+    drive_out,
+    lane_beside,
+    own_drive_out,
+)
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
 from laneweave.protocol.wire.messages import ClosedFormation, Name, OffLattice
 from laneweave.sim_bridge.bodies.motion_controller import (
@@ -67,6 +74,7 @@ class LaneEndControl:
     def __init__(self, scenario: Scenario, meter: EntryMeter) -> None:
         """Begin without vehicles."""
         self._meter = meter
+        self._types = scenario.types
         self._lattice = scenario.lattice
         ends = LaneEnds(scenario)
         self._any = bool(ends)
@@ -186,7 +194,9 @@ class LaneEndControl:
             passed_s = t_s - self._lattice.passing_time_s(gap.columns[-1], s_m)
             if gap.vehicle is None and 0.0 <= passed_s <= START_S and self._is_free(vehicle, gap):
                 gap.vehicle = vehicle.name
-                vehicle.controller.drive_out((gap.columns[0], gap.lane))
+                # Weak types need more columns than strong ones, which arrive earlier.
+                own = own_drive_out(self._types[vehicle.arrival.vehicle_type])
+                vehicle.controller.drive_out((gap.columns[-own.columns], gap.lane))
                 yield LaneEndChange(vehicle.name, DRIVES_OUT, gap.lane)
                 return
 

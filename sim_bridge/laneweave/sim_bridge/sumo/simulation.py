@@ -1,22 +1,17 @@
 """SUMO in this process; the only module that imports libsumo.
 
-libsumo stores its simulation in global variables, so a process can have only one `SumoSession` at a
-time. libsumo is imported when a session opens, so that other code works without it.
+libsumo stores its simulation in global variables, so a process can have only one `SumoProcess` at a
+time. libsumo is imported when one opens, so that other code works without it.
 """
 
 from __future__ import annotations
 
 import ctypes
-import math
 import os
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any, Self
 
 from laneweave.protocol.errors import CommandFailedError
-from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
-from laneweave.sim_bridge.sumo.network import write_network
 
 DEBIAN_PACKAGES = {
     "libX11.so.6": "libx11-6",
@@ -30,93 +25,76 @@ DEBIAN_PACKAGES = {
 _IMPORT_SWITCH = "LIBSUMO_AS_TRACI"
 
 
+class SumoFailedError(CommandFailedError):
+    """SUMO rejects its input; the message is SUMO's."""
+
+
 class SumoUnavailableError(CommandFailedError):
     """libsumo cannot be loaded; the message names the missing packages."""
 
 
-class SumoSession:
+class SumoProcess:
     """A running SUMO simulation. Close it, or use it as a context manager."""
 
-    _open: SumoSession | None = None
+    _open: SumoProcess | None = None
 
-    def __init__(self, scenario: Scenario, folder: Path, *, sumo_drives: bool = False) -> None:
-        """Load libsumo, write the network and start SUMO.
+    def __init__(self, command: Sequence[str]) -> None:
+        """Load libsumo and start SUMO.
 
         Args:
-            scenario: road, vehicles and tick.
-            folder: folder for SUMO's input files.
-            sumo_drives: whether SUMO drives; see `write_network`.
+            command: SUMO's command line, program name included.
 
         Raises:
             SumoUnavailableError: libsumo cannot be loaded.
-            RuntimeError: another session is open in this process.
+            SumoFailedError: SUMO cannot start.
+            RuntimeError: another simulation is open in this process.
         """
-        if SumoSession._open is not None:
+        if SumoProcess._open is not None:
             raise RuntimeError("libsumo supports one simulation per process, and one is open")
         self._sumo: Any = _load_libsumo()
-        self._sumo.start([*write_network(scenario, folder, sumo_drives=sumo_drives)])
-        self._types = scenario.types
-        self._half_bodies_m: dict[str, float] = {}
-        SumoSession._open = self
+        try:
+            self._sumo.start([*command])
+        except Exception as error:
+            reason = " ".join(str(error).split())
+            raise SumoFailedError(f"SUMO cannot start ({reason}); its messages say why") from error
+        SumoProcess._open = self
 
     @property
     def vehicle(self) -> Any:  # noqa: ANN401 - libsumo has no types
         """Interface to SUMO's vehicles in libsumo."""
         return self._sumo.vehicle
 
-    def set_type(self, vehicle: str, vehicle_type: str) -> None:
-        """Set the type of a vehicle that is about to be added."""
-        self._half_bodies_m[vehicle] = 0.5 * self._types[vehicle_type].vehicle.length_m
+    @property
+    def simulation(self) -> Any:  # noqa: ANN401 - libsumo has no types
+        """Interface to SUMO's simulation in libsumo."""
+        return self._sumo.simulation
 
-    def forget(self, vehicle: str) -> None:
-        """Remove a vehicle from SUMO."""
-        del self._half_bodies_m[vehicle]
-        self.vehicle.remove(vehicle)
+    @property
+    def lane(self) -> Any:  # noqa: ANN401 - libsumo has no types
+        """Interface to SUMO's lanes in libsumo."""
+        return self._sumo.lane
 
-    def half_body_m(self, vehicle: str) -> float:
-        """Return half of the length of a vehicle's body."""
-        return self._half_bodies_m[vehicle]
+    @property
+    def route(self) -> Any:  # noqa: ANN401 - libsumo has no types
+        """Interface to SUMO's routes in libsumo."""
+        return self._sumo.route
 
     def step(self) -> None:
         """Advance SUMO by one tick."""
         self._sumo.simulationStep()
 
-    def collisions(self) -> list[tuple[str, str]]:
-        """Return the sorted pairs that SUMO reports as colliding in the last step.
-
-        SUMO misses overlaps between lanes; `Bodies.overlapping_pairs` is exact.
-        """
-        return sorted(
-            {
-                (min(found.collider, found.victim), max(found.collider, found.victim))
-                for found in self._sumo.simulation.getCollisions()
-            }
-        )
-
-    def poses(self, vehicles: Iterable[str]) -> dict[str, Pose]:
-        """Return the poses of vehicles after the last step."""
-        api = self.vehicle
-        position, angle, speed = api.getPosition, api.getAngle, api.getSpeed
-        poses = {}
-        for vehicle in vehicles:
-            s_m, front_y_m = position(vehicle)
-            heading = math.radians(90.0 - angle(vehicle))
-            y_m = front_y_m - self._half_bodies_m[vehicle] * math.sin(heading)
-            poses[vehicle] = (s_m, y_m, heading, speed(vehicle))
-        return poses
-
     def close(self) -> None:
         """Stop SUMO. Idempotent."""
-        if SumoSession._open is self:
-            SumoSession._open = None
+        if SumoProcess._open is self:
+            SumoProcess._open = None
             self._sumo.close()
 
     def __enter__(self) -> Self:
-        """Return this session."""
+        """Return this simulation."""
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Close this session."""
+        """Close this simulation."""
         self.close()
 
 

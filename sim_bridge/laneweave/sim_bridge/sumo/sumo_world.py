@@ -13,15 +13,16 @@ replaces it with the plant's speed (setPreviousSpeed).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, pose_of
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
 from laneweave.sim_bridge.sumo.road_edges import ROAD, margin_m, route_name
-from laneweave.sim_bridge.sumo.simulation import SumoSession
+from laneweave.sim_bridge.sumo.session import SumoSession
 
 _ROUTE = route_name(MAIN_ENTRANCE, END_OF_ROAD)
 
@@ -93,6 +94,10 @@ class SumoWorld(SumoSession):
     def positions(self) -> dict[str, Pose]:
         """Return the pose of each vehicle after the last step, in the order of `add` calls."""
         return self.poses(self._shown)
+
+    def others(self) -> Sequence[OtherBody]:
+        """Return no bodies: the bridge drives all."""
+        return ()
 
     def remove(self, vehicle: str) -> None:
         """Remove a vehicle from the road.

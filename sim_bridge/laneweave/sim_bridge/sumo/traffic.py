@@ -18,7 +18,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.sumo.road_edges import road_edges, route_of
-from laneweave.sim_bridge.sumo.simulation import SumoSession
+from laneweave.sim_bridge.sumo.session import SumoSession
 
 _NO_LANE_CHANGES = 0
 _ALL_LANE_CHANGES = 0b011001010101

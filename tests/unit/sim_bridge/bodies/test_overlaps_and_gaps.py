@@ -250,6 +250,9 @@ def test_sensing_agrees_with_brute_force(road: dict[str, Pose]) -> None:
 def test_heading_points_where_the_body_goes() -> None:
     assert pose_of((10.0, 15.0, 1.0, 2.0, 1.5, 0.0)) == (10.0, 2.0, math.atan2(1.5, 15.0), 15.0)
     assert pose_of((10.0, 0.0, 0.0, 2.0, 0.0, 0.0))[2] == 0.0
+    # Whatever noise does to a body that stands, it does not turn into the next lane.
+    assert abs(pose_of((10.0, 0.01, 0.0, 2.0, 0.0025, 0.0))[2]) < 0.01
+    assert pose_of((10.0, 1.0, 0.0, 2.0, 0.25, 0.0))[2] == math.atan2(0.25, 1.0)
 
 
 def steps_taken(work: Callable[[], object]) -> int:
