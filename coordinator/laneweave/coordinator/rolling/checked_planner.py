@@ -15,7 +15,7 @@ from laneweave.coordinator.planning.rolling.problem import (
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
 from laneweave.protocol.lattice import Cell, Mode
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.lane_ends import sections_to_lines
+from laneweave.protocol.vehicle.lane_ends import early_start_m, sections_to_lines
 
 REWARD = -0.5
 """Cost of a column gained forwards if drift is rewarded; a move costs 0.3."""
@@ -71,4 +71,5 @@ def stream_road(scenario: Scenario) -> StreamRoad:
         mode=mode,
         model=ConflictModel(formation.conflict_kinds),
         sections=sections_to_lines(scenario),
+        early_m=None if formation.change_columns else early_start_m(scenario),
     )

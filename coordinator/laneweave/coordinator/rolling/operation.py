@@ -18,7 +18,7 @@ from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.conflict_kinds import Move
 from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
-from laneweave.coordinator.rolling.checked_planner import Planner
+from laneweave.coordinator.rolling.checked_planner import Planner, stream_road
 from laneweave.coordinator.rolling.observed import ObservedRoad
 from laneweave.coordinator.rolling.ownership import certain_cells, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
@@ -89,6 +89,7 @@ class RollingOperation:
         self._planner = planner
         self._slot_s = scenario.cycles_s[0]
         self._sections = scenario.sections
+        self._road = stream_road(scenario)
         self.observed = ObservedRoad()
         self.transfers: list[CellTransfer] = []
         self._transfer_of: dict[Name, CellTransfer] = {}
@@ -133,8 +134,8 @@ class RollingOperation:
             data = {"roster": list(transfer.roster), "why": transfer.reason}
             return [LogEntry(TRANSFER_ABORTED, data)]
         if transfer.phase is BallotPhase.IN_FORCE and self.in_force == 1:
-            slot = round(transfer.t0_s / self._slot_s)
-            begun_s = transfer.t0_s - self._slot_s
+            slot = math.floor(transfer.t0_s / self._slot_s + 1e-6)
+            begun_s = (slot - 1) * self._slot_s
             return [LogEntry(PLAN_IN_FORCE, {"slot": slot, "closed_s": begun_s + SNAPSHOT_S})]
         return []
 
@@ -216,7 +217,8 @@ class RollingOperation:
             owned |= certain_cells(state, snapshot.states, snapshot.gone)
             if late:
                 reserved |= {*state.owned} - {state.hold_cell}
-            held = late or not state.attended or state.t_s < since_s or self._is_displaced(state)
+            held = late or not state.attended or state.t_s < since_s
+            held = held or (self._is_displaced(state) and not self._is_on_ramp(state))
             known = StreamVehicle(entry.vehicle, state.hold_cell, targets, held, moves)
             vehicles.setdefault(state.hold_cell, known)
         columns = [column for column, _ in vehicles] or [0]
@@ -249,6 +251,14 @@ class RollingOperation:
         wanted = sections_for(sections, entry.preferred_lane, entry.destination)
         ahead = frozenset(number for number in wanted if sections[number].to_m > s_m)
         return ahead or sections_for(sections, ANY_LANE)
+
+    def _is_on_ramp(self, state: VehicleState) -> bool:
+        """Return whether a vehicle is on a ramp, where it settles before moves begin."""
+        return any(
+            section.lane == state.hold_cell[1]
+            and section.from_m <= state.s_m < section.moves_from_m
+            for section in self._sections
+        )
 
     def _is_displaced(self, state: VehicleState) -> bool:
         """Return whether a body is farther from its cell than any move of one cell takes it.
@@ -317,6 +327,7 @@ class RollingOperation:
             for cell in certain_cells(state, states, gone)
         }
         moves: dict[Name, Move] = {}
+        starts_s: dict[Name, float] = {}
         rosters: dict[Name, set[Name]] = {}
         for vehicle, path in plan.paths.items():
             if len(path) < 2 or path[0] == path[1]:
@@ -328,13 +339,16 @@ class RollingOperation:
             cells = footprint(path[0], path[1])
             if all(cell in owner for cell in cells):
                 moves[name] = (path[0], path[1])
+                front_m = self._road.position_m(plan.slot, path[0][0])
+                start_m = self._road.start_m(front_m, {path[0][1], path[1][1]})
+                starts_s[name] = t0_s + (start_m - front_m) / self._scenario.lattice.speed_mps
                 rosters[name] = self._with_partners({owner[cell] for cell in cells} | {name})
         for roster in _clusters(rosters.values()):
             yield CellTransfer(
                 ballot=self._new_ballot(self._highest),
                 roster=tuple(sorted(roster)),
                 moves={name: moves[name] for name in sorted(roster) if name in moves},
-                t0_s=t0_s,
+                t0_s=max(starts_s[name] for name in roster if name in moves),
                 slot_s=self._slot_s,
                 resend_s=self._scenario.network.resend_s,
                 due_s=now_s,

@@ -16,6 +16,7 @@ from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, end_exit
 from laneweave.protocol.scenario.fields import (
     MAIN_ENTRANCE,
     MAX_HORIZON_TICKS,
+    Entrance,
     Inflow,
     Scenario,
     formation_columns,
@@ -36,7 +37,7 @@ _RELATIONS = {"at least": ge, "at most": le, "more than": gt, "less than": lt}
 _Comparison = tuple[str, str, float, str]
 """(field, relation, limit, description of the limit)."""
 
-ROLLING_ONLY = ("sort_in_s2", "reward_drift")
+ROLLING_ONLY = ("sort_in_s2", "reward_drift", "change_columns")
 """Fields of `formation` that only the rolling operation reads."""
 FORMATIONS_ONLY = (
     "entry",
@@ -75,6 +76,7 @@ def check_scenario(scenario: Scenario) -> None:
         _check_timing,
         _check_braking,
         _check_settling,
+        _check_sumo,
         _check_security,
     ):
         check(scenario)
@@ -287,23 +289,25 @@ def _check_closures(scenario: Scenario) -> None:
 def _check_entrances(scenario: Scenario) -> None:
     """Check that ramps are where lanes open, and that they are long enough."""
     road, names = scenario.road, {MAIN_ENTRANCE}
-    first_m = {one.lane: one.to_m for one in road.closures if one.from_m <= 0.0}
     lanes = set[int]()
     for number, entrance in enumerate(scenario.entrance):
-        name = f"entrance[{number}]"
+        name, lane = f"entrance[{number}]", entrance.lane
         allowed = f"a name of its own, other than {MAIN_ENTRANCE}"
         _require(entrance.name not in names, f"{name}.name", entrance.name, allowed)
         names.add(entrance.name)
         allowed = "a lane that is closed from the start of the road to its only entrance"
-        is_ramp = entrance.lane in first_m and entrance.lane not in lanes
-        _require(is_ramp, f"{name}.lane", entrance.lane, allowed)
-        lanes.add(entrance.lane)
-        opens_m = first_m[entrance.lane]
-        allowed = f"{opens_m:g}, where lane {entrance.lane} opens"
-        _require(entrance.at_m == opens_m, f"{name}.at_m", entrance.at_m, allowed)
+        opens_m = [one.to_m for one in road.closures if one.lane == lane]
+        is_closed = any(one.lane == lane and one.from_m <= 0.0 for one in road.closures)
+        _require(is_closed and lane not in lanes, f"{name}.lane", lane, allowed)
+        lanes.add(lane)
+        _check_opening(scenario, f"{name}.at_m", entrance, opens_m)
         formation = scenario.formation
         low_m = entrance.at_m + formation.speed_mps * formation.settle_s
-        ends_m = [one.to_m for one in scenario.sections if one.lane == entrance.lane]
+        ends_m = [
+            one.to_m
+            for one in scenario.sections
+            if one.lane == entrance.lane and one.to_m > entrance.at_m
+        ]
         high_m = min(ends_m, default=road.length_m) - scenario.step_m
         _require(
             low_m <= entrance.merge_m <= high_m,
@@ -312,6 +316,29 @@ def _check_entrances(scenario: Scenario) -> None:
             f"from {low_m:g}, formation.settle_s after entrance.at_m, to {high_m:g}, a step before "
             "the end of the lane",
         )
+
+
+def _check_opening(
+    scenario: Scenario, field: str, entrance: Entrance, opens_m: Sequence[float]
+) -> None:
+    """Check that the lane of a ramp opens at its beginning, for the first time or behind exits."""
+    where = f"where lane {entrance.lane} opens"
+    if scenario.formation.change_columns:
+        _require(entrance.at_m == opens_m[0], field, entrance.at_m, f"{opens_m[0]:g}, {where}")
+        return
+    before = [
+        section
+        for section in scenario.sections
+        if section.lane == entrance.lane and section.to_m <= entrance.at_m
+    ]
+    after_m = max((section.to_m for section in before), default=-math.inf)
+    # The bodies of vehicles that leave and of vehicles that enter must not overlap on the road.
+    after_m += scenario.longest_body_m + scenario.vehicle.max_speed_mps * scenario.runtime.tick_s
+    possible = [one for one in opens_m if one >= after_m and all(each.exit for each in before)]
+    allowed = f"{' or '.join(f'{one:g}' for one in possible) or 'no position'}, {where}"
+    if before:
+        allowed += f" behind exits, and {after_m:g} or more"
+    _require(entrance.at_m in possible, field, entrance.at_m, allowed)
 
 
 def _check_exits(scenario: Scenario) -> None:
@@ -634,6 +661,8 @@ def _check_settling(scenario: Scenario) -> None:
     formation = scenario.formation
     # Types that do not change columns enter in their cells.
     limits = [one.vehicle for one in scenario.types.values() if one.changes_columns]
+    if not limits:
+        return
     offset_m = formation.entry_spread_s * formation.speed_mps
     max_mps = min(one.max_speed_mps for one in limits)
     speed_mps = min(max_mps - formation.speed_mps, formation.speed_mps)
@@ -651,6 +680,22 @@ def _check_settling(scenario: Scenario) -> None:
         f"at least {math.ceil(10.0 * min_s) / 10.0:g}: a vehicle that enters up to "
         f"{offset_m:g} m from its cell settles there within its limits",
     )
+
+
+def _check_sumo(scenario: Scenario) -> None:
+    """Check that a corridor of a SUMO simulation is named, and driven by the operation for it."""
+    sumo = scenario.sumo
+    first, _, last = sumo.corridor.partition(":")
+    if not sumo.config:
+        _require(not sumo.corridor, "sumo.corridor", sumo.corridor, "none without sumo.config")
+        return
+    allowed = "FIRST_EDGE:LAST_EDGE, two edges of the network of sumo.config"
+    _require(bool(first and last), "sumo.corridor", sumo.corridor, allowed)
+    formation = scenario.formation
+    allowed = '"rolling" with sumo.config'
+    _require(formation.rolling, "formation.operation", formation.operation, allowed)
+    allowed = "false with sumo.config: vehicles from SUMO settle in columns of their own"
+    _require(not formation.change_columns, "formation.change_columns", True, allowed)
 
 
 def _check_security(scenario: Scenario) -> None:

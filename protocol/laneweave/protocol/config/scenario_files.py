@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,14 +32,24 @@ def load_scenario(path: Path | None, **overrides: object) -> Scenario:
     data: dict[str, Any] = {}
     if path is not None:
         data = read_toml(path)
-        _resolve_folder(data, path)
+        _resolve_paths(data, path)
         check_effects(data, parse_scenario(data))
+    return scenario_of(data, **overrides)
+
+
+def scenario_of(tables: Mapping[str, Any], **overrides: object) -> Scenario:
+    """Return the scenario of nested tables, with overrides as in `load_scenario`.
+
+    Raises:
+        BadInputError: a value is invalid.
+    """
+    data = copy.deepcopy(dict(tables))
     for name, value in overrides.items():
         if value is None:
             continue
-        *tables, key = name.split("__")
+        *names, key = name.split("__")
         target = data
-        for table in tables:
+        for table in names:
             target = target.setdefault(table, {})
             if not isinstance(target, dict):
                 raise BadInputError(table, target, "a table")
@@ -46,13 +57,14 @@ def load_scenario(path: Path | None, **overrides: object) -> Scenario:
     return parse_scenario(data)
 
 
-def _resolve_folder(data: dict[str, Any], path: Path) -> None:
-    """Resolve the certificate folder relative to the scenario file."""
-    security = data.get("security")
-    if isinstance(security, dict):
-        folder = security.get("folder", Security().folder)
-        if isinstance(folder, str):
-            security["folder"] = str(path.parent / folder)
+def _resolve_paths(data: dict[str, Any], path: Path) -> None:
+    """Resolve paths relative to the scenario file: certificates, and SUMO's configuration."""
+    for table, key, default in (("security", "folder", Security().folder), ("sumo", "config", "")):
+        fields = data.get(table)
+        if isinstance(fields, dict):
+            value = fields.get(key, default)
+            if isinstance(value, str) and value:
+                fields[key] = str(path.parent / value)
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -129,3 +129,13 @@ class Observation:
 
     metrics: str = field(default="", validator=host_port)
     """HOST:PORT where a role serves its metrics in the Prometheus text format; empty: nowhere."""
+
+
+@frozen
+class SumoSettings:
+    """A SUMO simulation of the user, of which laneweave drives a corridor."""
+
+    config: str = ""
+    """SUMO's configuration file; empty: the road of the scenario itself."""
+    corridor: str = ""
+    """Its first and its last edge: FIRST_EDGE:LAST_EDGE."""

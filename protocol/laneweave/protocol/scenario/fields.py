@@ -21,7 +21,13 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import key_part, one_of, within
 from laneweave.protocol.lattice import Cell, Lattice, displacements
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, open_sections
-from laneweave.protocol.scenario.deployment_fields import Network, Observation, Security, Service
+from laneweave.protocol.scenario.deployment_fields import (
+    Network,
+    Observation,
+    Security,
+    Service,
+    SumoSettings,
+)
 from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.events import STREAM_PLANNED
 from laneweave.protocol.wire.messages import CAR
@@ -246,6 +252,8 @@ class FormationSettings:
     """Rolling operation: settled vehicles also change lanes in S2."""
     reward_drift: bool = False
     """Rolling operation: reward forward moves that cost no other vehicle anything."""
+    change_columns: bool = True
+    """Rolling operation: vehicles also move between columns. False: only between lanes."""
     block_columns: int = field(default=4, validator=within(1, 24))
     """Number of columns of a formation if `close` is `columns`."""
     max_columns: int = field(default=7, validator=within(1, 24))
@@ -590,6 +598,7 @@ class Scenario:
     security: Security = Security()
     service: Service = Service()
     observation: Observation = Observation()
+    sumo: SumoSettings = SumoSettings()
 
     @property
     def lattice(self) -> Lattice:
@@ -682,6 +691,13 @@ class Scenario:
         return tuple(at_m.get(lane, 0.0) for lane in range(self.road.lanes))
 
     @cached_property
+    def shared_exit_lanes(self) -> frozenset[int]:
+        """Lanes in which a ramp follows an exit, as in most interchanges."""
+        return frozenset(
+            section.lane for section in self.sections if section.to_m <= self.entry_m[section.lane]
+        )
+
+    @cached_property
     def closed_to_bodies(self) -> tuple[Closure, ...]:
         """Closed parts of lanes, which no body may touch.
 
@@ -726,14 +742,21 @@ class Scenario:
     def drivable_moves(self) -> frozenset[Cell]:
         """The moves (columns, lanes) that are planned for the type that `vehicle` describes.
 
-        Cars drive every move of the mode. Other types do not change columns if their limits along
-        the road are lower than such a move needs (`column_move_limits`).
+        Cars drive every move of the mode if `formation.change_columns` is set. Other types do not
+        change columns if their limits along the road are lower than such a move needs
+        (`column_move_limits`).
         """
-        moves = frozenset(displacements(self.formation.mode)[1:])
         needed = self.column_move_limits
-        if all(abs(getattr(self.vehicle, name)) >= limit for name, limit in needed.items()):
-            return moves
-        return frozenset((columns, lanes) for columns, lanes in moves if columns == 0)
+        if self.formation.change_columns and all(
+            abs(getattr(self.vehicle, name)) >= limit for name, limit in needed.items()
+        ):
+            return self._moves_of_mode
+        return frozenset(move for move in self._moves_of_mode if move[0] == 0)
+
+    @property
+    def _moves_of_mode(self) -> frozenset[Cell]:
+        """All moves (columns, lanes) of the mode."""
+        return frozenset(displacements(self.formation.mode)[1:])
 
     def moves_of(self, vehicle_type: str) -> frozenset[Cell] | None:
         """Return the moves (columns, lanes) that are planned for a type; None: all of the mode.
@@ -743,7 +766,7 @@ class Scenario:
         own = self.types.get(vehicle_type)
         if own is None:
             return frozenset()
-        return None if own.drivable_moves == self.types[CAR].drivable_moves else own.drivable_moves
+        return None if own.drivable_moves == self._moves_of_mode else own.drivable_moves
 
     @property
     def column_move_limits(self) -> dict[str, float]:
@@ -854,6 +877,8 @@ class Scenario:
         `FORMATION_CLOSING_MPS` and 1.3 times the limit: the check of moves refuses a few scenarios
         more, and asks for a longer T_F.
         """
+        if not self.formation.change_columns:
+            return SHORTEST_CYCLE_S
         # T_F is the same for all types; those that are weaker drive fewer moves.
         d_m, accel_mps2 = self.formation.gap_m, self.types[CAR].vehicle.max_accel_mps2
         closing_mps, ratio = FORMATION_CLOSING_MPS, 1.3

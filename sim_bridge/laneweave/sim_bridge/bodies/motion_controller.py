@@ -107,6 +107,8 @@ class MotionController:
     """Newest cell transfer, pending or completed."""
     _granted: frozenset[Cell] = frozenset()
     """Cells assigned by the roadside that are not part of any plan yet."""
+    _given_up: frozenset[Cell] = frozenset()
+    """Cells that the vehicle may have owned when it left the lattice."""
     motion_origin: Cell = field(init=False)
     motion_end_tick: int = 0
     motion_ticks: int = 0
@@ -236,6 +238,7 @@ class MotionController:
         """
         self.off_lattice = OffLatticePhase.WAITING
         self.hold_cell = (self.hold_cell[0], self._body_lane)
+        self._given_up = self.possible_cells
         self._granted, self.owned = frozenset(), ()
         ballots = [ballot for ballot in (self.promised, self.accepted) if ballot is not None]
         if self.transfer is not None:
@@ -421,6 +424,17 @@ class MotionController:
         if transfer is None or not transfer.undecided:
             return frozenset(self.owned)
         return frozenset(transfer.before) & frozenset(transfer.after)
+
+    @property
+    def possible_cells(self) -> frozenset[Cell]:
+        """Cells that the vehicle owns if the gate of its pending transfer opens, or if not.
+
+        Cells that it gave up when it left the lattice are included.
+        """
+        transfer, owned = self.transfer, self._given_up | frozenset(self.owned)
+        if transfer is None or not transfer.undecided:
+            return owned
+        return owned | frozenset(transfer.before) | frozenset(transfer.after)
 
     def join(self, blocks: Iterable[int]) -> None:
         """Add joined blocks."""

@@ -44,6 +44,8 @@ class Arrival:
     destination: str = END_OF_ROAD
     """Name of the exit by which the vehicle wants to leave the road, or `END_OF_ROAD`."""
     vehicle_type: str = CAR
+    sumo_id: str = ""
+    """Its name in a SUMO simulation of the user; empty: it has been drawn."""
 
 
 def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:

@@ -13,6 +13,10 @@ column could not pass each other, so they enter the same column only if they can
 lanes of the same order. They enter exactly in their cells: a weak vehicle would take long to
 settle, and a long one behind another has little room to approach it.
 
+A ramp may follow an exit in the same lane (`Scenario.shared_exit_lanes`). Cells of such a lane are
+not assigned to vehicles near them before the ramp: each vehicle that leaves by the exit enters with
+the cell of its column, and if it has left, the ramp can use the cell.
+
 Decisions do not depend on later arrivals: they are made in order of time and, at equal times, from
 the rightmost lane to the leftmost.
 """
@@ -46,6 +50,29 @@ class Admission:
     """Road time at which the vehicle passes the entrance."""
     offset_m: float = 0.0
     """Distance by which the vehicle is ahead of its cell."""
+    more_cells: tuple[Cell, ...] = ()
+    """Further cells of its column that the vehicle gets."""
+    start: EntryState | None = None
+    """How the vehicle enters if not at v_F beside its cell."""
+
+
+@frozen
+class EntryState:
+    """State of a vehicle that somebody else has driven to its entrance."""
+
+    s_m: float
+    speed_mps: float
+    settle_s: float
+    """Time in which it settles in its cell."""
+
+
+@frozen
+class Goals:
+    """Where a vehicle may leave the road."""
+
+    lanes: tuple[int, ...]
+    end_m: float
+    """The last of the ends of these lanes."""
 
 
 class EntryMeter:
@@ -60,7 +87,9 @@ class EntryMeter:
         interlaced: bool = False,
         entry_m: Sequence[float] = (),
         column_bound: Collection[str] = (),
-        lanes_of: Callable[[Arrival], Collection[int]] | None = None,
+        goals_of: Callable[[Arrival], Goals] | None = None,
+        shared_lanes: Collection[int] = (),
+        is_free: Callable[[Cell], bool] | None = None,
     ) -> None:
         """Start with an empty road at road time 0.
 
@@ -71,13 +100,17 @@ class EntryMeter:
             interlaced: only every other cell may be entered.
             entry_m: position of the entrance of each lane; empty: s = 0.
             column_bound: types of vehicles that do not change columns.
-            lanes_of: returns the lanes in which a vehicle may leave the road; None: its preferred
-                lane, if it has one.
+            goals_of: returns where a vehicle may leave the road; None: in its preferred lane, if it
+                has one, at the end of the road.
+            shared_lanes: lanes in which a ramp follows an exit.
+            is_free: returns whether a vehicle on a ramp can use a cell; None: always.
         """
-        self._lanes_of = lanes_of or self._preferred_lanes
+        self._goals_of = goals_of or self._goals
+        self._shared_lanes = frozenset(shared_lanes)
+        self._is_free = is_free
         self._column_bound = frozenset(column_bound)
-        self._keeping_columns: dict[int, dict[int, Collection[int]]] = {}
-        """Lanes in which the vehicles of these types may leave, by their column and lane."""
+        self._keeping_columns: dict[int, dict[int, Goals]] = {}
+        """Where the vehicles of these types may leave, by their column and lane."""
         self._entry_m = tuple(entry_m) or (0.0,) * lattice.lanes
         self._lattice = lattice
         self._builder = builder
@@ -137,6 +170,34 @@ class EntryMeter:
         self._names.add(arrival.vehicle)
         insort(self._queues[arrival.lane], arrival, key=lambda other: other.t_s)
 
+    def take(self, arrival: Arrival, column: int) -> bool:
+        """Give a cell to a vehicle that does not queue; return whether it can have it.
+
+        No later vehicle enters the lane in this column or ahead of it.
+        """
+        lane = arrival.lane
+        if column > self._columns[lane] or not self.is_possible(arrival, column):
+            return False
+        if arrival.vehicle_type in self._column_bound:
+            self._keep_column((column, lane), arrival)
+        self._columns[lane] = column - 1
+        return True
+
+    def is_possible(self, arrival: Arrival, column: int) -> bool:
+        """Return whether nothing but its formation keeps a vehicle from a column of its lane."""
+        cell = (column, arrival.lane)
+        from_ramp = self._entry_m[arrival.lane] > 0.0
+        if from_ramp and self._is_free is not None and not self._is_free(cell):
+            return False
+        return arrival.vehicle_type not in self._column_bound or self._can_keep_column(
+            cell, arrival
+        )
+
+    def next_open(self, lane: int, t_s: float) -> int:
+        """Return the next column of a lane that a vehicle can enter at a road time."""
+        self._skip(lane, t_s)
+        return self._columns[lane]
+
     def admit(self, until_s: float, full: Collection[int] = ()) -> list[Admission]:
         """Return the vehicles that have entered since the last call, by time, then lane.
 
@@ -157,7 +218,8 @@ class EntryMeter:
             if arrival is not None:
                 late_s = self._passing_time_s(cell[0], lane) - t_s
                 offset_m = late_s * self._lattice.speed_mps
-                admissions.append(Admission(arrival, cell, t_s, offset_m))
+                more_cells = self._exit_cells(arrival, cell[0])
+                admissions.append(Admission(arrival, cell, t_s, offset_m, more_cells))
                 self._free_s[lane] = t_s + self._lattice.pitch_m / self._lattice.speed_mps
             self._columns[lane] -= 1
         # Columns that have passed are not available to later arrivals.
@@ -200,7 +262,7 @@ class EntryMeter:
         """Remove and return the first vehicle of a queue, unless it needs a later cell."""
         builder, queue = self._builder, self._queues[cell[1]]
         keeps_column = queue[0].vehicle_type in self._column_bound
-        if keeps_column and not self._can_keep_column(cell, queue[0]):
+        if not self.is_possible(queue[0], cell[0]):
             return None
         if builder is not None and not builder.try_add(
             cell, queue[0].preferred_lane, t_s, column_bound=keeps_column
@@ -211,26 +273,44 @@ class EntryMeter:
         self._names.discard(queue[0].vehicle)
         return queue.pop(0)
 
-    def _preferred_lanes(self, arrival: Arrival) -> Collection[int]:
+    def _exit_cells(self, arrival: Arrival, column: int) -> tuple[Cell, ...]:
+        """Return the cells for leaving by lanes in which a ramp follows the exit."""
+        goals = self._goals_of(arrival)
+        return tuple(
+            (column, goal)
+            for goal in goals.lanes
+            if goal in self._shared_lanes and goals.end_m <= self._entry_m[goal]
+        )
+
+    def _goals(self, arrival: Arrival) -> Goals:
         preferred = arrival.preferred_lane
-        return range(self._lattice.lanes) if preferred == ANY_LANE else (preferred,)
+        lanes = range(self._lattice.lanes) if preferred == ANY_LANE else (preferred,)
+        return Goals(tuple(lanes), math.inf)
 
     def _can_keep_column(self, cell: Cell, arrival: Arrival) -> bool:
         """Return whether a vehicle, and those of its column, can leave in the order of their lanes.
 
-        These are the vehicles that do not change columns.
+        These are the vehicles that do not change columns, and have not left yet.
         """
         column, lane = cell
-        exits = {**self._keeping_columns.get(column, {}), lane: self._lanes_of(arrival)}
+        own = self._goals_of(arrival)
+        goals = {
+            here: goal.lanes
+            for here, goal in self._keeping_columns.get(column, {}).items()
+            if goal.end_m > self._entry_m[lane]
+        }
+        if not goals:
+            return True
         leaves_in: float = -1
-        for here in sorted(exits):
+        goals[lane] = own.lanes
+        for here in sorted(goals):
             # The rightmost lane that leaves the most room for those on its left.
-            leaves_in = min((goal for goal in exits[here] if goal > leaves_in), default=math.inf)
-        return leaves_in < math.inf or len(exits) == 1
+            leaves_in = min((goal for goal in goals[here] if goal > leaves_in), default=math.inf)
+        return leaves_in < math.inf
 
     def _keep_column(self, cell: Cell, arrival: Arrival) -> None:
         """Add a vehicle to the vehicles of its column that do not change columns."""
         column, lane = cell
-        self._keeping_columns.setdefault(column, {})[lane] = self._lanes_of(arrival)
+        self._keeping_columns.setdefault(column, {})[lane] = self._goals_of(arrival)
         while len(self._keeping_columns) > _MAX_KEEPING_COLUMNS:
             del self._keeping_columns[next(iter(self._keeping_columns))]

@@ -10,6 +10,8 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 
+from attrs import evolve
+
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import LaneSection, sections_for
 from laneweave.protocol.runtime.node import Effect, Send
@@ -26,9 +28,10 @@ from laneweave.protocol.wire.messages import (
 )
 from laneweave.protocol.wire.topics import CENSUS, CLOCK
 from laneweave.sim_bridge.road.demand import Arrival, arrivals, count_until
-from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter
+from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter, Goals
 from laneweave.sim_bridge.road.formation_building import formation_builder
 from laneweave.sim_bridge.road.lane_end_control import LaneEndChange, LaneEndControl
+from laneweave.sim_bridge.road.ramp_traffic import RampTraffic
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 CENSUS_EVERY_TICKS = 10
@@ -45,7 +48,11 @@ class Roadside:
     """Demand, entry metering and census."""
 
     def __init__(
-        self, scenario: Scenario, bridge: int = 0, stream: tuple[Arrival, ...] | None = None
+        self,
+        scenario: Scenario,
+        bridge: int = 0,
+        stream: tuple[Arrival, ...] | None = None,
+        ramp_traffic: RampTraffic | None = None,
     ) -> None:
         """Begin without vehicles.
 
@@ -53,6 +60,7 @@ class Roadside:
             scenario: road, demand, formations.
             bridge: incarnation of the bridge.
             stream: the arrivals, by time; None: drawn from the scenario's seed.
+            ramp_traffic: further vehicles, which others drive to ramps; None: there are none.
         """
         self._bridge = bridge
         self._announce_s = scenario.runtime.announce_s
@@ -71,6 +79,12 @@ class Roadside:
         self._rolling = formation.rolling
         self._length_m = scenario.road.length_m
         self._builder = formation_builder(scenario)
+        self._shared_lanes = scenario.shared_exit_lanes
+        self._keep_columns = not formation.change_columns
+        self._vehicles = NO_VEHICLES
+        """The vehicles on the road."""
+        self._lost = set[Cell]()
+        """Cells of these lanes that may belong to a vehicle that nothing on the road knows yet."""
         self._meter = EntryMeter(
             lattice,
             formation.entry_spread_s,
@@ -78,7 +92,9 @@ class Roadside:
             interlaced=formation.interlaced,
             entry_m=scenario.entry_m,
             column_bound=[name for name, one in scenario.types.items() if not one.changes_columns],
-            lanes_of=partial(_goal_lanes, scenario.sections),
+            goals_of=partial(_goals, scenario.sections),
+            shared_lanes=scenario.shared_exit_lanes,
+            is_free=self._is_free,
         )
         self._lane_ends = LaneEndControl(scenario, self._meter)
         self._closed: list[ClosedFormation] = []
@@ -104,10 +120,19 @@ class Roadside:
             MAX_EMPTY + self._meter.closed_column(lane) for lane in range(self._lanes)
         ]
         """Last column of each lane whose cells have been processed."""
+        self._ownerless_from = tuple(self._assigned_to)
+        """First column of each lane that had passed its entrance before the road began."""
+        self._ownerless = set[Cell]()
+        """Cells that have never had an owner, since no vehicle was near them at the entrance."""
+        self._given = set[Cell]()
+        """Cells of these columns that have been assigned since."""
         columns = int(scenario.moves_from_m / lattice.pitch_m)
         self._max_empty = max(0, min(MAX_EMPTY, columns - 2))
         self._arrivals = arrivals(scenario) if stream is None else stream
+        self._ramp_traffic = ramp_traffic
         self._demanded = 0
+        """Arrivals so far, without those of `ramp_traffic`."""
+        self._others_demanded = 0
         self._queued = 0
         self._entered = 0
         self._left = 0
@@ -120,7 +145,9 @@ class Roadside:
         """Return the arrivals since the last call."""
         first = self._demanded
         self._demanded = count_until(self._arrivals, t_s + TIME_TOLERANCE_S)
-        return self._arrivals[first : self._demanded]
+        others = () if self._ramp_traffic is None else self._ramp_traffic.demanded(t_s)
+        self._others_demanded += len(others)
+        return (*self._arrivals[first : self._demanded], *others)
 
     def admit(
         self, t_s: float, vehicles: Mapping[Name, RoadVehicle] = NO_VEHICLES
@@ -134,17 +161,44 @@ class Roadside:
             vehicles: the vehicles on the road.
         """
         # Also queue vehicles that arrive before the next tick, since cells pass between ticks.
+        self._vehicles = vehicles
         first, self._queued = self._queued, count_until(self._arrivals, t_s + self._tick_s)
         for arrival in self._arrivals[first : self._queued]:
             self._meter.demand(arrival)
         admissions = self._meter.admit(t_s, self._full_lanes(vehicles))
+        if self._ramp_traffic is not None:
+            occupied = frozenset(one.controller.hold_cell for one in vehicles.values())
+            admissions += self._ramp_traffic.admit(t_s, self._meter, occupied)
         if self._rolling:
+            admissions = [self._with_ownerless(admission) for admission in admissions]
             for admission in admissions:
                 column, lane = admission.cell
                 self._next[lane].append((column, Name(admission.arrival.vehicle)))
         self._entered += len(admissions)
         self._census_changed |= bool(admissions)
         return admissions
+
+    def _with_ownerless(self, admission: Admission) -> Admission:
+        """Add cells beside a vehicle from a ramp that have never had an owner.
+
+        Without an owner no vehicle could enter them.
+        """
+        column, lane = admission.cell
+        if self._entry_m[lane] <= 0.0:
+            return admission
+        beside = [(column, other) for other in range(self._lanes) if other != lane]
+        free = [cell for cell in beside if self._is_ownerless(cell)]
+        self._given.update(free)
+        self._ownerless.difference_update(free)
+        self._unassigned = [cell for cell in self._unassigned if cell not in self._given]
+        return evolve(admission, more_cells=(*admission.more_cells, *free))
+
+    def _is_ownerless(self, cell: Cell) -> bool:
+        """Return whether a cell has never had an owner."""
+        first = self._ownerless_from[cell[1]]
+        return cell not in self._given and (
+            cell[0] >= first or cell in self._ownerless or cell in self._unassigned
+        )
 
     def _full_lanes(self, vehicles: Mapping[Name, RoadVehicle]) -> set[int]:
         """Return the lanes in which a body at the entrance leaves too little room to brake.
@@ -203,13 +257,36 @@ class Roadside:
             for column in range(self._assigned_to[lane] - 1, closed - 1, -1):
                 if self._next[lane] and self._next[lane][0][0] == column:
                     self._store_recent(column, lane, self._next[lane].pop(0)[1])
-                elif not self._lane_ends.is_kept_free((column, lane)):
+                elif not self._lane_ends.is_kept_free((column, lane)) and (
+                    lane not in self._shared_lanes or self._is_free((column, lane))
+                ):
                     self._assign((column, lane), vehicles)
             self._assigned_to[lane] = closed
         unassigned, self._unassigned = self._unassigned, []
         for cell in unassigned:
             if cell[0] <= self._assigned_to[cell[1]] + 2 * self._max_empty:
                 self._assign(cell, vehicles)
+            else:
+                self._ownerless.add(cell)
+
+    def _is_free(self, cell: Cell) -> bool:
+        """Return whether a vehicle on a ramp can use a cell.
+
+        Behind an exit in the same lane, no vehicle may own it. A pending transfer may give the cell
+        to a vehicle later; those of vehicles that have left are in `_lost`. Vehicles that do not
+        change columns must not enter beside a gap that is kept free, which they could not enter.
+        """
+        column, lane = cell
+        if self._keep_columns and any(
+            self._lane_ends.is_kept_free((column, beside)) for beside in (lane - 1, lane + 1)
+        ):
+            return False
+        return lane not in self._shared_lanes or (
+            cell not in self._lost
+            and not any(
+                cell in vehicle.controller.possible_cells for vehicle in self._vehicles.values()
+            )
+        )
 
     def _assign(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
         """Assign an empty cell to a nearby vehicle, preferably one ahead of it in its lane."""
@@ -257,12 +334,22 @@ class Roadside:
         """
         self._left += 1
         self._census_changed = True
-        lattice = self._lattice
-        on_lattice = [one for one in vehicles.values() if one.controller.off_lattice is None]
-        if not self._rolling or not on_lattice:
+        if not self._rolling:
             return
-        for column, lane in sorted(vehicle.controller.certain_cells):
-            if lattice.cell_s_m(column, t_s) < self._length_m:
+        lattice, certain = self._lattice, vehicle.controller.certain_cells
+        self._lost |= {
+            cell
+            for cell in vehicle.controller.possible_cells - certain
+            if cell[1] in self._shared_lanes
+        }
+        on_lattice = [one for one in vehicles.values() if one.controller.off_lattice is None]
+        if not on_lattice:
+            return
+        for column, lane in sorted(certain):
+            s_m = lattice.cell_s_m(column, t_s)
+            if lane in self._shared_lanes and s_m < self._entry_m[lane]:
+                continue  # for vehicles on the ramp
+            if s_m < self._length_m:
                 near = min(
                     on_lattice,
                     key=lambda one: (
@@ -290,7 +377,7 @@ class Roadside:
         return RoadClock(
             tick=tick,
             t_s=t_s,
-            demanded=self._demanded,
+            demanded=self._demanded + self._others_demanded,
             entered=self._entered,
             on_road=on_road,
             left=self._left,
@@ -303,6 +390,7 @@ class Roadside:
         return (
             self._queued == len(self._arrivals)
             and not self._meter.waiting
+            and (self._ramp_traffic is None or self._ramp_traffic.exhausted)
             and (not self._arrivals or self._arrivals[-1].t_s <= t_s)
         )
 
@@ -348,6 +436,7 @@ class Roadside:
             if room[arrival.lane] > 0:
                 room[arrival.lane] -= 1
                 coming.append(arrival)
+        coming += () if self._ramp_traffic is None else self._ramp_traffic.announced()
         return tuple(
             Announcement(
                 vehicle=Name(arrival.vehicle),
@@ -359,7 +448,8 @@ class Roadside:
         )
 
 
-def _goal_lanes(sections: Sequence[LaneSection], arrival: Arrival) -> frozenset[int]:
-    """Return the lanes in which a vehicle may leave the road."""
+def _goals(sections: Sequence[LaneSection], arrival: Arrival) -> Goals:
+    """Return where a vehicle may leave the road."""
     numbers = sections_for(sections, arrival.preferred_lane, arrival.destination)
-    return frozenset(sections[number].lane for number in numbers)
+    lanes = {sections[number].lane for number in numbers}
+    return Goals(tuple(sorted(lanes)), max(sections[number].to_m for number in numbers))

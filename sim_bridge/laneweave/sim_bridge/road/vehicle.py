@@ -45,16 +45,22 @@ class RoadVehicle:
         """
         lattice, tick_s = scenario.lattice, scenario.runtime.tick_s
         rest = cell_state(lattice, admission.cell, t_s)
-        s_m = rest[0] + admission.offset_m
+        s_m, speed_mps, settle_s = rest[0] + admission.offset_m, rest[1], 0.0
+        if abs(admission.offset_m) > NEAR_M:
+            settle_s = scenario.formation.settle_s
+        if admission.start is not None:
+            start = admission.start
+            s_m, speed_mps, settle_s = start.s_m, start.speed_mps, start.settle_s
         name = Name(admission.arrival.vehicle)
         own = scenario.types[admission.arrival.vehicle_type]
         controller = MotionController(
-            Plant((s_m, *rest[1:]), own.vehicle, tick_s), own, admission.cell
+            Plant((s_m, speed_mps, *rest[2:]), own.vehicle, tick_s), own, admission.cell
         )
-        if abs(admission.offset_m) > NEAR_M:
-            controller.motion_end_tick = round((t_s + scenario.formation.settle_s) / tick_s)
+        if settle_s > 0.0:
+            controller.motion_end_tick = round((t_s + settle_s) / tick_s)
         if scenario.formation.rolling:
-            controller.assign_cell(admission.cell)
+            for cell in (admission.cell, *admission.more_cells):
+                controller.assign_cell(cell)
         formation = None if scenario.formation.closes_by_vehicles else controller.joined[0]
         return cls(name, admission, controller, Sensors(scenario, name), formation, bridge)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from itertools import pairwise
 
@@ -13,7 +14,7 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.sim_bridge.road.demand import Arrival, arrivals
-from laneweave.sim_bridge.road.entry import Admission, EntryMeter
+from laneweave.sim_bridge.road.entry import Admission, EntryMeter, Goals
 from laneweave.sim_bridge.road.formation_building import ColumnBlocks, Entrances
 
 COLUMN_S, SMALL_S = 1.0, 1e-6
@@ -205,13 +206,17 @@ def test_trucks_that_would_have_to_pass_each_other_enter_in_different_columns(
 
 def test_trucks_enter_a_column_only_if_the_road_has_lanes_for_all_of_them() -> None:
     # Lane 0 ends: three trucks side by side could not drive on in two lanes.
-    meter = EntryMeter(lattice(), 0.5, column_bound={"truck"}, lanes_of=lambda _: {1, 2})
+    meter = EntryMeter(
+        lattice(), 0.5, column_bound={"truck"}, goals_of=lambda _: Goals((1, 2), math.inf)
+    )
     for lane in range(3):
         meter.demand(truck(f"v{lane}", 10.0, lane, ANY_LANE))
     columns = [one.cell[0] for one in meter.admit(20.0)]
     assert sorted(columns, reverse=True) == [columns[0], columns[0], columns[0] - 1]
     # A single truck enters in any case.
-    meter = EntryMeter(lattice(), 0.5, column_bound={"truck"}, lanes_of=lambda _: set())
+    meter = EntryMeter(
+        lattice(), 0.5, column_bound={"truck"}, goals_of=lambda _: Goals((), math.inf)
+    )
     meter.demand(truck("a", 10.0, 0, 0))
     assert len(meter.admit(20.0)) == 1
 

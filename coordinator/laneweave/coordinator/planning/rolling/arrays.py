@@ -217,7 +217,7 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
 def _sections(road: StreamRoad, at_m: Floats) -> tuple[NDArray[np.int16], Bools, Bools]:
     """Return `Table.section` and `Table.left`, and the cells that are open throughout each slot.
 
-    A cell is open if the whole body is, from the beginning of the slot to its end.
+    A cell is open if the whole body is, from the beginning of a move to its end a slot later.
     """
     slots, columns = at_m.shape[0] - 1, at_m.shape[1]
     section = np.full((slots + 1, road.lanes, columns), -1, dtype=np.int16)
@@ -229,10 +229,15 @@ def _sections(road: StreamRoad, at_m: Floats) -> tuple[NDArray[np.int16], Bools,
             begun = at_m >= from_m - ROUNDING_M
             section[:, lane][begun] = number
             left[:, lane][begun] = (at_m > to_m + ROUNDING_M)[begun]
-            moves_m = max(start_m, from_m, road.sections[number].moves_from_m)
-            rear = at_m[:-1] - road.body_m >= moves_m - ROUNDING_M
-            front = at_m[1:] <= min(end_m, to_m) + ROUNDING_M
-            is_open[:, lane] |= rear & front
+            first_m, line_m = road.first_m(from_m, number), min(end_m, road.line_m(number, to_m))
+            begins = at_m[:-1] - road.body_m >= start_m - ROUNDING_M
+            if road.early_m is None:
+                begins &= at_m[:-1] >= first_m - ROUNDING_M
+                ends_m = at_m[1:]
+            else:
+                begins &= at_m[1:] >= first_m - ROUNDING_M
+                ends_m = np.maximum(at_m[:-1], first_m) + road.advance_m
+            is_open[:, lane] |= begins & (ends_m <= line_m + ROUNDING_M)
     return section, left, is_open
 
 

@@ -56,6 +56,36 @@ class StreamRoad:
         lambda road: open_sections(road.lanes, road.length_m), takes_self=True
     )
     """Where the lanes are open; by default all of them from end to end."""
+    early_m: float | None = None
+    """Moves begin at any time of a slot, as soon as the body, without its first `early_m`, is where
+    both lanes are open; None: at its beginning."""
+
+    def start_m(self, front_m: float, lanes: Iterable[int]) -> float:
+        """Return where a move begins that is planned for a slot.
+
+        Args:
+            front_m: position of the front at the beginning of the slot.
+            lanes: lanes of the move.
+        """
+        if self.early_m is None:
+            return front_m
+        opens_m = [
+            begins_m
+            for lane in lanes
+            for from_m, to_m, number in self.lane_sections[lane]
+            if front_m < self.line_m(number, to_m)
+            and front_m < (begins_m := self.first_m(from_m, number)) <= front_m + self.advance_m
+        ]
+        return max(opens_m, default=front_m)
+
+    def first_m(self, from_m: float, number: int) -> float:
+        """Return the position of the front at which moves may begin in a section."""
+        begins_m = max(from_m, self.sections[number].moves_from_m)
+        return begins_m + self.body_m - (self.early_m or 0.0)
+
+    def line_m(self, number: int, to_m: float) -> float:
+        """Return where moves end before the end of a section, whose end for planning is `to_m`."""
+        return max(to_m, self.sections[number].to_m) if self.sections[number].exit else to_m
 
     def ending_at(self, ends_m: Mapping[int, float]) -> StreamRoad:
         """Return the road with earlier ends of some sections [m], by index."""
@@ -85,7 +115,10 @@ class StreamRoad:
         return tuple(tuple(self._passable(sections)) for sections in by_lane)
 
     def _passable(self, sections: list[Section]) -> Iterator[Section]:
-        """Yield sections, shortened so that no vehicle can pass into the next one within a slot."""
+        """Yield sections, shortened so that no vehicle can pass into the next one within a slot.
+
+        At an exit vehicles leave the road, but paths would go on into the next section.
+        """
         jump_m = self.advance_m + self.pitch_m
         next_m = [from_m - jump_m for from_m, _, _ in sections[1:]] + [math.inf]
         for (from_m, to_m, number), latest_m in zip(sections, next_m, strict=True):
@@ -114,8 +147,8 @@ class StreamRoad:
     def is_open(self, lane: int, rear_m: float, front_m: float) -> bool:
         """Return whether moves are possible in a lane everywhere between two positions."""
         return any(
-            max(from_m, self.sections[number].moves_from_m) <= rear_m + ROUNDING_M
-            and front_m <= to_m + ROUNDING_M
+            self.first_m(from_m, number) - self.body_m <= rear_m + ROUNDING_M
+            and front_m <= self.line_m(number, to_m) + ROUNDING_M
             for from_m, to_m, number in self.lane_sections[lane]
         )
 

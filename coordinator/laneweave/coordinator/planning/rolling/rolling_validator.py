@@ -78,6 +78,7 @@ def _problems_of_move(
     road: StreamRoad, slot: int, name: str, here: Cell, there: Cell, blocked: frozenset[Cell]
 ) -> Iterator[str]:
     columns, lanes = abs(there[0] - here[0]), abs(there[1] - here[1])
+    lanes_of = {here[1], there[1]} & {*range(road.lanes)}
     if (columns + lanes if road.mode == 1 else max(columns, lanes)) != 1:
         yield f"{name} jumps from {here} to {there} in slot {slot}"
     if not 0 <= there[1] < road.lanes:
@@ -85,13 +86,16 @@ def _problems_of_move(
     entered = {there, (here[0], there[1]), (there[0], here[1])} - {here}
     if not blocked.isdisjoint(entered):
         yield f"{name} enters {sorted(blocked & entered)} (blocked) in slot {slot}"
-    rear_m = road.position_m(slot, min(here[0], there[0])) - road.body_m
-    front_m = road.position_m(slot + 1, max(here[0], there[0]))
+    later_m = road.start_m(road.position_m(slot, here[0]), lanes_of) - road.position_m(
+        slot, here[0]
+    )
+    rear_m = road.position_m(slot, min(here[0], there[0])) - road.body_m + later_m
+    front_m = road.position_m(slot + 1, max(here[0], there[0])) + later_m
     start_m, end_m = road.sorting_m
     if rear_m < start_m - ROUNDING_M or front_m > end_m + ROUNDING_M:
         yield f"{name} moves between {rear_m} m and {front_m} m in slot {slot}"
         return
-    for lane in {here[1], there[1]} & {*range(road.lanes)}:
+    for lane in lanes_of:
         # A section must be open for the whole body and the whole slot.
         if not road.is_open(lane, rear_m, front_m):
             yield f"{name} moves between {rear_m} m and {front_m} m, where lane {lane} is closed"

@@ -1,0 +1,33 @@
+"""Interface of traffic that others drive to the ramps of a road."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Protocol
+
+from laneweave.protocol.lattice import Cell
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.entry import Admission, EntryMeter
+
+
+class RampTraffic(Protocol):
+    """Vehicles that others drive to the entrances."""
+
+    def demanded(self, t_s: float) -> Sequence[Arrival]:
+        """Return the vehicles that have become known since the last call."""
+
+    def announced(self) -> Sequence[Arrival]:
+        """Return the vehicles that will enter soon, with the times at which they are expected."""
+
+    def admit(self, t_s: float, meter: EntryMeter, occupied: Collection[Cell]) -> list[Admission]:
+        """Return the vehicles that have come to their entrances since the last call.
+
+        Args:
+            t_s: road time.
+            meter: assigns cells.
+            occupied: cells in which vehicles are, or to which they move.
+        """
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether no more vehicles will come."""

@@ -1,0 +1,179 @@
+"""A ramp that follows an exit in the same lane: its cells have one owner at a time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import ANY_LANE
+from laneweave.protocol.wire.messages import Ballot, Name, PendingTransfer
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.roadside import Roadside
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.closed_lanes import LonelyRoad
+from support.road_vehicles import vehicle_in
+
+EXIT_M, RAMP_M = 500.0, 520.0
+BALLOT = Ballot(1, Name("c"), 1, 1)
+
+
+def tables(**formation: object) -> dict[str, Any]:
+    """Return four lanes; lane 0 opens at 300 m for an exit, and at 520 m for a ramp."""
+    return {
+        "road": {
+            "lanes": 4,
+            "s1_m": 50.0,
+            "s2_m": 100.0,
+            "s3_m": 850.0,
+            "closures": [
+                {"lane": 0, "to_m": 300.0},
+                {"lane": 0, "from_m": EXIT_M, "to_m": RAMP_M},
+                {"lane": 0, "from_m": 900.0},
+            ],
+        },
+        "entrance": [
+            {"name": "on", "lane": 0, "at_m": RAMP_M, "merge_m": 690.0, "volume_veh_per_h": 600.0}
+        ],
+        "exit": [{"name": "off", "lanes": [0], "at_m": EXIT_M}],
+        "demand": {
+            "volume_veh_per_lane_h": 900.0,
+            "duration_s": 60.0,
+            "destinations": [{"exit": "off", "share": 0.3}],
+        },
+        "formation": {"operation": "rolling", "change_columns": False, **formation},
+    }
+
+
+INTERCHANGE = parse_scenario(tables())
+LATTICE = INTERCHANGE.lattice
+
+
+def test_such_a_road_needs_vehicles_that_keep_their_columns() -> None:
+    assert INTERCHANGE.shared_exit_lanes == {0}
+    with pytest.raises(BadInputError, match=r"entrance\[0\].at_m: got 520.0; allowed: 300"):
+        parse_scenario(tables(change_columns=True))
+
+
+def test_the_bodies_of_leaving_and_entering_vehicles_are_apart_on_the_road() -> None:
+    data = tables()
+    data["road"]["closures"][1]["to_m"] = data["entrance"][0]["at_m"] = 506.0
+    with pytest.raises(BadInputError, match=r"behind exits, and 507\.5 or more"):
+        parse_scenario(data)
+
+
+def owners_of(road: LonelyRoad) -> dict[Cell, list[Name]]:
+    owners: dict[Cell, list[Name]] = {}
+    for name, vehicle in road.vehicles.items():
+        for cell in vehicle.controller.owned:
+            owners.setdefault(cell, []).append(name)
+    return owners
+
+
+def drive(road: LonelyRoad) -> None:
+    """Drive until nobody is left; no cell ever has two owners."""
+    while road.vehicles or not road.roadside.exhausted(road.t_s):
+        road.step()
+        assert road.t_s < 900.0
+        assert all(len(names) == 1 for names in owners_of(road).values())
+
+
+def test_no_cell_has_two_owners_and_leaving_vehicles_have_that_of_their_exit() -> None:
+    road = LonelyRoad(INTERCHANGE)
+    seen = set[Name]()
+    while road.t_s < 60.0:
+        road.step()
+        for name, vehicle in road.vehicles.items():
+            column, lane = vehicle.admission.cell
+            leaves = vehicle.arrival.destination == "off"
+            if name not in seen and lane != 0:
+                assert ((column, 0) in vehicle.controller.owned) == leaves
+            seen.add(name)
+        assert all(len(names) == 1 for names in owners_of(road).values())
+    drive(road)
+    # Nobody changes lanes without an agent, so all exits were missed and those cells never freed.
+    assert set(road.exits.values()) == {"lane-1", "lane-2", "lane-3"}
+
+
+def admitted_columns(vehicle: RoadVehicle | None, *, left: bool = False) -> list[int]:
+    """Return the columns of three vehicles from the ramp, one after another."""
+    stream = tuple(Arrival(f"r{number}", 0, ANY_LANE, 20.0 + number) for number in range(3))
+    roadside = Roadside(INTERCHANGE, stream=stream)
+    vehicles = {} if vehicle is None else {vehicle.name: vehicle}
+    if vehicle is not None and left:
+        roadside.on_left(vehicle, {}, 15.0)
+        vehicles = {}
+    columns = []
+    for tick in range(180, 300):
+        columns += [one.cell[0] for one in roadside.admit(0.1 * tick, vehicles)]
+    return columns
+
+
+def test_a_cell_that_a_vehicle_may_own_is_not_entered_from_the_ramp() -> None:
+    first, *_ = free = admitted_columns(None)
+    assert free == [first, first - 1, first - 2]
+    owner = vehicle_in((first, 1), "A", INTERCHANGE)
+    assert admitted_columns(owner) == free
+    owner.controller.assign_cell((first, 0))
+    assert admitted_columns(owner) == [first - 1, first - 2, first - 3]
+    # The owner has left by the exit: the cell is free again.
+    assert admitted_columns(owner, left=True) == free
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_cell_of_an_undecided_transfer_is_not_entered(*, before: bool) -> None:
+    first, *_ = admitted_columns(None)
+    vehicle = vehicle_in((first + 3, 1), "A", INTERCHANGE)
+    cell, own = (first, 0), (first + 3, 1)
+    both, one = (cell, own), (own,)
+    transfer = PendingTransfer(
+        BALLOT, both if before else one, one if before else both, (Name("A"), Name("B"))
+    )
+    vehicle.controller.store_promise(BALLOT)
+    vehicle.controller.begin_transfer(transfer)
+    later = [first - 1, first - 2, first - 3]
+    assert admitted_columns(vehicle) == later
+    # Nobody knows the outcome when it has left: another vehicle may get the cell.
+    assert admitted_columns(vehicle, left=True) == later
+
+
+def test_cells_given_up_at_the_end_of_a_lane_may_still_be_transferred() -> None:
+    first, *_ = admitted_columns(None)
+    vehicle = vehicle_in((first, 1), "A", INTERCHANGE)
+    vehicle.controller.assign_cell((first, 0))
+    vehicle.controller.leave_lattice()
+    assert vehicle.controller.owned == ()
+    assert admitted_columns(vehicle) == [first - 1, first - 2, first - 3]
+
+
+def test_vehicles_from_a_ramp_get_cells_that_never_had_an_owner() -> None:
+    """Nobody is near the first columns at the start of the road."""
+    stream = (Arrival("r", 0, ANY_LANE, 2.0),)
+    roadside = Roadside(INTERCHANGE, stream=stream)
+    admissions = [one for tick in range(60) for one in roadside.admit(0.1 * tick)]
+    (admission,) = admissions
+    column = admission.cell[0]
+    assert set(admission.more_cells) == {(column, lane) for lane in (1, 2, 3)}
+
+
+def test_a_vehicle_enters_after_those_of_its_column_that_leave_before() -> None:
+    """The order of lanes in which vehicles of a column leave counts only those still there."""
+    main = [Arrival(f"m{lane}", lane, ANY_LANE, 10.0) for lane in (2, 3)]
+    leaving = Arrival("x", 1, ANY_LANE, 10.0, "off")
+    roadside = Roadside(INTERCHANGE, stream=(*main, leaving))
+    admissions = [one for tick in range(95, 130) for one in roadside.admit(0.1 * tick)]
+    assert len({one.cell[0] for one in admissions}) == 1
+    column = admissions[0].cell[0]
+    meter = roadside._meter
+    on_ramp = Arrival("r", 0, ANY_LANE, 40.0)
+    assert meter.is_possible(on_ramp, column)
+    # With another one in lane 1 there would be no lane left.
+    later = min(meter.next_open(lane, 13.0) for lane in (1, 2, 3))
+    for lane in (1, 2, 3):
+        assert meter.is_possible(on_ramp, later)
+        assert meter.take(Arrival(f"z{lane}", lane, ANY_LANE, 13.0), later)
+        assert not meter.take(Arrival(f"late{lane}", lane, ANY_LANE, 13.0), later)
+    assert not meter.is_possible(on_ramp, later)
