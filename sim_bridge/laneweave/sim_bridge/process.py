@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.sim_bridge.core import BridgeCore
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
-from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
+from laneweave.sim_bridge.road_sources import open_road
 
 
 def run_bridge(
@@ -40,18 +39,17 @@ def run_bridge(
         SumoUnavailableError: libsumo cannot be loaded.
     """
     record = RunRecord(folder, scenario, method, time.perf_counter)
-    with (
-        tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as sumo_folder,
-        SumoWorld(scenario, Path(sumo_folder)) as world,
-    ):
+    with open_road(scenario, folder) as road:
         incarnations = Incarnations()
         core = BridgeCore(
             scenario,
-            world,
+            road.world,
             record,
             new_incarnation=incarnations,
             pace=pace,
             incarnation=incarnations(),
+            stream=road.stream,
+            ramp_traffic=road.ramp_traffic,
         )
         try:
             run_core(wrap(core), access_of(scenario, "bridge"), observe=observe)

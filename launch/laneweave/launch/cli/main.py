@@ -64,6 +64,7 @@ def command_line() -> typer.Typer:
 
     from laneweave.launch.cli import certs_commands, config_commands, role_commands, study_commands
     from laneweave.launch.cli.bench_command import bench
+    from laneweave.launch.cli.corridor_command import corridor
     from laneweave.launch.cli.plan_command import plan
     from laneweave.launch.cli.run_command import run
     from laneweave.launch.cli.simulate_command import simulate
@@ -78,7 +79,7 @@ def command_line() -> typer.Typer:
     roles, studies = role_commands, study_commands
     for command in (
         *(run, plan, roles.router, roles.ping, roles.coordinator, roles.agent, roles.bridge),
-        *(roles.watch, status, studies.sweep, studies.report, simulate, bench),
+        *(roles.watch, status, studies.sweep, studies.report, simulate, bench, corridor),
     ):
         app.command()(command)
     app.add_typer(certs_commands.app, name="certs")

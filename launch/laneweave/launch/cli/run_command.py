@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import tempfile
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
+from laneweave.launch.cli.corridor_command import CORRIDOR_HELP
 from laneweave.launch.cli.options import (
     Duration,
     NoProgress,
@@ -21,11 +23,16 @@ from laneweave.launch.cli.options import (
 )
 from laneweave.launch.run.run_folder import new_folder
 from laneweave.launch.run_methods import FORMATION, LC2013, RULE
-from laneweave.protocol.config.scenario_files import load_scenario
+from laneweave.protocol.config.scenario_files import load_scenario, scenario_of
+from laneweave.protocol.errors import NO_VALUE, BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 
 if TYPE_CHECKING:
     from laneweave.launch.run.outcome import Outcome
+
+
+COMPARED_ROUTES = 4
+"""Number of pairs of entrance and destination whose trips are printed."""
 
 
 class Transport(StrEnum):
@@ -80,6 +87,18 @@ def run(
         str | None,
         typer.Option("--faults", metavar="FILE|PRESET", help="Faults to inject: docs/FAULTS.md."),
     ] = None,
+    sumocfg: Annotated[
+        Path | None,
+        typer.Option("--sumocfg", help="SUMO simulation of which laneweave drives a corridor."),
+    ] = None,
+    corridor: Annotated[
+        str | None,
+        typer.Option("--corridor", metavar="FIRST_EDGE:LAST_EDGE", help=CORRIDOR_HELP),
+    ] = None,
+    compare: Annotated[
+        bool,
+        typer.Option("--compare", help="Also let SUMO drive alone, and compare (with --sumocfg)."),
+    ] = False,
     out: RunFolder = None,
     pace: Annotated[
         float | None,
@@ -88,16 +107,23 @@ def run(
     no_progress: NoProgress = False,
 ) -> None:
     """Run a scenario on this machine, and write the results to a folder."""
-    settings = load_scenario(
-        scenario,
-        seed=seed,
-        demand__volume_veh_per_lane_h=volume,
-        demand__duration_s=duration,
-        formation__operation=operation.value if operation is not None else None,
-        formation__solver=solver,
-        runtime__vehicles_per_process=vehicles_per_process,
-        runtime__coordinators=coordinators,
-    )
+    tables = corridor_scenario(scenario, sumocfg, corridor, seed)
+    if tables:
+        reject_unused_options(
+            "with --sumocfg", volume=volume, duration=duration, operation=operation, solver=solver
+        )
+    overrides = {
+        "seed": seed,
+        "demand__volume_veh_per_lane_h": volume,
+        "demand__duration_s": duration,
+        "formation__operation": operation.value if operation is not None else None,
+        "formation__solver": solver,
+        "runtime__vehicles_per_process": vehicles_per_process,
+        "runtime__coordinators": coordinators,
+    }
+    settings = scenario_of(tables, **overrides) if tables else load_scenario(scenario, **overrides)
+    if compare and not settings.sumo.config:
+        raise BadInputError("--compare", "given", "none without a SUMO simulation (--sumocfg)")
     check_pace(pace)
     show = shows_progress(no_progress)
     if method is Method.formation:
@@ -108,6 +134,9 @@ def run(
             reject_unused_options("with --transport simulated", pace=pace)
         outcome = _run_formations(settings, out, faults, pace, simulated=simulated, show=show)
     else:
+        allowed = "formation with a SUMO simulation; --compare adds SUMO alone"
+        if settings.sumo.config:
+            raise BadInputError("--method", method.value, allowed)
         reject_unused_options(
             f"with --method {method.value}",
             operation=operation,
@@ -127,7 +156,48 @@ def run(
         from laneweave.launch.report.report import draw_report
 
         draw_report(outcome.folder)
+        if compare:
+            _compare(settings, outcome.folder, show=show)
     raise typer.Exit(outcome.exit_status)
+
+
+def _compare(settings: Scenario, folder: Path, *, show: bool) -> None:
+    """Let SUMO drive alone, and print how long trips take with both."""
+    from rich.progress import Progress
+
+    from laneweave.launch.report.corridor_comparison import PAGE_FILE, compare
+
+    with Progress(console=Console(stderr=True), disable=not show) as bar:
+        task = bar.add_task("SUMO alone", total=1.0)
+        routes = compare(settings, folder, lambda share: bar.update(task, completed=share))
+    for one in routes[:COMPARED_ROUTES]:
+        own, alone = ("-" if mean is None else f"{mean:.1f} s" for mean in one.mean_s)
+        typer.echo(f"{one.entrance} to {one.destination}: {own} with laneweave, {alone} with SUMO")
+    typer.echo(f"comparison: {folder / PAGE_FILE}")
+
+
+def corridor_scenario(
+    scenario: Path | None, sumocfg: Path | None, corridor: str | None, seed: int | None
+) -> dict[str, Any]:
+    """Return the tables of the scenario of a corridor; none if it is not given by options.
+
+    Raises:
+        BadInputError: an option is missing, or there is no such corridor.
+    """
+    if sumocfg is None and corridor is None:
+        return {}
+    if sumocfg is None or corridor is None:
+        missing = "--sumocfg" if sumocfg is None else "--corridor"
+        raise BadInputError(missing, NO_VALUE, "both --sumocfg and --corridor, or none")
+    if scenario is not None:
+        allowed = "none with --sumocfg: table sumo of the file names the simulation"
+        raise BadInputError("SCENARIO.toml", str(scenario), allowed)
+    from laneweave.launch.cli.corridor_command import corridor_tables
+    from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
+
+    with tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as folder:
+        found = read_corridor(sumocfg, corridor, Path(folder), seed or Scenario().seed)
+    return corridor_tables(found, sumocfg, corridor)
 
 
 def _run_formations(
@@ -143,10 +213,10 @@ def _run_formations(
     from laneweave.launch.faults.specification import load_faults
     from laneweave.launch.run.local_run import LocalRun
     from laneweave.protocol.config.participants import coordinator_names
-    from laneweave.sim_bridge.road.demand import arrivals
+    from laneweave.sim_bridge.road_sources import demanded
 
     check_moves(settings)
-    vehicles = {arrival.vehicle for arrival in arrivals(settings)}
+    vehicles = {arrival.vehicle for arrival in demanded(settings)}
     specification = load_faults(faults, coordinator_names(settings), vehicles)
     with new_folder(out, settings, FORMATION) as folder:
         if simulated:

@@ -40,7 +40,7 @@ from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.topics import Keys
-from laneweave.sim_bridge.road.demand import arrivals
+from laneweave.sim_bridge.road_sources import demanded
 
 MAX_TEMPORARY_BYTES = 70
 """Maximum length of TMPDIR: socket paths are up to 37 bytes longer, and limited to 107 bytes."""
@@ -97,7 +97,7 @@ class LocalRun:
     def __attrs_post_init__(self) -> None:
         """Assign the demanded vehicles to groups."""
         per_process = self.scenario.runtime.vehicles_per_process
-        names = [arrival.vehicle for arrival in arrivals(self.scenario)]
+        names = [arrival.vehicle for arrival in demanded(self.scenario)]
         for first in range(0, len(names), per_process):
             group = tuple(names[first : first + per_process])
             self._group_of |= dict.fromkeys(group, group)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator
 from itertools import count
@@ -31,7 +30,7 @@ from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.messages import Census, Name
 from laneweave.sim_bridge.core import BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
-from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
+from laneweave.sim_bridge.road_sources import open_road
 
 STALL_S = 600.0
 """Virtual time after which a run fails if the road clock does not advance."""
@@ -151,16 +150,17 @@ class SimulatedRun:
             )
         record = RunRecord(self.folder, scenario, FORMATION, time.perf_counter)
         with (
-            tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as sumo_folder,
-            SumoWorld(scenario, Path(sumo_folder)) as world,
+            open_road(scenario, self.folder) as road,
             RunProgress(scenario, show=self.show_progress) as progress,
         ):
             bridge = BridgeCore(
                 scenario,
-                world,
+                road.world,
                 record,
                 new_incarnation=self._incarnations.__next__,
                 pace=1.0,
+                stream=road.stream,
+                ramp_traffic=road.ramp_traffic,
             )
             try:
                 self._drive(network, bridge, progress)

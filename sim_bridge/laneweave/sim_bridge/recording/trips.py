@@ -49,6 +49,7 @@ _COLUMNS: list[pa.Field[Any]] = [
     pa.field("exit", pa.string()),
     pa.field("free_flow_s", pa.float64(), nullable=False),
     pa.field("vehicle_type", pa.string(), nullable=False),
+    pa.field("sumo_id", pa.string()),
 ]
 
 
@@ -96,6 +97,7 @@ class Trip:
             "exit": self.exit,
             "free_flow_s": self.free_flow_s,
             "vehicle_type": self.arrival.vehicle_type,
+            "sumo_id": self.arrival.sumo_id or None,
         }
 
 

@@ -108,6 +108,7 @@ def test_trips_have_every_state() -> None:
         "exit": "end",
         "free_flow_s": 0.0,
         "vehicle_type": "car",
+        "sumo_id": None,
     }
     assert [row["counted"] for row in rows] == [False, True, False, False]
     assert [row["on_preferred_lane"] for row in rows] == [True, False, None, None]

@@ -1,0 +1,164 @@
+"""A run on a corridor beside the same simulation driven by SUMO alone."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from statistics import fmean
+
+from attrs import frozen
+
+from laneweave.launch.recordings.trajectories import read_trips
+from laneweave.launch.report.page import Section, render_page
+from laneweave.launch.report.tables import Table
+from laneweave.protocol.files import write_atomically
+from laneweave.protocol.road_layout import END_OF_ROAD
+from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.sim_bridge.corridors.corridor_arrivals import CorridorArrival
+from laneweave.sim_bridge.corridors.sumo_alone import drive_alone
+from laneweave.sim_bridge.corridors.sumo_statistics import (
+    SumoStatistics,
+    SumoTrip,
+    read_statistics,
+)
+from laneweave.sim_bridge.road_sources import sumo_corridor
+
+ALONE_FOLDER = "sumo-alone"
+PAGE_FILE = "comparison.html"
+METHODS = ("laneweave", "SUMO alone")
+_ROUTES = {MAIN_ENTRANCE: "start of the corridor", END_OF_ROAD: "end of the corridor"}
+
+
+@frozen
+class RouteTimes:
+    """Vehicles with the same entrance and destination."""
+
+    entrance: str
+    destination: str
+    vehicles: int
+    arrived: tuple[int, ...]
+    """Number that has arrived, for each method."""
+    mean_s: tuple[float | None, ...]
+    """Mean trip with the delay before departure [s], for each method."""
+    fuel_g: tuple[float | None, ...]
+    """Mean fuel, for each method."""
+
+
+def compare(
+    scenario: Scenario, folder: Path, progress: Callable[[float], None] = lambda _: None
+) -> Sequence[RouteTimes]:
+    """Run SUMO alone, and write the page that compares it with the run in a folder.
+
+    Raises:
+        CommandFailedError: SUMO rejects a file.
+    """
+    alone = folder / ALONE_FOLDER
+    alone.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as name:
+        setup = sumo_corridor(scenario, Path(name)).setup(scenario)
+        drive_alone(setup, scenario.seed, Path(name), alone, progress)
+    found = read_statistics(folder), read_statistics(alone)
+    delays_s = _entry_delays_s(folder, setup.arrivals)
+    routes = _by_route(setup.arrivals, found, delays_s)
+    tables = [_times_table(routes), _events_table(found)]
+    lead = f"Corridor {scenario.sumo.corridor} of {scenario.sumo.config}, seed {scenario.seed}."
+    page = render_page("laneweave and SUMO alone", lead, [Section("Trips", tables)])
+    write_atomically(folder / PAGE_FILE, page)
+    return routes
+
+
+def _entry_delays_s(folder: Path, arrivals: Sequence[CorridorArrival]) -> dict[str, float]:
+    """Return how long each vehicle has waited at the start of the corridor, by its name in SUMO.
+
+    SUMO sees these vehicles only when they enter, so that its own delay is 0.
+    """
+    entered_s = {
+        trip["sumo_id"]: trip["entered_s"]
+        for trip in read_trips(folder).values()
+        if trip["entered_s"] is not None
+    }
+    return {
+        name: entered_s[name] + one.begin_s - one.origin.vehicle.depart_s
+        for one in arrivals
+        if one.origin.entrance == MAIN_ENTRANCE and (name := one.origin.vehicle.name) in entered_s
+    }
+
+
+def _by_route(
+    arrivals: Sequence[CorridorArrival],
+    found: Sequence[SumoStatistics],
+    delays_s: Mapping[str, float],
+) -> list[RouteTimes]:
+    """Return the times of all pairs of entrance and destination, the most frequent first."""
+    names: dict[tuple[str, str], list[str]] = {}
+    for one in arrivals:
+        route = one.origin.entrance, one.origin.destination
+        names.setdefault(route, []).append(one.origin.vehicle.name)
+    routes = []
+    for (entrance, destination), own in sorted(names.items(), key=lambda item: -len(item[1])):
+        trips = [[each.trips[name] for name in own if name in each.trips] for each in found]
+        waited_s = fmean([delays_s.get(name, 0.0) for name in own if name in found[0].trips] or [0])
+        routes.append(
+            RouteTimes(
+                entrance,
+                destination,
+                len(own),
+                tuple(map(len, trips)),
+                (
+                    _mean([_total_s(trip) for trip in trips[0]], waited_s),
+                    _mean([_total_s(trip) for trip in trips[1]]),
+                ),
+                tuple(_mean([trip.fuel_g or 0.0 for trip in each]) for each in trips),
+            )
+        )
+    return routes
+
+
+def _total_s(trip: SumoTrip) -> float:
+    return trip.duration_s + trip.depart_delay_s
+
+
+def _mean(values: Sequence[float], added: float = 0.0) -> float | None:
+    return fmean(values) + added if values else None
+
+
+def _times_table(routes: Sequence[RouteTimes]) -> Table:
+    """Return the table of trips by entrance and destination."""
+    headings = ["from", "to", "vehicles"]
+    for what in ("arrived", "trip and delay [s]", "fuel [g]"):
+        headings += [f"{what}, {method}" for method in METHODS]
+    rows = [
+        [
+            _ROUTES.get(one.entrance, one.entrance),
+            _ROUTES.get(one.destination, one.destination),
+            f"{one.vehicles}",
+            *(f"{count}" for count in one.arrived),
+            *map(_shown, one.mean_s),
+            *map(_shown, one.fuel_g),
+        ]
+        for one in routes
+    ]
+    caption = (
+        "Mean trip from departure to arrival, with the delay before departure, of the vehicles "
+        "that have arrived"
+    )
+    return Table(headings, rows, caption, 2)
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
+
+
+def _events_table(found: Sequence[SumoStatistics]) -> Table:
+    """Return the table of what SUMO reports for the whole network.
+
+    SUMO does not know how hard vehicles brake that it does not drive.
+    """
+    brakings = ["-", f"{found[1].emergency_brakings}"]
+    rows = [
+        [method, f"{one.collisions}", f"{one.teleports}", braking]
+        for method, one, braking in zip(METHODS, found, brakings, strict=True)
+    ]
+    headings = ["method", "collisions", "teleports", "emergency brakings"]
+    return Table(headings, rows, "Events in the whole network, as SUMO reports them")

@@ -1,0 +1,332 @@
+"""Derives the road of a corridor: consecutive edges of a SUMO network.
+
+Lanes of successive edges continue each other if a link leads from one to the other. *Corridor
+lanes* are numbered from the right over all edges: the links between two edges determine by how much
+the numbers of the second are shifted. A lane that is fed from outside of the corridor is an on-ramp
+with its acceleration lane, and a lane whose links lead out of it an exit.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from statistics import median
+
+from attrs import frozen
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.fields import Closure
+from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network
+
+MAX_LANES = 8
+MAX_RAMP_M = 400.0
+"""Length of the part of a ramp before its acceleration lane that is used at most."""
+BEHIND_EXIT_M = 15.0
+"""Distance between an exit and a ramp in the same lane: their vehicles do not overlap on the road,
+though in the world they never meet."""
+MIN_AT_M = 1.0
+"""Position of ramps that begin before the corridor: their lanes are closed at its start."""
+HANDOVER_M = 4.0
+"""Distance before the end of an edge at which vehicles are given back to SUMO."""
+OPTION = "--corridor"
+
+
+@frozen
+class CorridorEdge:
+    """An edge of a corridor."""
+
+    name: str
+    from_m: float
+    """Where it begins along the corridor."""
+    to_m: float
+    first_lane: int
+    """Corridor lane of its lane 0."""
+    lanes: int
+
+
+@frozen
+class Ramp:
+    """An on-ramp with an acceleration lane."""
+
+    edge: str
+    """Name of the last edge before the corridor."""
+    to_edge: str
+    """Name of the edge with the acceleration lane."""
+    lane: int
+    at_m: float
+    """Where the ramp begins, as a position along the corridor."""
+    merge_m: float
+    """Where its acceleration lane begins."""
+    speed_mps: float
+    """Lowest speed limit of the ramp."""
+    path: tuple[Link, ...] = ()
+    """Links by which vehicles come to the acceleration lane, the last one first."""
+
+
+@frozen
+class WayOut:
+    """An exit: lanes that lead out of the corridor."""
+
+    edge: str
+    """Name of the first edge behind the corridor."""
+    from_edge: str
+    """Name of the edge before."""
+    lanes: tuple[int, ...]
+    at_m: float
+
+
+@frozen
+class Corridor:
+    """A road of lanes that are open from here to there, derived from consecutive edges."""
+
+    edges: tuple[CorridorEdge, ...]
+    lanes: int
+    length_m: float
+    lane_width_m: float
+    """Width of the narrowest lane."""
+    speed_mps: float
+    """Lowest speed limit of its lanes."""
+    closures: tuple[Closure, ...]
+    ramps: tuple[Ramp, ...] = ()
+    ways_out: tuple[WayOut, ...] = ()
+    unused: tuple[str, ...] = ()
+    """Ways into the corridor and out of it that vehicles cannot use, in words."""
+
+    @property
+    def name(self) -> str:
+        """Its first and its last edge, as in `--corridor`."""
+        return f"{self.edges[0].name}:{self.edges[-1].name}"
+
+
+def corridor_of(network: Network, first: str, last: str) -> Corridor:
+    """Return the corridor from one edge to another.
+
+    Raises:
+        BadInputError: an edge does not exist, no way leads from the first to the last, or vehicles
+            have to give way on it.
+    """
+    for name in (first, last):
+        if name not in network.edges:
+            raise BadInputError(OPTION, name, "FIRST_EDGE:LAST_EDGE, two edges of the network")
+    way = _way(network, first, last)
+    for before, after in pairwise(way):
+        _check_right_of_way(network, before, after)
+    return _Derivation(network, way).corridor()
+
+
+def _way(network: Network, first: str, last: str) -> tuple[Edge, ...]:
+    """Return the way with the fewest edges."""
+    before: dict[str, str] = {first: ""}
+    waiting = deque([first])
+    while waiting and last not in before:
+        name = waiting.popleft()
+        for edge in network.following(network.edges[name]):
+            if edge.name not in before:
+                before[edge.name] = name
+                waiting.append(edge.name)
+    if last not in before:
+        allowed = "FIRST_EDGE:LAST_EDGE with a way for cars from the first to the last; "
+        reached = f"{len(before) - 1} edges can be reached from {first}"
+        raise BadInputError(OPTION, f"{first}:{last}", allowed + reached)
+    names = [last]
+    while before[names[-1]]:
+        names.append(before[names[-1]])
+    return tuple(network.edges[name] for name in reversed(names))
+
+
+def through_links(network: Network, before: Edge, after: Edge) -> tuple[Link, ...]:
+    """Return the links by which lanes of an edge continue in the next one.
+
+    Their lanes are all shifted by the same number, the most frequent one; of several such numbers,
+    the one nearest to 0.
+    """
+    links = network.between(before, after)
+    counts = Counter(_shift(link) for link in links)
+    shift = min(counts, key=lambda one: (-counts[one], abs(one), one))
+    return tuple(link for link in links if _shift(link) == shift)
+
+
+def _shift(link: Link) -> int:
+    return link.target.index - link.origin.index
+
+
+def _check_right_of_way(network: Network, before: Edge, after: Edge) -> None:
+    """Check that vehicles need not give way between two edges."""
+    for link in through_links(network, before, after):
+        reason = f"its state is {link.state!r}"
+        if link.traffic_light:
+            reason = f"traffic light {link.traffic_light} controls it"
+        if not link.has_priority:
+            allowed = f"a corridor without crossings: the way to {after.name} has to have priority"
+            raise BadInputError(OPTION, before.name, f"{allowed}, but {reason}")
+
+
+@frozen
+class _OpenPart:
+    """A part of a corridor lane that is open without interruption, on some of the edges."""
+
+    lane: int
+    first: int
+    last: int
+    """Numbers of its first and its last edge."""
+
+
+class _Derivation:
+    """The derivation of one corridor."""
+
+    def __init__(self, network: Network, way: tuple[Edge, ...]) -> None:
+        self._network = network
+        self._way = way
+        self._names = {edge.name for edge in way}
+        self._links = [through_links(network, *pair) for pair in pairwise(way)]
+        first_lanes, at_m = [0], 0.0
+        places_m = []
+        for edge, links in zip(way, [*self._links, ()], strict=True):
+            places_m.append((at_m, at_m + edge.length_m))
+            if links:
+                first_lanes.append(first_lanes[-1] - _shift(links[0]))
+                at_m = places_m[-1][1] + median(link.length_m for link in links)
+        lowest = min(
+            first + lane.index
+            for first, edge in zip(first_lanes, way, strict=True)
+            for lane in edge.car_lanes
+        )
+        self._edges = tuple(
+            CorridorEdge(edge.name, from_m, to_m, first - lowest, len(edge.lanes))
+            for edge, first, (from_m, to_m) in zip(way, first_lanes, places_m, strict=True)
+        )
+        self._unused: list[str] = []
+
+    def corridor(self) -> Corridor:
+        """Return the corridor."""
+        parts = sorted(self._parts(), key=lambda part: (part.lane, part.first))
+        lanes = 1 + max(part.lane for part in parts)
+        if lanes > MAX_LANES:
+            raise BadInputError(OPTION, f"{lanes} lanes", f"at most {MAX_LANES} lanes")
+        ends_m = [(part.lane, self._edges[part.last].to_m) for part in parts]
+        ramps = tuple(
+            ramp
+            for number, part in enumerate(parts)
+            if (ramp := self._ramp(part, ends_m[:number])) is not None
+        )
+        used = [lane for edge in self._way for lane in edge.car_lanes]
+        ways_out = tuple(self._ways_out(parts))
+        return Corridor(
+            edges=self._edges,
+            lanes=lanes,
+            length_m=self._edges[-1].to_m - HANDOVER_M,
+            lane_width_m=min(lane.width_m for lane in used),
+            speed_mps=min(lane.speed_mps for lane in used),
+            closures=tuple(self._closures(parts, lanes, ramps, ways_out)),
+            ramps=ramps,
+            ways_out=ways_out,
+            unused=tuple(self._unused),
+        )
+
+    def _lane(self, number: int, lane: int) -> Lane:
+        """Return the lane of an edge that is part of a corridor lane."""
+        return self._way[number].lanes[lane - self._edges[number].first_lane]
+
+    def _parts(self) -> Iterator[_OpenPart]:
+        """Yield the open parts of all corridor lanes."""
+        continued = {link.target.name for links in self._links for link in links}
+        continuing = {link.origin.name for links in self._links for link in links}
+        for number, edge in enumerate(self._way):
+            for lane in edge.car_lanes:
+                if lane.name in continued:
+                    continue
+                here, last = self._edges[number].first_lane + lane.index, number
+                while self._lane(last, here).name in continuing:
+                    last += 1
+                yield _OpenPart(here, number, last)
+
+    def _ramp(self, part: _OpenPart, ends_m: Sequence[tuple[int, float]]) -> Ramp | None:
+        """Return the ramp at the beginning of a part; note others that merge into it."""
+        feeding = list[Link]()
+        for number in range(part.first, part.last + 1):
+            for link in self._network.links_to(self._lane(number, part.lane)):
+                if link.origin.edge in self._names or number == 0:
+                    continue
+                if number == part.first and not feeding:
+                    feeding.append(link)
+                else:
+                    self._unused.append(
+                        f"{link.origin.edge} merges into lane {part.lane} at "
+                        f"{self._edges[number].from_m:.0f} m without an acceleration lane"
+                    )
+        if not feeding:
+            return None
+        merge_m = self._edges[part.first].from_m
+        length_m, speed_mps, path = self._before(feeding[0])
+        before_m = [to_m for lane, to_m in ends_m if lane == part.lane]
+        at_m = max(
+            MIN_AT_M, merge_m - min(length_m, MAX_RAMP_M), *(m + BEHIND_EXIT_M for m in before_m)
+        )
+        to_edge = self._edges[part.first].name
+        return Ramp(feeding[0].origin.edge, to_edge, part.lane, at_m, merge_m, speed_mps, path)
+
+    def _before(self, link: Link) -> tuple[float, float, tuple[Link, ...]]:
+        """Return length, lowest speed limit and links of the way on which vehicles come to a link.
+
+        It begins where others join, where vehicles have to give way, or where it has more lanes.
+        """
+        length_m, speed_mps, path = 0.0, link.origin.speed_mps, list[Link]()
+        seen = set[str]()
+        while link.has_priority and link.origin.name not in seen and length_m < MAX_RAMP_M:
+            lane = link.origin
+            seen.add(lane.name)
+            path.append(link)
+            length_m += lane.length_m + link.length_m
+            speed_mps = min(speed_mps, lane.speed_mps)
+            before = self._network.links_to(lane)
+            if len(before) != 1 or len(self._network.edges[lane.edge].car_lanes) > 1:
+                break
+            link = before[0]
+        return length_m, speed_mps, tuple(path)
+
+    def _ways_out(self, parts: Sequence[_OpenPart]) -> Iterator[WayOut]:
+        """Yield the exits; note ways out of lanes that go on."""
+        lanes: dict[tuple[str, str, float], list[int]] = {}
+        for part in parts:
+            for number in range(part.first, min(part.last + 1, len(self._way) - 1)):
+                at_m = self._edges[number].to_m
+                for link in self._network.links_from(self._lane(number, part.lane)):
+                    if link.target.edge in self._names:
+                        continue
+                    if number == part.last:
+                        lanes.setdefault(
+                            (link.target.edge, self._edges[number].name, at_m), []
+                        ).append(part.lane)
+                        break
+                    self._unused.append(
+                        f"the way to {link.target.edge} leaves lane {part.lane} at {at_m:.0f} m "
+                        "without a lane of its own"
+                    )
+        for (edge, before, at_m), own in sorted(lanes.items(), key=lambda item: item[0][2]):
+            yield WayOut(edge, before, tuple(sorted(set(own))), at_m - HANDOVER_M)
+
+    def _closures(
+        self,
+        parts: Sequence[_OpenPart],
+        lanes: int,
+        ramps: Sequence[Ramp],
+        ways_out: Sequence[WayOut],
+    ) -> Iterator[Closure]:
+        """Yield the closed parts of all lanes."""
+        end_m = self._edges[-1].to_m
+        exits_m = {(lane, one.at_m + HANDOVER_M) for one in ways_out for lane in one.lanes}
+        at_m = {(ramp.lane, ramp.merge_m): ramp.at_m for ramp in ramps}
+        for lane in range(lanes):
+            closed_m = 0.0
+            for part in parts:
+                if part.lane == lane:
+                    begins_m = self._edges[part.first].from_m
+                    opens_m = at_m.get((lane, begins_m), begins_m)
+                    if opens_m > closed_m:
+                        yield Closure(lane, closed_m, opens_m)
+                    closed_m = self._edges[part.last].to_m
+                    if (lane, closed_m) in exits_m:
+                        closed_m -= HANDOVER_M
+            if closed_m < end_m:
+                yield Closure(lane, closed_m)

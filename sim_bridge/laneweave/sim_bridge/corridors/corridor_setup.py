@@ -1,0 +1,58 @@
+"""A corridor with everything that a run on it needs, read from the files of a SUMO simulation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from attrs import frozen
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor, corridor_of
+from laneweave.sim_bridge.corridors.corridor_arrivals import CorridorSetup, corridor_arrivals
+from laneweave.sim_bridge.corridors.sumo_config import SumoConfig, read_config
+from laneweave.sim_bridge.corridors.sumo_demand import CorridorDemand, demand_on, read_demand
+from laneweave.sim_bridge.corridors.sumo_network import Network, read_network
+
+
+@frozen
+class SumoCorridor:
+    """A corridor of a SUMO simulation, and the vehicles that drive through it."""
+
+    config: SumoConfig
+    network: Network
+    corridor: Corridor
+    demand: CorridorDemand
+
+    def setup(self, scenario: Scenario) -> CorridorSetup:
+        """Return the setup of a run."""
+        return CorridorSetup(
+            self.config,
+            self.network,
+            self.corridor,
+            corridor_arrivals(scenario, self.demand),
+            self.demand.duration_s,
+            self.demand.unserved,
+        )
+
+
+def read_corridor(file: Path, name: str, folder: Path, seed: int = 1) -> SumoCorridor:
+    """Read the files of a simulation, and derive a corridor.
+
+    Args:
+        file: SUMO's configuration file.
+        name: the first and the last edge, FIRST_EDGE:LAST_EDGE.
+        folder: folder for temporary files.
+        seed: seed of SUMO, from which it draws flows and types.
+
+    Raises:
+        BadInputError: a file cannot be read, or the edges are not a corridor.
+    """
+    first, separator, last = name.partition(":")
+    if not (first and separator and last):
+        raise BadInputError(OPTION, name, "FIRST_EDGE:LAST_EDGE, two edges of the network")
+    config = read_config(file)
+    network = read_network(config.net_file)
+    corridor = corridor_of(network, first, last)
+    demand = demand_on(corridor, read_demand(config, folder, seed))
+    return SumoCorridor(config, network, corridor, demand)

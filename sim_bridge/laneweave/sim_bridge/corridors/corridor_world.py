@@ -1,0 +1,283 @@
+"""A SUMO simulation of which laneweave drives a corridor, as the world of a bridge.
+
+SUMO loads and drives all vehicles outside. A vehicle that departs on the first edge of the corridor
+is taken out of SUMO when it is loaded, waits at the start of the road, and is added again when it
+enters. A vehicle from another edge is driven by SUMO until it comes to its ramp. Inside, SUMO
+displays all vehicles where their plants are, on the lanes of its network. At an exit, or at the end
+of the road, a vehicle is given back with its speed, and SUMO drives on along its route.
+
+What SUMO drives near the corridor is seen by the sensors of vehicles inside (`others`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.wire.messages import CAR
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
+from laneweave.sim_bridge.corridors.corridor import HANDOVER_M, Corridor, Ramp
+from laneweave.sim_bridge.corridors.corridor_arrivals import MAX_WAIT_S, CorridorSetup
+from laneweave.sim_bridge.corridors.corridor_ramps import Approaching
+from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape, Piece, ramp_pieces
+from laneweave.sim_bridge.corridors.sumo_config import sumo_command
+from laneweave.sim_bridge.corridors.sumo_network import Network
+from laneweave.sim_bridge.sumo.simulation import SumoProcess
+
+_PLANTS = ("--step-method.ballistic", "true", "--collision.mingap-factor", "0")
+"""Options with which SUMO displays bodies as the bridge drives them."""
+_OWN_SPEED_MODE, _OWN_LANE_CHANGES = 31, 1621
+"""SUMO's defaults: it drives."""
+SEEN_BEYOND_M = 200.0
+"""Distance beyond an exit up to which SUMO's vehicles are seen."""
+MAX_DISPLAY_ERROR_M = 0.1
+"""Maximum distance between a body and where SUMO displays it."""
+
+
+class CorridorWorld(SumoProcess):
+    """The corridor's vehicles in SUMO. Close it, or use it as a context manager."""
+
+    def __init__(
+        self, scenario: Scenario, setup: CorridorSetup, folder: Path, results: Path | None = None
+    ) -> None:
+        """Start SUMO.
+
+        Args:
+            scenario: road, vehicles and tick.
+            setup: network, demand, corridor.
+            folder: folder for temporary files.
+            results: folder for SUMO's own statistics; None: none are written.
+
+        Raises:
+            SumoUnavailableError: libsumo cannot be loaded.
+            SumoFailedError: SUMO rejects a file.
+        """
+        tick_s = scenario.runtime.tick_s
+        command = sumo_command(setup.config, tick_s, scenario.seed, folder, results)
+        super().__init__((*command, *_PLANTS))
+        self._types = scenario.types
+        self._lane_m = scenario.road.lane_width_m
+        self._length_m = scenario.road.length_m
+        self._shape = CorridorShape(setup.network, setup.corridor)
+        self._sumo_name = {one.arrival.vehicle: one.origin.vehicle.name for one in setup.arrivals}
+        self._coming = {one.origin.vehicle.name: one for one in setup.arrivals}
+        self._unserved = setup.unserved
+        self._states: dict[str, State] = {}
+        self._shown: dict[str, State] = {}
+        self._returned: set[str] = set()
+        """Names in SUMO of vehicles that have been given back and have not arrived."""
+        self._taken: set[str] = set()
+        """Names in SUMO of vehicles that have been taken over."""
+        self._ways = {
+            ramp.lane: {f"{piece.edge}_{piece.index}": piece for piece in _path(ramp)}
+            for ramp in setup.corridor.ramps
+        }
+        """Pieces on which SUMO drives towards each ramp, by the names of SUMO's lanes."""
+        self._beyond = dict(_beyond(setup.network, setup.corridor))
+        self._lengths_m = {
+            lane.name: lane.length_m for edge in setup.network.edges.values() for lane in edge.lanes
+        }
+
+        self._end_s = setup.config.begin_s + setup.duration_s + MAX_WAIT_S
+        self._take_out_loaded()
+
+    def _take_out_loaded(self) -> None:
+        """Take vehicles out of SUMO that wait at the start of the road, or are not served."""
+        for name in self.simulation.getLoadedIDList():
+            coming = self._coming.get(name)
+            waits = coming is not None and coming.origin.entrance == MAIN_ENTRANCE
+            if name in self._unserved or (waits and name not in self._taken):
+                self.vehicle.remove(name)
+
+    # --- traffic that SUMO drives -------------------------------------------------------------
+
+    def approaching(self, lane: int) -> list[Approaching]:
+        """Return the vehicles that come to the ramp of a lane, the foremost first."""
+        found = []
+        for name, piece in self._ways.get(lane, {}).items():
+            for vehicle in self.lane.getLastStepVehicleIDs(name):
+                coming = self._coming.get(vehicle)
+                if (
+                    coming is not None
+                    and coming.arrival.lane == lane
+                    and vehicle not in self._taken
+                ):
+                    at_m = self.vehicle.getLanePosition(vehicle)
+                    s_m = piece.position_m(at_m, self._lengths_m[name])
+                    found.append(Approaching(coming.arrival, s_m, self.vehicle.getSpeed(vehicle)))
+        return sorted(found, key=lambda one: -one.s_m)
+
+    def advise(self, vehicle: str, speed_mps: float | None) -> None:
+        """Set the speed at which SUMO drives a vehicle towards its ramp; None: its own."""
+        self.vehicle.setSpeed(self._sumo_name[vehicle], -1.0 if speed_mps is None else speed_mps)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether no vehicles come to a ramp any more, or they have not come for long."""
+        return not self._coming or self.simulation.getTime() >= self._end_s
+
+    def others(self) -> Sequence[OtherBody]:
+        """Return SUMO's own vehicles behind the exits and the end of the road."""
+        found, api = list[OtherBody](), self.vehicle
+        for name, (lane, exit_m, from_m) in self._beyond.items():
+            for vehicle in self.lane.getLastStepVehicleIDs(name):
+                rear_m = api.getLanePosition(vehicle) - api.getLength(vehicle)
+                seen = from_m + rear_m <= exit_m + SEEN_BEYOND_M
+                if seen and not self._is_driven(vehicle):
+                    found.append(
+                        OtherBody(
+                            vehicle,
+                            lane,
+                            exit_m,
+                            from_m + rear_m,
+                            api.getSpeed(vehicle),
+                            api.getAcceleration(vehicle),
+                        )
+                    )
+        return sorted(found, key=lambda one: one.rear_m)
+
+    def _is_driven(self, sumo_name: str) -> bool:
+        coming = self._coming.get(sumo_name)
+        return coming is not None and coming.arrival.vehicle in self._states
+
+    # --- the interface of worlds --------------------------------------------------------------
+
+    def add(self, vehicle: str, state: State, vehicle_type: str = CAR) -> None:  # noqa: ARG002 (SUMO has its own types)
+        """Take a vehicle over: one that waits is added to SUMO, another one is driven by SUMO.
+
+        Raises:
+            ValueError: the vehicle is already on the road.
+        """
+        if vehicle in self._states:
+            raise ValueError(f"{vehicle} is already on the road")
+        name = self._sumo_name[vehicle]
+        coming, api = self._coming[name], self.vehicle
+        if coming.origin.entrance == MAIN_ENTRANCE:
+            route = f"laneweave.{name}"
+            self.route.add(route, list(coming.origin.vehicle.route))
+            api.add(
+                name,
+                route,
+                typeID=coming.origin.vehicle.type_name,
+                depart="now",
+                departPos="0",
+                departSpeed="0",
+            )
+        api.setSpeed(name, -1.0)
+        api.setSpeedMode(name, 0)
+        api.setLaneChangeMode(name, 0)
+        self._taken.add(name)
+        self._states[vehicle] = state
+        self._move(vehicle, state)
+
+    def place(self, vehicle: str, state: State) -> None:
+        """Set the state of a vehicle at the end of the next step.
+
+        Raises:
+            ValueError: the vehicle is not on the road, or its state is not finite.
+        """
+        if vehicle not in self._states:
+            raise ValueError(f"{vehicle} is not on the road")
+        if not math.isfinite(sum(state)):
+            raise ValueError(f"{vehicle} must have a finite state, not {state}")
+        self._states[vehicle] = state
+        self._move(vehicle, state)
+
+    def step(self) -> None:
+        """Advance SUMO by one tick.
+
+        Raises:
+            RuntimeError: SUMO does not display a vehicle where it is (internal error).
+        """
+        super().step()
+        api = self.vehicle
+        self._take_out_loaded()
+        arrived = self.simulation.getArrivedIDList()
+        self._returned.difference_update(arrived)
+        for name in arrived:
+            if name not in self._taken and self._is_ramp_vehicle(name):
+                del self._coming[name]
+        on_road = set(api.getIDList())
+        for vehicle, state in self._states.items():
+            name = self._sumo_name[vehicle]
+            if name not in on_road:
+                raise RuntimeError(f"SUMO has lost {name} ({vehicle}) at s = {state[0]:.1f} m")
+            (x, y, _), _ = self._shape.at(state[0], state[3])
+            error_m = math.dist(api.getPosition(name), (x, y))
+            if error_m > MAX_DISPLAY_ERROR_M:
+                raise RuntimeError(f"SUMO displays {name} ({vehicle}) {error_m:.2f} m away")
+            api.setPreviousSpeed(name, max(state[1], 0.0), state[2])
+        self._shown = dict(self._states)
+
+    def _is_ramp_vehicle(self, name: str) -> bool:
+        coming = self._coming.get(name)
+        return coming is not None and coming.origin.entrance != MAIN_ENTRANCE
+
+    def positions(self) -> dict[str, Pose]:
+        """Return the pose of each vehicle after the last step, in the order of `add` calls."""
+        return {vehicle: pose_of(state) for vehicle, state in self._shown.items()}
+
+    def collisions(self) -> list[tuple[str, str]]:
+        """Return the sorted pairs that SUMO reports, with a vehicle of the corridor in each."""
+        pairs = set[tuple[str, str]]()
+        for hit in self.simulation.getCollisions():
+            if self._is_driven(hit.collider) or self._is_driven(hit.victim):
+                first, second = sorted((hit.collider, hit.victim))
+                pairs.add((first, second))
+        return sorted(pairs)
+
+    def remove(self, vehicle: str) -> None:
+        """Give a vehicle back to SUMO, with its speed.
+
+        Raises:
+            ValueError: the vehicle is not on the road.
+        """
+        if self._states.pop(vehicle, None) is None:
+            raise ValueError(f"{vehicle} is not on the road")
+        self._shown.pop(vehicle, None)
+        name, api = self._sumo_name[vehicle], self.vehicle
+        api.setSpeedMode(name, _OWN_SPEED_MODE)
+        api.setLaneChangeMode(name, _OWN_LANE_CHANGES)
+        del self._coming[name]
+        self._returned.add(name)
+
+    def drive_on(self) -> None:
+        """Let SUMO drive on until the vehicles that it got back have arrived (statistics)."""
+        end_s = self.simulation.getTime() + MAX_WAIT_S
+        while self._returned and self.simulation.getTime() < end_s:
+            super().step()
+            self._returned.difference_update(self.simulation.getArrivedIDList())
+
+    def _move(self, vehicle: str, state: State) -> None:
+        """Pass the middle of the front bumper and the angle to SUMO."""
+        _, _, heading, _ = pose_of(state)
+        (x, y, direction), piece = self._shape.at(state[0], state[3])
+        degrees = 90.0 - math.degrees(direction + heading)
+        name = self._sumo_name[vehicle]
+        self.vehicle.moveToXY(name, piece.edge, piece.index, x, y, degrees, 2)
+
+
+def _path(ramp: Ramp) -> Iterator[Piece]:
+    """Yield the pieces on which SUMO drives towards a ramp."""
+    return (piece for piece in ramp_pieces(ramp) if piece.edge)
+
+
+def _beyond(network: Network, corridor: Corridor) -> Iterator[tuple[str, tuple[int, float, float]]]:
+    """Yield SUMO's lanes behind the exits: (name, (lane, position of the exit, its own))."""
+    last = corridor.edges[-1]
+    ends = [(one.from_edge, one.lanes, one.at_m + HANDOVER_M) for one in corridor.ways_out]
+    every = tuple(range(last.first_lane, last.first_lane + last.lanes))
+    ends.append((last.name, every, last.to_m))
+    first = {edge.name: edge.first_lane for edge in corridor.edges}
+    inside = {edge.name for edge in corridor.edges}
+    for edge, lanes, at_m in ends:
+        for lane in network.edges[edge].car_lanes:
+            number = first[edge] + lane.index
+            if number in lanes:
+                yield lane.name, (number, at_m, at_m - lane.length_m)
+            for link in network.links_from(lane) if number in lanes else ():
+                if link.target.edge not in inside:
+                    yield link.target.name, (number, at_m, at_m + link.length_m)

@@ -1,0 +1,206 @@
+"""The scenario of a corridor: its road, and a random demand like that of its vehicles."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.road_layout import END_OF_ROAD
+from laneweave.protocol.scenario.fields import (
+    CYCLE_STEP_S,
+    MAIN_ENTRANCE,
+    SHORTEST_CYCLE_S,
+    SLACK_S,
+    Closure,
+    Scenario,
+)
+from laneweave.protocol.structuring import structure
+from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
+from laneweave.protocol.vehicle.lane_ends import drive_out
+from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor, Ramp
+from laneweave.sim_bridge.corridors.sumo_demand import (
+    CorridorDemand,
+    Pass,
+    SumoType,
+    entrance_name,
+    type_names,
+)
+
+SPEED_SHARE = 0.9
+"""v_F as a share of the speed limit: vehicles that move to a cell ahead are faster."""
+SPARE_PITCH_M = 2.0
+"""Part of the column pitch that leaves room for moves to a cell ahead."""
+MAX_SETTLE_S = 8.0
+"""Time in which vehicles settle in their cells, if ramps are long enough."""
+_WIDE_M = 100.0
+"""A column pitch that suits all types."""
+Tables = dict[str, Any]
+
+
+def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
+    """Return the tables of a scenario file; they have not been checked against each other.
+
+    Vehicles arrive at random with the mean volumes of the simulation. v_F is 90 % of the lowest
+    speed limit, the column pitch the least that suits all types, and T_F long enough for cars to
+    move by one column.
+
+    Raises:
+        BadInputError: no vehicle enters at the start of the corridor, or it is too short.
+    """
+    main = _from(demand, MAIN_ENTRANCE)
+    if not main:
+        edge = corridor.edges[0].name
+        raise BadInputError(OPTION, corridor.name, f"a corridor that vehicles enter on {edge}")
+    names = type_names(demand.passes)
+    car, *others = names
+    per_hour = 3600.0 / demand.duration_s
+    ramps = [ramp for ramp in corridor.ramps if _from(demand, ramp.edge)]
+    tables: Tables = {
+        "road": {
+            "lanes": corridor.lanes,
+            "lane_width_m": corridor.lane_width_m,
+            "closures": [_closure(one, corridor, ramps) for one in corridor.closures],
+        },
+        "entrance": [
+            {
+                "name": entrance_name(ramp.edge),
+                "lane": ramp.lane,
+                "at_m": _m(ramp.at_m),
+                "merge_m": _m(ramp.merge_m),
+                "volume_veh_per_h": round(per_hour * len(_from(demand, ramp.edge)), 1),
+                "destinations": _destinations(_from(demand, ramp.edge)),
+                "vehicle_types": [
+                    {"type": names[one], "share": share}
+                    for one, share in _shares_of_types(_from(demand, ramp.edge)).items()
+                    if one != car
+                ],
+            }
+            for ramp in ramps
+        ],
+        "exit": [
+            {"name": entrance_name(one.edge), "lanes": list(one.lanes), "at_m": _m(one.at_m)}
+            for one in corridor.ways_out
+        ],
+        "demand": {
+            "volume_veh_per_lane_h": round(per_hour * len(main) / _first_lanes(corridor), 1),
+            "duration_s": float(math.ceil(demand.duration_s)),
+            "destinations": _destinations(main),
+        },
+        "vehicle": _limits(car) | {"max_speed_mps": round(car.max_speed_mps, 2)},
+        "vehicle_type": [
+            {"name": names[one], "share": _shares_of_types(main).get(one, 0.0), **_limits(one)}
+            for one in others
+        ],
+    }
+    fastest_mps = min(corridor.speed_mps, *(one.max_speed_mps for one in names))
+    tables["formation"] = _motion(
+        tables, corridor, math.floor(2.0 * SPEED_SHARE * fastest_mps) / 2.0
+    )
+    formation = tables["formation"]
+    settled_m = _m(formation["speed_mps"] * formation["settle_s"])
+    if settled_m >= corridor.length_m:
+        raise BadInputError(OPTION, corridor.name, f"a corridor longer than {settled_m:g} m")
+    tables["road"] |= {"s1_m": settled_m, "s2_m": 0.0, "s3_m": _m(corridor.length_m - settled_m)}
+    filled = {name: table for name, table in tables.items() if table}
+    return {"schema": "laneweave.scenario/1", **filled}
+
+
+def _from(demand: CorridorDemand, entrance: str) -> list[Pass]:
+    return [one for one in demand.passes if one.entrance == entrance]
+
+
+def _m(position_m: float) -> float:
+    return round(position_m, 2)
+
+
+def _first_lanes(corridor: Corridor) -> int:
+    """Return the number of lanes that are open at the start."""
+    return corridor.lanes - sum(one.from_m <= 0.0 for one in corridor.closures)
+
+
+def _closure(closure: Closure, corridor: Corridor, ramps: Sequence[Ramp]) -> dict[str, Any]:
+    """Return the table of a closed part; a ramp that nobody uses is closed."""
+    to_m = closure.to_m
+    for ramp in corridor.ramps:
+        if (ramp.lane, ramp.at_m) == (closure.lane, to_m) and ramp not in ramps:
+            to_m = ramp.merge_m
+    table: dict[str, Any] = {"lane": closure.lane}
+    table |= {"from_m": _m(closure.from_m)} if closure.from_m > 0.0 else {}
+    return table | ({"to_m": _m(to_m)} if to_m < corridor.length_m else {})
+
+
+def _destinations(passes: Sequence[Pass]) -> list[dict[str, Any]]:
+    counts = Counter(one.destination for one in passes)
+    return [
+        {"exit": entrance_name(edge), "share": round(count / len(passes), 4)}
+        for edge, count in sorted(counts.items())
+        if edge != END_OF_ROAD
+    ]
+
+
+def _shares_of_types(passes: Sequence[Pass]) -> Mapping[SumoType, float]:
+    counts = Counter(one.vehicle.vehicle_type for one in passes)
+    return {kind: round(count / len(passes), 4) for kind, count in counts.items()}
+
+
+def _limits(kind: SumoType) -> dict[str, float]:
+    return {
+        "length_m": round(kind.length_m, 2),
+        "width_m": round(kind.width_m, 2),
+        "max_accel_mps2": round(kind.max_accel_mps2, 2),
+        "min_accel_mps2": round(kind.min_accel_mps2, 2),
+    }
+
+
+def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, Any]:
+    """Return the table `formation`."""
+    formation = {
+        "operation": "rolling",
+        "speed_mps": speed_mps,
+        "change_columns": False,
+        "sort_in_s2": True,
+    }
+    kinds = {name: tables[name] for name in ("road", "vehicle", "vehicle_type")}
+    wide = structure({"formation": formation | {"gap_m": _WIDE_M}, **kinds}, Scenario)
+    pitch_m = math.ceil(max(min_pitch_m(own) for own in wide.types.values()) + SPARE_PITCH_M)
+    ramps_m = (one["merge_m"] - one["at_m"] for one in tables["entrance"])
+    settle_s = min([MAX_SETTLE_S, *(length_m / speed_mps for length_m in ramps_m)])
+    formation |= {"gap_m": float(pitch_m), "settle_s": math.floor(10.0 * settle_s) / 10.0}
+    found = structure({"formation": formation, **kinds}, Scenario)
+    return formation | {"cycle_s": _cycle_s(found, corridor)}
+
+
+def _cycle_s(scenario: Scenario, corridor: Corridor) -> float:
+    """Return the longest T_F with which vehicles reach all exits, or the shortest possible one.
+
+    The minimum-jerk motion over d in T has a peak acceleration of 10/sqrt(3) d/T^2 and a peak jerk
+    of 60 d/T^3; vehicles use at most 90 % of their limits.
+    """
+    lane_m, limits = scenario.road.lane_width_m, [one.vehicle for one in scenario.types.values()]
+    accel_mps2 = 0.9 * min(one.max_lateral_accel_mps2 for one in limits)
+    jerk_mps3 = 0.9 * min(one.max_lateral_jerk_mps3 for one in limits)
+    move_s = max(
+        math.sqrt(10.0 / math.sqrt(3.0) * lane_m / accel_mps2), math.cbrt(60.0 * lane_m / jerk_mps3)
+    )
+    shortest_s = CYCLE_STEP_S * math.ceil((move_s + SLACK_S) / CYCLE_STEP_S)
+    needed_m = drive_out(scenario).room_m + scenario.longest_body_m
+    opens_m = {
+        one.at_m: max(
+            (each.to_m for each in corridor.closures if each.lane == lane and each.to_m < one.at_m),
+            default=-math.inf,
+        )
+        for one in corridor.ways_out
+        for lane in one.lanes
+    }
+    longest_s = min(
+        (
+            (at_m - opened_m - needed_m) / scenario.formation.speed_mps
+            for at_m, opened_m in opens_m.items()
+        ),
+        default=SHORTEST_CYCLE_S,
+    )
+    steps = math.floor(min(longest_s, SHORTEST_CYCLE_S) / CYCLE_STEP_S + 1e-9)
+    return round(max(CYCLE_STEP_S * steps, shortest_s), 1)

@@ -1,0 +1,71 @@
+"""SUMO drives all vehicles of a corridor itself: what laneweave is compared with.
+
+The vehicles are the same. Those that depart on the corridor's first edge do so at its start, in
+the lane that suits them best, whatever their files say: otherwise their trips would not be as long
+as with laneweave.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from laneweave.protocol.scenario.fields import MAIN_ENTRANCE
+from laneweave.sim_bridge.corridors.corridor_arrivals import MAX_WAIT_S, CorridorSetup
+from laneweave.sim_bridge.corridors.sumo_config import sumo_command
+from laneweave.sim_bridge.sumo.simulation import SumoProcess
+
+
+def drive_alone(
+    setup: CorridorSetup,
+    seed: int,
+    folder: Path,
+    results: Path,
+    progress: Callable[[float], None] = lambda _: None,
+) -> None:
+    """Run a simulation in which SUMO drives all vehicles, and write its statistics.
+
+    Args:
+        setup: network, demand, corridor.
+        seed: SUMO's seed.
+        folder: folder for temporary files.
+        results: folder for SUMO's statistics.
+        progress: called with the share of the simulated time that has passed.
+
+    Raises:
+        SumoUnavailableError: libsumo cannot be loaded.
+        SumoFailedError: SUMO rejects a file.
+    """
+    config = setup.config
+    command = sumo_command(config, config.step_s, seed, folder, results)
+    waiting = {
+        one.origin.vehicle.name: one.origin.vehicle
+        for one in setup.arrivals
+        if one.origin.entrance == MAIN_ENTRANCE
+    }
+    awaited = {one.origin.vehicle.name for one in setup.arrivals}
+    end_s = config.begin_s + setup.duration_s + MAX_WAIT_S
+    with SumoProcess(command) as sumo:
+        while True:
+            for name in sumo.simulation.getLoadedIDList():
+                vehicle = waiting.pop(name, None)
+                if vehicle is not None or name in setup.unserved:
+                    sumo.vehicle.remove(name)
+                if vehicle is not None:
+                    route = f"laneweave.{name}"
+                    sumo.route.add(route, list(vehicle.route))
+                    sumo.vehicle.add(
+                        name,
+                        route,
+                        typeID=vehicle.type_name,
+                        depart=f"{vehicle.depart_s:g}",
+                        departLane="best",
+                        departPos="base",
+                        departSpeed="max",
+                    )
+            now_s = sumo.simulation.getTime()
+            if now_s >= end_s or not awaited:
+                return
+            sumo.step()
+            awaited.difference_update(sumo.simulation.getArrivedIDList())
+            progress((now_s - config.begin_s) / (end_s - config.begin_s))

@@ -1,0 +1,89 @@
+"""Where the vehicles of a run come from: drawn arrivals, or a SUMO simulation of the user."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from attrs import frozen
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.sim_bridge.corridors.corridor_arrivals import main_stream
+from laneweave.sim_bridge.corridors.corridor_ramps import CorridorRamps
+from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor, read_corridor
+from laneweave.sim_bridge.corridors.corridor_world import CorridorWorld
+from laneweave.sim_bridge.road.demand import Arrival, arrivals
+from laneweave.sim_bridge.road.ramp_traffic import RampTraffic
+from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
+from laneweave.sim_bridge.world_interface import World
+
+TOLERANCE_M = 0.1
+"""Maximum difference between the road of a scenario and that of its corridor."""
+
+
+@frozen
+class RoadSource:
+    """A world, and the vehicles that come to it."""
+
+    world: World
+    stream: tuple[Arrival, ...] | None = None
+    """The arrivals, by time; None: drawn from the scenario's seed."""
+    ramp_traffic: RampTraffic | None = None
+
+
+@contextmanager
+def open_road(scenario: Scenario, results: Path) -> Iterator[RoadSource]:
+    """Open the world of a scenario.
+
+    Args:
+        scenario: road, demand, vehicles.
+        results: the run's folder, for SUMO's own statistics.
+
+    Raises:
+        BadInputError: the SUMO simulation cannot be read, or has another road.
+        CommandFailedError: libsumo cannot be loaded, or SUMO rejects a file.
+    """
+    with tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as name:
+        folder = Path(name)
+        if not scenario.sumo.config:
+            with SumoWorld(scenario, folder) as world:
+                yield RoadSource(world)
+            return
+        setup = sumo_corridor(scenario, folder).setup(scenario)
+        speeds_mps = {ramp.lane: ramp.speed_mps for ramp in setup.corridor.ramps}
+        with CorridorWorld(scenario, setup, folder, results) as world_of_sumo:
+            ramps = CorridorRamps(scenario, world_of_sumo, speeds_mps)
+            yield RoadSource(world_of_sumo, tuple(main_stream(setup.arrivals)), ramps)
+            world_of_sumo.drive_on()
+
+
+def demanded(scenario: Scenario) -> tuple[Arrival, ...]:
+    """Return all vehicles that may arrive; those from SUMO with the times of their departures."""
+    if not scenario.sumo.config:
+        return arrivals(scenario)
+    with tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as folder:
+        setup = sumo_corridor(scenario, Path(folder)).setup(scenario)
+    return tuple(one.arrival for one in setup.arrivals)
+
+
+def sumo_corridor(scenario: Scenario, folder: Path) -> SumoCorridor:
+    """Return the corridor of a scenario, whose road must be that of the corridor.
+
+    Raises:
+        BadInputError: the simulation cannot be read, or has another road.
+    """
+    sumo = scenario.sumo
+    found = read_corridor(Path(sumo.config), sumo.corridor, folder, scenario.seed)
+    corridor, road = found.corridor, scenario.road
+    for field, value, expected in (
+        ("road.lanes", road.lanes, corridor.lanes),
+        ("road.lane_width_m", road.lane_width_m, corridor.lane_width_m),
+        ("road.s1_m + s2_m + s3_m", road.length_m, corridor.length_m),
+    ):
+        if abs(value - expected) > TOLERANCE_M:
+            allowed = f"{expected:g}, as the corridor {sumo.corridor} has"
+            raise BadInputError(field, value, allowed)
+    return found

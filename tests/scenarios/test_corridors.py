@@ -1,0 +1,123 @@
+"""A corridor of a SUMO simulation as a whole: SUMO, bridge, agents, coordinators in one process."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from laneweave.launch.cli.corridor_command import corridor_tables
+from laneweave.launch.recordings.trajectories import read_trips
+from laneweave.launch.report.corridor_comparison import compare
+from laneweave.launch.run.simulated_run import SimulatedRun
+from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
+from laneweave.sim_bridge.corridors.sumo_statistics import read_statistics
+from support.interchange import CORRIDOR, TRUCKS, stream, vehicle, write_interchange
+
+Events = list[dict[str, Any]]
+
+
+def scenario(folder: Path, vehicles: Sequence[str]) -> Scenario:
+    config = write_interchange(folder, vehicles, types=TRUCKS)
+    found = read_corridor(config, CORRIDOR, folder)
+    return parse_scenario(corridor_tables(found, config, CORRIDOR))
+
+
+def drive(own: Scenario, folder: Path) -> tuple[dict[str, Any], Events]:
+    outcome = SimulatedRun(own, folder, show_progress=False).run()
+    assert not outcome.problems
+    events = (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()
+    return json.loads((folder / "summary.json").read_text()), [*map(json.loads, events)]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path, dict[str, Any], Events]:
+    files, folder = tmp_path_factory.mktemp("files"), tmp_path_factory.mktemp("run")
+    own = scenario(files, stream(50))
+    return own, folder, *drive(own, folder)
+
+
+def test_everybody_gets_where_the_route_leads(
+    run: tuple[Scenario, Path, dict[str, Any], Events],
+) -> None:
+    _, folder, summary, events = run
+    assert summary["vehicles"]["left"] == summary["vehicles"]["demanded"] == 59
+    assert summary["vehicles"]["at_destination"] == 59
+    assert summary["safety"]["overlaps"] == summary["safety"]["sumo_collisions"] == 0
+    assert summary["tracking"]["emergency_ticks"] == 0
+    assert summary["safety"]["min_gap_m"] >= 8.0
+    kinds = {event["kind"] for event in events}
+    assert kinds.isdisjoint({"left-lattice", "missed-exit", "agent-missing", "planning-failed"})
+    trips = read_trips(folder).values()
+    assert {trip["sumo_id"] for trip in trips} == {
+        *(f"m#{second}" for second in range(50)),
+        *(f"r.{second}" for second in range(0, 50, 6)),
+    }
+
+
+def test_sumo_counts_the_same_trips(
+    run: tuple[Scenario, Path, dict[str, Any], Events],
+) -> None:
+    own, folder, _, _ = run
+    found = read_statistics(folder)
+    assert (found.collisions, found.teleports) == (0, 0)
+    for trip in read_trips(folder).values():
+        sumos = found.trips[trip["sumo_id"]]
+        if trip["entrance"] == MAIN_ENTRANCE:
+            assert sumos.depart_s == pytest.approx(trip["entered_s"], abs=0.15)
+        if trip["destination"] == "end":
+            # SUMO lets vehicles arrive at the end of the last edge.
+            after_s = sumos.arrival_s - trip["left_s"]
+            assert 0.0 <= after_s <= 4.0 / own.formation.speed_mps + 0.3
+        assert sumos.fuel_g is not None
+
+
+def test_sumo_drives_the_same_vehicles_alone(
+    run: tuple[Scenario, Path, dict[str, Any], Events],
+) -> None:
+    own, folder, _, _ = run
+    routes = compare(own, folder)
+    counts = {(one.entrance, one.destination): (one.vehicles, *one.arrived) for one in routes}
+    assert counts == {
+        (MAIN_ENTRANCE, "end"): (44, 44, 44),
+        (MAIN_ENTRANCE, "off"): (6, 6, 6),
+        ("on", "end"): (9, 9, 9),
+    }
+    for one in routes:
+        ours_s, sumos_s = one.mean_s
+        assert ours_s is not None
+        assert sumos_s is not None
+        assert math.isclose(ours_s, sumos_s, rel_tol=0.15)
+    page = (folder / "comparison.html").read_text(encoding="utf-8")
+    assert "start of the corridor" in page
+    assert "SUMO alone" in page
+
+
+def test_equal_runs_are_equal(tmp_path: Path) -> None:
+    own = scenario(tmp_path, stream(8))
+    folders = [tmp_path / name for name in ("one", "two")]
+    for folder in folders:
+        drive(own, folder)
+    one, two = (read_trips(folder) for folder in folders)
+    assert one == two
+
+
+def test_a_queue_behind_the_exit_is_braked_for(tmp_path: Path) -> None:
+    standing = (
+        '<vehicle id="standing" type="car" depart="0" departPos="20"><route edges="off"/>'
+        '<stop lane="off_0" endPos="25" duration="60"/></vehicle>'
+    )
+    leaving = [vehicle(f"e{n}", 4.0 * n, "exit") for n in range(6)]
+    own = scenario(tmp_path, [standing, *leaving, vehicle("m", 24.0, "main")])
+    summary, _ = drive(own, tmp_path / "run")
+    assert summary["safety"]["overlaps"] == summary["safety"]["sumo_collisions"] == 0
+    assert summary["vehicles"]["left"] == summary["vehicles"]["at_destination"] == 7
+    trips = {trip["sumo_id"]: trip for trip in read_trips(tmp_path / "run").values()}
+    # The queue reaches back into the corridor until the first vehicle has stood for 60 s.
+    assert trips["e5"]["left_s"] > 60.0

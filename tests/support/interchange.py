@@ -1,0 +1,148 @@
+"""A small motorway interchange as a SUMO simulation: an exit, and behind it an on-ramp.
+
+    main1 (700 m, 3 lanes) -> main2 (250 m, 4: lane 0 leads to the exit) -> main3 (160 m, 3)
+    -> main4 (250 m, 4: lane 0 comes from the ramp, and ends) -> main5 (600 m, 3)
+
+The main road is straight, to the east; the exit and the ramp are beside it. The files are written
+without netconvert, like those of `sim_bridge.sumo.network`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from attrs import frozen
+
+LANE_M = 3.2
+CORRIDOR = "main1:main5"
+MAIN_SPEED_MPS, RAMP_SPEED_MPS = 27.78, 22.22
+
+
+@frozen
+class _Edge:
+    name: str
+    origin: str
+    destination: str
+    from_m: float
+    to_m: float
+    lanes: Sequence[float]
+    """Centre lines of its lanes, from the right [m]."""
+    speed_mps: float = MAIN_SPEED_MPS
+    right_of_way: str = "M"
+
+
+def _centres(first: int, count: int, shift_m: float = 0.0) -> tuple[float, ...]:
+    return tuple((lane + 0.5) * LANE_M + shift_m for lane in range(first, first + count))
+
+
+EDGES = (
+    _Edge("main1", "A", "B", 0.0, 700.0, _centres(1, 3)),
+    _Edge("main2", "B", "C", 700.0, 950.0, _centres(0, 4)),
+    _Edge("main3", "C", "D", 950.0, 1110.0, _centres(1, 3)),
+    _Edge("main4", "D", "E", 1110.0, 1360.0, _centres(0, 4)),
+    _Edge("main5", "E", "F", 1360.0, 1960.0, _centres(1, 3)),
+    _Edge("off", "C", "G", 950.0, 1250.0, _centres(0, 1, -20.0), RAMP_SPEED_MPS),
+    _Edge("before", "H", "I", 510.0, 810.0, _centres(0, 1, -40.0), RAMP_SPEED_MPS),
+    _Edge("on", "I", "D", 810.0, 1110.0, _centres(0, 1, -40.0), RAMP_SPEED_MPS),
+)
+LINKS = (
+    *(("main1", lane, "main2", lane + 1) for lane in range(3)),
+    *(("main2", lane + 1, "main3", lane) for lane in range(3)),
+    ("main2", 0, "off", 0),
+    *(("main3", lane, "main4", lane + 1) for lane in range(3)),
+    ("on", 0, "main4", 0),
+    *(("main4", lane + 1, "main5", lane) for lane in range(3)),
+    ("before", 0, "on", 0),
+)
+
+
+def write_interchange(
+    folder: Path, vehicles: Sequence[str] = (), *, types: str = "", state: str = "M"
+) -> Path:
+    """Write the files of the simulation, and return its configuration.
+
+    Args:
+        folder: their folder.
+        vehicles: XML elements of vehicles, in order of departure.
+        types: XML elements of types; the type `car` always exists.
+        state: right of way of the link from main4 to main5.
+    """
+    (folder / "small.net.xml").write_text("\n".join(_network(state)), encoding="utf-8")
+    routes = ["<routes>", '<vType id="car" sigma="0"/>', types, *vehicles, "</routes>"]
+    (folder / "small.rou.xml").write_text("\n".join(routes), encoding="utf-8")
+    config = folder / "small.sumocfg"
+    config.write_text(
+        "<configuration><input>"
+        '<net-file value="small.net.xml"/><route-files value="small.rou.xml"/>'
+        '</input><time><begin value="0"/><end value="300"/><step-length value="0.5"/></time>'
+        "</configuration>",
+        encoding="utf-8",
+    )
+    return config
+
+
+def vehicle(name: str, depart_s: float, route: str, kind: str = "car") -> str:
+    """Return the XML element of a vehicle; `route` is `main`, `exit` or `ramp`."""
+    edges = {
+        "main": "main1 main2 main3 main4 main5",
+        "exit": "main1 main2 off",
+        "ramp": "before on main4 main5",
+        "inside": "main3 main4 main5",
+    }[route]
+    return (
+        f'<vehicle id="{name}" type="{kind}" depart="{depart_s:g}" departSpeed="max">'
+        f'<route edges="{edges}"/></vehicle>'
+    )
+
+
+def stream(duration_s: int) -> list[str]:
+    """Return a mixed stream of vehicles: one per second on the main road, some by the ramp."""
+    found = []
+    for second in range(duration_s):
+        kind = "truck" if second % 7 == 3 else "car"
+        found.append(vehicle(f"m#{second}", second, "exit" if second % 9 == 4 else "main", kind))
+        if second % 6 == 0:
+            found.append(vehicle(f"r.{second}", second, "ramp"))
+    return found
+
+
+TRUCKS = '<vType id="truck" vClass="truck" length="7.1" accel="1.3" decel="4" sigma="0"/>'
+
+
+def _network(state: str) -> Iterator[str]:
+    yield '<net version="1.20">'
+    yield '<location netOffset="0,0" convBoundary="0,-60,1960,20" origBoundary="0,-60,1960,20"'
+    yield ' projParameter="!"/>'
+    for edge in EDGES:
+        yield f'<edge id="{edge.name}" from="{edge.origin}" to="{edge.destination}" priority="1">'
+        for index, y_m in enumerate(edge.lanes):
+            yield (
+                f'<lane id="{edge.name}_{index}" index="{index}" speed="{edge.speed_mps}"'
+                f' length="{edge.to_m - edge.from_m}" width="{LANE_M}"'
+                f' shape="{edge.from_m},{y_m} {edge.to_m},{y_m}"/>'
+            )
+        yield "</edge>"
+    nodes = {edge.origin: edge.from_m for edge in EDGES}
+    nodes |= {edge.destination: edge.to_m for edge in EDGES}
+    for node, x_m in nodes.items():
+        coming = [edge for edge in EDGES if edge.destination == node]
+        names = " ".join(
+            f"{edge.name}_{lane}" for edge in coming for lane in range(len(edge.lanes))
+        )
+        count = sum(before in {edge.name for edge in coming} for before, *_ in LINKS)
+        yield (
+            f'<junction id="{node}" type="{"priority" if count else "dead_end"}" x="{x_m}" y="20"'
+            f' incLanes="{names}" intLanes="" shape="{x_m},-60 {x_m},20">'
+        )
+        for number in range(count):
+            none = "0" * count
+            yield f'<request index="{number}" response="{none}" foes="{none}" cont="0"/>'
+        yield "</junction>"
+    for before, from_lane, after, to_lane in LINKS:
+        right = state if after == "main5" else "M"
+        yield (
+            f'<connection from="{before}" to="{after}" fromLane="{from_lane}" toLane="{to_lane}"'
+            f' dir="s" state="{right}"/>'
+        )
+    yield "</net>"

@@ -1,0 +1,117 @@
+"""Which road a corridor of a SUMO network is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.fields import Closure
+from laneweave.sim_bridge.corridors.corridor import HANDOVER_M, MIN_AT_M, corridor_of
+from laneweave.sim_bridge.corridors.corridor_search import find_corridors
+from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
+from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
+from laneweave.sim_bridge.corridors.sumo_config import read_config
+from laneweave.sim_bridge.corridors.sumo_demand import SumoDemand
+from laneweave.sim_bridge.corridors.sumo_network import Network, read_network
+from support.interchange import CORRIDOR, RAMP_SPEED_MPS, TRUCKS, stream, vehicle, write_interchange
+
+
+def network(folder: Path, state: str = "M") -> Network:
+    return read_network(read_config(write_interchange(folder, state=state)).net_file)
+
+
+def test_lanes_of_edges_are_joined_by_their_links(tmp_path: Path) -> None:
+    corridor = corridor_of(network(tmp_path), "main1", "main5")
+    assert [(one.name, one.first_lane, one.lanes) for one in corridor.edges] == [
+        ("main1", 1, 3),
+        ("main2", 0, 4),
+        ("main3", 1, 3),
+        ("main4", 0, 4),
+        ("main5", 1, 3),
+    ]
+    assert (corridor.lanes, corridor.length_m) == (4, 1960.0 - HANDOVER_M)
+    assert not corridor.unused
+
+
+def test_a_lane_from_outside_is_a_ramp_and_a_lane_that_leads_out_an_exit(tmp_path: Path) -> None:
+    corridor = corridor_of(network(tmp_path), "main1", "main5")
+    (ramp,), (exit_,) = corridor.ramps, corridor.ways_out
+    assert (ramp.edge, ramp.to_edge, ramp.lane, ramp.merge_m) == ("on", "main4", 0, 1110.0)
+    assert ramp.speed_mps == RAMP_SPEED_MPS
+    # It begins behind the exit in the same lane, though its edges are longer.
+    assert exit_.at_m == 950.0 - HANDOVER_M < ramp.at_m < ramp.merge_m - 100.0
+    assert (exit_.edge, exit_.from_edge, exit_.lanes) == ("off", "main2", (0,))
+    assert corridor.closures == (
+        Closure(0, 0.0, 700.0),
+        Closure(0, exit_.at_m, ramp.at_m),
+        Closure(0, 1360.0),
+    )
+
+
+def test_a_part_of_the_edges_is_a_corridor_too(tmp_path: Path) -> None:
+    corridor = corridor_of(network(tmp_path), "main3", "main5")
+    assert [edge.from_m for edge in corridor.edges] == [0.0, 160.0, 410.0]
+    assert corridor.ramps[0].at_m == MIN_AT_M
+    assert not corridor.ways_out
+    single = corridor_of(network(tmp_path), "main1", "main1")
+    assert (single.lanes, single.closures, single.ramps) == (3, (), ())
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("main1", "FIRST_EDGE:LAST_EDGE"),
+        ("main1:", "FIRST_EDGE:LAST_EDGE"),
+        ("main1:nowhere", "two edges of the network"),
+        ("main5:main1", "0 edges can be reached from main5"),
+    ],
+)
+def test_an_impossible_corridor_is_refused(tmp_path: Path, name: str, expected: str) -> None:
+    config = write_interchange(tmp_path, stream(3), types=TRUCKS)
+    with pytest.raises(BadInputError, match=expected):
+        read_corridor(config, name, tmp_path)
+
+
+def test_vehicles_of_a_corridor_do_not_give_way(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="its state is 'm'"):
+        corridor_of(network(tmp_path, state="m"), "main1", "main5")
+
+
+@pytest.mark.parametrize("text", ["", "<net", "<routes/>"])
+def test_a_file_that_is_no_network_is_refused(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "x.net.xml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(BadInputError, match="net-file"):
+        read_network(file)
+
+
+def test_the_longest_chain_with_priority_is_found(tmp_path: Path) -> None:
+    nobody = SumoDemand((), 0.0, 1.0)
+    (found,) = find_corridors(network(tmp_path), nobody)
+    assert found.name == CORRIDOR
+    assert found.volume_veh_per_h == 0.0
+    parts = {one.name for one in find_corridors(network(tmp_path, state="m"), nobody)}
+    assert parts == {"main1:main4", "main5:main5"}
+
+
+def test_the_tables_are_a_valid_scenario(tmp_path: Path) -> None:
+    found = read_corridor(write_interchange(tmp_path, stream(90), types=TRUCKS), CORRIDOR, tmp_path)
+    scenario = parse_scenario(scenario_tables(found.corridor, found.demand))
+    assert scenario.shared_exit_lanes == {0}
+    assert scenario.formation.speed_mps == 25.0
+    assert not scenario.formation.change_columns
+    truck = scenario.types["truck"].vehicle
+    assert (truck.length_m, truck.max_accel_mps2) == (7.1, 1.3)
+    # SUMO's trucks brake with 7 m/s2 in an emergency.
+    assert truck.min_accel_mps2 == -7.0
+    assert scenario.entrance[0].volume_veh_per_h == pytest.approx(600.0, rel=0.05)
+
+
+def test_a_corridor_that_nobody_enters_at_its_start_is_refused(tmp_path: Path) -> None:
+    config = write_interchange(tmp_path, [vehicle("r", 0.0, "ramp")])
+    found = read_corridor(config, CORRIDOR, tmp_path)
+    with pytest.raises(BadInputError, match="a corridor that vehicles enter on main1"):
+        scenario_tables(found.corridor, found.demand)
