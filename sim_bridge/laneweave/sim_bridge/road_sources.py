@@ -20,7 +20,7 @@ from laneweave.sim_bridge.road.ramp_traffic import RampTraffic
 from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 from laneweave.sim_bridge.world_interface import World
 
-TOLERANCE_M = 0.1
+TOLERANCE_M = 0.05
 """Maximum difference between the road of a scenario and that of its corridor."""
 
 
