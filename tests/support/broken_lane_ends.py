@@ -24,7 +24,7 @@ accept_command = MotionController.accept_command
 
 def never_leaves(patch: pytest.MonkeyPatch) -> None:
     """A vehicle whose cell has passed the stop line stays in it."""
-    patch.setattr(LaneEnds, "has_passed", lambda *_: False)
+    patch.setattr(LaneEnds, "has_passed", lambda *_, **_more: False)
 
 
 def agents_move_vehicles_without_cells(patch: pytest.MonkeyPatch) -> None:

@@ -62,10 +62,14 @@ def show_bodies(
     accels_mps2: dict[str, float] = {name: state[2] for name, state in states.items()}
     neighbours = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels_mps2)
     touching = []
-    if others := world.others():
+    exits_m = [(lane, one.at_m) for one in scenario.exit for lane in one.lanes]
+    others = world.others()
+    if exits_m or others:
         for name, vehicle in vehicles.items():
-            seen, touched = _behind_exits(vehicle, others, neighbours[name][0], scenario)
-            neighbours[name] = seen, neighbours[name][1]
+            ahead, behind = neighbours[name]
+            ahead = _before_exits(vehicle, ahead, exits_m)
+            seen, touched = _behind_exits(vehicle, others, ahead, scenario)
+            neighbours[name] = seen, behind
             touching += [(name, other) for other in touched]
     for name, vehicle in vehicles.items():
         vehicle.perceive(neighbours[name])
@@ -80,6 +84,24 @@ def show_bodies(
         collisions=world.collisions(),
         gaps=bodies.min_gaps(),
     )
+
+
+def _before_exits(
+    vehicle: RoadVehicle, ahead: Sequence[ExactNeighbour], exits_m: Sequence[tuple[int, float]]
+) -> list[ExactNeighbour]:
+    """Return the neighbours ahead without those behind an exit, in the lane of a ramp.
+
+    Args:
+        vehicle: the vehicle that sees them.
+        ahead: its neighbours ahead.
+        exits_m: lane and position of each exit.
+    """
+    s_m = vehicle.state[0]
+    return [
+        other
+        for other in ahead
+        if not any(lane == other[0] and s_m <= at_m < s_m + other[1] for lane, at_m in exits_m)
+    ]
 
 
 def _behind_exits(

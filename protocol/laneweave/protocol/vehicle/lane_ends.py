@@ -108,22 +108,25 @@ class LaneEnds:
         """Return the exit of the section in which a position is, or which it has passed."""
         return _end_ahead(self._exits, lane, s_m)
 
-    def has_passed(self, cell: Cell, t_s: float, since_s: float | None = None) -> bool:
+    def has_passed(
+        self, cell: Cell, t_s: float, since_s: float | None = None, body_m: float | None = None
+    ) -> bool:
         """Return whether a cell has passed the stop line of its section.
 
         Args:
             cell: the cell.
             t_s: road time.
             since_s: road time at which the cell is in the section; None: `t_s`.
+            body_m: a position in the section, instead of that of the cell.
         """
-        return self._has_passed_line(self.ahead, cell, t_s, since_s)
+        return self._has_passed_line(self.ahead, cell, t_s, since_s, body_m)
 
     def ends_changes(self, cell: Cell, t_s: float, since_s: float | None = None) -> bool:
         """Return whether a cell is where lane changes have ended before an exit.
 
         The arguments are those of `has_passed`.
         """
-        return self._has_passed_line(self.exit_ahead, cell, t_s, since_s)
+        return self._has_passed_line(self.exit_ahead, cell, t_s, since_s, None)
 
     def _has_passed_line(
         self,
@@ -131,10 +134,13 @@ class LaneEnds:
         cell: Cell,
         t_s: float,
         since_s: float | None,
+        body_m: float | None,
     ) -> bool:
         """Return whether a cell has passed the line of the end that is found for its section."""
         (column, lane), cell_s_m = cell, self._lattice.cell_s_m
-        end = find(lane, cell_s_m(column, t_s if since_s is None else since_s))
+        if body_m is None:
+            body_m = cell_s_m(column, t_s if since_s is None else since_s)
+        end = find(lane, body_m)
         return end is not None and cell_s_m(column, t_s) > end.line_m
 
     def too_late_to_move(self, origin: Cell, target: Cell, t_s: float) -> bool:

@@ -177,7 +177,9 @@ class MotionController:
             return False
         if not self.rolling and self._straddles and self.measured[1] > STANDING_MPS:
             return False
-        return self._lane_ends.has_passed((self.hold_cell[0], self._body_lane), t_s)
+        # Behind an exit the lane may belong to a ramp, to whose end the body does not come.
+        cell = self.hold_cell[0], self._body_lane
+        return self._lane_ends.has_passed(cell, t_s, body_m=self.measured[0])
 
     @property
     def _straddles(self) -> bool:

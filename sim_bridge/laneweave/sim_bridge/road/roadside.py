@@ -181,10 +181,10 @@ class Roadside:
     def _with_ownerless(self, admission: Admission) -> Admission:
         """Add cells beside a vehicle from a ramp that have never had an owner.
 
-        Without an owner no vehicle could enter them.
+        Without an owner no vehicle could enter them. A vehicle that changes columns reaches others.
         """
         column, lane = admission.cell
-        if self._entry_m[lane] <= 0.0:
+        if self._entry_m[lane] <= 0.0 or not self._keep_columns:
             return admission
         beside = [(column, other) for other in range(self._lanes) if other != lane]
         free = [cell for cell in beside if self._is_ownerless(cell)]

@@ -10,10 +10,16 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE
+from laneweave.protocol.vehicle.lane_ends import dead_ends
+from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import Ballot, Name, PendingTransfer
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
+from laneweave.sim_bridge.bodies.plant import Plant
+from laneweave.sim_bridge.bodies.sensors import Sensors
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from laneweave.sim_bridge.world_interface import show_bodies
 from support.closed_lanes import LonelyRoad
 from support.road_vehicles import vehicle_in
 
@@ -177,3 +183,69 @@ def test_a_vehicle_enters_after_those_of_its_column_that_leave_before() -> None:
         assert meter.take(Arrival(f"z{lane}", lane, ANY_LANE, 13.0), later)
         assert not meter.take(Arrival(f"late{lane}", lane, ANY_LANE, 13.0), later)
     assert not meter.is_possible(on_ramp, later)
+
+
+def test_a_vehicle_that_stands_before_the_exit_does_not_wait_at_the_end_of_the_ramp() -> None:
+    (end,) = dead_ends(INTERCHANGE)
+    vehicle = vehicle_in((0, 0), "A", INTERCHANGE)
+    passed_s = LATTICE.passing_time_s(0, end.line_m) + 1.0
+    for s_m, lost in ((EXIT_M - 5.0, False), (RAMP_M + 50.0, True)):
+        state = (s_m, 0.0, 0.0, LATTICE.cell_y_m(0), 0.0, 0.0)
+        vehicle.controller.plant = Plant(state, INTERCHANGE.vehicle, INTERCHANGE.runtime.tick_s)
+        assert vehicle.controller.has_lost_cell(passed_s) == lost
+
+
+class Standing:
+    """A world that shows bodies where they are, and one behind the exit."""
+
+    def __init__(self, rear_m: float) -> None:
+        """Let a body stand with its rear there."""
+        self.at: dict[str, Pose] = {}
+        self.body = OtherBody("other", 0, EXIT_M, rear_m, 0.0, 0.0)
+
+    def place(self, vehicle: str, state: State) -> None:
+        self.at[vehicle] = pose_of(state)
+
+    def step(self) -> None:
+        """Do nothing."""
+
+    def positions(self) -> dict[str, Pose]:
+        return self.at
+
+    def others(self) -> list[OtherBody]:
+        return [self.body]
+
+    def collisions(self) -> list[tuple[str, str]]:
+        return []
+
+
+class Overlaps:
+    """A record that keeps the overlaps."""
+
+    def on_positions(self, t_s: float, vehicles: object, **measured: Any) -> None:  # noqa: ANN401
+        del t_s, vehicles
+        self.pairs = measured["overlaps"]
+
+
+@pytest.mark.parametrize(("rear_m", "touches"), [(EXIT_M + 3.0, False), (EXIT_M - 11.0, True)])
+def test_a_vehicle_before_the_exit_sees_what_is_behind_it_and_no_vehicle_on_the_ramp(
+    rear_m: float, *, touches: bool
+) -> None:
+    leaving, other, entering = (
+        vehicle_in((column, lane), name, INTERCHANGE)
+        for column, lane, name in ((0, 0, "A"), (0, 1, "B"), (3, 0, "C"))
+    )
+    t_s = LATTICE.passing_time_s(0, EXIT_M - 10.0)
+    for each in (leaving, other, entering):
+        rest = cell_state(LATTICE, each.cell, t_s)
+        each.controller.plant = Plant(rest, INTERCHANGE.vehicle, INTERCHANGE.runtime.tick_s)
+        each.sensors = Sensors(INTERCHANGE, each.name)
+    vehicles = {each.name: each for each in (leaving, other, entering)}
+    record = Overlaps()
+    show_bodies(Standing(rear_m), vehicles, INTERCHANGE, record, t_s)  # type: ignore[arg-type]
+    ahead = {one.lane: one for one in leaving.controller.neighbours.ahead}
+    # C is 45 m ahead in the same lane, but on the ramp; the body that stands is much nearer.
+    assert ahead[0].gap_m == pytest.approx(rear_m - (EXIT_M - 10.0), abs=0.5)
+    assert ahead[0].speed_mps == pytest.approx(0.0, abs=0.3)
+    assert 0 in {one.lane for one in other.controller.neighbours.ahead}
+    assert record.pairs == ([("A", "other")] if touches else [])
