@@ -8,13 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from laneweave.protocol.errors import BadInputError
 
 if TYPE_CHECKING:
+    from laneweave.sim_bridge.corridors.corridor import Corridor
     from laneweave.sim_bridge.corridors.corridor_search import Candidate
     from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor
+    from laneweave.sim_bridge.corridors.sumo_demand import CorridorDemand
 
 CORRIDOR_HELP = "The corridor's first and last edge."
 
@@ -87,12 +90,11 @@ def _list(sumocfg: Path, folder: Path) -> None:
 
 
 def _row(one: Candidate) -> tuple[str, ...]:
-    corridor = one.corridor
-    if corridor is None:
-        return (one.name, *[""] * 7, one.problem)
-    unused = f"{len(corridor.unused)} ways not used" if corridor.unused else ""
+    name, corridor = escape(one.name), one.corridor
+    if corridor is None or one.demand is None:
+        return (name, *[""] * 7, escape(one.problem))
     return (
-        one.name,
+        name,
         f"{len(corridor.edges)}",
         f"{corridor.lanes}",
         f"{corridor.length_m:.0f}",
@@ -100,28 +102,44 @@ def _row(one: Candidate) -> tuple[str, ...]:
         f"{len(corridor.ramps)}",
         f"{len(corridor.ways_out)}",
         f"{one.volume_veh_per_h:.0f}",
-        unused,
+        escape(_remark(corridor, one.demand)),
     )
+
+
+def _remark(corridor: Corridor, demand: CorridorDemand) -> str:
+    """Return why laneweave cannot drive a corridor, or what it does not use."""
+    from laneweave.protocol.config.scenario_files import parse_scenario
+    from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
+
+    try:
+        parse_scenario(scenario_tables(corridor, demand))
+    except BadInputError as error:
+        return str(error)
+    return f"{len(corridor.unused)} ways not used" if corridor.unused else ""
 
 
 def _describe(found: SumoCorridor, name: str) -> None:
     """Print what a corridor consists of."""
     corridor, demand = found.corridor, found.demand
     console = Console()
-    table = Table(title=f"corridor {name}: {corridor.lanes} lanes, {corridor.length_m:.0f} m")
+    table = Table(
+        title=f"corridor {escape(name)}: {corridor.lanes} lanes, {corridor.length_m:.0f} m"
+    )
     for column in ("edge", "from m", "to m", "lanes"):
         table.add_column(column, justify="left" if column == "edge" else "right")
     for edge in corridor.edges:
         lanes = f"{edge.first_lane} to {edge.first_lane + edge.lanes - 1}"
-        table.add_row(edge.name, f"{edge.from_m:.0f}", f"{edge.to_m:.0f}", lanes)
+        table.add_row(escape(edge.name), f"{edge.from_m:.0f}", f"{edge.to_m:.0f}", lanes)
     console.print(table)
     for ramp in corridor.ramps:
-        console.print(f"on-ramp from {ramp.edge} into lane {ramp.lane} at {ramp.merge_m:.0f} m")
+        console.print(
+            f"on-ramp from {escape(ramp.edge)} into lane {ramp.lane} at {ramp.merge_m:.0f} m"
+        )
     for exit_ in corridor.ways_out:
         lanes = ", ".join(map(str, exit_.lanes))
-        console.print(f"exit to {exit_.edge} from lane {lanes} at {exit_.at_m:.0f} m")
+        console.print(f"exit to {escape(exit_.edge)} from lane {lanes} at {exit_.at_m:.0f} m")
     for remark in corridor.unused:
-        console.print(f"not used: {remark}")
+        console.print(f"not used: {escape(remark)}")
     console.print(f"{len(demand.passes)} vehicles in {demand.duration_s:.0f} s drive through it")
     for reason, count in sorted(demand.missing.items()):
-        console.print(f"left out: {count} vehicles that {reason}")
+        console.print(f"left out: {count} vehicles that {escape(reason)}")

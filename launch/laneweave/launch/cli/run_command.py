@@ -196,7 +196,9 @@ def corridor_scenario(
     from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 
     with tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as folder:
-        found = read_corridor(sumocfg, corridor, Path(folder), seed or Scenario().seed)
+        found = read_corridor(
+            sumocfg, corridor, Path(folder), Scenario().seed if seed is None else seed
+        )
     return corridor_tables(found, sumocfg, corridor)
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean
 
 from attrs import frozen
 
-from laneweave.launch.recordings.trajectories import read_trips
 from laneweave.launch.report.page import Section, render_page
 from laneweave.launch.report.tables import Table
 from laneweave.protocol.files import write_atomically
@@ -19,7 +18,6 @@ from laneweave.sim_bridge.corridors.corridor_arrivals import CorridorArrival
 from laneweave.sim_bridge.corridors.sumo_alone import drive_alone
 from laneweave.sim_bridge.corridors.sumo_statistics import (
     SumoStatistics,
-    SumoTrip,
     read_statistics,
 )
 from laneweave.sim_bridge.road_sources import sumo_corridor
@@ -59,8 +57,7 @@ def compare(
         setup = sumo_corridor(scenario, Path(name)).setup(scenario)
         drive_alone(setup, scenario.seed, Path(name), alone, progress)
     found = read_statistics(folder), read_statistics(alone)
-    delays_s = _entry_delays_s(folder, setup.arrivals)
-    routes = _by_route(setup.arrivals, found, delays_s)
+    routes = _by_route(setup.arrivals, found)
     tables = [_times_table(routes), _events_table(found)]
     lead = f"Corridor {scenario.sumo.corridor} of {scenario.sumo.config}, seed {scenario.seed}."
     page = render_page("laneweave and SUMO alone", lead, [Section("Trips", tables)])
@@ -68,59 +65,39 @@ def compare(
     return routes
 
 
-def _entry_delays_s(folder: Path, arrivals: Sequence[CorridorArrival]) -> dict[str, float]:
-    """Return how long each vehicle has waited at the start of the corridor, by its name in SUMO.
-
-    SUMO sees these vehicles only when they enter, so that its own delay is 0.
-    """
-    entered_s = {
-        trip["sumo_id"]: trip["entered_s"]
-        for trip in read_trips(folder).values()
-        if trip["entered_s"] is not None
-    }
-    return {
-        name: entered_s[name] + one.begin_s - one.origin.vehicle.depart_s
-        for one in arrivals
-        if one.origin.entrance == MAIN_ENTRANCE and (name := one.origin.vehicle.name) in entered_s
-    }
-
-
 def _by_route(
-    arrivals: Sequence[CorridorArrival],
-    found: Sequence[SumoStatistics],
-    delays_s: Mapping[str, float],
+    arrivals: Sequence[CorridorArrival], found: Sequence[SumoStatistics]
 ) -> list[RouteTimes]:
     """Return the times of all pairs of entrance and destination, the most frequent first."""
-    names: dict[tuple[str, str], list[str]] = {}
+    groups: dict[tuple[str, str], list[CorridorArrival]] = {}
     for one in arrivals:
-        route = one.origin.entrance, one.origin.destination
-        names.setdefault(route, []).append(one.origin.vehicle.name)
+        groups.setdefault((one.origin.entrance, one.origin.destination), []).append(one)
     routes = []
-    for (entrance, destination), own in sorted(names.items(), key=lambda item: -len(item[1])):
-        trips = [[each.trips[name] for name in own if name in each.trips] for each in found]
-        waited_s = fmean([delays_s.get(name, 0.0) for name in own if name in found[0].trips] or [0])
+    for (entrance, destination), own in sorted(groups.items(), key=lambda item: -len(item[1])):
+        trips = [
+            [
+                (each.trips[one.origin.vehicle.name], one.origin.vehicle.depart_s)
+                for one in own
+                if one.origin.vehicle.name in each.trips
+            ]
+            for each in found
+        ]
         routes.append(
             RouteTimes(
                 entrance,
                 destination,
                 len(own),
                 tuple(map(len, trips)),
-                (
-                    _mean([_total_s(trip) for trip in trips[0]], waited_s),
-                    _mean([_total_s(trip) for trip in trips[1]]),
-                ),
-                tuple(_mean([trip.fuel_g or 0.0 for trip in each]) for each in trips),
+                # SUMO sees a vehicle of laneweave when it enters, with a delay of 0.
+                tuple(_mean([trip.arrival_s - s for trip, s in each]) for each in trips),
+                tuple(_mean([trip.fuel_g or 0.0 for trip, _ in each]) for each in trips),
             )
         )
     return routes
 
 
-def _total_s(trip: SumoTrip) -> float:
-    return trip.duration_s + trip.depart_delay_s
-
-
-def _mean(values: Sequence[float], added: float = 0.0) -> float | None:
-    return fmean(values) + added if values else None
+def _mean(values: Sequence[float]) -> float | None:
+    return fmean(values) if values else None
 
 
 def _times_table(routes: Sequence[RouteTimes]) -> Table:

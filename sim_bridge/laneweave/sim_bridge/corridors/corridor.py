@@ -110,9 +110,28 @@ def corridor_of(network: Network, first: str, last: str) -> Corridor:
         if name not in network.edges:
             raise BadInputError(OPTION, name, "FIRST_EDGE:LAST_EDGE, two edges of the network")
     way = _way(network, first, last)
+    for edge in way:
+        if not edge.car_lanes:
+            raise BadInputError(OPTION, edge.name, "edges with a lane for cars")
+    _check_end(network, way[-1])
     for before, after in pairwise(way):
         _check_right_of_way(network, before, after)
     return _Derivation(network, way).corridor()
+
+
+def _check_end(network: Network, last: Edge) -> None:
+    """Check that vehicles may leave the last edge in any lane, wherever their routes lead."""
+    ahead = {
+        lane.index: {link.target.edge for link in network.links_from(lane)}
+        for lane in last.car_lanes
+    }
+    if len({frozenset(edges) for edges in ahead.values()}) > 1:
+        lanes = "; ".join(
+            f"lane {index} to {' and '.join(sorted(edges)) or 'nowhere'}"
+            for index, edges in ahead.items()
+        )
+        allowed = f"a last edge whose lanes all lead to the same edges, but there are {lanes}"
+        raise BadInputError(OPTION, last.name, allowed)
 
 
 def _way(network: Network, first: str, last: str) -> tuple[Edge, ...]:

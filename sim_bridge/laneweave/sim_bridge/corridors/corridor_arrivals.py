@@ -10,6 +10,7 @@ other edges arrive at a ramp; when is known only when SUMO has driven them there
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 
 from attrs import frozen
 
@@ -46,7 +47,7 @@ class CorridorArrival:
     """SUMO's time at road time 0."""
 
 
-@frozen
+@frozen(slots=False)
 class CorridorSetup:
     """Everything that the simulation of a corridor consists of."""
 
@@ -56,8 +57,16 @@ class CorridorSetup:
     arrivals: tuple[CorridorArrival, ...]
     duration_s: float
     """Time within which vehicles depart."""
-    unserved: frozenset[str] = frozenset()
-    """Names in SUMO of vehicles that start or end inside the corridor, and are left out."""
+
+    @cached_property
+    def by_name(self) -> Mapping[str, CorridorArrival]:
+        """Its vehicles by their names in SUMO."""
+        return {one.origin.vehicle.name: one for one in self.arrivals}
+
+    def is_left_out(self, name: str, route: Sequence[str]) -> bool:
+        """Return whether a vehicle is in the corridor, but not one of its vehicles."""
+        edges = {edge.name for edge in self.corridor.edges}
+        return name not in self.by_name and not edges.isdisjoint(route)
 
 
 def corridor_arrivals(scenario: Scenario, demand: CorridorDemand) -> tuple[CorridorArrival, ...]:

@@ -154,8 +154,13 @@ class CorridorRamps:
                 late = time_s > self._longest_s[lane]
                 settling.append((late, self._cost(column, lane), column, time_s))
         # If it settles too late, it may have to stop at the end of its lane.
-        nothing = True, 0, first - MAX_COLUMNS, LONGEST_S
-        _, _, column, time_s = min(settling, default=nothing)
+        if settling:
+            _, _, column, time_s = min(settling)
+        else:
+            # It settles somewhere behind, too late: it may have to stop at the end of its lane.
+            column, time_s = first, LONGEST_S
+            while not meter.is_possible(arrival, column):
+                column -= 1
         return self._admission(one, arrival, column, time_s, t_s, meter)
 
     def _cost(self, column: int, lane: int) -> int:
@@ -172,7 +177,8 @@ class CorridorRamps:
         t_s: float,
         meter: EntryMeter,
     ) -> Admission:
-        meter.take(arrival, column)
+        if not meter.take(arrival, column):
+            raise RuntimeError(f"{arrival.vehicle} cannot have column {column}")
         ahead_m = one.s_m - self._lattice.cell_s_m(column, t_s)
         start = EntryState(one.s_m, one.speed_mps, time_s)
         return Admission(arrival, (column, arrival.lane), t_s, ahead_m, start=start)

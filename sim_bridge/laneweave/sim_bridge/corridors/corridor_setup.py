@@ -32,7 +32,6 @@ class SumoCorridor:
             self.corridor,
             corridor_arrivals(scenario, self.demand),
             self.demand.duration_s,
-            self.demand.unserved,
         )
 
 

@@ -27,7 +27,7 @@ from laneweave.sim_bridge.corridors.sumo_config import sumo_command
 from laneweave.sim_bridge.corridors.sumo_network import Network
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
-_PLANTS = ("--step-method.ballistic", "true", "--collision.mingap-factor", "0")
+_PLANTS = {"step-method.ballistic": "true", "collision.mingap-factor": "0"}
 """Options with which SUMO displays bodies as the bridge drives them."""
 _OWN_SPEED_MODE, _OWN_LANE_CHANGES = 31, 1621
 """SUMO's defaults: it drives."""
@@ -56,15 +56,16 @@ class CorridorWorld(SumoProcess):
             SumoFailedError: SUMO rejects a file.
         """
         tick_s = scenario.runtime.tick_s
-        command = sumo_command(setup.config, tick_s, scenario.seed, folder, results)
-        super().__init__((*command, *_PLANTS))
+        super().__init__(
+            sumo_command(setup.config, tick_s, scenario.seed, folder, results, _PLANTS)
+        )
         self._types = scenario.types
         self._lane_m = scenario.road.lane_width_m
         self._length_m = scenario.road.length_m
         self._shape = CorridorShape(setup.network, setup.corridor)
         self._sumo_name = {one.arrival.vehicle: one.origin.vehicle.name for one in setup.arrivals}
-        self._coming = {one.origin.vehicle.name: one for one in setup.arrivals}
-        self._unserved = setup.unserved
+        self._coming = dict(setup.by_name)
+        self._setup = setup
         self._states: dict[str, State] = {}
         self._shown: dict[str, State] = {}
         self._returned: set[str] = set()
@@ -89,7 +90,9 @@ class CorridorWorld(SumoProcess):
         for name in self.simulation.getLoadedIDList():
             coming = self._coming.get(name)
             waits = coming is not None and coming.origin.entrance == MAIN_ENTRANCE
-            if name in self._unserved or (waits and name not in self._taken):
+            if (waits and name not in self._taken) or self._setup.is_left_out(
+                name, self.vehicle.getRoute(name)
+            ):
                 self.vehicle.remove(name)
 
     # --- traffic that SUMO drives -------------------------------------------------------------
@@ -246,6 +249,8 @@ class CorridorWorld(SumoProcess):
 
     def drive_on(self) -> None:
         """Let SUMO drive on until the vehicles that it got back have arrived (statistics)."""
+        if self._states or not self.exhausted:
+            return  # the run has been interrupted
         end_s = self.simulation.getTime() + MAX_WAIT_S
         while self._returned and self.simulation.getTime() < end_s:
             super().step()

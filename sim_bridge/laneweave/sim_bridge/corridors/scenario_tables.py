@@ -100,6 +100,13 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
         tables, corridor, math.floor(2.0 * SPEED_SHARE * fastest_mps) / 2.0
     )
     formation = tables["formation"]
+    # Vehicles that cannot enter wait; the volume is only that of a drawn demand.
+    most = 0.9 * min(3600.0 * formation["speed_mps"] / formation["gap_m"], 3600.0)
+    for table, key in (
+        (tables["demand"], "volume_veh_per_lane_h"),
+        *((one, "volume_veh_per_h") for one in tables["entrance"]),
+    ):
+        table[key] = min(table[key], math.floor(most))
     settled_m = _m(formation["speed_mps"] * formation["settle_s"])
     if settled_m >= corridor.length_m:
         raise BadInputError(OPTION, corridor.name, f"a corridor longer than {settled_m:g} m")

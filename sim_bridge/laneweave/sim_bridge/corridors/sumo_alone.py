@@ -49,16 +49,16 @@ def drive_alone(
         while True:
             for name in sumo.simulation.getLoadedIDList():
                 vehicle = waiting.pop(name, None)
-                if vehicle is not None or name in setup.unserved:
+                route = sumo.vehicle.getRoute(name)
+                if vehicle is not None or setup.is_left_out(name, route):
                     sumo.vehicle.remove(name)
                 if vehicle is not None:
-                    route = f"laneweave.{name}"
-                    sumo.route.add(route, list(vehicle.route))
+                    sumo.route.add(f"laneweave.{name}", list(vehicle.route))
                     sumo.vehicle.add(
                         name,
-                        route,
+                        f"laneweave.{name}",
                         typeID=vehicle.type_name,
-                        depart=f"{vehicle.depart_s:g}",
+                        depart=str(vehicle.depart_s),
                         departLane="best",
                         departPos="base",
                         departSpeed="max",

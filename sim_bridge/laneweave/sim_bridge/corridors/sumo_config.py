@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from xml.etree import ElementTree as ET
 
 from attrs import field, frozen
@@ -23,8 +24,9 @@ _SHORT_NAMES = {
 }
 _OPTIONS = frozenset({"processing", "routing", "random_number", "emissions"})
 """Sections of options that determine how vehicles drive."""
-ALL_AT_ONCE = ("--route-steps", "0")
+ALL_AT_ONCE = {"route-steps": "0"}
 """Option with which SUMO loads all vehicles when it starts, so that it draws the same types."""
+NO_OPTIONS: Mapping[str, str] = MappingProxyType({})
 _DEMAND = frozenset(
     {"vType", "vTypeDistribution", "route", "routeDistribution", "flow", "vehicle", "trip"}
 )
@@ -133,7 +135,12 @@ def _time_s(found: Mapping[str, str], name: str, default: float) -> float:
 
 
 def sumo_command(
-    config: SumoConfig, step_s: float, seed: int, folder: Path, results: Path | None
+    config: SumoConfig,
+    step_s: float,
+    seed: int,
+    folder: Path,
+    results: Path | None,
+    more: Mapping[str, str] = NO_OPTIONS,
 ) -> Sequence[str]:
     """Return SUMO's command line.
 
@@ -143,11 +150,14 @@ def sumo_command(
         seed: seed, unless the configuration has one.
         folder: folder for temporary files.
         results: folder for SUMO's statistics; None: none are written.
+        more: further options, by name.
     """
     files = ",".join(map(str, config.write_demand(folder)))
     own: dict[str, str] = {
+        **ALL_AT_ONCE,
+        **more,
         "net-file": str(config.net_file),
-        "begin": f"{config.begin_s:g}",
+        "begin": str(config.begin_s),
         "step-length": f"{step_s:g}",
         "collision.action": "warn",
         "no-step-log": "true",
@@ -161,9 +171,7 @@ def sumo_command(
         own["tripinfo-output"] = str(results / TRIPS_FILE)
         own["statistic-output"] = str(results / STATISTICS_FILE)
         own["device.emissions.probability"] = "1"
+    # Drawn vehicles must be those that have been read.
+    own["random"] = "false"
     options = {"seed": str(seed % 2**31), **config.options, **own}
-    return (
-        "sumo",
-        *ALL_AT_ONCE,
-        *(part for name, value in options.items() for part in (f"--{name}", value)),
-    )
+    return ("sumo", *(part for name, value in options.items() for part in (f"--{name}", value)))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -87,8 +87,6 @@ class CorridorDemand:
     """Time within which they depart."""
     missing: Mapping[str, int]
     """Number of vehicles that a corridor cannot serve, by reason."""
-    unserved: frozenset[str] = frozenset()
-    """Their names."""
 
 
 def read_demand(config: SumoConfig, folder: Path, seed: int = 1) -> SumoDemand:
@@ -104,12 +102,13 @@ def read_demand(config: SumoConfig, folder: Path, seed: int = 1) -> SumoDemand:
     """
     files = config.write_demand(folder)
     end_s = min(config.end_s, config.begin_s + MAX_DEMAND_S)
-    command = ["sumo", "--net-file", str(config.net_file), "--begin", f"{config.begin_s:g}"]
+    command = ["sumo", "--net-file", str(config.net_file), "--begin", str(config.begin_s)]
     if files:
         command += ["--route-files", ",".join(map(str, files))]
     command += ["--step-length", f"{STEP_S:g}", "--no-warnings", "true", "--no-step-log", "true"]
     command += ["--seed", str(config.options.get("seed", seed % 2**31))]
-    command += ["--ignore-route-errors", "true", "--xml-validation", "never", *ALL_AT_ONCE]
+    command += ["--ignore-route-errors", "true", "--xml-validation", "never"]
+    command += [part for name, value in ALL_AT_ONCE.items() for part in (f"--{name}", value)]
     vehicles: list[SumoVehicle] = []
     with SumoProcess(command) as sumo:
         while True:
@@ -120,6 +119,7 @@ def read_demand(config: SumoConfig, folder: Path, seed: int = 1) -> SumoDemand:
             loaded, now_s = sumo.simulation.getLoadedIDList(), sumo.simulation.getTime()
             if now_s >= end_s or not (loaded or sumo.simulation.getMinExpectedNumber() > 0):
                 break
+    vehicles = [one for one in vehicles if one.depart_s < end_s]
     vehicles.sort(key=lambda one: one.depart_s)
     last_s = max((one.depart_s for one in vehicles), default=end_s)
     return SumoDemand(tuple(vehicles), config.begin_s, min(end_s, math.ceil(last_s)))
@@ -145,34 +145,58 @@ def _vehicle(api: Any, name: str, now_s: float) -> SumoVehicle:  # noqa: ANN401
 
 def demand_on(corridor: Corridor, demand: SumoDemand) -> CorridorDemand:
     """Return the vehicles whose routes lead through a corridor."""
-    passes, missing, unserved = list[Pass](), Counter[str](), set[str]()
+    passes, missing = list[Pass](), Counter[str]()
     ways_in = {(ramp.edge, ramp.to_edge) for ramp in corridor.ramps}
     ways_out = {(one.from_edge, one.edge) for one in corridor.ways_out}
     numbers = {edge.name: number for number, edge in enumerate(corridor.edges)}
     for vehicle in demand.vehicles:
-        route = vehicle.route
-        first = next((place for place, edge in enumerate(route) if edge in numbers), None)
-        if first is None:
-            continue
-        last = first
-        while last + 1 < len(route) and numbers.get(route[last + 1]) == numbers[route[last]] + 1:
-            last += 1
-        entrance, destination = MAIN_ENTRANCE, END_OF_ROAD
-        if numbers[route[first]] > 0:
-            entrance = route[first - 1] if first else ""
-            if (entrance, route[first]) not in ways_in:
-                unserved.add(vehicle.name)
-                missing[f"enter from {entrance}" if entrance else f"start on {route[first]}"] += 1
-                continue
-        if route[last] != corridor.edges[-1].name:
-            destination = route[last + 1] if last + 1 < len(route) else ""
-            if (route[last], destination) not in ways_out:
-                unserved.add(vehicle.name)
-                missing[f"leave to {destination}" if destination else f"end on {route[last]}"] += 1
-                continue
-        passes.append(Pass(vehicle, entrance, destination))
-    duration_s = demand.end_s - demand.begin_s
-    return CorridorDemand(tuple(passes), demand.begin_s, duration_s, missing, frozenset(unserved))
+        found = _pass_of(vehicle, numbers, ways_in, ways_out)
+        if isinstance(found, Pass):
+            passes.append(found)
+        elif found:
+            missing[found] += 1
+    duration_s = max(demand.end_s - demand.begin_s, 1.0)
+    return CorridorDemand(tuple(passes), demand.begin_s, duration_s, missing)
+
+
+def _pass_of(
+    vehicle: SumoVehicle,
+    numbers: Mapping[str, int],
+    ways_in: Collection[tuple[str, str]],
+    ways_out: Collection[tuple[str, str]],
+) -> Pass | str:
+    """Return a vehicle's way through the corridor, or why it is left out; empty: no contact.
+
+    Args:
+        vehicle: the vehicle.
+        numbers: number of each edge of the corridor.
+        ways_in: (edge before, edge of the corridor) of each ramp.
+        ways_out: (edge of the corridor, edge behind) of each exit.
+    """
+    route = vehicle.route
+    inside = [place for place, edge in enumerate(route) if edge in numbers]
+    if not inside:
+        return ""
+    first, last = inside[0], inside[-1]
+    if [numbers[route[place]] for place in inside] != [
+        *range(numbers[route[first]], numbers[route[first]] + last - first + 1)
+    ]:
+        return "drive through it twice"
+    before = route[first - 1] if first else ""
+    after = route[last + 1] if last + 1 < len(route) else ""
+    entrance, destination = MAIN_ENTRANCE, END_OF_ROAD
+    if numbers[route[first]] == 0:
+        if before:
+            return f"come to its start from {before}"
+    elif (before, route[first]) in ways_in:
+        entrance = before
+    else:
+        return f"enter from {before}" if before else f"start on {route[first]}"
+    if numbers[route[last]] < len(numbers) - 1:
+        if (route[last], after) not in ways_out:
+            return f"leave to {after}" if after else f"end on {route[last]}"
+        destination = after
+    return Pass(vehicle, entrance, destination)
 
 
 def type_names(passes: Sequence[Pass]) -> dict[SumoType, str]:

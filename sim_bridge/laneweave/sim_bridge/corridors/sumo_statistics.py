@@ -46,7 +46,8 @@ def read_statistics(folder: Path) -> SumoStatistics:
     trips = {}
     for _, element in ET.iterparse(folder / TRIPS_FILE):  # noqa: S314 (SUMO has written it)
         if element.tag == "tripinfo":
-            if float(element.get("arrival", "-1")) >= 0.0:
+            # Vehicles that have been taken out of SUMO have not arrived.
+            if float(element.get("arrival", "-1")) >= 0.0 and not element.get("vaporized"):
                 trips[element.get("id", "")] = _trip(element)
             element.clear()
     found = ET.parse(folder / STATISTICS_FILE).getroot()  # noqa: S314 (SUMO has written it)

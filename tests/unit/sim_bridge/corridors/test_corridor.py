@@ -75,6 +75,19 @@ def test_an_impossible_corridor_is_refused(tmp_path: Path, name: str, expected: 
         read_corridor(config, name, tmp_path)
 
 
+def test_a_corridor_does_not_end_where_its_lanes_part(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="lane 0 to off; lane 1 to main3"):
+        corridor_of(network(tmp_path), "main1", "main2")
+
+
+def test_more_vehicles_than_the_road_carries_wait(tmp_path: Path) -> None:
+    crowd = [vehicle(f"m{number}", 1.0, "main") for number in range(9)]
+    found = read_corridor(write_interchange(tmp_path, crowd), CORRIDOR, tmp_path)
+    assert found.demand.duration_s == 1.0
+    scenario = parse_scenario(scenario_tables(found.corridor, found.demand))
+    assert scenario.demand.volume_veh_per_lane_h < 3600.0
+
+
 def test_vehicles_of_a_corridor_do_not_give_way(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="its state is 'm'"):
         corridor_of(network(tmp_path, state="m"), "main1", "main5")

@@ -18,7 +18,12 @@ from laneweave.sim_bridge.corridors.corridor_arrivals import (
 from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor, read_corridor
 from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
 from laneweave.sim_bridge.corridors.sumo_config import read_config
-from laneweave.sim_bridge.corridors.sumo_demand import STEP_S
+from laneweave.sim_bridge.corridors.sumo_demand import (
+    STEP_S,
+    SumoDemand,
+    SumoVehicle,
+    demand_on,
+)
 from laneweave.sim_bridge.sumo.simulation import SumoFailedError
 from support.interchange import CORRIDOR, TRUCKS, stream, vehicle, write_interchange
 
@@ -50,7 +55,27 @@ def test_vehicles_that_start_inside_are_left_out_and_listed(tmp_path: Path) -> N
     found = corridor(tmp_path, vehicle("a", 0.0, "main"), vehicle("b", 1.0, "inside"))
     assert [one.vehicle.name for one in found.demand.passes] == ["a"]
     assert found.demand.missing == {"start on main3": 1}
-    assert found.demand.unserved == {"b"}
+    setup = found.setup(parse_scenario(scenario_tables(found.corridor, found.demand)))
+    assert setup.is_left_out("b", ["main3", "main4"])
+    assert not setup.is_left_out("a", ["main1"])
+    assert not setup.is_left_out("elsewhere", ["before", "off"])
+
+
+def test_vehicles_from_upstream_and_those_that_come_twice_are_left_out(tmp_path: Path) -> None:
+    config = write_interchange(tmp_path, [vehicle("a", 0.0, "main"), vehicle("r", 1.0, "ramp")])
+    found = read_corridor(config, "main3:main5", tmp_path)
+    assert [one.vehicle.name for one in found.demand.passes] == ["r"]
+    assert found.demand.missing == {"come to its start from main2": 1}
+    kind = found.demand.passes[0].vehicle.vehicle_type
+    twice = ("main1", "main2", "off", "before", "on", "main4", "main5")
+    again = SumoVehicle("x", 0.0, twice, kind, "passenger")
+    demand = SumoDemand((again,), 0.0, 10.0)
+    assert demand_on(corridor(tmp_path).corridor, demand).missing == {"drive through it twice": 1}
+
+
+def test_vehicles_that_depart_after_the_end_are_left_out(tmp_path: Path) -> None:
+    found = corridor(tmp_path, vehicle("a", 299.0, "main"), vehicle("b", 300.5, "main"))
+    assert [one.vehicle.name for one in found.demand.passes] == ["a"]
 
 
 def test_flows_are_vehicles_as_sumo_makes_them(tmp_path: Path) -> None:
