@@ -12,7 +12,7 @@ What SUMO drives near the corridor is seen by the sensors of vehicles inside (`o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
@@ -24,7 +24,7 @@ from laneweave.sim_bridge.corridors.corridor_arrivals import MAX_WAIT_S, Corrido
 from laneweave.sim_bridge.corridors.corridor_ramps import Approaching
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape, Piece, ramp_pieces
 from laneweave.sim_bridge.corridors.sumo_config import sumo_command
-from laneweave.sim_bridge.corridors.sumo_network import Network
+from laneweave.sim_bridge.corridors.sumo_network import Lane, Network
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 _PLANTS = {"step-method.ballistic": "true", "collision.mingap-factor": "0"}
@@ -271,18 +271,43 @@ def _path(ramp: Ramp) -> Iterator[Piece]:
 
 
 def _beyond(network: Network, corridor: Corridor) -> Iterator[tuple[str, tuple[int, float, float]]]:
-    """Yield SUMO's lanes behind the exits: (name, (lane, position of the exit, its own))."""
+    """Yield SUMO's lanes before and behind the exits: (name, (lane, exit, beginning of the lane)).
+
+    Positions are distances [m] from the start of the road, along the lane of the corridor.
+    """
     last = corridor.edges[-1]
     ends = [(one.from_edge, one.lanes, one.at_m + HANDOVER_M) for one in corridor.ways_out]
     every = tuple(range(last.first_lane, last.first_lane + last.lanes))
     ends.append((last.name, every, last.to_m))
     first = {edge.name: edge.first_lane for edge in corridor.edges}
-    inside = {edge.name for edge in corridor.edges}
-    for edge, lanes, at_m in ends:
+    for edge, lanes, exit_m in ends:
         for lane in network.edges[edge].car_lanes:
             number = first[edge] + lane.index
             if number in lanes:
-                yield lane.name, (number, at_m, at_m - lane.length_m)
-            for link in network.links_from(lane) if number in lanes else ():
-                if link.target.edge not in inside:
-                    yield link.target.name, (number, at_m, at_m + link.length_m)
+                yield lane.name, (number, exit_m, exit_m - lane.length_m)
+                inside = {each.name for each in corridor.edges}
+                for name, from_m in _ahead(network, lane, exit_m, exit_m + SEEN_BEYOND_M, inside):
+                    yield name, (number, exit_m, from_m)
+
+
+def _ahead(
+    network: Network, lane: Lane, end_m: float, until_m: float, inside: Collection[str]
+) -> Iterator[tuple[str, float]]:
+    """Yield name and beginning of the lanes behind a lane that ends at a position.
+
+    Args:
+        network: the network.
+        lane: the lane.
+        end_m: its end.
+        until_m: where lanes begin at most.
+        inside: edges of the corridor, which are left out.
+    """
+    for link in network.links_from(lane) if end_m < until_m else ():
+        if link.target.edge in inside:
+            continue
+        from_m = end_m
+        for name, length_m in link.across:
+            yield name, from_m
+            from_m += length_m
+        yield link.target.name, from_m
+        yield from _ahead(network, link.target, from_m + link.target.length_m, until_m, inside)

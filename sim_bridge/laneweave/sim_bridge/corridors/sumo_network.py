@@ -68,6 +68,8 @@ class Link:
     traffic_light: str = ""
     shape: tuple[Point, ...] = ()
     """Centre line of the way across the junction in the network's coordinates [m]."""
+    across: tuple[tuple[str, float], ...] = ()
+    """Name and length [m] of the lanes inside the junction, in order."""
 
     @property
     def has_priority(self) -> bool:
@@ -168,6 +170,7 @@ def _links(network: Any, edges: Mapping[str, Edge]) -> Iterable[Link]:  # noqa: 
                         shape=tuple(
                             (point[0], point[1]) for one in across for point in one.getShape()
                         ),
+                        across=tuple((one.getID(), one.getLength()) for one in across),
                     )
 
 
