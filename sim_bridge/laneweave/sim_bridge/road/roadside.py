@@ -13,7 +13,7 @@ from types import MappingProxyType
 from attrs import evolve
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import LaneSection, sections_for
+from laneweave.protocol.road_layout import END_OF_ROAD, LaneSection, sections_for
 from laneweave.protocol.runtime.node import Effect, Send
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
@@ -298,11 +298,20 @@ class Roadside:
             if first <= entered <= last
             and name in vehicles
             and vehicles[name].controller.off_lattice is None
+            and self._keeps_cells(vehicles[name])
         ]
         if near:
             vehicles[min(near)[-1]].controller.assign_cell(cell)
         else:
             self._unassigned.append(cell)
+
+    def _keeps_cells(self, vehicle: RoadVehicle) -> bool:
+        """Return whether a vehicle may get empty cells.
+
+        Where a ramp follows an exit, vehicles that leave by the exit get none: those from the ramp
+        need the agreement of the owners of such cells, while these leave.
+        """
+        return not self._shared_lanes or vehicle.arrival.destination == END_OF_ROAD
 
     def _store_recent(self, column: int, lane: int, name: Name) -> None:
         """Add an entered vehicle to the recent ones, and drop those far ahead of it."""
@@ -342,7 +351,11 @@ class Roadside:
             for cell in vehicle.controller.possible_cells - certain
             if cell[1] in self._shared_lanes
         }
-        on_lattice = [one for one in vehicles.values() if one.controller.off_lattice is None]
+        on_lattice = [
+            one
+            for one in vehicles.values()
+            if one.controller.off_lattice is None and self._keeps_cells(one)
+        ]
         if not on_lattice:
             return
         for column, lane in sorted(certain):
