@@ -135,7 +135,7 @@ class BridgeCore:
             incarnation: distinguishes this road from earlier roads of the same deployment.
             stopwatch: clock [s] that measures how long ticks take.
             stream: the arrivals, by time; None: drawn from the scenario's seed.
-            ramp_traffic: further vehicles, which others drive to ramps; None: there are none.
+            ramp_traffic: further vehicles, which a simulator drives to ramps; None: there are none.
         """
         self.scenario = scenario
         self.tick = 0

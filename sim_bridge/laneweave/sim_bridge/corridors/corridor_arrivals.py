@@ -43,8 +43,11 @@ class CorridorArrival:
     arrival: Arrival
     """At a ramp, its time is that of the departure from its first edge."""
     origin: Pass
-    begin_s: float
-    """SUMO's time at road time 0."""
+
+    @property
+    def departs_at_start(self) -> bool:
+        """Whether it departs on the first edge of the corridor, and not before a ramp."""
+        return self.origin.entrance == MAIN_ENTRANCE
 
 
 @frozen(slots=False)
@@ -63,6 +66,11 @@ class CorridorSetup:
         """Its vehicles by their names in SUMO."""
         return {one.origin.vehicle.name: one for one in self.arrivals}
 
+    @property
+    def end_s(self) -> float:
+        """SUMO's time until which vehicles are awaited."""
+        return self.config.begin_s + self.duration_s + MAX_WAIT_S
+
     def is_left_out(self, name: str, route: Sequence[str]) -> bool:
         """Return whether a vehicle is in the corridor, but not one of its vehicles."""
         edges = {edge.name for edge in self.corridor.edges}
@@ -74,11 +82,10 @@ def corridor_arrivals(scenario: Scenario, demand: CorridorDemand) -> tuple[Corri
     names = type_names(demand.passes)
     car = next(iter(names))
     lanes = {entrance.name: entrance.lane for entrance in scenario.entrance}
-    begin_s = demand.begin_s
     choose = _LaneChoice(scenario)
     found = []
     for number, one in enumerate(demand.passes, start=1):
-        t_s = one.vehicle.depart_s - begin_s
+        t_s = one.vehicle.depart_s - demand.begin_s
         destination = one.destination
         if destination != END_OF_ROAD:
             destination = entrance_name(destination)
@@ -96,7 +103,7 @@ def corridor_arrivals(scenario: Scenario, demand: CorridorDemand) -> tuple[Corri
             CAR if kind == car else names[kind],
             one.vehicle.name,
         )
-        found.append(CorridorArrival(arrival, one, begin_s))
+        found.append(CorridorArrival(arrival, one))
     return tuple(found)
 
 
@@ -128,5 +135,5 @@ class _LaneChoice:
 def main_stream(found: Sequence[CorridorArrival]) -> Iterator[Arrival]:
     """Yield the arrivals at the start of the road, by time."""
     for one in found:
-        if one.origin.entrance == MAIN_ENTRANCE:
+        if one.departs_at_start:
             yield one.arrival

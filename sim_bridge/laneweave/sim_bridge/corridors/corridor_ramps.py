@@ -52,7 +52,7 @@ class RampView(Protocol):
         """Return the vehicles that come to the ramp of a lane, the foremost first."""
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
-        """Set the speed at which a vehicle is driven towards its ramp; None: as SUMO wants."""
+        """Set the speed at which a vehicle is driven towards its ramp; None: its own."""
 
     @property
     def exhausted(self) -> bool:
@@ -95,7 +95,7 @@ class CorridorRamps:
         self._occupied: Collection[Cell] = ()
         """Cells in which vehicles are, or to which they move."""
         self._known: dict[Name, Arrival] = {}
-        """Vehicles that approach, with the times at which they were expected first."""
+        """Approaching vehicles, each with the time at which it was first expected at its ramp."""
 
     def demanded(self, t_s: float) -> Sequence[Arrival]:
         """Return the vehicles that have come near a ramp since the last call."""
@@ -157,7 +157,6 @@ class CorridorRamps:
         if settling:
             _, _, column, time_s = min(settling)
         else:
-            # It settles somewhere behind, too late: it may have to stop at the end of its lane.
             column, time_s = first, LONGEST_S
             while not meter.is_possible(arrival, column):
                 column -= 1

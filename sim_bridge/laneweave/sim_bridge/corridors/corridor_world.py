@@ -15,7 +15,7 @@ import math
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
-from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
@@ -81,15 +81,13 @@ class CorridorWorld(SumoProcess):
         self._lengths_m = {
             lane.name: lane.length_m for edge in setup.network.edges.values() for lane in edge.lanes
         }
-
-        self._end_s = setup.config.begin_s + setup.duration_s + MAX_WAIT_S
         self._take_out_loaded()
 
     def _take_out_loaded(self) -> None:
         """Take vehicles out of SUMO that wait at the start of the road, or are not served."""
         for name in self.simulation.getLoadedIDList():
             coming = self._coming.get(name)
-            waits = coming is not None and coming.origin.entrance == MAIN_ENTRANCE
+            waits = coming is not None and coming.departs_at_start
             if (waits and name not in self._taken) or self._setup.is_left_out(
                 name, self.vehicle.getRoute(name)
             ):
@@ -120,7 +118,7 @@ class CorridorWorld(SumoProcess):
     @property
     def exhausted(self) -> bool:
         """Whether no vehicles come to a ramp any more, or they have not come for long."""
-        return not self._coming or self.simulation.getTime() >= self._end_s
+        return not self._coming or self.simulation.getTime() >= self._setup.end_s
 
     def others(self) -> Sequence[OtherBody]:
         """Return SUMO's own vehicles behind the exits and the end of the road."""
@@ -158,7 +156,7 @@ class CorridorWorld(SumoProcess):
             raise ValueError(f"{vehicle} is already on the road")
         name = self._sumo_name[vehicle]
         coming, api = self._coming[name], self.vehicle
-        if coming.origin.entrance == MAIN_ENTRANCE:
+        if coming.departs_at_start:
             route = f"laneweave.{name}"
             self.route.add(route, list(coming.origin.vehicle.route))
             api.add(
@@ -217,7 +215,7 @@ class CorridorWorld(SumoProcess):
 
     def _is_ramp_vehicle(self, name: str) -> bool:
         coming = self._coming.get(name)
-        return coming is not None and coming.origin.entrance != MAIN_ENTRANCE
+        return coming is not None and not coming.departs_at_start
 
     def positions(self) -> dict[str, Pose]:
         """Return the pose of each vehicle after the last step, in the order of `add` calls."""
@@ -225,12 +223,7 @@ class CorridorWorld(SumoProcess):
 
     def collisions(self) -> list[tuple[str, str]]:
         """Return the sorted pairs that SUMO reports, with a vehicle of the corridor in each."""
-        pairs = set[tuple[str, str]]()
-        for hit in self.simulation.getCollisions():
-            if self._is_driven(hit.collider) or self._is_driven(hit.victim):
-                first, second = sorted((hit.collider, hit.victim))
-                pairs.add((first, second))
-        return sorted(pairs)
+        return [pair for pair in super().collisions() if any(map(self._is_driven, pair))]
 
     def remove(self, vehicle: str) -> None:
         """Give a vehicle back to SUMO, with its speed.

@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from laneweave.protocol.scenario.fields import MAIN_ENTRANCE
-from laneweave.sim_bridge.corridors.corridor_arrivals import MAX_WAIT_S, CorridorSetup
+from laneweave.sim_bridge.corridors.corridor_arrivals import CorridorSetup
 from laneweave.sim_bridge.corridors.sumo_config import sumo_command
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
@@ -41,10 +40,10 @@ def drive_alone(
     waiting = {
         one.origin.vehicle.name: one.origin.vehicle
         for one in setup.arrivals
-        if one.origin.entrance == MAIN_ENTRANCE
+        if one.departs_at_start
     }
     awaited = {one.origin.vehicle.name for one in setup.arrivals}
-    end_s = config.begin_s + setup.duration_s + MAX_WAIT_S
+    end_s = setup.end_s
     with SumoProcess(command) as sumo:
         while True:
             for name in sumo.simulation.getLoadedIDList():

@@ -25,7 +25,7 @@ from laneweave.sim_bridge.sumo.simulation import SumoProcess
 STEP_S = 0.1
 """Step with which vehicles are loaded; those of flows depart up to a step earlier."""
 MAX_DEMAND_S = 7200.0
-"""Time for which vehicles are loaded at most."""
+"""Maximum time for which vehicles are loaded."""
 
 
 @frozen

@@ -17,13 +17,11 @@ class SumoTrip:
     """The trip of a vehicle that has arrived."""
 
     depart_s: float
-    depart_delay_s: float
     duration_s: float
     """From its departure to its arrival."""
     arrival_s: float
     fuel_g: float | None = None
     """None: emissions were not computed."""
-    co2_g: float | None = None
 
 
 @frozen
@@ -65,18 +63,12 @@ def _trip(element: ET.Element) -> SumoTrip:
         return float(element.get(name, "0"))
 
     emissions = element.find("emissions")
-    grams = (
-        {}
-        if emissions is None
-        else {name: float(emissions.get(f"{name}_abs", "0")) / 1000.0 for name in ("fuel", "CO2")}
-    )
+    fuel_g = None if emissions is None else float(emissions.get("fuel_abs", "0")) / 1000.0
     return SumoTrip(
         number("depart"),
-        number("departDelay"),
         number("duration"),
         number("arrival"),
-        grams.get("fuel"),
-        grams.get("CO2"),
+        fuel_g,
     )
 
 

@@ -58,7 +58,7 @@ class Admission:
 
 @frozen
 class EntryState:
-    """State of a vehicle that somebody else has driven to its entrance."""
+    """State of a vehicle that a simulator has driven to its entrance."""
 
     s_m: float
     speed_mps: float

@@ -1,4 +1,4 @@
-"""Interface of traffic that others drive to the ramps of a road."""
+"""Interface of traffic that a simulator drives to the ramps of a road."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from laneweave.sim_bridge.road.entry import Admission, EntryMeter
 
 
 class RampTraffic(Protocol):
-    """Vehicles that others drive to the entrances."""
+    """Vehicles that a simulator drives to the ramps."""
 
     def demanded(self, t_s: float) -> Sequence[Arrival]:
         """Return the vehicles that have become known since the last call."""

@@ -60,7 +60,7 @@ class Roadside:
             scenario: road, demand, formations.
             bridge: incarnation of the bridge.
             stream: the arrivals, by time; None: drawn from the scenario's seed.
-            ramp_traffic: further vehicles, which others drive to ramps; None: there are none.
+            ramp_traffic: further vehicles, which a simulator drives to ramps; None: there are none.
         """
         self._bridge = bridge
         self._announce_s = scenario.runtime.announce_s
@@ -93,7 +93,7 @@ class Roadside:
             entry_m=scenario.entry_m,
             column_bound=[name for name, one in scenario.types.items() if not one.changes_columns],
             goals_of=partial(_goals, scenario.sections),
-            shared_lanes=scenario.shared_exit_lanes,
+            shared_lanes=self._shared_lanes,
             is_free=self._is_free,
         )
         self._lane_ends = LaneEndControl(scenario, self._meter)

@@ -40,18 +40,6 @@ class SumoSession(SumoProcess):
         """Return half of the length of a vehicle's body."""
         return self._half_bodies_m[vehicle]
 
-    def collisions(self) -> list[tuple[str, str]]:
-        """Return the sorted pairs that SUMO reports as colliding in the last step.
-
-        SUMO misses overlaps between lanes; `Bodies.overlapping_pairs` is exact.
-        """
-        return sorted(
-            {
-                (min(found.collider, found.victim), max(found.collider, found.victim))
-                for found in self._sumo.simulation.getCollisions()
-            }
-        )
-
     def poses(self, vehicles: Iterable[str]) -> dict[str, Pose]:
         """Return the poses of vehicles after the last step."""
         api = self.vehicle

@@ -79,6 +79,18 @@ class SumoProcess:
         """Interface to SUMO's routes in libsumo."""
         return self._sumo.route
 
+    def collisions(self) -> list[tuple[str, str]]:
+        """Return the sorted pairs that SUMO reports as colliding in the last step.
+
+        SUMO misses overlaps between lanes; `Bodies.overlapping_pairs` is exact.
+        """
+        return sorted(
+            {
+                (min(found.collider, found.victim), max(found.collider, found.victim))
+                for found in self._sumo.simulation.getCollisions()
+            }
+        )
+
     def step(self) -> None:
         """Advance SUMO by one tick."""
         self._sumo.simulationStep()
