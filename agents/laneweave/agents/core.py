@@ -391,7 +391,10 @@ class AgentCore:
             self._driver.begin(self._move, sense.tick, self._move_ticks)
         if execution.moving and self._driver.at_rest(sense):
             execution.end_motion()
-        if displaced(sense.state, self._scenario.lattice, execution.hold_cell, sense.t_s):
+        scenario = self._scenario
+        if displaced(
+            sense.state, scenario.lattice, execution.hold_cell, sense.t_s, scenario.room_ahead_m
+        ):
             execution.displace()
         move = execution.tick(sense.t_s)
         if move is not None and execution.plan is not None:

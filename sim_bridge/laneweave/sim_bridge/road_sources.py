@@ -53,9 +53,8 @@ def open_road(scenario: Scenario, results: Path) -> Iterator[RoadSource]:
                 yield RoadSource(world)
             return
         setup = sumo_corridor(scenario, folder).setup(scenario)
-        speeds_mps = {ramp.lane: ramp.speed_mps for ramp in setup.corridor.ramps}
         with CorridorWorld(scenario, setup, folder, results) as world_of_sumo:
-            ramps = CorridorRamps(scenario, world_of_sumo, speeds_mps)
+            ramps = CorridorRamps(scenario, world_of_sumo)
             yield RoadSource(world_of_sumo, tuple(main_stream(setup.arrivals)), ramps)
             world_of_sumo.drive_on()
 

@@ -21,7 +21,12 @@ from laneweave.agents.driving.tracker import Tracker
 from laneweave.agents.driving.tracking_problem import NO_GAPS
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.motion import at_rest_in_cell, cell_state, commanded_state
+from laneweave.protocol.vehicle.motion import (
+    at_rest_in_cell,
+    cell_state,
+    commanded_state,
+    nearly_settled,
+)
 from laneweave.protocol.wire.messages import Motion, Sense
 
 _FLOAT32 = np.dtype("<f4")
@@ -124,12 +129,21 @@ class TrackingDriver:
 
     def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
         """Begin a move at `tick` that lasts `ticks` ticks."""
-        self._goal, self._ticks = move[2], ticks
+        before = self._reference
         self._reference = Reference.move(self._scenario, move[1], move[2], tick, ticks)
+        if before is not None and before.origin == self._goal == move[1]:
+            self._reference.settle_meanwhile(before)
+        self._goal, self._ticks = move[2], ticks
 
     def at_rest(self, sense: Sense) -> bool:
-        """Return whether the motion's time has passed and the body has arrived."""
-        return sense.tick >= self._current.end_tick and at_rest_in_cell(
+        """Return whether the motion's time has passed and the body has arrived.
+
+        One that settles may still fall back to its cell if others have the room.
+        """
+        reference, room_ahead_m = self._current, self._scenario.room_ahead_m
+        if room_ahead_m > 0.0 and reference.origin == self._goal:
+            return nearly_settled(sense.state, self._lattice, self._goal, sense.t_s, room_ahead_m)
+        return sense.tick >= reference.end_tick and at_rest_in_cell(
             sense.state, self._lattice, self._goal, sense.t_s
         )
 

@@ -121,6 +121,23 @@ class Reference:
         trajectory = settling_trajectory(scenario, np.array(state) - goal, end_tick - tick)
         return cls(scenario, cell, trajectory, tick)
 
+    def settle_meanwhile(self, before: Reference) -> None:
+        """Add what is left of an earlier motion along the road into the origin of this move."""
+        first = self.start_tick - before.start_tick + self._horizon
+        left = before._states[first:, :3] - before._states[-1, :3]
+        if self.start_tick >= before.end_tick or first < 0:
+            return
+        n, padding = self._horizon, max(0, self._horizon + len(left) - len(self._states))
+        rest = self._states[-1:] * (1.0, 1.0, 0.0, 1.0, 0.0, 0.0)
+        self._states = np.concatenate([self._states, np.repeat(rest, padding, axis=0)])
+        self._states[n : n + len(left), :3] += left
+        jerks = np.concatenate([self._jerks, np.zeros((padding, 2))])
+        along = before._jerks[first:, 0]
+        jerks[n : n + len(along), 0] += along
+        jerks.flags.writeable = False
+        self._jerks = jerks
+        self.end_tick = max(self.end_tick, before.end_tick)
+
     def window(self, tick: int) -> Window:
         """Return the part of the reference from `tick` on; its jerks are read-only."""
         n = self._horizon

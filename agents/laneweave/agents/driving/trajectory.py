@@ -56,6 +56,8 @@ _END_TOLERANCE = 1e-3
 """Maximum error at the end of a trajectory [m, m/s, m/s2]."""
 _LIMIT_TOLERANCE = 1e-4
 """Maximum excess over `LIMIT_SHARE` of a limit [m/s, m/s2, m/s3]."""
+_MAX_BEHIND_M = 0.4
+"""Distance behind its cell at which a settling vehicle may be; farther behind others may be."""
 _TRACKING_ERROR_M = 0.25
 """Margin for tracking errors behind the vehicle ahead."""
 _CLOSING_SPEEDUP = 0.5
@@ -335,19 +337,58 @@ def _both(limit: float) -> tuple[float, float]:
 def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Trajectory:
     """Return the trajectory of minimum squared jerk from a state to rest at the origin.
 
-    Limits are not checked: `config.cross_checks` ensures that an entering vehicle can settle within
-    them.
+    If the time is short, only a trajectory that uses the limits throughout is within them; it also
+    stays ahead of the cell. If none is found, the limits are ignored: the tracker keeps them.
 
     Args:
-        scenario: source of the tick length.
+        scenario: source of the tick length and the limits.
         start: state (6,) relative to the final lattice point.
         ticks: duration, at least three.
     """
-    tick_s = scenario.runtime.tick_s
+    tick_s, speed_mps = scenario.runtime.tick_s, scenario.lattice.speed_mps
     reach, power = _reach(tick_s, ticks)
     ends = np.stack([power @ start[:3], power @ start[3:]], axis=1)
     jerks = np.asarray(np.linalg.lstsq(reach, -ends, rcond=None)[0], dtype=np.float64)
-    return _integrated(jerks, tick_s, start)
+    free = _integrated(jerks, tick_s, start)
+    behind_m = min(start[0], 0.0) - _MAX_BEHIND_M
+    if (
+        _excess(free, scenario.vehicle, speed_mps) < _LIMIT_TOLERANCE
+        and free.states[:, 0].min() >= behind_m
+    ):
+        return free
+    unit_s = ticks * tick_s / 8.0
+    program = _settling_program(scenario.vehicle, speed_mps, tick_s, ticks, start, behind_m)
+    solution = program.solve()
+    if not solution.usable:
+        return free
+    return _integrated(solution.x[6 * ticks :].reshape(2, ticks).T / unit_s**3, tick_s, start)
+
+
+def _settling_program(
+    limits: Vehicle, speed_mps: float, tick_s: float, n: int, start: Array, behind_m: float
+) -> QuadraticProgram:
+    """Return the program of a motion from a state to rest at the origin; see `settling_trajectory`.
+
+    Its units are those of `_trajectory_program`.
+    """
+    unit_s = n * tick_s / 8.0
+    constraints = _constraints(limits, speed_mps, tick_s / unit_s, unit_s, n, None)
+    lower, upper = constraints.lower.copy(), constraints.upper.copy()
+    transition, _ = axis_matrices(tick_s / unit_s)
+    units = np.array([1.0, unit_s, unit_s**2])
+    for first, part in ((0, start[:3]), (3 * n, start[3:])):
+        rows = slice(first, first + 3)
+        lower[rows] = upper[rows] = -transition @ (part * units)
+    width = constraints.matrix.shape[1]
+    ahead = sparse.csr_matrix((np.ones(n), (np.arange(n), np.arange(0, 3 * n, 3))), (n, width))
+    cost = sparse.diags([np.concatenate([np.zeros(6 * n), np.ones(2 * n)])], [0])
+    return QuadraticProgram(
+        cost,
+        sparse.vstack([constraints.matrix, ahead]),
+        np.concatenate([lower, np.full(n, behind_m)]),
+        np.concatenate([upper, np.full(n, np.inf)]),
+        settings=_SETTINGS,
+    )
 
 
 @lru_cache(maxsize=256)

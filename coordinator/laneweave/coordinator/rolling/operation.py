@@ -10,7 +10,7 @@ starts from its cell.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -18,14 +18,14 @@ from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.conflict_kinds import Move
 from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
-from laneweave.coordinator.rolling.checked_planner import Planner, stream_road
+from laneweave.coordinator.rolling.checked_planner import Planner
 from laneweave.coordinator.rolling.observed import ObservedRoad
 from laneweave.coordinator.rolling.ownership import certain_cells, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.road_layout import ANY_LANE, sections_for
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.fields import READY_LATE_S, SNAPSHOT_S, Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.motion import DISPLACED_ALONG_M
 from laneweave.protocol.wire.events import (
@@ -45,11 +45,6 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 
-SNAPSHOT_S = 0.5
-"""Time into a slot at which all its moves have begun and been reported.
-
-Plans are made one tick later, from the states up to this time, all of which have arrived by then.
-So plans do not depend on message delays."""
 LISTEN_S = 0.5
 """Time for which a new leader only listens (node clock), so that it does not outbid a leader whose
 heartbeats it has missed."""
@@ -89,7 +84,6 @@ class RollingOperation:
         self._planner = planner
         self._slot_s = scenario.cycles_s[0]
         self._sections = scenario.sections
-        self._road = stream_road(scenario)
         self.observed = ObservedRoad()
         self.transfers: list[CellTransfer] = []
         self._transfer_of: dict[Name, CellTransfer] = {}
@@ -196,6 +190,7 @@ class RollingOperation:
         since_s = self._since[0] - 1e-6 if self._since is not None else 0.0
         far_m = self._scenario.moves_from_m - LOOKAHEAD_M
         snapshot = self.observed.at(snapshot_s)
+        gated = self._gated(snapshot.states, slot - 1)
         # Vehicles without a state come last: they may have moved, and others may hold their cells.
         for entry in sorted(
             snapshot.census.on_lattice, key=lambda entry: entry.vehicle not in snapshot.states
@@ -215,11 +210,16 @@ class RollingOperation:
             # once the vehicle promises the newer ballot.
             late = state.go and not state.done and not state.moving
             owned |= certain_cells(state, snapshot.states, snapshot.gone)
-            if late:
+            if late or entry.vehicle in gated:
                 reserved |= {*state.owned} - {state.hold_cell}
+            settles = entry.ready_s > (slot - 1) * self._slot_s
             held = late or not state.attended or state.t_s < since_s
-            held = held or (self._is_displaced(state) and not self._is_on_ramp(state))
-            known = StreamVehicle(entry.vehicle, state.hold_cell, targets, held, moves)
+            held = held or (self._is_displaced(state) and not settles)
+            ready_s = entry.ready_s - READY_LATE_S
+            waits = max(0, math.ceil(ready_s / self._slot_s - slot - 1e-9))
+            if entry.vehicle in gated:
+                waits = max(waits, 1)
+            known = StreamVehicle(entry.vehicle, state.hold_cell, targets, held, moves, waits)
             vehicles.setdefault(state.hold_cell, known)
         columns = [column for column, _ in vehicles] or [0]
         window = range(min(columns) - MARGIN_COLUMNS, max(columns) + MARGIN_COLUMNS + 1)
@@ -230,6 +230,20 @@ class RollingOperation:
             if (column, lane) not in owned or (column, lane) in reserved
         )
         return tuple(vehicles.values()), blocked, self._ends_m(snapshot.census)
+
+    def _gated(self, states: Mapping[Name, VehicleState], slot: int) -> frozenset[Name]:
+        """Return the members of ballots for a slot whose start gates are not open yet.
+
+        If one of them promised the next ballot, the gate would stay closed.
+        """
+        return frozenset(
+            name
+            for transfer in self.transfers
+            if transfer.phase is BallotPhase.IN_FORCE
+            and transfer.t0_s >= slot * self._slot_s - 1e-6
+            and not any(states[one].go for one in transfer.roster if one in states)
+            for name in transfer.roster
+        )
 
     def _assigned_columns(self, lane: int, columns: range, t_s: float) -> range:
         """Return the columns whose cells may have been assigned to vehicles at a road time.
@@ -251,14 +265,6 @@ class RollingOperation:
         wanted = sections_for(sections, entry.preferred_lane, entry.destination)
         ahead = frozenset(number for number in wanted if sections[number].to_m > s_m)
         return ahead or sections_for(sections, ANY_LANE)
-
-    def _is_on_ramp(self, state: VehicleState) -> bool:
-        """Return whether a vehicle is on a ramp, where it settles before moves begin."""
-        return any(
-            section.lane == state.hold_cell[1]
-            and section.from_m <= state.s_m < section.moves_from_m
-            for section in self._sections
-        )
 
     def _is_displaced(self, state: VehicleState) -> bool:
         """Return whether a body is farther from its cell than any move of one cell takes it.
@@ -327,7 +333,6 @@ class RollingOperation:
             for cell in certain_cells(state, states, gone)
         }
         moves: dict[Name, Move] = {}
-        starts_s: dict[Name, float] = {}
         rosters: dict[Name, set[Name]] = {}
         for vehicle, path in plan.paths.items():
             if len(path) < 2 or path[0] == path[1]:
@@ -339,16 +344,13 @@ class RollingOperation:
             cells = footprint(path[0], path[1])
             if all(cell in owner for cell in cells):
                 moves[name] = (path[0], path[1])
-                front_m = self._road.position_m(plan.slot, path[0][0])
-                start_m = self._road.start_m(front_m, {path[0][1], path[1][1]})
-                starts_s[name] = t0_s + (start_m - front_m) / self._scenario.lattice.speed_mps
                 rosters[name] = self._with_partners({owner[cell] for cell in cells} | {name})
         for roster in _clusters(rosters.values()):
             yield CellTransfer(
                 ballot=self._new_ballot(self._highest),
                 roster=tuple(sorted(roster)),
                 moves={name: moves[name] for name in sorted(roster) if name in moves},
-                t0_s=max(starts_s[name] for name in roster if name in moves),
+                t0_s=t0_s,
                 slot_s=self._slot_s,
                 resend_s=self._scenario.network.resend_s,
                 due_s=now_s,

@@ -39,6 +39,17 @@ DEFAULT_CONFLICTS: Mapping[int, tuple[str, ...]] = MappingProxyType(
     {1: BASE_CONFLICTS, 2: ("geometric",)}
 )
 """Conflict kinds that planners avoid by default, by mode; formations also avoid `closing`."""
+SNAPSHOT_S = 0.5
+"""Time into a slot at which all its moves have begun and been reported.
+
+The rolling operation plans the next slot one tick later, from the states up to this time, all of
+which have arrived by then. So plans do not depend on message delays."""
+READY_LATE_S = 1.2
+"""Time into a slot until which a vehicle may become ready for the move that it makes in it."""
+GAP_AHEAD_M = 9.0
+"""Least net gap of a vehicle that changes lanes while it still falls back to its cell."""
+MAX_ROOM_AHEAD_M = 6.0
+"""Maximum distance from which it falls back meanwhile."""
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 """Range of T_F if `formation.cycle_s` is not set; the lower end is the paper's value."""
 COMFORT_MPS2 = 3.0
@@ -798,6 +809,19 @@ class Scenario:
     def longest_body_m(self) -> float:
         """Length of the longest type of vehicle."""
         return max(one.vehicle.length_m for one in self.types.values())
+
+    @property
+    def room_ahead_m(self) -> float:
+        """How far ahead of its cell a vehicle that settles may be when it changes lanes.
+
+        All others stay in their columns, so the net gap to the cell ahead is at least
+        `GAP_AHEAD_M`. 0 if vehicles change columns.
+        """
+        formation = self.formation
+        if formation.change_columns:
+            return 0.0
+        room_m = formation.gap_m - self.longest_body_m - GAP_AHEAD_M
+        return min(max(room_m, 0.0), MAX_ROOM_AHEAD_M)
 
     @property
     def widest_body_m(self) -> float:

@@ -40,6 +40,8 @@ _MAX_COLUMNS = 24
 """Upper bound on the columns that a vehicle needs to drive out."""
 _MAX_DRIVE_OUT_S = 120.0
 _FAR_M = 1000.0
+ROUNDING_M = 1e-6
+"""Tolerance for comparing positions."""
 
 
 @frozen
@@ -89,6 +91,19 @@ class LaneEnds:
         self._dead_ends = _by_lane(dead_ends(scenario), lanes)
         self._exits = _by_lane(exit_lanes(scenario), lanes)
         self._touching_s = (1.0 - BEFORE_TOUCHING) * scenario.move_s
+        early_m = 0.0 if scenario.formation.change_columns else early_start_m(scenario)
+        self._begins_m = [
+            [
+                (
+                    max(section.from_m, section.moves_from_m) + scenario.longest_body_m - early_m,
+                    section.to_m,
+                )
+                for section in scenario.sections
+                if section.lane == lane
+            ]
+            for lane in lanes
+        ]
+        """Where fronts may begin moves in the sections of each lane, and where these end."""
         self._any = any(self._dead_ends) or any(self._exits)
 
     def __bool__(self) -> bool:
@@ -99,6 +114,12 @@ class LaneEnds:
         """Yield the dead ends in order of lane, then of position."""
         for ends in self._dead_ends:
             yield from ends
+
+    def has_begun(self, lane: int, front_m: float) -> bool:
+        """Return whether moves into and out of a lane may begin at a position of the front."""
+        return any(
+            begins_m - ROUNDING_M <= front_m < to_m for begins_m, to_m in self._begins_m[lane]
+        )
 
     def ahead(self, lane: int, s_m: float) -> LaneEnd | None:
         """Return the dead end of the section in which a position is, or which it has passed."""

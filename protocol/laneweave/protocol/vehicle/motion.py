@@ -38,6 +38,8 @@ ARRIVED_ACROSS_M = 0.3
 
 SETTLED_MPS = 0.5
 """Difference in speed to its cell up to which a body has settled in it."""
+NEARLY_SETTLED_MPS = 4.0
+"""Difference in speed to its cell up to which a body that settles is ready for plans."""
 DISPLACED_ALONG_M = 1.0
 DISPLACED_ACROSS_M = 0.5
 """Distances from its cell from which a vehicle no longer holds it, for example after an emergency
@@ -128,11 +130,43 @@ def has_settled(state: State, lattice: Lattice, cell: Cell, t_s: float) -> bool:
     )
 
 
-def displaced(state: State, lattice: Lattice, cell: Cell, t_s: float) -> bool:
-    """Return whether a body is too far from `cell` to hold it at road time `t_s` [s]."""
+def nearly_settled(
+    state: State, lattice: Lattice, cell: Cell, t_s: float, room_ahead_m: float
+) -> bool:
+    """Return whether a body that settles in `cell` is near enough to take part in plans.
+
+    Args:
+        state: state of the body.
+        lattice: the lattice.
+        cell: the cell.
+        t_s: road time.
+        room_ahead_m: how far ahead of its cell a body may be (`Scenario.room_ahead_m`).
+    """
     goal = cell_state(lattice, cell, t_s)
     return (
-        abs(state[0] - goal[0]) > DISPLACED_ALONG_M or abs(state[3] - goal[3]) > DISPLACED_ACROSS_M
+        -ARRIVED_ALONG_M <= state[0] - goal[0] <= room_ahead_m
+        and abs(state[3] - goal[3]) <= ARRIVED_ACROSS_M
+        and abs(state[1] - goal[1]) <= NEARLY_SETTLED_MPS
+    )
+
+
+def displaced(
+    state: State, lattice: Lattice, cell: Cell, t_s: float, room_ahead_m: float = 0.0
+) -> bool:
+    """Return whether a body is too far from `cell` to hold it at road time `t_s` [s].
+
+    Args:
+        state: state of the body.
+        lattice: the lattice.
+        cell: the cell.
+        t_s: road time.
+        room_ahead_m: how far ahead of its cell a body may be, if farther than behind it.
+    """
+    goal = cell_state(lattice, cell, t_s)
+    ahead_m = state[0] - goal[0]
+    return (
+        not -DISPLACED_ALONG_M <= ahead_m <= max(DISPLACED_ALONG_M, room_ahead_m)
+        or abs(state[3] - goal[3]) > DISPLACED_ACROSS_M
     )
 
 

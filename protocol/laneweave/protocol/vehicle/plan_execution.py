@@ -443,6 +443,16 @@ def ends_in_time(execution: PlanExecution, _: object) -> bool:
     )
 
 
+def both_lanes_are_open(execution: PlanExecution, _: object) -> bool:
+    """The cell is where moves may begin in both lanes."""
+    # A move may be planned for later in its slot.
+    move, ends = execution.next_move, execution.lane_ends
+    if move is None or ends is None or move[1][1] == move[2][1]:
+        return True
+    front_m = execution.lattice.cell_s_m(move[1][0], execution.t_s)
+    return all(ends.has_begun(lane, front_m) for _, lane in move[1:])
+
+
 def is_released(execution: PlanExecution, _: object) -> bool:
     """progress[A] >= needs[A] for all dependencies of the move."""
     progress = execution.progress
@@ -531,7 +541,14 @@ VEHICLE_RULES: RuleBook = RuleBook(
             "V6",
             TICK,
             (_GOING,),
-            (is_holding, has_next_move, move_is_due, ends_in_time, is_released),
+            (
+                is_holding,
+                has_next_move,
+                move_is_due,
+                both_lanes_are_open,
+                ends_in_time,
+                is_released,
+            ),
             (start_move,),
         ),
         Transition("V7", REST, _ANY, (is_moving, moved_in_plan), (count_move, rest)),

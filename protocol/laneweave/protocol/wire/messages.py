@@ -370,6 +370,8 @@ class CensusEntry:
     """Name of the exit by which it wants to leave the road; `end`: the end of the road."""
     vehicle_type: Name = Name(CAR)
     """Type of the vehicle, which determines the moves that it can drive."""
+    ready_s: float = 0.0
+    """Road time from which it is in this cell, or almost: it is ready for no plan before [s]."""
 
 
 @frozen

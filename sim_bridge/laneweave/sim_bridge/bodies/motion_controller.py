@@ -38,6 +38,7 @@ from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import (
     DISPLACED_ALONG_M,
+    NEARLY_SETTLED_MPS,
     Jerk,
     State,
     at_rest_in_cell,
@@ -458,7 +459,8 @@ class MotionController:
     def displaced(self, tick: int) -> bool:
         """Return whether the body is too far from its cell to hold it at `tick`."""
         t_s = tick * self.tick_s
-        return displaced(self.measured, self.lattice, self.hold_cell, t_s)
+        room_ahead_m = self._scenario.room_ahead_m
+        return displaced(self.measured, self.lattice, self.hold_cell, t_s, room_ahead_m)
 
     def step(self, tick: int) -> None:
         """Advance from `tick` to the next one."""
@@ -550,9 +552,12 @@ class MotionController:
         if self.has_missed_exit(t_s):
             return True
         rear_m = self.lattice.cell_s_m(min(columns), t_s) - DISPLACED_ALONG_M
-        front_m = self.lattice.cell_s_m(max(columns), t_s) + DISPLACED_ALONG_M
+        front_m = self.lattice.cell_s_m(max(columns), t_s)
+        # One that still falls back to its cell is slower.
+        slower_mps = SLOWED_MPS if s_m <= front_m + DISPLACED_ALONG_M else NEARLY_SETTLED_MPS
         # Only moves along the road change the speed.
-        slowed = columns[0] == columns[1] and speed_mps < self.lattice.speed_mps - SLOWED_MPS
+        slowed = columns[0] == columns[1] and speed_mps < self.lattice.speed_mps - slower_mps
+        front_m += max(DISPLACED_ALONG_M, self._scenario.room_ahead_m)
         return slowed or not rear_m <= s_m <= front_m
 
     def _must_brake(self, measured: State, jerk: Jerk, near: Iterable[Neighbour]) -> bool:

@@ -8,30 +8,32 @@ time that it loses counts as delay. When its front is on the ramp, laneweave tak
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Protocol
 
 from attrs import evolve, frozen
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.fields import READY_LATE_S, SNAPSHOT_S, Scenario
 from laneweave.protocol.vehicle.lane_ends import dead_ends
 from laneweave.protocol.wire.messages import Name
-from laneweave.sim_bridge.corridors.settling import LONGEST_S, fall_back_m, settling_s
+from laneweave.sim_bridge.corridors.settling import LONGEST_S, before_rest_s, fall_back, settling_s
 from laneweave.sim_bridge.road.demand import Arrival
-from laneweave.sim_bridge.road.entry import Admission, EntryMeter, EntryState
+from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter, EntryState
 
-RAMP_SHARE = 0.9
-"""Share of the speed limit at which vehicles are expected to come to their ramp."""
-ADVICE_SHARE = 0.7
+ADVICE_SHARE = 0.9
 """Share of its maximum acceleration with which a vehicle is expected to accelerate."""
 MIN_ADVICE_MPS = 3.0
 """Lowest speed that a vehicle is advised to drive."""
+UPSTREAM_SHARE = 0.6
+"""Share of its own speed at which a vehicle is advised to drive at least before a junction."""
 EARLY_S = 0.3
 """Time by which a vehicle may be too early without advice."""
-BESIDE_COLUMNS = 3
-"""Number of columns by which a vehicle rather falls back than entering beside another one."""
-MAX_COLUMNS = 12
+CENSUS_S = 0.2
+"""Time after its entry in which coordinators know a vehicle."""
+BESIDE_COLUMNS = 1
+"""Number of columns by which a vehicle rather falls back than entering beside another vehicle."""
+MAX_COLUMNS = 40
 """Maximum number of columns that are tried."""
 
 
@@ -43,6 +45,10 @@ class Approaching:
     s_m: float
     """Position of its front on the road; before `Entrance.at_m` it is not on the ramp yet."""
     speed_mps: float
+    limits: tuple[tuple[float, float], ...]
+    """Where each lane on its way ends [m], from its own on, and how fast it drives there [m/s]."""
+    upstream: bool = False
+    """Whether it still has to pass a junction where ways join, so that others may come before."""
 
 
 class RampView(Protocol):
@@ -52,7 +58,7 @@ class RampView(Protocol):
         """Return the vehicles that come to the ramp of a lane, the foremost first."""
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
-        """Set the speed at which a vehicle is driven towards its ramp; None: its own."""
+        """Set the speed at which a vehicle is driven, if it can drive at it; None: its own."""
 
     @property
     def exhausted(self) -> bool:
@@ -62,21 +68,23 @@ class RampView(Protocol):
 class CorridorRamps:
     """Takes vehicles over from SUMO; see `RampTraffic`."""
 
-    def __init__(self, scenario: Scenario, view: RampView, speeds_mps: Mapping[int, float]) -> None:
+    def __init__(self, scenario: Scenario, view: RampView) -> None:
         """Begin without vehicles.
 
         Args:
             scenario: road, types of vehicles.
             view: the vehicles on their way to the ramps.
-            speeds_mps: speed limit of the ramp of each lane.
         """
         self._view = view
-        self._speeds_mps = {lane: RAMP_SHARE * one for lane, one in speeds_mps.items()}
         self._lattice = scenario.lattice
         self._limits = {name: one.vehicle for name, one in scenario.types.items()}
         self._at_m = {one.lane: one.at_m for one in scenario.entrance}
-        move_m = scenario.formation.speed_mps * scenario.cycles_s[0]
-        lines_m = {
+        self._before_rest_s = {
+            name: before_rest_s(scenario.room_ahead_m, one.vehicle)
+            for name, one in scenario.types.items()
+        }
+        self._slot_s = scenario.cycles_s[0]
+        self._lines_m = {
             one.lane: min(
                 (
                     end.line_m
@@ -87,11 +95,7 @@ class CorridorRamps:
             )
             for one in scenario.entrance
         }
-        self._longest_s = {
-            lane: min((lines_m[lane] - move_m - at_m) / scenario.formation.speed_mps, LONGEST_S)
-            for lane, at_m in self._at_m.items()
-        }
-        """Time in which a vehicle has to settle to change lanes in time, by lane."""
+        """Where moves out of the lane of a ramp have ended, by lane."""
         self._occupied: Collection[Cell] = ()
         """Cells in which vehicles are, or to which they move."""
         self._known: dict[Name, Arrival] = {}
@@ -133,39 +137,85 @@ class CorridorRamps:
                 if one.s_m < at_m:
                     column = self._advise(one, lane, column, t_s, meter)
                     continue
-                admission = self._take(one, lane, column, t_s, meter)
+                admission = self._take(one, column, t_s, meter)
                 admissions.append(admission)
                 column = admission.cell[0] - 1
                 del self._known[name]
         return admissions
 
-    def _take(
-        self, one: Approaching, lane: int, first: int, t_s: float, meter: EntryMeter
-    ) -> Admission:
+    def _take(self, one: Approaching, first: int, t_s: float, meter: EntryMeter) -> Admission:
         """Return the entry of a vehicle whose front is on its ramp."""
         arrival = self._known[Name(one.arrival.vehicle)]
         slower_mps = self._lattice.speed_mps - one.speed_mps
         limits = self._limits[arrival.vehicle_type]
-        settling: list[tuple[bool, int, int, float]] = []
-        for column in range(first, first - MAX_COLUMNS, -1):
+
+        def entry(column: int) -> tuple[float, float] | None:
             ahead_m = one.s_m - self._lattice.cell_s_m(column, t_s)
             time_s = settling_s(ahead_m, slower_mps, self._lattice.speed_mps, limits)
-            if time_s is not None and meter.is_possible(arrival, column):
-                late = time_s > self._longest_s[lane]
-                settling.append((late, self._cost(column, lane), column, time_s))
-        # If it settles too late, it may have to stop at the end of its lane.
-        if settling:
-            _, _, column, time_s = min(settling)
+            return None if time_s is None else (t_s, time_s)
+
+        chosen = self._choose(arrival, first, meter, entry)
+        if chosen is not None:
+            column, _, time_s = chosen
         else:
             column, time_s = first, LONGEST_S
             while not meter.is_possible(arrival, column):
                 column -= 1
         return self._admission(one, arrival, column, time_s, t_s, meter)
 
-    def _cost(self, column: int, lane: int) -> int:
-        """Return how far behind a column is; more if a vehicle beside it has to make room first."""
-        is_beside = (column, lane + 1) in self._occupied
-        return BESIDE_COLUMNS * is_beside - column
+    def _choose(
+        self,
+        arrival: Arrival,
+        first: int,
+        meter: EntryMeter,
+        entry: Callable[[int], tuple[float, float] | None],
+    ) -> tuple[int, float, float] | None:
+        """Return the best column for a vehicle, its entry time and settling time; None: none.
+
+        Args:
+            arrival: the vehicle.
+            first: the first column that it can have.
+            meter: knows which columns are possible.
+            entry: returns when it would enter a column, and how long it would settle; None: it
+                cannot get there.
+        """
+        found: list[tuple[bool, int, int, float, float]] = []
+        for column in range(first, first - MAX_COLUMNS, -1):
+            times = entry(column)
+            if times is None or not meter.is_possible(arrival, column):
+                continue
+            beside = 0
+            while (column, arrival.lane + 1 + beside) in self._occupied:
+                beside += 1
+            # It rather falls back than entering beside a vehicle that has to make room first.
+            cost = BESIDE_COLUMNS * (beside > 0) - column
+            # If it is too late, it will stop at the end of its lane.
+            late = self._is_late(arrival, column, times, beside)
+            found.append((late, cost, column, *times))
+            if not late and not beside:
+                break  # none behind is better
+        return min(found)[2:] if found else None
+
+    def _is_late(
+        self, arrival: Arrival, column: int, times: tuple[float, float], beside: int
+    ) -> bool:
+        """Return whether a vehicle cannot change lanes in time.
+
+        Args:
+            arrival: the vehicle.
+            column: its column.
+            times: when it enters, and how long it settles.
+            beside: number of vehicles that make room before, one after another.
+        """
+        entry_s, settle_s = times
+        move_m = self._slot_s * self._lattice.speed_mps
+        ahead_m = self._lines_m[arrival.lane] - move_m - self._lattice.cell_s_m(column, 0.0)
+        # The last slot in which it can change lanes, and the first that is planned with it.
+        last = math.floor(ahead_m / move_m + TIME_TOLERANCE_S)
+        planned = math.ceil((entry_s + CENSUS_S - SNAPSHOT_S) / self._slot_s) + 1
+        ready_s = entry_s + settle_s - self._before_rest_s[arrival.vehicle_type]
+        latest_s = min(last * self._slot_s + READY_LATE_S, ahead_m / self._lattice.speed_mps)
+        return ready_s > latest_s or last < planned + beside
 
     def _admission(
         self,
@@ -179,7 +229,8 @@ class CorridorRamps:
         if not meter.take(arrival, column):
             raise RuntimeError(f"{arrival.vehicle} cannot have column {column}")
         ahead_m = one.s_m - self._lattice.cell_s_m(column, t_s)
-        start = EntryState(one.s_m, one.speed_mps, time_s)
+        ready_s = max(0.0, time_s - self._before_rest_s[arrival.vehicle_type])
+        start = EntryState(one.s_m, one.speed_mps, time_s, ready_s)
         return Admission(arrival, (column, arrival.lane), t_s, ahead_m, start=start)
 
     def _advise(
@@ -189,28 +240,46 @@ class CorridorRamps:
         arrival = self._known[Name(one.arrival.vehicle)]
         lattice, limits = self._lattice, self._limits[arrival.vehicle_type]
         distance_m = self._at_m[lane] - one.s_m
-        # SUMO drives at the limit of the ramp, if nothing is ahead.
-        comes_mps = max(one.speed_mps, self._speeds_mps[lane])
-        slower_mps = round(lattice.speed_mps - comes_mps, 0)
-        longest_s = self._longest_s[lane]
-        fall_back = fall_back_m(slower_mps, lattice.speed_mps, limits, longest_s)
         accel_mps2 = ADVICE_SHARE * limits.max_accel_mps2
-        comes_s = t_s + _shortest_s(distance_m, one.speed_mps, comes_mps, accel_mps2)
-        for column in sorted(
-            range(first, first - MAX_COLUMNS, -1), key=lambda column: self._cost(column, lane)
-        ):
-            if not meter.is_possible(arrival, column):
-                continue
-            wanted_s = lattice.passing_time_s(column, self._at_m[lane] - fall_back)
-            if wanted_s < comes_s - EARLY_S:
-                continue  # the cell will have passed
-            advice = None
+        takes_s, comes_mps = _soonest(one, self._at_m[lane], accel_mps2)
+        slower_mps = math.ceil(lattice.speed_mps - comes_mps)
+        falls_back_m, settle_s = fall_back(slower_mps, lattice.speed_mps, limits)
+        comes_s = t_s + takes_s
+        cell_m = self._at_m[lane] - falls_back_m
+
+        def entry(column: int) -> tuple[float, float] | None:
+            at_ramp_s = lattice.passing_time_s(column, cell_m)
+            # Earlier ones will have passed.
+            return (at_ramp_s, settle_s) if at_ramp_s >= comes_s - EARLY_S else None
+
+        chosen = self._choose(arrival, first, meter, entry)
+        own_mps = one.limits[0][1]
+        slower_ahead = any(limit_mps < own_mps for _, limit_mps in one.limits)
+        # SUMO's drivers may be inattentive, and then accelerate less than they can.
+        advice = None if slower_ahead else own_mps
+        if chosen is not None:
+            column, wanted_s, _ = chosen
+            first = first if one.upstream else column - 1
             if wanted_s > comes_s + EARLY_S:
-                advice = _slow_mps(distance_m, wanted_s - t_s, comes_mps, accel_mps2)
-            self._view.advise(arrival.vehicle, advice)
-            return column - 1
-        self._view.advise(arrival.vehicle, None)
+                advice = _slow_mps(distance_m, wanted_s - t_s, comes_mps, accel_mps2) or advice
+                if advice is not None and one.upstream:
+                    advice = max(advice, UPSTREAM_SHARE * own_mps)
+        self._view.advise(arrival.vehicle, advice)
         return first
+
+
+def _soonest(one: Approaching, at_m: float, accel_mps2: float) -> tuple[float, float]:
+    """Return the time in which a vehicle can be at a position, and its speed there."""
+    takes_s, s_m, speed_mps = 0.0, one.s_m, one.speed_mps
+    for end_m, limit_mps in one.limits:
+        if s_m >= at_m:
+            break
+        to_m = min(end_m, at_m)
+        speed_mps = min(speed_mps, limit_mps)
+        takes_s += _shortest_s(to_m - s_m, speed_mps, limit_mps, accel_mps2)
+        speed_mps = min(limit_mps, math.sqrt(speed_mps**2 + 2.0 * accel_mps2 * (to_m - s_m)))
+        s_m = to_m
+    return takes_s, speed_mps
 
 
 def _shortest_s(distance_m: float, speed_mps: float, end_mps: float, accel_mps2: float) -> float:

@@ -19,12 +19,13 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
-from laneweave.sim_bridge.corridors.corridor import HANDOVER_M, Corridor, Ramp
+from laneweave.sim_bridge.corridors.corridor import HANDOVER_M, Corridor
 from laneweave.sim_bridge.corridors.corridor_arrivals import MAX_WAIT_S, CorridorSetup
 from laneweave.sim_bridge.corridors.corridor_ramps import Approaching
-from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape, Piece, ramp_pieces
+from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
 from laneweave.sim_bridge.corridors.sumo_config import sumo_command
 from laneweave.sim_bridge.corridors.sumo_network import Lane, Network
+from laneweave.sim_bridge.corridors.ways_in import ways_in
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 _PLANTS = {"step-method.ballistic": "true", "collision.mingap-factor": "0"}
@@ -72,15 +73,10 @@ class CorridorWorld(SumoProcess):
         """Names in SUMO of vehicles that have been given back and have not arrived."""
         self._taken: set[str] = set()
         """Names in SUMO of vehicles that have been taken over."""
-        self._ways = {
-            ramp.lane: {f"{piece.edge}_{piece.index}": piece for piece in _path(ramp)}
-            for ramp in setup.corridor.ramps
+        self._ways_in = {
+            ramp.lane: ways_in(setup.network, setup.corridor, ramp) for ramp in setup.corridor.ramps
         }
-        """Pieces on which SUMO drives towards each ramp, by the names of SUMO's lanes."""
         self._beyond = dict(_beyond(setup.network, setup.corridor))
-        self._lengths_m = {
-            lane.name: lane.length_m for edge in setup.network.edges.values() for lane in edge.lanes
-        }
         self._take_out_loaded()
 
     def _take_out_loaded(self) -> None:
@@ -97,8 +93,8 @@ class CorridorWorld(SumoProcess):
 
     def approaching(self, lane: int) -> list[Approaching]:
         """Return the vehicles that come to the ramp of a lane, the foremost first."""
-        found = []
-        for name, piece in self._ways.get(lane, {}).items():
+        found, api = [], self.vehicle
+        for name, way in self._ways_in.get(lane, {}).items():
             for vehicle in self.lane.getLastStepVehicleIDs(name):
                 coming = self._coming.get(vehicle)
                 if (
@@ -106,13 +102,15 @@ class CorridorWorld(SumoProcess):
                     and coming.arrival.lane == lane
                     and vehicle not in self._taken
                 ):
-                    at_m = self.vehicle.getLanePosition(vehicle)
-                    s_m = piece.position_m(at_m, self._lengths_m[name])
-                    found.append(Approaching(coming.arrival, s_m, self.vehicle.getSpeed(vehicle)))
+                    s_m = way.from_m + api.getLanePosition(vehicle)
+                    factor = api.getSpeedFactor(vehicle)
+                    limits = tuple((to_m, factor * limit) for to_m, limit in way.limits)
+                    speed_mps = api.getSpeed(vehicle)
+                    found.append(Approaching(coming.arrival, s_m, speed_mps, limits, way.upstream))
         return sorted(found, key=lambda one: -one.s_m)
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
-        """Set the speed at which SUMO drives a vehicle towards its ramp; None: its own."""
+        """Set the speed at which SUMO drives a vehicle, as far as it is safe; None: its own."""
         self.vehicle.setSpeed(self._sumo_name[vehicle], -1.0 if speed_mps is None else speed_mps)
 
     @property
@@ -256,11 +254,6 @@ class CorridorWorld(SumoProcess):
         degrees = 90.0 - math.degrees(direction + heading)
         name = self._sumo_name[vehicle]
         self.vehicle.moveToXY(name, piece.edge, piece.index, x, y, degrees, 2)
-
-
-def _path(ramp: Ramp) -> Iterator[Piece]:
-    """Yield the pieces on which SUMO drives towards a ramp."""
-    return (piece for piece in ramp_pieces(ramp) if piece.edge)
 
 
 def _beyond(network: Network, corridor: Corridor) -> Iterator[tuple[str, tuple[int, float, float]]]:

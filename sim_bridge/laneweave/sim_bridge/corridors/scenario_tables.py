@@ -202,12 +202,14 @@ def _cycle_s(scenario: Scenario, corridor: Corridor) -> float:
         for one in corridor.ways_out
         for lane in one.lanes
     }
-    longest_s = min(
-        (
-            (at_m - opened_m - needed_m) / scenario.formation.speed_mps
-            for at_m, opened_m in opens_m.items()
-        ),
-        default=SHORTEST_CYCLE_S,
-    )
+    rooms_m = [at_m - opened_m - needed_m for at_m, opened_m in opens_m.items()]
+    # At a ramp, a slot shall begin where a move into the next lane is possible.
+    rooms_m += [
+        0.5 * (closure.from_m - ramp.merge_m - needed_m)
+        for ramp in corridor.ramps
+        for closure in corridor.closures
+        if closure.lane == ramp.lane and closure.from_m > ramp.merge_m
+    ]
+    longest_s = min(rooms_m, default=math.inf) / scenario.formation.speed_mps
     steps = math.floor(min(longest_s, SHORTEST_CYCLE_S) / CYCLE_STEP_S + 1e-9)
     return round(max(CYCLE_STEP_S * steps, shortest_s), 1)

@@ -1,7 +1,9 @@
 """How a vehicle that enters with another speed than v_F gets into a cell.
 
 In the moving frame the vehicle is ahead of its cell by some distance, and slower: it falls back
-while it accelerates. It follows the quintic from its state to rest in the cell (minimum jerk).
+while it accelerates. The fastest way is to brake first, so that it falls back faster, then to hold
+the speed, and to accelerate last, each phase with limited jerk. The agent then plans the trajectory
+of minimum squared jerk in the time that this takes (`agents.driving.trajectory`).
 """
 
 from __future__ import annotations
@@ -9,31 +11,25 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
-import numpy as np
-from numpy.typing import NDArray
-
 from laneweave.protocol.scenario.fields import Vehicle
+from laneweave.protocol.vehicle.motion import NEARLY_SETTLED_MPS
 
 LIMIT_SHARE = 0.9
 """Share of its limits that a vehicle uses."""
-COMFORTABLE_BRAKE_MPS2 = 3.0
-MAX_BEHIND_M = 0.5
-"""Distance behind its cell at which the vehicle may be; farther behind is the room of others."""
+BRAKE_MPS2 = 2.0
+"""Deceleration with which a vehicle falls back."""
+MIN_SPEED_MPS = 6.0
+"""Lowest speed to which a vehicle brakes."""
 LONGEST_S = 30.0
-_STEP_S = 0.5
-_X = np.linspace(0.0, 1.0, 41)
-_POSITION = np.stack(
-    [1.0 - _X**3 * (10.0 - 15.0 * _X + 6.0 * _X**2), _X - _X**3 * (6.0 - 8.0 * _X + 3.0 * _X**2)]
-)
-_SPEED = np.stack(
-    [-30.0 * _X**2 * (1.0 - _X) ** 2, 1.0 - _X**2 * (18.0 - 32.0 * _X + 15.0 * _X**2)]
-)
-_ACCEL = np.stack(
-    [-60.0 * _X * (1.0 - 3.0 * _X + 2.0 * _X**2), -_X * (36.0 - 96.0 * _X + 60.0 * _X**2)]
-)
-_JERK = np.stack([-60.0 * (1.0 - 6.0 * _X + 6.0 * _X**2), -36.0 + 192.0 * _X - 180.0 * _X**2])
+_SHORTEST_S = 1.0
+_SLACK_S = 0.3
+"""Spare time: ticks are discrete, and the agent does not begin at once."""
+_STEP_MPS = 0.25
+_NEAR_M, _NEAR_MPS = 0.1, 0.1
+"""Distance and difference in speed at which a vehicle is in its cell."""
 
 
+@lru_cache(maxsize=4096)
 def settling_s(
     ahead_m: float, slower_mps: float, speed_mps: float, limits: Vehicle
 ) -> float | None:
@@ -46,39 +42,59 @@ def settling_s(
         limits: the vehicle's limits.
 
     Returns:
-        None: it cannot, or takes longer than `LONGEST_S`.
+        None: it cannot without falling behind the cell, or takes longer than `LONGEST_S`.
     """
-    for count in range(2, round(LONGEST_S / _STEP_S) + 1):
-        if _is_possible(ahead_m, slower_mps, speed_mps, limits, count * _STEP_S):
-            return count * _STEP_S
-    return None
+    if abs(ahead_m) <= _NEAR_M and abs(slower_mps) <= _NEAR_MPS:
+        return _SHORTEST_S
+    brake_mps2 = min(BRAKE_MPS2, -LIMIT_SHARE * limits.min_accel_mps2)
+    least_mps = max(slower_mps, _STEP_MPS)
+    found = []
+    for step in range(max(1, math.ceil((speed_mps - MIN_SPEED_MPS - least_mps) / _STEP_MPS))):
+        slowest_mps = least_mps + step * _STEP_MPS
+        brake_s, brakes_m = _change(slower_mps, slowest_mps, brake_mps2, limits)
+        accel_s, accelerates_m = _change(
+            slowest_mps, 0.0, LIMIT_SHARE * limits.max_accel_mps2, limits
+        )
+        holds_s = (ahead_m - brakes_m - accelerates_m) / slowest_mps
+        if holds_s < 0.0:
+            break  # slower still, it would fall back farther
+        found.append(brake_s + holds_s + accel_s)
+    time_s = max(min(found, default=math.inf) + _SLACK_S, _SHORTEST_S)
+    return round(time_s, 1) if time_s <= LONGEST_S else None
+
+
+def before_rest_s(room_ahead_m: float, limits: Vehicle) -> float:
+    """Return how long before it is in its cell a vehicle is ready for plans, at least.
+
+    Args:
+        room_ahead_m: how far ahead of the cell it may be (`Scenario.room_ahead_m`).
+        limits: its limits.
+    """
+    accel_mps2 = limits.max_accel_mps2
+    return min(NEARLY_SETTLED_MPS / accel_mps2, math.sqrt(2.0 * room_ahead_m / accel_mps2))
+
+
+def _change(
+    from_mps: float, to_mps: float, accel_mps2: float, limits: Vehicle
+) -> tuple[float, float]:
+    """Return the time and the distance of a change of the speed in the moving frame."""
+    jerk_mps3 = LIMIT_SHARE * limits.max_jerk_mps3
+    change_mps = abs(to_mps - from_mps)
+    if change_mps < accel_mps2**2 / jerk_mps3:
+        time_s = 2.0 * math.sqrt(change_mps / jerk_mps3)
+    else:
+        time_s = change_mps / accel_mps2 + accel_mps2 / jerk_mps3
+    return time_s, 0.5 * (from_mps + to_mps) * time_s
 
 
 @lru_cache(maxsize=4096)
-def fall_back_m(slower_mps: float, speed_mps: float, limits: Vehicle, longest_s: float) -> float:
-    """Return how far ahead of its cell a vehicle must be to settle there in a given time [m].
+def fall_back(slower_mps: float, speed_mps: float, limits: Vehicle) -> tuple[float, float]:
+    """Return how far ahead of its cell a vehicle must be to settle there soonest [m], and the time.
 
-    If it cannot, it is the distance for `LONGEST_S`.
+    If it cannot settle, they are infinite.
     """
-    for ahead_m in np.arange(0.0, 200.0, 1.0):
+    for ahead_m in range(200):
         time_s = settling_s(float(ahead_m), slower_mps, speed_mps, limits)
-        if time_s is not None and time_s <= longest_s:
-            return float(ahead_m)
-    return 0.5 * slower_mps * longest_s if longest_s < LONGEST_S else math.inf
-
-
-def _is_possible(
-    ahead_m: float, slower_mps: float, speed_mps: float, limits: Vehicle, time_s: float
-) -> bool:
-    """Return whether the motion of this duration is within limits, and not behind the cell."""
-    weights: NDArray[np.float64] = np.array([ahead_m, -slower_mps * time_s])
-    speed = weights @ _SPEED / time_s
-    accel = weights @ _ACCEL / time_s**2
-    return bool(
-        (weights @ _POSITION).min() >= -MAX_BEHIND_M
-        and accel.max() <= LIMIT_SHARE * limits.max_accel_mps2
-        and accel.min() >= -min(COMFORTABLE_BRAKE_MPS2, -LIMIT_SHARE * limits.min_accel_mps2)
-        and np.abs(weights @ _JERK).max() / time_s**3 <= LIMIT_SHARE * limits.max_jerk_mps3
-        and speed.max() + speed_mps <= limits.max_speed_mps
-        and speed.min() + speed_mps >= 0.0
-    )
+        if time_s is not None:
+            return float(ahead_m), time_s
+    return math.inf, math.inf

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -70,6 +71,8 @@ class Link:
     """Centre line of the way across the junction in the network's coordinates [m]."""
     across: tuple[tuple[str, float], ...] = ()
     """Name and length [m] of the lanes inside the junction, in order."""
+    speed_mps: float = math.inf
+    """Lowest speed limit inside the junction."""
 
     @property
     def has_priority(self) -> bool:
@@ -171,6 +174,7 @@ def _links(network: Any, edges: Mapping[str, Edge]) -> Iterable[Link]:  # noqa: 
                             (point[0], point[1]) for one in across for point in one.getShape()
                         ),
                         across=tuple((one.getID(), one.getLength()) for one in across),
+                        speed_mps=min((one.getSpeed() for one in across), default=math.inf),
                     )
 
 

@@ -64,6 +64,8 @@ class EntryState:
     speed_mps: float
     settle_s: float
     """Time in which it settles in its cell."""
+    ready_s: float
+    """Time after which it is so near to its cell that it is ready for plans."""
 
 
 @frozen

@@ -85,6 +85,8 @@ class Roadside:
         """The vehicles on the road."""
         self._lost = set[Cell]()
         """Cells of these lanes that may belong to a vehicle that nothing on the road knows yet."""
+        self._owned: set[Cell] | None = None
+        """Cells that somebody may own, and those in `_lost`; None: not determined yet."""
         self._meter = EntryMeter(
             lattice,
             formation.entry_spread_s,
@@ -161,7 +163,7 @@ class Roadside:
             vehicles: the vehicles on the road.
         """
         # Also queue vehicles that arrive before the next tick, since cells pass between ticks.
-        self._vehicles = vehicles
+        self._vehicles, self._owned = vehicles, None
         first, self._queued = self._queued, count_until(self._arrivals, t_s + self._tick_s)
         for arrival in self._arrivals[first : self._queued]:
             self._meter.demand(arrival)
@@ -252,6 +254,7 @@ class Roadside:
         """
         if not self._rolling:
             return
+        self._owned = None
         for lane in range(self._lanes):
             closed = self._meter.closed_column(lane)
             for column in range(self._assigned_to[lane] - 1, closed - 1, -1):
@@ -281,19 +284,30 @@ class Roadside:
             self._lane_ends.is_kept_free((column, beside)) for beside in (lane - 1, lane + 1)
         ):
             return False
-        return lane not in self._shared_lanes or (
-            cell not in self._lost
-            and not any(
-                cell in vehicle.controller.possible_cells for vehicle in self._vehicles.values()
+        if lane not in self._shared_lanes:
+            return True
+        if self._owned is None:
+            self._owned = self._lost.union(
+                *(vehicle.controller.possible_cells for vehicle in self._vehicles.values())
             )
-        )
+        return cell not in self._owned
 
     def _assign(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
-        """Assign an empty cell to a nearby vehicle, preferably one ahead of it in its lane."""
+        """Assign an empty cell to a nearby vehicle, preferably one ahead of it in its lane.
+
+        If vehicles keep their columns, only those of its column need the cell: preferably one of
+        them, so that few vehicles have to agree to a move.
+        """
         column, lane = cell
         first, last = column - self._max_empty, column + self._max_empty
         near = [
-            (entered < column, number != lane, abs(entered - column), name)
+            (
+                self._keep_columns and entered != column,
+                entered < column,
+                number != lane,
+                abs(entered - column),
+                name,
+            )
             for entered, number, name in self._recent
             if first <= entered <= last
             and name in vehicles
@@ -431,6 +445,7 @@ class Roadside:
                     off_lattice=off_lattice.get(vehicle.name),
                     destination=Name(vehicle.admission.arrival.destination),
                     vehicle_type=Name(vehicle.admission.arrival.vehicle_type),
+                    ready_s=vehicle.ready_s,
                 )
                 for vehicle in vehicles
             ),

@@ -34,6 +34,8 @@ class RoadVehicle:
     """Formation number (rolling operation: block number); None: not known yet."""
     bridge: int = 0
     """Incarnation of the bridge."""
+    ready_s: float = 0.0
+    """Road time from which the vehicle is in the cell in which it has entered, or almost [s]."""
 
     @classmethod
     def entering(
@@ -48,9 +50,11 @@ class RoadVehicle:
         s_m, speed_mps, settle_s = rest[0] + admission.offset_m, rest[1], 0.0
         if abs(admission.offset_m) > NEAR_M:
             settle_s = scenario.formation.settle_s
+        ready_s = settle_s
         if admission.start is not None:
             start = admission.start
-            s_m, speed_mps, settle_s = start.s_m, start.speed_mps, start.settle_s
+            s_m, speed_mps = start.s_m, start.speed_mps
+            settle_s, ready_s = start.settle_s, start.ready_s
         name = Name(admission.arrival.vehicle)
         own = scenario.types[admission.arrival.vehicle_type]
         controller = MotionController(
@@ -62,7 +66,8 @@ class RoadVehicle:
             for cell in (admission.cell, *admission.more_cells):
                 controller.assign_cell(cell)
         formation = None if scenario.formation.closes_by_vehicles else controller.joined[0]
-        return cls(name, admission, controller, Sensors(scenario, name), formation, bridge)
+        sensors = Sensors(scenario, name)
+        return cls(name, admission, controller, sensors, formation, bridge, t_s + ready_s)
 
     @property
     def state(self) -> State:

@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,14 +16,21 @@ from laneweave.agents.driving.trajectory import (
     Trajectory,
     move_profile,
     plan_trajectory,
+    settling_trajectory,
 )
 from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state, integrate
 
 SCENARIO = Scenario()
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
 TICK_S, N = SCENARIO.runtime.tick_s, SCENARIO.horizon_ticks
+WEAK = evolve(
+    SCENARIO,
+    formation=evolve(SCENARIO.formation, speed_mps=25.0, gap_m=27.0, change_columns=False),
+    vehicle=evolve(SCENARIO.vehicle, max_accel_mps2=2.6, max_speed_mps=36.0),
+)
 MARGIN = 0.97
 """Trajectories use 96 % of each limit; the tests allow a little more."""
 
@@ -168,3 +176,65 @@ def _window_time_s(reference: Reference) -> float:
     for tick in range(50):
         reference.window(tick)
     return (time.thread_time() - start) / 50
+
+
+# --- settling ---------------------------------------------------------------------------------
+
+
+def test_a_vehicle_settles_within_its_limits_if_it_has_little_time() -> None:
+    """The trajectory of least jerk would exceed them."""
+    start = np.array([40.0, -7.5, 0.0, 0.0, 0.0, 0.0])
+    ticks = 68
+    profile = settling_trajectory(WEAK, start, ticks)
+    np.testing.assert_array_equal(profile.states[0], start)
+    np.testing.assert_allclose(profile.states[-1], np.zeros(6), atol=1e-3)
+    check_limits(profile, WEAK)
+    assert profile.states[:, 0].min() >= -0.5
+    unlimited = settling_trajectory(
+        evolve(WEAK, vehicle=evolve(WEAK.vehicle, max_accel_mps2=9.0)), start, ticks
+    )
+    assert unlimited.states[:, 2].max() > WEAK.vehicle.max_accel_mps2
+
+
+def test_a_vehicle_without_enough_time_gets_the_trajectory_of_least_jerk() -> None:
+    start = np.array([2.0, -7.5, 0.0, 0.0, 0.0, 0.0])
+    profile = settling_trajectory(WEAK, start, 30)
+    np.testing.assert_allclose(profile.states[-1], np.zeros(6), atol=1e-6)
+    assert profile.states[:, 2].max() > WEAK.vehicle.max_accel_mps2
+
+
+def settling(cell: Cell, tick: int, end_tick: int) -> Reference:
+    """Return the reference of a vehicle that is 60 m ahead of its cell, and slower."""
+    s, v, a, y, v_y, a_y = cell_state(WEAK.lattice, cell, tick * TICK_S)
+    return Reference.settling(WEAK, cell, (s + 60.0, v - 7.0, a, y, v_y, a_y), tick, end_tick)
+
+
+@pytest.mark.parametrize("left_ticks", [25, 60])
+def test_a_vehicle_changes_lanes_while_it_settles(left_ticks: int) -> None:
+    """Along the road it goes on settling, also after the move; across it makes the move."""
+    cell, target, tick = (4, 0), (4, 1), 100
+    end_tick = tick + 80
+    before = settling(cell, tick, end_tick)
+    begin = end_tick - left_ticks
+    move = Reference.move(WEAK, cell, target, begin)
+    plain = Reference.move(WEAK, cell, target, begin)
+    move.settle_meanwhile(before)
+    assert move.end_tick == max(plain.end_tick, end_tick)
+    for now in range(begin - 3, move.end_tick + 5):
+        one, old, new = move.window(now), before.window(now), plain.window(now)
+        np.testing.assert_allclose(one.states[:, 3:], new.states[:, 3:])
+        np.testing.assert_allclose(one.jerks[:, 1], new.jerks[:, 1])
+        if now >= begin:
+            np.testing.assert_allclose(one.states[:, :3], old.states[:, :3], atol=1e-9)
+            np.testing.assert_allclose(one.jerks[:, 0], old.jerks[:, 0])
+            check_exact(one.states, one.jerks)
+    goal = cell_state(WEAK.lattice, target, (move.end_tick + 5) * TICK_S)
+    np.testing.assert_allclose(move.window(move.end_tick + 5).states[0], goal, atol=1e-3)
+
+
+def test_a_settled_vehicle_moves_as_before() -> None:
+    before = settling((4, 0), 100, 180)
+    move, plain = (Reference.move(WEAK, (4, 0), (4, 1), 180) for _ in range(2))
+    move.settle_meanwhile(before)
+    np.testing.assert_array_equal(move.window(185).states, plain.window(185).states)
+    assert move.end_tick == plain.end_tick

@@ -19,7 +19,6 @@ from laneweave.coordinator.rolling.operation import (
     LOOKAHEAD_M,
     MARGIN_COLUMNS,
     MAX_DELAY_S,
-    SNAPSHOT_S,
     RollingOperation,
     _clusters,
 )
@@ -27,6 +26,7 @@ from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Compute, Computed
+from laneweave.protocol.scenario.fields import READY_LATE_S, SNAPSHOT_S
 from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
@@ -307,6 +307,46 @@ def test_a_body_that_is_more_than_a_move_from_its_cell_is_held(
     desk.control.on_state(evolve(state, s_m=place_m(state) + ahead_m), 0.0)
     desk.think()
     assert desk.calls[0].vehicles[A].held == held
+
+
+@pytest.mark.parametrize(
+    ("ready_s", "waits"),
+    [(0.0, 0), ((SLOT + 1) * SLOT_S + READY_LATE_S, 0), ((SLOT + 2) * SLOT_S + 1.3, 2)],
+)
+def test_a_vehicle_that_settles_is_planned_from_when_it_is_ready(
+    ready_s: float, waits: int
+) -> None:
+    desk = bench(A)
+    entry = CensusEntry(A, HOMES[A], 1, 0.0, ready_s=ready_s)
+    desk.control.on_census(Census(BEGUN_S + 0.1, (entry,), ()))
+    state = evolve(shown(A), t_s=BEGUN_S + SNAPSHOT_S)
+    far_m = 40.0 if waits else 0.0
+    desk.control.on_state(evolve(state, s_m=place_m(state) + far_m), 0.0)
+    desk.think()
+    asked = desk.calls[0].vehicles[A]
+    assert (asked.waits, asked.held) == (waits, False)
+
+
+def test_members_of_a_ballot_whose_gate_is_closed_take_part_in_no_other() -> None:
+    """In the slot of its moves; with another promise, the gate would stay closed."""
+    desk = bench(A, B, ways={A: ((0, 0), (1, 0))})
+    desk.think()
+    transfer = desk.transfer
+    transfer.phase = BallotPhase.IN_FORCE
+
+    def next_call(slots: int, *, go: bool) -> Call:
+        t_s = BEGUN_S + slots * SLOT_S
+        pending = PendingTransfer(transfer.ballot, OWNED[A], OWNED[A], (A,))
+        first = shown(A, transfer.ballot, pending, accepted=True, go=go, done=False)
+        desk.hear(*(evolve(one, t_s=t_s + 0.4) for one in (first, shown(B))))
+        return desk.call(t_s + SNAPSHOT_S + 0.1)
+
+    call = next_call(1, go=False)
+    assert call.vehicles[A].waits == 1
+    assert {(1, 0), (-1, 0)} <= call.blocked
+    assert call.vehicles[B].waits == 0
+    later = next_call(2, go=False)
+    assert later.vehicles[A].waits == 0
 
 
 def test_vehicles_without_cells_are_not_planned_and_end_the_sections_they_are_in() -> None:

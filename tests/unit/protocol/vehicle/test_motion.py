@@ -17,12 +17,15 @@ from laneweave.protocol.scenario.fields import Scenario, Vehicle
 from laneweave.protocol.vehicle.motion import (
     ARRIVED_ACROSS_M,
     ARRIVED_ALONG_M,
+    NEARLY_SETTLED_MPS,
     State,
     at_rest_in_cell,
     cell_state,
+    displaced,
     hold_law,
     integrate,
     keep_gap,
+    nearly_settled,
 )
 
 SCENARIO = Scenario()
@@ -205,6 +208,35 @@ def test_at_rest_is_close_to_the_target(along_m: float, across_m: float, *, at_r
     s, v, a, y, v_y, a_y = cell_state(LATTICE, cell, t_s)
     state = (s + along_m, v, a, y + across_m, v_y, a_y)
     assert at_rest_in_cell(state, LATTICE, cell, t_s) == at_rest
+
+
+@pytest.mark.parametrize(
+    ("ahead_m", "slower_mps", "nearly"),
+    [
+        (0.0, 0.0, True),
+        (5.9, 0.9 * NEARLY_SETTLED_MPS, True),
+        (6.1, 0.0, False),
+        (-1.1 * ARRIVED_ALONG_M, 0.0, False),
+        (3.0, 1.1 * NEARLY_SETTLED_MPS, False),
+    ],
+)
+def test_a_body_that_settles_is_ready_before_it_is_in_its_cell(
+    ahead_m: float, slower_mps: float, *, nearly: bool
+) -> None:
+    s, v, a, y, v_y, a_y = cell_state(LATTICE, (-3, 2), 17.0)
+    state = (s + ahead_m, v - slower_mps, a, y, v_y, a_y)
+    assert nearly_settled(state, LATTICE, (-3, 2), 17.0, 6.0) == nearly
+    assert not nearly_settled((s, v, a, y + 0.5, v_y, a_y), LATTICE, (-3, 2), 17.0, 6.0)
+
+
+def test_a_body_with_room_ahead_is_displaced_farther_ahead_only() -> None:
+    s, *others = cell_state(LATTICE, (-3, 2), 17.0)
+
+    def out(along_m: float, room_ahead_m: float) -> bool:
+        return displaced((s + along_m, *others), LATTICE, (-3, 2), 17.0, room_ahead_m)  # type: ignore[arg-type]
+
+    assert [out(along_m, 0.0) for along_m in (-1.1, -0.9, 0.9, 1.1)] == [True, False, False, True]
+    assert [out(along_m, 6.0) for along_m in (-1.1, -0.9, 5.9, 6.1)] == [True, False, False, True]
 
 
 def moving_back(before_s: float) -> Motion:

@@ -10,7 +10,7 @@ from attrs import evolve
 
 from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
 from laneweave.protocol.scenario.fields import Closure
-from laneweave.protocol.vehicle.lane_ends import LaneEnds, drive_out
+from laneweave.protocol.vehicle.lane_ends import LaneEnds, drive_out, early_start_m
 from laneweave.protocol.vehicle.plan_execution import (
     LATE_S,
     LISTEN_S,
@@ -472,6 +472,22 @@ def test_a_move_from_or_into_a_lane_that_ends_begins_only_if_it_ends_before_the_
     execution = going()
     execution.lane_ends = LaneEnds(evolve(ROLLING, road=road))
     assert (execution.tick(T0_S + late_s) is not None) == begins
+
+
+@pytest.mark.parametrize("lane", [0, 1])
+def test_a_move_begins_where_both_lanes_are_open(lane: int) -> None:
+    """It may be planned for later in its slot. Without moves between columns."""
+    early = evolve(ROLLING, formation=evolve(ROLLING.formation, change_columns=False))
+    cell_m = early.lattice.cell_s_m(-4, T0_S)
+    # Its front may begin 20 m beyond the cell: the body, without the part that may be early.
+    opens_m = cell_m + 20.0 - early.longest_body_m + early_start_m(early)
+    road = evolve(early.road, s3_m=20_000.0, closures=(Closure(lane, 0.0, opens_m),))
+    execution = going()
+    execution.lane_ends = LaneEnds(evolve(early, road=road))
+    begins_s = T0_S + 20.0 / early.lattice.speed_mps
+    assert execution.tick(T0_S) is None
+    assert execution.tick(begins_s - 0.01) is None
+    assert execution.tick(begins_s) is not None
 
 
 # --- the table as a whole ---------------------------------------------------------------------

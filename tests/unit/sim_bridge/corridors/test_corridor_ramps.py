@@ -56,13 +56,15 @@ def admit(
     t_s: float = 50.0,
 ) -> tuple[list[Admission], View]:
     view = View([*coming])
-    ramps = CorridorRamps(scenario, view, {0: 22.0})
+    ramps = CorridorRamps(scenario, view)
     ramps.demanded(t_s)
     return ramps.admit(t_s, meter_of(scenario, taken), occupied), view
 
 
 def on_ramp(name: str, s_m: float, speed_mps: float, kind: str = "car") -> Approaching:
-    return Approaching(Arrival(name, 0, ANY_LANE, 0.0, vehicle_type=kind), s_m, speed_mps)
+    return Approaching(
+        Arrival(name, 0, ANY_LANE, 0.0, vehicle_type=kind), s_m, speed_mps, ((9e9, 22.0),)
+    )
 
 
 def test_a_slow_vehicle_gets_a_cell_to_which_it_can_fall_back(tmp_path: Path) -> None:

@@ -83,6 +83,8 @@ class Paths(NamedTuple):
     target: Bools
     """Whether each section is a target, and False for no section; (vehicles, sections + 1)."""
     held: Bools
+    waits: Ints
+    """Number of slots in which the vehicle stays first."""
     drives: Bools
     """Whether the vehicle can drive each displacement; (vehicles, displacements)."""
     missing_cost: Floats
@@ -279,6 +281,8 @@ def _paths(
     # Number of slots in which each vehicle may change lanes, ignoring others.
     begin, end = table.moving_columns.T[:, :, None]
     may_move = (begin <= column[:, 0]) & (column[:, 0] <= end)
+    stays = np.array([vehicle.waits for vehicle in vehicles], dtype=np.int64)
+    may_move &= np.arange(slots)[:, None] >= stays
     chances = may_move.sum(axis=0)
     # Lower bounds on the numbers of slots outside target sections and of moves.
     of_lane = np.array([section.lane for section in road.sections])
@@ -294,6 +298,7 @@ def _paths(
         np.zeros(count, dtype=np.int64),
         target,
         held,
+        stays,
         np.array([[one.drives(*step) for step in steps] for one in vehicles], dtype=np.bool_),
         costs.missing * (1.0 + 1.0 / (1.0 + chances)),
         min_cost,

@@ -103,7 +103,7 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
                 here = row[: high + 1 - low]
             elif not paths.target[v, section[s, lane, low + shift]]:
                 off = costs.off_lane
-            for d in range(fan if moves else 1):
+            for d in range(fan if moves and s >= paths.waits[v] else 1):
                 to_lane, to = lane + steps[d, 1], low + steps[d, 0]
                 if 0 <= to_lane < lanes and paths.drives[v, d]:
                     base = off + of_move[d] + (scratch.delay[s] if d > 0 else np.float32(0.0))
@@ -128,7 +128,7 @@ def _trace(table, paths, costs, v, scale, slots, lane, offset, scratch):
     for s in range(slots - 1, -1, -1):
         paths.column[v, s + 1], paths.lane[v, s + 1] = offset + shift, lane
         best, move = np.float32(np.inf), 0
-        for d in range(fan):
+        for d in range(fan if s >= paths.waits[v] else 1):
             before, from_lane = offset - steps[d, 0], lane - steps[d, 1]
             if not (0 <= from_lane < lanes and 1 <= before < value.shape[2] - 1):
                 continue
@@ -181,6 +181,8 @@ def follow(table, paths, costs, v, cells):
             if cells[s + 1, 0] == column + step[0] and cells[s + 1, 1] == lane + step[1]:
                 move = d
         if move < 0 or not paths.drives[v, move] or table.load[s, move, lane, column] > 0.0:
+            return False
+        if move > 0 and s < paths.waits[v]:
             return False
         paths.move[v, s] = move
         paths.column[v, s + 1], paths.lane[v, s + 1] = cells[s + 1, 0], cells[s + 1, 1]

@@ -191,9 +191,11 @@ class StreamVehicle:
     targets: frozenset[int] = field(converter=_as_set)
     """Sections by whose ends the vehicle may leave the road; on a straight road, target lanes."""
     held: bool = False
-    """Whether the vehicle must stay in its cell."""
+    """Whether the vehicle must stay in its cell, in all slots of the plan."""
     moves: frozenset[Cell] | None = None
     """Moves (columns, lanes) that the vehicle can drive; None: all of the mode."""
+    waits: int = 0
+    """Number of slots for which it stays in its cell first, since it settles there."""
 
     def drives(self, columns: int, lanes: int) -> bool:
         """Return whether the vehicle can drive a move."""

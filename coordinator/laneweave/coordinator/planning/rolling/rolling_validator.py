@@ -64,6 +64,8 @@ def _problems_of_path(
                 yield f"{name} cannot drive from {here} to {there} in slot {s}"
             if vehicle.held:
                 yield f"{name} is held, but moves in slot {s}"
+            if s < slot + vehicle.waits:
+                yield f"{name} moves in slot {s}, before {slot + vehicle.waits}"
             here = there
     if not road.has_left(slot + len(path) - 1, path[-1]):
         yield f"the path of {name} ends in {path[-1]}, on the road"

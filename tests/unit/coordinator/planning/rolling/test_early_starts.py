@@ -77,3 +77,18 @@ def test_a_move_that_would_end_behind_the_line_is_an_error() -> None:
     early = evolve(plan, paths={"x": ((22, 1), (22, 0))}, missed=())  # at 330 m
     before = [evolve(leaving, cell=(22, 1))]
     assert any("where lane 0 is closed" in one for one in problems_of_plan(EARLY, early, before))
+
+
+def test_others_make_room_for_a_vehicle_that_still_settles() -> None:
+    """It can move only in slot 3, in the last before its lane ends."""
+    ramp = StreamVehicle("r", (35, 0), {2, 3}, moves=LATERAL, waits=2)
+    beside = [StreamVehicle(f"v{lane}", (35, lane), {2, 3}, moves=LATERAL) for lane in (1,)]
+    plan = StreamPlanner(EARLY).plan(0, [ramp, *beside])
+    assert problems_of_plan(EARLY, plan, [ramp, *beside]) == []
+    assert plan.missed == ()
+    lanes = [lane for _, lane in plan.paths["r"]]
+    assert lanes[:3] == [0, 0, 0]
+    assert lanes[-1] == 1
+    earlier = StreamPlanner(EARLY).plan(0, [evolve(ramp, waits=0), *beside])
+    again = StreamPlanner(EARLY).plan(0, [ramp, *beside], earlier)
+    assert problems_of_plan(EARLY, again, [ramp, *beside]) == []

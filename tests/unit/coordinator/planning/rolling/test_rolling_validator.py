@@ -73,6 +73,14 @@ def test_held_vehicles_do_not_move() -> None:
     assert problems_of_plan(ROAD, standing_still, [vehicle]) == []
 
 
+def test_vehicles_that_settle_move_later() -> None:
+    vehicle = Vehicle("v", (50, 0), 1, waits=2)
+    way = to_the_end((50, 0), (50, 0), (50, 1))
+    assert "moves in slot 1, before 2" in only_problem([vehicle], {"v": way})
+    later = StreamPlan(0, {"v": to_the_end((50, 0), (50, 0), (50, 0), (50, 1))}, ())
+    assert problems_of_plan(ROAD, later, [vehicle]) == []
+
+
 def test_vehicles_make_only_moves_that_they_can_drive() -> None:
     vehicle = Vehicle("v", (50, 0), 1, moves=frozenset({(0, 1), (0, -1)}))
     way = to_the_end((50, 0), (50, 1), (51, 1))
