@@ -99,6 +99,28 @@ def test_sumo_drives_the_same_vehicles_alone(
     assert "SUMO alone" in page
 
 
+def test_vehicles_come_from_upstream(tmp_path: Path) -> None:
+    """SUMO drives them to the start, in whichever lanes it likes, together and one by one."""
+    vehicles = []
+    for second in range(0, 50, 2):
+        route = "upstream exit" if second % 12 == 4 else "upstream"
+        kind = "truck" if second % 10 == 6 else "car"
+        vehicles.append(vehicle(f"u{second}", second, route, kind))
+        vehicles.append(vehicle(f"v{second}", second, "upstream"))
+        if second % 6 == 0:
+            vehicles.append(vehicle(f"m{second}", second + 1, "main"))
+            vehicles.append(vehicle(f"r{second}", second + 1, "ramp"))
+    own = scenario(tmp_path, vehicles)
+    summary, events = drive(own, tmp_path / "run")
+    count = len(vehicles)
+    assert summary["vehicles"]["left"] == summary["vehicles"]["at_destination"] == count
+    assert summary["safety"]["overlaps"] == summary["safety"]["sumo_collisions"] == 0
+    assert summary["safety"]["min_gap_m"] >= 5.0
+    assert {event["kind"] for event in events}.isdisjoint({"missed-exit", "left-lattice"})
+    trips = read_trips(tmp_path / "run").values()
+    assert {trip["entrance"] for trip in trips} == {MAIN_ENTRANCE, "on"}
+
+
 def test_equal_runs_are_equal(tmp_path: Path) -> None:
     own = scenario(tmp_path, stream(8))
     folders = [tmp_path / name for name in ("one", "two")]

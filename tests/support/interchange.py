@@ -1,7 +1,7 @@
 """A small motorway interchange as a SUMO simulation: an exit, and behind it an on-ramp.
 
-    main1 (700 m, 3 lanes) -> main2 (250 m, 4: lane 0 leads to the exit) -> main3 (160 m, 3)
-    -> main4 (250 m, 4: lane 0 comes from the ramp, and ends) -> main5 (600 m, 3)
+    start (400 m, 3 lanes) -> main1 (700 m, 3) -> main2 (250 m, 4: lane 0 leads to the exit)
+    -> main3 (160 m, 3) -> main4 (250 m, 4: lane 0 comes from the ramp, and ends) -> main5 (600 m, 3)
 
 The main road is straight, to the east; the exit and the ramp are beside it. The files are written
 without netconvert, like those of `sim_bridge.sumo.network`.
@@ -16,6 +16,7 @@ from attrs import frozen
 
 LANE_M = 3.2
 CORRIDOR = "main1:main5"
+LONGEST_CORRIDOR = "start:main5"
 MAIN_SPEED_MPS, RAMP_SPEED_MPS = 27.78, 22.22
 
 
@@ -37,6 +38,7 @@ def _centres(first: int, count: int, shift_m: float = 0.0) -> tuple[float, ...]:
 
 
 EDGES = (
+    _Edge("start", "Z", "A", -400.0, 0.0, _centres(1, 3)),
     _Edge("main1", "A", "B", 0.0, 700.0, _centres(1, 3)),
     _Edge("main2", "B", "C", 700.0, 950.0, _centres(0, 4)),
     _Edge("main3", "C", "D", 950.0, 1110.0, _centres(1, 3)),
@@ -47,6 +49,7 @@ EDGES = (
     _Edge("on", "I", "D", 810.0, 1110.0, _centres(0, 1, -40.0), RAMP_SPEED_MPS),
 )
 LINKS = (
+    *(("start", lane, "main1", lane) for lane in range(3)),
     *(("main1", lane, "main2", lane + 1) for lane in range(3)),
     *(("main2", lane + 1, "main3", lane) for lane in range(3)),
     ("main2", 0, "off", 0),
@@ -83,12 +86,14 @@ def write_interchange(
 
 
 def vehicle(name: str, depart_s: float, route: str, kind: str = "car") -> str:
-    """Return the XML element of a vehicle; `route` is `main`, `exit` or `ramp`."""
+    """Return the XML element of a vehicle; `route` is the name of one of these."""
     edges = {
         "main": "main1 main2 main3 main4 main5",
         "exit": "main1 main2 off",
         "ramp": "before on main4 main5",
         "inside": "main3 main4 main5",
+        "upstream": "start main1 main2 main3 main4 main5",
+        "upstream exit": "start main1 main2 off",
     }[route]
     return (
         f'<vehicle id="{name}" type="{kind}" depart="{depart_s:g}" departSpeed="max">'
@@ -112,7 +117,8 @@ TRUCKS = '<vType id="truck" vClass="truck" length="7.1" accel="1.3" decel="4" si
 
 def _network(state: str) -> Iterator[str]:
     yield '<net version="1.20">'
-    yield '<location netOffset="0,0" convBoundary="0,-60,1960,20" origBoundary="0,-60,1960,20"'
+    bounds = "-400,-60,1960,20"
+    yield f'<location netOffset="0,0" convBoundary="{bounds}" origBoundary="{bounds}"'
     yield ' projParameter="!"/>'
     for edge in EDGES:
         yield f'<edge id="{edge.name}" from="{edge.origin}" to="{edge.destination}" priority="1">'

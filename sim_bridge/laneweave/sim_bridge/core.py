@@ -60,7 +60,7 @@ from laneweave.protocol.wire.topics import (
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road.attendance import Attendance, notify_left
 from laneweave.sim_bridge.road.demand import Arrival
-from laneweave.sim_bridge.road.ramp_traffic import RampTraffic
+from laneweave.sim_bridge.road.outside_traffic import OutsideTraffic
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from laneweave.sim_bridge.world_interface import World, show_bodies
@@ -121,7 +121,7 @@ class BridgeCore:
         incarnation: int = 0,
         stopwatch: Callable[[], float] = time.perf_counter,
         stream: tuple[Arrival, ...] | None = None,
-        ramp_traffic: RampTraffic | None = None,
+        outside_traffic: OutsideTraffic | None = None,
     ) -> None:
         """Create the bridge before the first tick.
 
@@ -135,7 +135,8 @@ class BridgeCore:
             incarnation: distinguishes this road from earlier roads of the same deployment.
             stopwatch: clock [s] that measures how long ticks take.
             stream: the arrivals, by time; None: drawn from the scenario's seed.
-            ramp_traffic: further vehicles, which a simulator drives to ramps; None: there are none.
+            outside_traffic: further vehicles, which a simulator drives to entrances; None: there
+                are none.
         """
         self.scenario = scenario
         self.tick = 0
@@ -143,7 +144,7 @@ class BridgeCore:
         self.vehicles: dict[Name, RoadVehicle] = {}
         self._world = world
         self._record = record
-        self._roadside = Roadside(scenario, incarnation, stream, ramp_traffic)
+        self._roadside = Roadside(scenario, incarnation, stream, outside_traffic)
         self._exits = Exits(scenario.sections, scenario.road.length_m)
         runtime = scenario.runtime
         self._tick_duration_s = runtime.tick_s / (pace or runtime.max_pace)

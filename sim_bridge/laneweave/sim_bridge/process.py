@@ -49,7 +49,7 @@ def run_bridge(
             pace=pace,
             incarnation=incarnations(),
             stream=road.stream,
-            ramp_traffic=road.ramp_traffic,
+            outside_traffic=road.outside_traffic,
         )
         try:
             run_core(wrap(core), access_of(scenario, "bridge"), observe=observe)

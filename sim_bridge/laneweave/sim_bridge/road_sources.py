@@ -12,11 +12,11 @@ from attrs import frozen
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.corridors.corridor_arrivals import main_stream
-from laneweave.sim_bridge.corridors.corridor_ramps import CorridorRamps
 from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor, read_corridor
 from laneweave.sim_bridge.corridors.corridor_world import CorridorWorld
+from laneweave.sim_bridge.corridors.take_over import TakeOver
 from laneweave.sim_bridge.road.demand import Arrival, arrivals
-from laneweave.sim_bridge.road.ramp_traffic import RampTraffic
+from laneweave.sim_bridge.road.outside_traffic import OutsideTraffic
 from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 from laneweave.sim_bridge.world_interface import World
 
@@ -31,7 +31,7 @@ class RoadSource:
     world: World
     stream: tuple[Arrival, ...] | None = None
     """The arrivals, by time; None: drawn from the scenario's seed."""
-    ramp_traffic: RampTraffic | None = None
+    outside_traffic: OutsideTraffic | None = None
 
 
 @contextmanager
@@ -54,7 +54,7 @@ def open_road(scenario: Scenario, results: Path) -> Iterator[RoadSource]:
             return
         setup = sumo_corridor(scenario, folder).setup(scenario)
         with CorridorWorld(scenario, setup, folder, results) as world_of_sumo:
-            ramps = CorridorRamps(scenario, world_of_sumo)
+            ramps = TakeOver(scenario, world_of_sumo)
             yield RoadSource(world_of_sumo, tuple(main_stream(setup.arrivals)), ramps)
             world_of_sumo.drive_on()
 

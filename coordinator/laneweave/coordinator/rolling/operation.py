@@ -212,6 +212,10 @@ class RollingOperation:
             owned |= certain_cells(state, snapshot.states, snapshot.gone)
             if late or entry.vehicle in gated:
                 reserved |= {*state.owned} - {state.hold_cell}
+            elif entry.ready_s > slot * self._slot_s:
+                # It may still be beside these cells.
+                column, lane = state.hold_cell
+                reserved |= {cell for cell in state.owned if cell[1] == lane and cell[0] > column}
             settles = entry.ready_s > (slot - 1) * self._slot_s
             held = late or not state.attended or state.t_s < since_s
             held = held or (self._is_displaced(state) and not settles)

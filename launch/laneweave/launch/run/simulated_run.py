@@ -160,7 +160,7 @@ class SimulatedRun:
                 new_incarnation=self._incarnations.__next__,
                 pace=1.0,
                 stream=road.stream,
-                ramp_traffic=road.ramp_traffic,
+                outside_traffic=road.outside_traffic,
             )
             try:
                 self._drive(network, bridge, progress)

@@ -4,7 +4,8 @@ Vehicles get the names of all vehicles of laneweave, v0001 and so on in order of
 names in SUMO may contain characters that keys of messages must not. Those that depart on the
 first edge arrive at the start of the road, in a lane that suits their destination: with an exit,
 the lane next to it, and otherwise the one in which they can enter first. Vehicles that come from
-other edges arrive at a ramp; when is known only when SUMO has driven them there.
+other edges arrive at the start or at a ramp; when, and in which lane of the start, is known only
+when SUMO has driven them there.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ class CorridorArrival:
 
     @property
     def departs_at_start(self) -> bool:
-        """Whether it departs on the first edge of the corridor, and not before a ramp."""
-        return self.origin.entrance == MAIN_ENTRANCE
+        """Whether it departs on the first edge of the corridor; others come from outside."""
+        return self.origin.entrance == MAIN_ENTRANCE and not self.origin.upstream
 
 
 @frozen(slots=False)
@@ -89,7 +90,9 @@ def corridor_arrivals(scenario: Scenario, demand: CorridorDemand) -> tuple[Corri
         destination = one.destination
         if destination != END_OF_ROAD:
             destination = entrance_name(destination)
-        if one.entrance == MAIN_ENTRANCE:
+        if one.upstream:
+            lane = scenario.road.first_lanes[0]  # which one it is depends on SUMO
+        elif one.entrance == MAIN_ENTRANCE:
             lane = choose.lane(t_s, destination)
         else:
             lane = lanes[entrance_name(one.entrance)]

@@ -15,17 +15,19 @@ import math
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
+from attrs import evolve
+
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
 from laneweave.sim_bridge.corridors.corridor import HANDOVER_M, Corridor
 from laneweave.sim_bridge.corridors.corridor_arrivals import MAX_WAIT_S, CorridorSetup
-from laneweave.sim_bridge.corridors.corridor_ramps import Approaching
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
 from laneweave.sim_bridge.corridors.sumo_config import sumo_command
 from laneweave.sim_bridge.corridors.sumo_network import Lane, Network
-from laneweave.sim_bridge.corridors.ways_in import ways_in
+from laneweave.sim_bridge.corridors.take_over import Approaching
+from laneweave.sim_bridge.corridors.ways_in import ways_to_ramp, ways_to_start
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 _PLANTS = {"step-method.ballistic": "true", "collision.mingap-factor": "0"}
@@ -73,8 +75,16 @@ class CorridorWorld(SumoProcess):
         """Names in SUMO of vehicles that have been given back and have not arrived."""
         self._taken: set[str] = set()
         """Names in SUMO of vehicles that have been taken over."""
+        upstream = any(one.origin.upstream for one in setup.arrivals)
+        to_start = ways_to_start(setup.network, setup.corridor) if upstream else {}
+        self.start_lanes = tuple(to_start)
+        """Lanes to whose beginning vehicles come from upstream."""
         self._ways_in = {
-            ramp.lane: ways_in(setup.network, setup.corridor, ramp) for ramp in setup.corridor.ramps
+            **to_start,
+            **{
+                ramp.lane: ways_to_ramp(setup.network, setup.corridor, ramp)
+                for ramp in setup.corridor.ramps
+            },
         }
         self._beyond = dict(_beyond(setup.network, setup.corridor))
         self._take_out_loaded()
@@ -92,21 +102,22 @@ class CorridorWorld(SumoProcess):
     # --- traffic that SUMO drives -------------------------------------------------------------
 
     def approaching(self, lane: int) -> list[Approaching]:
-        """Return the vehicles that come to the ramp of a lane, the foremost first."""
+        """Return the vehicles that come to the entrance of a lane, the foremost first."""
         found, api = [], self.vehicle
         for name, way in self._ways_in.get(lane, {}).items():
             for vehicle in self.lane.getLastStepVehicleIDs(name):
                 coming = self._coming.get(vehicle)
                 if (
                     coming is not None
-                    and coming.arrival.lane == lane
                     and vehicle not in self._taken
+                    and (coming.arrival.lane == lane or coming.origin.upstream)
                 ):
                     s_m = way.from_m + api.getLanePosition(vehicle)
                     factor = api.getSpeedFactor(vehicle)
                     limits = tuple((to_m, factor * limit) for to_m, limit in way.limits)
                     speed_mps = api.getSpeed(vehicle)
-                    found.append(Approaching(coming.arrival, s_m, speed_mps, limits, way.upstream))
+                    arrival = evolve(coming.arrival, lane=lane)
+                    found.append(Approaching(arrival, s_m, speed_mps, limits, way.upstream))
         return sorted(found, key=lambda one: -one.s_m)
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:

@@ -74,6 +74,8 @@ class Pass:
     """`MAIN_ENTRANCE`, or the last edge of a ramp."""
     destination: str
     """`END_OF_ROAD`, or the first edge of an exit."""
+    upstream: str = ""
+    """Edge from which it comes to the start; empty: it departs on the first edge, or by a ramp."""
 
 
 @frozen
@@ -184,10 +186,9 @@ def _pass_of(
         return "drive through it twice"
     before = route[first - 1] if first else ""
     after = route[last + 1] if last + 1 < len(route) else ""
-    entrance, destination = MAIN_ENTRANCE, END_OF_ROAD
+    entrance, destination, upstream = MAIN_ENTRANCE, END_OF_ROAD, ""
     if numbers[route[first]] == 0:
-        if before:
-            return f"come to its start from {before}"
+        upstream = before
     elif (before, route[first]) in ways_in:
         entrance = before
     else:
@@ -196,7 +197,7 @@ def _pass_of(
         if (route[last], after) not in ways_out:
             return f"leave to {after}" if after else f"end on {route[last]}"
         destination = after
-    return Pass(vehicle, entrance, destination)
+    return Pass(vehicle, entrance, destination, upstream)
 
 
 def type_names(passes: Sequence[Pass]) -> dict[SumoType, str]:

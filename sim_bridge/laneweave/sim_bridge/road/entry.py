@@ -220,7 +220,7 @@ class EntryMeter:
             if arrival is not None:
                 late_s = self._passing_time_s(cell[0], lane) - t_s
                 offset_m = late_s * self._lattice.speed_mps
-                more_cells = self._exit_cells(arrival, cell[0])
+                more_cells = self.exit_cells(arrival, cell[0])
                 admissions.append(Admission(arrival, cell, t_s, offset_m, more_cells))
                 self._free_s[lane] = t_s + self._lattice.pitch_m / self._lattice.speed_mps
             self._columns[lane] -= 1
@@ -275,8 +275,11 @@ class EntryMeter:
         self._names.discard(queue[0].vehicle)
         return queue.pop(0)
 
-    def _exit_cells(self, arrival: Arrival, column: int) -> tuple[Cell, ...]:
-        """Return the cells for leaving by lanes in which a ramp follows the exit."""
+    def exit_cells(self, arrival: Arrival, column: int) -> tuple[Cell, ...]:
+        """Return the cells for leaving by lanes in which a ramp follows the exit.
+
+        There are none for a vehicle that enters from the ramp.
+        """
         goals = self._goals_of(arrival)
         return tuple(
             (column, goal)

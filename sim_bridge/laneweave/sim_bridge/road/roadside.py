@@ -31,7 +31,7 @@ from laneweave.sim_bridge.road.demand import Arrival, arrivals, count_until
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter, Goals
 from laneweave.sim_bridge.road.formation_building import formation_builder
 from laneweave.sim_bridge.road.lane_end_control import LaneEndChange, LaneEndControl
-from laneweave.sim_bridge.road.ramp_traffic import RampTraffic
+from laneweave.sim_bridge.road.outside_traffic import OutsideTraffic
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 CENSUS_EVERY_TICKS = 10
@@ -52,7 +52,7 @@ class Roadside:
         scenario: Scenario,
         bridge: int = 0,
         stream: tuple[Arrival, ...] | None = None,
-        ramp_traffic: RampTraffic | None = None,
+        outside_traffic: OutsideTraffic | None = None,
     ) -> None:
         """Begin without vehicles.
 
@@ -60,7 +60,8 @@ class Roadside:
             scenario: road, demand, formations.
             bridge: incarnation of the bridge.
             stream: the arrivals, by time; None: drawn from the scenario's seed.
-            ramp_traffic: further vehicles, which a simulator drives to ramps; None: there are none.
+            outside_traffic: further vehicles, which a simulator drives to entrances; None: there
+                are none.
         """
         self._bridge = bridge
         self._announce_s = scenario.runtime.announce_s
@@ -131,9 +132,9 @@ class Roadside:
         columns = int(scenario.moves_from_m / lattice.pitch_m)
         self._max_empty = max(0, min(MAX_EMPTY, columns - 2))
         self._arrivals = arrivals(scenario) if stream is None else stream
-        self._ramp_traffic = ramp_traffic
+        self._outside_traffic = outside_traffic
         self._demanded = 0
-        """Arrivals so far, without those of `ramp_traffic`."""
+        """Arrivals so far, without those of `outside_traffic`."""
         self._others_demanded = 0
         self._queued = 0
         self._entered = 0
@@ -147,7 +148,7 @@ class Roadside:
         """Return the arrivals since the last call."""
         first = self._demanded
         self._demanded = count_until(self._arrivals, t_s + TIME_TOLERANCE_S)
-        others = () if self._ramp_traffic is None else self._ramp_traffic.demanded(t_s)
+        others = () if self._outside_traffic is None else self._outside_traffic.demanded(t_s)
         self._others_demanded += len(others)
         return (*self._arrivals[first : self._demanded], *others)
 
@@ -167,15 +168,19 @@ class Roadside:
         first, self._queued = self._queued, count_until(self._arrivals, t_s + self._tick_s)
         for arrival in self._arrivals[first : self._queued]:
             self._meter.demand(arrival)
-        admissions = self._meter.admit(t_s, self._full_lanes(vehicles))
-        if self._ramp_traffic is not None:
+        full = self._full_lanes(vehicles)
+        if self._outside_traffic is not None:
+            full |= self._outside_traffic.full_lanes()
+        admissions = self._meter.admit(t_s, full)
+        if self._outside_traffic is not None:
             occupied = frozenset(one.controller.hold_cell for one in vehicles.values())
-            admissions += self._ramp_traffic.admit(t_s, self._meter, occupied)
+            admissions += self._outside_traffic.admit(t_s, self._meter, occupied)
         if self._rolling:
             admissions = [self._with_ownerless(admission) for admission in admissions]
             for admission in admissions:
                 column, lane = admission.cell
                 self._next[lane].append((column, Name(admission.arrival.vehicle)))
+                self._given.update(admission.more_cells)
         self._entered += len(admissions)
         self._census_changed |= bool(admissions)
         return admissions
@@ -190,8 +195,8 @@ class Roadside:
             return admission
         beside = [(column, other) for other in range(self._lanes) if other != lane]
         free = [cell for cell in beside if self._is_ownerless(cell)]
-        self._given.update(free)
         self._ownerless.difference_update(free)
+        self._given.update(free)
         self._unassigned = [cell for cell in self._unassigned if cell not in self._given]
         return evolve(admission, more_cells=(*admission.more_cells, *free))
 
@@ -260,8 +265,10 @@ class Roadside:
             for column in range(self._assigned_to[lane] - 1, closed - 1, -1):
                 if self._next[lane] and self._next[lane][0][0] == column:
                     self._store_recent(column, lane, self._next[lane].pop(0)[1])
-                elif not self._lane_ends.is_kept_free((column, lane)) and (
-                    lane not in self._shared_lanes or self._is_free((column, lane))
+                elif (
+                    not self._lane_ends.is_kept_free((column, lane))
+                    and (column, lane) not in self._given
+                    and (lane not in self._shared_lanes or self._is_free((column, lane)))
                 ):
                     self._assign((column, lane), vehicles)
             self._assigned_to[lane] = closed
@@ -417,7 +424,7 @@ class Roadside:
         return (
             self._queued == len(self._arrivals)
             and not self._meter.waiting
-            and (self._ramp_traffic is None or self._ramp_traffic.exhausted)
+            and (self._outside_traffic is None or self._outside_traffic.exhausted)
             and (not self._arrivals or self._arrivals[-1].t_s <= t_s)
         )
 
@@ -464,7 +471,7 @@ class Roadside:
             if room[arrival.lane] > 0:
                 room[arrival.lane] -= 1
                 coming.append(arrival)
-        coming += () if self._ramp_traffic is None else self._ramp_traffic.announced()
+        coming += () if self._outside_traffic is None else self._outside_traffic.announced()
         return tuple(
             Announcement(
                 vehicle=Name(arrival.vehicle),

@@ -16,7 +16,15 @@ from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
 from laneweave.sim_bridge.corridors.sumo_config import read_config
 from laneweave.sim_bridge.corridors.sumo_demand import SumoDemand
 from laneweave.sim_bridge.corridors.sumo_network import Network, read_network
-from support.interchange import CORRIDOR, RAMP_SPEED_MPS, TRUCKS, stream, vehicle, write_interchange
+from support.interchange import (
+    CORRIDOR,
+    LONGEST_CORRIDOR,
+    RAMP_SPEED_MPS,
+    TRUCKS,
+    stream,
+    vehicle,
+    write_interchange,
+)
 
 
 def network(folder: Path, state: str = "M") -> Network:
@@ -104,10 +112,10 @@ def test_a_file_that_is_no_network_is_refused(tmp_path: Path, text: str) -> None
 def test_the_longest_chain_with_priority_is_found(tmp_path: Path) -> None:
     nobody = SumoDemand((), 0.0, 1.0)
     (found,) = find_corridors(network(tmp_path), nobody)
-    assert found.name == CORRIDOR
+    assert found.name == LONGEST_CORRIDOR
     assert found.volume_veh_per_h == 0.0
     parts = {one.name for one in find_corridors(network(tmp_path, state="m"), nobody)}
-    assert parts == {"main1:main4", "main5:main5"}
+    assert parts == {"start:main4", "main5:main5"}
 
 
 def test_the_tables_are_a_valid_scenario(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from scipy.optimize import linprog
 
 from laneweave.agents.driving.trajectory import settling_trajectory
 from laneweave.protocol.scenario.fields import Scenario, Vehicle
-from laneweave.sim_bridge.corridors.corridor_ramps import _cruising_s, _shortest_s, _slow_mps
 from laneweave.sim_bridge.corridors.settling import (
     BRAKE_MPS2,
     LIMIT_SHARE,
@@ -20,6 +19,7 @@ from laneweave.sim_bridge.corridors.settling import (
     fall_back,
     settling_s,
 )
+from laneweave.sim_bridge.corridors.take_over import _cruising_s, _shortest_s, _slow_mps
 
 SPEED_MPS = 25.0
 CAR = Vehicle(max_accel_mps2=2.6, min_accel_mps2=-9.0, max_speed_mps=40.0)

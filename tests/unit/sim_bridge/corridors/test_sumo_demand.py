@@ -61,11 +61,13 @@ def test_vehicles_that_start_inside_are_left_out_and_listed(tmp_path: Path) -> N
     assert not setup.is_left_out("elsewhere", ["before", "off"])
 
 
-def test_vehicles_from_upstream_and_those_that_come_twice_are_left_out(tmp_path: Path) -> None:
+def test_vehicles_come_from_upstream_but_not_twice(tmp_path: Path) -> None:
     config = write_interchange(tmp_path, [vehicle("a", 0.0, "main"), vehicle("r", 1.0, "ramp")])
     found = read_corridor(config, "main3:main5", tmp_path)
-    assert [one.vehicle.name for one in found.demand.passes] == ["r"]
-    assert found.demand.missing == {"come to its start from main2": 1}
+    assert {one.vehicle.name: one.upstream for one in found.demand.passes} == {
+        "a": "main2",
+        "r": "",
+    }
     kind = found.demand.passes[0].vehicle.vehicle_type
     twice = ("main1", "main2", "off", "before", "on", "main4", "main5")
     again = SumoVehicle("x", 0.0, twice, kind, "passenger")

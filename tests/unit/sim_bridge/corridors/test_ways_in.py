@@ -1,4 +1,4 @@
-"""The lanes on which SUMO drives vehicles towards a ramp."""
+"""The lanes on which SUMO drives vehicles to the entrances of a corridor."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 
 from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
-from laneweave.sim_bridge.corridors.ways_in import ways_in
+from laneweave.sim_bridge.corridors.ways_in import ways_to_ramp, ways_to_start
 from support.interchange import CORRIDOR, RAMP_SPEED_MPS, TRUCKS, stream, write_interchange
 
 
 def test_the_way_in_with_its_limits(tmp_path: Path) -> None:
     found = read_corridor(write_interchange(tmp_path, stream(10), types=TRUCKS), CORRIDOR, tmp_path)
     (ramp,) = found.corridor.ramps
-    ways = ways_in(found.network, found.corridor, ramp)
+    ways = ways_to_ramp(found.network, found.corridor, ramp)
     lanes = {name: way for name, way in ways.items() if not name.startswith(":")}
     assert [*lanes] == ["on_0", "before_0"]
     assert lanes["on_0"].from_m == pytest.approx(ramp.merge_m - 300.0, abs=15.0)
@@ -28,3 +28,12 @@ def test_the_way_in_with_its_limits(tmp_path: Path) -> None:
         assert ends_m == sorted(ends_m)
         assert not way.upstream
     assert not any(name.startswith("main") for name in lanes)
+
+
+def test_the_ways_to_the_start_are_parallel(tmp_path: Path) -> None:
+    found = read_corridor(write_interchange(tmp_path, stream(10), types=TRUCKS), CORRIDOR, tmp_path)
+    lanes = ways_to_start(found.network, found.corridor)
+    assert [*lanes] == [1, 2, 3]
+    for lane, ways in lanes.items():
+        named = {name: way.from_m for name, way in ways.items() if not name.startswith(":")}
+        assert named == {f"main1_{lane - 1}": 0.0, f"start_{lane - 1}": -400.0}

@@ -1,4 +1,4 @@
-"""Interface of traffic that a simulator drives to the ramps of a road."""
+"""Interface of traffic that a simulator drives to the entrances of a road."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
 
 
-class RampTraffic(Protocol):
-    """Vehicles that a simulator drives to the ramps."""
+class OutsideTraffic(Protocol):
+    """Vehicles that a simulator drives to the entrances."""
 
     def demanded(self, t_s: float) -> Sequence[Arrival]:
         """Return the vehicles that have become known since the last call."""
 
     def announced(self) -> Sequence[Arrival]:
         """Return the vehicles that will enter soon, with the times at which they are expected."""
+
+    def full_lanes(self) -> set[int]:
+        """Return the lanes to whose start a vehicle is too close for another to enter before it."""
 
     def admit(self, t_s: float, meter: EntryMeter, occupied: Collection[Cell]) -> list[Admission]:
         """Return the vehicles that have come to their entrances since the last call.

@@ -10,9 +10,9 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.corridors.corridor_ramps import Approaching, CorridorRamps
 from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
+from laneweave.sim_bridge.corridors.take_over import Approaching, TakeOver
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
 from support.interchange import CORRIDOR, TRUCKS, stream, write_interchange
@@ -25,6 +25,7 @@ class View:
     coming: list[Approaching]
     advice: dict[str, float | None] = field(factory=dict)
     exhausted: bool = False
+    start_lanes: tuple[int, ...] = ()
 
     def approaching(self, lane: int) -> list[Approaching]:
         return [one for one in self.coming if one.arrival.lane == lane]
@@ -56,7 +57,7 @@ def admit(
     t_s: float = 50.0,
 ) -> tuple[list[Admission], View]:
     view = View([*coming])
-    ramps = CorridorRamps(scenario, view)
+    ramps = TakeOver(scenario, view)
     ramps.demanded(t_s)
     return ramps.admit(t_s, meter_of(scenario, taken), occupied), view
 

@@ -1,8 +1,10 @@
-"""Vehicles that SUMO drives to the ramps of a corridor.
+"""Takes over the vehicles that SUMO drives to the entrances of a corridor.
 
-Each gets the first cell of its lane into which it can settle from its speed, behind the vehicle
-before. If it would be at the ramp too early for this cell, it is advised to drive more slowly; the
-time that it loses counts as delay. When its front is on the ramp, laneweave takes over.
+These are its ramps, and the start of the road for vehicles that come from upstream. Each vehicle
+gets the first cell of its lane, behind the vehicle before, into which it can settle from its speed
+in time for changing lanes. If it would be at the entrance too early for this cell, it is advised to
+drive more slowly; the time that it loses counts as delay. When its front is at the entrance,
+laneweave takes over.
 """
 
 from __future__ import annotations
@@ -27,9 +29,11 @@ MIN_ADVICE_MPS = 3.0
 """Lowest speed that a vehicle is advised to drive."""
 UPSTREAM_SHARE = 0.6
 """Share of its own speed at which a vehicle is advised to drive at least before a junction."""
+NEAR_S = 2.0
+"""Time before its arrival at the start within which no other vehicle enters before a vehicle."""
 EARLY_S = 0.3
 """Time by which a vehicle may be too early without advice."""
-CENSUS_S = 0.2
+CENSUS_S = 0.7
 """Time after its entry in which coordinators know a vehicle."""
 BESIDE_COLUMNS = 1
 """Number of columns by which a vehicle rather falls back than entering beside another vehicle."""
@@ -39,11 +43,12 @@ MAX_COLUMNS = 40
 
 @frozen
 class Approaching:
-    """A vehicle that SUMO drives towards a ramp, or on it."""
+    """A vehicle that SUMO drives towards an entrance."""
 
     arrival: Arrival
+    """With the lane to which it comes."""
     s_m: float
-    """Position of its front on the road; before `Entrance.at_m` it is not on the ramp yet."""
+    """Position of its front on the road; it is negative before the start."""
     speed_mps: float
     limits: tuple[tuple[float, float], ...]
     """Where each lane on its way ends [m], from its own on, and how fast it drives there [m/s]."""
@@ -51,58 +56,61 @@ class Approaching:
     """Whether it still has to pass a junction where ways join, so that others may come before."""
 
 
-class RampView(Protocol):
-    """What SUMO drives to the ramps."""
+class OutsideView(Protocol):
+    """What SUMO drives to the entrances."""
+
+    @property
+    def start_lanes(self) -> Sequence[int]:
+        """Lanes to whose beginning vehicles come from upstream."""
 
     def approaching(self, lane: int) -> Sequence[Approaching]:
-        """Return the vehicles that come to the ramp of a lane, the foremost first."""
+        """Return the vehicles that come to the entrance of a lane, the foremost first."""
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
         """Set the speed at which a vehicle is driven, if it can drive at it; None: its own."""
 
     @property
     def exhausted(self) -> bool:
-        """Whether no vehicles come to a ramp any more."""
+        """Whether no vehicles come to an entrance any more."""
 
 
-class CorridorRamps:
-    """Takes vehicles over from SUMO; see `RampTraffic`."""
+class TakeOver:
+    """Takes vehicles over from SUMO; see `OutsideTraffic`."""
 
-    def __init__(self, scenario: Scenario, view: RampView) -> None:
+    def __init__(self, scenario: Scenario, view: OutsideView) -> None:
         """Begin without vehicles.
 
         Args:
             scenario: road, types of vehicles.
-            view: the vehicles on their way to the ramps.
+            view: the vehicles on their way to the entrances.
         """
         self._view = view
         self._lattice = scenario.lattice
         self._limits = {name: one.vehicle for name, one in scenario.types.items()}
         self._at_m = {one.lane: one.at_m for one in scenario.entrance}
+        """Positions of the entrances, by lane."""
+        self._at_m |= dict.fromkeys(view.start_lanes, 0.0)
         self._before_rest_s = {
             name: before_rest_s(scenario.room_ahead_m, one.vehicle)
             for name, one in scenario.types.items()
         }
         self._slot_s = scenario.cycles_s[0]
+        ends = dead_ends(scenario)
         self._lines_m = {
-            one.lane: min(
-                (
-                    end.line_m
-                    for end in dead_ends(scenario)
-                    if end.lane == one.lane and end.end_m > one.at_m
-                ),
+            lane: min(
+                (end.line_m for end in ends if end.lane == lane and end.end_m > at_m),
                 default=scenario.road.length_m,
             )
-            for one in scenario.entrance
+            for lane, at_m in self._at_m.items()
         }
-        """Where moves out of the lane of a ramp have ended, by lane."""
+        """Where moves out of each of these lanes have ended."""
         self._occupied: Collection[Cell] = ()
         """Cells in which vehicles are, or to which they move."""
         self._known: dict[Name, Arrival] = {}
-        """Approaching vehicles, each with the time at which it was first expected at its ramp."""
+        """Approaching vehicles, each with the time at which it was expected first."""
 
     def demanded(self, t_s: float) -> Sequence[Arrival]:
-        """Return the vehicles that have come near a ramp since the last call."""
+        """Return the vehicles that have come near an entrance since the last call."""
         new = []
         for lane, at_m in self._at_m.items():
             for one in self._view.approaching(lane):
@@ -124,8 +132,18 @@ class CorridorRamps:
         """Whether no more vehicles will come."""
         return self._view.exhausted
 
+    def full_lanes(self) -> set[int]:
+        """Return the lanes to whose start a vehicle is too close for another to enter before it."""
+        return {
+            lane
+            for lane, at_m in self._at_m.items()
+            if at_m <= 0.0
+            for one in self._view.approaching(lane)[:1]
+            if one.s_m > -NEAR_S * max(one.speed_mps, self._lattice.speed_mps)
+        }
+
     def admit(self, t_s: float, meter: EntryMeter, occupied: Collection[Cell]) -> list[Admission]:
-        """Take over the vehicles whose fronts are on their ramps, and advise the others."""
+        """Take over the vehicles whose fronts are at their entrances, and advise the others."""
         admissions = []
         self._occupied = occupied
         for lane, at_m in self._at_m.items():
@@ -137,15 +155,14 @@ class CorridorRamps:
                 if one.s_m < at_m:
                     column = self._advise(one, lane, column, t_s, meter)
                     continue
-                admission = self._take(one, column, t_s, meter)
-                admissions.append(admission)
-                column = admission.cell[0] - 1
+                admissions.append(self._take(one, column, t_s, meter))
+                column = admissions[-1].cell[0] - 1
                 del self._known[name]
         return admissions
 
     def _take(self, one: Approaching, first: int, t_s: float, meter: EntryMeter) -> Admission:
-        """Return the entry of a vehicle whose front is on its ramp."""
-        arrival = self._known[Name(one.arrival.vehicle)]
+        """Return the entry of a vehicle whose front is at its entrance."""
+        arrival = self._arrival(one)
         slower_mps = self._lattice.speed_mps - one.speed_mps
         limits = self._limits[arrival.vehicle_type]
 
@@ -161,7 +178,20 @@ class CorridorRamps:
             column, time_s = first, LONGEST_S
             while not meter.is_possible(arrival, column):
                 column -= 1
-        return self._admission(one, arrival, column, time_s, t_s, meter)
+        if not meter.take(arrival, column):
+            raise RuntimeError(f"{arrival.vehicle} cannot have column {column}")
+        ahead_m = one.s_m - self._lattice.cell_s_m(column, t_s)
+        ready_s = max(0.0, time_s - self._before_rest_s[arrival.vehicle_type])
+        start = EntryState(one.s_m, one.speed_mps, time_s, ready_s)
+        more = meter.exit_cells(arrival, column)
+        if self._at_m[arrival.lane] <= 0.0:
+            # From the lanes beside it, nobody may enter the cells that it still touches.
+            more += tuple((ahead, arrival.lane) for ahead in range(column + 1, first + 1))
+        return Admission(arrival, (column, arrival.lane), t_s, ahead_m, more, start)
+
+    def _arrival(self, one: Approaching) -> Arrival:
+        """Return the arrival of a vehicle in the lane to which it comes."""
+        return evolve(self._known[Name(one.arrival.vehicle)], lane=one.arrival.lane)
 
     def _choose(
         self,
@@ -217,31 +247,15 @@ class CorridorRamps:
         latest_s = min(last * self._slot_s + READY_LATE_S, ahead_m / self._lattice.speed_mps)
         return ready_s > latest_s or last < planned + beside
 
-    def _admission(
-        self,
-        one: Approaching,
-        arrival: Arrival,
-        column: int,
-        time_s: float,
-        t_s: float,
-        meter: EntryMeter,
-    ) -> Admission:
-        if not meter.take(arrival, column):
-            raise RuntimeError(f"{arrival.vehicle} cannot have column {column}")
-        ahead_m = one.s_m - self._lattice.cell_s_m(column, t_s)
-        ready_s = max(0.0, time_s - self._before_rest_s[arrival.vehicle_type])
-        start = EntryState(one.s_m, one.speed_mps, time_s, ready_s)
-        return Admission(arrival, (column, arrival.lane), t_s, ahead_m, start=start)
-
     def _advise(
         self, one: Approaching, lane: int, first: int, t_s: float, meter: EntryMeter
     ) -> int:
         """Advise a vehicle for the first cell that it can reach; return the column behind it."""
-        arrival = self._known[Name(one.arrival.vehicle)]
+        arrival = self._arrival(one)
         lattice, limits = self._lattice, self._limits[arrival.vehicle_type]
         distance_m = self._at_m[lane] - one.s_m
         accel_mps2 = ADVICE_SHARE * limits.max_accel_mps2
-        takes_s, comes_mps = _soonest(one, self._at_m[lane], accel_mps2)
+        takes_s, comes_mps = _soonest(one, self._at_m[lane], accel_mps2, lattice.speed_mps)
         slower_mps = math.ceil(lattice.speed_mps - comes_mps)
         falls_back_m, settle_s = fall_back(slower_mps, lattice.speed_mps, limits)
         comes_s = t_s + takes_s
@@ -256,7 +270,7 @@ class CorridorRamps:
         own_mps = one.limits[0][1]
         slower_ahead = any(limit_mps < own_mps for _, limit_mps in one.limits)
         # SUMO's drivers may be inattentive, and then accelerate less than they can.
-        advice = None if slower_ahead else own_mps
+        advice = None if slower_ahead else min(own_mps, lattice.speed_mps)
         if chosen is not None:
             column, wanted_s, _ = chosen
             first = first if one.upstream else column - 1
@@ -268,13 +282,15 @@ class CorridorRamps:
         return first
 
 
-def _soonest(one: Approaching, at_m: float, accel_mps2: float) -> tuple[float, float]:
+def _soonest(
+    one: Approaching, at_m: float, accel_mps2: float, fastest_mps: float
+) -> tuple[float, float]:
     """Return the time in which a vehicle can be at a position, and its speed there."""
     takes_s, s_m, speed_mps = 0.0, one.s_m, one.speed_mps
-    for end_m, limit_mps in one.limits:
+    for end_m, own_limit_mps in one.limits:
         if s_m >= at_m:
             break
-        to_m = min(end_m, at_m)
+        to_m, limit_mps = min(end_m, at_m), min(own_limit_mps, fastest_mps)
         speed_mps = min(speed_mps, limit_mps)
         takes_s += _shortest_s(to_m - s_m, speed_mps, limit_mps, accel_mps2)
         speed_mps = min(limit_mps, math.sqrt(speed_mps**2 + 2.0 * accel_mps2 * (to_m - s_m)))
