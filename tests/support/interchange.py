@@ -1,7 +1,8 @@
 """A small motorway interchange as a SUMO simulation: an exit, and behind it an on-ramp.
 
     start (400 m, 3 lanes) -> main1 (700 m, 3) -> main2 (250 m, 4: lane 0 leads to the exit)
-    -> main3 (160 m, 3) -> main4 (250 m, 4: lane 0 comes from the ramp, and ends) -> main5 (600 m, 3)
+    -> main3 (160 m, 3) -> main4 (250 m, 4: lane 0 comes from the ramp, and ends)
+    -> main5 (600 m, 3)
 
 The main road is straight, to the east; the exit and the ramp are beside it. The files are written
 without netconvert, like those of `sim_bridge.sumo.network`.
