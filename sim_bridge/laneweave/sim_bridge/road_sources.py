@@ -50,10 +50,14 @@ def open_road(scenario: Scenario, results: Path) -> Iterator[RoadSource]:
         folder = Path(name)
         if not scenario.sumo.config:
             with SumoWorld(scenario, folder) as world:
+                if scenario.sumo.gui:
+                    world.show(scenario.runtime.tick_s)
                 yield RoadSource(world)
             return
         setup = sumo_corridor(scenario, folder).setup(scenario)
         with CorridorWorld(scenario, setup, folder, results) as world_of_sumo:
+            if scenario.sumo.gui:
+                world_of_sumo.show(scenario.runtime.tick_s)
             ramps = TakeOver(scenario, world_of_sumo)
             yield RoadSource(world_of_sumo, tuple(main_stream(setup.arrivals)), ramps)
             world_of_sumo.drive_on()

@@ -99,6 +99,9 @@ def run(
         bool,
         typer.Option("--compare", help="Also let SUMO drive alone, and compare (with --sumocfg)."),
     ] = False,
+    gui: Annotated[
+        bool, typer.Option("--gui", help="Show the run in sumo-gui (pip install 'laneweave[gui]').")
+    ] = False,
     out: RunFolder = None,
     pace: Annotated[
         float | None,
@@ -120,6 +123,7 @@ def run(
         "formation__solver": solver,
         "runtime__vehicles_per_process": vehicles_per_process,
         "runtime__coordinators": coordinators,
+        "sumo__gui": gui or None,
     }
     settings = scenario_of(tables, **overrides) if tables else load_scenario(scenario, **overrides)
     if compare and not settings.sumo.config:
@@ -146,6 +150,7 @@ def run(
             faults=faults,
             pace=pace,
             transport=transport,
+            gui=gui or None,
         )
         outcome = _run_reference(settings, out, method, show=show)
 

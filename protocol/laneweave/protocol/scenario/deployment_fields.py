@@ -139,3 +139,5 @@ class SumoSettings:
     """SUMO's configuration file; empty: the road of the scenario itself."""
     corridor: str = ""
     """Its first and its last edge: FIRST_EDGE:LAST_EDGE."""
+    gui: bool = False
+    """Whether sumo-gui shows the run; with `config` or without."""

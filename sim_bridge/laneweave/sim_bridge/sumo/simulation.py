@@ -9,9 +9,11 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Self
 
 from laneweave.protocol.errors import CommandFailedError
+from laneweave.sim_bridge.sumo.sumo_gui import SumoGui, load_traci
 
 DEBIAN_PACKAGES = {
     "libX11.so.6": "libx11-6",
@@ -58,6 +60,19 @@ class SumoProcess:
             reason = " ".join(str(error).split())
             raise SumoFailedError(f"SUMO cannot start ({reason}); its messages say why") from error
         SumoProcess._open = self
+        self._network = Path(command[command.index("--net-file") + 1])
+        self._gui: SumoGui | None = None
+
+    def show(self, tick_s: float) -> None:
+        """Show this simulation in sumo-gui.
+
+        Args:
+            tick_s: length of a tick.
+
+        Raises:
+            CommandFailedError: sumo-gui is not installed, or cannot start.
+        """
+        self._gui = SumoGui(self._network, tick_s)
 
     @property
     def vehicle(self) -> Any:  # noqa: ANN401 - libsumo has no types
@@ -94,9 +109,14 @@ class SumoProcess:
     def step(self) -> None:
         """Advance SUMO by one tick."""
         self._sumo.simulationStep()
+        if self._gui is not None and not self._gui.show(self.vehicle, self.vehicle.getIDList()):
+            self._gui = None
 
     def close(self) -> None:
         """Stop SUMO. Idempotent."""
+        if self._gui is not None:
+            self._gui.close()
+            self._gui = None
         if SumoProcess._open is self:
             SumoProcess._open = None
             self._sumo.close()
@@ -116,6 +136,7 @@ def _load_libsumo() -> Any:  # noqa: ANN401 - libsumo has no types
     The warning concerns SUMO's Parquet output, which is not used. libsumo and pyarrow were tested
     together, imported in either order.
     """
+    load_traci()  # before the switch, which also makes traci an alias of libsumo
     previous = os.environ.get(_IMPORT_SWITCH)
     os.environ[_IMPORT_SWITCH] = "quiet"
     try:
