@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pyarrow.parquet import read_table
 
 from laneweave.launch.cli.corridor_command import corridor_tables
 from laneweave.launch.recordings.trajectories import read_trips
@@ -16,6 +17,7 @@ from laneweave.launch.report.corridor_comparison import compare
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.sim_bridge.corridors import sumo_config
 from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 from laneweave.sim_bridge.corridors.sumo_statistics import read_statistics
 from support.interchange import CORRIDOR, TRUCKS, stream, vehicle, write_interchange
@@ -27,6 +29,13 @@ def scenario(folder: Path, vehicles: Sequence[str]) -> Scenario:
     config = write_interchange(folder, vehicles, types=TRUCKS)
     found = read_corridor(config, CORRIDOR, folder)
     return parse_scenario(corridor_tables(found, config, CORRIDOR))
+
+
+def read_rows(folder: Path) -> dict[tuple[str, int], tuple[float, float]]:
+    """Return position and speed of each vehicle by tick."""
+    columns = read_table(folder / "trajectories.parquet").to_pydict()
+    keys = zip(columns["vehicle"], (round(t_s / 0.1) for t_s in columns["t_s"]), strict=True)
+    return dict(zip(keys, zip(columns["s_m"], columns["speed_mps"], strict=True), strict=True))
 
 
 def drive(own: Scenario, folder: Path) -> tuple[dict[str, Any], Events]:
@@ -130,7 +139,10 @@ def test_equal_runs_are_equal(tmp_path: Path) -> None:
     assert one == two
 
 
-def test_a_queue_behind_the_exit_is_braked_for(tmp_path: Path) -> None:
+def test_a_queue_behind_the_exit_is_braked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sumo_config, "CONFLICT_S", 5.0)  # so that there are some
     standing = (
         '<vehicle id="standing" type="car" depart="0" departPos="20"><route edges="off"/>'
         '<stop lane="off_0" endPos="25" duration="60"/></vehicle>'
@@ -143,3 +155,18 @@ def test_a_queue_behind_the_exit_is_braked_for(tmp_path: Path) -> None:
     trips = {trip["sumo_id"]: trip for trip in read_trips(tmp_path / "run").values()}
     # The queue reaches back into the corridor until the first vehicle has stood for 60 s.
     assert trips["e5"]["left_s"] > 60.0
+    # Times to collision that SUMO reports are those of the recorded trajectories.
+    names = {trip["sumo_id"]: name for name, trip in read_trips(tmp_path / "run").items()}
+    rows, checked = read_rows(tmp_path / "run"), 0
+    for one in read_statistics(tmp_path / "run").conflicts:
+        tick = round(one.at_s / own.runtime.tick_s)
+        keys = [(names.get(name, ""), tick) for name in (one.vehicle, one.other)]
+        if not rows.keys() >= {*keys}:
+            continue  # SUMO drives one of them
+        (rear_m, fast_mps), (front_m, slow_mps) = sorted(rows[key] for key in keys)
+        gap_m = front_m - own.vehicle.length_m - rear_m
+        gap_m = front_m - own.vehicle.length_m - rear_m
+        # SUMO measures along its lanes, from which bodies are up to some decimetres away.
+        assert one.least_ttc_s == pytest.approx(gap_m / (fast_mps - slow_mps), rel=0.1)
+        checked += 1
+    assert checked > 0

@@ -17,6 +17,7 @@ from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.sim_bridge.corridors.corridor_arrivals import CorridorArrival
 from laneweave.sim_bridge.corridors.sumo_alone import drive_alone
 from laneweave.sim_bridge.corridors.sumo_statistics import (
+    CONFLICT_S,
     SumoStatistics,
     read_statistics,
 )
@@ -134,8 +135,9 @@ def _events_table(found: Sequence[SumoStatistics]) -> Table:
     """
     brakings = ["-", f"{found[1].emergency_brakings}"]
     rows = [
-        [method, f"{one.collisions}", f"{one.teleports}", braking]
+        [method, f"{one.collisions}", f"{one.teleports}", f"{len(one.conflicts)}", braking]
         for method, one, braking in zip(METHODS, found, brakings, strict=True)
     ]
-    headings = ["method", "collisions", "teleports", "emergency brakings"]
+    conflicts = f"time to collision < {CONFLICT_S:g} s"
+    headings = ["method", "collisions", "teleports", conflicts, "emergency brakings"]
     return Table(headings, rows, "Events in the whole network, as SUMO reports them")

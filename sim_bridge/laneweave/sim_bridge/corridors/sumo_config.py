@@ -11,7 +11,12 @@ from xml.etree import ElementTree as ET
 from attrs import field, frozen
 
 from laneweave.protocol.errors import NO_VALUE, BadInputError
-from laneweave.sim_bridge.corridors.sumo_statistics import STATISTICS_FILE, TRIPS_FILE
+from laneweave.sim_bridge.corridors.sumo_statistics import (
+    CONFLICT_S,
+    CONFLICTS_FILE,
+    STATISTICS_FILE,
+    TRIPS_FILE,
+)
 
 _SHORT_NAMES = {
     "n": "net-file",
@@ -171,6 +176,13 @@ def sumo_command(
         own["tripinfo-output"] = str(results / TRIPS_FILE)
         own["statistic-output"] = str(results / STATISTICS_FILE)
         own["device.emissions.probability"] = "1"
+        own |= {
+            "device.ssm.probability": "1",
+            "device.ssm.file": str(results / CONFLICTS_FILE),
+            "device.ssm.measures": "TTC",
+            "device.ssm.thresholds": f"{CONFLICT_S:g}",
+            "device.ssm.trajectories": "false",
+        }
     # Drawn vehicles must be those that have been read.
     own["random"] = "false"
     options = {"seed": str(seed % 2**31), **config.options, **own}

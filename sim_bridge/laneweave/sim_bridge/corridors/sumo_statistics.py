@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -10,6 +10,10 @@ from attrs import frozen
 
 TRIPS_FILE = "tripinfo.xml"
 STATISTICS_FILE = "statistics.xml"
+CONFLICTS_FILE = "ssm.xml"
+"""Output of SUMO's device for surrogate safety measures."""
+CONFLICT_S = 1.5
+"""Time to collision below which two vehicles are in conflict (Hayward 1972)."""
 
 
 @frozen
@@ -25,6 +29,18 @@ class SumoTrip:
 
 
 @frozen
+class Conflict:
+    """Two vehicles with a short time to collision."""
+
+    vehicle: str
+    other: str
+    least_ttc_s: float
+    """Least time to collision."""
+    at_s: float
+    """When it was reached."""
+
+
+@frozen
 class SumoStatistics:
     """The statistics of a run."""
 
@@ -33,6 +49,8 @@ class SumoStatistics:
     collisions: int
     teleports: int
     emergency_brakings: int
+    conflicts: tuple[Conflict, ...] = ()
+    """Conflicts of vehicles that SUMO displays, each of a pair once."""
 
 
 def read_statistics(folder: Path) -> SumoStatistics:
@@ -55,7 +73,24 @@ def read_statistics(folder: Path) -> SumoStatistics:
         collisions=_count(safety, "collisions"),
         teleports=_count(teleports, "total"),
         emergency_brakings=_count(safety, "emergencyBraking"),
+        conflicts=tuple(_conflicts(folder / CONFLICTS_FILE)),
     )
+
+
+def _conflicts(file: Path) -> Iterator[Conflict]:
+    """Yield the conflicts in the output of SUMO's device."""
+    for _, element in ET.iterparse(file):  # noqa: S314 (SUMO has written it)
+        if element.tag != "conflict":
+            continue
+        least = element.find("minTTC")
+        if least is not None and least.get("value", "NA") != "NA":
+            yield Conflict(
+                element.get("ego", ""),
+                element.get("foe", ""),
+                float(least.get("value", "nan")),
+                float(least.get("time", "nan")),
+            )
+        element.clear()
 
 
 def _trip(element: ET.Element) -> SumoTrip:
