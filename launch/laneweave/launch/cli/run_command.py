@@ -112,9 +112,7 @@ def run(
     """Run a scenario on this machine, and write the results to a folder."""
     tables = corridor_scenario(scenario, sumocfg, corridor, seed)
     if tables:
-        reject_unused_options(
-            "with --sumocfg", volume=volume, duration=duration, operation=operation, solver=solver
-        )
+        reject_unused_options("with --sumocfg", volume=volume, operation=operation, solver=solver)
     overrides = {
         "seed": seed,
         "demand__volume_veh_per_lane_h": volume,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from attrs import frozen
+from attrs import evolve, frozen
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
@@ -25,13 +25,22 @@ class SumoCorridor:
     demand: CorridorDemand
 
     def setup(self, scenario: Scenario) -> CorridorSetup:
-        """Return the setup of a run."""
+        """Return the setup of a run, with the vehicles that depart in its time."""
+        duration_s = min(self.demand.duration_s, scenario.demand.duration_s)
+        demand = evolve(
+            self.demand,
+            passes=tuple(
+                one
+                for one in self.demand.passes
+                if one.vehicle.depart_s - self.demand.begin_s <= duration_s
+            ),
+        )
         return CorridorSetup(
             self.config,
             self.network,
             self.corridor,
-            corridor_arrivals(scenario, self.demand),
-            self.demand.duration_s,
+            corridor_arrivals(scenario, demand),
+            duration_s,
         )
 
 

@@ -11,8 +11,8 @@ import math
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 from attrs import frozen
 
@@ -115,7 +115,7 @@ def read_demand(config: SumoConfig, folder: Path, seed: int = 1) -> SumoDemand:
     with SumoProcess(command) as sumo:
         while True:
             for name in sumo.simulation.getLoadedIDList():
-                vehicles.append(_vehicle(sumo.vehicle, name, sumo.simulation.getTime()))
+                vehicles.append(_vehicle(sumo, name))
                 sumo.vehicle.remove(name)
             sumo.step()
             loaded, now_s = sumo.simulation.getLoadedIDList(), sumo.simulation.getTime()
@@ -127,12 +127,13 @@ def read_demand(config: SumoConfig, folder: Path, seed: int = 1) -> SumoDemand:
     return SumoDemand(tuple(vehicles), config.begin_s, min(end_s, math.ceil(last_s)))
 
 
-def _vehicle(api: Any, name: str, now_s: float) -> SumoVehicle:  # noqa: ANN401
+def _vehicle(sumo: SumoProcess, name: str) -> SumoVehicle:
+    api = sumo.vehicle
     # Until they depart, loaded vehicles have a negative delay; those of flows come a step late.
     return SumoVehicle(
         name,
-        round(now_s - api.getDepartDelay(name), 3),
-        tuple(api.getRoute(name)),
+        round(sumo.simulation.getTime() - api.getDepartDelay(name), 3),
+        _route(sumo, name),
         SumoType(
             length_m=api.getLength(name),
             width_m=api.getWidth(name),
@@ -143,6 +144,20 @@ def _vehicle(api: Any, name: str, now_s: float) -> SumoVehicle:  # noqa: ANN401
         api.getVehicleClass(name),
         api.getTypeID(name),
     )
+
+
+def _route(sumo: SumoProcess, name: str) -> tuple[str, ...]:
+    """Return the route of a loaded vehicle; that of a trip is the one that SUMO would choose."""
+    given: tuple[str, ...] = tuple(sumo.vehicle.getRoute(name))
+    if sumo.vehicle.isRouteValid(name):
+        return given
+    found = list(given[:1])
+    for before, after in pairwise(given):
+        way = sumo.simulation.findRoute(before, after, sumo.vehicle.getTypeID(name)).edges
+        if not way:
+            return given
+        found += way[1:]
+    return tuple(found)
 
 
 def demand_on(corridor: Corridor, demand: SumoDemand) -> CorridorDemand:

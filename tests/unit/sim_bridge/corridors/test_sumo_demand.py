@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from attrs import evolve
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
@@ -151,3 +152,28 @@ def test_what_sumo_refuses_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(SumoFailedError) as caught:
         read_corridor(config, CORRIDOR, tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_shorter_demand_is_the_beginning_of_the_whole(tmp_path: Path) -> None:
+    found = corridor(tmp_path, *(vehicle(f"m{n}", 2.0 * n, "main") for n in range(10)))
+    own = parse_scenario(scenario_tables(found.corridor, found.demand))
+    whole = found.setup(own)
+    part = found.setup(evolve(own, demand=evolve(own.demand, duration_s=7.0)))
+    assert part.arrivals == whole.arrivals[:4]
+    assert part.end_s == whole.end_s - whole.duration_s + 7.0
+    assert part.is_left_out("m4", ["main1"])
+
+
+def test_trips_get_the_routes_that_sumo_chooses(tmp_path: Path) -> None:
+    trips = [
+        '<trip id="a" type="car" depart="0" from="main1" to="main5"/>',
+        '<trip id="b" type="car" depart="1" from="before" to="main5"/>',
+        '<trip id="c" type="car" depart="2" from="start" to="off" via="main1"/>',
+        '<trip id="nowhere" type="car" depart="3" from="off" to="main1"/>',
+    ]
+    passes = corridor(tmp_path, *trips).demand.passes
+    assert {one.vehicle.name: (one.upstream, one.entrance, one.destination) for one in passes} == {
+        "a": ("", MAIN_ENTRANCE, END_OF_ROAD),
+        "b": ("", "on", END_OF_ROAD),
+        "c": ("start", MAIN_ENTRANCE, "off"),
+    }
