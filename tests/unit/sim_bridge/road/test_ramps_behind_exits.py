@@ -104,6 +104,23 @@ def test_no_cell_has_two_owners_and_leaving_vehicles_have_that_of_their_exit() -
     assert set(road.exits.values()) == {"lane-1", "lane-2", "lane-3"}
 
 
+def test_empty_cells_belong_to_vehicles_of_their_column() -> None:
+    """If there is one: nobody else needs them."""
+    stream = tuple(
+        Arrival(f"v{number}", 1 + number % 3, ANY_LANE, 5.0 + 1.2 * number) for number in range(20)
+    )
+    road = LonelyRoad(INTERCHANGE)
+    road.roadside = Roadside(INTERCHANGE, bridge=1, stream=stream)
+    while road.t_s < 26.0:
+        road.step()
+    columns = {name: vehicle.admission.cell[0] for name, vehicle in road.vehicles.items()}
+    owned = [(cell, name) for cell, names in owners_of(road).items() for name in names]
+    shared = [(cell, name) for cell, name in owned if cell[0] in columns.values()]
+    assert len(shared) > len(columns)
+    assert all(columns[name] == cell[0] for cell, name in shared)
+    assert {cell[0] for cell, _ in owned} > {*columns.values()}
+
+
 def admitted_columns(vehicle: RoadVehicle | None, *, left: bool = False) -> list[int]:
     """Return the columns of three vehicles from the ramp, one after another."""
     stream = tuple(Arrival(f"r{number}", 0, ANY_LANE, 20.0 + number) for number in range(3))
