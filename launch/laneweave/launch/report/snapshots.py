@@ -182,8 +182,18 @@ def _draw_closed_parts(axes: Axes, scenario: Scenario) -> None:
         axes.plot([from_m, to_m], [lane * width_m] * 2, color=INK, linewidth=1.6, zorder=2)
     for one in scenario.exit:
         for lane in one.lanes:
-            place = (one.at_m + 2.0, (lane + 0.5) * width_m)
-            axes.annotate(f"→ {one.name}", place, va="center", fontsize=8, zorder=3, clip_on=True)
+            # Where a ramp follows in the same lane, its vehicles must not be hidden.
+            before = lane in scenario.shared_exit_lanes
+            place = (one.at_m + (-2.0 if before else 2.0), (lane + 0.5) * width_m)
+            axes.annotate(
+                f"{one.name} →" if before else f"→ {one.name}",
+                place,
+                ha="right" if before else "left",
+                va="center",
+                fontsize=8,
+                zorder=1.6,
+                clip_on=True,
+            )
 
 
 def _draw_formations(
