@@ -60,6 +60,8 @@ MAX_LINE_GAP_M = 200.0
 """Distance from which stop lines are seen; more than any stopping distance."""
 BESIDE_M = 1.0
 """Net gap along the road below which another body is beside this one."""
+BEFORE_ENTERING = 0.4
+"""Share of a move before a body touches the other lane."""
 SLOWED_MPS = 2.0
 """Loss of speed from which a body does not enter another lane."""
 STANDING_MPS = 0.3
@@ -134,6 +136,8 @@ class MotionController:
     lattice: Lattice = field(init=False)
     tick_s: float = field(init=False)
     _brake: EmergencyBrake = field(init=False)
+    _weakest_brake: EmergencyBrake = field(init=False)
+    """That of the type that brakes least hard."""
     _lane_ends: LaneEnds = field(init=False)
 
     def __attrs_post_init__(self) -> None:
@@ -146,6 +150,8 @@ class MotionController:
         self.rung_ticks = dict.fromkeys(Rung, 0)
         self._jerks = array("f")
         self._brake = EmergencyBrake(self._scenario)
+        types = self._scenario.types.values()
+        self._weakest_brake = EmergencyBrake(max(types, key=lambda one: one.vehicle.min_accel_mps2))
         self._lane_ends = LaneEnds(self._scenario)
 
     @property
@@ -302,8 +308,8 @@ class MotionController:
 
         A command is rejected if its incarnation is older than that of the process in charge, if its
         tick is not later than that of the last command, if the vehicle does not own its hold cell
-        (rolling operation), or if it changes lanes in an emergency, beside another body, or too
-        late for an exit. A newer incarnation takes charge. Its first command must keep the hold
+        (rolling operation), or if it changes lanes in an emergency, beside another body, before one
+        that could not brake for it, or too late for an exit. A newer incarnation takes charge. Its first command must keep the hold
         cell: no plan can allow a process to move the vehicle before it is in charge. A rejected
         process may try again at the next tick.
 
@@ -334,6 +340,7 @@ class MotionController:
         if lane != self.hold_cell[1] and (
             self.rung is Rung.EMERGENCY
             or self._is_beside(lane)
+            or self._cuts_in(lane)
             or self._misses_exit(command.hold_cell, command.tick * self.tick_s)
         ):
             return False
@@ -489,6 +496,25 @@ class MotionController:
         """
         ahead, behind = self.neighbours
         return any(other.lane == lane and other.gap_m < BESIDE_M for other in (*ahead, *behind))
+
+    def _cuts_in(self, lane: int) -> bool:
+        """Return whether a measured neighbour behind in a lane could not brake for this vehicle.
+
+        In its cell none is so near and fast. One that has had to stop and catches up with a cell
+        farther ahead is, where vehicles keep their columns and others change lanes in them.
+        """
+        if self._scenario.formation.change_columns:
+            return False
+        speed_mps, touching_s = self.measured[1], BEFORE_ENTERING * self._scenario.move_s
+        for other in self.neighbours[1]:
+            if other.lane != lane:
+                continue
+            closes_m = max(0.0, other.speed_mps - speed_mps) * touching_s
+            body = Neighbour(lane, other.gap_m - closes_m, speed_mps, 0.0)
+            state = (0.0, other.speed_mps, 0.0, 0.0, 0.0, 0.0)
+            if self._weakest_brake.spare_m(state, 0.0, (0.0, 0.0), [body]) < 0.0:
+                return True
+        return False
 
     def _checked_jerks(self, command: Command) -> array[float]:
         for cell in (command.hold_cell, command.motion_origin):

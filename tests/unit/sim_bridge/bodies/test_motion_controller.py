@@ -333,6 +333,35 @@ def test_no_lane_change_begins_beside_another_body(
     assert controller.accept_command(command(2, (0.1, 0.0), hold_cell=ahead))
 
 
+KEEPING = evolve(SCENARIO, formation=evolve(SCENARIO.formation, change_columns=False))
+"""Vehicles keep their columns."""
+
+
+@pytest.mark.parametrize(
+    ("gap_m", "faster_mps", "accepted"),
+    [
+        (SCENARIO.formation.gap_m - SCENARIO.vehicle.length_m, 0.0, True),  # in the next cell
+        (5.0, 5.0, False),
+        (12.0, 5.0, False),
+        (30.0, 5.0, True),
+        (5.0, -15.0, True),  # it stands
+    ],
+)
+def test_no_lane_change_begins_before_a_body_that_could_not_brake(
+    gap_m: float, faster_mps: float, *, accepted: bool
+) -> None:
+    """It catches up with a cell farther ahead, and passes the cells of others."""
+    controller = controller_in(HOME, KEEPING, attendant=AGENT)
+    speed_mps = controller.plant.state[1] + faster_mps
+    behind = (Neighbour(2, gap_m, speed_mps),)
+    controller.perceive(controller.plant.state, Neighbours((), behind))
+    there: Cell = (HOME[0], 2)
+    assert controller.accept_command(command(1, (0.0, 0.1), hold_cell=there)) == accepted
+    other_lane = controller_in(HOME, KEEPING, attendant=AGENT)
+    other_lane.perceive(other_lane.plant.state, Neighbours((), behind))
+    assert other_lane.accept_command(command(1, (0.0, 0.1), hold_cell=(HOME[0], 0)))
+
+
 def test_no_lane_change_begins_in_an_emergency(controller: MotionController) -> None:
     controller.rung = Rung.EMERGENCY
     assert not controller.accept_command(command(1, (0.0, 0.1), hold_cell=(HOME[0], 2)))
