@@ -309,9 +309,9 @@ class MotionController:
         A command is rejected if its incarnation is older than that of the process in charge, if its
         tick is not later than that of the last command, if the vehicle does not own its hold cell
         (rolling operation), or if it changes lanes in an emergency, beside another body, before one
-        that could not brake for it, or too late for an exit. A newer incarnation takes charge. Its first command must keep the hold
-        cell: no plan can allow a process to move the vehicle before it is in charge. A rejected
-        process may try again at the next tick.
+        that could not brake for it, or too late for an exit. A newer incarnation takes charge. Its
+        first command must keep the hold cell: no plan can allow a process to move the vehicle
+        before it is in charge. A rejected process may try again at the next tick.
 
         A command without jerks and with the current hold cell does not change the motion.
 
