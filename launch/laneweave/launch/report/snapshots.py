@@ -81,6 +81,7 @@ def road_snapshots(
     if not times:
         times = _instants(tracks, scenario, stretch_m)
     trips = read_trips(folder)
+    exits = {one.name: one.lanes[0] for one in scenario.exit}
     formations = closed_formations(folder, scenario)
     beyond_m = 2.0 * scenario.longest_body_m
     width_in, road_m = 9.6, road.lanes * road.lane_width_m + _HEADROOM_M
@@ -98,6 +99,8 @@ def road_snapshots(
                 if pose is not None and stretch_m[0] <= pose[0] <= stretch_m[1] + beyond_m:
                     trip = trips.get(name, {})
                     preferred = trip.get("preferred_lane", ANY_LANE)
+                    if preferred == ANY_LANE:
+                        preferred = exits.get(trip.get("destination", ""), ANY_LANE)
                     own = scenario.types[trip.get("vehicle_type", CAR)]
                     _draw_vehicle(axes, pose, preferred, own)
         strips[-1].tick_params(axis="x", bottom=True, labelbottom=True)
