@@ -165,7 +165,6 @@ def test_a_queue_behind_the_exit_is_braked_for(
             continue  # SUMO drives one of them
         (rear_m, fast_mps), (front_m, slow_mps) = sorted(rows[key] for key in keys)
         gap_m = front_m - own.vehicle.length_m - rear_m
-        gap_m = front_m - own.vehicle.length_m - rear_m
         # SUMO measures along its lanes, from which bodies are up to some decimetres away.
         assert one.least_ttc_s == pytest.approx(gap_m / (fast_mps - slow_mps), rel=0.1)
         checked += 1

@@ -94,6 +94,8 @@ class TrackingDriver:
         self._scenario = scenario
         self._tracker = Tracker(scenario)
         self._reference: Reference | None = None
+        self._settling: Reference | None = None
+        """The reference with which the vehicle settles in the cell in which it has entered."""
         self._goal: Cell = (0, 0)
         self._durations = scenario.move_durations
         self._ticks = 0
@@ -115,10 +117,10 @@ class TrackingDriver:
     def take_over(self, sense: Sense) -> None:
         """Continue the motion controller's current motion."""
         scenario = self._scenario
-        self._goal = sense.hold_cell
+        self._goal, self._settling = sense.hold_cell, None
         if sense.motion_origin == sense.hold_cell and sense.motion_end_tick > sense.tick + 3:
             state = commanded_state(sense.state, sense.setpoint, self._vehicle, self._speed_mps)
-            self._reference = Reference.settling(
+            self._reference = self._settling = Reference.settling(
                 scenario, sense.hold_cell, state, sense.tick, sense.motion_end_tick
             )
         elif sense.motion_end_tick > sense.tick and sense.motion_ticks in self._durations:
@@ -129,10 +131,10 @@ class TrackingDriver:
 
     def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
         """Begin a move at `tick` that lasts `ticks` ticks."""
-        before = self._reference
         self._reference = Reference.move(self._scenario, move[1], move[2], tick, ticks)
-        if before is not None and before.origin == self._goal == move[1]:
-            self._reference.settle_meanwhile(before)
+        # The same move may begin again, if the command with its beginning was lost.
+        if self._settling is not None and self._settling.origin == move[1]:
+            self._reference.settle_meanwhile(self._settling)
         self._goal, self._ticks = move[2], ticks
 
     def at_rest(self, sense: Sense) -> bool:
@@ -143,7 +145,7 @@ class TrackingDriver:
         reference, room_ahead_m = self._current, self._scenario.room_ahead_m
         if room_ahead_m > 0.0 and reference.origin == self._goal:
             return nearly_settled(sense.state, self._lattice, self._goal, sense.t_s, room_ahead_m)
-        return sense.tick >= reference.end_tick and at_rest_in_cell(
+        return sense.tick >= reference.rest_tick and at_rest_in_cell(
             sense.state, self._lattice, self._goal, sense.t_s
         )
 
@@ -165,9 +167,12 @@ class TrackingDriver:
         self._solve_ms.append(result.solve_ms)
         self._unusable += not result.usable
         self._osqp_solves += result.iterations > 0
+        end_tick = max(reference.end_tick, tick + 1) if moving else 0
+        if reference is self._settling and tick < reference.end_tick:
+            end_tick = reference.end_tick  # ready for plans, but still settling
         return Drive(
             # A late body is still moving; an agent that takes over must know this.
-            motion_end_tick=max(reference.end_tick, tick + 1) if moving else 0,
+            motion_end_tick=end_tick,
             motion_origin=reference.origin,
             motion_ticks=self._ticks if reference.origin != self._goal else 0,
             jerks=result.jerk.astype(_FLOAT32).tobytes() if result.usable else b"",

@@ -75,6 +75,8 @@ class Reference:
             states.append(trajectory.states[:-1])
             jerks.append(trajectory.jerks)
             rest = trajectory.states[-1:] * (1.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+        self.rest_tick = self.end_tick
+        """Tick from which the body is at rest in the last cell."""
         states.append(np.repeat(rest, n + 1, axis=0))
         jerks.append(np.zeros((n, 2)))
         self._states = np.concatenate(states)
@@ -136,7 +138,7 @@ class Reference:
         jerks[n : n + len(along), 0] += along
         jerks.flags.writeable = False
         self._jerks = jerks
-        self.end_tick = max(self.end_tick, before.end_tick)
+        self.rest_tick = max(self.end_tick, before.end_tick)
 
     def window(self, tick: int) -> Window:
         """Return the part of the reference from `tick` on; its jerks are read-only."""

@@ -10,7 +10,7 @@ starts from its cell.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,7 @@ from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.conflict_kinds import Move
 from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import Planner
-from laneweave.coordinator.rolling.observed import ObservedRoad
+from laneweave.coordinator.rolling.observed import ObservedRoad, Snapshot
 from laneweave.coordinator.rolling.ownership import certain_cells, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
@@ -190,7 +190,7 @@ class RollingOperation:
         since_s = self._since[0] - 1e-6 if self._since is not None else 0.0
         far_m = self._scenario.moves_from_m - LOOKAHEAD_M
         snapshot = self.observed.at(snapshot_s)
-        gated = self._gated(snapshot.states, slot - 1)
+        gated = self._gated(snapshot, slot - 1)
         # Vehicles without a state come last: they may have moved, and others may hold their cells.
         for entry in sorted(
             snapshot.census.on_lattice, key=lambda entry: entry.vehicle not in snapshot.states
@@ -235,16 +235,19 @@ class RollingOperation:
         )
         return tuple(vehicles.values()), blocked, self._ends_m(snapshot.census)
 
-    def _gated(self, states: Mapping[Name, VehicleState], slot: int) -> frozenset[Name]:
-        """Return the members of ballots for a slot whose start gates are not open yet.
+    def _gated(self, snapshot: Snapshot, slot: int) -> frozenset[Name]:
+        """Return the members of ballots for a slot that wait for one that settles.
 
         If one of them promised the next ballot, the gate would stay closed.
         """
+        t0_s, states = slot * self._slot_s, snapshot.states
+        settling = {one.vehicle for one in snapshot.census.on_lattice if one.ready_s > t0_s}
         return frozenset(
             name
             for transfer in self.transfers
             if transfer.phase is BallotPhase.IN_FORCE
-            and transfer.t0_s >= slot * self._slot_s - 1e-6
+            and transfer.t0_s >= t0_s - 1e-6
+            and not settling.isdisjoint(transfer.roster)
             and not any(states[one].go for one in transfer.roster if one in states)
             for name in transfer.roster
         )

@@ -39,7 +39,7 @@ ARRIVED_ACROSS_M = 0.3
 SETTLED_MPS = 0.5
 """Difference in speed to its cell up to which a body has settled in it."""
 NEARLY_SETTLED_MPS = 4.0
-"""Difference in speed to its cell up to which a body that settles is ready for plans."""
+"""How much slower than its cell a body that settles may be when it is ready for plans."""
 DISPLACED_ALONG_M = 1.0
 DISPLACED_ACROSS_M = 0.5
 """Distances from its cell from which a vehicle no longer holds it, for example after an emergency
@@ -146,7 +146,7 @@ def nearly_settled(
     return (
         -ARRIVED_ALONG_M <= state[0] - goal[0] <= room_ahead_m
         and abs(state[3] - goal[3]) <= ARRIVED_ACROSS_M
-        and abs(state[1] - goal[1]) <= NEARLY_SETTLED_MPS
+        and -NEARLY_SETTLED_MPS <= state[1] - goal[1] <= SETTLED_MPS
     )
 
 

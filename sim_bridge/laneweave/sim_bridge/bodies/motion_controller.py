@@ -62,6 +62,8 @@ BESIDE_M = 1.0
 """Net gap along the road below which another body is beside this one."""
 BEFORE_ENTERING = 0.4
 """Share of a move before a body touches the other lane."""
+CATCHING_UP_MPS = 1.0
+"""Speed above v_F from which a body that keeps its column catches up with its cell."""
 SLOWED_MPS = 2.0
 """Loss of speed from which a body does not enter another lane."""
 STANDING_MPS = 0.3
@@ -498,16 +500,16 @@ class MotionController:
         return any(other.lane == lane and other.gap_m < BESIDE_M for other in (*ahead, *behind))
 
     def _cuts_in(self, lane: int) -> bool:
-        """Return whether a measured neighbour behind in a lane could not brake for this vehicle.
+        """Return whether one that catches up in a lane could not brake for this vehicle.
 
-        In its cell none is so near and fast. One that has had to stop and catches up with a cell
-        farther ahead is, where vehicles keep their columns and others change lanes in them.
+        It has had to stop, and passes the cells of others: vehicles that keep their columns change
+        lanes in them.
         """
         if self._scenario.formation.change_columns:
             return False
         speed_mps, touching_s = self.measured[1], BEFORE_ENTERING * self._scenario.move_s
         for other in self.neighbours[1]:
-            if other.lane != lane:
+            if other.lane != lane or other.speed_mps < self.lattice.speed_mps + CATCHING_UP_MPS:
                 continue
             closes_m = max(0.0, other.speed_mps - speed_mps) * touching_s
             body = Neighbour(lane, other.gap_m - closes_m, speed_mps, 0.0)

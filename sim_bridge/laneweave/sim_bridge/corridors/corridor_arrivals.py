@@ -61,6 +61,8 @@ class CorridorSetup:
     arrivals: tuple[CorridorArrival, ...]
     duration_s: float
     """Time within which vehicles depart."""
+    left_out: frozenset[str] = frozenset()
+    """Names in SUMO of vehicles that come through the corridor, but are not among its vehicles."""
 
     @cached_property
     def by_name(self) -> Mapping[str, CorridorArrival]:
@@ -74,8 +76,9 @@ class CorridorSetup:
 
     def is_left_out(self, name: str, route: Sequence[str]) -> bool:
         """Return whether a vehicle is in the corridor, but not one of its vehicles."""
+        # The route of a trip is not known yet, and names of later vehicles are not.
         edges = {edge.name for edge in self.corridor.edges}
-        return name not in self.by_name and not edges.isdisjoint(route)
+        return name in self.left_out or (name not in self.by_name and not edges.isdisjoint(route))
 
 
 def corridor_arrivals(scenario: Scenario, demand: CorridorDemand) -> tuple[CorridorArrival, ...]:

@@ -27,20 +27,17 @@ class SumoCorridor:
     def setup(self, scenario: Scenario) -> CorridorSetup:
         """Return the setup of a run, with the vehicles that depart in its time."""
         duration_s = min(self.demand.duration_s, scenario.demand.duration_s)
-        demand = evolve(
-            self.demand,
-            passes=tuple(
-                one
-                for one in self.demand.passes
-                if one.vehicle.depart_s - self.demand.begin_s <= duration_s
-            ),
-        )
+        latest_s = self.demand.begin_s + duration_s
+        passes = tuple(one for one in self.demand.passes if one.vehicle.depart_s <= latest_s)
+        demand = evolve(self.demand, passes=passes)
+        later = {one.vehicle.name for one in self.demand.passes[len(passes) :]}
         return CorridorSetup(
             self.config,
             self.network,
             self.corridor,
             corridor_arrivals(scenario, demand),
             duration_s,
+            self.demand.left_out | later,
         )
 
 

@@ -17,11 +17,12 @@ from pathlib import Path
 
 from attrs import evolve
 
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
-from laneweave.sim_bridge.corridors.corridor import HANDOVER_M, Corridor
+from laneweave.sim_bridge.corridors.corridor import HANDOVER_M, OPTION, Corridor
 from laneweave.sim_bridge.corridors.corridor_arrivals import MAX_WAIT_S, CorridorSetup
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
 from laneweave.sim_bridge.corridors.sumo_config import sumo_command
@@ -30,7 +31,11 @@ from laneweave.sim_bridge.corridors.take_over import Approaching
 from laneweave.sim_bridge.corridors.ways_in import ways_to_ramp, ways_to_start
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
-_PLANTS = {"step-method.ballistic": "true", "collision.mingap-factor": "0"}
+_PLANTS = {
+    "step-method.ballistic": "true",
+    "collision.mingap-factor": "0",
+    "time-to-teleport": "-1",
+}
 """Options with which SUMO displays bodies as the bridge drives them."""
 _OWN_SPEED_MODE, _OWN_LANE_CHANGES = 31, 1621
 """SUMO's defaults: it drives."""
@@ -79,13 +84,17 @@ class CorridorWorld(SumoProcess):
         to_start = ways_to_start(setup.network, setup.corridor) if upstream else {}
         self.start_lanes = tuple(to_start)
         """Lanes to whose beginning vehicles come from upstream."""
-        self._ways_in = {
-            **to_start,
-            **{
-                ramp.lane: ways_to_ramp(setup.network, setup.corridor, ramp)
-                for ramp in setup.corridor.ramps
-            },
+        used = {(one.lane, round(one.at_m, 1)) for one in scenario.entrance}
+        to_ramps = {
+            ramp.lane: ways_to_ramp(setup.network, setup.corridor, ramp)
+            for ramp in setup.corridor.ramps
+            if (ramp.lane, round(ramp.at_m, 1)) in used
         }
+        both = to_ramps.keys() & to_start.keys()
+        if both:
+            allowed = f"one whose lane {min(both)} is either open at the start or that of a ramp"
+            raise BadInputError(OPTION, setup.corridor.name, allowed)
+        self._ways_in = {**to_start, **to_ramps}
         self._beyond = dict(_beyond(setup.network, setup.corridor))
         self._take_out_loaded()
 
@@ -126,7 +135,7 @@ class CorridorWorld(SumoProcess):
 
     @property
     def exhausted(self) -> bool:
-        """Whether no vehicles come to a ramp any more, or they have not come for long."""
+        """Whether no vehicles come to an entrance any more, or they have not come for long."""
         return not self._coming or self.simulation.getTime() >= self._setup.end_s
 
     def others(self) -> Sequence[OtherBody]:

@@ -20,10 +20,12 @@ BRAKE_MPS2 = 2.0
 """Deceleration with which a vehicle falls back."""
 MIN_SPEED_MPS = 6.0
 """Lowest speed to which a vehicle brakes."""
-LONGEST_S = 30.0
+LONGEST_S = 60.0
 _SHORTEST_S = 1.0
 _SLACK_S = 0.3
-"""Spare time: ticks are discrete, and the agent does not begin at once."""
+"""Spare time: ticks are discrete."""
+_LATE_S = 0.15
+"""Time for which it may hold its speed before it has to accelerate: agents do not begin at once."""
 _STEP_MPS = 0.25
 _NEAR_M, _NEAR_MPS = 0.1, 0.1
 """Distance and difference in speed at which a vehicle is in its cell."""
@@ -56,7 +58,7 @@ def settling_s(
             slowest_mps, 0.0, LIMIT_SHARE * limits.max_accel_mps2, limits
         )
         holds_s = (ahead_m - brakes_m - accelerates_m) / slowest_mps
-        if holds_s < 0.0:
+        if holds_s < _LATE_S:
             break  # slower still, it would fall back farther
         found.append(brake_s + holds_s + accel_s)
     time_s = max(min(found, default=math.inf) + _SLACK_S, _SHORTEST_S)
@@ -93,7 +95,7 @@ def fall_back(slower_mps: float, speed_mps: float, limits: Vehicle) -> tuple[flo
 
     If it cannot settle, they are infinite.
     """
-    for ahead_m in range(200):
+    for ahead_m in range(500):
         time_s = settling_s(float(ahead_m), slower_mps, speed_mps, limits)
         if time_s is not None:
             return float(ahead_m), time_s

@@ -89,6 +89,8 @@ class CorridorDemand:
     """Time within which they depart."""
     missing: Mapping[str, int]
     """Number of vehicles that a corridor cannot serve, by reason."""
+    left_out: frozenset[str] = frozenset()
+    """Their names in SUMO."""
 
 
 def read_demand(config: SumoConfig, folder: Path, seed: int = 1) -> SumoDemand:
@@ -162,7 +164,7 @@ def _route(sumo: SumoProcess, name: str) -> tuple[str, ...]:
 
 def demand_on(corridor: Corridor, demand: SumoDemand) -> CorridorDemand:
     """Return the vehicles whose routes lead through a corridor."""
-    passes, missing = list[Pass](), Counter[str]()
+    passes, missing, left_out = list[Pass](), Counter[str](), set[str]()
     ways_in = {(ramp.edge, ramp.to_edge) for ramp in corridor.ramps}
     ways_out = {(one.from_edge, one.edge) for one in corridor.ways_out}
     numbers = {edge.name: number for number, edge in enumerate(corridor.edges)}
@@ -172,8 +174,10 @@ def demand_on(corridor: Corridor, demand: SumoDemand) -> CorridorDemand:
             passes.append(found)
         elif found:
             missing[found] += 1
+            left_out.add(vehicle.name)
     duration_s = max(demand.end_s - demand.begin_s, 1.0)
-    return CorridorDemand(tuple(passes), demand.begin_s, duration_s, missing)
+    names = frozenset(left_out)
+    return CorridorDemand(tuple(passes), demand.begin_s, duration_s, missing, names)
 
 
 def _pass_of(

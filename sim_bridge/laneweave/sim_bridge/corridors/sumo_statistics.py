@@ -73,7 +73,12 @@ def read_statistics(folder: Path) -> SumoStatistics:
         collisions=_count(safety, "collisions"),
         teleports=_count(teleports, "total"),
         emergency_brakings=_count(safety, "emergencyBraking"),
-        conflicts=tuple(_conflicts(folder / CONFLICTS_FILE)),
+        conflicts=tuple(
+            {
+                (*sorted((one.vehicle, one.other)), one.at_s): one
+                for one in _conflicts(folder / CONFLICTS_FILE)
+            }.values()
+        ),
     )
 
 

@@ -104,7 +104,7 @@ class TakeOver:
             for lane, at_m in self._at_m.items()
         }
         """Where moves out of each of these lanes have ended."""
-        self._occupied: Collection[Cell] = ()
+        self._occupied = set[Cell]()
         """Cells in which vehicles are, or to which they move."""
         self._known: dict[Name, Arrival] = {}
         """Approaching vehicles, each with the time at which it was expected first."""
@@ -132,6 +132,11 @@ class TakeOver:
         """Whether no more vehicles will come."""
         return self._view.exhausted
 
+    @property
+    def start_lanes(self) -> Sequence[int]:
+        """Lanes to whose beginning vehicles come from upstream."""
+        return self._view.start_lanes
+
     def full_lanes(self) -> set[int]:
         """Return the lanes to whose start a vehicle is too close for another to enter before it."""
         return {
@@ -145,7 +150,7 @@ class TakeOver:
     def admit(self, t_s: float, meter: EntryMeter, occupied: Collection[Cell]) -> list[Admission]:
         """Take over the vehicles whose fronts are at their entrances, and advise the others."""
         admissions = []
-        self._occupied = occupied
+        self._occupied = set(occupied)
         for lane, at_m in self._at_m.items():
             column = meter.next_open(lane, t_s)
             for one in self._view.approaching(lane):
@@ -156,6 +161,7 @@ class TakeOver:
                     column = self._advise(one, lane, column, t_s, meter)
                     continue
                 admissions.append(self._take(one, column, t_s, meter))
+                self._occupied.add(admissions[-1].cell)
                 column = admissions[-1].cell[0] - 1
                 del self._known[name]
         return admissions
@@ -185,8 +191,10 @@ class TakeOver:
         start = EntryState(one.s_m, one.speed_mps, time_s, ready_s)
         more = meter.exit_cells(arrival, column)
         if self._at_m[arrival.lane] <= 0.0:
-            # From the lanes beside it, nobody may enter the cells that it still touches.
-            more += tuple((ahead, arrival.lane) for ahead in range(column + 1, first + 1))
+            # From the lanes beside it, nobody may enter the cells that it may touch: the last one
+            # that has passed the start is not assigned yet (`Roadside.assign_empty_cells`).
+            last = first if (first + 1, arrival.lane) in self._occupied else first + 1
+            more += tuple((ahead, arrival.lane) for ahead in range(column + 1, last + 1))
         return Admission(arrival, (column, arrival.lane), t_s, ahead_m, more, start)
 
     def _arrival(self, one: Approaching) -> Arrival:

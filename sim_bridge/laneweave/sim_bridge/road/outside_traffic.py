@@ -19,6 +19,10 @@ class OutsideTraffic(Protocol):
     def announced(self) -> Sequence[Arrival]:
         """Return the vehicles that will enter soon, with the times at which they are expected."""
 
+    @property
+    def start_lanes(self) -> Sequence[int]:
+        """Lanes to whose beginning vehicles come from upstream."""
+
     def full_lanes(self) -> set[int]:
         """Return the lanes to whose start a vehicle is too close for another to enter before it."""
 

@@ -262,6 +262,8 @@ class Roadside:
         self._owned = None
         for lane in range(self._lanes):
             closed = self._meter.closed_column(lane)
+            if self._outside_traffic is not None and lane in self._outside_traffic.start_lanes:
+                closed += 1  # a vehicle from upstream may touch it
             for column in range(self._assigned_to[lane] - 1, closed - 1, -1):
                 if self._next[lane] and self._next[lane][0][0] == column:
                     self._store_recent(column, lane, self._next[lane].pop(0)[1])

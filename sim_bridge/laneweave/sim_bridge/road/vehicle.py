@@ -35,7 +35,8 @@ class RoadVehicle:
     bridge: int = 0
     """Incarnation of the bridge."""
     ready_s: float = 0.0
-    """Road time from which the vehicle is in the cell in which it has entered, or almost [s]."""
+    """Road time from which a vehicle that has entered more slowly than v_F is in its cell, or
+    almost [s]."""
 
     @classmethod
     def entering(
@@ -50,7 +51,7 @@ class RoadVehicle:
         s_m, speed_mps, settle_s = rest[0] + admission.offset_m, rest[1], 0.0
         if abs(admission.offset_m) > NEAR_M:
             settle_s = scenario.formation.settle_s
-        ready_s = settle_s
+        ready_s = 0.0
         if admission.start is not None:
             start = admission.start
             s_m, speed_mps = start.s_m, start.speed_mps

@@ -55,8 +55,11 @@ class SumoGui:
         try:
             traci.start(command, label=_LABEL)
             self._gui: Any = traci.getConnection(_LABEL)
-            edges = (edge for edge in self._gui.edge.getIDList() if not edge.startswith(":"))
-            self._gui.route.add(_ROUTE, [next(edges)])
+            lanes = (lane for lane in self._gui.lane.getIDList() if not lane.startswith(":"))
+            for_cars = (
+                one for one in lanes if "passenger" not in self._gui.lane.getDisallowed(one)
+            )
+            self._gui.route.add(_ROUTE, [self._gui.lane.getEdgeID(next(for_cars))])
         except (*self._lost, self._refused) as error:
             raise CommandFailedError(f"sumo-gui does not start ({error})") from error
         self._shown = set[str]()
@@ -82,8 +85,8 @@ class SumoGui:
                 )
             self._shown = set(names)
             self._gui.simulationStep()
-        except self._lost:
-            return False  # the user has closed the window
+        except (*self._lost, self._refused):
+            return False  # the user has closed the window, or sumo-gui cannot show a vehicle
         return True
 
     def _add(self, vehicles: Any, name: str) -> None:  # noqa: ANN401

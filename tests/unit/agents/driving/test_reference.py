@@ -219,8 +219,8 @@ def test_a_vehicle_changes_lanes_while_it_settles(left_ticks: int) -> None:
     move = Reference.move(WEAK, cell, target, begin)
     plain = Reference.move(WEAK, cell, target, begin)
     move.settle_meanwhile(before)
-    assert move.end_tick == max(plain.end_tick, end_tick)
-    for now in range(begin - 3, move.end_tick + 5):
+    assert move.rest_tick == max(plain.end_tick, end_tick)
+    for now in range(begin - 3, move.rest_tick + 5):
         one, old, new = move.window(now), before.window(now), plain.window(now)
         np.testing.assert_allclose(one.states[:, 3:], new.states[:, 3:])
         np.testing.assert_allclose(one.jerks[:, 1], new.jerks[:, 1])
@@ -228,8 +228,8 @@ def test_a_vehicle_changes_lanes_while_it_settles(left_ticks: int) -> None:
             np.testing.assert_allclose(one.states[:, :3], old.states[:, :3], atol=1e-9)
             np.testing.assert_allclose(one.jerks[:, 0], old.jerks[:, 0])
             check_exact(one.states, one.jerks)
-    goal = cell_state(WEAK.lattice, target, (move.end_tick + 5) * TICK_S)
-    np.testing.assert_allclose(move.window(move.end_tick + 5).states[0], goal, atol=1e-3)
+    goal = cell_state(WEAK.lattice, target, (move.rest_tick + 5) * TICK_S)
+    np.testing.assert_allclose(move.window(move.rest_tick + 5).states[0], goal, atol=1e-3)
 
 
 def test_a_settled_vehicle_moves_as_before() -> None:
@@ -237,4 +237,4 @@ def test_a_settled_vehicle_moves_as_before() -> None:
     move, plain = (Reference.move(WEAK, (4, 0), (4, 1), 180) for _ in range(2))
     move.settle_meanwhile(before)
     np.testing.assert_array_equal(move.window(185).states, plain.window(185).states)
-    assert move.end_tick == plain.end_tick
+    assert move.rest_tick == plain.end_tick

@@ -328,8 +328,10 @@ def test_a_vehicle_that_settles_is_planned_from_when_it_is_ready(
 
 
 def test_members_of_a_ballot_whose_gate_is_closed_take_part_in_no_other() -> None:
-    """In the slot of its moves; with another promise, the gate would stay closed."""
+    """If it waits for one that settles; with another promise, the gate would stay closed."""
     desk = bench(A, B, ways={A: ((0, 0), (1, 0))})
+    settles = CensusEntry(A, HOMES[A], 1, 0.0, ready_s=BEGUN_S + SLOT_S + 1.0)
+    desk.control.on_census(Census(BEGUN_S + 0.1, (settles, CensusEntry(B, HOMES[B], 1, 0.0)), ()))
     desk.think()
     transfer = desk.transfer
     transfer.phase = BallotPhase.IN_FORCE

@@ -218,6 +218,7 @@ def test_at_rest_is_close_to_the_target(along_m: float, across_m: float, *, at_r
         (6.1, 0.0, False),
         (-1.1 * ARRIVED_ALONG_M, 0.0, False),
         (3.0, 1.1 * NEARLY_SETTLED_MPS, False),
+        (3.0, -1.0, False),
     ],
 )
 def test_a_body_that_settles_is_ready_before_it_is_in_its_cell(

@@ -344,6 +344,7 @@ KEEPING = evolve(SCENARIO, formation=evolve(SCENARIO.formation, change_columns=F
         (5.0, 5.0, False),
         (12.0, 5.0, False),
         (30.0, 5.0, True),
+        (5.0, 0.5, True),  # nearly in its cell: it settles
         (5.0, -15.0, True),  # it stands
     ],
 )
