@@ -302,6 +302,7 @@ NOT_A_SAFETY_MATTER: Mapping[Function, str] = {
     vehicle.has_next_move: "without a next move there is nothing to begin",
     vehicle.rest: "a vehicle that never rests never moves again",
     vehicle.drives_its_moves: "the planner offers no other move; too weak a body lags, and brakes",
+    vehicle.both_lanes_are_open: "it delays moves that are planned for later in a slot",
     vehicle.ends_in_time: "a move that begins late is stopped at the stop line of its lane",
     leader.observe_members: "how long a leader listens is a matter of progress",
     leader.back_off: "the length of a pause is a matter of progress",

@@ -337,8 +337,9 @@ def _both(limit: float) -> tuple[float, float]:
 def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Trajectory:
     """Return the trajectory of minimum squared jerk from a state to rest at the origin.
 
-    If the time is short, only a trajectory that uses the limits throughout is within them; it also
-    stays ahead of the cell. If none is found, the limits are ignored: the tracker keeps them.
+    Vehicles that keep their columns may enter far more slowly than v_F. In the short time that they
+    have, only a trajectory that uses the limits throughout is within them; it also stays ahead of
+    the cell. If none is found, the limits are ignored: the tracker keeps them.
 
     Args:
         scenario: source of the tick length and the limits.
@@ -351,7 +352,7 @@ def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Traject
     jerks = np.asarray(np.linalg.lstsq(reach, -ends, rcond=None)[0], dtype=np.float64)
     free = _integrated(jerks, tick_s, start)
     behind_m = min(start[0], 0.0) - _MAX_BEHIND_M
-    if (
+    if scenario.formation.change_columns or (
         _excess(free, scenario.vehicle, speed_mps) < _LIMIT_TOLERANCE
         and free.states[:, 0].min() >= behind_m
     ):

@@ -38,7 +38,7 @@ def test_a_vehicle_settles_within_its_limits_and_not_behind_its_cell(
     if time_s is None:
         return
     assert time_s <= LONGEST_S
-    own = evolve(ROAD, vehicle=limits)
+    own = evolve(ROAD, vehicle=limits, formation=evolve(ROAD.formation, change_columns=False))
     late_m = ahead_m - slower_mps * TICK_S
     start = np.array([late_m, -slower_mps, 0.0, 0.0, 0.0, 0.0])
     trajectory = settling_trajectory(own, start, round(time_s / TICK_S) - 1)
