@@ -109,7 +109,7 @@ def test_sumo_drives_the_same_vehicles_alone(
 
 
 def test_vehicles_come_from_upstream(tmp_path: Path) -> None:
-    """SUMO drives them to the start, in whichever lanes it likes, together and one by one."""
+    """SUMO determines their lanes; some arrive at the same time in different lanes."""
     vehicles = []
     for second in range(0, 50, 2):
         route = "upstream exit" if second % 12 == 4 else "upstream"

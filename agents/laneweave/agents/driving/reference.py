@@ -125,10 +125,10 @@ class Reference:
 
     def settle_meanwhile(self, before: Reference) -> None:
         """Add what is left of an earlier motion along the road into the origin of this move."""
+        if self.start_tick >= before.end_tick:
+            return
         first = self.start_tick - before.start_tick + self._horizon
         left = before._states[first:, :3] - before._states[-1, :3]
-        if self.start_tick >= before.end_tick or first < 0:
-            return
         n, padding = self._horizon, max(0, self._horizon + len(left) - len(self._states))
         rest = self._states[-1:] * (1.0, 1.0, 0.0, 1.0, 0.0, 0.0)
         self._states = np.concatenate([self._states, np.repeat(rest, padding, axis=0)])

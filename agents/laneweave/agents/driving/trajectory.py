@@ -57,7 +57,7 @@ _END_TOLERANCE = 1e-3
 _LIMIT_TOLERANCE = 1e-4
 """Maximum excess over `LIMIT_SHARE` of a limit [m/s, m/s2, m/s3]."""
 _MAX_BEHIND_M = 0.4
-"""Distance behind its cell at which a settling vehicle may be; farther behind others may be."""
+"""Maximum distance of a settling vehicle behind its cell; the room beyond is that of others."""
 _TRACKING_ERROR_M = 0.25
 """Margin for tracking errors behind the vehicle ahead."""
 _CLOSING_SPEEDUP = 0.5
@@ -249,8 +249,12 @@ def _trajectory_program(
     constraints = _constraints(limits, speed_mps, h, unit_s, n, envelope)
     lower, upper = constraints.lower.copy(), constraints.upper.copy()
     lower[constraints.ends] = upper[constraints.ends] = [end_m[0], 0.0, 0.0, end_m[1], 0.0, 0.0]
-    cost = sparse.diags([np.concatenate([np.zeros(6 * n), np.ones(2 * n)])], [0])
-    return QuadraticProgram(cost, constraints.matrix, lower, upper, settings=_SETTINGS)
+    return QuadraticProgram(_squared_jerks(n), constraints.matrix, lower, upper, settings=_SETTINGS)
+
+
+def _squared_jerks(n: int) -> Any:  # noqa: ANN401 - scipy.sparse has no types
+    """Return the cost of the jerks of n ticks; states cost nothing."""
+    return sparse.diags([np.concatenate([np.zeros(6 * n), np.ones(2 * n)])], [0])
 
 
 @frozen(eq=False)
@@ -382,9 +386,8 @@ def _settling_program(
         lower[rows] = upper[rows] = -transition @ (part * units)
     width = constraints.matrix.shape[1]
     ahead = sparse.csr_matrix((np.ones(n), (np.arange(n), np.arange(0, 3 * n, 3))), (n, width))
-    cost = sparse.diags([np.concatenate([np.zeros(6 * n), np.ones(2 * n)])], [0])
     return QuadraticProgram(
-        cost,
+        _squared_jerks(n),
         sparse.vstack([constraints.matrix, ahead]),
         np.concatenate([lower, np.full(n, behind_m)]),
         np.concatenate([upper, np.full(n, np.inf)]),

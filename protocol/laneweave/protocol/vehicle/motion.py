@@ -155,12 +155,7 @@ def displaced(
 ) -> bool:
     """Return whether a body is too far from `cell` to hold it at road time `t_s` [s].
 
-    Args:
-        state: state of the body.
-        lattice: the lattice.
-        cell: the cell.
-        t_s: road time.
-        room_ahead_m: how far ahead of its cell a body may be, if farther than behind it.
+    It may be as far ahead of its cell as behind it, and `room_ahead_m` if that is farther.
     """
     goal = cell_state(lattice, cell, t_s)
     ahead_m = state[0] - goal[0]

@@ -195,8 +195,8 @@ class Roadside:
             return admission
         beside = [(column, other) for other in range(self._lanes) if other != lane]
         free = [cell for cell in beside if self._is_ownerless(cell)]
-        self._ownerless.difference_update(free)
         self._given.update(free)
+        self._ownerless.difference_update(free)
         self._unassigned = [cell for cell in self._unassigned if cell not in self._given]
         return evolve(admission, more_cells=(*admission.more_cells, *free))
 

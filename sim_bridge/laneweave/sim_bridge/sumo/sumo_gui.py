@@ -20,7 +20,7 @@ _EXACT = 2
 
 
 class SumoGui:
-    """A window of sumo-gui. Close it, or use it as a context manager."""
+    """A window of sumo-gui, to be closed."""
 
     def __init__(self, network: Path, tick_s: float, program: str = "sumo-gui") -> None:
         """Start sumo-gui, and wait until it has loaded the network.
