@@ -268,12 +268,16 @@ class PlanningService:
         self._sessions.add(session)
 
     def close_session(self, session: ClientSession) -> Iterator[Effect]:
-        """Drop all requests of a session that has ended."""
+        """Drop all requests of a session that has ended.
+
+        Its queries are declined: if this coordinator was disconnected and not the client, the client
+        asks again.
+        """
         self._sessions.discard(session)
         for entry in self._pending.of_session(session):
-            yield from self._withdraw(
-                entry, [query for query in entry.queries if query.session == session]
-            )
+            ended = [query for query in entry.queries if query.session == session]
+            yield from self._withdraw(entry, ended)
+            yield from (Decline(query.token) for query in ended)
 
     def cancel(
         self, token: int, payload: bytes, encoding: str, session: ClientSession
@@ -294,13 +298,14 @@ class PlanningService:
             yield Decline(token)
             return
         yield from self._withdraw(entry, own)
+        refusal = Refusal(CANCELLED, "cancelled by the client", "")
+        yield from (query.form.reply(query.token, refusal) for query in own)
         yield Reply(token, form.write({"id": entry.request.id}), encoding=form.encoding)
 
     def _withdraw(self, entry: PendingPlan, queries: list[OpenQuery]) -> Iterator[Effect]:
-        """Answer cancelled queries, and drop the request if there are no others for it."""
+        """Remove queries from a request, and drop the request if there are no others for it."""
         for query in queries:
             entry.queries.remove(query)
-            yield query.form.reply(query.token, Refusal(CANCELLED, "cancelled by the client", ""))
         if not entry.queries:
             self._count("cancelled_total")
             self._forget(entry)
