@@ -169,3 +169,29 @@ def test_a_queue_behind_the_exit_is_braked_for(
         assert one.least_ttc_s == pytest.approx(gap_m / (fast_mps - slow_mps), rel=0.1)
         checked += 1
     assert checked > 0
+
+
+def test_vehicles_wait_at_the_start_while_their_exit_is_full(tmp_path: Path) -> None:
+    """Inside, they would stop beside the exit, and everybody behind them."""
+    until_s = 100
+    blocked = (
+        '<vehicle id="blocked" type="car" depart="0"><route edges="off"/>'
+        f'<stop lane="off_0" endPos="10" until="{until_s}"/></vehicle>'
+    )
+    own = scenario(tmp_path, [blocked, *stream(60)])
+    summary, events = drive(own, tmp_path / "run")
+    assert summary["vehicles"]["left"] == summary["vehicles"]["at_destination"] == 70
+    assert summary["safety"]["overlaps"] == summary["safety"]["sumo_collisions"] == 0
+    assert {event["kind"] for event in events}.isdisjoint({"missed-exit", "left-lattice"})
+    by_exit: dict[str, list[dict[str, Any]]] = {"off": [], "end": []}
+    for trip in read_trips(tmp_path / "run").values():
+        by_exit[trip["destination"]].append(trip)
+    # Only some fit behind the one that stands; the others enter when it has driven on.
+    late = [trip for trip in by_exit["off"] if trip["entered_s"] > until_s]
+    assert 2 <= len(late) < len(by_exit["off"])
+    # Others are not held back, and none is slowed down.
+    for trip in by_exit["end"]:
+        if trip["entrance"] == MAIN_ENTRANCE:
+            assert trip["entered_s"] - trip["demanded_s"] < 3.0
+            free_s = own.road.length_m / own.formation.speed_mps
+            assert trip["left_s"] - trip["entered_s"] == pytest.approx(free_s, abs=1.5)

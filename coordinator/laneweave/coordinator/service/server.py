@@ -270,8 +270,8 @@ class PlanningService:
     def close_session(self, session: ClientSession) -> Iterator[Effect]:
         """Drop all requests of a session that has ended.
 
-        Its queries are declined: if this coordinator was disconnected and not the client, the client
-        asks again.
+        Its queries are declined: if this coordinator was disconnected, and not the client, the
+        client asks again.
         """
         self._sessions.discard(session)
         for entry in self._pending.of_session(session):

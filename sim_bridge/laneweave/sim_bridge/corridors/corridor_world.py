@@ -27,7 +27,7 @@ from laneweave.sim_bridge.corridors.corridor_arrivals import MAX_WAIT_S, Corrido
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
 from laneweave.sim_bridge.corridors.sumo_config import sumo_command
 from laneweave.sim_bridge.corridors.sumo_network import Lane, Network
-from laneweave.sim_bridge.corridors.take_over import Approaching
+from laneweave.sim_bridge.corridors.take_over import SEEN_BEYOND_M, Approaching
 from laneweave.sim_bridge.corridors.ways_in import ways_to_ramp, ways_to_start
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
@@ -39,8 +39,6 @@ _PLANTS = {
 """Options with which SUMO displays bodies as the bridge drives them."""
 _OWN_SPEED_MODE, _OWN_LANE_CHANGES = 31, 1621
 """SUMO's defaults: it drives."""
-SEEN_BEYOND_M = 200.0
-"""Distance beyond an exit up to which SUMO's vehicles are seen."""
 MAX_DISPLAY_ERROR_M = 0.1
 """Maximum distance between a body and where SUMO displays it."""
 
@@ -96,6 +94,10 @@ class CorridorWorld(SumoProcess):
             raise BadInputError(OPTION, setup.corridor.name, allowed)
         self._ways_in = {**to_start, **to_ramps}
         self._beyond = dict(_beyond(setup.network, setup.corridor))
+        self._approaching: dict[int, list[Approaching]] = {}
+        """What SUMO has been asked since its last step, by lane."""
+        self._others: list[OtherBody] | None = None
+        """The same for bodies behind the exits; None: it has not been asked."""
         self._take_out_loaded()
 
     def _take_out_loaded(self) -> None:
@@ -112,7 +114,12 @@ class CorridorWorld(SumoProcess):
 
     def approaching(self, lane: int) -> list[Approaching]:
         """Return the vehicles that come to the entrance of a lane, the foremost first."""
-        found, api = [], self.vehicle
+        if lane not in self._approaching:
+            self._approaching[lane] = sorted(self._find_approaching(lane), key=lambda one: -one.s_m)
+        return self._approaching[lane]
+
+    def _find_approaching(self, lane: int) -> Iterator[Approaching]:
+        api = self.vehicle
         for name, way in self._ways_in.get(lane, {}).items():
             for vehicle in self.lane.getLastStepVehicleIDs(name):
                 coming = self._coming.get(vehicle)
@@ -126,8 +133,7 @@ class CorridorWorld(SumoProcess):
                     limits = tuple((to_m, factor * limit) for to_m, limit in way.limits)
                     speed_mps = api.getSpeed(vehicle)
                     arrival = evolve(coming.arrival, lane=lane)
-                    found.append(Approaching(arrival, s_m, speed_mps, limits, way.upstream))
-        return sorted(found, key=lambda one: -one.s_m)
+                    yield Approaching(arrival, s_m, speed_mps, limits, way.upstream)
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
         """Set the speed at which SUMO drives a vehicle, as far as it is safe; None: its own."""
@@ -140,23 +146,19 @@ class CorridorWorld(SumoProcess):
 
     def others(self) -> Sequence[OtherBody]:
         """Return SUMO's own vehicles behind the exits and the end of the road."""
-        found, api = list[OtherBody](), self.vehicle
+        if self._others is None:
+            self._others = sorted(self._find_others(), key=lambda one: one.rear_m)
+        return self._others
+
+    def _find_others(self) -> Iterator[OtherBody]:
+        api = self.vehicle
         for name, (lane, exit_m, from_m) in self._beyond.items():
             for vehicle in self.lane.getLastStepVehicleIDs(name):
                 rear_m = api.getLanePosition(vehicle) - api.getLength(vehicle)
                 seen = from_m + rear_m <= exit_m + SEEN_BEYOND_M
                 if seen and not self._is_driven(vehicle):
-                    found.append(
-                        OtherBody(
-                            vehicle,
-                            lane,
-                            exit_m,
-                            from_m + rear_m,
-                            api.getSpeed(vehicle),
-                            api.getAcceleration(vehicle),
-                        )
-                    )
-        return sorted(found, key=lambda one: one.rear_m)
+                    speed_mps, accel_mps2 = api.getSpeed(vehicle), api.getAcceleration(vehicle)
+                    yield OtherBody(vehicle, lane, exit_m, from_m + rear_m, speed_mps, accel_mps2)
 
     def _is_driven(self, sumo_name: str) -> bool:
         coming = self._coming.get(sumo_name)
@@ -189,6 +191,7 @@ class CorridorWorld(SumoProcess):
         api.setSpeedMode(name, 0)
         api.setLaneChangeMode(name, 0)
         self._taken.add(name)
+        self._approaching.clear()
         self._states[vehicle] = state
         self._move(vehicle, state)
 
@@ -213,6 +216,8 @@ class CorridorWorld(SumoProcess):
         """
         super().step()
         api = self.vehicle
+        self._approaching.clear()
+        self._others = None
         self._take_out_loaded()
         arrived = self.simulation.getArrivedIDList()
         self._returned.difference_update(arrived)

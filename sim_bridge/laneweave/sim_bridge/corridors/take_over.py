@@ -19,6 +19,8 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import READY_LATE_S, SNAPSHOT_S, Scenario
 from laneweave.protocol.vehicle.lane_ends import dead_ends
 from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
+from laneweave.sim_bridge.corridors.exit_room import ExitRoom
 from laneweave.sim_bridge.corridors.settling import LONGEST_S, before_rest_s, fall_back, settling_s
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter, EntryState
@@ -37,6 +39,8 @@ CENSUS_S = 0.7
 """Time after its entry in which coordinators know a vehicle."""
 BESIDE_COLUMNS = 1
 """Number of columns by which a vehicle rather falls back than entering beside another vehicle."""
+SEEN_BEYOND_M = 200.0
+"""Distance behind an exit up to which SUMO's vehicles are seen."""
 MAX_COLUMNS = 40
 """Maximum number of columns that are tried."""
 
@@ -68,6 +72,9 @@ class OutsideView(Protocol):
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
         """Set the speed at which a vehicle is driven, if it can drive at it; None: its own."""
+
+    def others(self) -> Sequence[OtherBody]:
+        """Return the bodies up to `SEEN_BEYOND_M` behind the exits."""
 
     @property
     def exhausted(self) -> bool:
@@ -104,6 +111,7 @@ class TakeOver:
             for lane, at_m in self._at_m.items()
         }
         """Where moves out of each of these lanes have ended."""
+        self._exit_room = ExitRoom(scenario, SEEN_BEYOND_M)
         self._occupied = set[Cell]()
         """Cells in which vehicles are, or to which they move."""
         self._known: dict[Name, Arrival] = {}
@@ -136,6 +144,10 @@ class TakeOver:
     def start_lanes(self) -> Sequence[int]:
         """Lanes to whose beginning vehicles come from upstream."""
         return self._view.start_lanes
+
+    def has_room(self, destination: str, going: int, waiting: int) -> bool:
+        """Return whether a vehicle that waits at the start may enter; see `ExitRoom`."""
+        return self._exit_room.has_room(destination, going, waiting, self._view.others())
 
     def full_lanes(self) -> set[int]:
         """Return the lanes to whose start a vehicle is too close for another to enter before it."""

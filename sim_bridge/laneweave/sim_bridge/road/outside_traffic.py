@@ -23,6 +23,15 @@ class OutsideTraffic(Protocol):
     def start_lanes(self) -> Sequence[int]:
         """Lanes to whose beginning vehicles come from upstream."""
 
+    def has_room(self, destination: str, going: int, waiting: int) -> bool:
+        """Return whether a vehicle that waits at the start may enter: its exit is not full.
+
+        Args:
+            destination: name of its exit, or `END_OF_ROAD`.
+            going: number of vehicles that are on the way to it.
+            waiting: number of those that are held back.
+        """
+
     def full_lanes(self) -> set[int]:
         """Return the lanes to whose start a vehicle is too close for another to enter before it."""
 

@@ -6,6 +6,7 @@ The census is complete, so coordinators know all rosters.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
@@ -136,6 +137,10 @@ class Roadside:
         self._demanded = 0
         """Arrivals so far, without those of `outside_traffic`."""
         self._others_demanded = 0
+        self._held: list[Arrival] = []
+        """Vehicles that wait at the start until their exits have room."""
+        self._was_held = Counter[str]()
+        """Their number by exit, at the last tick."""
         self._queued = 0
         self._entered = 0
         self._left = 0
@@ -166,8 +171,7 @@ class Roadside:
         # Also queue vehicles that arrive before the next tick, since cells pass between ticks.
         self._vehicles, self._owned = vehicles, None
         first, self._queued = self._queued, count_until(self._arrivals, t_s + self._tick_s)
-        for arrival in self._arrivals[first : self._queued]:
-            self._meter.demand(arrival)
+        self._demand(self._arrivals[first : self._queued])
         full = self._full_lanes(vehicles)
         if self._outside_traffic is not None:
             full |= self._outside_traffic.full_lanes()
@@ -184,6 +188,27 @@ class Roadside:
         self._entered += len(admissions)
         self._census_changed |= bool(admissions)
         return admissions
+
+    def _demand(self, coming: Sequence[Arrival]) -> None:
+        """Queue vehicles at the start, and hold those back whose exits are full."""
+        outside, held = self._outside_traffic, [*self._held, *coming]
+        if outside is None or not held:
+            for arrival in held:
+                self._meter.demand(arrival)
+            return
+        on_road = (one.arrival for one in self._vehicles.values())
+        going = Counter(one.destination for one in (*self._meter.waiting, *on_road))
+        self._held.clear()
+        waiting = Counter[str]()
+        for arrival in held:
+            to = arrival.destination
+            if not waiting[to] and outside.has_room(to, going[to], self._was_held[to]):
+                going[to] += 1
+                self._meter.demand(arrival)
+            else:
+                waiting[to] += 1
+                self._held.append(arrival)
+        self._was_held = waiting
 
     def _with_ownerless(self, admission: Admission) -> Admission:
         """Add cells beside a vehicle from a ramp that have never had an owner.

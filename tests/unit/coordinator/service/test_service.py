@@ -638,13 +638,14 @@ def test_a_request_is_planned_while_anyone_waits_for_it(desk: Desk) -> None:
 
 
 def test_all_requests_of_a_closed_session_are_dropped(desk: Desk) -> None:
-    # A coordinator that was disconnected cannot tell whether the client or itself was: a client that
-    # is still there must ask again, and not be told that it has cancelled.
+    # A coordinator cannot tell whether the client or itself was disconnected: a client that is
+    # still there must ask again, and not be told that it has cancelled.
     session, other = opened(desk, "a"), opened(desk, "a", "2")
     tokens = [desk.ask(REQUEST, session=session) for _ in range(5)]
     kept = desk.ask(REQUEST, session=other)
     desk.leave(session)
-    assert desk.left == tokens and not desk.replies
+    assert desk.left == tokens
+    assert not desk.replies
     assert len(desk.stopped) == 2
     for job in desk.stopped:
         desk.end(Computed(job, None, STOPPED))

@@ -10,6 +10,7 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
 from laneweave.sim_bridge.corridors.take_over import Approaching, TakeOver
@@ -29,6 +30,9 @@ class View:
 
     def approaching(self, lane: int) -> list[Approaching]:
         return [one for one in self.coming if one.arrival.lane == lane]
+
+    def others(self) -> list[OtherBody]:
+        return []
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
         self.advice[vehicle] = speed_mps

@@ -1,0 +1,96 @@
+"""Room at the exits: who must wait before the corridor, since there is a queue behind the exit.
+
+A vehicle that finds its exit full would stop inside, beside the exit, and everybody behind it. So a
+vehicle that departs at the start enters only if there will be room for it, and for all vehicles on
+the way to the same exit, between the tail of the queue and the place where they brake for it. The
+queue is expected to move no further: a vehicle needs the better part of a minute to the exit, and a
+traffic light may be red for longer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from attrs import frozen
+
+from laneweave.protocol.road_layout import END_OF_ROAD, LaneSection
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
+from laneweave.sim_bridge.corridors.corridor import HANDOVER_M
+
+STANDING_MPS = 3.0
+"""Speed below which vehicles are in a queue."""
+QUEUE_DECEL_MPS2 = 3.0
+"""Deceleration with which vehicles brake for a queue."""
+SPACE_M = 2.5
+"""Net gap in a queue, SUMO's default."""
+
+
+@frozen
+class _Way:
+    """A lane that leads to an exit."""
+
+    lane: int
+    exit_m: float
+    inside_m: float
+    """Length of the part before the exit in which vehicles may brake, after they changed lanes."""
+
+
+class ExitRoom:
+    """Knows which exits have room for another vehicle."""
+
+    def __init__(self, scenario: Scenario, seen_m: float) -> None:
+        """Read the exits of a road.
+
+        Args:
+            scenario: road, types of vehicles.
+            seen_m: distance behind an exit up to which bodies are seen.
+        """
+        self._seen_m = seen_m
+        self._braking_m = scenario.formation.speed_mps**2 / (2.0 * QUEUE_DECEL_MPS2)
+        self._place_m = scenario.longest_body_m + SPACE_M
+        self._ways: dict[str, list[_Way]] = {}
+        for section in scenario.sections:
+            if section.exit in {one.name for one in scenario.exit}:
+                way = _Way(section.lane, section.to_m, _inside_m(section, scenario.step_m))
+                self._ways.setdefault(section.exit, []).append(way)
+
+    def has_room(
+        self, destination: str, going: int, waiting: int, others: Sequence[OtherBody]
+    ) -> bool:
+        """Return whether another vehicle may enter.
+
+        Args:
+            destination: name of its exit, or `END_OF_ROAD`, which is not watched.
+            going: number of vehicles that are on the way to the same exit.
+            waiting: number of those that are held back.
+            others: bodies behind the exits.
+        """
+        if destination == END_OF_ROAD:
+            return True
+        ways = self._ways[destination]
+        return going + 1 <= sum(self._places(way, waiting, others) for way in ways)
+
+    def _places(self, way: _Way, waiting: int, others: Sequence[OtherBody]) -> float:
+        """Return the number of vehicles, inside or on the way, that fit behind a queue."""
+        ahead_m = [
+            (other.rear_m - way.exit_m, other.speed_mps < STANDING_MPS)
+            for other in others
+            if other.lane == way.lane and abs(other.exit_m - way.exit_m) <= 2.0 * HANDOVER_M
+        ]
+        tail_m = min((rear_m for rear_m, stands in ahead_m if stands), default=math.inf)
+        room_m = way.inside_m + tail_m - self._braking_m
+        if math.isinf(tail_m):
+            if not waiting:
+                return math.inf
+            # The queue has gone, and may come back before all who have waited are at the exit.
+            room_m = way.inside_m + self._seen_m
+        before = sum(rear_m < tail_m for rear_m, _ in ahead_m)
+        return room_m / self._place_m - before
+
+
+def _inside_m(section: LaneSection, step_m: float) -> float:
+    """Return how far before its end vehicles are in the lane of an exit, all moves completed."""
+    begin_m = max(section.from_m, section.moves_from_m)
+    return max(0.0, section.to_m - begin_m - step_m) if begin_m > 0.0 else 0.0
