@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import re
+import sys
 import tomllib
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from support.commands import run
 from support.harness import Lab, check_safe_and_complete, summary, trips
 from support.interchange import CORRIDOR, LONGEST_CORRIDOR, TRUCKS, stream, write_interchange
 
@@ -91,3 +96,53 @@ def test_a_road_that_is_not_that_of_the_corridor_is_refused(lab: Lab, config: Pa
     (line,) = ended.complaints
     assert ended.status == 2
     assert "road.lane_width_m: got 3.3; allowed: 3.2, as the corridor main1:main5 has" in line
+
+
+def test_a_network_from_opendrive(lab: Lab, config: Path) -> None:
+    """Names of edges are new after the interchange was written as OpenDRIVE and read again."""
+    network, drive = (config.with_name(name) for name in ("small.net.xml", "small.xodr"))
+    netconvert = Path(sys.executable).with_name("netconvert")
+    written = run(
+        netconvert, "-s", network, "--opendrive-output", drive, "-o", lab.folder / "unused.net.xml"
+    )
+    assert written.returncode == 0, written.stderr
+    read = run(netconvert, "--opendrive-files", drive, "-o", network)
+    assert read.returncode == 0, read.stderr
+    names = dict(_names_of_edges(network))
+    assert names["main1"].startswith("-")
+    routes = config.with_name("small.rou.xml")
+    text = routes.read_text(encoding="utf-8")
+    for old, new in names.items():
+        text = re.sub(rf"(?<=[ \"]){old}(?=[ \"])", new, text)
+    routes.write_text(text, encoding="utf-8")
+    folder = lab.folder / "run"
+    corridor = f"{names['main1']}:{names['main5']}"
+    options = "--sumocfg", config, "--corridor", corridor, "--transport", "simulated"
+    ended = lab.run("run", *options, "--out", folder)
+    assert (ended.status, ended.complaints) == (0, []), ended
+    check_safe_and_complete(folder)
+    assert summary(folder)["vehicles"]["at_destination"] == 18
+
+
+def _names_of_edges(network: Path) -> Iterator[tuple[str, str]]:
+    """Yield (name in the interchange, name in the network) of the edges."""
+    root = ET.parse(network).getroot()  # noqa: S314 (written by netconvert)
+    lanes = {edge.attrib["id"]: len(edge.findall("lane")) for edge in root.iter("edge")}
+    after: dict[str, set[str]] = {name: set() for name in lanes if not name.startswith(":")}
+    for link in root.iter("connection"):
+        if link.attrib["from"] in after:
+            after[link.attrib["from"]].add(link.attrib["to"])
+    begins = after.keys() - set[str]().union(*after.values())
+    for name, count, route in (("start", 3, "main1 main2"), ("before", 1, "on")):
+        (edge,) = (each for each in begins if lanes[each] == count)
+        yield name, edge
+        for behind in route.split():
+            (edge,) = after[edge]
+            yield behind, edge
+    (edge,) = (each for each in after if {lanes[one] for one in after[each]} == {1, 3})
+    for name, count in (("off", 1), ("main3", 3)):
+        (found,) = (each for each in after[edge] if lanes[each] == count)
+        yield name, found
+    (main4,) = after[found]
+    yield "main4", main4
+    yield from (("main5", each) for each in after[main4])

@@ -43,9 +43,9 @@ Tables = dict[str, Any]
 def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
     """Return the tables of a scenario file; they have not been checked against each other.
 
-    Vehicles arrive at random with the mean volumes of the simulation. v_F is 90 % of the lowest
-    speed limit, the column pitch the least that suits all types, and T_F long enough for cars to
-    move by one column.
+    Vehicles arrive at random with the mean volumes of the simulation. No vehicle exceeds the lowest
+    speed limit of edges and types, and v_F is 90 % of it. The column pitch is the least that suits
+    all types, and T_F is long enough for moves between lanes.
 
     Raises:
         BadInputError: no vehicle enters at the start of the corridor, or it is too short.
@@ -56,6 +56,7 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
         raise BadInputError(OPTION, corridor.name, f"a corridor that vehicles enter on {edge}")
     names = type_names(demand.passes)
     car, *others = names
+    fastest_mps = min(corridor.speed_mps, *(one.max_speed_mps for one in names))
     per_hour = 3600.0 / demand.duration_s
     ramps = [ramp for ramp in corridor.ramps if _from(demand, ramp.edge)]
     tables: Tables = {
@@ -89,13 +90,12 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
             "duration_s": float(math.ceil(demand.duration_s)),
             "destinations": _destinations(main),
         },
-        "vehicle": _limits(car) | {"max_speed_mps": round(car.max_speed_mps, 2)},
+        "vehicle": _limits(car) | {"max_speed_mps": round(fastest_mps, 2)},
         "vehicle_type": [
             {"name": names[one], "share": _shares_of_types(main).get(one, 0.0), **_limits(one)}
             for one in others
         ],
     }
-    fastest_mps = min(corridor.speed_mps, *(one.max_speed_mps for one in names))
     tables["formation"] = _motion(
         tables, corridor, math.floor(2.0 * SPEED_SHARE * fastest_mps) / 2.0
     )

@@ -1,0 +1,73 @@
+"""Who must wait at the start, since there is a queue behind the exit."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.road_layout import END_OF_ROAD
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
+from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
+from laneweave.sim_bridge.corridors.exit_room import QUEUE_DECEL_MPS2, SPACE_M, ExitRoom
+from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
+from support.interchange import CORRIDOR, TRUCKS, stream, write_interchange
+
+SEEN_M = 200.0
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
+    folder = tmp_path_factory.mktemp("interchange")
+    found = read_corridor(write_interchange(folder, stream(60), types=TRUCKS), CORRIDOR, folder)
+    return parse_scenario(scenario_tables(found.corridor, found.demand))
+
+
+def body(scenario: Scenario, rear_m: float, speed_mps: float = 0.0, lane: int = 0) -> OtherBody:
+    exit_m = scenario.exit[0].at_m + 4.0
+    return OtherBody("other", lane, exit_m, exit_m + rear_m, speed_mps, 0.0)
+
+
+def places(scenario: Scenario, *others: OtherBody, waiting: int = 0) -> int:
+    """Return how many vehicles may be on their way to the exit."""
+    room = ExitRoom(scenario, SEEN_M)
+    count = 0
+    while count < 1000 and room.has_room("off", count, waiting, others):
+        count += 1
+    return count
+
+
+def test_an_exit_without_a_queue_has_room(scenario: Scenario) -> None:
+    flowing = [body(scenario, rear_m, 15.0) for rear_m in (10.0, 50.0, 120.0)]
+    assert places(scenario) == places(scenario, *flowing) == 1000
+
+
+def test_all_on_the_way_fit_between_the_queue_and_where_they_brake(scenario: Scenario) -> None:
+    # The deceleration lane, without a move into it, and the road up to the queue.
+    inside_m = 246.0 - scenario.step_m
+    braking_m = scenario.formation.speed_mps**2 / (2.0 * QUEUE_DECEL_MPS2)
+    for tail_m in (5.0, 40.0, 150.0):
+        fit = (inside_m + 4.0 + tail_m - braking_m) / (7.1 + SPACE_M)
+        assert places(scenario, body(scenario, tail_m)) == math.floor(fit)
+
+
+def test_those_who_drive_to_the_queue_take_places_as_well(scenario: Scenario) -> None:
+    queue = body(scenario, 150.0), body(scenario, 158.0)
+    before, behind = body(scenario, 60.0, 12.0), body(scenario, 170.0, 12.0)
+    assert places(scenario, *queue, before) == places(scenario, *queue) - 1
+    assert places(scenario, *queue, behind) == places(scenario, *queue)
+
+
+def test_a_queue_to_the_exit_is_full(scenario: Scenario) -> None:
+    assert places(scenario, body(scenario, -130.0)) == 0
+
+
+def test_those_who_have_waited_do_not_come_all_at_once(scenario: Scenario) -> None:
+    assert places(scenario, body(scenario, 150.0)) < places(scenario, waiting=9) < 60
+
+
+def test_other_lanes_and_the_end_of_the_road_do_not_matter(scenario: Scenario) -> None:
+    assert places(scenario, body(scenario, 5.0, lane=1)) == 1000
+    assert ExitRoom(scenario, SEEN_M).has_room(END_OF_ROAD, 500, 9, [body(scenario, 5.0)])
