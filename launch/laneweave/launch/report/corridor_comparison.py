@@ -129,7 +129,7 @@ def _shown(value: float | None) -> str:
 
 
 def _events_table(found: Sequence[SumoStatistics]) -> Table:
-    """Return the table of what SUMO reports for the whole network.
+    """Return the table of what SUMO reports: conflicts in the corridor, the rest everywhere.
 
     SUMO does not know how hard vehicles brake that it does not drive.
     """
@@ -138,6 +138,6 @@ def _events_table(found: Sequence[SumoStatistics]) -> Table:
         [method, f"{one.collisions}", f"{one.teleports}", f"{len(one.conflicts)}", braking]
         for method, one, braking in zip(METHODS, found, brakings, strict=True)
     ]
-    conflicts = f"time to collision < {CONFLICT_S:g} s"
+    conflicts = f"times to collision < {CONFLICT_S:g} s in the corridor"
     headings = ["method", "collisions", "teleports", conflicts, "emergency brakings"]
-    return Table(headings, rows, "Events in the whole network, as SUMO reports them")
+    return Table(headings, rows, "Events in the network, as SUMO reports them")

@@ -98,6 +98,11 @@ class Corridor:
         """Its first and its last edge, as in `--corridor`."""
         return f"{self.edges[0].name}:{self.edges[-1].name}"
 
+    @property
+    def edge_names(self) -> frozenset[str]:
+        """The names of its edges."""
+        return frozenset(edge.name for edge in self.edges)
+
 
 def corridor_of(network: Network, first: str, last: str) -> Corridor:
     """Return the corridor from one edge to another.

@@ -77,8 +77,9 @@ class CorridorSetup:
     def is_left_out(self, name: str, route: Sequence[str]) -> bool:
         """Return whether a vehicle is in the corridor, but not one of its vehicles."""
         # The route of a trip is not known yet, and names of later vehicles are not.
-        edges = {edge.name for edge in self.corridor.edges}
-        return name in self.left_out or (name not in self.by_name and not edges.isdisjoint(route))
+        return name in self.left_out or (
+            name not in self.by_name and not self.corridor.edge_names.isdisjoint(route)
+        )
 
 
 def corridor_arrivals(scenario: Scenario, demand: CorridorDemand) -> tuple[CorridorArrival, ...]:

@@ -63,7 +63,15 @@ class CorridorWorld(SumoProcess):
         """
         tick_s = scenario.runtime.tick_s
         super().__init__(
-            sumo_command(setup.config, tick_s, scenario.seed, folder, results, _PLANTS)
+            sumo_command(
+                setup.config,
+                tick_s,
+                scenario.seed,
+                folder,
+                results,
+                setup.corridor.edge_names,
+                _PLANTS,
+            )
         )
         self._types = scenario.types
         self._lane_m = scenario.road.lane_width_m
@@ -296,8 +304,8 @@ def _beyond(network: Network, corridor: Corridor) -> Iterator[tuple[str, tuple[i
             number = first[edge] + lane.index
             if number in lanes:
                 yield lane.name, (number, exit_m, exit_m - lane.length_m)
-                inside = {each.name for each in corridor.edges}
-                for name, from_m in _ahead(network, lane, exit_m, exit_m + SEEN_BEYOND_M, inside):
+                until_m, inside = exit_m + SEEN_BEYOND_M, corridor.edge_names
+                for name, from_m in _ahead(network, lane, exit_m, until_m, inside):
                     yield name, (number, exit_m, from_m)
 
 

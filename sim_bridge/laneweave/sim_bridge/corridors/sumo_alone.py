@@ -36,7 +36,7 @@ def drive_alone(
         SumoFailedError: SUMO rejects a file.
     """
     config = setup.config
-    command = sumo_command(config, config.step_s, seed, folder, results)
+    command = sumo_command(config, config.step_s, seed, folder, results, setup.corridor.edge_names)
     waiting = {
         one.origin.vehicle.name: one.origin.vehicle
         for one in setup.arrivals

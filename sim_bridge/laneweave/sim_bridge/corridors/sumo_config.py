@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from xml.etree import ElementTree as ET
@@ -31,6 +31,8 @@ _OPTIONS = frozenset({"processing", "routing", "random_number", "emissions"})
 """Sections of options that determine how vehicles drive."""
 ALL_AT_ONCE = {"route-steps": "0"}
 """Option with which SUMO loads all vehicles when it starts, so that it draws the same types."""
+CONFLICT_RANGE_M = 30.0
+"""Distance within which SUMO looks for vehicles that a vehicle may collide with."""
 NO_OPTIONS: Mapping[str, str] = MappingProxyType({})
 _DEMAND = frozenset(
     {"vType", "vTypeDistribution", "route", "routeDistribution", "flow", "vehicle", "trip"}
@@ -145,6 +147,7 @@ def sumo_command(
     seed: int,
     folder: Path,
     results: Path | None,
+    conflict_edges: Iterable[str],
     more: Mapping[str, str] = NO_OPTIONS,
 ) -> Sequence[str]:
     """Return SUMO's command line.
@@ -155,6 +158,7 @@ def sumo_command(
         seed: seed, unless the configuration has one.
         folder: folder for temporary files.
         results: folder for SUMO's statistics; None: none are written.
+        conflict_edges: edges on which SUMO reports short times to collision.
         more: further options, by name.
     """
     files = ",".join(map(str, config.write_demand(folder)))
@@ -173,6 +177,10 @@ def sumo_command(
     if files:
         own["route-files"] = files
     if results is not None:
+        # In a queue, the device keeps all pairs of vehicles, tick by tick: 20 GB in half an hour.
+        edges = folder / "conflicts.txt"
+        lines = [f"edge:{name}\n" for name in sorted(conflict_edges)]
+        edges.write_text("".join(lines), encoding="utf-8")
         own["tripinfo-output"] = str(results / TRIPS_FILE)
         own["statistic-output"] = str(results / STATISTICS_FILE)
         own["device.emissions.probability"] = "1"
@@ -182,6 +190,8 @@ def sumo_command(
             "device.ssm.measures": "TTC",
             "device.ssm.thresholds": f"{CONFLICT_S:g}",
             "device.ssm.trajectories": "false",
+            "device.ssm.range": f"{CONFLICT_RANGE_M:g}",
+            "device.ssm.filter-edges.input-file": str(edges),
         }
     # Drawn vehicles must be those that have been read.
     own["random"] = "false"
