@@ -399,6 +399,10 @@ class Roadside:
             for cell in vehicle.controller.possible_cells - certain
             if cell[1] in self._shared_lanes
         }
+        for cells in (self._given, self._ownerless, self._lost):
+            cells -= {
+                cell for cell in cells if lattice.passing_time_s(cell[0], self._length_m) < t_s
+            }
         on_lattice = [
             one
             for one in vehicles.values()
