@@ -36,6 +36,7 @@ def _traffic_rows(summary: RunSummary, *, preferences: bool) -> list[tuple[str, 
         ("demand", f"{summary.volume_veh_per_lane_h:g} vehicles/(lane h), seed {summary.seed}"),
         ("simulated time", f"{summary.simulated_s:.1f} s"),
         ("vehicles left / entered", f"{vehicles.left} / {vehicles.entered}"),
+        *_outside_rows(summary),
         ("maximum at one time", f"{vehicles.peak}"),
         ("in their preferred lane", preferred),
         ("travel time mean / p95 / max", _join(travel_s.mean, travel_s.p95, travel_s.max) + " s"),
@@ -48,6 +49,14 @@ def _traffic_rows(summary: RunSummary, *, preferences: bool) -> list[tuple[str, 
         ),
         ("acceleration", f"{low} to {high} m/s2{_discomfort(safety)}"),
     ]
+
+
+def _outside_rows(summary: RunSummary) -> list[tuple[str, str]]:
+    """Return the row of vehicles that a complete run has left outside; none: no row."""
+    outside = summary.vehicles.demanded - summary.vehicles.entered
+    if not outside or summary.ending != "complete":
+        return []
+    return [("never entered", f"{outside}: did not come to the corridor, or exit full")]
 
 
 def _discomfort(safety: Safety) -> str:

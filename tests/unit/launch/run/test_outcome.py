@@ -23,11 +23,22 @@ MANY_RECOVERIES = Failover(1.0, [0.1, 0.2, 0.3, 0.4, 0.5, 0.9], [])
 
 
 def summary(
-    *, overlaps: int = 0, left: int = 5, measured: float | None = 1.5, ending: str = "complete"
+    *,
+    overlaps: int = 0,
+    left: int = 5,
+    measured: float | None = 1.5,
+    ending: str = "complete",
+    entered: int = 5,
 ) -> RunSummary:
     return make_summary(
         ending=ending,
-        vehicles={"demanded": 5, "entered": 5, "left": left, "on_preferred_lane": left, "peak": 4},
+        vehicles={
+            "demanded": 5,
+            "entered": entered,
+            "left": left,
+            "on_preferred_lane": left,
+            "peak": 4,
+        },
         travel_time_s=dict.fromkeys(("mean", "p50", "p95", "max"), measured),
         safety={"overlaps": overlaps} | dict.fromkeys(MEASURED, measured),
         tracking={"osqp_solves": 17, "unconstrained_steps": 50_383},
@@ -65,6 +76,16 @@ def test_a_broken_promise_fails_a_run(tmp_path: Path, found: RunSummary, problem
     outcome = judge(tmp_path, found)
     assert outcome.exit_status == 1
     assert outcome.problems == (problem,)
+
+
+def test_vehicles_that_stay_outside_do_not_fail_a_complete_run(tmp_path: Path) -> None:
+    outside = judge(tmp_path, summary(entered=3, left=3))
+    assert outside.exit_status == 0
+    assert "2: did not come to the corridor, or exit full" in printed(outside)
+    assert "never entered" not in printed(judge(tmp_path, summary()))
+    stopped = judge(tmp_path, summary(entered=3, left=3, ending="limit"))
+    assert stopped.problems[1] == "2 of 5 vehicles did not leave the road"
+    assert "never entered" not in printed(stopped)
 
 
 def test_a_problem_fails_a_run_that_kept_its_promises(tmp_path: Path) -> None:
