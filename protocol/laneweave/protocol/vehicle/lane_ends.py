@@ -121,6 +121,16 @@ class LaneEnds:
             begins_m - ROUNDING_M <= front_m < to_m for begins_m, to_m in self._begins_m[lane]
         )
 
+    def opens_s(self, cell: Cell, t_s: float) -> float:
+        """Return the road time from which moves may begin in the lane of a cell.
+
+        This is `t_s` if they may begin already, and infinite if no section is ahead.
+        """
+        s_m, speed_mps = self._lattice.cell_s_m(cell[0], t_s), self._lattice.speed_mps
+        sections_m = [begins for begins in self._begins_m[cell[1]] if s_m < begins[1]]
+        begins_m = min((begins_m for begins_m, _ in sections_m), default=math.inf)
+        return t_s + max(0.0, begins_m - s_m) / speed_mps
+
     def ahead(self, lane: int, s_m: float) -> LaneEnd | None:
         """Return the dead end of the section in which a position is, or which it has passed."""
         return _end_ahead(self._dead_ends, lane, s_m)

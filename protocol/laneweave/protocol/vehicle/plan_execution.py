@@ -428,12 +428,16 @@ def move_is_due(execution: PlanExecution, _: object) -> bool:
 
 
 def ends_in_time(execution: PlanExecution, _: object) -> bool:
-    """The move, begun now, ends before the stop lines, or lines of exits, of both lanes."""
+    """The move, begun as soon as it can, ends before the lines of both lanes' ends and exits."""
     plan, move, ends = execution.plan, execution.next_move, execution.lane_ends
     if plan is None or move is None or not ends:
         return True
-    _, origin, target = move
-    begin_s, front = execution.t_s, max(origin[0], target[0])
+    step, origin, target = move
+    front = max(origin[0], target[0])
+    # A move may be planned for later in its slot, when both lanes are open.
+    due_s = max(execution.t_s, plan.t0_s + step * plan.slot_s)
+    opens_s = max(ends.opens_s((front, lane), due_s) for lane in (origin[1], target[1]))
+    begin_s = opens_s if opens_s < due_s + plan.slot_s else due_s
     end_s = begin_s + plan.slot_s - LATE_S
     across = origin[1] != target[1]
     return not any(
