@@ -96,6 +96,7 @@ class LaneEnds:
             [
                 (
                     max(section.from_m, section.moves_from_m) + scenario.longest_body_m - early_m,
+                    section.from_m,
                     section.to_m,
                 )
                 for section in scenario.sections
@@ -103,7 +104,7 @@ class LaneEnds:
             ]
             for lane in lanes
         ]
-        """Where fronts may begin moves in the sections of each lane, and where these end."""
+        """Where fronts may begin moves in the sections of each lane; where these begin and end."""
         self._any = any(self._dead_ends) or any(self._exits)
 
     def __bool__(self) -> bool:
@@ -118,7 +119,7 @@ class LaneEnds:
     def has_begun(self, lane: int, front_m: float) -> bool:
         """Return whether moves into and out of a lane may begin at a position of the front."""
         return any(
-            begins_m - ROUNDING_M <= front_m < to_m for begins_m, to_m in self._begins_m[lane]
+            begins_m - ROUNDING_M <= front_m < to_m for begins_m, _, to_m in self._begins_m[lane]
         )
 
     def opens_s(self, cell: Cell, t_s: float) -> float:
@@ -127,9 +128,18 @@ class LaneEnds:
         This is `t_s` if they may begin already, and infinite if no section is ahead.
         """
         s_m, speed_mps = self._lattice.cell_s_m(cell[0], t_s), self._lattice.speed_mps
-        sections_m = [begins for begins in self._begins_m[cell[1]] if s_m < begins[1]]
-        begins_m = min((begins_m for begins_m, _ in sections_m), default=math.inf)
-        return t_s + max(0.0, begins_m - s_m) / speed_mps
+        begins_m = [begins_m for begins_m, _, to_m in self._begins_m[cell[1]] if s_m < to_m]
+        return t_s + max(0.0, min(begins_m, default=math.inf) - s_m) / speed_mps
+
+    def in_section_m(self, cell: Cell, t_s: float) -> float:
+        """Return the position of a cell, moved into the section in which it may begin a move.
+
+        A move may begin so early that the body does not touch the lane before it opens.
+        """
+        s_m = self._lattice.cell_s_m(cell[0], t_s)
+        sections = self._begins_m[cell[1]]
+        opened_m = [from_m for begins_m, from_m, to_m in sections if begins_m <= s_m < to_m]
+        return max(s_m, *opened_m) if opened_m else s_m
 
     def ahead(self, lane: int, s_m: float) -> LaneEnd | None:
         """Return the dead end of the section in which a position is, or which it has passed."""
@@ -152,12 +162,14 @@ class LaneEnds:
         """
         return self._has_passed_line(self.ahead, cell, t_s, since_s, body_m)
 
-    def ends_changes(self, cell: Cell, t_s: float, since_s: float | None = None) -> bool:
+    def ends_changes(
+        self, cell: Cell, t_s: float, since_s: float | None = None, body_m: float | None = None
+    ) -> bool:
         """Return whether a cell is where lane changes have ended before an exit.
 
         The arguments are those of `has_passed`.
         """
-        return self._has_passed_line(self.exit_ahead, cell, t_s, since_s, None)
+        return self._has_passed_line(self.exit_ahead, cell, t_s, since_s, body_m)
 
     def _has_passed_line(
         self,

@@ -440,11 +440,13 @@ def ends_in_time(execution: PlanExecution, _: object) -> bool:
     begin_s = opens_s if opens_s < due_s + plan.slot_s else due_s
     end_s = begin_s + plan.slot_s - LATE_S
     across = origin[1] != target[1]
-    return not any(
-        ends.has_passed((front, lane), end_s, begin_s)
-        or (across and ends.ends_changes((front, lane), end_s, begin_s))
-        for lane in (origin[1], target[1])
-    )
+    for cell in ((front, origin[1]), (front, target[1])):
+        body_m = ends.in_section_m(cell, begin_s)
+        if ends.has_passed(cell, end_s, body_m=body_m):
+            return False
+        if across and ends.ends_changes(cell, end_s, body_m=body_m):
+            return False
+    return True
 
 
 def both_lanes_are_open(execution: PlanExecution, _: object) -> bool:

@@ -53,11 +53,27 @@ def read_corridor(file: Path, name: str, folder: Path, seed: int = 1) -> SumoCor
     Raises:
         BadInputError: a file cannot be read, or the edges are not a corridor.
     """
-    first, separator, last = name.partition(":")
-    if not (first and separator and last):
-        raise BadInputError(OPTION, name, "FIRST_EDGE:LAST_EDGE, two edges of the network")
     config = read_config(file)
     network = read_network(config.net_file)
-    corridor = corridor_of(network, first, last)
+    corridor = corridor_of(network, *_edges_of(name, network))
     demand = demand_on(corridor, read_demand(config, folder, seed))
     return SumoCorridor(config, network, corridor, demand)
+
+
+def _edges_of(name: str, network: Network) -> tuple[str, str]:
+    """Return the first and the last edge that a name of a corridor consists of.
+
+    Names of edges may contain colons.
+
+    Raises:
+        BadInputError: it does not consist of two names.
+    """
+    colons = [place for place, letter in enumerate(name) if letter == ":"]
+    pairs = [(name[:place], name[place + 1 :]) for place in colons]
+    pairs = [pair for pair in pairs if all(pair)]
+    for pair in pairs:
+        if all(edge in network.edges for edge in pair):
+            return pair
+    if len(pairs) != 1:
+        raise BadInputError(OPTION, name, "FIRST_EDGE:LAST_EDGE, two edges of the network")
+    return pairs[0]

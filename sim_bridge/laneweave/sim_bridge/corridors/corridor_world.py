@@ -39,6 +39,12 @@ _PLANTS = {
 """Options with which SUMO displays bodies as the bridge drives them."""
 _OWN_SPEED_MODE, _OWN_LANE_CHANGES = 31, 1621
 """SUMO's defaults: it drives."""
+STEPS_OUT = 2
+"""Steps after which SUMO's devices have forgotten a vehicle that was taken out.
+
+SUMO has driven a vehicle of a flow for a step already. If another one had its name at once, the
+device for conflicts would read the memory of the first.
+"""
 MAX_DISPLAY_ERROR_M = 0.1
 """Maximum distance between a body and where SUMO displays it."""
 
@@ -84,6 +90,9 @@ class CorridorWorld(SumoProcess):
         self._shown: dict[str, State] = {}
         self._returned: set[str] = set()
         """Names in SUMO of vehicles that have been given back and have not arrived."""
+        self._steps = 0
+        self._out: dict[str, int] = {}
+        """Step from which vehicles that were taken out of SUMO may be added again, by name."""
         self._taken: set[str] = set()
         """Names in SUMO of vehicles that have been taken over."""
         upstream = any(one.origin.upstream for one in setup.arrivals)
@@ -117,6 +126,8 @@ class CorridorWorld(SumoProcess):
                 name, self.vehicle.getRoute(name)
             ):
                 self.vehicle.remove(name)
+                if waits:
+                    self._out[name] = self._steps + STEPS_OUT
 
     # --- traffic that SUMO drives -------------------------------------------------------------
 
@@ -142,6 +153,10 @@ class CorridorWorld(SumoProcess):
                     speed_mps = api.getSpeed(vehicle)
                     arrival = evolve(coming.arrival, lane=lane)
                     yield Approaching(arrival, s_m, speed_mps, limits, way.upstream)
+
+    def is_out(self, vehicle: str) -> bool:
+        """Return whether a vehicle that departs at the start has been taken out of SUMO."""
+        return self._steps >= self._out.get(self._sumo_name[vehicle], math.inf)
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
         """Set the speed at which SUMO drives a vehicle, as far as it is safe; None: its own."""
@@ -185,6 +200,7 @@ class CorridorWorld(SumoProcess):
         name = self._sumo_name[vehicle]
         coming, api = self._coming[name], self.vehicle
         if coming.departs_at_start:
+            del self._out[name]
             route = f"laneweave.{name}"
             self.route.add(route, list(coming.origin.vehicle.route))
             api.add(
@@ -224,6 +240,7 @@ class CorridorWorld(SumoProcess):
         """
         super().step()
         api = self.vehicle
+        self._steps += 1
         self._approaching.clear()
         self._others = None
         self._take_out_loaded()
@@ -253,8 +270,16 @@ class CorridorWorld(SumoProcess):
         return {vehicle: pose_of(state) for vehicle, state in self._shown.items()}
 
     def collisions(self) -> list[tuple[str, str]]:
-        """Return the sorted pairs that SUMO reports, with a vehicle of the corridor in each."""
-        return [pair for pair in super().collisions() if any(map(self._is_driven, pair))]
+        """Return the sorted pairs that SUMO reports, with a vehicle of the corridor in each.
+
+        SUMO has driven the vehicles of flows for a step when they are taken out.
+        """
+        waiting = self._out.keys()
+        return [
+            pair
+            for pair in super().collisions()
+            if any(map(self._is_driven, pair)) and waiting.isdisjoint(pair)
+        ]
 
     def remove(self, vehicle: str) -> None:
         """Give a vehicle back to SUMO, with its speed.

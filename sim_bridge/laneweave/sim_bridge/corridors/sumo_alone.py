@@ -12,6 +12,7 @@ from pathlib import Path
 
 from laneweave.sim_bridge.corridors.corridor_arrivals import CorridorSetup
 from laneweave.sim_bridge.corridors.sumo_config import sumo_command
+from laneweave.sim_bridge.corridors.sumo_statistics import AGAIN
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 
@@ -47,15 +48,18 @@ def drive_alone(
     with SumoProcess(command) as sumo:
         while True:
             for name in sumo.simulation.getLoadedIDList():
+                if name.startswith(AGAIN):
+                    continue
                 vehicle = waiting.pop(name, None)
                 route = sumo.vehicle.getRoute(name)
                 if vehicle is not None or setup.is_left_out(name, route):
                     sumo.vehicle.remove(name)
                 if vehicle is not None:
-                    sumo.route.add(f"laneweave.{name}", list(vehicle.route))
+                    sumo.route.add(f"{AGAIN}{name}", list(vehicle.route))
+                    # The device for conflicts may still know the vehicle of a flow by its name.
                     sumo.vehicle.add(
-                        name,
-                        f"laneweave.{name}",
+                        f"{AGAIN}{name}",
+                        f"{AGAIN}{name}",
                         typeID=vehicle.type_name,
                         depart=str(vehicle.depart_s),
                         departLane="best",
@@ -66,5 +70,6 @@ def drive_alone(
             if now_s >= end_s or not awaited:
                 return
             sumo.step()
-            awaited.difference_update(sumo.simulation.getArrivedIDList())
+            arrived = sumo.simulation.getArrivedIDList()
+            awaited.difference_update(name.removeprefix(AGAIN) for name in arrived)
             progress((now_s - config.begin_s) / (end_s - config.begin_s))

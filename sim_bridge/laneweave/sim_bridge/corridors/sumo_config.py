@@ -12,6 +12,7 @@ from attrs import field, frozen
 
 from laneweave.protocol.errors import NO_VALUE, BadInputError
 from laneweave.sim_bridge.corridors.sumo_statistics import (
+    COLLISIONS_FILE,
     CONFLICT_S,
     CONFLICTS_FILE,
     STATISTICS_FILE,
@@ -183,6 +184,7 @@ def sumo_command(
         edges.write_text("".join(lines), encoding="utf-8")
         own["tripinfo-output"] = str(results / TRIPS_FILE)
         own["statistic-output"] = str(results / STATISTICS_FILE)
+        own["collision-output"] = str(results / COLLISIONS_FILE)
         own["device.emissions.probability"] = "1"
         own |= {
             "device.ssm.probability": "1",

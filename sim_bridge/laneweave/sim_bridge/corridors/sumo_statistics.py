@@ -10,8 +10,11 @@ from attrs import frozen
 
 TRIPS_FILE = "tripinfo.xml"
 STATISTICS_FILE = "statistics.xml"
+COLLISIONS_FILE = "collisions.xml"
 CONFLICTS_FILE = "ssm.xml"
 """Output of SUMO's device for surrogate safety measures."""
+AGAIN = "laneweave."
+"""Beginning of the names of vehicles that SUMO has begun to drive, and begins again elsewhere."""
 CONFLICT_S = 1.5
 """Time to collision below which two vehicles are in conflict (Hayward 1972)."""
 
@@ -59,18 +62,20 @@ def read_statistics(folder: Path) -> SumoStatistics:
     Raises:
         OSError: a file cannot be read.
     """
-    trips = {}
+    trips, taken_out = dict[str, SumoTrip](), dict[str, SumoTrip]()
     for _, element in ET.iterparse(folder / TRIPS_FILE):  # noqa: S314 (SUMO has written it)
         if element.tag == "tripinfo":
-            # Vehicles that have been taken out of SUMO have not arrived.
-            if float(element.get("arrival", "-1")) >= 0.0 and not element.get("vaporized"):
-                trips[element.get("id", "")] = _trip(element)
+            name, trip = element.get("id", "").removeprefix(AGAIN), _trip(element)
+            if element.get("vaporized"):
+                taken_out[name] = trip
+            elif trip.arrival_s >= 0.0:
+                trips[name] = trip
             element.clear()
     found = ET.parse(folder / STATISTICS_FILE).getroot()  # noqa: S314 (SUMO has written it)
     safety, teleports = found.find("safety"), found.find("teleports")
     return SumoStatistics(
         trips,
-        collisions=_count(safety, "collisions"),
+        collisions=_collisions(folder / COLLISIONS_FILE, taken_out),
         teleports=_count(teleports, "total"),
         emergency_brakings=_count(safety, "emergencyBraking"),
         conflicts=tuple(
@@ -82,6 +87,27 @@ def read_statistics(folder: Path) -> SumoStatistics:
     )
 
 
+def _collisions(file: Path, taken_out: Mapping[str, SumoTrip]) -> int:
+    """Return the number of collisions of vehicles that were not being taken out.
+
+    Args:
+        file: SUMO's list of collisions.
+        taken_out: vehicles that were taken out, by name.
+    """
+
+    def is_out(name: str | None, at_s: float) -> bool:
+        trip = taken_out.get((name or "").removeprefix(AGAIN))
+        return trip is not None and trip.depart_s - trip.duration_s <= at_s <= trip.arrival_s
+
+    found = 0
+    for _, element in ET.iterparse(file):  # noqa: S314 (SUMO has written it)
+        if element.tag == "collision":
+            at_s, pair = float(element.get("time", "nan")), map(element.get, ("collider", "victim"))
+            found += not any(is_out(name, at_s) for name in pair)
+            element.clear()
+    return found
+
+
 def _conflicts(file: Path) -> Iterator[Conflict]:
     """Yield the conflicts in the output of SUMO's device."""
     for _, element in ET.iterparse(file):  # noqa: S314 (SUMO has written it)
@@ -90,8 +116,8 @@ def _conflicts(file: Path) -> Iterator[Conflict]:
         least = element.find("minTTC")
         if least is not None and least.get("value", "NA") != "NA":
             yield Conflict(
-                element.get("ego", ""),
-                element.get("foe", ""),
+                element.get("ego", "").removeprefix(AGAIN),
+                element.get("foe", "").removeprefix(AGAIN),
                 float(least.get("value", "nan")),
                 float(least.get("time", "nan")),
             )
@@ -107,7 +133,7 @@ def _trip(element: ET.Element) -> SumoTrip:
     return SumoTrip(
         number("depart"),
         number("duration"),
-        number("arrival"),
+        float(element.get("arrival", "-1")),
         fuel_g,
     )
 

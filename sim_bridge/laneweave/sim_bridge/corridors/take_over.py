@@ -73,6 +73,9 @@ class OutsideView(Protocol):
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
         """Set the speed at which a vehicle is driven, if it can drive at it; None: its own."""
 
+    def is_out(self, vehicle: str) -> bool:
+        """Return whether a vehicle that departs at the start has been taken out of SUMO."""
+
     def others(self) -> Sequence[OtherBody]:
         """Return the bodies up to `SEEN_BEYOND_M` behind the exits."""
 
@@ -144,6 +147,10 @@ class TakeOver:
     def start_lanes(self) -> Sequence[int]:
         """Lanes to whose beginning vehicles come from upstream."""
         return self._view.start_lanes
+
+    def has_come(self, vehicle: str) -> bool:
+        """Return whether a vehicle is waiting at the start."""
+        return self._view.is_out(vehicle)
 
     def has_room(self, destination: str, going: int, waiting: int) -> bool:
         """Return whether a vehicle that waits at the start may enter; see `ExitRoom`."""

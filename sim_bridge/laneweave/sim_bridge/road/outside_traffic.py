@@ -23,6 +23,9 @@ class OutsideTraffic(Protocol):
     def start_lanes(self) -> Sequence[int]:
         """Lanes to whose beginning vehicles come from upstream."""
 
+    def has_come(self, vehicle: str) -> bool:
+        """Return whether a vehicle is waiting at the start: the simulator has loaded it."""
+
     def has_room(self, destination: str, going: int, waiting: int) -> bool:
         """Return whether a vehicle that waits at the start may enter: its exit is not full.
 

@@ -138,9 +138,9 @@ class Roadside:
         """Arrivals so far, without those of `outside_traffic`."""
         self._others_demanded = 0
         self._held: list[Arrival] = []
-        """Vehicles that wait at the start until their exits have room."""
+        """Vehicles that the simulator has not loaded yet, or whose exits have no room."""
         self._was_held = Counter[str]()
-        """Their number by exit, at the last tick."""
+        """Number of the latter by exit, at the last tick."""
         self._queued = 0
         self._entered = 0
         self._left = 0
@@ -190,7 +190,7 @@ class Roadside:
         return admissions
 
     def _demand(self, coming: Sequence[Arrival]) -> None:
-        """Queue vehicles at the start, and hold those back whose exits are full."""
+        """Queue vehicles that have come to the start, and whose exits are not full."""
         outside, held = self._outside_traffic, [*self._held, *coming]
         if outside is None or not held:
             for arrival in held:
@@ -202,7 +202,9 @@ class Roadside:
         waiting = Counter[str]()
         for arrival in held:
             to = arrival.destination
-            if not waiting[to] and outside.has_room(to, going[to], self._was_held[to]):
+            if not outside.has_come(arrival.vehicle):
+                self._held.append(arrival)
+            elif not waiting[to] and outside.has_room(to, going[to], self._was_held[to]):
                 going[to] += 1
                 self._meter.demand(arrival)
             else:

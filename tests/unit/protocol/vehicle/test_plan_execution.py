@@ -17,6 +17,7 @@ from laneweave.protocol.vehicle.plan_execution import (
     VEHICLE_RULES,
     ExecutionPhase,
     PlanExecution,
+    ends_in_time,
 )
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
 from support.convoy import ROLLING
@@ -475,16 +476,22 @@ def test_a_move_from_or_into_a_lane_that_ends_begins_only_if_it_ends_before_the_
 
 
 @pytest.mark.parametrize("lane", [0, 1])
-def test_a_move_begins_where_both_lanes_are_open(lane: int) -> None:
-    """It may be planned for later in its slot. Without moves between columns."""
+@pytest.mark.parametrize("closed_m", [0.0, 60.0])
+def test_a_move_begins_where_both_lanes_are_open(lane: int, closed_m: float) -> None:
+    """It may be planned for later in its slot. Without moves between columns.
+
+    The lane may have been open and closed before.
+    """
     early = evolve(ROLLING, formation=evolve(ROLLING.formation, change_columns=False))
     cell_m = early.lattice.cell_s_m(-4, T0_S)
     # Its front may begin 20 m beyond the cell: the body, without the part that may be early.
     opens_m = cell_m + 20.0 - early.longest_body_m + early_start_m(early)
-    road = evolve(early.road, s3_m=20_000.0, closures=(Closure(lane, 0.0, opens_m),))
+    closure = Closure(lane, max(0.0, opens_m - closed_m) if closed_m else 0.0, opens_m)
+    road = evolve(early.road, s3_m=20_000.0, closures=(closure,))
     execution = going()
     execution.lane_ends = LaneEnds(evolve(early, road=road))
     begins_s = T0_S + 20.0 / early.lattice.speed_mps
+    assert ends_in_time(evolve(execution, t_s=T0_S - 1.0), None)
     assert execution.tick(T0_S) is None
     assert execution.tick(begins_s - 0.01) is None
     assert execution.tick(begins_s) is not None

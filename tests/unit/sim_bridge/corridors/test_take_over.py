@@ -31,6 +31,9 @@ class View:
     def approaching(self, lane: int) -> list[Approaching]:
         return [one for one in self.coming if one.arrival.lane == lane]
 
+    def is_out(self, _: str) -> bool:
+        return True
+
     def others(self) -> list[OtherBody]:
         return []
 
