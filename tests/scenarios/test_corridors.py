@@ -17,7 +17,7 @@ from laneweave.launch.report.corridor_comparison import compare
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
-from laneweave.sim_bridge.corridors import sumo_config
+from laneweave.sim_bridge.corridors import corridor_arrivals, sumo_config
 from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 from laneweave.sim_bridge.corridors.sumo_statistics import read_statistics
 from support.interchange import CORRIDOR, TRUCKS, stream, vehicle, write_interchange
@@ -38,9 +38,11 @@ def read_rows(folder: Path) -> dict[tuple[str, int], tuple[float, float]]:
     return dict(zip(keys, zip(columns["s_m"], columns["speed_mps"], strict=True), strict=True))
 
 
-def drive(own: Scenario, folder: Path) -> tuple[dict[str, Any], Events]:
+def drive(
+    own: Scenario, folder: Path, problems: tuple[str, ...] = ()
+) -> tuple[dict[str, Any], Events]:
     outcome = SimulatedRun(own, folder, show_progress=False).run()
-    assert not outcome.problems
+    assert outcome.problems == problems
     events = (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()
     return json.loads((folder / "summary.json").read_text()), [*map(json.loads, events)]
 
@@ -195,3 +197,21 @@ def test_vehicles_wait_at_the_start_while_their_exit_is_full(tmp_path: Path) -> 
             assert trip["entered_s"] - trip["demanded_s"] < 3.0
             free_s = own.road.length_m / own.formation.speed_mps
             assert trip["left_s"] - trip["entered_s"] == pytest.approx(free_s, abs=1.5)
+
+
+def test_a_run_ends_although_an_exit_remains_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(corridor_arrivals, "MAX_WAIT_S", 60.0)
+    blocked = (
+        '<vehicle id="blocked" type="car" depart="0"><route edges="off"/>'
+        '<stop lane="off_0" endPos="10" duration="100000"/></vehicle>'
+    )
+    leaving = [vehicle(f"e{n}", 3.0 * n, "exit") for n in range(9)]
+    own = scenario(tmp_path, [blocked, *leaving, vehicle("m", 24.0, "main")])
+    stay = "5 of 10 vehicles did not leave the road"
+    summary, events = drive(own, tmp_path / "run", (stay,))
+    assert summary["ending"] == "complete"
+    assert summary["vehicles"]["demanded"] == 10
+    assert summary["safety"]["overlaps"] == 0
+    assert {event["kind"] for event in events}.isdisjoint({"missed-exit", "left-lattice"})

@@ -420,7 +420,7 @@ class BridgeCore:
             self._unreported.discard(self._departures.popleft()[1])
 
     def _is_over(self) -> bool:
-        if not self.vehicles and self._roadside.exhausted(self.t_s):
+        if self._roadside.is_over(self.t_s, self.vehicles):
             return True
         if self.t_s >= self.scenario.runtime.max_road_s:
             self._ending = Ending.LIMIT

@@ -52,9 +52,9 @@ def corridor(
 
 def corridor_tables(found: SumoCorridor, sumocfg: Path, name: str) -> dict[str, Any]:
     """Return the tables of the scenario of a corridor."""
-    from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
+    from laneweave.sim_bridge.corridors.scenario_tables import checked_tables
 
-    tables = scenario_tables(found.corridor, found.demand)
+    tables = checked_tables(found.corridor, found.demand)
     return tables | {"sumo": {"config": str(sumocfg.resolve()), "corridor": name}}
 
 
@@ -108,14 +108,19 @@ def _row(one: Candidate) -> tuple[str, ...]:
 
 def _remark(corridor: Corridor, demand: CorridorDemand) -> str:
     """Return why laneweave cannot drive a corridor, or what it does not use."""
-    from laneweave.protocol.config.scenario_files import parse_scenario
-    from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
+    unused = f"{len(corridor.unused)} ways not used" if corridor.unused else ""
+    return _problem(corridor, demand) or unused
+
+
+def _problem(corridor: Corridor, demand: CorridorDemand) -> str:
+    """Return why laneweave cannot drive a corridor; empty: it can."""
+    from laneweave.sim_bridge.corridors.scenario_tables import checked_tables
 
     try:
-        parse_scenario(scenario_tables(corridor, demand))
+        checked_tables(corridor, demand)
     except BadInputError as error:
         return str(error)
-    return f"{len(corridor.unused)} ways not used" if corridor.unused else ""
+    return ""
 
 
 def _describe(found: SumoCorridor, name: str) -> None:
@@ -138,6 +143,9 @@ def _describe(found: SumoCorridor, name: str) -> None:
     for exit_ in corridor.ways_out:
         lanes = ", ".join(map(str, exit_.lanes))
         console.print(f"exit to {escape(exit_.edge)} from lane {lanes} at {exit_.at_m:.0f} m")
+    problem = _problem(corridor, demand)
+    if problem:
+        console.print(f"laneweave cannot drive it: {escape(problem)}")
     for remark in corridor.unused:
         console.print(f"not used: {escape(remark)}")
     console.print(f"{len(demand.passes)} vehicles in {demand.duration_s:.0f} s drive through it")

@@ -36,7 +36,7 @@ BEFORE_TOUCHING = 0.6
 """Share of a move by which a body that changes lanes touches the other lane (by default 0.36)."""
 START_S = 0.3
 """Time after the front of a gap has passed in which a waiting vehicle may start into it."""
-_MAX_COLUMNS = 24
+_MAX_COLUMNS = 48
 """Upper bound on the columns that a vehicle needs to drive out."""
 _MAX_DRIVE_OUT_S = 120.0
 _FAR_M = 1000.0

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.fields import (
@@ -19,7 +21,7 @@ from laneweave.protocol.scenario.fields import (
 )
 from laneweave.protocol.structuring import structure
 from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
-from laneweave.protocol.vehicle.lane_ends import drive_out
+from laneweave.protocol.vehicle.lane_ends import drive_out, own_drive_out
 from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor, Ramp
 from laneweave.sim_bridge.corridors.sumo_demand import (
     CorridorDemand,
@@ -40,8 +42,43 @@ _WIDE_M = 100.0
 Tables = dict[str, Any]
 
 
+def checked_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
+    """Return the tables of a scenario file, which laneweave can drive.
+
+    Raises:
+        BadInputError: it cannot; the error names the ramp, exit or edge.
+    """
+    tables = scenario_tables(corridor, demand)
+    try:
+        parse_scenario(tables)
+    except BadInputError as error:
+        where = _where(error.field, tables, corridor)
+        if not where:
+            raise
+        field = f"{OPTION} {corridor.name}, {where} ({error.field} of its scenario)"
+        raise BadInputError(field, error.value, error.allowed) from error
+    return tables
+
+
+def _where(field: str, tables: Tables, corridor: Corridor) -> str:
+    """Return what a field of a scenario means in the network; empty: nothing special."""
+    found = re.match(r"(?:road\.)?(entrance|exit|closures)\[(\d+)\]", field)
+    if found is None:
+        return ""
+    kind, number = found[1], int(found[2])
+    if kind == "exit":
+        return f"exit to {corridor.ways_out[number].edge}"
+    if kind == "entrance":
+        names = {entrance_name(ramp.edge): ramp.edge for ramp in corridor.ramps}
+        return f"on-ramp from {names[tables['entrance'][number]['name']]}"
+    closure = tables["road"]["closures"][number]
+    ends_m = closure.get("from_m", 0.0)
+    edges = [edge.name for edge in corridor.edges if edge.from_m <= ends_m <= edge.to_m]
+    return f"end of lane {closure['lane']} on edge {edges[0]}" if edges else ""
+
+
 def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
-    """Return the tables of a scenario file; they have not been checked against each other.
+    """Return the tables of a scenario file, not checked against each other.
 
     Vehicles arrive at random with the mean volumes of the simulation. No vehicle exceeds the lowest
     speed limit of edges and types, and v_F is 90 % of it. The column pitch is the least that suits
@@ -177,6 +214,15 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
     settle_s = min([MAX_SETTLE_S, *(length_m / speed_mps for length_m in ramps_m)])
     formation |= {"gap_m": float(pitch_m), "settle_s": math.floor(10.0 * settle_s) / 10.0}
     found = structure({"formation": formation, **kinds}, Scenario)
+    for own in found.types.values():
+        try:
+            own_drive_out(own)
+        except ValueError as error:
+            limit_mps2 = own.vehicle.max_accel_mps2
+            field = f"{OPTION} {corridor.name}, vehicles that accelerate with {limit_mps2:g} m/s2"
+            raise BadInputError(
+                field, limit_mps2, f"more, for {speed_mps:g} m/s: {error}"
+            ) from error
     return formation | {"cycle_s": _cycle_s(found, corridor)}
 
 

@@ -40,6 +40,9 @@ NO_VEHICLES: Mapping[Name, RoadVehicle] = MappingProxyType({})
 """The empty road, as a default argument."""
 QUEUE_ROOM_M = 20.0
 """Spare distance behind a slow vehicle near the entrance, beyond that for the hardest braking."""
+MOVING_MPS = 0.1
+STANDING_S = 120.0
+"""Time for which all vehicles stand in queues behind exits when a run ends, after all entries."""
 MAX_EMPTY = 12
 """Maximum distance in columns between a vehicle and empty cells assigned to it; smaller if moves
 begin near the entrance, since all cells must be assigned before a plan can transfer them."""
@@ -144,6 +147,8 @@ class Roadside:
         self._queued = 0
         self._entered = 0
         self._left = 0
+        self._moved_s = 0.0
+        """When a vehicle moved the last time."""
         self._announced: tuple[Announcement, ...] = ()
         self._census_sent_tick = -CENSUS_EVERY_TICKS
         self._census_changed = True
@@ -451,6 +456,18 @@ class Roadside:
             ended=ended,
             bridge=self._bridge,
         )
+
+    def is_over(self, t_s: float, vehicles: Mapping[Name, RoadVehicle]) -> bool:
+        """Return whether the road will not change any more.
+
+        No vehicle will enter, and all have left, or have stood for long in a queue behind an exit.
+        """
+        if any(one.state[1] > MOVING_MPS for one in vehicles.values()):
+            self._moved_s = t_s
+        if not self.exhausted(t_s):
+            return False
+        stand = self._outside_traffic is not None and t_s >= self._moved_s + STANDING_S
+        return not vehicles or stand
 
     def exhausted(self, t_s: float) -> bool:
         """Return whether no vehicle waits or will arrive."""

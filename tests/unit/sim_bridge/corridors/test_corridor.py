@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
+from attrs import evolve
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
@@ -12,7 +14,7 @@ from laneweave.protocol.scenario.fields import Closure
 from laneweave.sim_bridge.corridors.corridor import HANDOVER_M, MIN_AT_M, corridor_of
 from laneweave.sim_bridge.corridors.corridor_search import find_corridors
 from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
-from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
+from laneweave.sim_bridge.corridors.scenario_tables import checked_tables, scenario_tables
 from laneweave.sim_bridge.corridors.sumo_config import read_config
 from laneweave.sim_bridge.corridors.sumo_demand import SumoDemand
 from laneweave.sim_bridge.corridors.sumo_network import Network, read_network
@@ -81,6 +83,52 @@ def test_an_impossible_corridor_is_refused(tmp_path: Path, name: str, expected: 
     config = write_interchange(tmp_path, stream(3), types=TRUCKS)
     with pytest.raises(BadInputError, match=expected):
         read_corridor(config, name, tmp_path)
+
+
+def test_names_of_edges_may_contain_colons(tmp_path: Path) -> None:
+    config = write_interchange(tmp_path, stream(3), types=TRUCKS)
+    for file in tmp_path.glob("small.*"):
+        text = file.read_text(encoding="utf-8")
+        file.write_text(re.sub(r"\bmain([15])\b", r"main:\1", text), encoding="utf-8")
+    found = read_corridor(config, "main:1:main:5", tmp_path)
+    assert found.corridor.name == "main:1:main:5"
+    with pytest.raises(BadInputError, match="two edges of the network"):
+        read_corridor(config, "main:1:main:6", tmp_path)
+
+
+def test_what_does_not_fit_is_named_as_in_the_network(tmp_path: Path) -> None:
+    config = write_interchange(tmp_path, stream(60), types=TRUCKS)
+    found = read_corridor(config, CORRIDOR, tmp_path)
+    assert checked_tables(found.corridor, found.demand)
+    (ramp,), opening = found.corridor.ramps, found.corridor.closures[0]
+    late = evolve(found.corridor, ramps=(evolve(ramp, merge_m=ramp.merge_m + 200.0),))
+    with pytest.raises(BadInputError, match=r"on-ramp from on \(entrance\[0\]\.merge_m"):
+        checked_tables(late, found.demand)
+    others = found.corridor.closures[1:]
+    early = evolve(found.corridor, closures=(evolve(opening, to_m=900.0), *others))
+    with pytest.raises(BadInputError, match=r"exit to off \(exit\[0\]\.at_m"):
+        checked_tables(early, found.demand)
+    closures = tuple(
+        evolve(one, from_m=ramp.merge_m + 60.0) if one.from_m > ramp.merge_m else one
+        for one in found.corridor.closures
+    )
+    short = evolve(found.corridor, closures=closures)
+    with pytest.raises(BadInputError, match=r"end of lane 0 on edge main4|on-ramp from on"):
+        checked_tables(short, found.demand)
+
+
+@pytest.mark.parametrize(("accel_mps2", "fits"), [(0.8, True), (0.2, False)])
+def test_types_that_are_too_weak_are_named(
+    tmp_path: Path, accel_mps2: float, *, fits: bool
+) -> None:
+    types = f'<vType id="truck" vClass="truck" accel="{accel_mps2}" decel="4" sigma="0"/>'
+    config = write_interchange(tmp_path, stream(60), types=types)
+    found = read_corridor(config, CORRIDOR, tmp_path)
+    if fits:
+        assert scenario_tables(found.corridor, found.demand)
+        return
+    with pytest.raises(BadInputError, match=r"vehicles that accelerate with 0\.2 m/s2"):
+        scenario_tables(found.corridor, found.demand)
 
 
 def test_a_corridor_does_not_end_where_its_lanes_part(tmp_path: Path) -> None:
