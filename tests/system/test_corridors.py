@@ -68,7 +68,7 @@ def test_corridors_are_listed_described_and_written(lab: Lab, config: Path) -> N
             ("--sumocfg", "nowhere.sumocfg", "--corridor", CORRIDOR),
             "SUMOCFG: got 'nowhere.sumocfg'",
         ),
-        (("--sumocfg", "CONFIG", "--corridor", "main1:off:x"), "--corridor: got 'off:x'"),
+        (("--sumocfg", "CONFIG", "--corridor", "main1:off:x"), "--corridor: got 'main1:off:x'"),
         (("--sumocfg", "CONFIG", "--corridor", "main5:main1"), "0 edges can be reached"),
         (("--sumocfg", "CONFIG", "--corridor", CORRIDOR, "--volume", "9"), "--volume: got '9.0'"),
         (

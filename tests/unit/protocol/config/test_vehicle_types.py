@@ -193,9 +193,9 @@ def test_the_pitch_suits_every_pair_of_types() -> None:
         ),
         ([{**TRUCK, "width_m": 3.2}], {}, "road.lane_width_m: got 3.5; allowed: at least 3.7"),
         (
-            [{**TRUCK, "max_accel_mps2": 0.2}],
+            [{**TRUCK, "max_accel_mps2": 0.1}],
             {"road": {"closures": [{"lane": 0, "from_m": 900.0}]}},
-            "vehicle_type[0].max_accel_mps2: got 0.2; allowed: more",
+            "vehicle_type[0].max_accel_mps2: got 0.1; allowed: more",
         ),
         (
             [{**TRUCK, "min_accel_mps2": -10.5}],
