@@ -63,6 +63,7 @@ def test_everybody_gets_where_the_route_leads(
     assert summary["safety"]["overlaps"] == summary["safety"]["sumo_collisions"] == 0
     assert summary["tracking"]["emergency_ticks"] == 0
     assert summary["safety"]["min_gap_m"] >= 8.0
+    assert summary["travel_time_s"]["n"] == 59
     kinds = {event["kind"] for event in events}
     assert kinds.isdisjoint({"left-lattice", "missed-exit", "agent-missing", "planning-failed"})
     trips = read_trips(folder).values()

@@ -29,7 +29,7 @@ SCENARIO_KEY = b"laneweave.scenario"
 ROWS_PER_GROUP = 500
 """Number of rows that are written together."""
 WARM_UP_S = 60.0
-"""Road time from which entering vehicles are counted; until then the road fills up."""
+"""Road time from which drawn vehicles that enter are counted; until then the road fills up."""
 
 _COLUMNS: list[pa.Field[Any]] = [
     pa.field("vehicle", pa.string(), nullable=False),
@@ -78,7 +78,10 @@ class Trip:
     def row(self, last_arrival_s: float) -> dict[str, Any]:
         """Return the row of the trip; travel time includes waiting at the entrance."""
         demanded_s, entered_s, left_s = self.arrival.t_s, self.entered_s, self.left_s
-        entered_in_time = entered_s is not None and WARM_UP_S <= entered_s <= last_arrival_s
+        # The comparison with SUMO alone counts all vehicles of the user's demand, too.
+        entered_in_time = entered_s is not None and (
+            bool(self.arrival.sumo_id) or WARM_UP_S <= entered_s <= last_arrival_s
+        )
         return {
             "vehicle": self.arrival.vehicle,
             "arrival_lane": self.arrival.lane,
