@@ -179,7 +179,7 @@ def test_vehicles_wait_at_the_start_while_their_exit_is_full(tmp_path: Path) -> 
     until_s = 100
     blocked = (
         '<vehicle id="blocked" type="car" depart="0"><route edges="off"/>'
-        f'<stop lane="off_0" endPos="10" until="{until_s}"/></vehicle>'
+        f'<stop lane="off_0" endPos="45" until="{until_s}"/></vehicle>'
     )
     own = scenario(tmp_path, [blocked, *stream(60)])
     summary, events = drive(own, tmp_path / "run")
@@ -206,12 +206,11 @@ def test_a_run_ends_although_an_exit_remains_full(
     monkeypatch.setattr(corridor_arrivals, "MAX_WAIT_S", 60.0)
     blocked = (
         '<vehicle id="blocked" type="car" depart="0"><route edges="off"/>'
-        '<stop lane="off_0" endPos="10" duration="100000"/></vehicle>'
+        '<stop lane="off_0" endPos="40" duration="100000"/></vehicle>'
     )
     leaving = [vehicle(f"e{n}", 3.0 * n, "exit") for n in range(9)]
     own = scenario(tmp_path, [blocked, *leaving, vehicle("m", 24.0, "main")])
-    stay = "5 of 10 vehicles did not leave the road"
-    summary, events = drive(own, tmp_path / "run", (stay,))
+    summary, events = drive(own, tmp_path / "run")
     assert summary["ending"] == "complete"
     assert summary["vehicles"]["demanded"] == 10
     assert summary["safety"]["overlaps"] == 0

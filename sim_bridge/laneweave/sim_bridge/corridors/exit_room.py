@@ -2,9 +2,9 @@
 
 A vehicle that finds its exit full would stop inside, beside the exit, and everybody behind it. So a
 vehicle that departs at the start enters only if there will be room for it, and for all vehicles on
-the way to the same exit, between the tail of the queue and the place where they brake for it. The
-queue is expected to move no further: a vehicle needs the better part of a minute to the exit, and a
-traffic light may be red for longer.
+the way to the same exit, between the exit and the tail of the queue, after they have braked. The
+queue is expected to move no further: a vehicle needs the better part of a minute to the exit, and
+a traffic light may be red for longer.
 """
 
 from __future__ import annotations
@@ -80,12 +80,14 @@ class ExitRoom:
             if other.lane == way.lane and abs(other.exit_m - way.exit_m) <= 2.0 * HANDOVER_M
         ]
         tail_m = min((rear_m for rear_m, stands in ahead_m if stands), default=math.inf)
-        room_m = way.inside_m + tail_m - self._braking_m
+        # They may brake in the lane of the exit, but stand behind it. One place remains free, since
+        # vehicles brake earlier than they have to.
+        room_m = tail_m - max(0.0, self._braking_m - way.inside_m) - self._place_m
         if math.isinf(tail_m):
             if not waiting:
                 return math.inf
             # The queue has gone, and may come back before all who have waited are at the exit.
-            room_m = way.inside_m + self._seen_m
+            room_m = self._seen_m
         before = sum(rear_m < tail_m for rear_m, _ in ahead_m)
         return room_m / self._place_m - before
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
+from attrs import evolve
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.road_layout import END_OF_ROAD
@@ -45,12 +46,21 @@ def test_an_exit_without_a_queue_has_room(scenario: Scenario) -> None:
 
 
 def test_all_on_the_way_fit_between_the_queue_and_where_they_brake(scenario: Scenario) -> None:
-    # The deceleration lane, without a move into it, and the road up to the queue.
-    inside_m = 246.0 - scenario.step_m
+    # They brake in the deceleration lane, without the distance for a move into it.
     braking_m = scenario.formation.speed_mps**2 / (2.0 * QUEUE_DECEL_MPS2)
+    assert braking_m < 246.0 - scenario.step_m
     for tail_m in (5.0, 40.0, 150.0):
-        fit = (inside_m + 4.0 + tail_m - braking_m) / (7.1 + SPACE_M)
-        assert places(scenario, body(scenario, tail_m)) == math.floor(fit)
+        fit = (4.0 + tail_m) / (7.1 + SPACE_M)
+        assert places(scenario, body(scenario, tail_m)) == max(0, math.floor(fit) - 1)
+
+
+def test_a_short_deceleration_lane_leaves_less_room(scenario: Scenario) -> None:
+    closed = scenario.road.closures[0]
+    later = evolve(closed, to_m=closed.to_m + 90.0)
+    road = evolve(scenario.road, closures=(later, *scenario.road.closures[1:]))
+    short = evolve(scenario, road=road)
+    queue = body(scenario, 150.0)
+    assert places(scenario, queue) - 9 <= places(short, queue) < places(scenario, queue)
 
 
 def test_those_who_drive_to_the_queue_take_places_as_well(scenario: Scenario) -> None:
