@@ -554,7 +554,7 @@ def test_a_request_ends_with_its_clients_session() -> None:
     (job,) = desk.give(QueryArrived(5, PLAN_REQUEST, sender=sender))
     assert isinstance(job, Delegate)
     effects = desk.give(PeerDown(CLIENT_ALIVE, sender))
-    assert [type(effect) for effect in effects] == [Reply, StopJob]
+    assert [type(effect) for effect in effects] == [StopJob, Decline]
     assert desk.give(QueryArrived(6, PLAN_REQUEST, sender=sender)) == [Decline(6)]
 
 
@@ -564,4 +564,4 @@ def test_a_client_cancels_its_request() -> None:
     desk.give(QueryArrived(5, named))
     cancellation = b'{"schema": "laneweave.plan.cancel/1", "id": "r1"}'
     effects = desk.give(QueryArrived(6, cancellation, topic=SERVICE_CANCEL))
-    assert [type(effect) for effect in effects] == [Reply, StopJob, Reply]
+    assert [type(effect) for effect in effects] == [StopJob, Reply, Reply]

@@ -69,19 +69,27 @@ def complete_summary(
         faults=faults if faults is not None else summary.faults,
     )
     write_summary(folder, summary)
-    return Outcome(folder, summary, (*problems, *_violations(summary)))
+    trips = folder / "trips.parquet"
+    of_sumo = trips.is_file() and bool(scenario_of(trips).sumo.config)
+    return Outcome(folder, summary, (*problems, *_violations(summary, of_sumo=of_sumo)))
 
 
-def _violations(summary: RunSummary) -> list[str]:
+def _violations(summary: RunSummary, *, of_sumo: bool) -> list[str]:
+    """Return which guarantees a run has violated.
+
+    Args:
+        summary: summary of the run.
+        of_sumo: whether vehicles come from a SUMO simulation. Then a complete run may leave some
+            outside: SUMO drives them elsewhere, or their exits are full.
+    """
     vehicles, safety = summary.vehicles, summary.safety
     found = []
     if safety.overlaps:
         found.append(f"{safety.overlaps} pairs of vehicles overlapped")
-    # A complete run may leave vehicles outside, which SUMO drives, or whose exits are full.
-    expected = vehicles.entered
-    if summary.ending != "complete":
+    complete = summary.ending == "complete"
+    if not complete:
         found.append(f"the run is not complete: {summary.ending}")
-        expected = vehicles.demanded
+    expected = vehicles.entered if complete and of_sumo else vehicles.demanded
     if vehicles.left < expected:
         missing = expected - vehicles.left
         found.append(f"{missing} of {vehicles.demanded} vehicles did not leave the road")

@@ -434,18 +434,18 @@ def ends_in_time(execution: PlanExecution, _: object) -> bool:
         return True
     step, origin, target = move
     front = max(origin[0], target[0])
-    # A move may be planned for later in its slot, when both lanes are open.
-    due_s = max(execution.t_s, plan.t0_s + step * plan.slot_s)
-    opens_s = max(ends.opens_s((front, lane), due_s) for lane in (origin[1], target[1]))
-    begin_s = opens_s if opens_s < due_s + plan.slot_s else due_s
+    begin_s = max(execution.t_s, plan.t0_s + step * plan.slot_s)
+    if origin[1] == target[1]:
+        return not ends.has_passed((front, origin[1]), begin_s + plan.slot_s - LATE_S, begin_s)
+    # It may be planned for later in its slot, when both lanes are open (`both_lanes_are_open`).
+    opens_s = max(ends.opens_s((origin[0], lane), begin_s) for lane in (origin[1], target[1]))
+    begin_s = opens_s if opens_s < begin_s + plan.slot_s else begin_s
     end_s = begin_s + plan.slot_s - LATE_S
-    across = origin[1] != target[1]
-    for cell in ((front, origin[1]), (front, target[1])):
-        body_m = ends.in_section_m(cell, begin_s)
-        if ends.has_passed(cell, end_s, body_m=body_m):
-            return False
-        if across and ends.ends_changes(cell, end_s, body_m=body_m):
-            return False
+    for lane in (origin[1], target[1]):
+        body_m = ends.in_section_m((origin[0], lane), begin_s)
+        for has_passed in (ends.has_passed, ends.ends_changes):
+            if has_passed((front, lane), end_s, body_m=body_m):
+                return False
     return True
 
 

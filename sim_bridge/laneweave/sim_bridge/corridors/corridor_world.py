@@ -110,7 +110,7 @@ class CorridorWorld(SumoProcess):
             allowed = f"one whose lane {min(both)} is either open at the start or that of a ramp"
             raise BadInputError(OPTION, setup.corridor.name, allowed)
         self._ways_in = {**to_start, **to_ramps}
-        self._beyond = dict(_beyond(setup.network, setup.corridor))
+        self._beyond = tuple(dict.fromkeys(_beyond(setup.network, setup.corridor)))
         self._approaching: dict[int, list[Approaching]] = {}
         """What SUMO has been asked since its last step, by lane."""
         self._others: list[OtherBody] | None = None
@@ -175,7 +175,7 @@ class CorridorWorld(SumoProcess):
 
     def _find_others(self) -> Iterator[OtherBody]:
         api = self.vehicle
-        for name, (lane, exit_m, from_m) in self._beyond.items():
+        for name, (lane, exit_m, from_m) in self._beyond:
             for vehicle in self.lane.getLastStepVehicleIDs(name):
                 rear_m = api.getLanePosition(vehicle) - api.getLength(vehicle)
                 seen = from_m + rear_m <= exit_m + SEEN_BEYOND_M
@@ -295,11 +295,12 @@ class CorridorWorld(SumoProcess):
         api.setLaneChangeMode(name, _OWN_LANE_CHANGES)
         del self._coming[name]
         self._returned.add(name)
+        self._others = None
 
     def drive_on(self) -> None:
         """Let SUMO drive on until the vehicles that it got back have arrived (statistics)."""
         if self._states or not self.exhausted:
-            return  # the run has been interrupted
+            return  # the run has been interrupted, or vehicles stand inside
         end_s = self.simulation.getTime() + MAX_WAIT_S
         while self._returned and self.simulation.getTime() < end_s:
             super().step()

@@ -1,10 +1,10 @@
-"""Room at the exits: who must wait before the corridor, since there is a queue behind the exit.
+"""Room at the exits: which vehicles wait before the corridor because of queues behind exits.
 
-A vehicle that finds its exit full would stop inside, beside the exit, and everybody behind it. So a
-vehicle that departs at the start enters only if there will be room for it, and for all vehicles on
-the way to the same exit, between the exit and the tail of the queue, after they have braked. The
-queue is expected to move no further: a vehicle needs the better part of a minute to the exit, and
-a traffic light may be red for longer.
+A vehicle whose exit is full would stop in the corridor, beside the exit, and so would all vehicles
+behind it. So a vehicle that departs at the start enters only if there will be room for it, and for
+all vehicles on the way to the same exit, between the exit and the tail of the queue, after they
+have braked. The queue is expected to move no further: a vehicle needs up to a minute to the exit,
+and a traffic light may be red for longer.
 """
 
 from __future__ import annotations
@@ -35,6 +35,16 @@ class _Way:
     exit_m: float
     inside_m: float
     """Length of the part before the exit in which vehicles may brake, after they changed lanes."""
+
+
+@frozen
+class _Queue:
+    """A queue behind an exit."""
+
+    tail_m: float
+    """Distance of its tail from the exit; infinite: there is none."""
+    before: int
+    """Number of bodies that drive towards it behind the exit."""
 
 
 class ExitRoom:
@@ -70,26 +80,37 @@ class ExitRoom:
         if destination == END_OF_ROAD:
             return True
         ways = self._ways[destination]
-        return going + 1 <= sum(self._places(way, waiting, others) for way in ways)
+        queues = [_queue(way, others) for way in ways]
+        if not waiting and all(math.isinf(queue.tail_m) for queue in queues):
+            return True
+        if not going and any(queue.tail_m >= 2.0 * self._place_m for queue in queues):
+            # Otherwise nobody would enter before a queue that moves on again and again.
+            return True
+        places = (self._places(way, queue) for way, queue in zip(ways, queues, strict=True))
+        return going + 1 <= sum(places)
 
-    def _places(self, way: _Way, waiting: int, others: Sequence[OtherBody]) -> float:
-        """Return the number of vehicles, inside or on the way, that fit behind a queue."""
-        ahead_m = [
-            (other.rear_m - way.exit_m, other.speed_mps < STANDING_MPS)
-            for other in others
-            if other.lane == way.lane and abs(other.exit_m - way.exit_m) <= 2.0 * HANDOVER_M
-        ]
-        tail_m = min((rear_m for rear_m, stands in ahead_m if stands), default=math.inf)
-        # They may brake in the lane of the exit, but stand behind it. One place remains free, since
-        # vehicles brake earlier than they have to.
-        room_m = tail_m - max(0.0, self._braking_m - way.inside_m) - self._place_m
-        if math.isinf(tail_m):
-            if not waiting:
-                return math.inf
+    def _places(self, way: _Way, queue: _Queue) -> float:
+        """Return the number of vehicles on the way that fit behind a queue."""
+        if math.isinf(queue.tail_m):
             # The queue has gone, and may come back before all who have waited are at the exit.
             room_m = self._seen_m
-        before = sum(rear_m < tail_m for rear_m, _ in ahead_m)
-        return room_m / self._place_m - before
+        else:
+            # They may brake in the lane of the exit, but stand behind it. One place remains free,
+            # since vehicles brake earlier than they have to.
+            braking_m = max(0.0, self._braking_m - way.inside_m)
+            room_m = queue.tail_m - braking_m - self._place_m
+        return max(0.0, room_m / self._place_m - queue.before)
+
+
+def _queue(way: _Way, others: Sequence[OtherBody]) -> _Queue:
+    """Return the queue behind an exit in one of its lanes."""
+    ahead_m = [
+        (other.rear_m - way.exit_m, other.speed_mps < STANDING_MPS)
+        for other in others
+        if other.lane == way.lane and abs(other.exit_m - way.exit_m) <= 2.0 * HANDOVER_M
+    ]
+    tail_m = min((rear_m for rear_m, stands in ahead_m if stands), default=math.inf)
+    return _Queue(tail_m, sum(rear_m < tail_m for rear_m, _ in ahead_m))
 
 
 def _inside_m(section: LaneSection, step_m: float) -> float:

@@ -218,10 +218,12 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
         try:
             own_drive_out(own)
         except ValueError as error:
-            limit_mps2 = own.vehicle.max_accel_mps2
-            field = f"{OPTION} {corridor.name}, vehicles that accelerate with {limit_mps2:g} m/s2"
+            max_accel_mps2 = own.vehicle.max_accel_mps2
+            field = (
+                f"{OPTION} {corridor.name}, vehicles that accelerate with {max_accel_mps2:g} m/s2"
+            )
             raise BadInputError(
-                field, limit_mps2, f"more, for {speed_mps:g} m/s: {error}"
+                field, max_accel_mps2, f"more, for {speed_mps:g} m/s: {error}"
             ) from error
     return formation | {"cycle_s": _cycle_s(found, corridor)}
 

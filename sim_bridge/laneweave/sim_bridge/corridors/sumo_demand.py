@@ -110,9 +110,9 @@ def read_demand(config: SumoConfig, folder: Path, seed: int = 1) -> SumoDemand:
     if files:
         command += ["--route-files", ",".join(map(str, files))]
     command += ["--step-length", f"{STEP_S:g}", "--no-warnings", "true", "--no-step-log", "true"]
-    command += ["--seed", str(config.options.get("seed", seed % 2**31))]
-    command += ["--ignore-route-errors", "true", "--xml-validation", "never"]
-    command += [part for name, value in ALL_AT_ONCE.items() for part in (f"--{name}", value)]
+    options = {"seed": str(seed % 2**31), **config.options}
+    options |= {"ignore-route-errors": "true", "xml-validation": "never", **ALL_AT_ONCE}
+    command += [part for name, value in options.items() for part in (f"--{name}", value)]
     vehicles: list[SumoVehicle] = []
     with SumoProcess(command) as sumo:
         while True:

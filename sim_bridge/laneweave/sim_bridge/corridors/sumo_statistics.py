@@ -97,7 +97,10 @@ def _collisions(file: Path, taken_out: Mapping[str, SumoTrip]) -> int:
 
     def is_out(name: str | None, at_s: float) -> bool:
         trip = taken_out.get((name or "").removeprefix(AGAIN))
-        return trip is not None and trip.depart_s - trip.duration_s <= at_s <= trip.arrival_s
+        if trip is None:
+            return False
+        # It lasts for one step, at whose beginning SUMO notes collisions.
+        return trip.depart_s - trip.duration_s <= at_s <= trip.arrival_s
 
     found = 0
     for _, element in ET.iterparse(file):  # noqa: S314 (SUMO has written it)

@@ -122,6 +122,8 @@ class EntryMeter:
         self._names: set[str] = set()
         self._columns = [int(s_m // lattice.pitch_m) for s_m in self._entry_m]
         """Next column of each lane that vehicles can enter."""
+        self._until_s = -math.inf
+        """Time up to which vehicles have entered."""
         self._free_s = [-math.inf] * lattice.lanes
         """Earliest time at which the next vehicle of each lane may enter."""
 
@@ -224,6 +226,7 @@ class EntryMeter:
                 admissions.append(Admission(arrival, cell, t_s, offset_m, more_cells))
                 self._free_s[lane] = t_s + self._lattice.pitch_m / self._lattice.speed_mps
             self._columns[lane] -= 1
+        self._until_s = until_s
         # Columns that have passed are not available to later arrivals.
         for lane in range(self._lattice.lanes):
             self._skip(lane, until_s - TIME_TOLERANCE_S)
@@ -234,7 +237,8 @@ class EntryMeter:
         queue = self._queues[lane]
         if not queue:
             return math.inf
-        ready_s = max(queue[0].t_s, self._free_s[lane])
+        # A vehicle that was held back comes to the queue late.
+        ready_s = max(queue[0].t_s, self._free_s[lane], self._until_s)
         self._skip(lane, ready_s)
         passing_s = self._passing_time_s(self._columns[lane], lane)
         return max(ready_s, passing_s - self._spread_in(lane))

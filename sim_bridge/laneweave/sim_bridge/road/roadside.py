@@ -40,7 +40,10 @@ NO_VEHICLES: Mapping[Name, RoadVehicle] = MappingProxyType({})
 """The empty road, as a default argument."""
 QUEUE_ROOM_M = 20.0
 """Spare distance behind a slow vehicle near the entrance, beyond that for the hardest braking."""
+HELD_ANNOUNCED = 4
+"""Maximum number of vehicles for each exit that are announced while they are held back."""
 MOVING_MPS = 0.1
+"""Speed above which a vehicle does not stand."""
 STANDING_S = 120.0
 """Time for which all vehicles stand in queues behind exits when a run ends, after all entries."""
 MAX_EMPTY = 12
@@ -464,10 +467,11 @@ class Roadside:
         """
         if any(one.state[1] > MOVING_MPS for one in vehicles.values()):
             self._moved_s = t_s
-        if not self.exhausted(t_s):
-            return False
-        stand = self._outside_traffic is not None and t_s >= self._moved_s + STANDING_S
-        return not vehicles or stand
+        if not vehicles:
+            return self.exhausted(t_s)
+        # A queue may reach back to the start, where more vehicles wait.
+        outside = self._outside_traffic
+        return outside is not None and outside.exhausted and t_s >= self._moved_s + STANDING_S
 
     def exhausted(self, t_s: float) -> bool:
         """Return whether no vehicle waits or will arrive."""
@@ -517,6 +521,11 @@ class Roadside:
         room = [self._announced_per_lane] * self._lanes
         coming = []
         until = count_until(self._arrivals, t_s + self._announce_s)
+        held = Counter[str]()
+        for arrival in self._held:
+            held[arrival.destination] += 1
+            if held[arrival.destination] <= HELD_ANNOUNCED:
+                coming.append(arrival)
         for arrival in (*self._meter.waiting, *self._arrivals[self._queued : until]):
             if room[arrival.lane] > 0:
                 room[arrival.lane] -= 1

@@ -9,12 +9,16 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
+from laneweave.launch.cli.corridor_command import corridor_tables
 from laneweave.launch.faults.failover import Failover
 from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.run.outcome import Outcome, complete_summary, print_outcome
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.summary import RunSummary, write_summary
+from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 from laneweave.sim_bridge.recording.trips import metadata_of, trips_table
 from support.closed_lanes import DROP
+from support.interchange import CORRIDOR, TRUCKS, stream, write_interchange
 from support.summaries import make_summary
 
 MEASURED = ("min_gap_m", "min_headway_s", "max_accel_mps2", "min_accel_mps2", "max_jerk_mps3")
@@ -79,6 +83,12 @@ def test_a_broken_promise_fails_a_run(tmp_path: Path, found: RunSummary, problem
 
 
 def test_vehicles_that_stay_outside_do_not_fail_a_complete_run(tmp_path: Path) -> None:
+    lost = judge(tmp_path, summary(entered=3, left=3))
+    assert lost.problems == ("2 of 5 vehicles did not leave the road",)
+    config = write_interchange(tmp_path, stream(9), types=TRUCKS)
+    tables = corridor_tables(read_corridor(config, CORRIDOR, tmp_path), config, CORRIDOR)
+    of_sumo = parse_scenario(tables)
+    pq.write_table(trips_table([], 0.0, metadata_of(of_sumo)), tmp_path / "trips.parquet")
     outside = judge(tmp_path, summary(entered=3, left=3))
     assert outside.exit_status == 0
     assert "2: did not come to the corridor, or exit full" in printed(outside)

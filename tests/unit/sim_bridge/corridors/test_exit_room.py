@@ -1,4 +1,4 @@
-"""Who must wait at the start, since there is a queue behind the exit."""
+"""Which vehicles wait at the start because of queues behind their exits."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ def test_all_on_the_way_fit_between_the_queue_and_where_they_brake(scenario: Sce
     assert braking_m < 246.0 - scenario.step_m
     for tail_m in (5.0, 40.0, 150.0):
         fit = (4.0 + tail_m) / (7.1 + SPACE_M)
-        assert places(scenario, body(scenario, tail_m)) == max(0, math.floor(fit) - 1)
+        first = int(tail_m > 20.0)  # one may always try if there is room behind the exit
+        assert places(scenario, body(scenario, tail_m)) == max(first, math.floor(fit) - 1)
 
 
 def test_a_short_deceleration_lane_leaves_less_room(scenario: Scenario) -> None:
@@ -81,3 +82,21 @@ def test_those_who_have_waited_do_not_come_all_at_once(scenario: Scenario) -> No
 def test_other_lanes_and_the_end_of_the_road_do_not_matter(scenario: Scenario) -> None:
     assert places(scenario, body(scenario, 5.0, lane=1)) == 1000
     assert ExitRoom(scenario, SEEN_M).has_room(END_OF_ROAD, 500, 9, [body(scenario, 5.0)])
+
+
+def test_a_queue_that_moves_on_again_and_again_keeps_nobody_out(scenario: Scenario) -> None:
+    closed = scenario.road.closures[0]
+    later = evolve(closed, to_m=closed.to_m + 140.0)
+    road = evolve(scenario.road, closures=(later, *scenario.road.closures[1:]))
+    short = evolve(scenario, road=road)
+    assert places(short, body(short, 70.0)) == places(short, body(short, 30.0)) == 1
+    assert places(short, body(short, 10.0)) == 0
+
+
+def test_an_empty_lane_of_an_exit_is_not_for_all(scenario: Scenario) -> None:
+    lanes = evolve(scenario.exit[0], lanes=(0, 1))
+    closure = evolve(scenario.road.closures[0], lane=1, from_m=lanes.at_m, to_m=lanes.at_m + 20.0)
+    road = evolve(scenario.road, closures=(*scenario.road.closures, closure))
+    wide = evolve(scenario, road=road, exit=(lanes,))
+    assert places(wide) == 1000
+    assert 0 < places(wide, body(wide, 5.0)) < 30
