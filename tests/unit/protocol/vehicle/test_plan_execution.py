@@ -17,6 +17,7 @@ from laneweave.protocol.vehicle.plan_execution import (
     VEHICLE_RULES,
     ExecutionPhase,
     PlanExecution,
+    both_lanes_are_open,
     ends_in_time,
 )
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
@@ -495,6 +496,22 @@ def test_a_move_begins_where_both_lanes_are_open(lane: int, closed_m: float) -> 
     assert execution.tick(T0_S) is None
     assert execution.tick(begins_s - 0.01) is None
     assert execution.tick(begins_s) is not None
+
+
+@pytest.mark.parametrize("columns", [0, 1])
+def test_a_lane_that_opens_again_does_not_excuse_a_move_beyond_the_stop_line(columns: int) -> None:
+    """The section is that of the cell that moves, not that of the cell ahead of it."""
+    origin, target = (-4, 0), (-4 + columns, 1)
+    ends_m = ROLLING.lattice.cell_s_m(-4, T0_S) + 9.0
+    closure = Closure(1, ends_m, ends_m + 9.0)
+    road = evolve(ROLLING.road, s3_m=20_000.0, closures=(closure,))
+    execution = going()
+    assert execution.plan is not None
+    execution.plan = evolve(execution.plan, moves={execution.vehicle: ((0, origin, target),)})
+    execution.lane_ends = LaneEnds(evolve(ROLLING, road=road))
+    execution.t_s = T0_S
+    assert both_lanes_are_open(execution, None)
+    assert not ends_in_time(execution, None)
 
 
 # --- the table as a whole ---------------------------------------------------------------------
