@@ -10,12 +10,15 @@ import pytest
 from attrs import define, field
 
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.runtime.node import Send
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.structuring import structure
 from laneweave.protocol.wire.messages import Census, ClosedFormation, Name, RoadClock
+from laneweave.sim_bridge.bodies.plant import Plant
+from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
-from laneweave.sim_bridge.road.roadside import Roadside
+from laneweave.sim_bridge.road.roadside import HELD_ANNOUNCED, STANDING_S, Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.paper import closing_time_s, paper
 from support.road_vehicles import vehicle_in
@@ -291,3 +294,104 @@ def test_a_census_of_the_rolling_operation_has_no_formations() -> None:
         assert roadside.close_formations(0.1 * tick) == []
     census = roadside.census(60.0, ())
     assert (census.formations, census.closed_to) == ((), -1)
+
+
+# --- vehicles that are held back --------------------------------------------------------------
+
+OFF_RAMP = {
+    "road": {
+        "lanes": 4,
+        "s3_m": 850.0,
+        "closures": [{"lane": 0, "to_m": 500.0}, {"lane": 0, "from_m": 800.0}],
+    },
+    "exit": [{"name": "off", "lanes": [0], "at_m": 800.0}],
+    "demand": {"destinations": [{"exit": "off", "share": 0.2}]},
+    "formation": {"operation": "rolling"},
+}
+
+
+@define
+class Gate:
+    """A simulator that brings no vehicles, and keeps those that wait for an exit."""
+
+    come: bool = True
+    room: bool = True
+    exhausted: bool = False
+    start_lanes: tuple[int, ...] = ()
+
+    def demanded(self, _: float) -> list[Arrival]:
+        return []
+
+    def announced(self) -> list[Arrival]:
+        return []
+
+    def has_come(self, vehicle: str) -> bool:
+        return self.come or vehicle != "v0001"
+
+    def has_room(self, destination: str, going: int, waiting: int) -> bool:
+        del going, waiting
+        return self.room or destination != "off"
+
+    def full_lanes(self) -> set[int]:
+        return set()
+
+    def admit(self, *_: object) -> list[Admission]:
+        return []
+
+
+def held_roadside(gate: Gate, exits: int) -> tuple[Roadside, Scenario]:
+    scenario = parse_scenario(OFF_RAMP)
+    stream = tuple(
+        Arrival(f"v{n:04}", 1, ANY_LANE, 2.0 + 2.0 * n, "off" if n <= exits else END_OF_ROAD)
+        for n in range(1, 9)
+    )
+    return Roadside(scenario, stream=stream, outside_traffic=gate), scenario
+
+
+def admitted(roadside: Roadside, scenario: Scenario, from_s: float, to_s: float) -> list[Admission]:
+    found: list[Admission] = []
+    tick_s = scenario.runtime.tick_s
+    for tick in range(round(from_s / tick_s), round(to_s / tick_s)):
+        roadside.newly_demanded(tick * tick_s)
+        found += roadside.admit(tick * tick_s)
+        roadside.update_announcements(tick * tick_s)
+    return found
+
+
+@pytest.mark.parametrize("gate", [Gate(come=False), Gate(room=False)], ids=["come", "room"])
+def test_a_vehicle_that_is_held_back_is_announced_and_enters_when_it_is_released(
+    gate: Gate,
+) -> None:
+    roadside, scenario = held_roadside(gate, exits=1)
+    before = admitted(roadside, scenario, 0.0, 60.0)
+    # It does not keep those behind it back.
+    assert [one.arrival.vehicle for one in before] == [f"v{n:04}" for n in range(2, 9)]
+    assert [one.vehicle for one in roadside.census(60.0, ()).announced] == ["v0001"]
+    assert not roadside.exhausted(60.0)
+    gate.come = gate.room = True
+    (late,) = admitted(roadside, scenario, 60.0, 65.0)
+    assert late.arrival.vehicle == "v0001"
+    # It does not enter in the past, where its body would be on the road already.
+    assert late.t_s >= 60.0 - scenario.runtime.tick_s
+
+
+def test_few_vehicles_of_those_that_are_held_back_are_announced() -> None:
+    roadside, scenario = held_roadside(Gate(room=False), exits=7)
+    assert len(admitted(roadside, scenario, 0.0, 60.0)) == 1
+    assert len(roadside.census(60.0, ()).announced) == HELD_ANNOUNCED
+
+
+def test_a_road_on_which_all_stand_is_over_when_nobody_comes_any_more() -> None:
+    gate = Gate(room=False)
+    roadside, scenario = held_roadside(gate, exits=7)
+    (one,) = admitted(roadside, scenario, 0.0, 60.0)
+    vehicle = RoadVehicle.entering(one, 20.0, scenario, 0)
+    vehicles = {vehicle.name: vehicle}
+    assert not roadside.is_over(60.0, vehicles)
+    standing = (100.0, 0.0, 0.0, 1.75, 0.0, 0.0)
+    vehicle.controller.plant = Plant(standing, scenario.vehicle, 0.1)
+    gate.exhausted = True
+    assert not roadside.is_over(60.0 + 0.5 * STANDING_S, vehicles)
+    assert roadside.is_over(60.0 + STANDING_S, vehicles)
+    gate.exhausted = False
+    assert not roadside.is_over(60.0 + STANDING_S, vehicles)
