@@ -72,29 +72,25 @@ def _list(sumocfg: Path, folder: Path) -> None:
             "SUMOCFG", str(sumocfg), "a network with a chain of edges of 500 m with two lanes"
         )
     table = Table(title=f"corridors of {sumocfg.name}")
-    for column in (
-        "--corridor",
-        "edges",
-        "lanes",
-        "m",
-        "m/s",
-        "ramps",
-        "exits",
-        "veh/h",
-        "remarks",
-    ):
-        table.add_column(column, justify="left" if column in ("--corridor", "remarks") else "right")
+    # Names are to be copied, however narrow the terminal is.
+    table.add_column("--corridor", min_width=max(len(one.name) for one in found))
+    for column in ("edges", "lanes", "m", "m/s", "ramps", "exits", "veh/h"):
+        table.add_column(column, justify="right")
     for one in found:
-        table.add_row(*_row(one))
-    Console().print(table)
+        table.add_row(escape(one.name), *_numbers(one))
+    console = Console()
+    console.print(table)
+    for one in found:
+        remark = _remark(one)
+        if remark:
+            console.print(f"{escape(one.name)}: {escape(remark)}", soft_wrap=True)
 
 
-def _row(one: Candidate) -> tuple[str, ...]:
-    name, corridor = escape(one.name), one.corridor
-    if corridor is None or one.demand is None:
-        return (name, *[""] * 7, escape(one.problem))
+def _numbers(one: Candidate) -> tuple[str, ...]:
+    corridor = one.corridor
+    if corridor is None:
+        return ("",) * 7
     return (
-        name,
         f"{len(corridor.edges)}",
         f"{corridor.lanes}",
         f"{corridor.length_m:.0f}",
@@ -102,12 +98,14 @@ def _row(one: Candidate) -> tuple[str, ...]:
         f"{len(corridor.ramps)}",
         f"{len(corridor.ways_out)}",
         f"{one.volume_veh_per_h:.0f}",
-        escape(_remark(corridor, one.demand)),
     )
 
 
-def _remark(corridor: Corridor, demand: CorridorDemand) -> str:
+def _remark(one: Candidate) -> str:
     """Return why laneweave cannot drive a corridor, or what it does not use."""
+    corridor, demand = one.corridor, one.demand
+    if corridor is None or demand is None:
+        return one.problem
     unused = f"{len(corridor.unused)} ways not used" if corridor.unused else ""
     return _problem(corridor, demand) or unused
 

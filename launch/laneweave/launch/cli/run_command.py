@@ -159,7 +159,7 @@ def run(
         from laneweave.launch.report.report import draw_report
 
         draw_report(outcome.folder)
-        if compare:
+        if compare and outcome.summary.ending == "complete":
             _compare(settings, outcome.folder, show=show)
     raise typer.Exit(outcome.exit_status)
 
@@ -174,7 +174,10 @@ def _compare(settings: Scenario, folder: Path, *, show: bool) -> None:
         task = bar.add_task("SUMO alone", total=1.0)
         routes = compare(settings, folder, lambda share: bar.update(task, completed=share))
     for one in routes[:COMPARED_ROUTES]:
-        own, alone = ("-" if mean is None else f"{mean:.1f} s" for mean in one.mean_s)
+        own, alone = (
+            f"{count} of {one.vehicles}" + ("" if mean is None else f" in {mean:.1f} s")
+            for mean, count in zip(one.mean_s, one.arrived, strict=True)
+        )
         typer.echo(f"{one.entrance} to {one.destination}: {own} with laneweave, {alone} with SUMO")
     typer.echo(f"comparison: {folder / PAGE_FILE}")
 
