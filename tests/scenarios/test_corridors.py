@@ -31,6 +31,20 @@ def scenario(folder: Path, vehicles: Sequence[str]) -> Scenario:
     return parse_scenario(corridor_tables(found, config, CORRIDOR))
 
 
+def standing_vehicle(depart_s: int, at_m: int, stop: str) -> str:
+    """Return the XML element of a vehicle that stands on the road behind the exit.
+
+    Args:
+        depart_s: when it appears.
+        at_m: position of its front.
+        stop: attribute that says how long it stands.
+    """
+    return (
+        f'<vehicle id="standing" type="car" depart="{depart_s}" departPos="{at_m - 5}">'
+        f'<route edges="off"/><stop lane="off_0" endPos="{at_m}" {stop}/></vehicle>'
+    )
+
+
 def read_rows(folder: Path) -> dict[tuple[str, int], tuple[float, float]]:
     """Return position and speed of each vehicle by tick."""
     columns = read_table(folder / "trajectories.parquet").to_pydict()
@@ -144,10 +158,7 @@ def test_a_queue_behind_the_exit_is_braked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sumo_config, "CONFLICT_S", 5.0)  # so that there are some
-    standing = (
-        '<vehicle id="standing" type="car" depart="22" departPos="20"><route edges="off"/>'
-        '<stop lane="off_0" endPos="25" duration="60"/></vehicle>'
-    )
+    standing = standing_vehicle(22, 25, 'duration="60"')
     leaving = [vehicle(f"e{n}", 4.0 * n, "exit") for n in range(6)]
     own = scenario(tmp_path, [standing, *leaving, vehicle("m", 24.0, "main")])
     summary, _ = drive(own, tmp_path / "run")
@@ -174,12 +185,9 @@ def test_a_queue_behind_the_exit_is_braked_for(
 
 
 def test_vehicles_wait_at_the_start_while_their_exit_is_full(tmp_path: Path) -> None:
-    """Inside, they would stop beside the exit, and everybody behind them."""
+    """In the corridor they would stop beside the exit, and so would all vehicles behind them."""
     until_s = 100
-    blocked = (
-        '<vehicle id="blocked" type="car" depart="0"><route edges="off"/>'
-        f'<stop lane="off_0" endPos="45" until="{until_s}"/></vehicle>'
-    )
+    blocked = standing_vehicle(0, 45, f'until="{until_s}"')
     own = scenario(tmp_path, [blocked, *stream(60)])
     summary, events = drive(own, tmp_path / "run")
     assert summary["vehicles"]["left"] == summary["vehicles"]["at_destination"] == 70
@@ -205,10 +213,7 @@ def test_a_run_ends_although_an_exit_remains_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(corridor_arrivals, "MAX_WAIT_S", 60.0)
-    blocked = (
-        '<vehicle id="blocked" type="car" depart="0"><route edges="off"/>'
-        '<stop lane="off_0" endPos="40" duration="100000"/></vehicle>'
-    )
+    blocked = standing_vehicle(0, 40, 'duration="100000"')
     leaving = [vehicle(f"e{n}", 3.0 * n, "exit") for n in range(9)]
     own = scenario(tmp_path, [blocked, *leaving, vehicle("m", 24.0, "main")])
     summary, events = drive(own, tmp_path / "run")

@@ -15,6 +15,11 @@ from pathlib import Path
 
 from attrs import frozen
 
+from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
+from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
+
 LANE_M = 3.2
 CORRIDOR = "main1:main5"
 LONGEST_CORRIDOR = "start:main5"
@@ -114,6 +119,12 @@ def stream(duration_s: int) -> list[str]:
 
 
 TRUCKS = '<vType id="truck" vClass="truck" length="7.1" accel="1.3" decel="4" sigma="0"/>'
+
+
+def interchange_scenario(folder: Path) -> Scenario:
+    """Return the scenario of the corridor with a stream of vehicles of a minute."""
+    found = read_corridor(write_interchange(folder, stream(60), types=TRUCKS), CORRIDOR, folder)
+    return parse_scenario(scenario_tables(found.corridor, found.demand))
 
 
 def _network(state: str) -> Iterator[str]:

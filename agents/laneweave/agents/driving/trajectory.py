@@ -253,7 +253,7 @@ def _trajectory_program(
 
 
 def _squared_jerks(n: int) -> Any:  # noqa: ANN401 - scipy.sparse has no types
-    """Return the cost of the jerks of n ticks; states cost nothing."""
+    """Return the cost matrix of the squared jerks of n ticks."""
     return sparse.diags([np.concatenate([np.zeros(6 * n), np.ones(2 * n)])], [0])
 
 

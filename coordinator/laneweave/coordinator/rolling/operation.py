@@ -236,7 +236,7 @@ class RollingOperation:
         return tuple(vehicles.values()), blocked, self._ends_m(snapshot.census)
 
     def _gated(self, snapshot: Snapshot, slot: int) -> frozenset[Name]:
-        """Return the members of ballots for a slot that wait for one that settles.
+        """Return the members of ballots for a slot whose start gates wait for a settling vehicle.
 
         If one of them promised the next ballot, the gate would stay closed.
         """

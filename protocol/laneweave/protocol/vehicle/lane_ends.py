@@ -118,9 +118,15 @@ class LaneEnds:
 
     def has_begun(self, lane: int, front_m: float) -> bool:
         """Return whether moves into and out of a lane may begin at a position of the front."""
-        return any(
-            begins_m - ROUNDING_M <= front_m < to_m for begins_m, _, to_m in self._begins_m[lane]
-        )
+        return bool(self._begun_m(lane, front_m))
+
+    def _begun_m(self, lane: int, front_m: float) -> list[float]:
+        """Return where the section begins in which moves may begin; empty: they may not."""
+        return [
+            from_m
+            for begins_m, from_m, to_m in self._begins_m[lane]
+            if begins_m - ROUNDING_M <= front_m < to_m
+        ]
 
     def opens_s(self, cell: Cell, t_s: float) -> float:
         """Return the road time from which moves may begin in the lane of a cell.
@@ -137,9 +143,7 @@ class LaneEnds:
         A move may begin so early that the body does not touch the lane before it opens.
         """
         s_m = self._lattice.cell_s_m(cell[0], t_s)
-        sections = self._begins_m[cell[1]]
-        opened_m = [from_m for begins_m, from_m, to_m in sections if begins_m <= s_m < to_m]
-        return max(s_m, *opened_m) if opened_m else s_m
+        return max([s_m, *self._begun_m(cell[1], s_m)])
 
     def ahead(self, lane: int, s_m: float) -> LaneEnd | None:
         """Return the dead end of the section in which a position is, or which it has passed."""

@@ -428,7 +428,7 @@ def move_is_due(execution: PlanExecution, _: object) -> bool:
 
 
 def ends_in_time(execution: PlanExecution, _: object) -> bool:
-    """The move, begun as soon as it can, ends before the lines of both lanes' ends and exits."""
+    """The move, begun as soon as possible, ends before the stop and exit lines of both lanes."""
     plan, move, ends = execution.plan, execution.next_move, execution.lane_ends
     if plan is None or move is None or not ends:
         return True

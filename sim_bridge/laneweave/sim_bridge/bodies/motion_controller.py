@@ -139,7 +139,7 @@ class MotionController:
     tick_s: float = field(init=False)
     _brake: EmergencyBrake = field(init=False)
     _weakest_brake: EmergencyBrake = field(init=False)
-    """That of the type that brakes least hard."""
+    """Emergency brake of the type with the least maximum deceleration."""
     _lane_ends: LaneEnds = field(init=False)
 
     def __attrs_post_init__(self) -> None:

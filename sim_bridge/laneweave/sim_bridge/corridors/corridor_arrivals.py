@@ -62,7 +62,7 @@ class CorridorSetup:
     duration_s: float
     """Time within which vehicles depart."""
     left_out: frozenset[str] = frozenset()
-    """Names in SUMO of vehicles that come through the corridor, but are not among its vehicles."""
+    """Names in SUMO of vehicles with routes through the corridor that are not simulated."""
 
     @cached_property
     def by_name(self) -> Mapping[str, CorridorArrival]:
@@ -76,7 +76,7 @@ class CorridorSetup:
 
     def is_left_out(self, name: str, route: Sequence[str]) -> bool:
         """Return whether a vehicle is in the corridor, but not one of its vehicles."""
-        # The route of a trip is not known yet, and names of later vehicles are not.
+        # Those that were read are found by name: SUMO computes routes of trips only at departure.
         return name in self.left_out or (
             name not in self.by_name and not self.corridor.edge_names.isdisjoint(route)
         )

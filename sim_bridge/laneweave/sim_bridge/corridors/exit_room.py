@@ -19,7 +19,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.corridors.corridor import HANDOVER_M
 
-STANDING_MPS = 3.0
+QUEUEING_MPS = 3.0
 """Speed below which vehicles are in a queue."""
 QUEUE_DECEL_MPS2 = 3.0
 """Deceleration with which vehicles brake for a queue."""
@@ -61,8 +61,9 @@ class ExitRoom:
         self._braking_m = scenario.formation.speed_mps**2 / (2.0 * QUEUE_DECEL_MPS2)
         self._place_m = scenario.longest_body_m + SPACE_M
         self._ways: dict[str, list[_Way]] = {}
+        names = {one.name for one in scenario.exit}
         for section in scenario.sections:
-            if section.exit in {one.name for one in scenario.exit}:
+            if section.exit in names:
                 way = _Way(section.lane, section.to_m, _inside_m(section, scenario.step_m))
                 self._ways.setdefault(section.exit, []).append(way)
 
@@ -79,20 +80,18 @@ class ExitRoom:
         """
         if destination == END_OF_ROAD:
             return True
-        ways = self._ways[destination]
-        queues = [_queue(way, others) for way in ways]
-        if not waiting and all(math.isinf(queue.tail_m) for queue in queues):
+        queues = [(way, _queue(way, others)) for way in self._ways[destination]]
+        if not waiting and all(math.isinf(queue.tail_m) for _, queue in queues):
             return True
-        if not going and any(queue.tail_m >= 2.0 * self._place_m for queue in queues):
-            # Otherwise nobody would enter before a queue that moves on again and again.
+        if not going and any(queue.tail_m >= 2.0 * self._place_m for _, queue in queues):
+            # A queue that always stands somewhere may still advance.
             return True
-        places = (self._places(way, queue) for way, queue in zip(ways, queues, strict=True))
-        return going + 1 <= sum(places)
+        return going + 1 <= sum(self._places(way, queue) for way, queue in queues)
 
     def _places(self, way: _Way, queue: _Queue) -> float:
         """Return the number of vehicles on the way that fit behind a queue."""
         if math.isinf(queue.tail_m):
-            # The queue has gone, and may come back before all who have waited are at the exit.
+            # The queue may be back before all vehicles that have waited are at the exit.
             room_m = self._seen_m
         else:
             # They may brake in the lane of the exit, but stand behind it. One place remains free,
@@ -105,7 +104,7 @@ class ExitRoom:
 def _queue(way: _Way, others: Sequence[OtherBody]) -> _Queue:
     """Return the queue behind an exit in one of its lanes."""
     ahead_m = [
-        (other.rear_m - way.exit_m, other.speed_mps < STANDING_MPS)
+        (other.rear_m - way.exit_m, other.speed_mps < QUEUEING_MPS)
         for other in others
         if other.lane == way.lane and abs(other.exit_m - way.exit_m) <= 2.0 * HANDOVER_M
     ]

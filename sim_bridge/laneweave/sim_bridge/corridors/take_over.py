@@ -210,8 +210,8 @@ class TakeOver:
         start = EntryState(one.s_m, one.speed_mps, time_s, ready_s)
         more = meter.exit_cells(arrival, column)
         if self._at_m[arrival.lane] <= 0.0:
-            # From the lanes beside it, nobody may enter the cells that it may touch: the last one
-            # that has passed the start is not assigned yet (`Roadside.assign_empty_cells`).
+            # From the lanes beside it, no vehicle may enter the cells that it may touch. The last
+            # one past the start is not assigned yet (`Roadside.assign_empty_cells`).
             last = first if (first + 1, arrival.lane) in self._occupied else first + 1
             more += tuple((ahead, arrival.lane) for ahead in range(column + 1, last + 1))
         return Admission(arrival, (column, arrival.lane), t_s, ahead_m, more, start)

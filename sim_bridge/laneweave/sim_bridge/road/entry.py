@@ -123,7 +123,7 @@ class EntryMeter:
         self._columns = [int(s_m // lattice.pitch_m) for s_m in self._entry_m]
         """Next column of each lane that vehicles can enter."""
         self._until_s = -math.inf
-        """Time up to which vehicles have entered."""
+        """Time after which the next vehicles enter."""
         self._free_s = [-math.inf] * lattice.lanes
         """Earliest time at which the next vehicle of each lane may enter."""
 
@@ -210,8 +210,6 @@ class EntryMeter:
             full: lanes without room at the entrance, which no vehicle may enter now.
         """
         admissions = []
-        for lane in full:
-            self._free_s[lane] = max(self._free_s[lane], until_s + TIME_TOLERANCE_S)
         lanes = [lane for lane in range(self._lattice.lanes) if lane not in full]
         while lanes:
             t_s, lane = min((self._entry_s(lane), lane) for lane in lanes)
@@ -226,7 +224,7 @@ class EntryMeter:
                 admissions.append(Admission(arrival, cell, t_s, offset_m, more_cells))
                 self._free_s[lane] = t_s + self._lattice.pitch_m / self._lattice.speed_mps
             self._columns[lane] -= 1
-        self._until_s = until_s
+        self._until_s = until_s + TIME_TOLERANCE_S
         # Columns that have passed are not available to later arrivals.
         for lane in range(self._lattice.lanes):
             self._skip(lane, until_s - TIME_TOLERANCE_S)
@@ -237,7 +235,7 @@ class EntryMeter:
         queue = self._queues[lane]
         if not queue:
             return math.inf
-        # A vehicle that was held back comes to the queue late.
+        # A lane may have been full, and a vehicle that was held back is queued late.
         ready_s = max(queue[0].t_s, self._free_s[lane], self._until_s)
         self._skip(lane, ready_s)
         passing_s = self._passing_time_s(self._columns[lane], lane)

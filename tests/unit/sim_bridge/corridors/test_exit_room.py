@@ -7,23 +7,18 @@ import math
 import pytest
 from attrs import evolve
 
-from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
-from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 from laneweave.sim_bridge.corridors.exit_room import QUEUE_DECEL_MPS2, SPACE_M, ExitRoom
-from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
-from support.interchange import CORRIDOR, TRUCKS, stream, write_interchange
+from support.interchange import interchange_scenario
 
 SEEN_M = 200.0
 
 
 @pytest.fixture(scope="module")
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
-    folder = tmp_path_factory.mktemp("interchange")
-    found = read_corridor(write_interchange(folder, stream(60), types=TRUCKS), CORRIDOR, folder)
-    return parse_scenario(scenario_tables(found.corridor, found.demand))
+    return interchange_scenario(tmp_path_factory.mktemp("interchange"))
 
 
 def body(scenario: Scenario, rear_m: float, speed_mps: float = 0.0, lane: int = 0) -> OtherBody:
@@ -84,7 +79,7 @@ def test_other_lanes_and_the_end_of_the_road_do_not_matter(scenario: Scenario) -
     assert ExitRoom(scenario, SEEN_M).has_room(END_OF_ROAD, 500, 9, [body(scenario, 5.0)])
 
 
-def test_a_queue_that_moves_on_again_and_again_keeps_nobody_out(scenario: Scenario) -> None:
+def test_a_queue_does_not_keep_the_exit_unused(scenario: Scenario) -> None:
     closed = scenario.road.closures[0]
     later = evolve(closed, to_m=closed.to_m + 140.0)
     road = evolve(scenario.road, closures=(later, *scenario.road.closures[1:]))

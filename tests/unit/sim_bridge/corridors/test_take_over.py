@@ -6,17 +6,14 @@ from pathlib import Path
 
 from attrs import define, evolve, field
 
-from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
-from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
-from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
 from laneweave.sim_bridge.corridors.take_over import Approaching, TakeOver
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
-from support.interchange import CORRIDOR, TRUCKS, stream, write_interchange
+from support.interchange import interchange_scenario
 
 
 @define
@@ -39,11 +36,6 @@ class View:
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
         self.advice[vehicle] = speed_mps
-
-
-def interchange(folder: Path) -> Scenario:
-    found = read_corridor(write_interchange(folder, stream(60), types=TRUCKS), CORRIDOR, folder)
-    return parse_scenario(scenario_tables(found.corridor, found.demand))
 
 
 def meter_of(scenario: Scenario, taken: frozenset[Cell] = frozenset()) -> EntryMeter:
@@ -76,7 +68,7 @@ def on_ramp(name: str, s_m: float, speed_mps: float, kind: str = "car") -> Appro
 
 
 def test_a_slow_vehicle_gets_a_cell_to_which_it_can_fall_back(tmp_path: Path) -> None:
-    scenario = interchange(tmp_path)
+    scenario = interchange_scenario(tmp_path)
     at_m = scenario.entrance[0].at_m
     (fast,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 22.0))
     (slow,), _ = admit(scenario, on_ramp("b", at_m + 1.0, 15.0))
@@ -91,7 +83,7 @@ def test_a_slow_vehicle_gets_a_cell_to_which_it_can_fall_back(tmp_path: Path) ->
 
 
 def test_one_behind_another_gets_a_column_behind_it(tmp_path: Path) -> None:
-    scenario = interchange(tmp_path)
+    scenario = interchange_scenario(tmp_path)
     at_m = scenario.entrance[0].at_m
     coming = on_ramp("a", at_m + 30.0, 20.0), on_ramp("b", at_m + 1.0, 20.0)
     first, second = admit(scenario, *coming)[0]
@@ -100,7 +92,7 @@ def test_one_behind_another_gets_a_column_behind_it(tmp_path: Path) -> None:
 
 def test_a_vehicle_never_gets_a_cell_that_it_cannot_have(tmp_path: Path) -> None:
     """Not even where none of the columns that it would reach in time is free."""
-    scenario = interchange(tmp_path)
+    scenario = interchange_scenario(tmp_path)
     at_m = scenario.entrance[0].at_m
     (alone,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 20.0))
     taken = frozenset((alone.cell[0] + 3 - number, 0) for number in range(25))
@@ -112,7 +104,7 @@ def test_a_vehicle_never_gets_a_cell_that_it_cannot_have(tmp_path: Path) -> None
 
 
 def test_a_vehicle_rather_enters_where_nobody_has_to_make_room(tmp_path: Path) -> None:
-    scenario = interchange(tmp_path)
+    scenario = interchange_scenario(tmp_path)
     at_m = scenario.entrance[0].at_m
     (alone,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 20.0))
     column = alone.cell[0]
@@ -125,7 +117,7 @@ def test_a_vehicle_rather_enters_where_nobody_has_to_make_room(tmp_path: Path) -
 
 
 def test_a_vehicle_that_would_be_too_early_is_slowed_down_on_its_way(tmp_path: Path) -> None:
-    scenario = interchange(tmp_path)
+    scenario = interchange_scenario(tmp_path)
     at_m = scenario.entrance[0].at_m
     ahead = on_ramp("a", at_m - 150.0, 20.0)
     close = evolve(on_ramp("b", at_m - 158.0, 20.0), s_m=at_m - 158.0)

@@ -312,7 +312,7 @@ OFF_RAMP = {
 
 @define
 class Gate:
-    """A simulator that brings no vehicles, and keeps those that wait for an exit."""
+    """Outside traffic without vehicles, which may hold back those that wait at the start."""
 
     come: bool = True
     room: bool = True
@@ -381,7 +381,7 @@ def test_few_vehicles_of_those_that_are_held_back_are_announced() -> None:
     assert len(roadside.census(60.0, ()).announced) == HELD_ANNOUNCED
 
 
-def test_a_road_on_which_all_stand_is_over_when_nobody_comes_any_more() -> None:
+def test_a_road_on_which_all_stand_is_over_when_no_more_vehicles_come() -> None:
     gate = Gate(room=False)
     roadside, scenario = held_roadside(gate, exits=7)
     (one,) = admitted(roadside, scenario, 0.0, 60.0)
