@@ -11,6 +11,7 @@ from typing import Final
 import attrs
 
 from laneweave.coordinator.planning.budget import DEFAULT_MEMORY_MB, Budget, BudgetSpentError, Clock
+from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.paper.tappa import Tappa
 from laneweave.coordinator.planning.path_map import RelativePathMap
@@ -48,6 +49,7 @@ def plan(
     weights: Weights | None = None,
     solver: str | None = None,
     fallback: bool = True,
+    compiled_only: bool = False,
     clock: Clock = time.monotonic,
 ) -> PlanResponse:
     """Answer one request; check the plan with `plan_validator`.
@@ -64,9 +66,12 @@ def plan(
         fallback: branching continues when TAPPA has spent `TAPPA_SHARE`, and the cheaper path set
             is returned; False: TAPPA may spend the whole budget. A solver that cannot handle the
             request at all is always replaced by the other one.
+        compiled_only: without the compiled kernels of branching, TAPPA answers alone; False: they
+            are compiled when they are needed, so that the plan does not depend on them.
         clock: returns the time [s].
 
     Raises:
+        CacheError: the kernels cannot be compiled, see `kernels`.
         RuntimeError: the plan is invalid because of an error in the planner.
     """
     started = clock()
@@ -76,12 +81,16 @@ def plan(
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
     problem = request.problem()
     order = _order(requested, problem, fallback=fallback)
+    if compiled_only and BRANCHING.known_missing:
+        order = ("tappa",)
     results: list[_Result] = []
     for name in order:
         if name == "branching":
             began = clock()
-            _warm_up_branching()
+            available = _load_branching(compiled_only=compiled_only)
             started += clock() - began  # loading compiled code is not part of planning
+            if not available:
+                continue
         is_limited = name == "tappa" and order[-1] != name
         share = TAPPA_SHARE if is_limited else 1.0
         left = nodes - sum(result.nodes for result in results)
@@ -110,6 +119,14 @@ def _order(requested: str, problem: Problem, *, fallback: bool) -> tuple[str, ..
     if requested == "tappa":
         return ("tappa", "branching") if fallback else ("tappa",)
     return (requested, "tappa")
+
+
+def _load_branching(*, compiled_only: bool) -> bool:
+    """Load the kernels of branching; return whether they are available."""
+    if compiled_only:
+        return BRANCHING.load_if_compiled()
+    BRANCHING.load()
+    return True
 
 
 def _solve(
@@ -170,17 +187,3 @@ def _status(*, found: bool, finished: bool) -> Status:
     if found:
         return "optimal" if finished else "feasible"
     return "infeasible" if finished else "timeout"
-
-
-def warm_up() -> None:
-    """Load the compiled parts of all planners (1 s); compile them if they are not cached (60 s)."""
-    from laneweave.coordinator.planning.rolling import path_search as stream  # noqa: PLC0415 (numba is slow to load)
-
-    _warm_up_branching()
-    stream.warm_up()
-
-
-def _warm_up_branching() -> None:
-    from laneweave.coordinator.planning.exact import branching  # noqa: PLC0415
-
-    branching.warm_up()

@@ -93,6 +93,11 @@ COMMANDS = {
         "corridor",
         "List what can be a corridor in a SUMO simulation, or describe one.",
     ),
+    "compile": CommandEntry(
+        "compile_command",
+        "compile_solvers",
+        "Compile the solvers that need it, which otherwise happens when they are first used.",
+    ),
     "certs": CommandEntry("certs_commands", "app", "Make test certificates."),
     "config": CommandEntry("config_commands", "app", "Check a configuration."),
 }
