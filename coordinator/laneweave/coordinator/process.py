@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import structlog
 
 from laneweave.coordinator.core import CoordinatorCore
-from laneweave.coordinator.planning.solve import warm_up
+from laneweave.coordinator.planning.solve import prepare, warm_up
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.runtime.worker_pool import WorkerPool
@@ -48,8 +48,9 @@ def run_coordinator(
             loaded, instead of starting new ones at its first request.
 
     Raises:
-        BadInputError: no router answers at the scenario's endpoint.
+        BadInputError: no router answers at the scenario's endpoint, or there is no such solver.
     """
+    prepare(scenario.formation.solver, "formation.solver")
     with _exits_on_sigterm(), _warns_when_slow():
         warm_up()
     workers = scenario.service.workers or max(1, len(os.sched_getaffinity(0)) - 1)
