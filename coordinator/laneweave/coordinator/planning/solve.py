@@ -11,6 +11,7 @@ from typing import Final
 import attrs
 
 from laneweave.coordinator.planning.budget import DEFAULT_MEMORY_MB, Budget, BudgetSpentError, Clock
+from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.plan_validator import problems_of_response
@@ -50,6 +51,7 @@ def plan(
     weights: Weights | None = None,
     solver: str | None = None,
     fallback: bool = True,
+    compiled_only: bool = False,
     clock: Clock = time.monotonic,
 ) -> PlanResponse:
     """Answer one request; check the plan with `plan_validator`.
@@ -67,10 +69,13 @@ def plan(
         fallback: branching continues when TAPPA has spent `TAPPA_SHARE`, and the cheaper path set
             is returned; False: TAPPA may spend the whole budget. A solver that cannot handle the
             request at all, or a plug-in without a valid plan, is always replaced by others.
+        compiled_only: without the compiled kernels of branching, TAPPA answers instead; False: they
+            are compiled when they are needed, so that the plan does not depend on them.
         clock: returns the time [s].
 
     Raises:
         BadInputError: there is no such solver, or it cannot be loaded.
+        CacheError: the kernels cannot be compiled, see `kernels`.
         RuntimeError: the plan is invalid because of an error in the planner.
     """
     started = clock()
@@ -80,14 +85,15 @@ def plan(
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
     problem = request.problem()
     order = _order(requested, problem, fallback=fallback)
+    if compiled_only and BRANCHING.known_missing:
+        order = tuple(name for name in order if name != BRANCHING.name) or ("tappa",)
     results: list[_Result] = []
     for name in order:
         began = clock()
-        if name == "branching":
-            _warm_up_branching()
-        elif not PLANNERS.is_built_in(name):
-            prepare(name)
+        available = _load(name, compiled_only=compiled_only)
         started += clock() - began  # loading code is not part of planning
+        if not available:
+            continue
         is_limited = name == "tappa" and order[-1] != name
         share = TAPPA_SHARE if is_limited else 1.0
         left = nodes - sum(result.nodes for result in results)
@@ -121,6 +127,17 @@ def _order(requested: str, problem: Problem, *, fallback: bool) -> tuple[str, ..
     if requested == "tappa":
         return ("tappa", "branching") if fallback else ("tappa",)
     return (requested, "tappa")
+
+
+def _load(solver: str, *, compiled_only: bool) -> bool:
+    """Load a solver; return whether it is available."""
+    if solver != BRANCHING.name:
+        prepare(solver)
+    elif compiled_only:
+        return BRANCHING.load_if_compiled()
+    else:
+        BRANCHING.load()
+    return True
 
 
 def _solve(
@@ -203,17 +220,3 @@ def prepare(solver: str, field: str = "solver") -> None:
         from laneweave.coordinator.planning.plug_ins.process import load_planner  # noqa: PLC0415
 
         load_planner(solver, field)
-
-
-def warm_up() -> None:
-    """Load the compiled parts of all planners (1 s); compile them if they are not cached (60 s)."""
-    from laneweave.coordinator.planning.rolling import path_search as stream  # noqa: PLC0415 (numba is slow to load)
-
-    _warm_up_branching()
-    stream.warm_up()
-
-
-def _warm_up_branching() -> None:
-    from laneweave.coordinator.planning.exact import branching  # noqa: PLC0415
-
-    branching.warm_up()
