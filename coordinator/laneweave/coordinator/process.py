@@ -14,7 +14,7 @@ from attrs import frozen
 
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.planning.kernels import BRANCHING, ROLLING, BackgroundCompilation
-from laneweave.coordinator.planning.solve import plan
+from laneweave.coordinator.planning.solve import plan, prepare
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.metrics import (
     MetricsSnapshot,
@@ -64,9 +64,10 @@ def run_coordinator(
             loaded, instead of starting new ones at its first request.
 
     Raises:
-        BadInputError: no router answers at the scenario's endpoint.
+        BadInputError: no router answers at the scenario's endpoint, or there is no such solver.
         CacheError: the rolling planner cannot be compiled.
     """
+    prepare(scenario.formation.solver, "formation.solver")
     with _exits_on_sigterm():
         if scenario.formation.rolling:
             ROLLING.load()

@@ -185,6 +185,10 @@ class RunSummary:
     failover: LeaderChanges
     faults: dict[str, Any] | None = None
     """Injected faults; None: the run has no fault file."""
+    plug_ins: list[str] | None = None
+    """Name and version of the distributions whose plug-ins made plans or drove the vehicles."""
+    folder: Path | None = attrs.field(default=None, eq=False)
+    """Folder of the run, which is not part of the file."""
 
     @classmethod
     def from_json(cls, data: object) -> RunSummary:
@@ -212,7 +216,8 @@ class RunSummary:
 def read_summary(folder: Path) -> RunSummary | None:
     """Return the summary in a run's folder; None if it is missing or invalid."""
     try:
-        return RunSummary.from_json(json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8")))
+        data = json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+        return attrs.evolve(RunSummary.from_json(data), folder=folder)
     except (OSError, ValueError):
         return None
 
@@ -224,6 +229,8 @@ def write_summary(folder: Path, summary: RunSummary) -> None:
 
 
 def _is_written(one: attrs.Attribute[Any], value: object) -> bool:
+    if isinstance(value, Path):
+        return False
     return one.default is attrs.NOTHING or value is not None
 
 

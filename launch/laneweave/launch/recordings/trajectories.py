@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from attrs import frozen
 from numpy.typing import NDArray
 
 from laneweave.launch.recordings.runs import TRAJECTORIES, not_a_run
+from laneweave.protocol.errors import BadInputError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -70,6 +73,28 @@ def read_trips(folder: Path) -> dict[str, dict[str, Any]]:
     return {trip["vehicle"]: trip for trip in pq.read_table(folder / "trips.parquet").to_pylist()}
 
 
+def read_trajectories(folder: Path, columns: Sequence[str] | None = None) -> pa.Table:
+    """Return the trajectories of a run in the order of the file: by time.
+
+    Args:
+        folder: folder of the run.
+        columns: names of the columns to read; None: all.
+
+    Raises:
+        BadInputError: there is no such column, or the trajectories cannot be read.
+    """
+    try:
+        names = pq.read_schema(folder / TRAJECTORIES).names
+        unknown = [name for name in columns or () if name not in names]
+        if not unknown:
+            return pq.read_table(
+                folder / TRAJECTORIES, columns=None if columns is None else [*columns]
+            )
+    except (OSError, ValueError, KeyError) as error:
+        raise not_a_run(folder, error) from error
+    raise BadInputError("columns", unknown[0], "any of " + ", ".join(names))
+
+
 def read_tracks(folder: Path) -> Tracks:
     """Return the trajectories of a run.
 
@@ -77,10 +102,7 @@ def read_tracks(folder: Path) -> Tracks:
         BadInputError: the trajectories cannot be read.
     """
     columns = ["vehicle", "t_s", "s_m", "y_m", "speed_mps", "accel_mps2", "column", "lane"]
-    try:
-        table = pq.read_table(folder / TRAJECTORIES, columns=columns)
-    except (OSError, ValueError, KeyError) as error:
-        raise not_a_run(folder, error) from error
+    table = read_trajectories(folder, columns)
     codes = table["vehicle"].combine_chunks().dictionary_encode()
     names = [str(name) for name in codes.dictionary.to_pylist()]
     vehicle = codes.indices.to_numpy(zero_copy_only=False).astype(np.int64)

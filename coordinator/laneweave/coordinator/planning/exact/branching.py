@@ -374,3 +374,13 @@ class Branching(Search):
 def _doubled(nodes: Stack) -> Stack:
     """Return a stack of twice the size."""
     return Stack(*(np.concatenate([array, np.zeros_like(array)]) for array in nodes))
+
+
+def new_search(
+    request: PlanRequest,
+    problem: Problem,
+    weights: object,  # noqa: ARG001 (of TAPPA)
+    budget: Budget,
+) -> Search:
+    """Return the search of branch and bound for a request."""
+    return Branching(problem, request.choices(), budget)
