@@ -14,6 +14,7 @@ from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.planning.solve import warm_up
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.metrics import Observe, unobserved
+from laneweave.protocol.runtime.processes import accepted_stop_signals
 from laneweave.protocol.runtime.worker_pool import WorkerPool
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
@@ -50,7 +51,7 @@ def run_coordinator(
     Raises:
         BadInputError: no router answers at the scenario's endpoint.
     """
-    with _exits_on_sigterm(), _warns_when_slow():
+    with _exits_on_stop_signals(), _warns_when_slow():
         warm_up()
     workers = scenario.service.workers or max(1, len(os.sched_getaffinity(0)) - 1)
     core = CoordinatorCore(Name(name), Incarnations()(), scenario, workers=workers)
@@ -61,15 +62,15 @@ def run_coordinator(
 
 
 @contextlib.contextmanager
-def _exits_on_sigterm() -> Iterator[None]:
-    """Exit with status 0 on SIGTERM: there is nothing to complete yet.
+def _exits_on_stop_signals() -> Iterator[None]:
+    """Exit with status 0 on a stop signal: there is nothing to complete yet.
 
     An exception that a signal handler raises in a compiler callback would only be printed, so a
     thread waits for the byte that Python writes when a signal arrives.
     """
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
-    handler = signal.signal(signal.SIGTERM, lambda *_: None)
+    before = {number: signal.signal(number, lambda *_: None) for number in accepted_stop_signals()}
     descriptor = signal.set_wakeup_fd(writer)
 
     def wait() -> None:
@@ -82,7 +83,8 @@ def _exits_on_sigterm() -> Iterator[None]:
         yield
     finally:
         signal.set_wakeup_fd(descriptor)
-        signal.signal(signal.SIGTERM, handler)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         os.close(writer)  # ends the thread
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,12 +26,15 @@ from laneweave.launch.run.run_folder import new_folder
 from laneweave.launch.run_methods import FORMATION, LC2013, RULE
 from laneweave.protocol.config.scenario_files import load_scenario, scenario_of
 from laneweave.protocol.errors import NO_VALUE, BadInputError
+from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
 
 if TYPE_CHECKING:
+    from laneweave.launch.run.live_page import LivePage
     from laneweave.launch.run.outcome import Outcome
 
 
+RECORDED_ONLY = "it does not run in real time; `laneweave watch DIR` shows its recording"
 COMPARED_ROUTES = 4
 """Number of pairs of entrance and destination whose trips are printed."""
 
@@ -107,6 +111,21 @@ def run(
         float | None,
         typer.Option("--pace", help="Mean road seconds per second; default: runtime.max_pace."),
     ] = None,
+    endpoint: Annotated[
+        str | None,
+        typer.Option("--endpoint", help="Endpoint of the router; default: network.endpoint."),
+    ] = None,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Serve a page that shows the road during the run.")
+    ] = False,
+    watch_listen: Annotated[
+        str | None,
+        typer.Option(
+            "--watch-listen",
+            metavar="HOST:PORT",
+            help="Address of this page; implies --watch. Default: 127.0.0.1:8080 or a free port.",
+        ),
+    ] = None,
     no_progress: NoProgress = False,
 ) -> None:
     """Run a scenario on this machine, and write the results to a folder."""
@@ -121,6 +140,7 @@ def run(
         "formation__solver": solver,
         "runtime__vehicles_per_process": vehicles_per_process,
         "runtime__coordinators": coordinators,
+        "network__endpoint": endpoint,
         "sumo__gui": gui or None,
     }
     settings = scenario_of(tables, **overrides) if tables else load_scenario(scenario, **overrides)
@@ -128,13 +148,14 @@ def run(
         raise BadInputError("--compare", "given", "none without a SUMO simulation (--sumocfg)")
     check_pace(pace)
     show = shows_progress(no_progress)
+    live = {"watch": watch or None, "watch_listen": watch_listen}
     if method is Method.formation:
         if settings.formation.rolling:
             reject_unused_options("with the rolling operation", solver=solver)
         simulated = transport is Transport.simulated
         if simulated:
-            reject_unused_options("with --transport simulated", pace=pace)
-        outcome = _run_formations(settings, out, faults, pace, simulated=simulated, show=show)
+            reject_unused_options("with --transport simulated", pace=pace, endpoint=endpoint)
+            reject_unused_options(f"with --transport simulated: {RECORDED_ONLY}", **live)
     else:
         allowed = "formation with a SUMO simulation; --compare adds SUMO alone"
         if settings.sumo.config:
@@ -149,19 +170,58 @@ def run(
             pace=pace,
             transport=transport,
             gui=gui or None,
+            endpoint=endpoint,
         )
-        outcome = _run_reference(settings, out, method, show=show)
+        reject_unused_options(f"with --method {method.value}: {RECORDED_ONLY}", **live)
+    with _live_page(watch_listen, shown=watch or watch_listen is not None) as page:
+        if method is not Method.formation:
+            outcome = _run_reference(settings, out, method, show=show)
+        else:
+            hint = None if tables else _watch_command(scenario)
+            outcome = _run_formations(
+                settings, out, faults, pace, simulated=simulated, show=show, hint=hint, page=page
+            )
+        report = _finish(outcome)
+        if page is not None:
+            page.end(f"{outcome.ending}, report at {report}" if report else outcome.ending)
+    if compare and outcome.summary is not None and outcome.summary.ending == "complete":
+        _compare(settings, outcome.folder, show=show)
+    raise typer.Exit(outcome.exit_status)
 
+
+def _finish(outcome: Outcome) -> Path | None:
+    """Print the outcome of a run and write its report; return the path of the page, if any."""
     from laneweave.launch.run.outcome import print_outcome
 
     print_outcome(outcome, Console())
-    if outcome.summary is not None:
-        from laneweave.launch.report.report import draw_report
+    if not outcome.has_traffic:
+        return None
+    from laneweave.launch.report.report import draw_report
 
-        draw_report(outcome.folder)
-        if compare and outcome.summary.ending == "complete":
-            _compare(settings, outcome.folder, show=show)
-    raise typer.Exit(outcome.exit_status)
+    try:
+        return draw_report(outcome.folder)
+    except KeyboardInterrupt:
+        if outcome.interrupted:
+            return None  # already reported
+        raise
+
+
+@contextmanager
+def _live_page(listen: str | None, *, shown: bool) -> Iterator[LivePage | None]:
+    """Yield the live page of a run and print its address; None if it is not wanted."""
+    if not shown:
+        yield None
+        return
+    from laneweave.launch.run.live_page import LivePage
+
+    with LivePage.open(listen) as page:
+        typer.echo(f"live page: {page.address}", err=True)
+        yield page
+
+
+def _watch_command(scenario: Path | None) -> str:
+    """Return the command that shows the road of this run, but for the endpoint."""
+    return "laneweave watch" + ("" if scenario is None else f" --config {scenario}")
 
 
 def _compare(settings: Scenario, folder: Path, *, show: bool) -> None:
@@ -201,10 +261,8 @@ def corridor_scenario(
     from laneweave.launch.cli.corridor_command import corridor_tables
     from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 
-    with tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as folder:
-        found = read_corridor(
-            sumocfg, corridor, Path(folder), Scenario().seed if seed is None else seed
-        )
+    with temporary_folder("sumo") as folder:
+        found = read_corridor(sumocfg, corridor, folder, Scenario().seed if seed is None else seed)
     return corridor_tables(found, sumocfg, corridor)
 
 
@@ -216,6 +274,8 @@ def _run_formations(
     *,
     simulated: bool,
     show: bool,
+    hint: str | None,
+    page: LivePage | None,
 ) -> Outcome:
     from laneweave.agents.driving.trajectory import check_moves
     from laneweave.launch.faults.specification import load_faults
@@ -233,7 +293,13 @@ def _run_formations(
 
             tune_garbage_collector()
             return SimulatedRun(settings, folder, faults=specification, show_progress=show).run()
-        return LocalRun(settings, folder, specification, show, pace).run()
+
+        def announce(endpoint: str) -> None:
+            more = "" if hint is None else f" ({hint} --endpoint {endpoint})"
+            typer.echo(f"endpoint: {endpoint}{more}", err=True)
+
+        run = LocalRun(settings, folder, specification, show, pace, announce=announce, page=page)
+        return run.run()
 
 
 def _run_reference(settings: Scenario, out: Path | None, method: Method, *, show: bool) -> Outcome:
