@@ -315,7 +315,8 @@ def network_in(temporary: Path, network: Network) -> Network:
     if network.endpoint:
         return network
     endpoint = f"unixsock-stream/{temporary}/router.sock"
-    return attrs.evolve(network, endpoint=endpoint, listen=(endpoint, *network.listen))
+    listen = (endpoint, *network.listen) if network.listen else ()
+    return attrs.evolve(network, endpoint=endpoint, listen=listen)
 
 
 def fault_injection(
