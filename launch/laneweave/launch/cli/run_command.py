@@ -298,7 +298,12 @@ def _run_formations(
             more = "" if hint is None else f" ({hint} --endpoint {endpoint})"
             typer.echo(f"endpoint: {endpoint}{more}", err=True)
 
-        run = LocalRun(settings, folder, specification, show, pace, announce=announce, page=page)
+        def warn(line: str) -> None:
+            typer.echo(line, err=True)
+
+        run = LocalRun(
+            settings, folder, specification, show, pace, announce=announce, warn=warn, page=page
+        )
         return run.run()
 
 

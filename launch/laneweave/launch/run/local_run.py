@@ -92,6 +92,8 @@ class LocalRun:
     """Called ten times per second with the observed state and the process ids of the roles."""
     announce: Callable[[str], None] = lambda _: None
     """Called with the endpoint of the router once it listens."""
+    warn: Callable[[str], None] = lambda _: None
+    """Called with a line if the run is slower than real time."""
     page: LivePage | None = None
     """The live page of this run."""
     _processes: RoleProcesses = field(init=False)
@@ -192,10 +194,14 @@ class LocalRun:
                 return
             processes.start(BRIDGE, BRIDGE)
             stall = _StallDetector(self.scenario, time.monotonic())
+            wanted_pace: float | None = min(1.0, self.pace or runtime.max_pace)
             while not self._stop and self._check_processes():
                 observer.wait(POLL_S)
                 view, now = observer.view, time.monotonic()
                 progress.show(view)
+                if wanted_pace and (slowness := progress.meter.slowness(wanted_pace)):
+                    self.warn(slowness)
+                    wanted_pace = None  # warn once
                 for group in self._agents_to_start(observer):
                     processes.start("agent", f"agent-{group[0]}", vehicles=group)
                 road_s = view.t_s
