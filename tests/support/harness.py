@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,11 @@ from laneweave.launch.cli.main import main
 from support.commands import LANEWEAVE
 from support.waiting import wait_until
 
+PIPES = {
+    "stdin": subprocess.DEVNULL,
+    "stdout": subprocess.PIPE,
+    "stderr": subprocess.PIPE,
+}
 MARK = "LANEWEAVE_TEST_MARK"
 LOADED = (
     *(
@@ -41,6 +46,8 @@ LOADED = (
     *(f"laneweave.{role}.process" for role in ("agents", "coordinator", "sim_bridge")),
 )
 """What commands load."""
+NOTES = ("endpoint: ", "live page: ", "slower than real time: ")
+"""Beginnings of the lines with which a run over Zenoh describes itself."""
 RUN_S = 240.0
 """Nothing here takes a tenth of this; it only guards against hanging."""
 END_S = 90.0
@@ -75,8 +82,8 @@ class Ended:
 
     @property
     def complaints(self) -> list[str]:
-        """Lines of stderr without warnings of the log or of Zenoh: a slow machine causes some."""
-        lines = self.err.splitlines()
+        """Lines of stderr without warnings, which a slow machine causes, and without notes."""
+        lines = [line for line in self.err.splitlines() if not line.startswith(NOTES)]
         return [line for line in lines if "[warning" not in line and " WARN " not in line]
 
 
@@ -118,15 +125,19 @@ class Lab:
 
     def start(self, *arguments: object, **environment: str) -> subprocess.Popen[str]:
         """Start `laneweave ARGUMENTS` as the leader of a new process group."""
+        return self.start_with({}, *arguments, **environment)
+
+    def start_with(
+        self, options: Mapping[str, Any], *arguments: object, **environment: str
+    ) -> subprocess.Popen[str]:
+        """As `start`, with options of `subprocess.Popen`."""
         process = subprocess.Popen(
             [LANEWEAVE, *map(str, arguments)],
             cwd=self.folder,
             env=self.environment | environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
+            **PIPES | dict(options),
         )
         self._started.append(process)
         return process

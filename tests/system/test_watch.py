@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import signal
+import socket
 import subprocess
 import threading
 import time
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from attrs import define, field
+from websockets.exceptions import ConnectionClosedOK
 from websockets.sync.client import connect
 
 from laneweave.launch.recordings.formations import read_events
@@ -29,7 +31,7 @@ from laneweave.protocol.wire.topics import Keys
 from support.chromium import Page, needs_chromium, new_page
 from support.convoy import Convoy
 from support.deployments import REALM, deployment, free_tcp, start_router, stop
-from support.harness import END_S, RUN_S, Lab, summary
+from support.harness import DEMAND, END_S, RUN_S, Lab, summary
 from system.conftest import FinishedRun
 
 VEHICLES = 90
@@ -292,6 +294,109 @@ def _check_places(frames: list[dict[str, Any]], folder: Path) -> None:
                     assert abs(row[2] - y_m) < 0.6
                     checked += 1
     assert checked > 100
+
+
+def start_watched_run(lab: Lab, *arguments: object) -> tuple[subprocess.Popen[str], str]:
+    """Start a run with a live page; return it and the page's address."""
+    run = lab.start("run", *arguments, "--vehicles-per-process", "8", "--out", "out")
+    assert run.stderr is not None
+    line = run.stderr.readline()
+    assert line.startswith("live page: http://127.0.0.1:"), lab.finish(run, END_S)
+    return run, line.removeprefix("live page: ").strip()
+
+
+@needs_chromium
+def test_a_run_is_watched_to_its_end(lab: Lab, page: Page, road: Path) -> None:
+    run, address = start_watched_run(lab, road, *DEMAND, "--watch-listen", "127.0.0.1:0")
+    page.open(address)
+    page.wait_until(lambda: page.text("pill") == "live")
+    page.wait_until(lambda: int(page.text("count")) > 3)
+    first = page.run(PLACES)
+    page.wait_until(lambda: moved_m(first, page.run(PLACES)) > 20.0)
+    page.wait_until(lambda: page.text("pill") == "ended")
+
+    ended = lab.finish(run)
+    assert (ended.status, ended.complaints) == (0, []), ended
+    lab.check_nothing_left()
+    left = summary(lab.folder / "out")["vehicles"]["left"]
+    said = f"run ended: {left} of {left} left, report at out/report.html"
+    page.wait_until(lambda: page.text("banner") == said)
+    # The page does not try to connect again, and can still go back in time.
+    page.run("(s => { s.value = s.max - 5; s.dispatchEvent(new Event('input')); })(slider)")
+    page.wait_until(lambda: "s ago" in page.text("now"))
+    assert (page.text("pill"), page.text("banner")) == ("ended", said)
+    assert page.console_errors() == []
+    assert left > 10
+
+
+PLACES = "Object.fromEntries(laneweaveWatch.picture.bodies.map((one) => [one.name, one.s]))"
+
+
+def moved_m(before: dict[str, float], after: dict[str, float]) -> float:
+    """Return the longest way of a vehicle that is in both pictures."""
+    return max((after[name] - before[name] for name in before.keys() & after.keys()), default=0.0)
+
+
+def test_an_interrupted_run_says_so_on_its_page(lab: Lab, road: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        refused = lab.run("run", road, "--watch-listen", f"127.0.0.1:{taken.getsockname()[1]}")
+    assert (refused.status, len(refused.complaints)) == (2, 1)
+    assert "--watch-listen" in refused.err
+    assert not (lab.folder / "runs").exists()
+
+    # Another program has the default port, or this page has it.
+    run, address = start_watched_run(lab, road, *DEMAND, "--watch")
+    with connect(address.replace("http", "ws") + "stream", open_timeout=END_S) as browser:
+        messages = [json.loads(browser.recv(timeout=END_S))]
+        assert messages[0]["scene"]["title"] == "out"
+        while not messages[-1].get("vehicles"):
+            messages.append(json.loads(browser.recv(timeout=RUN_S)))
+        run.send_signal(signal.SIGTERM)
+        with contextlib.suppress(ConnectionClosedOK):
+            while True:
+                messages.append(json.loads(browser.recv(timeout=END_S)))
+    assert messages[-1]["end"].startswith("run interrupted: 0 of ")
+    assert lab.finish(run, END_S).complaints[0].startswith("interrupted at ")
+    lab.check_nothing_left()
+
+
+def test_a_watcher_waits_for_the_router_of_a_run_and_sees_its_end(lab: Lab) -> None:
+    config = lab.path("short.toml", SHORT)
+    watch = lab.start("watch", "--config", config, "--wait", "60", "--listen", "127.0.0.1:0")
+    run = lab.start("run", config, "--vehicles-per-process", "8", "--out", "out")
+    assert watch.stdout is not None
+    address = watch.stdout.readline().strip()
+    with connect(address.replace("http", "ws") + "stream", open_timeout=END_S) as browser:
+        frames: list[dict[str, Any]] = [json.loads(browser.recv(timeout=END_S))]
+        while frames[-1].get("status") != "ended":
+            frames.append(json.loads(browser.recv(timeout=RUN_S)))
+        ended = lab.finish(run)
+        assert (ended.status, ended.complaints) == (0, []), ended
+        assert "endpoint: unixsock-stream/router.sock (laneweave watch --config " in ended.err
+        # The router is gone, but the run has ended.
+        lab.wait_until(lambda: not health(address)[1]["connected"], END_S)
+        last = json.loads(browser.recv(timeout=END_S))
+        while last["w"] < time.time() - 0.2:
+            last = json.loads(browser.recv(timeout=END_S))
+    assert last["status"] == "ended"
+    assert last["counts"][0] == last["counts"][3] == summary(lab.folder / "out")["vehicles"]["left"]
+    stop(lab, watch)
+    lab.check_nothing_left()
+
+
+def test_two_runs_do_not_share_an_endpoint(lab: Lab) -> None:
+    config = lab.path("short.toml", SHORT)
+    first = lab.start("run", config, "--vehicles-per-process", "8", "--out", "out")
+    assert first.stderr is not None
+    assert first.stderr.readline().startswith("endpoint: ")
+
+    second = lab.run_forked("run", config, "--out", "second", alone=False)
+
+    assert (second.status, len(second.complaints)) == (2, 1), second
+    assert second.err.startswith("network.endpoint: got 'unixsock-stream/router.sock'")
+    assert not (lab.folder / "second").exists()
+    assert lab.finish(first).status == 0
+    lab.check_nothing_left()
 
 
 def test_it_ends_at_ctrl_c(finished_run: FinishedRun, lab: Lab) -> None:

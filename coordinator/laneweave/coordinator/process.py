@@ -23,6 +23,7 @@ from laneweave.protocol.runtime.metrics import (
     metric,
     unobserved,
 )
+from laneweave.protocol.runtime.processes import accepted_stop_signals
 from laneweave.protocol.runtime.worker_pool import WorkerPool
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
@@ -68,7 +69,7 @@ def run_coordinator(
         CacheError: the rolling planner cannot be compiled.
     """
     prepare(scenario.formation.solver, "formation.solver")
-    with _exits_on_sigterm():
+    with _exits_on_stop_signals():
         if scenario.formation.rolling:
             ROLLING.load()
         BRANCHING.load_if_compiled()
@@ -103,15 +104,15 @@ def _observe_solvers(observe: Observe, source: Source) -> None:
 
 
 @contextlib.contextmanager
-def _exits_on_sigterm() -> Iterator[None]:
-    """Exit with status 0 on SIGTERM: there is nothing to complete yet.
+def _exits_on_stop_signals() -> Iterator[None]:
+    """Exit with status 0 on a stop signal: there is nothing to complete yet.
 
     An exception that a signal handler raises in a compiler callback would only be printed, so a
     thread waits for the byte that Python writes when a signal arrives.
     """
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
-    handler = signal.signal(signal.SIGTERM, lambda *_: None)
+    before = {number: signal.signal(number, lambda *_: None) for number in accepted_stop_signals()}
     descriptor = signal.set_wakeup_fd(writer)
 
     def wait() -> None:
@@ -124,5 +125,6 @@ def _exits_on_sigterm() -> Iterator[None]:
         yield
     finally:
         signal.set_wakeup_fd(descriptor)
-        signal.signal(signal.SIGTERM, handler)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         os.close(writer)  # ends the thread

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.metrics import Observe, unobserved
+from laneweave.protocol.runtime.processes import interrupts_deferred
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.transports.zenoh.runner import run_core
@@ -38,21 +40,22 @@ def run_bridge(
         BadInputError: no router answers at the scenario's endpoint.
         SumoUnavailableError: libsumo cannot be loaded.
     """
-    record = RunRecord(folder, scenario, method, time.perf_counter)
-    with open_road(scenario, folder) as road:
-        incarnations = Incarnations()
-        core = BridgeCore(
-            scenario,
-            road.world,
-            record,
-            new_incarnation=incarnations,
-            pace=pace,
-            incarnation=incarnations(),
-            stream=road.stream,
-            outside_traffic=road.outside_traffic,
-        )
-        try:
-            run_core(wrap(core), access_of(scenario, "bridge"), observe=observe)
-        finally:
+    access = access_of(scenario, "bridge")
+    with open_road(scenario, folder) as road, ExitStack() as closing:
+        # A signal must not leave a record behind that is not closed.
+        with interrupts_deferred():
+            record = RunRecord(folder, scenario, method, time.perf_counter)
+            incarnations = Incarnations()
+            core = BridgeCore(
+                scenario,
+                road.world,
+                record,
+                new_incarnation=incarnations,
+                pace=pace,
+                incarnation=incarnations(),
+                stream=road.stream,
+                outside_traffic=road.outside_traffic,
+            )
             # Also after an error, to save the recorded data.
-            record.close(core.t_s, Ending.INTERRUPTED)
+            closing.callback(lambda: record.close(core.t_s, Ending.INTERRUPTED))
+        run_core(wrap(core), access, observe=observe)

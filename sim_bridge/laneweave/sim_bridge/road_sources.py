@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.corridors.corridor_arrivals import main_stream
 from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor, read_corridor
@@ -46,8 +46,7 @@ def open_road(scenario: Scenario, results: Path) -> Iterator[RoadSource]:
         BadInputError: the SUMO simulation cannot be read, or has another road.
         CommandFailedError: libsumo cannot be loaded, or SUMO rejects a file.
     """
-    with tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as name:
-        folder = Path(name)
+    with temporary_folder("sumo") as folder:
         if not scenario.sumo.config:
             with SumoWorld(scenario, folder) as world:
                 if scenario.sumo.gui:
@@ -67,8 +66,8 @@ def demanded(scenario: Scenario) -> tuple[Arrival, ...]:
     """Return all vehicles that may arrive; those from SUMO with the times of their departures."""
     if not scenario.sumo.config:
         return arrivals(scenario)
-    with tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as folder:
-        setup = sumo_corridor(scenario, Path(folder)).setup(scenario)
+    with temporary_folder("sumo") as folder:
+        setup = sumo_corridor(scenario, folder).setup(scenario)
     return tuple(one.arrival for one in setup.arrivals)
 
 

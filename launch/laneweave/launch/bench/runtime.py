@@ -8,10 +8,8 @@ from __future__ import annotations
 import contextlib
 import os
 import platform
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +21,7 @@ from rich.table import Table
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.local_run import LocalRun
 from laneweave.protocol.config.scenario_files import load_scenario
+from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.recording.trips import percentiles_of
 
@@ -99,10 +98,10 @@ def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int)
         runtime__vehicles_per_process=per_process,
     )
     window = _Window(begin_s, begin_s + seconds)
-    with tempfile.TemporaryDirectory(prefix="laneweave-bench-") as folder:
-        run = LocalRun(scenario, Path(folder) / "run", show_progress=False, watch=window.watch)
+    with temporary_folder("bench") as folder:
+        run = LocalRun(scenario, folder / "run", show_progress=False, watch=window.watch)
         outcome = run.run()
-        ticks = pq.read_table(Path(folder) / "run" / "ticks.parquet")
+        ticks = pq.read_table(folder / "run" / "ticks.parquet")
     times_s = ticks.column("t_s").to_numpy()
     measured = (times_s > window.begin_s) & (times_s <= window.end_s)
     return {

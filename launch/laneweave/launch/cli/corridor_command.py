@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.temporary_folders import temporary_folder
 
 if TYPE_CHECKING:
     from laneweave.sim_bridge.corridors.corridor import Corridor
@@ -37,11 +37,11 @@ def corridor(
         raise BadInputError("--corridor", "none", "FIRST_EDGE:LAST_EDGE with --toml")
     from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 
-    with tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as folder:
+    with temporary_folder("sumo") as folder:
         if name is None:
-            _list(sumocfg, Path(folder))
+            _list(sumocfg, folder)
             return
-        found = read_corridor(sumocfg, name, Path(folder))
+        found = read_corridor(sumocfg, name, folder)
     if toml:
         import tomli_w
 

@@ -48,7 +48,7 @@ def main() -> None:
         threading.Thread(target=_forward_interrupts, name="interrupts", daemon=True).start()
     status = _status(sys.argv[1:])
     # A second Ctrl-C must not interrupt the end of this process, which would print a traceback.
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     # The interpreter would look for cyclic garbage among all objects, which takes 0.1 s.
     gc.freeze()
@@ -90,10 +90,11 @@ def _status(arguments: list[str]) -> int:
     import typer
 
     from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
+    from laneweave.protocol.runtime.processes import raise_interrupts, stop_signal_received
 
-    # Handle SIGTERM like Ctrl-C: complete files and remove temporary folders. Roles install
-    # their own handlers.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # Handle SIGTERM and SIGHUP like Ctrl-C: complete files and remove temporary folders. Roles
+    # install their own handlers.
+    raise_interrupts(signal.SIGTERM, signal.SIGHUP)
     command = typer.main.get_command(app)
     try:
         result: Any = command.main(
@@ -102,14 +103,16 @@ def _status(arguments: list[str]) -> int:
     except (BadInputError, RefusedError) as error:
         return _bad_input(str(error))
     except (typer.Abort, KeyboardInterrupt):
-        sys.stderr.write("interrupted\n")
-        return 1
+        return _interrupted()
     except typer.TyperException as error:
         # Unknown option or argument; print one line instead of typer's multi-line report.
         return _bad_input(getattr(error, "format_message", error.__str__)())
     except BrokenPipeError:
         return 1
     except CommandFailedError as error:
+        if stop_signal_received():
+            # The signal has ended a program that this command was using, too.
+            return _interrupted()
         sys.stderr.write(" ".join(str(error).split()) + "\n")
         return 1
     except ModuleNotFoundError as error:
@@ -118,9 +121,13 @@ def _status(arguments: list[str]) -> int:
         hint = INSTALL_HINTS.get((error.name or "").partition(".")[0], SIM_HINT)
         return _bad_input(f"{error.name}: not installed ({hint})")
     if result == TYPER_INTERRUPTED:
-        sys.stderr.write("interrupted\n")
-        return 1
+        return _interrupted()
     return result if isinstance(result, int) else 0
+
+
+def _interrupted() -> int:
+    sys.stderr.write("interrupted\n")
+    return 1
 
 
 def _bad_input(line: str) -> int:

@@ -168,14 +168,24 @@ def watch(
     listen: Annotated[
         str, typer.Option("--listen", metavar="HOST:PORT", help="Port 0: any free port.")
     ] = "127.0.0.1:8080",
+    wait: Annotated[
+        float | None,
+        typer.Option(
+            "--wait",
+            metavar="SECONDS",
+            help="Wait for a router that is not up yet; default: network.connect_timeout_s.",
+        ),
+    ] = None,
 ) -> None:
     """Serve a page that shows the road of a deployment or of a recorded run, until Ctrl-C."""
     from laneweave.launch.watch.process import watch_live, watch_recorded
 
     if folder is None:
-        watch_live(load_deployment(config, endpoint), listen, typer.echo)
+        settings = load_deployment(config, endpoint, network__connect_timeout_s=wait)
+        watch_live(settings, listen, typer.echo)
         return
-    reject_unused_options("with DIR, which needs no network", config=config, endpoint=endpoint)
+    unused = {"config": config, "endpoint": endpoint, "wait": wait}
+    reject_unused_options("with DIR, which needs no network", **unused)
     watch_recorded(folder, listen, typer.echo)
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -24,8 +25,14 @@ from laneweave.launch.cli.options import (
 from laneweave.launch.run_methods import FORMATION, LC2013, RULE, checked_method
 from laneweave.protocol.config.scenario_files import load_scenario, scenario_of
 from laneweave.protocol.errors import NO_VALUE, BadInputError
+from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
 
+if TYPE_CHECKING:
+    from laneweave.launch.run.live_page import LivePage
+    from laneweave.launch.run.outcome import Outcome
+
+RECORDED_ONLY = "it does not run in real time; `laneweave watch DIR` shows its recording"
 COMPARED_ROUTES = 4
 """Number of pairs of entrance and destination whose trips are printed."""
 
@@ -97,6 +104,21 @@ def run(
         float | None,
         typer.Option("--pace", help="Mean road seconds per second; default: runtime.max_pace."),
     ] = None,
+    endpoint: Annotated[
+        str | None,
+        typer.Option("--endpoint", help="Endpoint of the router; default: network.endpoint."),
+    ] = None,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Serve a page that shows the road during the run.")
+    ] = False,
+    watch_listen: Annotated[
+        str | None,
+        typer.Option(
+            "--watch-listen",
+            metavar="HOST:PORT",
+            help="Address of this page; implies --watch. Default: 127.0.0.1:8080 or a free port.",
+        ),
+    ] = None,
     no_progress: NoProgress = False,
 ) -> None:
     """Run a scenario on this machine, and write the results to a folder."""
@@ -111,6 +133,7 @@ def run(
         "formation__solver": solver,
         "runtime__vehicles_per_process": vehicles_per_process,
         "runtime__coordinators": coordinators,
+        "network__endpoint": endpoint,
         "sumo__gui": gui or None,
     }
     settings = scenario_of(tables, **overrides) if tables else load_scenario(scenario, **overrides)
@@ -119,11 +142,13 @@ def run(
     check_pace(pace)
     show = shows_progress(no_progress)
     checked_method(method, "--method")
+    live = {"watch": watch or None, "watch_listen": watch_listen}
     if method == FORMATION:
         if settings.formation.rolling:
             reject_unused_options("with the rolling operation", solver=solver)
         if transport is Transport.simulated:
-            reject_unused_options("with --transport simulated", pace=pace)
+            reject_unused_options("with --transport simulated", pace=pace, endpoint=endpoint)
+            reject_unused_options(f"with --transport simulated: {RECORDED_ONLY}", **live)
     else:
         allowed = "formation with a SUMO simulation; --compare adds SUMO alone"
         if settings.sumo.config:
@@ -138,27 +163,74 @@ def run(
             pace=pace,
             transport=transport,
             gui=gui or None,
+            endpoint=endpoint,
         )
+        reject_unused_options(f"with --method {method}: {RECORDED_ONLY}", **live)
     from laneweave.launch.library.runs import perform_run
+
+    hint = None if tables else _watch_command(scenario)
+
+    def announce(endpoint: str) -> None:
+        more = "" if hint is None else f" ({hint} --endpoint {endpoint})"
+        warn(f"endpoint: {endpoint}{more}")
+
+    def warn(line: str) -> None:
+        typer.echo(line, err=True)
+
+    with _live_page(watch_listen, shown=watch or watch_listen is not None) as page:
+        outcome = perform_run(
+            settings,
+            out=out,
+            method=method,
+            transport=None if transport is None else transport.value,
+            faults=faults,
+            pace=pace,
+            show_progress=show,
+            announce=announce,
+            warn=warn,
+            page=page,
+        )
+        report = _finish(outcome)
+        if page is not None:
+            page.end(f"{outcome.ending}, report at {report}" if report else outcome.ending)
+    if compare and outcome.summary is not None and outcome.summary.ending == "complete":
+        _compare(settings, outcome.folder, show=show)
+    raise typer.Exit(outcome.exit_status)
+
+
+def _finish(outcome: Outcome) -> Path | None:
+    """Print the outcome of a run and write its report; return the path of the page, if any."""
     from laneweave.launch.run.outcome import print_outcome
 
-    outcome = perform_run(
-        settings,
-        out=out,
-        method=method,
-        transport=None if transport is None else transport.value,
-        faults=faults,
-        pace=pace,
-        show_progress=show,
-    )
     print_outcome(outcome, Console())
-    if outcome.summary is not None:
-        from laneweave.launch.report.report import draw_report
+    if not outcome.has_traffic:
+        return None
+    from laneweave.launch.report.report import draw_report
 
-        draw_report(outcome.folder)
-        if compare and outcome.summary.ending == "complete":
-            _compare(settings, outcome.folder, show=show)
-    raise typer.Exit(outcome.exit_status)
+    try:
+        return draw_report(outcome.folder)
+    except KeyboardInterrupt:
+        if outcome.interrupted:
+            return None  # already reported
+        raise
+
+
+@contextmanager
+def _live_page(listen: str | None, *, shown: bool) -> Iterator[LivePage | None]:
+    """Yield the live page of a run and print its address; None if it is not wanted."""
+    if not shown:
+        yield None
+        return
+    from laneweave.launch.run.live_page import LivePage
+
+    with LivePage.open(listen) as page:
+        typer.echo(f"live page: {page.address}", err=True)
+        yield page
+
+
+def _watch_command(scenario: Path | None) -> str:
+    """Return the command that shows the road of this run, but for the endpoint."""
+    return "laneweave watch" + ("" if scenario is None else f" --config {scenario}")
 
 
 def _compare(settings: Scenario, folder: Path, *, show: bool) -> None:
@@ -198,8 +270,6 @@ def corridor_scenario(
     from laneweave.launch.cli.corridor_command import corridor_tables
     from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 
-    with tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as folder:
-        found = read_corridor(
-            sumocfg, corridor, Path(folder), Scenario().seed if seed is None else seed
-        )
+    with temporary_folder("sumo") as folder:
+        found = read_corridor(sumocfg, corridor, folder, Scenario().seed if seed is None else seed)
     return corridor_tables(found, sumocfg, corridor)

@@ -184,10 +184,11 @@ def _batches(tasks: Sequence[Task]) -> list[Sequence[Task]]:
 
 
 def _prepare_worker() -> None:
-    """Ignore Ctrl-C, log critical errors only, and exit with the parent."""
+    """Ignore Ctrl-C and hang-ups, log critical errors only, and exit with the parent."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with_supervisor()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     silence_logs()
     tune_garbage_collector()
 

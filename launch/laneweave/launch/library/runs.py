@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from laneweave.agents.driving.trajectory import check_moves
 from laneweave.coordinator.planning.solve import prepare
-from laneweave.launch.faults.specification import load_faults
+from laneweave.launch.faults.specification import FaultSpec, load_faults
 from laneweave.launch.report.report import draw_report
 from laneweave.launch.run.local_run import LocalRun
 from laneweave.launch.run.logs import log_by_default
@@ -27,6 +28,9 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import RunSummary
 from laneweave.sim_bridge.road_sources import demanded
 
+if TYPE_CHECKING:  # needs the extra `watch`
+    from laneweave.launch.run.live_page import LivePage
+
 ZENOH: Final = "zenoh"
 SIMULATED: Final = "simulated"
 Transport = Literal["zenoh", "simulated"]
@@ -37,12 +41,16 @@ _in_process = threading.Lock()
 """Held by a run in this process: libsumo has one simulation per process."""
 
 
+def _ignore(_: str) -> None:
+    pass
+
+
 class RunFailedError(CommandFailedError):
     """A run failed, was interrupted, or violated a guarantee; its files are in `folder`."""
 
     def __init__(self, outcome: Outcome) -> None:
         """Store the outcome."""
-        super().__init__(f"{outcome.folder}: {'; '.join(outcome.problems)}")
+        super().__init__(f"{outcome.folder}: {'; '.join(outcome.problems) or 'interrupted'}")
         self.folder = outcome.folder
         self.problems = outcome.problems
         """Reasons, one line each."""
@@ -118,7 +126,7 @@ def run(
         pace=pace,
         show_progress=show_progress,
     )
-    if outcome.problems or outcome.summary is None:
+    if outcome.exit_status or outcome.summary is None:
         raise RunFailedError(outcome)
     if report:
         draw_report(outcome.folder)
@@ -134,8 +142,14 @@ def perform_run(
     faults: str | None = None,
     pace: float | None = None,
     show_progress: bool = False,
+    announce: Callable[[str], None] = _ignore,
+    warn: Callable[[str], None] = _ignore,
+    page: LivePage | None = None,
 ) -> Outcome:
     """Run a scenario to its end and return its outcome; see `run`.
+
+    Over Zenoh, `announce` is called with the endpoint of the router, and `warn` with a line if the
+    run is slower than real time; `page` shows the run.
 
     Raises:
         BadInputError: an argument is invalid, or does not fit the scenario.
@@ -143,7 +157,15 @@ def perform_run(
     """
     _check_arguments(method, transport, faults, pace)
     if method == FORMATION:
-        return _run_formations(scenario, out, transport, faults, pace, show=show_progress)
+        local = partial(
+            LocalRun,
+            show_progress=show_progress,
+            pace=pace,
+            announce=announce,
+            warn=warn,
+            page=page,
+        )
+        return _run_formations(scenario, out, transport, faults, local, show=show_progress)
     if scenario.sumo.config:
         raise BadInputError("method", method, "formation, with a SUMO simulation")
     reference_method(method).check(scenario)
@@ -173,7 +195,7 @@ def _run_formations(
     out: Path | None,
     transport: str | None,
     faults: str | None,
-    pace: float | None,
+    local: Callable[[Scenario, Path, FaultSpec], LocalRun],
     *,
     show: bool,
 ) -> Outcome:
@@ -184,7 +206,7 @@ def _run_formations(
     prepare(scenario.formation.solver, "formation.solver", keep=transport == SIMULATED)
     if transport != SIMULATED:
         with new_folder(out, scenario, FORMATION) as folder:
-            return LocalRun(scenario, folder, specification, show, pace).run()
+            return local(scenario, folder, specification).run()
     with (
         _only_run(),
         new_folder(out, scenario, FORMATION) as folder,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean
@@ -13,6 +12,7 @@ from laneweave.launch.report.page import Section, render_page
 from laneweave.launch.report.tables import Table
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.road_layout import END_OF_ROAD
+from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.sim_bridge.corridors.corridor_arrivals import CorridorArrival
 from laneweave.sim_bridge.corridors.sumo_alone import drive_alone
@@ -54,9 +54,9 @@ def compare(
     """
     alone = folder / ALONE_FOLDER
     alone.mkdir(exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as name:
-        setup = sumo_corridor(scenario, Path(name)).setup(scenario)
-        drive_alone(setup, scenario.seed, Path(name), alone, progress)
+    with temporary_folder("sumo") as temporary:
+        setup = sumo_corridor(scenario, temporary).setup(scenario)
+        drive_alone(setup, scenario.seed, temporary, alone, progress)
     found = read_statistics(folder), read_statistics(alone)
     routes = _by_route(setup.arrivals, found)
     tables = [_times_table(routes), _events_table(found)]

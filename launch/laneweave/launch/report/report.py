@@ -81,14 +81,14 @@ class _Report:
         self.sections.append(Section(title, pictures=self.draw(name, draw, caption, alt)))
 
 
-def draw_report(folder: Path) -> None:
-    """Write the pictures and the page of a finished run.
+def draw_report(folder: Path) -> Path:
+    """Write the pictures and the page of a finished run; return the path of the page.
 
     Raises:
         CommandFailedError: the files cannot be written.
     """
     try:
-        report_run(single_run(folder))
+        return report_run(single_run(folder))
     except OSError as error:
         raise CommandFailedError(f"{folder}: the report cannot be written: {error}") from error
 

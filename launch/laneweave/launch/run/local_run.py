@@ -12,7 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import attrs
 from attrs import define, field
@@ -27,15 +27,16 @@ from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.logs import last_error
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
-from laneweave.launch.run.role_processes import RoleExit, RoleProcesses, RoleStart
+from laneweave.launch.run.role_processes import BRIDGE, RoleExit, RoleProcesses, RoleStart
 from laneweave.launch.run.roles import fork_server
-from laneweave.launch.run.run_folder import LOG_FILE
+from laneweave.launch.run.run_folder import LOG_FILE, ROUTER_READY_FILE
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.runtime.message_faults import SENDER_OF_ROLE
 from laneweave.protocol.runtime.processes import stop_signals
-from laneweave.protocol.scenario.deployment_fields import Security
+from laneweave.protocol.runtime.temporary_folders import temporary_folder
+from laneweave.protocol.scenario.deployment_fields import Network
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
@@ -43,6 +44,12 @@ from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.topics import Keys
 from laneweave.sim_bridge.road_sources import demanded
 
+if TYPE_CHECKING:
+    # Needs the extra `watch`.
+    from laneweave.launch.run.live_page import LivePage
+
+OBSERVER = "observer.watch"
+"""Identity of the launcher in a secured network."""
 MAX_TEMPORARY_BYTES = 70
 """Maximum length of TMPDIR: socket paths are up to 37 bytes longer, and limited to 107 bytes."""
 ROUTER_START_S = 20.0
@@ -84,6 +91,12 @@ class LocalRun:
     pace: float | None = None
     watch: Callable[[RoadView, Mapping[str, int]], None] | None = None
     """Called ten times per second with the observed state and the process ids of the roles."""
+    announce: Callable[[str], None] = lambda _: None
+    """Called with the endpoint of the router once it listens."""
+    warn: Callable[[str], None] = lambda _: None
+    """Called with a line if the run is slower than real time."""
+    page: LivePage | None = None
+    """The live page of this run."""
     _processes: RoleProcesses = field(init=False)
     _options: dict[str, Any] = field(init=False)
     """Options that every role receives."""
@@ -108,38 +121,38 @@ class LocalRun:
 
         Raises:
             BadInputError: the run is not possible in this environment.
+            KeyboardInterrupt: a signal has stopped the run before the bridge began.
         """
         check_temporary_folder()
+        check_network(self.scenario)
         formation = self.scenario.formation
         needed = "rolling" if formation.rolling else formation.solver
         context = fork_server({needed} & KERNELS.keys())
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
             stop_signals(self._request_stop),
-            tempfile.TemporaryDirectory(prefix="laneweave-") as temporary,
+            temporary_folder() as temporary,
             RunProgress(self.scenario, show=self.show_progress) as progress,
         ):
-            network = attrs.evolve(
-                self.scenario.network,
-                endpoint=f"unixsock-stream/{temporary}/router.sock",
-                listen=(),
+            self.scenario = attrs.evolve(
+                self.scenario, network=network_in(temporary, self.scenario.network)
             )
-            # Encryption is unnecessary: only this user can access sockets in this folder.
-            self.scenario = attrs.evolve(self.scenario, network=network, security=Security())
             self._options = {
                 "folder": str(self.folder),
-                "temporary": temporary,
+                "temporary": str(temporary),
                 "pace": self.pace,
             }
             names = coordinator_names(self.scenario)
             self._processes = RoleProcesses(context, self._prepare, names)
             try:
                 if self.faults:
-                    self._board = SharedBoard(Path(temporary) / "board")
+                    self._board = SharedBoard(temporary / "board")
                     self._injection = fault_injection(self.faults, self.scenario, self._processes)
                 self._supervise(progress)
             except CommandFailedError as error:
-                self._problems.append(str(error))
+                # Processes that a signal has ended, too, are no failure.
+                if not self._stop:
+                    self._problems.append(str(error))
             finally:
                 self._processes.end_all()
                 if self._injection is not None:
@@ -147,7 +160,11 @@ class LocalRun:
             injection, processes = self._injection, self._processes.peak
             results = {} if injection is None else injection.results(self._board.dropped)
             return complete_summary(
-                self.folder, problems=self._problems, processes=processes, **results
+                self.folder,
+                problems=self._problems,
+                interrupted=self._stop,
+                processes=processes,
+                **results,
             )
 
     def _prepare(self, start: RoleStart) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -166,18 +183,28 @@ class LocalRun:
         bounds = runtime.bounds(Incarnations()())
         view = RoadView(bounds=bounds)
         observer = Observer(Keys(self.scenario.network.realm), view=view)
+        self._await_router()
         with contextlib.closing(self._connect(observer)) as transport:
             observer.subscribe(transport)
+            self.announce(self.scenario.network.endpoint)
+            if self.page is not None:
+                self.page.start(processes.context, to_tables(self.scenario), self._options)
             for name in processes.coordinators:
                 processes.start("coordinator", name)
             # Start road time only once a coordinator can plan.
             self._await_leader(observer)
-            processes.start("bridge", "bridge")
+            if self._stop:
+                return
+            processes.start(BRIDGE, BRIDGE)
             stall = _StallDetector(self.scenario, time.monotonic())
+            wanted_pace: float | None = min(1.0, self.pace or runtime.max_pace)
             while not self._stop and self._check_processes():
                 observer.wait(POLL_S)
                 view, now = observer.view, time.monotonic()
                 progress.show(view)
+                if wanted_pace and (slowness := progress.meter.slowness(wanted_pace)):
+                    self.warn(slowness)
+                    wanted_pace = None  # warn once
                 for group in self._agents_to_start(observer):
                     processes.start("agent", f"agent-{group[0]}", vehicles=group)
                 road_s = view.t_s
@@ -191,21 +218,40 @@ class LocalRun:
                 if stall.is_stalled(road_s, now):
                     self._problems.append(f"the road clock stopped at {view.t_s:.1f} s")
                     return
-            if self._stop:
-                self._problems.append("interrupted")
-            if injection is not None:
+            if injection is not None and not self._stop:
                 self._problems += injection.unused_faults()
 
+    def _await_router(self) -> None:
+        """Wait until this run's router listens; another one may be at the same endpoint.
+
+        Raises:
+            BadInputError: the router cannot listen.
+            CommandFailedError: the router has not started in time.
+        """
+        network = self.scenario.network
+        deadline_s = time.monotonic() + ROUTER_START_S
+        while not (Path(self._options["temporary"]) / ROUTER_READY_FILE).exists():
+            if self._stop:
+                raise KeyboardInterrupt
+            if not self._processes.is_alive(ROUTER):
+                name = "network.listen" if network.listen else "network.endpoint"
+                reason = last_error(self.folder / LOG_FILE, ROUTER) or "its process has ended"
+                allowed = f"where the router of this run can listen ({reason})"
+                raise BadInputError(name, ", ".join(network.listens_at), allowed)
+            if time.monotonic() > deadline_s:
+                raise CommandFailedError(f"the router did not start within {ROUTER_START_S:g} s")
+            time.sleep(0.02)
+
     def _connect(self, observer: Observer) -> ZenohTransport:
-        access = access_of(self.scenario, "observer.run")
+        access = access_of(self.scenario, OBSERVER)
         deadline_s = time.monotonic() + ROUTER_START_S
         while True:
             try:
                 return ZenohTransport(access, observer.inbox.put)
-            except BadInputError:
+            except BadInputError as error:
                 if self._stop:
                     raise KeyboardInterrupt from None
-                if time.monotonic() > deadline_s or not self._processes.is_alive(ROUTER):
+                if error.field != "network.endpoint" or time.monotonic() > deadline_s:
                     raise
                 time.sleep(0.02)
 
@@ -217,7 +263,9 @@ class LocalRun:
     def _check_processes(self) -> bool:
         """Record the processes that have exited; return whether the run continues."""
         for end in self._processes.ended():
-            if end.name in ("bridge", ROUTER):
+            if self._stop:
+                return False
+            if end.name in (BRIDGE, ROUTER):
                 if end.status != 0 or end.name == ROUTER:
                     self._record_end(f"the {end.name}", end)
                 return False
@@ -248,6 +296,38 @@ class LocalRun:
         self._stop = True
 
 
+def check_network(scenario: Scenario) -> None:
+    """Check that the processes of a run can use the network of a scenario.
+
+    Raises:
+        BadInputError: they cannot.
+    """
+    network, security, runtime = scenario.network, scenario.security, scenario.runtime
+    if security.mode == "off":
+        return
+    if not network.endpoint:
+        allowed = "tls/HOST:PORT or quic/HOST:PORT, as security.mode is mtls"
+        raise BadInputError("network.endpoint", "", allowed)
+    if runtime.vehicles_per_process != 1:
+        allowed = "1, as security.mode is mtls: every agent has the certificate of its vehicle"
+        value = runtime.vehicles_per_process
+        raise BadInputError("runtime.vehicles_per_process", value, allowed)
+
+
+def network_in(temporary: Path, network: Network) -> Network:
+    """Return the network of a run; without an endpoint, roles use a socket that only this user can.
+
+    Args:
+        temporary: temporary folder of the run.
+        network: that of the scenario. If it has no endpoint, its `listen` are additional endpoints.
+    """
+    if network.endpoint:
+        return network
+    endpoint = f"unixsock-stream/{temporary}/router.sock"
+    listen = (endpoint, *network.listen) if network.listen else ()
+    return attrs.evolve(network, endpoint=endpoint, listen=listen)
+
+
 def fault_injection(
     faults: FaultSpec, scenario: Scenario, processes: RoleProcesses
 ) -> FaultInjection:
@@ -258,6 +338,11 @@ def fault_injection(
     """
     seed = faults.seed_of_run(scenario.seed)
     network, reason = open_network(faults, processes.context, seed)
+    endpoint = scenario.network.endpoint
+    if network is not None and not endpoint.startswith("unixsock-stream/"):
+        network.close()
+        allowed = "none, or unixsock-stream/PATH: the faults use network namespaces"
+        raise BadInputError("network.endpoint", endpoint, allowed)
     lease_s = scenario.network.lease_s
     return FaultInjection(faults, scenario.seed, processes, lease_s, network, reason)
 

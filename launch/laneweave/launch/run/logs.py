@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import io
 import json
 import logging
@@ -92,6 +93,9 @@ def log_to_file(path: Path, role: str, name: str) -> None:
     """Log JSON lines to a file that all processes of a run share."""
     # Lines of different processes do not interleave, because each line is one write.
     stream = path.open("a", buffering=1, encoding="utf-8")
+    # While a process of a run lives, no other run can use the folder (`run_folder`).
+    with contextlib.suppress(OSError):
+        fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
     _log_json(lambda *_: structlog.WriteLogger(_lossy(stream)), role, name, LogLevel.info)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,18 +27,35 @@ class Outcome:
     summary: RunSummary | None
     """Summary; None: the run wrote no summary."""
     problems: tuple[str, ...]
-    """Reasons for failure; empty: the run succeeded."""
+    """Reasons for failure; empty: the run succeeded, or was interrupted."""
+    interrupted: bool = False
+    """Whether a signal has ended the run."""
 
     @property
     def exit_status(self) -> int:
-        """Exit status: 0 success; 1 the run failed or violated a guarantee."""
-        return 1 if self.problems else 0
+        """Exit status: 0 success; 1 the run failed, violated a guarantee or was interrupted."""
+        return 1 if self.problems or self.interrupted else 0
+
+    @property
+    def has_traffic(self) -> bool:
+        """Whether a vehicle has entered the road, so that there is something to show."""
+        return self.summary is not None and self.summary.vehicles.entered > 0
+
+    @property
+    def ending(self) -> str:
+        """How the run has ended, in a few words."""
+        vehicles = self.summary.vehicles if self.summary is not None else None
+        left = f": {vehicles.left} of {vehicles.demanded} left" if vehicles is not None else ""
+        if self.problems:
+            return f"run failed: {self.problems[0]}"
+        return f"run {'interrupted' if self.interrupted else 'ended'}{left}"
 
 
 def complete_summary(
     folder: Path,
     *,
     problems: Sequence[str],
+    interrupted: bool = False,
     processes: int | None = None,
     failover: Failover | None = None,
     dropped: int = 0,
@@ -48,13 +66,19 @@ def complete_summary(
     Args:
         folder: the run's folder.
         problems: problems known so far.
+        interrupted: whether a signal has asked the run to end.
         processes: maximum number of simultaneous role processes; None: unknown.
         failover: measured recoveries from leader faults; None: no faults.
         dropped: number of messages dropped by faults.
         faults: record of the injected faults; None: no faults.
+
+    Raises:
+        KeyboardInterrupt: the run was interrupted before it began.
     """
     summary = read_summary(folder)
     if summary is None:
+        if interrupted:
+            raise KeyboardInterrupt
         return Outcome(folder, None, (*problems, "the run wrote no summary"))
     measured = summary.failover
     if failover is not None:
@@ -74,7 +98,10 @@ def complete_summary(
     write_summary(folder, summary)
     trips = folder / "trips.parquet"
     of_sumo = trips.is_file() and bool(scenario_of(trips).sumo.config)
-    return Outcome(folder, summary, (*problems, *_violations(summary, of_sumo=of_sumo)))
+    # A signal may arrive when the run is already complete.
+    interrupted = interrupted and summary.ending == "interrupted"
+    violations = _violations(summary, interrupted=interrupted, of_sumo=of_sumo)
+    return Outcome(folder, summary, (*problems, *violations), interrupted)
 
 
 def _plug_ins(summary: RunSummary) -> list[str]:
@@ -85,11 +112,12 @@ def _plug_ins(summary: RunSummary) -> list[str]:
     return sorted({origin for origin in origins if origin})
 
 
-def _violations(summary: RunSummary, *, of_sumo: bool) -> list[str]:
+def _violations(summary: RunSummary, *, interrupted: bool, of_sumo: bool) -> list[str]:
     """Return which guarantees a run has violated.
 
     Args:
         summary: summary of the run.
+        interrupted: whether a signal has ended the run, which is then not complete.
         of_sumo: whether vehicles come from a SUMO simulation. Then a complete run may leave some
             outside: SUMO drives them elsewhere, or their exits are full.
     """
@@ -97,6 +125,8 @@ def _violations(summary: RunSummary, *, of_sumo: bool) -> list[str]:
     found = []
     if safety.overlaps:
         found.append(f"{safety.overlaps} pairs of vehicles overlapped")
+    if interrupted:
+        return found
     complete = summary.ending == "complete"
     if not complete:
         found.append(f"the run is not complete: {summary.ending}")
@@ -108,7 +138,7 @@ def _violations(summary: RunSummary, *, of_sumo: bool) -> list[str]:
 
 
 def print_outcome(outcome: Outcome, console: Console) -> None:
-    """Print the results and the problems of a run."""
+    """Print the results and the problems of a run; on stderr, that it was interrupted."""
     summary = outcome.summary
     if summary is not None:
         table = Table(title=f"laneweave run: {outcome.folder}", show_header=False)
@@ -121,3 +151,6 @@ def print_outcome(outcome: Outcome, console: Console) -> None:
         console.print(table)
     for problem in outcome.problems:
         console.print(f"FAILED: {problem}", style="bold red", highlight=False)
+    if outcome.interrupted and summary is not None:
+        t_s, folder = summary.simulated_s, outcome.folder
+        sys.stderr.write(f"interrupted at {t_s:.1f} s of road time; the data so far: {folder}\n")

@@ -10,6 +10,7 @@ process would copy all of them.
 from __future__ import annotations
 
 import os
+import signal
 
 import laneweave.coordinator.process  # noqa: F401
 from laneweave.agents import process as agents
@@ -20,11 +21,16 @@ from laneweave.protocol.runtime.processes import die_with_parent, outlive_parent
 from laneweave.protocol.wire import codec
 
 # The fork server itself notices the end of its launcher only after this preparation; from then on
-# it must outlive the launcher until its last child has exited.
-die_with_parent(int(os.environ.pop(LAUNCHER)))
+# it must outlive the launcher until its last child has exited. All stop signals are blocked here.
+die_with_parent(int(os.environ.pop(LAUNCHER)), signal.SIGKILL)
 codec.warm_up()
 agents.warm_up(parse_scenario({}))
 for kernels in KERNELS.values():
     kernels.load_if_compiled()
 outlive_parent()
+# The roles inherit this: the launcher ends them, in the right order. SIGINT remains blocked,
+# because OSQP replaces its handler.
+for number in (signal.SIGTERM, signal.SIGHUP):
+    signal.signal(number, signal.SIG_IGN)
+signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGTERM, signal.SIGHUP))
 tune_garbage_collector()

@@ -1,18 +1,75 @@
-"""The progress bar of a run."""
+"""The progress of a run: a bar, the pace, and an estimate of the time left."""
 
 from __future__ import annotations
 
 import time
+from collections import deque
 
+from attrs import define, field
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.scenario.fields import Scenario
 
+WINDOW_S = 20.0
+"""Wall-clock time over which the pace is measured: it falls while the road fills."""
+MIN_WINDOW_S = 5.0
+"""Shortest measurement of the pace."""
+EARLY_S, WAITED_S = 3.0, 15.0
+"""Road time or wall-clock time after which a run may be reported as slow."""
+SLOW = 0.9
+"""Share of the wanted pace below which a run is reported as slow."""
+
+
+@define
+class PaceMeter:
+    """Pace of a run over the last `WINDOW_S`, in road seconds per wall-clock second."""
+
+    total_s: float
+    """Expected road time of the whole run."""
+    began: tuple[float, float] | None = None
+    """First measurement; None: none yet."""
+    _measured: deque[tuple[float, float]] = field(factory=deque)
+    """(wall-clock time, road time)."""
+
+    def add(self, now_s: float, road_s: float) -> None:
+        """Add a measurement; road time must not decrease."""
+        self._measured.append((now_s, road_s))
+        self.began = self.began or self._measured[0]
+        while now_s - self._measured[0][0] > WINDOW_S:
+            self._measured.popleft()
+
+    @property
+    def pace(self) -> float | None:
+        """Pace; None before `MIN_WINDOW_S`."""
+        if not self._measured:
+            return None
+        (first_s, from_s), (last_s, to_s) = self._measured[0], self._measured[-1]
+        return (to_s - from_s) / (last_s - first_s) if last_s - first_s >= MIN_WINDOW_S else None
+
+    @property
+    def left_s(self) -> float | None:
+        """Wall-clock time that the run still takes at this pace; None: unknown."""
+        pace = self.pace
+        return max(0.0, self.total_s - self._measured[-1][1]) / pace if pace else None
+
+    def slowness(self, wanted_pace: float) -> str:
+        """Return a line that reports a pace well below the wanted one; empty: it is not."""
+        pace, left_s = self.pace, self.left_s
+        if pace is None or left_s is None or self.began is None or pace >= SLOW * wanted_pace:
+            return ""
+        now_s, road_s = self._measured[-1]
+        if road_s - self.began[1] < EARLY_S and now_s - self.began[0] < WAITED_S:
+            return ""
+        return (
+            f"slower than real time: x{pace:.2f} at {road_s:.0f} s of road time, "
+            f"about {duration(left_s)} left for {self.total_s - road_s:.0f} s"
+        )
+
 
 class RunProgress(Progress):
-    """Progress bar with road time, vehicles on the road, leader and real-time factor."""
+    """Progress bar with road time, vehicles on the road, leader, pace and time left."""
 
     def __init__(self, scenario: Scenario, *, show: bool) -> None:
         """Create a bar, full when the last vehicle leaves in free flow; hidden unless `show`."""
@@ -23,30 +80,41 @@ class RunProgress(Progress):
             TextColumn("{task.fields[leader]}"),
             TextColumn("{task.fields[rate]}"),
             TimeElapsedColumn(),
+            TextColumn("{task.fields[left]}"),
             console=Console(stderr=True),
             disable=not show,
             transient=True,
         )
-        self._total_s = scenario.demand.duration_s + scenario.free_flow_s
+        self.meter = PaceMeter(scenario.demand.duration_s + scenario.free_flow_s)
         self._task: TaskID = self.add_task(
-            "run", total=self._total_s, now="starting", road="", leader="no leader", rate=""
+            "run",
+            total=self.meter.total_s,
+            now="starting",
+            road="",
+            leader="no leader",
+            rate="",
+            left="",
         )
-        self._began: tuple[float, float] | None = None
 
     def show(self, view: RoadView) -> None:
         """Show the current state of the run."""
         clock = view.clock
         if clock is None:
             return
-        now = time.monotonic()
-        if self._began is None:
-            self._began = (now, clock.t_s)
-        wall_s, road_s = now - self._began[0], clock.t_s - self._began[1]
+        meter = self.meter
+        meter.add(time.monotonic(), clock.t_s)
+        pace, left_s = meter.pace, meter.left_s
         self.update(
             self._task,
-            completed=min(clock.t_s, self._total_s),
+            completed=min(clock.t_s, meter.total_s),
             now=f"{clock.t_s:6.1f} s",
             road=f"{clock.on_road:3d} on the road, {clock.left}/{clock.demanded} left",
             leader=f"leader {view.leader}, term {view.term}" if view.leader else "no leader",
-            rate=f"x{road_s / wall_s:.2f} real time" if wall_s > 1 else "",
+            rate=f"x{pace:.2f} real time" if pace is not None else "",
+            left=f"about {duration(left_s)} to go" if left_s is not None else "",
         )
+
+
+def duration(seconds: float) -> str:
+    """Return a time in words, in minutes from two minutes on."""
+    return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{seconds:.0f} s"

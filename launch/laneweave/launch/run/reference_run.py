@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from pathlib import Path
 
@@ -13,6 +12,8 @@ from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
 from laneweave.launch.run_methods import REFERENCE_METHODS
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.processes import stop_signals
+from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod
 from laneweave.sim_bridge.baselines.reference_road import ReferenceRoad
@@ -29,25 +30,34 @@ class ReferenceRun:
     folder: Path
     method: str
     show_progress: bool = True
+    _stop: bool = False
 
     def run(self) -> Outcome:
-        """Run the scenario and return its outcome."""
+        """Run the scenario and return its outcome.
+
+        Raises:
+            KeyboardInterrupt: a signal has stopped the run before it began.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
-            tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as folder,
-            reference_method(self.method).open(self.scenario, Path(folder)) as traffic,
+            stop_signals(self._request_stop),
+            temporary_folder("sumo") as folder,
+            reference_method(self.method).open(self.scenario, folder) as traffic,
             RunProgress(self.scenario, show=self.show_progress) as progress,
         ):
             record = RunRecord(self.folder, self.scenario, self.method, time.perf_counter)
             road = ReferenceRoad(self.scenario, traffic, record)
             try:
-                while road.ending is None:
+                while road.ending is None and not self._stop:
                     road.advance()
                     if road.tick % PROGRESS_EVERY_TICKS == 0:
                         progress.show(RoadView(clock=road.clock))
             finally:
                 record.close(road.t_s, road.ending or Ending.INTERRUPTED)
-        return complete_summary(self.folder, problems=(), processes=1)
+        return complete_summary(self.folder, problems=(), interrupted=self._stop, processes=1)
+
+    def _request_stop(self) -> None:
+        self._stop = True
 
 
 def reference_method(name: str, field_name: str = "method") -> ReferenceMethod:

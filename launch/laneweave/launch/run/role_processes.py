@@ -14,12 +14,16 @@ import structlog
 from attrs import define, field, frozen
 
 from laneweave.launch.faults.specification import ROUTER
-from laneweave.launch.run.roles import start_role
+from laneweave.launch.run.roles import end_role, start_role
 
 log = structlog.get_logger(__name__)
 
+BRIDGE = "bridge"
+"""Role and name of the bridge's process."""
 STOP_S = 5.0
-"""Grace period after SIGTERM before processes are killed."""
+"""Grace period after the request to end before processes are killed."""
+WRITING_S = 30.0
+"""Grace period of the bridge, which has files to complete."""
 
 
 @frozen
@@ -137,20 +141,20 @@ class RoleProcesses:
     # --- shutdown -----------------------------------------------------------------------------
 
     def end_all(self) -> None:
-        """Terminate all processes with SIGTERM, then SIGKILL if necessary; the router last."""
+        """Ask all processes to end, kill them if necessary; the bridge first, the router last."""
         for name in list(self._paused):
             self.resume(name)
-        router = self._running.pop(ROUTER, None)
-        _end(list(self._running.values()))
+        first, last = ((self._running.pop(name, None)) for name in (BRIDGE, ROUTER))
+        rest = list(self._running.values())
         self._running.clear()
-        if router is not None:
-            _end([router])
+        for processes, grace_s in (([first], WRITING_S), (rest, STOP_S), ([last], STOP_S)):
+            _end([process for process in processes if process is not None], grace_s)
 
 
-def _end(processes: list[ForkServerProcess]) -> None:
+def _end(processes: list[ForkServerProcess], grace_s: float) -> None:
     for process in processes:
-        process.terminate()
-    deadline = time.monotonic() + STOP_S
+        end_role(process)
+    deadline = time.monotonic() + grace_s
     for process in processes:
         process.join(max(0.0, deadline - time.monotonic()))
         if process.is_alive():

@@ -27,13 +27,19 @@ import structlog
 
 from laneweave.launch.faults.namespace_processes import join_namespace
 from laneweave.launch.run.logs import log_to_file, log_to_terminal
-from laneweave.launch.run.run_folder import LOG_FILE
+from laneweave.launch.run.run_folder import LOG_FILE, ROUTER_READY_FILE
 from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
-from laneweave.protocol.runtime.processes import die_with_parent
-from laneweave.protocol.security.access_control import access_of
+from laneweave.protocol.runtime.processes import (
+    ROLE_STOP,
+    STOP_SIGNALS,
+    die_with_parent,
+    raise_interrupts,
+)
+from laneweave.protocol.runtime.temporary_folders import hold_folder
+from laneweave.protocol.security.access_control import access_of, guard_of
 
 log = structlog.get_logger(__name__)
 
@@ -45,7 +51,7 @@ THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 AGENT_NICENESS = 5
 RECONNECT_S = 0.1
 """Time between attempts to connect in runs with faults."""
-ORPHAN_S = 5.0
+ORPHAN_S = 20.0
 """Grace period of a process after its launcher has died."""
 GC_THRESHOLD = 50_000
 """New objects between garbage collections; the default of 700 slows down a run by 6 %."""
@@ -90,17 +96,19 @@ def fork_server(solvers: Collection[str] = ()) -> ForkServerContext:
         os.environ.setdefault(name, "1")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([PRELOADED])
-    # Starting the resource tracker unblocks SIGINT, so it must not start below.
-    resource_tracker.ensure_running()
-    # Ctrl-C reaches the whole process group. Role processes inherit the blocked SIGINT, because
-    # the launcher terminates them in the right order. A Ctrl-C in the meantime is delivered later.
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    # Stop signals may be sent to all processes at once, but the launcher ends its roles in the
+    # right order. The fork server inherits the blocked signals until it can ignore them
+    # (`preload`), the resource tracker only SIGHUP: it ignores the others, and its start unblocks
+    # them here, too. A signal in the meantime is delivered later.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
     os.environ[LAUNCHER] = str(os.getpid())
     try:
+        resource_tracker.ensure_running()
+        signal.pthread_sigmask(signal.SIG_BLOCK, (*STOP_SIGNALS, ROLE_STOP))
         forkserver.ensure_running()
     finally:
         del os.environ[LAUNCHER]
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     # Starting it waits for the server; at this point Ctrl-C still raises KeyboardInterrupt.
     first = context.Process(target=_compile, args=(tuple(solvers),), name="processes")
     _start(first)
@@ -171,16 +179,38 @@ def _main_module_hidden() -> Iterator[None]:
         sys.modules["__main__"] = main
 
 
+def end_role(process: ForkServerProcess) -> None:
+    """Ask a role to end in good order."""
+    if process.is_alive() and process.pid is not None:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process.pid, ROLE_STOP)
+
+
 def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     """Run a role in this process to completion; the target of `start_role`."""
-    die_with_parent()
+    with contextlib.suppress(KeyboardInterrupt):
+        become_role(name, options)
+        log_to_file(Path(options["folder"]) / LOG_FILE, role, name)
+        _run_until_connected(role, name, tables, options)
+
+
+def become_role(name: str, options: dict[str, Any]) -> None:
+    """Make this forked process a role, which its launcher ends: `ROLE_STOP` interrupts it."""
+    raise_interrupts(ROLE_STOP)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {ROLE_STOP})
+    die_with_parent(number=ROLE_STOP)
     if "namespace" in options:
         # Namespaces are properties of threads: join before other threads start.
         join_namespace(options["namespace"])
-    die_with_supervisor()
+    die_with_supervisor(ROLE_STOP)
     ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
     tempfile.tempdir = options["temporary"]
-    log_to_file(Path(options["folder"]) / LOG_FILE, role, name)
+    hold_folder(Path(tempfile.tempdir))
+
+
+def _run_until_connected(
+    role: str, name: str, tables: dict[str, Any], options: dict[str, Any]
+) -> None:
     try:
         while not _run_once(role, name, tables, options):
             time.sleep(RECONNECT_S)
@@ -204,8 +234,8 @@ def _run_once(role: str, name: str, tables: dict[str, Any], options: dict[str, A
     return True
 
 
-def die_with_supervisor() -> None:
-    """Terminate this process when the launcher exits for any reason.
+def die_with_supervisor(number: signal.Signals = signal.SIGTERM) -> None:
+    """Send a signal to this process when the launcher exits for any reason; kill it if it hangs.
 
     The parent process is the fork server, which runs until its last child process has exited.
     """
@@ -219,7 +249,7 @@ def die_with_supervisor() -> None:
         supervisor.join()
         if os.getppid() == parent:
             resume_children(parent)
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
         time.sleep(ORPHAN_S)
         os._exit(1)
 
@@ -243,8 +273,14 @@ def _wrap(options: dict[str, Any]) -> CoreWrapper:
 def _router(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     from laneweave.protocol.transports.zenoh.transport import run_router
 
-    network = parse_scenario(tables).network
-    run_router((network.endpoint, *options.get("listen", ())), network.lease_s)
+    scenario = parse_scenario(tables)
+    network = scenario.network
+    run_router(
+        (*network.listens_at, *options.get("listen", ())),
+        network.lease_s,
+        ready=(Path(options["temporary"]) / ROUTER_READY_FILE).touch,
+        guard=guard_of(scenario),
+    )
 
 
 def _coordinator(name: str, tables: dict[str, Any], options: dict[str, Any]) -> None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import json
+import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,30 +13,45 @@ from pathlib import Path
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.summary import SUMMARY_FILE, read_summary
+from laneweave.protocol.wire.events import ENTERED
 
 LOG_FILE = "log.jsonl"
+"""Log of all processes of a run, which keep it locked: a folder is used by one run at a time."""
+ROUTER_READY_FILE = "router.ready"
+"""File in the temporary folder of a run that exists once the router listens."""
+EVENTS_FILE = "events.jsonl"
+EARLY_FILES = frozenset(
+    (LOG_FILE, EVENTS_FILE, SUMMARY_FILE, "ticks.parquet", "trajectories.parquet", "trips.parquet")
+)
+"""Files that an interrupted run may have before a vehicle enters."""
+FOLDER_RULE = "a new or empty folder"
 
 
 @contextmanager
 def new_folder(out: Path | None, settings: Scenario, method: str) -> Iterator[Path]:
-    """Yield a new or empty folder; remove a new one if the run is rejected or interrupted early.
+    """Yield a new or empty folder, or one that only an interrupted start has left behind.
+
+    If the run is rejected, or interrupted before it writes results, the folder is as before.
 
     Raises:
-        BadInputError: the folder is not empty, or cannot be created.
+        BadInputError: the folder is not empty, is used by another run, or cannot be created.
     """
     volume = f"{settings.demand.volume_veh_per_lane_h:g}"
     folder = out or timestamped_folder(f"{method}-{volume}-seed{settings.seed}")
     existed = folder.is_dir()
-    _claim(folder)
+    log = _claim(folder)
     try:
         yield folder
     except (BadInputError, KeyboardInterrupt):
         files = list(folder.iterdir())
-        if files == [folder / LOG_FILE] and not files[0].stat().st_size:
+        if files == [folder / LOG_FILE]:
             files[0].unlink()
             if not existed:
                 folder.rmdir()
         raise
+    finally:
+        os.close(log)
 
 
 def timestamped_folder(prefix: str) -> Path:
@@ -45,14 +64,61 @@ def timestamped_folder(prefix: str) -> Path:
     return folder
 
 
-def _claim(folder: Path) -> None:
+def _claim(folder: Path) -> int:
+    """Lock the log of a folder and empty the folder; return the log's descriptor."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise BadInputError("--out", str(folder), "a new or empty folder")
-        # If two runs start simultaneously, the second one fails here.
-        (folder / LOG_FILE).touch(exist_ok=False)
+        if not _is_unused(folder):
+            raise BadInputError("--out", str(folder), FOLDER_RULE)
+        log = os.open(folder / LOG_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            _lock(log, fcntl.LOCK_EX)
+        except BlockingIOError as error:
+            os.close(log)
+            allowed = f"{FOLDER_RULE}; another run uses this one"
+            raise BadInputError("--out", str(folder), allowed) from error
+        for path in folder.iterdir():
+            if path.name != LOG_FILE:
+                path.unlink()
+        os.ftruncate(log, 0)
+        # The processes of this run lock it, too.
+        _lock(log, fcntl.LOCK_SH)
     except FileExistsError as error:
-        raise BadInputError("--out", str(folder), "a new or empty folder") from error
+        raise BadInputError("--out", str(folder), FOLDER_RULE) from error
     except OSError as error:
         raise BadInputError("--out", str(folder), f"a folder ({error.strerror})") from error
+    return log
+
+
+def _lock(descriptor: int, kind: int) -> None:
+    """Lock a file, if its file system has locks.
+
+    Raises:
+        BlockingIOError: another process has locked it.
+    """
+    try:
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
+    except OSError:
+        pass
+
+
+def _is_unused(folder: Path) -> bool:
+    """Return whether a folder is empty, or was left by a run that ended before a vehicle entered.
+
+    Raises:
+        OSError: the folder or a file cannot be read.
+    """
+    if not EARLY_FILES.issuperset(path.name for path in folder.iterdir()):
+        return False
+    events = folder / EVENTS_FILE
+    if events.exists():
+        for line in events.read_text(encoding="utf-8", errors="replace").splitlines():
+            with contextlib.suppress(ValueError, KeyError, TypeError):
+                if json.loads(line)["kind"] == ENTERED:
+                    return False
+    if not (folder / SUMMARY_FILE).exists():
+        return True
+    summary = read_summary(folder)
+    return summary is not None and summary.ending == "interrupted"

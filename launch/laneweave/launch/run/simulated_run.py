@@ -24,6 +24,7 @@ from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.runtime.message_faults import FaultyCore
 from laneweave.protocol.runtime.node import Arrived, Core, Effect, Event, Listen, Started
+from laneweave.protocol.runtime.processes import stop_signals
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
@@ -132,12 +133,14 @@ class SimulatedRun:
     """Unique incarnation numbers for agents and caretakers."""
     _coordinator_incarnations: Iterator[int] = field(factory=lambda: count(1))
     _problems: list[str] = field(factory=list)
+    _stop: bool = False
 
     def run(self) -> Outcome:
         """Run the scenario and return its outcome.
 
         Raises:
             BadInputError: the simulated network does not support one of the faults.
+            KeyboardInterrupt: a signal has stopped the run before it began.
         """
         scenario = self.scenario
         self.faults.check_simulated()
@@ -148,11 +151,12 @@ class SimulatedRun:
             self._injection = FaultInjection(
                 self.faults, scenario.seed, self._roles, self.conditions.lease_s
             )
-        record = RunRecord(self.folder, scenario, FORMATION, time.perf_counter)
         with (
+            stop_signals(self._request_stop),
             open_road(scenario, self.folder) as road,
             RunProgress(scenario, show=self.show_progress) as progress,
         ):
+            record = RunRecord(self.folder, scenario, FORMATION, time.perf_counter)
             bridge = BridgeCore(
                 scenario,
                 road.world,
@@ -169,9 +173,19 @@ class SimulatedRun:
         dropped = network.dropped + self._board.dropped
         results: dict[str, Any] = {"dropped": dropped}
         if self._injection is not None:
-            self._problems += self._injection.unused_faults()
+            if not self._stop:
+                self._problems += self._injection.unused_faults()
             results = self._injection.results(dropped)
-        return complete_summary(self.folder, problems=self._problems, processes=1, **results)
+        return complete_summary(
+            self.folder,
+            problems=self._problems,
+            interrupted=self._stop,
+            processes=1,
+            **results,
+        )
+
+    def _request_stop(self) -> None:
+        self._stop = True
 
     def _drive(self, network: SimulatedNetwork, bridge: BridgeCore, progress: RunProgress) -> None:
         realm = self.scenario.network.realm
@@ -181,7 +195,7 @@ class SimulatedRun:
         self._add("bridge", bridge, "bridge")
         shown = advanced_tick = 0
         advanced_s = 0.0
-        while bridge.phase is not TickPhase.ENDED and network.queue:
+        while bridge.phase is not TickPhase.ENDED and network.queue and not self._stop:
             if self._injection is None:
                 network.run(network.now_s + STRIDE_S)
             else:

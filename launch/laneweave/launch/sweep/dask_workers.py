@@ -8,7 +8,6 @@ one process, and SUMO may crash.
 from __future__ import annotations
 
 import asyncio
-import tempfile
 import uuid
 from collections.abc import Generator, Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from distributed import Client, Event, Future, as_completed, connect
 from laneweave.launch.sweep.execution import LOG_FILE, PointResult, kept_files, run_in_process
 from laneweave.launch.sweep.points import Point
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.temporary_folders import temporary_folder
 
 CONNECT_S = 10.0
 
@@ -66,8 +66,8 @@ def run_on_dask(
 def run_as_task(point: Point, sweep: str) -> TaskResult:
     """Run a point on a worker, as a Dask task."""
     stop = Event(sweep)
-    with tempfile.TemporaryDirectory(prefix="laneweave-point-") as temporary:
-        result = run_in_process(point, Path(temporary) / point.name, stop.is_set)
+    with temporary_folder("point") as temporary:
+        result = run_in_process(point, temporary / point.name, stop.is_set)
         paths = (result.folder / name for name in (*kept_files(point), LOG_FILE))
         return result, {path.name: path.read_bytes() for path in paths if path.is_file()}
 

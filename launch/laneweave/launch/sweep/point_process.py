@@ -15,7 +15,7 @@ from laneweave.launch.run_methods import FORMATION
 from laneweave.launch.sweep.execution import JOB_FILE, RESULT_FILE
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.files import write_atomically
-from laneweave.protocol.runtime.processes import die_with_parent
+from laneweave.protocol.runtime.processes import die_with_parent, raise_interrupts
 
 
 def main(folder: Path, parent: int) -> None:
@@ -25,8 +25,8 @@ def main(folder: Path, parent: int) -> None:
         folder: folder with `job.json`.
         parent: id of the process that started this one; this process exits when it does.
     """
-    # Handle SIGTERM like Ctrl-C, to complete files and remove temporary folders.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # Handle these like Ctrl-C, to complete files and remove temporary folders.
+    raise_interrupts(signal.SIGTERM, signal.SIGHUP)
     die_with_parent(parent)
     log_to_terminal()
     tune_garbage_collector()

@@ -48,6 +48,9 @@ accepted but not completed.
 
 **Request** from the page: `{"want": [from, to]}`, at most `MAX_REQUESTED` frame numbers. The
 response has the available frames: `{"reel": [from, to], "first": n, "last": n, "frames": [...]}`.
+
+**Ending**, the last message of the page of `laneweave run --watch`: `{"end": text}`. The page shows
+the text and does not connect again.
 """
 
 from __future__ import annotations
@@ -260,6 +263,11 @@ def batch(source: FrameSource, begin: int, end: int) -> str:
     frames = ",".join(source.frames(begin, end))
     head = compact({"reel": [begin, end], "first": source.first, "last": source.last})
     return f'{head[:-1]},"frames":[{frames}]}}'
+
+
+def ending(text: str) -> str:
+    """Return the last message of the page of a run."""
+    return compact({"end": text})
 
 
 def opening(source: FrameSource, session: str) -> str:

@@ -138,12 +138,13 @@ class LiveRoad:
 
     def _status_at(self, wall_s: float) -> str:
         view = self.view
+        # The router of a run ends with it.
+        if view.clock is not None and view.clock.ended:
+            return "ended"
         if not view.linked:
             return "lost"
         if view.clock is None:
             return "waiting"
-        if view.clock.ended:
-            return "ended"
         return "still" if wall_s - view.clock_received_s > STILL_S else "live"
 
     def _update_status(self, wall_s: float) -> None:

@@ -1,4 +1,4 @@
-"""The process of `laneweave watch`: socket, signals, observer thread.
+"""The process of the live page: socket, signals, observer thread.
 
 The thread processes Zenoh deliveries and makes frames; the event loop serves browsers. Only
 complete frames are passed from the thread to the loop.
@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import signal
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from itertools import islice
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,11 +21,12 @@ import structlog
 import uvicorn
 
 from laneweave.launch.observe.observer import Observer
-from laneweave.launch.watch.frames import FrameBuffer, FrameSource, compact, scene_of
+from laneweave.launch.watch.frames import FrameBuffer, FrameSource, compact, ending, scene_of
 from laneweave.launch.watch.live_road import TOPICS, LiveRoad
 from laneweave.launch.watch.server import Browsers, Health, make_app
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import Arrived
+from laneweave.protocol.runtime.processes import accepted_stop_signals
 from laneweave.protocol.runtime.transport import Delivery
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
@@ -63,6 +64,34 @@ def watch_live(scenario: Scenario, listen: str, ready: Callable[[str], None]) ->
         observer.check()
 
 
+def watch_run(
+    scenario: Scenario, title: str, listener: socket.socket, launcher: Connection
+) -> None:
+    """Serve the page of a run at a listening socket until its launcher ends it.
+
+    Args:
+        scenario: road and network of the run, whose router must already listen.
+        title: title of the page.
+        listener: listening socket.
+        launcher: receives how the run has ended, which the page then shows; closed without: nothing
+            is shown.
+
+    Raises:
+        BadInputError: there is no router at the endpoint.
+    """
+    with contextlib.closing(listener), _LiveObserver(scenario, title) as observer:
+        _serve(
+            listener,
+            observer.buffer,
+            observer.browsers,
+            observer.health,
+            lambda _: None,
+            observer.start,
+            launcher,
+        )
+        observer.check()
+
+
 def watch_recorded(folder: Path, listen: str, ready: Callable[[str], None]) -> None:
     """Serve the page of a recorded run until SIGINT or SIGTERM; call `ready` with the page's URL.
 
@@ -80,8 +109,8 @@ def watch_recorded(folder: Path, listen: str, ready: Callable[[str], None]) -> N
         _serve(listener, recording, Browsers(), health, ready)
 
 
-def open_socket(listen: str) -> socket.socket:
-    """Return a socket that listens at an address.
+def open_socket(listen: str, option: str = "--listen") -> socket.socket:
+    """Return a socket that listens at an address, which was given by an option.
 
     Raises:
         BadInputError: the address is malformed or cannot be used.
@@ -89,26 +118,27 @@ def open_socket(listen: str) -> socket.socket:
     host, colon, port = listen.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if not colon or not host or not port.isdecimal() or int(port) > 65535:
-        raise BadInputError("--listen", listen, LISTEN_RULE)
+        raise BadInputError(option, listen, LISTEN_RULE)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, int(port)), family=family)
     except (OSError, UnicodeError) as error:
         allowed = f"{LISTEN_RULE} ({getattr(error, 'strerror', None) or error})"
-        raise BadInputError("--listen", listen, allowed) from error
+        raise BadInputError(option, listen, allowed) from error
 
 
 class _LiveObserver:
     """Observer of a deployment that makes frames in a separate thread."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        """Connect to the router, with retries.
+    def __init__(self, scenario: Scenario, title: str = "") -> None:
+        """Connect to the router, with retries; the default title of the page is the realm.
 
         Raises:
             BadInputError: there is no router at the endpoint.
         """
         self.browsers = Browsers()
-        self.buffer = FrameBuffer(scene_of(scenario, "live", scenario.network.realm, STEP_S))
+        title = title or scenario.network.realm
+        self.buffer = FrameBuffer(scene_of(scenario, "live", title, STEP_S))
         self._observer = Observer(Keys(scenario.network.realm), topics=TOPICS)
         self._transport = connect_blocking(access_of(scenario, IDENTITY), self._deliver)
         # Offset for wall-clock times that do not jump when the system clock is set.
@@ -208,6 +238,7 @@ def _serve(
     health: Health,
     ready: Callable[[str], None],
     start: Callable[[Callable[[], None]], None] = lambda _: None,
+    launcher: Connection | None = None,
 ) -> None:
     config = uvicorn.Config(
         make_app(source, browsers, health),
@@ -231,12 +262,19 @@ def _serve(
     def end() -> None:
         server.should_exit = True
 
+    def on_launcher(connection: Connection) -> None:
+        asyncio.get_running_loop().remove_reader(connection.fileno())
+        with contextlib.suppress(EOFError, OSError):
+            browsers.end(ending(connection.recv()))
+        # Closing the browsers' connections waits until the ending has been sent.
+        asyncio.get_running_loop().call_later(END_S if browsers.connected else 0.0, end)
+
     async def main() -> None:
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            # Keep ignored signals ignored.
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                loop.add_signal_handler(number, end)
+        for number in accepted_stop_signals():
+            loop.add_signal_handler(number, end)
+        if launcher is not None:
+            loop.add_reader(launcher.fileno(), on_launcher, launcher)
         start(end)
         ready(address_of(listener))
         await server.serve(sockets=[listener])

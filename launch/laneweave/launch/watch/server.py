@@ -51,10 +51,12 @@ _FILES: Final = {
 
 @define(eq=False)
 class Browser:
-    """Pending output for one browser: at most one frame and one request."""
+    """Pending output for one browser: at most one frame, one request and the ending."""
 
     frame: str | None = None
     request: tuple[int, int] | None = None
+    ending: str | None = None
+    """Last message, after which the connection is closed; None: not yet."""
     skipped: int = 0
     """Number of unsent frames replaced by newer ones."""
     _pending: asyncio.Event = field(factory=asyncio.Event)
@@ -70,9 +72,16 @@ class Browser:
         self.request = request
         self._pending.set()
 
+    def end(self, ending: str) -> None:
+        """Set the last message."""
+        self.ending = ending
+        self._pending.set()
+
     async def next(self, source: FrameSource) -> str:
-        """Wait for the next message to send, and return it; responses precede live frames."""
+        """Wait for the next message to send, and return it: responses, live frames, the ending."""
         while self.request is None and self.frame is None:
+            if self.ending is not None:
+                return self.ending
             self._pending.clear()
             await self._pending.wait()
         if self.request is not None:
@@ -93,6 +102,11 @@ class Browsers:
         """Set the next frame of every browser."""
         for browser in self.connected:
             browser.offer(frame)
+
+    def end(self, ending: str) -> None:
+        """Set the last message of every browser."""
+        for browser in self.connected:
+            browser.end(ending)
 
 
 Health = Callable[[], tuple[bool, dict[str, Any]]]
@@ -167,9 +181,12 @@ async def _send(socket: WebSocket, browser: Browser, source: FrameSource, scene:
     # If the browser disconnects, the listener cancels this task.
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):
         await socket.send_text(scene)
-        while True:
+        message = ""
+        while message != browser.ending:
+            message = await browser.next(source)
             # This waits while the browser does not read; meanwhile frames are skipped, not queued.
-            await socket.send_text(await browser.next(source))
+            await socket.send_text(message)
+        await socket.close()
 
 
 async def _listen(socket: WebSocket, browser: Browser) -> None:

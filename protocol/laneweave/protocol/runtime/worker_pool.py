@@ -306,8 +306,9 @@ def _work(
     connection: Connection, warm_up: Callable[[], None] | None, job_to_stop: ctypes.c_int64
 ) -> None:
     """Run jobs until the parent closes its connection; main function of a worker process."""
-    # Ctrl-C reaches the whole process group, but the parent stops its workers itself.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # These signals reach the whole process group, but the parent stops its workers itself.
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.nice(NICENESS)
     parent = multiprocessing.parent_process()

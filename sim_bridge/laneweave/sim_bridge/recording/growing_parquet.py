@@ -51,9 +51,10 @@ class GrowingParquet:
         """Return the bytes of a row group that begins at `_end`, and metadata that list only it."""
         metadata: list[pq.FileMetaData] = []
         # The metadata contain positions in the file, so write to a copy with a hole up to `_end`.
-        with tempfile.NamedTemporaryFile() as copy:
+        # The copy has no name, so that a process that is killed leaves nothing behind.
+        with tempfile.TemporaryFile() as copy:
             copy.truncate(self._end + 2 * batch.nbytes + _MAX_OVERHEAD_BYTES)
-            with pa.memory_map(copy.name, "r+") as sink:
+            with pa.memory_map(f"/proc/self/fd/{copy.fileno()}", "r+") as sink:
                 with pq.ParquetWriter(
                     sink, self.schema, metadata_collector=metadata, **self._options
                 ) as writer:

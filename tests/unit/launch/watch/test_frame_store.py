@@ -83,6 +83,16 @@ def row(name: str, s_m: float, y_m: float, flags: int = 1) -> list[Any]:
     return [name, s_m, y_m, 15.0, 1, -1, [-3, 1], 0, flags, [-4, 1, -5, 1]]
 
 
+def test_the_ending_of_a_run_is_no_frame() -> None:
+    messages = [scene("live", 0, -1), frame(0), json.dumps({"end": "run ended"})]
+    found = in_node(
+        f"{BEGIN} const kinds = data.map((one) => store.take(one));"
+        "return [kinds, store.end, store.newest.n, store.last];",
+        messages,
+    )
+    assert found == [["scene", "frame", "end"], "run ended", 0, 0]
+
+
 def test_vehicles_are_interpolated_between_frames() -> None:
     one = json.loads(frame(1, 10.0, vehicles=[row("a", 100.0, 5.0), row("gone", 999.0, 5.0)]))
     two = json.loads(frame(2, 10.2, vehicles=[row("a", 103.0, 5.3), row("new", 0.0, 5.0)]))

@@ -251,6 +251,9 @@ def test_the_status_and_its_beginning() -> None:
     assert status(10.0) == ["live", 10.0]
     road.update(CONVOY.clock(START + 31, ended=True), 11.0)
     assert status(20.0) == ["ended", 20.0]
+    # The router ends with the run.
+    road.update(LinkDown(), 21.0)
+    assert status(22.0) == ["ended", 20.0]
 
 
 def test_frames_are_made_after_changes() -> None:

@@ -11,7 +11,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from attrs import define, field
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from laneweave.launch.watch.frames import MAX_REQUESTED, FrameBuffer, FrameSource, compact
+from laneweave.launch.watch.frames import MAX_REQUESTED, FrameBuffer, FrameSource, compact, ending
 from laneweave.launch.watch.process import open_socket
 from laneweave.launch.watch.recorded_run import Recording
 from laneweave.launch.watch.server import Browser, Browsers, make_app, request_of
@@ -61,10 +61,14 @@ class Site:
         await server.serve(sockets=[self._listener])
 
     def offer(self, frame: str) -> None:
-        """Offer a frame to all browsers, from another thread than the server's."""
+        """Offer a frame to all browsers."""
+        self.call(self.browsers.offer, frame)
+
+    def call(self, function: Callable[[str], None], text: str) -> None:
+        """Call a function in the server's thread."""
         wait_until(lambda: self._loop is not None, WAIT_S)
         assert self._loop is not None
-        self._loop.call_soon_threadsafe(self.browsers.offer, frame)
+        self._loop.call_soon_threadsafe(function, text)
 
     @property
     def host(self) -> str:
@@ -224,6 +228,20 @@ def test_the_number_of_browsers_is_limited(site: Site, monkeypatch: pytest.Monke
         receive(first)
         with pytest.raises(ConnectionClosed):
             receive(second)
+
+
+def test_the_ending_is_the_last_message(site: Site) -> None:
+    with site.browser() as one, site.browser() as other:
+        assert "scene" in receive(one)
+        assert "scene" in receive(other)
+        wait_until(lambda: len(site.browsers.connected) == 2, WAIT_S)
+        site.offer(compact({"n": 5}))
+        site.call(site.browsers.end, ending("run ended"))
+        for browser in (one, other):
+            assert receive(browser) == {"n": 5}
+            assert receive(browser) == {"end": "run ended"}
+            with pytest.raises(ConnectionClosed):
+                browser.recv(timeout=WAIT_S)
 
 
 def test_the_end_does_not_wait_for_browsers() -> None:

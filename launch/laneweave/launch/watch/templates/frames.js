@@ -13,6 +13,7 @@ const laneweaveFrames = (() => {
   class FrameStore {
     constructor() {
       this.scene = null;
+      this.end = null; // how the run of this page has ended
       this.clear();
     }
 
@@ -26,7 +27,7 @@ const laneweaveFrames = (() => {
       this.waiting = false; // for a response
     }
 
-    /** Process a message from the server; return "scene", "frame" or "reel". */
+    /** Process a message from the server; return "scene", "frame", "reel" or "end". */
     take(text) {
       const message = JSON.parse(text);
       if (message.scene) {
@@ -42,6 +43,10 @@ const laneweaveFrames = (() => {
         this.bounds(message);
         for (const frame of message.frames) this.keep(frame.n, JSON.stringify(frame));
         return "reel";
+      }
+      if (message.end) {
+        this.end = message.end;
+        return "end";
       }
       this.keep(message.n, text);
       this.before = this.newest;

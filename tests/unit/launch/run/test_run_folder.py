@@ -1,0 +1,92 @@
+"""Folders of new runs: claimed by one run, used again after an interrupted start."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from laneweave.launch.run.run_folder import EVENTS_FILE, LOG_FILE, new_folder
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.summary import write_summary
+from support.summaries import make_summary
+
+
+@pytest.fixture
+def claims() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
+
+
+def claim(claims: ExitStack, folder: Path) -> Path:
+    return claims.enter_context(new_folder(folder, Scenario(), "formation"))
+
+
+def refusal(folder: Path) -> str:
+    with pytest.raises(BadInputError) as refused, new_folder(folder, Scenario(), "formation"):
+        pass
+    assert refused.value.field == "--out"
+    return str(refused.value)
+
+
+def write_events(folder: Path, *kinds: str) -> None:
+    folder.mkdir(exist_ok=True)
+    lines = [json.dumps({"t_s": 1.0, "kind": kind}) for kind in kinds]
+    (folder / EVENTS_FILE).write_text("\n".join(lines) + '\n{"cut', encoding="utf-8")
+
+
+def test_a_folder_is_used_by_one_run_at_a_time(tmp_path: Path, claims: ExitStack) -> None:
+    folder = claim(claims, tmp_path / "new")
+    assert [path.name for path in folder.iterdir()] == [LOG_FILE]
+    assert "another run uses this one" in refusal(folder)
+    claims.close()
+    assert claim(claims, folder) == folder
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, BadInputError("a", "b", "c")])
+@pytest.mark.parametrize("existed", [False, True])
+def test_a_run_that_does_not_begin_leaves_the_folder_as_it_was(
+    tmp_path: Path, error: BaseException, *, existed: bool
+) -> None:
+    folder = tmp_path / "out"
+    if existed:
+        folder.mkdir()
+
+    def use() -> None:
+        with new_folder(folder, Scenario(), "formation"):
+            (folder / LOG_FILE).write_text("{}\n", encoding="utf-8")
+            raise error
+
+    with pytest.raises((KeyboardInterrupt, BadInputError)):
+        use()
+    assert folder.exists() is existed
+    assert not existed or list(folder.iterdir()) == []
+
+
+def test_what_an_interrupted_start_has_left_is_used_again(
+    tmp_path: Path, claims: ExitStack
+) -> None:
+    write_events(tmp_path, "leader", "demanded")
+    for name in (LOG_FILE, "trips.parquet", "trajectories.parquet", "ticks.parquet"):
+        (tmp_path / name).write_text("left", encoding="utf-8")
+    write_summary(tmp_path, make_summary(ending="interrupted"))
+    claim(claims, tmp_path)
+    assert [(path.name, path.stat().st_size) for path in tmp_path.iterdir()] == [(LOG_FILE, 0)]
+
+
+def test_results_and_files_of_others_are_never_removed(tmp_path: Path) -> None:
+    recorded, complete, foreign, broken = (tmp_path / name for name in "abcd")
+    write_events(recorded, "leader", "entered")
+    for folder in (complete, foreign, broken):
+        write_events(folder)
+    write_summary(complete, make_summary(ending="complete"))
+    (foreign / "notes.txt").touch()
+    (broken / "summary.json").touch()
+    for folder in (recorded, complete, foreign, broken):
+        before = sorted(folder.iterdir())
+        assert refusal(folder).endswith("a new or empty folder")
+        assert sorted(folder.iterdir()) == before
