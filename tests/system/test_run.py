@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from laneweave.protocol.summary import RunSummary
+from laneweave.protocol.wire.events import COMMON_FIELDS, FIELDS
 from laneweave.sim_bridge.recording.columns import TRAJECTORIES
 from support.harness import (
     DEMAND,
@@ -60,7 +61,9 @@ def test_a_run_leaves_all_its_files(finished_run: FinishedRun, name: str) -> Non
     assert not rows["lane"].equals(rows["reserved_lane"])
     assert set(rows["vehicle"].unique().to_pylist()) == set(vehicles)
     assert {event["vehicle"] for event in events(folder, "left")} == set(vehicles)
-    assert all({"t_s", "kind", "role"} <= event.keys() for event in events(folder))
+    for event in events(folder):
+        assert {"t_s", "kind", "role"} <= event.keys()
+        assert event.keys() <= {*COMMON_FIELDS, *FIELDS[event["kind"]]}
     assert len(plans(folder)) == found["planning"]["plans"]
     for picture in ("travel_time", "speed", "road"):
         assert (folder / f"{picture}.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
