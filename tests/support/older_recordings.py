@@ -13,7 +13,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from laneweave.sim_bridge.recording.columns import SCENARIO_KEY, SCHEMA_KEY
+from laneweave.sim_bridge.recording.columns import SCENARIO_KEY, SCHEMA_KEY, Metadata
 
 NEWER_FIELDS = ("entry", "close", "max_columns")
 """Fields of `formation` that earlier versions did not have."""
@@ -65,5 +65,6 @@ def first_schema(table: pa.Table) -> pa.Table:
     """Return trajectories as the first version of the schema had them."""
     chosen = table.select(list(FIRST_SCHEMA)).rename_columns(list(FIRST_SCHEMA.values()))
     fields = [field.remove_metadata() for field in chosen.schema]
-    metadata = {key: text for key, text in table.schema.metadata.items() if key != SCHEMA_KEY}
+    found = table.schema.metadata or {}
+    metadata: Metadata = {key: text for key, text in found.items() if key != SCHEMA_KEY}
     return pa.table(chosen.columns, schema=pa.schema(fields, metadata))

@@ -45,7 +45,7 @@ def results_table(runs: Iterable[Run]) -> pa.Table:
     Counts are integers, other numbers floats; missing numbers are null.
     """
     listed = list(runs)
-    arrays = {
+    arrays: dict[str, pa.Array[Any]] = {
         "label": pa.array([run.label for run in listed], pa.string()),
         "method": pa.array([run.method for run in listed], pa.string()),
         KEYS[1]: pa.array([run.volume_veh_per_lane_h for run in listed], pa.float64()),

@@ -142,7 +142,8 @@ def _from_first_schema(folder: Path, names: Sequence[str]) -> pa.Table:
         found["lateral_speed_mps"] = _lateral_speeds(table)
     if "preferred_lane" in names:
         preferred = {name: trip["preferred_lane"] for name, trip in read_trips(folder).items()}
-        found["preferred_lane"] = [preferred.get(name) for name in table["vehicle"].to_pylist()]
+        vehicles = map(str, table["vehicle"].to_pylist())
+        found["preferred_lane"] = [preferred.get(name) for name in vehicles]
     if "column" in names or "lane" in names:
         lattice: Lattice = scenario_of(folder / FILE).lattice
         t_s, s_m, y_m = (
@@ -151,11 +152,9 @@ def _from_first_schema(folder: Path, names: Sequence[str]) -> pa.Table:
         columns, found["lane"] = body_cells(t_s, s_m, y_m, lattice)
         no_lattice = np.asarray(table["column"].is_null())
         found["column"] = pa.array(columns, mask=no_lattice)
-    metadata = pq.read_schema(folder / FILE).metadata
-    schema = pa.schema(
-        [column.field for column in TRAJECTORIES.columns if column.name in names],
-        TRAJECTORIES.arrow_schema(metadata).metadata,
-    )
+    whole = TRAJECTORIES.arrow_schema(pq.read_schema(folder / FILE).metadata)
+    chosen = pa.schema([field for field in whole if field.name in names])
+    schema = chosen.with_metadata(whole.metadata or {})
     arrays = [
         found[field.name].cast(field.type)
         if isinstance(found[field.name], pa.ChunkedArray)
@@ -165,7 +164,7 @@ def _from_first_schema(folder: Path, names: Sequence[str]) -> pa.Table:
     return pa.table(arrays, schema=schema).select(list(names))
 
 
-def _lateral_speeds(table: pa.Table) -> pa.Array:
+def _lateral_speeds(table: pa.Table) -> pa.Array[Any]:
     """Return lateral speeds from differences of y; null for vehicles with a single row."""
     vehicle = table["vehicle"].combine_chunks().dictionary_encode().indices.to_numpy()
     t_s, y_m = (table[name].to_numpy().astype(np.float64) for name in ("t_s", "y_m"))

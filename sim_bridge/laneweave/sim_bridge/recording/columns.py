@@ -6,6 +6,7 @@ number in the metadata of the file (key `SCHEMA_KEY`). docs/RESULT_FILES.md is g
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import pyarrow as pa
@@ -52,7 +53,7 @@ class Table:
     """Name and number of the schema."""
     columns: tuple[Column, ...]
 
-    def arrow_schema(self, metadata: Metadata | None = None) -> pa.Schema:
+    def arrow_schema(self, metadata: Mapping[Any, bytes | str] | None = None) -> pa.Schema:
         """Return the schema; `metadata` are added to those of the file."""
         fields = [column.field for column in self.columns]
         return pa.schema(fields, {SCHEMA_KEY: self.schema, **(metadata or {})})

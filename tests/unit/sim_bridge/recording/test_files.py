@@ -77,9 +77,9 @@ def test_trajectories_come_back(
         for tick in range(40):
             samples: list[Sample] = []
             for n in range(tick % 5):
-                floats = tuple(map(float, rng.uniform(0, 10, 5)))
+                s_m, y_m, speed, across, accel = map(float, rng.uniform(0, 10, 5))
                 cell = (-n, n % 3) if n else (None, None)
-                samples.append((f"v{n}", *floats, *cell, 2 - n % 3))
+                samples.append((f"v{n}", s_m, y_m, speed, across, accel, *cell, 2 - n % 3))
             trajectories.tick(0.1 * tick, samples)
             expected += [(0.1 * tick, *sample) for sample in samples]
     file = pq.ParquetFile(tmp_path / "trajectories.parquet")
@@ -123,16 +123,17 @@ def test_files_describe_their_columns(declared: Table, tmp_path: Path) -> None:
     path = tmp_path / "file.parquet"
     GrowingParquet(path, declared.arrow_schema({"other": "kept"})).close()
     found = pq.read_schema(path)
-    assert found.metadata[SCHEMA_KEY].decode() == declared.schema
-    assert found.metadata[b"other"] == b"kept"
+    metadata = found.metadata or {}
+    assert metadata[SCHEMA_KEY].decode() == declared.schema
+    assert metadata[b"other"] == b"kept"
     for column, field in zip(declared.columns, found, strict=True):
         assert (field.name, field.type, field.nullable) == (
             column.name,
             column.type,
             column.nullable,
         )
-        assert field.metadata[b"meaning"].decode() == column.meaning
-        assert field.metadata.get(b"unit", b"").decode() == column.unit
+        assert (field.metadata or {})[b"meaning"].decode() == column.meaning
+        assert (field.metadata or {}).get(b"unit", b"").decode() == column.unit
         unit = {"s": "s", "ms": "ms", "m": "m", "mps": "m/s", "mps2": "m/s2"}
         assert column.unit == unit.get(column.name.rpartition("_")[2], "")
         assert ("position" in column.meaning) <= (column.frame == ROAD)
