@@ -32,11 +32,11 @@ from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
-from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.messages import Command, Name, Prepare, Report, Sense
 from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, REPORT, VEHICLE_ALIVE, Keys
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
+from laneweave.sim_bridge.bodies.bodies_world import BodiesWorld
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.core import BRIDGE, BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
@@ -66,38 +66,17 @@ TWO = (arrival(A, 0.5, lane=1), arrival(B, 0.6, lane=0))
 """A enters at 1 s, B at 2 s: when the first free cells pass that are in the structure."""
 
 
-class PlainWorld:
+class PlainWorld(BodiesWorld):
     """Shows every body where it was placed, and records all poses."""
 
     def __init__(self) -> None:
         """Begin with an empty road."""
+        super().__init__()
         self.shown: list[dict[str, Pose]] = []
         """After each tick."""
-        self.at: dict[str, State] = {}
-
-    def add(self, vehicle: str, state: State, vehicle_type: str = "car") -> None:
-        del vehicle_type
-        assert vehicle not in self.at
-        self.at[vehicle] = state
-
-    def place(self, vehicle: str, state: State) -> None:
-        assert vehicle in self.at
-        self.at[vehicle] = state
 
     def step(self) -> None:
         self.shown.append(self.positions())
-
-    def positions(self) -> dict[str, Pose]:
-        return {vehicle: pose_of(state) for vehicle, state in self.at.items()}
-
-    def collisions(self) -> list[tuple[str, str]]:
-        return []
-
-    def others(self) -> Sequence[OtherBody]:
-        return ()
-
-    def remove(self, vehicle: str) -> None:
-        del self.at[vehicle]
 
 
 def make_bridge(

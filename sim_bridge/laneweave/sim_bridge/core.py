@@ -57,7 +57,8 @@ from laneweave.protocol.wire.topics import (
     SENSE,
     VEHICLE_ALIVE,
 )
-from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.recording.record_interface import Record
+from laneweave.sim_bridge.recording.run_record import Ending
 from laneweave.sim_bridge.road.attendance import Attendance, notify_left
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.outside_traffic import OutsideTraffic
@@ -114,7 +115,7 @@ class BridgeCore:
         self,
         scenario: Scenario,
         world: World,
-        record: RunRecord,
+        record: Record,
         *,
         new_incarnation: Callable[[], int],
         pace: float | None,

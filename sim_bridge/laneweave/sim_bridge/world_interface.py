@@ -9,7 +9,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR, Name
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import ExactNeighbour, OtherBody, Pose
-from laneweave.sim_bridge.recording.run_record import RunRecord
+from laneweave.sim_bridge.recording.record_interface import Record
 from laneweave.sim_bridge.road.sized_bodies import bodies_of
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
@@ -46,7 +46,7 @@ def show_bodies(
     world: World,
     vehicles: Mapping[Name, RoadVehicle],
     scenario: Scenario,
-    record: RunRecord,
+    record: Record,
     t_s: float,
 ) -> None:
     """Display all bodies after a tick, record their poses and update all sensors.

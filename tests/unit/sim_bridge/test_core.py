@@ -98,7 +98,7 @@ def test_a_tick_ends_when_all_have_answered(desk: Desk) -> None:
     assert asked(effects) == [A, B]
     for sense in sent(effects, Sense):
         assert sense.tick == tick + 1
-        assert sense.state == desk.world.at[sense.vehicle]
+        assert sense.state == desk.world.states[sense.vehicle]
 
 
 def test_the_answers_are_played_from_this_tick_on(desk: Desk) -> None:
@@ -479,7 +479,7 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
         *(core.vehicles, core._attendance.departed, core._attendance._caretakers),
         *(core._answers._without_message, core._answers._silence_s),
         *(core._answers.silent, core._answers.awaited, core._answers.up),
-        *(core._at_entrance, core._unreported, desk.world.at),
+        *(core._at_entrance, core._unreported, desk.world.states),
     ):
         assert not left_over
 

@@ -33,7 +33,7 @@ def problems_of_plan(
     blocked_cells = frozenset(blocked)
     problems: list[str] = []
     for vehicle in vehicles:
-        problems += _problems_of_path(
+        problems += problems_of_path(
             road, plan.slot, vehicle, plan.paths[vehicle.vehicle], blocked_cells
         )
     missed = {
@@ -49,9 +49,10 @@ def problems_of_plan(
     return problems or list(_conflicts(road, plan))
 
 
-def _problems_of_path(
+def problems_of_path(
     road: StreamRoad, slot: int, vehicle: StreamVehicle, path: CellPath, blocked: frozenset[Cell]
 ) -> Iterator[str]:
+    """Yield the errors in a path from a slot on, without regard to other vehicles."""
     name = vehicle.vehicle
     if not path or path[0] != vehicle.cell:
         yield f"{name} starts at {path[:1]} instead of {vehicle.cell}"
@@ -105,7 +106,10 @@ def _problems_of_move(
 
 def _conflicts(road: StreamRoad, plan: StreamPlan) -> Iterator[str]:
     """Yield the conflicts of each move with the moves of nearby vehicles in the same slot."""
-    near = {step: _near(road.mode, road.model, step) for step in displacements(road.mode)}
+    near = {
+        step: conflicting_displacements(road.mode, road.model, step)
+        for step in displacements(road.mode)
+    }
     for s in range(max((len(path) for path in plan.paths.values()), default=1) - 1):
         moves: dict[Cell, tuple[Cell, str]] = {}
         moving: list[Cell] = []
@@ -127,7 +131,9 @@ def _conflicts(road: StreamRoad, plan: StreamPlan) -> Iterator[str]:
 
 
 @lru_cache(maxsize=256)
-def _near(mode: Mode, model: ConflictModel, step: Cell) -> dict[Cell, dict[Cell, str]]:
+def conflicting_displacements(
+    mode: Mode, model: ConflictModel, step: Cell
+) -> dict[Cell, dict[Cell, str]]:
     """Return the conflicting displacements and conflict kinds, by offset of the other vehicle."""
     columns, lanes = model.reach
     found: dict[Cell, dict[Cell, str]] = {}

@@ -1,0 +1,14 @@
+"""Multi-agent reinforcement learning on laneweave: a PettingZoo environment of vehicles.
+
+    from laneweave.env import parallel_env
+
+    env = parallel_env("scenarios/demo.toml")
+    observations, infos = env.reset(seed=1)
+
+See docs/ENVIRONMENT.md.
+"""
+
+from laneweave.env.rewards import Rewards
+from laneweave.env.vehicles_env import VehiclesEnv, parallel_env
+
+__all__ = ("Rewards", "VehiclesEnv", "parallel_env")

@@ -1,0 +1,106 @@
+"""One run of the real roles in virtual time, without SUMO and files, that advances on request."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+
+from laneweave.coordinator.core import CoordinatorCore
+from laneweave.env.record import EpisodeRecord
+from laneweave.launch.run.simulated_roles import SimulatedRoles
+from laneweave.protocol.runtime.node import Arrived, Effect, Event, Listen, Started
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.transports.simulated.network import SimulatedNetwork
+from laneweave.protocol.wire.messages import Census, Name
+from laneweave.protocol.wire.topics import CENSUS
+from laneweave.sim_bridge.bodies.bodies_world import BodiesWorld
+from laneweave.sim_bridge.core import BridgeCore, TickPhase
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+
+STALL_S = 600.0
+"""Virtual time after which an episode fails if the road clock does not advance."""
+
+
+class _AgentStarter:
+    """Core that starts the agents of announced vehicles, as the launcher does."""
+
+    wakeup_s = None
+
+    def __init__(self, start_agents: Callable[[Census], None]) -> None:
+        self._start_agents = start_agents
+
+    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
+        del now_s
+        if isinstance(event, Started):
+            yield Listen(CENSUS)
+        elif isinstance(event, Arrived):
+            self._start_agents(event.message)
+
+
+class Episode:
+    """A simulated run: coordinators, agents and the bridge, from the first tick to the last."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        make_coordinator: Callable[[Name, int, Scenario], CoordinatorCore],
+        stream: tuple[Arrival, ...] | None = None,
+    ) -> None:
+        """Start all roles; the road time is 0.
+
+        Args:
+            scenario: road, demand, vehicles; its seed determines everything that is drawn.
+            make_coordinator: returns the core of a coordinator of this name and incarnation.
+            stream: the arrivals, by time; None: drawn from the scenario's seed.
+        """
+        self.scenario = scenario
+        self.record = EpisodeRecord(scenario)
+        self.network = SimulatedNetwork(scenario.seed, skip_codec=True)
+        roles = SimulatedRoles(scenario, self.network, make_coordinator)
+        self._bridge = BridgeCore(
+            scenario,
+            BodiesWorld(),
+            self.record,
+            new_incarnation=roles.incarnations.__next__,
+            pace=1.0,
+            stream=stream,
+        )
+        self.network.add("starter", _AgentStarter(roles.start_agents), scenario.network.realm)
+        for name in roles.coordinators:
+            roles.start(name)
+        roles.add("bridge", self._bridge, "bridge")
+
+    @property
+    def vehicles(self) -> Mapping[Name, RoadVehicle]:
+        """The vehicles on the road, by name, in the order in which they entered."""
+        return self._bridge.vehicles
+
+    @property
+    def tick(self) -> int:
+        """Number of completed ticks."""
+        return self._bridge.tick
+
+    @property
+    def t_s(self) -> float:
+        """Road time."""
+        return self._bridge.t_s
+
+    @property
+    def ended(self) -> bool:
+        """Whether all demanded vehicles have left, or the scenario's time is over."""
+        return self._bridge.phase in (TickPhase.SHUTTING_DOWN, TickPhase.ENDED)
+
+    def advance(self, stop: Callable[[], bool]) -> None:
+        """Advance until `stop` returns True after a tick, or until the episode has ended.
+
+        Raises:
+            RuntimeError: the road clock has stopped.
+        """
+        network, bridge = self.network, self._bridge
+        while not self.ended:
+            tick, began_s = bridge.tick, network.now_s
+            network.run(began_s + STALL_S, lambda: bridge.tick != tick or self.ended)
+            if bridge.tick == tick and not self.ended:
+                raise RuntimeError(f"the road clock has stopped at {bridge.t_s:g} s")
+            if stop():
+                return
