@@ -240,9 +240,11 @@ def slow_ticks(answers: Answers, names: list[Name], count: int, *, late: bool) -
         answers.start_tick(names, now_s, link_up=True)
         for name in names:
             answers.on_message(name)
-            answers.in_time(name)
-            if late:
-                answers.late(name)
+            if not late:
+                answers.in_time(name)
+        answers.close()
+        for name in names:
+            answers.late(name)  # without effect if another answer has arrived in time
         now_s += 1.0
     answers.start_tick(names, now_s, link_up=True)
     return answers.deadline_s - now_s
