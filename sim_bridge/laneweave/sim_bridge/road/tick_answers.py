@@ -100,6 +100,8 @@ class Answers:
     """Weighted number of answers until the last tick."""
     _round_s: float | None = None
     """Time at which the last round of SENSE was sent; None: it is being sent."""
+    _first_round_s: float | None = None
+    """Time at which the first SENSE messages of the tick were sent; None: they are being sent."""
     _round_trip_s: float = math.inf
     """Shortest recent time from sending a tick to the first answer."""
 
@@ -144,11 +146,9 @@ class Answers:
         """
         first = not self._received
         self._received[name] += 1
-        if self._round_s is None:
-            return
-        if current and first:
-            self._round_trip_s = min(self._round_trip_s, now_s - self._round_s)
-        if self.lossy:
+        if self._first_round_s is not None and current and first:
+            self._round_trip_s = min(self._round_trip_s, now_s - self._first_round_s)
+        if self.lossy and self._round_s is not None:
             self.resend_s = max(self.resend_s, now_s + 0.5 * self._quiet_s)
 
     def late(self, name: Name) -> None:
@@ -200,7 +200,7 @@ class Answers:
         self._stretch = min(max(self._stretch, 1.0), MAX_STRETCH)
         self._late.clear()
         self._estimate_loss()
-        self._sent_s = now_s
+        self._sent_s, self._first_round_s = now_s, None
         self._begin_round(now_s, self.awaited)
         self.deadline_s = now_s + self._stretch * self._patience_s
 
@@ -222,6 +222,7 @@ class Answers:
             self._round_s, self.resend_s = None, now_s
         else:
             self._round_s = now_s
+            self._first_round_s = self._first_round_s or now_s
             self.resend_s = now_s + self._stretch * self.runtime.tick_resend_s
 
     @property
@@ -231,7 +232,8 @@ class Answers:
         Half of it after an answer, since those of other agents follow shortly.
         """
         longest_s = self.runtime.tick_resend_s
-        return self._stretch * min(longest_s, max(_FLOOR * longest_s, _ROUND_TRIPS * self._round_trip_s))
+        needed_s = max(_FLOOR * longest_s, _ROUND_TRIPS * self._round_trip_s)
+        return self._stretch * min(longest_s, needed_s)
 
     @property
     def _patience_s(self) -> float:
@@ -251,6 +253,7 @@ class Answers:
             return []
         if self._round_s is None:
             self._round_s, self.resend_s = now_s, now_s + self._quiet_s
+            self._first_round_s = self._first_round_s or now_s
             return []
         if self.lossy and now_s + self._quiet_s > self.deadline_s:
             self.deadline_s = now_s
