@@ -1,6 +1,6 @@
 """One episode of the PettingZoo environment, in which each vehicle moves towards its lane.
 
-    python examples/pettingzoo_env.py [SCENARIO.toml] [SEED]
+python examples/pettingzoo_env.py [SCENARIO.toml] [SEED]
 """
 
 import sys

@@ -35,9 +35,7 @@ SEEDS = 2**31
 """Seeds of episodes are below this number."""
 
 Infos = dict[str, dict[str, Any]]
-Stepped = tuple[
-    dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], Infos
-]
+Stepped = tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], Infos]
 
 
 def parallel_env(

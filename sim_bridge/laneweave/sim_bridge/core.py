@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
+from itertools import groupby
 from typing import ClassVar
 
 import structlog
@@ -235,8 +236,9 @@ class BridgeCore:
                 if parameters["vehicle"] in self.vehicles:
                     self._unreported.add(parameters["vehicle"])
             case Wakeup() if self.phase is TickPhase.ANSWERS:
-                for name in self._answers.due_resends(now_s):
-                    yield self._sense_of(self.vehicles[name])
+                for name, copies in groupby(self._answers.due_resends(now_s)):
+                    sense = self._sense_of(self.vehicles[name])  # encoded once
+                    yield from (sense for _ in copies)
             case Stopping():
                 # While the bridge waits for final reports, the run itself has ended.
                 shutting_down = self.phase is TickPhase.SHUTTING_DOWN
@@ -271,10 +273,13 @@ class BridgeCore:
         attendant = vehicle.controller.attendant
         self._bounds.check(command, self.t_s, now_s)
         self._bounds.check_claim(command.incarnation, attendant, now_s)
+        current = command.tick == self.tick and self.phase is TickPhase.ANSWERS
+        if command.incarnation >= attendant:
+            self._answers.received(name, now_s, current=current)
         had_caretaker = name in self._attendance
         if self._attendance.register_command(vehicle, command):
             effects.append(self._sense_of(vehicle))
-        if command.tick != self.tick or self.phase is not TickPhase.ANSWERS:
+        if not current:
             # A late answer was computed for a past state and would lead to a wrong position.
             if command.tick < self.tick and command.incarnation == attendant:
                 self._answers.late(name)

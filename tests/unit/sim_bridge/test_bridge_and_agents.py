@@ -10,7 +10,7 @@ from laneweave.coordinator.core import CoordinatorCore
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.sim_bridge.bodies.motion_controller import Rung
-from laneweave.sim_bridge.core import CATCH_UP_S, TickPhase
+from laneweave.sim_bridge.core import CATCH_UP_S, BridgeMetrics, TickPhase
 from support.bridge_bench import (
     A,
     B,
@@ -298,6 +298,40 @@ def test_a_bad_network_slows_a_run_down_and_nothing_else(tmp_path: Path) -> None
     street.run()
     check_complete(street, tmp_path)
     assert read_events(tmp_path, "agent-silent") == []
+
+
+def test_at_half_of_all_messages_lost_the_road_keeps_real_time_and_agents_stay_in_charge(
+    tmp_path: Path,
+) -> None:
+    """A quarter of the rounds between bridge and agent succeed; each agent still answers."""
+    street = Street(LONG_ROAD, tmp_path, MANY, Conditions(loss=0.5), pace=PACE)
+    for one in MANY:
+        street.start_agents(one.vehicle)
+    street.run_to(150)
+    began_s, tick, missed = street.network.now_s, street.bridge.tick, missed_ticks(street)
+    street.run_to(350)
+    ticks = street.bridge.tick - tick
+    assert street.network.now_s - began_s < ticks * TICK_S
+    assert missed_ticks(street) - missed < 0.03 * ticks * len(MANY)
+    assert read_events(tmp_path, "caretaker-took-over") == []
+
+
+@pytest.mark.parametrize("delay_s", [0.002, 0.02])
+def test_messages_that_are_not_lost_are_waited_for(tmp_path: Path, delay_s: float) -> None:
+    """A process that is late now and then, or a long way, is no reason to hurry."""
+    conditions = Conditions(delay_s=delay_s, jitter_s=0.07)
+    street = Street(LONG_ROAD, tmp_path, MANY, conditions, pace=PACE)
+    for one in MANY:
+        street.start_agents(one.vehicle)
+    street.run_to(250)
+    assert not street.bridge._answers.lossy
+    assert missed_ticks(street) == 0
+
+
+def missed_ticks(street: Street) -> int:
+    (metrics,) = street.bridge.metrics
+    assert isinstance(metrics, BridgeMetrics)
+    return metrics.missed_answers_total
 
 
 def test_the_clock_does_not_race_while_the_bridge_is_off_the_network(tmp_path: Path) -> None:

@@ -18,8 +18,10 @@ import pyarrow.parquet as pq
 from attrs import define, field
 from rich.table import Table
 
+from laneweave.launch.faults.specification import load_faults
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.local_run import LocalRun
+from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
@@ -81,11 +83,23 @@ class _Window:
                 self.memory.setdefault(_role(name), []).append((info.pss / 2**20, info.uss / 2**20))
 
 
-def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int) -> dict[str, Any]:
+def bench_runtime(
+    vehicles: int, *, seconds: float, per_process: int, seed: int, faults: str | None = None
+) -> dict[str, Any]:
     """Measure a run with about `vehicles` vehicles on the road, `per_process` in each process.
+
+    Args:
+        vehicles: mean number of vehicles on the road, which determines the volume.
+        seconds: measured road time [s].
+        per_process: agents in each process.
+        seed: seed of the arrivals.
+        faults: a fault file or a preset; None: no faults.
 
     Returns:
         Real-time factor, tick time, CPU and memory per role, over `seconds` of road time.
+
+    Raises:
+        BadInputError: the fault file or preset does not exist, or is invalid.
     """
     base = load_scenario(None)
     volume = vehicles / (base.free_flow_s * base.road.lanes) * 3600.0
@@ -99,7 +113,13 @@ def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int)
     )
     window = _Window(begin_s, begin_s + seconds)
     with temporary_folder("bench") as folder:
-        run = LocalRun(scenario, folder / "run", show_progress=False, watch=window.watch)
+        run = LocalRun(
+            scenario,
+            folder / "run",
+            load_faults(faults, coordinator_names(scenario)),
+            show_progress=False,
+            watch=window.watch,
+        )
         outcome = run.run()
         ticks = pq.read_table(folder / "run" / "ticks.parquet")
     times_s = ticks.column("t_s").to_numpy()
@@ -108,6 +128,7 @@ def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int)
         "vehicles_wanted": vehicles,
         "volume_veh_per_lane_h": round(volume, 1),
         "vehicles_per_process": per_process,
+        "faults": faults,
         "vehicles_on_road": round(float(ticks.column("on_road").to_numpy()[measured].mean()), 1),
         "real_time_factor": _real_time_factor(window),
         "tick_ms": percentiles_of(ticks.column("tick_ms").to_numpy()[measured], 50, 99),
@@ -128,7 +149,7 @@ def machine() -> dict[str, Any]:
 
 def runtime_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Return the results of `bench_runtime` as a table."""
-    table = Table("vehicles", "per process", "real-time factor", "tick p50 / p99 ms")
+    table = Table("vehicles", "per process", "faults", "real-time factor", "tick p50 / p99 ms")
     for role in ROLES:
         table.add_column(f"{role} CPU ms/tick")
     table.add_column("agents' memory MiB (each)")
@@ -137,6 +158,7 @@ def runtime_table(rows: Sequence[dict[str, Any]]) -> Table:
         table.add_row(
             f"{row['vehicles_on_road']:.0f}",
             str(row["vehicles_per_process"]),
+            row["faults"] or "none",
             f"{row['real_time_factor']:.2f}",
             f"{row['tick_ms']['p50']:.1f} / {row['tick_ms']['p99']:.1f}",
             *(f"{cpu.get(role, 0.0):.2f}" for role in ROLES),

@@ -35,6 +35,12 @@ def bench(
     seconds: Annotated[
         float, typer.Option("--seconds", min=5.0, max=3600.0, help="runtime: measured road time.")
     ] = 60.0,
+    faults: Annotated[
+        str | None,
+        typer.Option(
+            "--faults", metavar="FILE|PRESET", help="runtime: faults to inject: docs/FAULTS.md."
+        ),
+    ] = None,
     families: Annotated[
         str,
         typer.Option(
@@ -81,7 +87,7 @@ def bench(
     else:
         sizes = _parse_sizes(vehicles, "30,60,90")
         rows = [
-            bench_runtime(size, seconds=seconds, per_process=per_process, seed=seed)
+            bench_runtime(size, seconds=seconds, per_process=per_process, seed=seed, faults=faults)
             for size in sizes
         ]
         make_table = runtime_table

@@ -8,6 +8,11 @@ Answers after the deadline indicate a slow machine rather than lost messages. Ti
 time, and SENSE is repeated less often, so that the road slows down and agents keep up. When answers
 arrive in time again, the extra time slowly shrinks.
 
+An agent answers every SENSE, also a repeated one. If it answers fewer than it was sent, messages are
+lost, which waiting does not cure. While they are, SENSE is repeated as soon as no more answers
+arrive, two copies at a time, and a tick lasts little longer than the road needs in real time. An
+agent that answers no SENSE at all, because it hangs, is not evidence of loss.
+
 Times are on the node's clock. Each tick counts for at most its deadline; other waits of the road
 (pace, starting agents) do not count as silence.
 """
@@ -15,6 +20,7 @@ Times are on the node's clock. Each tick counts for at most its deadline; other 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable
 
 from attrs import define, field
@@ -30,6 +36,22 @@ _LATE_AGENTS = 0.05
 """Fraction of agents that may be late before the deadline is increased."""
 LATE_SHARE = 2.0
 """Multiple of `agent_silent_s` after which an agent that always answers late is replaced."""
+LOSSY_SHARE = 0.9
+"""Share of answered SENSE messages below which messages count as lost."""
+LOSSY_TICK = 0.6
+"""Deadline of a tick while messages are lost, as a multiple of `tick_s`."""
+LOSSY_ROUNDS = 6
+"""Minimum number of rounds of SENSE for which that deadline has time, on slow networks."""
+COPIES = 3
+"""Copies of a repeated SENSE while messages are lost."""
+_FLOOR = 0.1
+"""Minimum wait for further answers, as a multiple of `tick_resend_s`."""
+_ROUND_TRIPS = 1.5
+"""The same, as a multiple of the shortest round trip."""
+_MEMORY = 0.95
+"""Multiplier of the numbers of earlier SENSE messages and answers at each tick."""
+_FORGET = 1.1
+"""Multiplier of the round-trip time at each tick, to detect that it has increased."""
 _ROUNDING_S = 1e-6
 """Tolerance for comparing sums of deadlines with `agent_silent_s`."""
 
@@ -63,11 +85,35 @@ class Answers:
     _any_message: bool = False
     _all_silent_s: float = 0.0
     """Total duration of ticks since the last message from any agent."""
+    _missing: set[Name] = field(factory=set)
+    """Agents whose answers the last tick awaited in vain."""
+    _asked: Counter[Name] = field(factory=Counter)
+    """SENSE messages to each awaited agent since the current tick started."""
+    _received: Counter[Name] = field(factory=Counter)
+    """Answers to any tick from each agent since the current tick started."""
+    _asked_last: int = 0
+    """SENSE messages in the last tick to agents that answered any."""
+    _asked_before: float = 0.0
+    """Weighted number of such messages in the ticks before: their answers have arrived or are
+    lost."""
+    _received_before: float = 0.0
+    """Weighted number of answers until the last tick."""
+    _round_s: float | None = None
+    """Time at which the last round of SENSE was sent; None: it is being sent."""
+    _first_round_s: float | None = None
+    """Time at which the first SENSE messages of the tick were sent; None: they are being sent."""
+    _round_trip_s: float = math.inf
+    """Shortest recent time from sending a tick to the first answer."""
 
     @property
     def all_silent(self) -> bool:
         """Whether no agent has sent a message for `agent_silent_s`."""
         return self._too_long(self._all_silent_s)
+
+    @property
+    def lossy(self) -> bool:
+        """Whether messages are being lost: agents answer fewer SENSE messages than they are sent."""
+        return self._received_before < LOSSY_SHARE * self._asked_before
 
     def agent_up(self, name: Name) -> None:
         """Register an agent's token and reset its counters."""
@@ -90,9 +136,25 @@ class Answers:
         self._any_message = True
         self._all_silent_s = 0.0
 
+    def received(self, name: Name, now_s: float, *, current: bool) -> None:
+        """Register the arrival of an answer, which may be a duplicate.
+
+        Args:
+            name: the agent.
+            now_s: the node's clock.
+            current: whether it answers the current tick.
+        """
+        first = not self._received
+        self._received[name] += 1
+        if self._first_round_s is not None and current and first:
+            self._round_trip_s = min(self._round_trip_s, now_s - self._first_round_s)
+        if self.lossy and self._round_s is not None:
+            self.resend_s = max(self.resend_s, now_s + 0.5 * self._quiet_s)
+
     def late(self, name: Name) -> None:
-        """Register an answer to an earlier tick."""
-        self._late.add(name)
+        """Register an answer to an earlier tick, unless another one had arrived in time."""
+        if name in self._missing:
+            self._late.add(name)
 
     def in_time(self, name: Name) -> None:
         """Register an answer to the current tick."""
@@ -137,16 +199,69 @@ class Answers:
         self._stretch *= _STRETCH if slow else _RELAX
         self._stretch = min(max(self._stretch, 1.0), MAX_STRETCH)
         self._late.clear()
-        self._sent_s = now_s
-        self.resend_s = now_s + self._stretch * self.runtime.tick_resend_s
-        self.deadline_s = now_s + self._stretch * self.runtime.tick_deadline_s
+        self._estimate_loss()
+        self._sent_s, self._first_round_s = now_s, None
+        self._begin_round(now_s, self.awaited)
+        self.deadline_s = now_s + self._stretch * self._patience_s
+
+    def _estimate_loss(self) -> None:
+        """Compare the answers with the SENSE messages of one tick before: some arrive late."""
+        received = sum(count for name, count in self._received.items() if name in self._asked)
+        self._asked_before = _MEMORY * self._asked_before + self._asked_last
+        self._received_before = _MEMORY * self._received_before + received
+        self._asked_last = sum(self._asked[name] for name in self._received)
+        self._asked.clear()
+        self._received.clear()
+        self._round_trip_s *= _FORGET
+
+    def _begin_round(self, now_s: float, names: Iterable[Name]) -> None:
+        """Register that a SENSE is being sent to agents."""
+        self._asked.update(names)
+        if self.lossy:
+            # Sending takes time: the wait for answers begins with the next event.
+            self._round_s, self.resend_s = None, now_s
+        else:
+            self._round_s = now_s
+            self._first_round_s = self._first_round_s or now_s
+            self.resend_s = now_s + self._stretch * self.runtime.tick_resend_s
+
+    @property
+    def _quiet_s(self) -> float:
+        """Time without any answer after which SENSE is repeated while messages are lost.
+
+        Half of it after an answer, since those of other agents follow shortly.
+        """
+        longest_s = self.runtime.tick_resend_s
+        needed_s = max(_FLOOR * longest_s, _ROUND_TRIPS * self._round_trip_s)
+        return self._stretch * min(longest_s, needed_s)
+
+    @property
+    def _patience_s(self) -> float:
+        """Deadline of a tick, from its start."""
+        runtime = self.runtime
+        if not self.lossy:
+            return runtime.tick_deadline_s
+        rounds_s = LOSSY_ROUNDS * self._quiet_s / self._stretch
+        return min(runtime.tick_deadline_s, max(LOSSY_TICK * runtime.tick_s, rounds_s))
 
     def due_resends(self, now_s: float) -> list[Name]:
-        """Return the agents to which SENSE must be repeated now."""
+        """Return the agents to which SENSE must be repeated now, each as often as it must be sent.
+
+        While messages are lost, a tick without time for another round ends here.
+        """
         if now_s < self.resend_s:
             return []
-        self.resend_s = now_s + self._stretch * self.runtime.tick_resend_s
-        return sorted(self.awaited)
+        if self._round_s is None:
+            self._round_s, self.resend_s = now_s, now_s + self._quiet_s
+            self._first_round_s = self._first_round_s or now_s
+            return []
+        if self.lossy and now_s + self._quiet_s > self.deadline_s:
+            self.deadline_s = now_s
+            return []
+        copies = COPIES if self.lossy else 1
+        again = [name for name in sorted(self.awaited) for _ in range(copies)]
+        self._begin_round(now_s, again)
+        return again
 
     def complete(self, now_s: float) -> bool:
         """Return whether the tick may proceed."""
@@ -154,9 +269,9 @@ class Answers:
 
     def close(self) -> int:
         """Close the tick; return the number of missing answers."""
-        missed = len(self.awaited)
+        self._missing = set(self.awaited)
         self.awaited.clear()
-        return missed
+        return len(self._missing)
 
     def always_late(self, name: Name) -> bool:
         """Return whether all answers from an agent have been late for too long."""

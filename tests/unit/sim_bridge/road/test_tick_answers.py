@@ -7,7 +7,14 @@ from attrs import evolve
 
 from laneweave.protocol.scenario.fields import Runtime
 from laneweave.protocol.wire.messages import Name
-from laneweave.sim_bridge.road.tick_answers import LATE_SHARE, MAX_STRETCH, Answers
+from laneweave.sim_bridge.road.tick_answers import (
+    COPIES,
+    LATE_SHARE,
+    LOSSY_ROUNDS,
+    LOSSY_TICK,
+    MAX_STRETCH,
+    Answers,
+)
 
 RUNTIME = Runtime()
 DEADLINE_S, SILENT_S = RUNTIME.tick_deadline_s, RUNTIME.agent_silent_s
@@ -240,9 +247,11 @@ def slow_ticks(answers: Answers, names: list[Name], count: int, *, late: bool) -
         answers.start_tick(names, now_s, link_up=True)
         for name in names:
             answers.on_message(name)
-            answers.in_time(name)
-            if late:
-                answers.late(name)
+            if not late:
+                answers.in_time(name)
+        answers.close()
+        for name in names:
+            answers.late(name)  # without effect if another answer has arrived in time
         now_s += 1.0
     answers.start_tick(names, now_s, link_up=True)
     return answers.deadline_s - now_s
@@ -266,3 +275,144 @@ def test_ticks_get_more_time_while_many_answers_are_late_and_less_again() -> Non
     relaxed_s = slow_ticks(answers, names, 30, late=False)
     assert DEADLINE_S < relaxed_s < MAX_STRETCH * DEADLINE_S
     assert slow_ticks(answers, names, 200, late=False) == pytest.approx(DEADLINE_S)
+
+
+# --- messages are lost ------------------------------------------------------------------------
+
+FLEET = [Name(f"v{number:02d}") for number in range(20)]
+RESEND_S, TICK_S = RUNTIME.tick_resend_s, RUNTIME.tick_s
+
+
+def fleet() -> Answers:
+    answers = Answers(RUNTIME)
+    for name in FLEET:
+        answers.agent_up(name)
+    return answers
+
+
+def ask(answers: Answers, now_s: float, **answered: int) -> None:
+    """Begin a tick; agents answer a number of times, after 2 ms."""
+    answers.start_tick(FLEET, now_s, link_up=True)
+    answers.due_resends(now_s)
+    for name, times in answered.items():
+        for _ in range(times):
+            answers.received(Name(name), now_s + 0.002, current=True)
+        answers.on_message(Name(name))
+        answers.in_time(Name(name))
+
+
+def lose_half(answers: Answers, ticks: int, now_s: float = 0.0, answer_s: float = 0.002) -> float:
+    """Let ticks pass in which half of the agents answer the first SENSE, others the second one."""
+    for number in range(ticks):
+        answers.start_tick(FLEET, now_s, link_up=True)
+        answers.due_resends(now_s)
+        for name in FLEET[number % 2 :: 2]:
+            answers.received(name, now_s + answer_s, current=True)
+            answers.in_time(name)
+        now_s = max(now_s + answer_s, answers.resend_s)
+        assert len(answers.due_resends(now_s)) in {10, 10 * COPIES}
+        answers.due_resends(now_s)
+        for name in FLEET[(number + 1) % 2 :: 2]:
+            answers.received(name, now_s + answer_s, current=True)
+            answers.in_time(name)
+        answers.close()
+        now_s += answer_s
+    return now_s
+
+
+def test_unanswered_messages_are_lost() -> None:
+    answers = fleet()
+    assert not answers.lossy
+    now_s = lose_half(answers, 5)
+    answers.start_tick(FLEET, now_s, link_up=True)
+    assert answers.lossy
+    assert answers.deadline_s == pytest.approx(now_s + LOSSY_TICK * TICK_S)
+    for number in range(60):  # and until they are answered again
+        ask(answers, now_s + number, **dict.fromkeys(FLEET, 1))
+    assert not answers.lossy
+    answers.start_tick(FLEET, 99.0, link_up=True)
+    assert answers.deadline_s == pytest.approx(99.0 + DEADLINE_S)
+    assert answers.resend_s == pytest.approx(99.0 + RESEND_S)
+
+
+def test_answers_that_arrive_in_the_next_tick_are_not_lost() -> None:
+    answers = fleet()
+    now_s = 0.0
+    for number in range(50):
+        answers.start_tick(FLEET, now_s, link_up=True)
+        assert not answers.lossy
+        for name in FLEET if number else ():
+            for _ in range(2):  # to what was repeated
+                answers.received(name, now_s + 0.01, current=False)
+        for _ in range(2):
+            assert answers.due_resends(answers.resend_s) == FLEET
+        for name in FLEET:
+            answers.received(name, answers.resend_s, current=True)
+            answers.in_time(name)
+        now_s = answers.resend_s
+
+
+def test_an_agent_that_answers_nothing_hangs_and_is_waited_for() -> None:
+    answers = fleet()
+    for number in range(20):
+        now_s = float(number)
+        ask(answers, now_s, **dict.fromkeys(FLEET[1:], 1))
+        while not answers.complete(now_s):
+            now_s = min(answers.resend_s, answers.deadline_s)
+            answers.due_resends(now_s)
+        assert now_s == pytest.approx(number + DEADLINE_S)
+        assert answers.close() == 1
+    assert not answers.lossy
+
+
+def test_while_messages_are_lost_sense_is_repeated_when_no_more_answers_arrive() -> None:
+    answers = fleet()
+    now_s = lose_half(answers, 20)
+    answers.start_tick(FLEET, now_s, link_up=True)
+    assert answers.resend_s == now_s
+    sent_s = now_s + 0.004  # as long as it takes to send 20 messages
+    assert answers.due_resends(sent_s) == []
+    first_wait_s = answers.resend_s - sent_s
+    assert 0.002 < first_wait_s < RESEND_S / 5
+    for name in FLEET[:18]:
+        now_s = answers.resend_s - 0.001
+        answers.received(name, now_s, current=True)
+        answers.in_time(name)
+        assert now_s < answers.resend_s <= now_s + first_wait_s
+    wanted = [name for name in FLEET[18:] for _ in range(COPIES)]
+    assert answers.due_resends(answers.resend_s) == wanted
+
+
+def test_a_tick_without_time_for_another_round_ends_early() -> None:
+    answers = fleet()
+    began_s = now_s = lose_half(answers, 20)
+    answers.start_tick(FLEET, now_s, link_up=True)
+    rounds = 1
+    while not answers.complete(now_s):
+        now_s = max(now_s, answers.resend_s)
+        rounds += bool(answers.due_resends(now_s))
+    lasted_s = now_s - began_s
+    assert 0.8 * LOSSY_TICK * TICK_S < lasted_s <= LOSSY_TICK * TICK_S
+    assert rounds > LOSSY_ROUNDS
+    assert answers.close() == len(FLEET)
+
+
+def test_on_a_slow_network_there_is_time_for_some_rounds() -> None:
+    answers = fleet()
+    answer_s = 0.02
+    now_s = lose_half(answers, 20, answer_s=answer_s)
+    answers.start_tick(FLEET, now_s, link_up=True)
+    assert LOSSY_ROUNDS * answer_s < answers.deadline_s - now_s < DEADLINE_S
+    answers.due_resends(now_s)
+    assert answer_s < answers.resend_s - now_s <= RESEND_S
+
+
+def test_a_second_answer_to_a_tick_is_not_late() -> None:
+    answers = fleet()
+    for number in range(20):
+        ask(answers, float(number), **dict.fromkeys(FLEET, 2))
+        answers.close()
+        for name in FLEET:
+            answers.late(name)
+    answers.start_tick(FLEET, 99.0, link_up=True)
+    assert answers.deadline_s == pytest.approx(99.0 + DEADLINE_S)
