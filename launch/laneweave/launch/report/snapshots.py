@@ -18,6 +18,7 @@ from laneweave.launch.drawing.colours import (
     NEUTRAL,
     SHADE_STRENGTH,
     SPEED_SPAN_MPS,
+    text_colour,
     vehicle_colour,
     vehicle_legend,
 )
@@ -44,6 +45,10 @@ _ACROSS_SCALE, _LONG_ACROSS_SCALE = 1.8, 2.1
 the second one is for stretches longer than `_LONG_M`."""
 _LONG_M = 450.0
 _MAX_LEGEND_COLUMNS = 7
+_MIN_LANE_PT, _MAX_LANE_PT = 4.0, 6.5
+"""Sizes of the numbers of lanes on vehicles; smaller ones are not written."""
+_LANE_PLACE = 0.68
+"""Distance of the number from the front bumper, as a share of the length."""
 _HEADROOM_M = 4.5
 """Space above the road for formation numbers."""
 _MAX_STRETCH_M, _MAX_CLOSED_M, _BEYOND_M = 740.0, 120.0, 50.0
@@ -61,9 +66,9 @@ def road_snapshots(
 ) -> None:
     """Draw a stretch of road at given times, one strip below another.
 
-    Vehicles have the colour of their preferred lane; faster vehicles are lighter. Left lanes are on
-    top, and traffic moves to the right. The columns of formations are in alternating shades of
-    grey, with the formation numbers above the road. Closed parts of lanes are hatched.
+    Vehicles have colour and number of their preferred lane; faster vehicles are lighter. Left lanes
+    are on top, and traffic moves to the right. The columns of formations are in alternating shades
+    of grey, with the formation numbers above the road. Closed parts of lanes are hatched.
 
     Args:
         folder: folder of the run.
@@ -88,6 +93,7 @@ def road_snapshots(
     length_m = stretch_m[1] - stretch_m[0]
     across = _ACROSS_SCALE if length_m <= _LONG_M else _LONG_ACROSS_SCALE
     strip_in = across * (width_in - 0.9) * road_m / length_m
+    width_pt = 72.0 * (width_in - 0.9)
     with picture(width_in, 0.9 + len(times) * (strip_in + 0.06), out, dpi) as figure:
         strips = figure.subplots(len(times), 1, sharex=True, squeeze=False)[:, 0]
         for axes, t_s in zip(strips, times, strict=True):
@@ -103,6 +109,7 @@ def road_snapshots(
                         preferred = exits.get(trip.get("destination", ""), ANY_LANE)
                     own = scenario.types[trip.get("vehicle_type", CAR)]
                     _draw_vehicle(axes, pose, preferred, own)
+                    _write_lane(axes, pose, preferred, own, across * width_pt / length_m)
         strips[-1].tick_params(axis="x", bottom=True, labelbottom=True)
         strips[-1].set_xlabel("position on the road (m)")
         _draw_legend(figure, scenario)
@@ -254,6 +261,35 @@ def _draw_vehicle(
         Polygon(shape(-0.5, 0.5, 0.5), facecolor=colour, edgecolor=INK, linewidth=0.5, zorder=3)
     )
     axes.add_patch(Polygon(shape(0.12, 0.3, 0.36), facecolor="#ffffffb0", linewidth=0.0, zorder=4))
+
+
+def _write_lane(
+    axes: Axes,
+    pose: tuple[float, float, float, float],
+    preferred: int,
+    scenario: Scenario,
+    scale_pt_per_m: float,
+) -> None:
+    """Write the preferred lane on a vehicle if it is large enough.
+
+    Args:
+        axes: axes of the strip.
+        pose: (s m, y m, heading rad, speed m/s).
+        preferred: preferred lane, or `ANY_LANE`.
+        scenario: scenario of the vehicle's type.
+        scale_pt_per_m: scale across the road.
+    """
+    size_pt = min(_MAX_LANE_PT, 0.9 * scenario.vehicle.width_m * scale_pt_per_m)
+    if preferred == ANY_LANE or size_pt < _MIN_LANE_PT:
+        return
+    s_m, y_m, heading, speed_mps = pose
+    own = _shade(
+        vehicle_colour(scenario.road.lanes, preferred), speed_mps - scenario.formation.speed_mps
+    )
+    colour = text_colour("#" + "".join(f"{round(255 * part):02x}" for part in own))
+    at_m = s_m - _LANE_PLACE * scenario.vehicle.length_m * float(np.cos(heading))
+    style: dict[str, Any] = {"ha": "center", "va": "center_baseline", "clip_on": True, "zorder": 5}
+    axes.text(at_m, y_m, f"{preferred}", fontsize=size_pt, color=colour, **style)
 
 
 def _draw_legend(figure: Figure, scenario: Scenario) -> None:
