@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -278,25 +279,30 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
         bar = figure.colorbar(mesh, ax=panels, pad=0.012, extendfrac=0.04, **style)
         bar.set_ticks(ticks, labels=[f"{one:.4g}" for one in ticks])
         bar.minorticks_off()
-        bar.set_label(f"mean speed (m/s); white: v_F = {set_mps:g}")
+        bar.set_label(f"mean speed (m/s)\nwhite: $v_F$ = {set_mps:g} m/s")
 
 
 def speed_scale(maps: Iterable[MeanSpeeds], set_mps: float) -> tuple[FuncNorm, list[float]]:
-    """Return the scale of mean speeds around v_F, and the speeds to label on it."""
+    """Return the scale of mean speeds around v_F, and the speeds to label on it.
+
+    It ends at 1, 2 or 5 times a power of ten.
+    """
     from matplotlib.colors import FuncNorm  # noqa: PLC0415 - lazily
 
     off = np.concatenate([np.abs(one.speed_mps.compressed() - set_mps) for one in maps])
     limit_mps = max(MIN_LIMIT_MPS, float(np.percentile(off, LIMIT_PERCENT)) if len(off) else 0.0)
+    power = 10.0 ** math.floor(math.log10(limit_mps))
+    limit_mps = power * next(step for step in (1.0, 2.0, 5.0, 10.0) if limit_mps <= step * power)
 
     def forward(speed_mps: Floats) -> Floats:
-        share = (np.asarray(speed_mps) - set_mps) / limit_mps
+        # Masked bins become NaN, which the scale masks again.
+        share = (np.ma.filled(speed_mps, np.nan) - set_mps) / limit_mps
         return np.asarray(np.sign(share) * np.sqrt(np.abs(share)))
 
     def inverse(place: Floats) -> Floats:
-        place = np.asarray(place)
-        return np.asarray(set_mps + limit_mps * np.sign(place) * place**2)
+        return np.asarray(set_mps + limit_mps * np.sign(place) * np.square(place))
 
-    norm = FuncNorm((forward, inverse), set_mps - limit_mps, set_mps + limit_mps, clip=False)
+    norm = FuncNorm((forward, inverse), set_mps - limit_mps, set_mps + limit_mps)
     shares = (-1.0, -0.5, -0.1, 0.0, 0.1, 0.5, 1.0)
     return norm, [set_mps + share * limit_mps for share in shares]
 

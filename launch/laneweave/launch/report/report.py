@@ -40,9 +40,9 @@ FLOW_CAPTION = (
 )
 SPEED_CAPTION = (
     "Mean speed in bins of 20 m and 5 s, in the first run with trajectories of each method and "
-    "volume. White: v_F; red: slower; blue: faster; grey: no vehicle. One scale for all panels: the "
-    "square root of the difference from v_F, up to its 98th percentile over all bins (at least "
-    "0.5 m/s). Dashed: start of lane sorting."
+    "volume. White: v_F; red: slower; blue: faster; grey: no vehicle. Scale of all panels: square "
+    "root of the difference from v_F, up to its 98th percentile over all bins, rounded up. Dashed: "
+    "start of lane sorting."
 )
 SPEED_CLOSED_CAPTION = " Hatched, between dotted lines: positions at which a lane is closed."
 SPACING_CAPTION = (

@@ -47,8 +47,6 @@ _LONG_M = 450.0
 _MAX_LEGEND_COLUMNS = 7
 _MIN_LANE_PT, _MAX_LANE_PT = 4.0, 6.5
 """Sizes of the numbers of lanes on vehicles; smaller ones are not written."""
-_LANE_PLACE = 0.68
-"""Distance of the number from the front bumper, as a share of the length."""
 _HEADROOM_M = 4.5
 """Space above the road for formation numbers."""
 _MAX_STRETCH_M, _MAX_CLOSED_M, _BEYOND_M = 740.0, 120.0, 50.0
@@ -108,8 +106,7 @@ def road_snapshots(
                     if preferred == ANY_LANE:
                         preferred = exits.get(trip.get("destination", ""), ANY_LANE)
                     own = scenario.types[trip.get("vehicle_type", CAR)]
-                    _draw_vehicle(axes, pose, preferred, own)
-                    _write_lane(axes, pose, preferred, own, across * width_pt / length_m)
+                    _draw_vehicle(axes, pose, preferred, own, across * width_pt / length_m)
         strips[-1].tick_params(axis="x", bottom=True, labelbottom=True)
         strips[-1].set_xlabel("position on the road (m)")
         _draw_legend(figure, scenario)
@@ -240,9 +237,23 @@ def _draw_formations(
 
 
 def _draw_vehicle(
-    axes: Axes, pose: tuple[float, float, float, float], preferred: int, scenario: Scenario
+    axes: Axes,
+    pose: tuple[float, float, float, float],
+    preferred: int,
+    scenario: Scenario,
+    scale_pt_per_m: float,
 ) -> None:
-    """Draw the body of a vehicle, of the type that a scenario describes, with a pale windscreen."""
+    """Draw the body of a vehicle with the number of its preferred lane.
+
+    A small vehicle, or one without a preferred lane, has a pale windscreen instead.
+
+    Args:
+        axes: axes of the strip.
+        pose: (s m, y m, heading rad, speed m/s).
+        preferred: preferred lane, or `ANY_LANE`.
+        scenario: scenario of the vehicle's type.
+        scale_pt_per_m: scale across the road.
+    """
     from matplotlib.patches import Polygon  # noqa: PLC0415 - lazily
 
     s_m, y_m, heading, speed_mps = pose
@@ -260,36 +271,16 @@ def _draw_vehicle(
     axes.add_patch(
         Polygon(shape(-0.5, 0.5, 0.5), facecolor=colour, edgecolor=INK, linewidth=0.5, zorder=3)
     )
-    axes.add_patch(Polygon(shape(0.12, 0.3, 0.36), facecolor="#ffffffb0", linewidth=0.0, zorder=4))
-
-
-def _write_lane(
-    axes: Axes,
-    pose: tuple[float, float, float, float],
-    preferred: int,
-    scenario: Scenario,
-    scale_pt_per_m: float,
-) -> None:
-    """Write the preferred lane on a vehicle if it is large enough.
-
-    Args:
-        axes: axes of the strip.
-        pose: (s m, y m, heading rad, speed m/s).
-        preferred: preferred lane, or `ANY_LANE`.
-        scenario: scenario of the vehicle's type.
-        scale_pt_per_m: scale across the road.
-    """
-    size_pt = min(_MAX_LANE_PT, 0.9 * scenario.vehicle.width_m * scale_pt_per_m)
+    size_pt = min(_MAX_LANE_PT, 0.95 * width_m * scale_pt_per_m)
     if preferred == ANY_LANE or size_pt < _MIN_LANE_PT:
+        glass: dict[str, Any] = {"facecolor": "#ffffffb0", "linewidth": 0.0}
+        axes.add_patch(Polygon(shape(0.12, 0.3, 0.36), zorder=4, **glass))
         return
-    s_m, y_m, heading, speed_mps = pose
-    own = _shade(
-        vehicle_colour(scenario.road.lanes, preferred), speed_mps - scenario.formation.speed_mps
-    )
-    colour = text_colour("#" + "".join(f"{round(255 * part):02x}" for part in own))
-    at_m = s_m - _LANE_PLACE * scenario.vehicle.length_m * float(np.cos(heading))
+    shown = text_colour("#" + "".join(f"{round(255 * part):02x}" for part in colour))
     style: dict[str, Any] = {"ha": "center", "va": "center_baseline", "clip_on": True, "zorder": 5}
-    axes.text(at_m, y_m, f"{preferred}", fontsize=size_pt, color=colour, **style)
+    axes.text(
+        centre[0], centre[1], f"{preferred}", fontsize=size_pt, color=shown, weight="bold", **style
+    )
 
 
 def _draw_legend(figure: Figure, scenario: Scenario) -> None:

@@ -241,20 +241,18 @@ const laneweaveRoad = (() => {
       else pen.fill();
       pen.stroke();
       pen.setLineDash([]);
-      if (!body.faint) {
+      const numbered = body.lane >= 0 && length * scale >= NUMBERED_PX;
+      if (numbered && !body.faint) {
+        const high = Math.round(Math.max(9, Math.min(15, 0.95 * width * scale * ACROSS)));
+        pen.fillStyle = textColour(this.colour(body.lane, body.v));
+        pen.font = `600 ${high}px system-ui, sans-serif`;
+        pen.textAlign = "center";
+        pen.textBaseline = "middle";
+        pen.fillText(body.lane, this.x(centreS), this.y(centreY) + 0.5);
+      } else if (!body.faint) {
         pen.fillStyle = theme.glass;
         path(0.12, 0.3, 0.36);
         pen.fill();
-        if (body.lane >= 0 && length * scale >= NUMBERED_PX) {
-          // Between the rear and the windscreen.
-          const back = 0.19 * length;
-          const high = Math.round(Math.max(8, Math.min(13, 0.85 * width * scale * ACROSS)));
-          pen.fillStyle = textColour(this.colour(body.lane, body.v));
-          pen.font = `600 ${high}px system-ui, sans-serif`;
-          pen.textAlign = "center";
-          pen.textBaseline = "middle";
-          pen.fillText(body.lane, this.x(centreS - back * along), this.y(centreY - back * across) + 0.5);
-        }
       }
       if (scale > NAMED_FROM) {
         pen.fillStyle = theme.ink;
