@@ -128,7 +128,7 @@ const laneweaveLayers = (() => {
     const odd = laneweaveFrames.UNATTENDED | laneweaveFrames.OVERDUE;
     return (painter) => {
       const { pen, scene } = painter;
-      pen.strokeStyle = "#e08b27";
+      pen.strokeStyle = "#cc79a7";
       pen.lineWidth = 2;
       for (const body of bodies) {
         const [length] = laneweaveRoad.sizeOf(scene, body);

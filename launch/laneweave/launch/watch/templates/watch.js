@@ -270,14 +270,15 @@ class Watch {
 
   strips(scene, { t, bodies }) {
     const length = scene.road.length_m;
-    if (!this.follow || t === null) return laneweaveRoad.wholeRoad(length);
+    const whole = laneweaveRoad.wholeRoad(length, part("road").clientWidth);
+    if (!this.follow || t === null) return whole;
     if (this.follow.vehicle) {
       const body = bodies.find((one) => one.name === this.follow.vehicle);
       this.centre = body ? body.s : (this.centre ?? length);
     } else {
       const found = this.current.formations.find(([number]) => number === this.follow.formation);
       if (found) this.columns = found.slice(1);
-      if (!this.columns) return laneweaveRoad.wholeRoad(length);
+      if (!this.columns) return whole;
       const [rear, front] = laneweaveRoad.columnsAt(scene, ...this.columns, t);
       this.centre = (rear + front) / 2;
     }
@@ -414,7 +415,7 @@ class Watch {
   }
 
   showLegend() {
-    const { legend, road, lattice, rolling } = this.store.scene;
+    const { legend, road, lattice, preferences, rolling } = this.store.scene;
     const entry = (style, words) => {
       const span = document.createElement("span");
       if (style) {
@@ -428,6 +429,7 @@ class Watch {
     };
     const own = legend.map(([colour, words]) => entry({ kind: "car", colour }, words));
     const rest = [
+      ...(preferences ? [entry(null, "number: preferred lane, 0 is the rightmost")] : []),
       entry(null, `darker: slower than ${lattice.speed_mps} m/s; lighter: faster`),
       entry({ kind: "cell" }, this.live && rolling ? "cells that a vehicle owns; framed: its hold cell" : "hold cell of a vehicle"),
       entry({ kind: "target" }, "target of a vehicle"),
