@@ -27,11 +27,11 @@ from laneweave.launch.run.logs import last_error
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
 from laneweave.launch.run.role_processes import BRIDGE, RoleExit, RoleProcesses, RoleStart
-from laneweave.launch.run.roles import fork_server
+from laneweave.launch.run.roles import BAD_INPUT, fork_server
 from laneweave.launch.run.run_folder import LOG_FILE, ROUTER_READY_FILE
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import to_tables
-from laneweave.protocol.errors import BadInputError, CommandFailedError
+from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.runtime.message_faults import SENDER_OF_ROLE
 from laneweave.protocol.runtime.processes import stop_signals
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
@@ -120,6 +120,7 @@ class LocalRun:
 
         Raises:
             BadInputError: the run is not possible in this environment.
+            RefusedError: its router cannot listen.
             KeyboardInterrupt: a signal has stopped the run before the bridge began.
         """
         check_temporary_folder()
@@ -222,19 +223,18 @@ class LocalRun:
         """Wait until this run's router listens; another one may be at the same endpoint.
 
         Raises:
-            BadInputError: the router cannot listen.
+            RefusedError: the router cannot listen.
             CommandFailedError: the router has not started in time.
         """
-        network = self.scenario.network
         deadline_s = time.monotonic() + ROUTER_START_S
         while not (Path(self._options["temporary"]) / ROUTER_READY_FILE).exists():
             if self._stop:
                 raise KeyboardInterrupt
-            if not self._processes.is_alive(ROUTER):
-                name = "network.listen" if network.listen else "network.endpoint"
-                reason = last_error(self.folder / LOG_FILE, ROUTER) or "its process has ended"
-                allowed = f"where the router of this run can listen ({reason})"
-                raise BadInputError(name, ", ".join(network.listens_at), allowed)
+            for end in self._processes.ended():
+                if end.name == ROUTER:
+                    reason = last_error(self.folder / LOG_FILE, ROUTER)
+                    error = RefusedError if end.status == BAD_INPUT else CommandFailedError
+                    raise error(reason or f"the router ended with status {end.status}")
             if time.monotonic() > deadline_s:
                 raise CommandFailedError(f"the router did not start within {ROUTER_START_S:g} s")
             time.sleep(0.02)

@@ -47,6 +47,8 @@ LAUNCHER = "LANEWEAVE_LAUNCHER"
 """Environment variable of the fork server with the process ID of its launcher."""
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that limit the threads of linear algebra libraries."""
+BAD_INPUT = 2
+"""Exit status of a role that cannot start."""
 AGENT_NICENESS = 5
 RECONNECT_S = 0.1
 """Time between attempts to connect in runs with faults."""
@@ -171,7 +173,7 @@ def _run_until_connected(
             time.sleep(RECONNECT_S)
     except BadInputError as error:
         log.error("cannot start", reason=str(error))  # noqa: TRY400 (the message is complete)
-        sys.exit(2)
+        sys.exit(BAD_INPUT)
     except Exception:
         log.exception("role failed")
         sys.exit(1)
@@ -233,6 +235,7 @@ def _router(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     run_router(
         (*network.listens_at, *options.get("listen", ())),
         network.lease_s,
+        field="network.listen" if network.listen else "network.endpoint",
         ready=(Path(options["temporary"]) / ROUTER_READY_FILE).touch,
         guard=guard_of(scenario),
     )
