@@ -38,6 +38,7 @@ from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.deployment_fields import Network
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
+from laneweave.protocol.security.certificates import check_credentials
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.topics import Keys
@@ -297,7 +298,7 @@ def check_network(scenario: Scenario) -> None:
     """Check that the processes of a run can use the network of a scenario.
 
     Raises:
-        BadInputError: they cannot.
+        BadInputError: they cannot; for example, a certificate is missing.
     """
     network, security, runtime = scenario.network, scenario.security, scenario.runtime
     if security.mode == "off":
@@ -309,6 +310,12 @@ def check_network(scenario: Scenario) -> None:
         allowed = "1, as security.mode is mtls: every agent has the certificate of its vehicle"
         value = runtime.vehicles_per_process
         raise BadInputError("runtime.vehicles_per_process", value, allowed)
+    roles = ("bridge", OBSERVER, *(f"coordinator.{name}" for name in coordinator_names(scenario)))
+    vehicles = (f"vehicle.{arrival.vehicle}" for arrival in demanded(scenario))
+    for identity in (*roles, *vehicles):
+        credentials = access_of(scenario, identity).credentials
+        assert credentials is not None  # noqa: S101 (the network is secured)
+        check_credentials(credentials, identity)
 
 
 def network_in(temporary: Path, network: Network) -> Network:
