@@ -31,8 +31,8 @@ from attrs import define, evolve, field
 from laneweave.launch.run.roles import end_role, fork_server, start_role
 from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.runtime.transport import Delivery, Received, TokenUp
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
+from laneweave.protocol.runtime.transport import Delivery, Received, TokenUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport

@@ -182,7 +182,8 @@ def test_what_killed_runs_left_is_removed_at_the_next_start(lab: Lab, road: Path
         process.kill()
         process.wait()
     lab.wait_until(lambda: len(lab.processes()) == 1, END_S)
-    assert len(list(lab.sockets.iterdir())) == 4
+    left = set(lab.sockets.iterdir()) - {own, of_live_run}
+    assert len(left) >= len(processes)
 
     short = ("--duration", "1", *SIMULATED)
     assert lab.finish(lab.start("run", road, *DEMAND, *short, "--out", "next")).status == 0

@@ -301,9 +301,9 @@ def _run_formations(
         def warn(line: str) -> None:
             typer.echo(line, err=True)
 
-        run = LocalRun(
-            settings, folder, specification, show, pace, announce=announce, warn=warn, page=page
-        )
+        run = LocalRun(settings, folder, specification, show, pace, announce=announce, warn=warn)
+        if page is not None:
+            run.start_page = page.start
         return run.run()
 
 

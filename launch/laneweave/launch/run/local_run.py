@@ -11,8 +11,9 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import attrs
 from attrs import define, field
@@ -43,10 +44,6 @@ from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.topics import Keys
 from laneweave.sim_bridge.road_sources import demanded
-
-if TYPE_CHECKING:
-    # Needs the extra `watch`.
-    from laneweave.launch.run.live_page import LivePage
 
 OBSERVER = "observer.watch"
 """Identity of the launcher in a secured network."""
@@ -95,8 +92,8 @@ class LocalRun:
     """Called with the endpoint of the router once it listens."""
     warn: Callable[[str], None] = lambda _: None
     """Called with a line if the run is slower than real time."""
-    page: LivePage | None = None
-    """The live page of this run."""
+    start_page: Callable[[ForkServerContext, dict[str, Any], dict[str, Any]], None] | None = None
+    """Starts the live page of this run once the router listens; see `LivePage.start`."""
     _processes: RoleProcesses = field(init=False)
     _options: dict[str, Any] = field(init=False)
     """Options that every role receives."""
@@ -186,8 +183,8 @@ class LocalRun:
         with contextlib.closing(self._connect(observer)) as transport:
             observer.subscribe(transport)
             self.announce(self.scenario.network.endpoint)
-            if self.page is not None:
-                self.page.start(processes.context, to_tables(self.scenario), self._options)
+            if self.start_page is not None:
+                self.start_page(processes.context, to_tables(self.scenario), self._options)
             for name in processes.coordinators:
                 processes.start("coordinator", name)
             # Start road time only once a coordinator can plan.

@@ -6,6 +6,7 @@ cheaper than starting an interpreter.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import gc
@@ -17,6 +18,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from functools import cache
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
@@ -37,7 +39,7 @@ from laneweave.protocol.runtime.processes import (
     die_with_parent,
     raise_interrupts,
 )
-from laneweave.protocol.runtime.temporary_folders import hold_folder
+from laneweave.protocol.runtime.temporary_folders import hold_folder, temporary_folder
 from laneweave.protocol.security.access_control import access_of, guard_of
 
 log = structlog.get_logger(__name__)
@@ -78,6 +80,7 @@ def fork_server() -> ForkServerContext:
     Raises:
         CommandFailedError: the server has exited.
     """
+    _make_socket_folder()
     for name in THREAD_LIMITS:
         os.environ.setdefault(name, "1")
     context = multiprocessing.get_context("forkserver")
@@ -100,6 +103,18 @@ def fork_server() -> ForkServerContext:
     _start(first)
     first.join()
     return context
+
+
+@cache
+def _make_socket_folder() -> None:
+    """Let multiprocessing use a temporary folder that does not outlive this process.
+
+    Its own remains if the process is killed.
+    """
+    closing = contextlib.ExitStack()
+    atexit.register(closing.close)
+    folder = closing.enter_context(temporary_folder())
+    multiprocessing.current_process()._config.setdefault("tempdir", str(folder))  # type: ignore[attr-defined]  # noqa: SLF001
 
 
 def start_role(
