@@ -83,6 +83,7 @@ def test_a_signal_ends_a_run(
     assert summary(lab.folder / "out")["runtime"]["processes"] is not None
 
 
+@pytest.mark.timeout(2400)
 @pytest.mark.parametrize("tries", [3, pytest.param(20, marks=pytest.mark.full)])
 @pytest.mark.parametrize("options", [OVER_ZENOH, SIMULATED], ids=["zenoh", "simulated"])
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])

@@ -340,7 +340,7 @@ def fault_injection(
     seed = faults.seed_of_run(scenario.seed)
     network, reason = open_network(faults, processes.context, seed)
     endpoint = scenario.network.endpoint
-    if network is not None and not endpoint.startswith("unixsock-stream/"):
+    if network is not None and endpoint and not endpoint.startswith("unixsock-stream/"):
         network.close()
         allowed = "none, or unixsock-stream/PATH: the faults use network namespaces"
         raise BadInputError("network.endpoint", endpoint, allowed)
