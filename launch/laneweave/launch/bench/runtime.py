@@ -100,7 +100,7 @@ def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int)
     window = _Window(begin_s, begin_s + seconds)
     with temporary_folder("bench") as folder:
         run = LocalRun(scenario, folder / "run", show_progress=False, watch=window.watch)
-        outcome = run.run()
+        outcome = run.run().or_interrupt()
         ticks = pq.read_table(folder / "run" / "ticks.parquet")
     times_s = ticks.column("t_s").to_numpy()
     measured = (times_s > window.begin_s) & (times_s <= window.end_s)

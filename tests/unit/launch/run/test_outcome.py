@@ -109,6 +109,8 @@ def test_an_interrupted_run_has_not_failed(
     outcome = judge(tmp_path, summary(left=3, ending="interrupted"), interrupted=True)
     assert (outcome.exit_status, outcome.problems) == (1, ())
     assert outcome.ending == "run interrupted: 3 of 5 left"
+    with pytest.raises(KeyboardInterrupt):
+        outcome.or_interrupt()
     assert "FAILED" not in printed(outcome)
     said = f"interrupted at 100.0 s of road time; the data so far: {tmp_path}\n"
     assert capsys.readouterr().err == said
