@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from laneweave.launch.run.outcome import Outcome
 
 
-RECORDED_ONLY = "it does not run in real time; `laneweave watch DIR` shows its recording"
+RECORDED_ONLY = "it runs faster than real time; `laneweave watch DIR` shows its recording"
 COMPARED_ROUTES = 4
 """Number of pairs of entrance and destination whose trips are printed."""
 
@@ -148,7 +148,7 @@ def run(
         raise BadInputError("--compare", "given", "none without a SUMO simulation (--sumocfg)")
     check_pace(pace)
     show = shows_progress(no_progress)
-    live = {"watch": watch or None, "watch_listen": watch_listen}
+    live = {"watch": "given" if watch else None, "watch_listen": watch_listen}
     if method is Method.formation:
         if settings.formation.rolling:
             reject_unused_options("with the rolling operation", solver=solver)
