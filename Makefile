@@ -31,9 +31,10 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/laneweave compile
 	touch $@
 
-demo: $(STAMP) ## run lane sorting on the paper's road, one process per vehicle
+demo: $(STAMP) ## run lane sorting on the paper's road, one process per vehicle (WATCH=1: with a live page)
 	rm -rf $(RUN)
-	$(BIN)/laneweave run scenarios/demo.toml --out $(RUN)
+	$(if $(WATCH),,@echo 'To watch the road in a browser: make demo WATCH=1')
+	$(BIN)/laneweave run scenarios/demo.toml --out $(RUN) $(if $(WATCH),--watch)
 
 check: $(STAMP) ## check format, lint, types and import contracts
 	$(BIN)/ruff format --check .

@@ -134,7 +134,9 @@ class VirtualRun:
     def run(self, folder: Path) -> dict[str, Any]:
         """Drive the scenario and return the figures."""
         began_s = time.process_time()
-        SimulatedRun(self.scenario, folder, show_progress=False, watch=self._watch).run()
+        SimulatedRun(
+            self.scenario, folder, show_progress=False, watch=self._watch
+        ).run().or_interrupt()
         clock = self.clock
         assert clock is not None  # noqa: S101 (the run has had ticks)
         return {

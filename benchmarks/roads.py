@@ -210,9 +210,11 @@ def drive(job: Job) -> dict[str, Any]:
             problems: Sequence[str] = _run_processes(job, folder)
         elif method == FORMATION:
             faults = _faults(job.point.faults, scenario)
-            problems = SimulatedRun(scenario, folder, faults, show_progress=False).run().problems
+            run = SimulatedRun(scenario, folder, faults, show_progress=False)
+            problems = run.run().or_interrupt().problems
         else:
-            problems = ReferenceRun(scenario, folder, method, show_progress=False).run().problems
+            reference = ReferenceRun(scenario, folder, method, show_progress=False)
+            problems = reference.run().or_interrupt().problems
         cpu_s = time.process_time() - began_s
         return metrics(folder, scenario, method) | {
             "point": job.point.name,

@@ -18,7 +18,6 @@ import json
 import queue
 import statistics
 import sys
-import tempfile
 import time
 from collections.abc import Iterable
 from contextlib import closing, suppress
@@ -29,9 +28,10 @@ from typing import Any
 import psutil
 from attrs import define, evolve, field
 
-from laneweave.launch.run.roles import fork_server, start_role
+from laneweave.launch.run.roles import end_role, fork_server, start_role
 from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.runtime.transport import Delivery, Received, TokenUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.connection import Access
@@ -104,7 +104,7 @@ class Fleet:
     def end(self) -> None:
         """End all processes."""
         for process in reversed(self.processes.values()):
-            process.terminate()
+            end_role(process)
             process.join()
 
 
@@ -134,12 +134,12 @@ def measured(count: int) -> dict[str, Any]:
     """Start agents and return the cost of one more."""
     # Each process executes the main file of its supervisor: use the one of `laneweave` here, too.
     sys.modules["__main__"].__file__ = str(Path(sys.executable).with_name("laneweave"))
-    with tempfile.TemporaryDirectory(prefix="laneweave-") as folder:
+    with temporary_folder() as folder:
         base = Scenario()
         network = evolve(base.network, endpoint=f"unixsock-stream/{folder}/router.sock")
         fleet = Fleet(evolve(base, network=network))
         try:
-            fleet.start(count, folder)
+            fleet.start(count, str(folder))
             return _figures(fleet)
         finally:
             fleet.end()

@@ -83,6 +83,7 @@ def test_a_signal_ends_a_run(
     assert summary(lab.folder / "out")["runtime"]["processes"] is not None
 
 
+@pytest.mark.timeout(2400)
 @pytest.mark.parametrize("tries", [3, pytest.param(20, marks=pytest.mark.full)])
 @pytest.mark.parametrize("options", [OVER_ZENOH, SIMULATED], ids=["zenoh", "simulated"])
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
@@ -182,7 +183,8 @@ def test_what_killed_runs_left_is_removed_at_the_next_start(lab: Lab, road: Path
         process.kill()
         process.wait()
     lab.wait_until(lambda: len(lab.processes()) == 1, END_S)
-    assert len(list(lab.sockets.iterdir())) == 4
+    left = set(lab.sockets.iterdir()) - {own, of_live_run}
+    assert len(left) >= len(processes)
 
     short = ("--duration", "1", *SIMULATED)
     assert lab.finish(lab.start("run", road, *DEMAND, *short, "--out", "next")).status == 0

@@ -386,16 +386,18 @@ def test_a_watcher_waits_for_the_router_of_a_run_and_sees_its_end(lab: Lab) -> N
 
 def test_two_runs_do_not_share_an_endpoint(lab: Lab) -> None:
     config = lab.path("short.toml", SHORT)
-    first = lab.start("run", config, "--vehicles-per-process", "8", "--out", "out")
+    options = ("--vehicles-per-process", "8", "--duration", "600")
+    first = lab.start("run", config, *options, "--out", "out")
     assert first.stderr is not None
     assert first.stderr.readline().startswith("endpoint: ")
 
-    second = lab.run_forked("run", config, "--out", "second", alone=False)
+    second = lab.finish(lab.start("run", config, "--out", "second"), END_S)
 
     assert (second.status, len(second.complaints)) == (2, 1), second
     assert second.err.startswith("network.endpoint: got 'unixsock-stream/router.sock'")
     assert not (lab.folder / "second").exists()
-    assert lab.finish(first).status == 0
+    first.send_signal(signal.SIGTERM)
+    assert lab.finish(first, END_S).complaints[0].startswith("interrupted at ")
     lab.check_nothing_left()
 
 

@@ -120,7 +120,7 @@ def bench_runtime(
             show_progress=False,
             watch=window.watch,
         )
-        outcome = run.run()
+        outcome = run.run().or_interrupt()
         ticks = pq.read_table(folder / "run" / "ticks.parquet")
     times_s = ticks.column("t_s").to_numpy()
     measured = (times_s > window.begin_s) & (times_s <= window.end_s)

@@ -46,7 +46,10 @@ def main() -> None:
         # Threads and processes that start later inherit the mask.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         threading.Thread(target=_forward_interrupts, name="interrupts", daemon=True).start()
-    status = _status(sys.argv[1:])
+    try:
+        status = _status(sys.argv[1:])
+    except KeyboardInterrupt:  # before or after the command itself
+        status = _interrupted()
     # A second Ctrl-C must not interrupt the end of this process, which would print a traceback.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)

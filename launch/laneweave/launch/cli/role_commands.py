@@ -32,6 +32,7 @@ from laneweave.launch.run.run_folder import new_folder
 from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import Observe, unobserved
+from laneweave.protocol.runtime.processes import stop_signal_received
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
 
@@ -149,13 +150,12 @@ def bridge(
         new_folder(out, settings, FORMATION) as folder,
     ):
         run_bridge(settings, folder, FORMATION, pace, observe=observe)
-    outcome = complete_summary(folder, problems=())
+    outcome = complete_summary(folder, problems=(), interrupted=stop_signal_received())
     print_outcome(outcome, Console())
-    draw_report(folder)
+    if outcome.has_traffic:
+        draw_report(folder)
     # A role stopped by a signal has not failed, even if its run is incomplete.
-    interrupted = outcome.summary is not None and outcome.summary.ending == "interrupted"
-    broken = outcome.summary is None or outcome.summary.safety.overlaps
-    raise typer.Exit(1 if broken else 0 if interrupted else outcome.exit_status)
+    raise typer.Exit(1 if outcome.problems else 0)
 
 
 def watch(

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from laneweave.launch.run.live_page import LivePage
     from laneweave.launch.run.outcome import Outcome
 
-RECORDED_ONLY = "it does not run in real time; `laneweave watch DIR` shows its recording"
+
+RECORDED_ONLY = "it runs faster than real time; `laneweave watch DIR` shows its recording"
 COMPARED_ROUTES = 4
 """Number of pairs of entrance and destination whose trips are printed."""
 
@@ -142,7 +143,7 @@ def run(
     check_pace(pace)
     show = shows_progress(no_progress)
     checked_method(method, "--method")
-    live = {"watch": watch or None, "watch_listen": watch_listen}
+    live = {"watch": "given" if watch else None, "watch_listen": watch_listen}
     if method == FORMATION:
         if settings.formation.rolling:
             reject_unused_options("with the rolling operation", solver=solver)
@@ -188,7 +189,7 @@ def run(
             show_progress=show,
             announce=announce,
             warn=warn,
-            page=page,
+            start_page=None if page is None else page.start,
         )
         report = _finish(outcome)
         if page is not None:

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 from laneweave.agents.driving.trajectory import check_moves
 from laneweave.coordinator.planning.solve import prepare
 from laneweave.launch.faults.specification import FaultSpec, load_faults
 from laneweave.launch.report.report import draw_report
-from laneweave.launch.run.local_run import LocalRun
+from laneweave.launch.run.local_run import LocalRun, StartPage
 from laneweave.launch.run.logs import log_by_default
 from laneweave.launch.run.outcome import Outcome
 from laneweave.launch.run.reference_run import ReferenceRun, reference_method
@@ -27,9 +27,6 @@ from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import RunSummary
 from laneweave.sim_bridge.road_sources import demanded
-
-if TYPE_CHECKING:  # needs the extra `watch`
-    from laneweave.launch.run.live_page import LivePage
 
 ZENOH: Final = "zenoh"
 SIMULATED: Final = "simulated"
@@ -144,12 +141,12 @@ def perform_run(
     show_progress: bool = False,
     announce: Callable[[str], None] = _ignore,
     warn: Callable[[str], None] = _ignore,
-    page: LivePage | None = None,
+    start_page: StartPage | None = None,
 ) -> Outcome:
     """Run a scenario to its end and return its outcome; see `run`.
 
     Over Zenoh, `announce` is called with the endpoint of the router, and `warn` with a line if the
-    run is slower than real time; `page` shows the run.
+    run is slower than real time; `start_page` starts the live page.
 
     Raises:
         BadInputError: an argument is invalid, or does not fit the scenario.
@@ -163,7 +160,7 @@ def perform_run(
             pace=pace,
             announce=announce,
             warn=warn,
-            page=page,
+            start_page=start_page,
         )
         return _run_formations(scenario, out, transport, faults, local, show=show_progress)
     if scenario.sumo.config:

@@ -1,14 +1,15 @@
 """The live page of a run: a process that the launcher starts with the run and ends after it.
 
-This module needs the extra `watch`.
+Only that process imports the web server, which takes as long as all else that a launcher imports.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib
+import importlib.util
 import os
 import socket
-from collections.abc import Mapping
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
@@ -20,7 +21,7 @@ from attrs import define
 from laneweave.launch.run.logs import log_to_file
 from laneweave.launch.run.roles import AGENT_NICENESS, become_role, end_role
 from laneweave.launch.run.run_folder import LOG_FILE
-from laneweave.launch.watch.process import address_of, open_socket, watch_run
+from laneweave.launch.watch.listening import address_of, open_socket
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 
@@ -31,6 +32,9 @@ FREE_PORT = "127.0.0.1:0"
 END_S = 5.0
 """Grace period for browsers to receive how the run has ended."""
 NAME = "watch"
+SERVER = "laneweave.launch.watch.process"
+PACKAGES = ("starlette", "uvicorn", "websockets")
+"""Packages that the server needs, of the extra `watch`."""
 
 
 @define
@@ -51,7 +55,11 @@ class LivePage:
 
         Raises:
             BadInputError: the address cannot be used.
+            ModuleNotFoundError: a package of the web server is not installed.
         """
+        for package in PACKAGES:
+            if importlib.util.find_spec(package) is None:
+                raise ModuleNotFoundError(f"no module named {package}", name=package)
         try:
             listener = open_socket(listen or DEFAULT_LISTEN, OPTION)
         except BadInputError:
@@ -71,7 +79,7 @@ class LivePage:
         self.end()
 
     def start(
-        self, context: ForkServerContext, tables: dict[str, Any], options: Mapping[str, Any]
+        self, context: ForkServerContext, tables: dict[str, Any], options: dict[str, Any]
     ) -> None:
         """Start the process, once the router listens.
 
@@ -81,7 +89,7 @@ class LivePage:
             options: options that every role receives.
         """
         self._connection, theirs = context.Pipe()
-        arguments = (tables, dict(options), self.listener, theirs)
+        arguments = (tables, options, self.listener, theirs)
         self._process = context.Process(target=_serve_page, args=arguments, name=NAME)
         self._process.start()
         theirs.close()
@@ -115,4 +123,5 @@ def _serve_page(
         log_to_file(folder / LOG_FILE, NAME, NAME)
         # The roles take priority.
         os.nice(AGENT_NICENESS)
-        watch_run(parse_scenario(tables), folder.resolve().name, listener, launcher)
+        process = importlib.import_module(SERVER)
+        process.watch_run(parse_scenario(tables), folder.resolve().name, listener, launcher)

@@ -11,8 +11,9 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import attrs
 from attrs import define, field
@@ -28,25 +29,22 @@ from laneweave.launch.run.logs import last_error
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
 from laneweave.launch.run.role_processes import BRIDGE, RoleExit, RoleProcesses, RoleStart
-from laneweave.launch.run.roles import fork_server
+from laneweave.launch.run.roles import BAD_INPUT, fork_server
 from laneweave.launch.run.run_folder import LOG_FILE, ROUTER_READY_FILE
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import to_tables
-from laneweave.protocol.errors import BadInputError, CommandFailedError
+from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.runtime.message_faults import SENDER_OF_ROLE
 from laneweave.protocol.runtime.processes import stop_signals
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.deployment_fields import Network
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
+from laneweave.protocol.security.certificates import check_credentials
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.topics import Keys
 from laneweave.sim_bridge.road_sources import demanded
-
-if TYPE_CHECKING:
-    # Needs the extra `watch`.
-    from laneweave.launch.run.live_page import LivePage
 
 OBSERVER = "observer.watch"
 """Identity of the launcher in a secured network."""
@@ -61,6 +59,10 @@ LEADER_S = 5.0
 """Maximum wait for a leader before the bridge starts, in addition to two election timeouts."""
 POLL_S = 0.1
 _GROUP_OF_SENDER = {sender: group for group, sender in SENDER_OF_GROUP.items()}
+
+
+StartPage = Callable[[ForkServerContext, dict[str, Any], dict[str, Any]], None]
+"""See `LivePage.start`."""
 
 
 @define
@@ -95,8 +97,8 @@ class LocalRun:
     """Called with the endpoint of the router once it listens."""
     warn: Callable[[str], None] = lambda _: None
     """Called with a line if the run is slower than real time."""
-    page: LivePage | None = None
-    """The live page of this run."""
+    start_page: StartPage | None = None
+    """Starts the live page of this run once the router listens; see `LivePage.start`."""
     _processes: RoleProcesses = field(init=False)
     _options: dict[str, Any] = field(init=False)
     """Options that every role receives."""
@@ -121,6 +123,7 @@ class LocalRun:
 
         Raises:
             BadInputError: the run is not possible in this environment.
+            RefusedError: its router cannot listen.
             KeyboardInterrupt: a signal has stopped the run before the bridge began.
         """
         check_temporary_folder()
@@ -187,8 +190,8 @@ class LocalRun:
         with contextlib.closing(self._connect(observer)) as transport:
             observer.subscribe(transport)
             self.announce(self.scenario.network.endpoint)
-            if self.page is not None:
-                self.page.start(processes.context, to_tables(self.scenario), self._options)
+            if self.start_page is not None:
+                self.start_page(processes.context, to_tables(self.scenario), self._options)
             for name in processes.coordinators:
                 processes.start("coordinator", name)
             # Start road time only once a coordinator can plan.
@@ -225,19 +228,18 @@ class LocalRun:
         """Wait until this run's router listens; another one may be at the same endpoint.
 
         Raises:
-            BadInputError: the router cannot listen.
+            RefusedError: the router cannot listen.
             CommandFailedError: the router has not started in time.
         """
-        network = self.scenario.network
         deadline_s = time.monotonic() + ROUTER_START_S
         while not (Path(self._options["temporary"]) / ROUTER_READY_FILE).exists():
             if self._stop:
                 raise KeyboardInterrupt
-            if not self._processes.is_alive(ROUTER):
-                name = "network.listen" if network.listen else "network.endpoint"
-                reason = last_error(self.folder / LOG_FILE, ROUTER) or "its process has ended"
-                allowed = f"where the router of this run can listen ({reason})"
-                raise BadInputError(name, ", ".join(network.listens_at), allowed)
+            for end in self._processes.ended():
+                if end.name == ROUTER:
+                    reason = last_error(self.folder / LOG_FILE, ROUTER)
+                    error = RefusedError if end.status == BAD_INPUT else CommandFailedError
+                    raise error(reason or f"the router ended with status {end.status}")
             if time.monotonic() > deadline_s:
                 raise CommandFailedError(f"the router did not start within {ROUTER_START_S:g} s")
             time.sleep(0.02)
@@ -300,7 +302,7 @@ def check_network(scenario: Scenario) -> None:
     """Check that the processes of a run can use the network of a scenario.
 
     Raises:
-        BadInputError: they cannot.
+        BadInputError: they cannot; for example, a certificate is missing.
     """
     network, security, runtime = scenario.network, scenario.security, scenario.runtime
     if security.mode == "off":
@@ -312,6 +314,12 @@ def check_network(scenario: Scenario) -> None:
         allowed = "1, as security.mode is mtls: every agent has the certificate of its vehicle"
         value = runtime.vehicles_per_process
         raise BadInputError("runtime.vehicles_per_process", value, allowed)
+    roles = ("bridge", OBSERVER, *(f"coordinator.{name}" for name in coordinator_names(scenario)))
+    vehicles = (f"vehicle.{arrival.vehicle}" for arrival in demanded(scenario))
+    for identity in (*roles, *vehicles):
+        credentials = access_of(scenario, identity).credentials
+        assert credentials is not None  # noqa: S101 (the network is secured)
+        check_credentials(credentials, identity)
 
 
 def network_in(temporary: Path, network: Network) -> Network:
@@ -339,7 +347,7 @@ def fault_injection(
     seed = faults.seed_of_run(scenario.seed)
     network, reason = open_network(faults, processes.context, seed)
     endpoint = scenario.network.endpoint
-    if network is not None and not endpoint.startswith("unixsock-stream/"):
+    if network is not None and endpoint and not endpoint.startswith("unixsock-stream/"):
         network.close()
         allowed = "none, or unixsock-stream/PATH: the faults use network namespaces"
         raise BadInputError("network.endpoint", endpoint, allowed)

@@ -31,6 +31,16 @@ class Outcome:
     interrupted: bool = False
     """Whether a signal has ended the run."""
 
+    def or_interrupt(self) -> Outcome:
+        """Return this outcome, for callers that go on after the run.
+
+        Raises:
+            KeyboardInterrupt: a signal has ended the run.
+        """
+        if self.interrupted:
+            raise KeyboardInterrupt
+        return self
+
     @property
     def exit_status(self) -> int:
         """Exit status: 0 success; 1 the run failed, violated a guarantee or was interrupted."""

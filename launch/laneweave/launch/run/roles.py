@@ -6,6 +6,7 @@ cheaper than starting an interpreter.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import gc
@@ -17,6 +18,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import cache
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, ForkServerProcess
@@ -39,7 +41,7 @@ from laneweave.protocol.runtime.processes import (
     die_with_parent,
     raise_interrupts,
 )
-from laneweave.protocol.runtime.temporary_folders import hold_folder
+from laneweave.protocol.runtime.temporary_folders import hold_folder, temporary_folder
 from laneweave.protocol.security.access_control import access_of, guard_of
 
 log = structlog.get_logger(__name__)
@@ -49,6 +51,8 @@ LAUNCHER = "LANEWEAVE_LAUNCHER"
 """Environment variable of the fork server with the process ID of its launcher."""
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that limit the threads of linear algebra libraries."""
+BAD_INPUT = 2
+"""Exit status of a role that cannot start."""
 AGENT_NICENESS = 5
 RECONNECT_S = 0.1
 """Time between attempts to connect in runs with faults."""
@@ -93,6 +97,7 @@ def fork_server(solvers: Collection[str] = ()) -> ForkServerContext:
     Raises:
         CommandFailedError: the server has exited, or a solver cannot be compiled.
     """
+    _make_socket_folder()
     for name in THREAD_LIMITS:
         os.environ.setdefault(name, "1")
     context = multiprocessing.get_context("forkserver")
@@ -135,6 +140,18 @@ def _compile(solvers: Sequence[str], problems: Connection) -> None:
     except CacheError as error:
         problems.send(str(error))
         sys.exit(1)
+
+
+@cache
+def _make_socket_folder() -> None:
+    """Let multiprocessing use a temporary folder that does not outlive this process.
+
+    Its own remains if the process is killed.
+    """
+    closing = contextlib.ExitStack()
+    atexit.register(closing.close)
+    folder = closing.enter_context(temporary_folder())
+    multiprocessing.current_process()._config.setdefault("tempdir", str(folder))  # type: ignore[attr-defined]  # noqa: SLF001
 
 
 def start_role(
@@ -223,7 +240,7 @@ def _run_until_connected(
             time.sleep(RECONNECT_S)
     except BadInputError as error:
         log.error("cannot start", reason=str(error))  # noqa: TRY400 (the message is complete)
-        sys.exit(2)
+        sys.exit(BAD_INPUT)
     except Exception:
         log.exception("role failed")
         sys.exit(1)
@@ -285,6 +302,7 @@ def _router(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     run_router(
         (*network.listens_at, *options.get("listen", ())),
         network.lease_s,
+        field="network.listen" if network.listen else "network.endpoint",
         ready=(Path(options["temporary"]) / ROUTER_READY_FILE).touch,
         guard=guard_of(scenario),
     )

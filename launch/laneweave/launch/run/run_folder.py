@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, RefusedError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import SUMMARY_FILE, read_summary
 from laneweave.protocol.wire.events import ENTERED
@@ -43,7 +43,7 @@ def new_folder(out: Path | None, settings: Scenario, method: str) -> Iterator[Pa
     log = _claim(folder)
     try:
         yield folder
-    except (BadInputError, KeyboardInterrupt):
+    except (BadInputError, RefusedError, KeyboardInterrupt):
         files = list(folder.iterdir())
         if files == [folder / LOG_FILE]:
             files[0].unlink()

@@ -37,7 +37,8 @@ def main(folder: Path, parent: int) -> None:
         if method == FORMATION
         else ReferenceRun(scenario, folder, method, show_progress=False)
     )
-    write_atomically(folder / RESULT_FILE, json.dumps({"problems": run.run().problems}))
+    problems = run.run().or_interrupt().problems
+    write_atomically(folder / RESULT_FILE, json.dumps({"problems": problems}))
 
 
 if __name__ == "__main__":

@@ -22,9 +22,9 @@ import uvicorn
 
 from laneweave.launch.observe.observer import Observer
 from laneweave.launch.watch.frames import FrameBuffer, FrameSource, compact, ending, scene_of
+from laneweave.launch.watch.listening import address_of, open_socket
 from laneweave.launch.watch.live_road import TOPICS, LiveRoad
 from laneweave.launch.watch.server import Browsers, Health, make_app
-from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import Arrived
 from laneweave.protocol.runtime.processes import accepted_stop_signals
 from laneweave.protocol.runtime.transport import Delivery
@@ -50,7 +50,6 @@ MAX_QUEUED: Final = 20_000
 """Maximum number of queued messages; further ones are dropped."""
 END_S: Final = 1.0
 """Grace period for browsers to disconnect at shutdown."""
-LISTEN_RULE: Final = "HOST:PORT, an address of this machine; port 0: any free port"
 
 
 def watch_live(scenario: Scenario, listen: str, ready: Callable[[str], None]) -> None:
@@ -107,24 +106,6 @@ def watch_recorded(folder: Path, listen: str, ready: Callable[[str], None]) -> N
 
     with contextlib.closing(open_socket(listen)) as listener:
         _serve(listener, recording, Browsers(), health, ready)
-
-
-def open_socket(listen: str, option: str = "--listen") -> socket.socket:
-    """Return a socket that listens at an address, which was given by an option.
-
-    Raises:
-        BadInputError: the address is malformed or cannot be used.
-    """
-    host, colon, port = listen.rpartition(":")
-    host = host.removeprefix("[").removesuffix("]")
-    if not colon or not host or not port.isdecimal() or int(port) > 65535:
-        raise BadInputError(option, listen, LISTEN_RULE)
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        return socket.create_server((host, int(port)), family=family)
-    except (OSError, UnicodeError) as error:
-        allowed = f"{LISTEN_RULE} ({getattr(error, 'strerror', None) or error})"
-        raise BadInputError(option, listen, allowed) from error
 
 
 class _LiveObserver:
@@ -280,9 +261,3 @@ def _serve(
         await server.serve(sockets=[listener])
 
     asyncio.run(main())
-
-
-def address_of(listener: socket.socket) -> str:
-    """Return the URL of the page."""
-    host, port = listener.getsockname()[:2]
-    return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"

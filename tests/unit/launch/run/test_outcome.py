@@ -103,6 +103,33 @@ def test_a_problem_fails_a_run_that_kept_its_promises(tmp_path: Path) -> None:
     assert (outcome.exit_status, outcome.problems) == (1, ("interrupted",))
 
 
+def test_an_interrupted_run_has_not_failed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    outcome = judge(tmp_path, summary(left=3, ending="interrupted"), interrupted=True)
+    assert (outcome.exit_status, outcome.problems) == (1, ())
+    assert outcome.ending == "run interrupted: 3 of 5 left"
+    with pytest.raises(KeyboardInterrupt):
+        outcome.or_interrupt()
+    assert "FAILED" not in printed(outcome)
+    said = f"interrupted at 100.0 s of road time; the data so far: {tmp_path}\n"
+    assert capsys.readouterr().err == said
+    unsafe = judge(tmp_path, summary(left=3, ending="interrupted", overlaps=1), interrupted=True)
+    assert unsafe.problems == ("1 pairs of vehicles overlapped",)
+    assert unsafe.ending == "run failed: 1 pairs of vehicles overlapped"
+
+
+def test_a_signal_after_the_end_interrupts_nothing(tmp_path: Path) -> None:
+    outcome = judge(tmp_path, summary(), interrupted=True)
+    assert (outcome.exit_status, outcome.interrupted) == (0, False)
+    assert outcome.ending == "run ended: 5 of 5 left"
+
+
+def test_a_run_that_was_interrupted_before_it_began_has_no_outcome(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        complete_summary(tmp_path, problems=(), interrupted=True)
+
+
 def test_a_run_without_a_summary_failed(tmp_path: Path) -> None:
     outcome = complete_summary(tmp_path, problems=["the bridge ended"], processes=3)
     assert outcome.exit_status == 1

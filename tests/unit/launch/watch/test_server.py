@@ -22,7 +22,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from laneweave.launch.watch.frames import MAX_REQUESTED, FrameBuffer, FrameSource, compact, ending
-from laneweave.launch.watch.process import open_socket
+from laneweave.launch.watch.listening import open_socket
 from laneweave.launch.watch.recorded_run import Recording
 from laneweave.launch.watch.server import Browser, Browsers, make_app, request_of
 from laneweave.protocol.errors import BadInputError
