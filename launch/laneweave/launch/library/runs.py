@@ -43,11 +43,11 @@ def _ignore(_: str) -> None:
 
 
 class RunFailedError(CommandFailedError):
-    """A run failed, was interrupted, or violated a guarantee; its files are in `folder`."""
+    """A run failed, or violated a guarantee; its files are in `folder`."""
 
     def __init__(self, outcome: Outcome) -> None:
         """Store the outcome."""
-        super().__init__(f"{outcome.folder}: {'; '.join(outcome.problems) or 'interrupted'}")
+        super().__init__(f"{outcome.folder}: {'; '.join(outcome.problems)}")
         self.folder = outcome.folder
         self.problems = outcome.problems
         """Reasons, one line each."""
@@ -110,7 +110,8 @@ def run(
 
     Raises:
         BadInputError: an argument or a value of the scenario is invalid.
-        RunFailedError: the run failed, was interrupted, or violated a guarantee.
+        RunFailedError: the run failed, or violated a guarantee.
+        KeyboardInterrupt: a signal has ended the run; its files are complete up to then.
         CommandFailedError: the run could not be started.
     """
     log_by_default()
@@ -122,8 +123,8 @@ def run(
         faults=None if faults is None else str(faults),
         pace=pace,
         show_progress=show_progress,
-    )
-    if outcome.exit_status or outcome.summary is None:
+    ).or_interrupt()
+    if outcome.problems or outcome.summary is None:
         raise RunFailedError(outcome)
     if report:
         draw_report(outcome.folder)
