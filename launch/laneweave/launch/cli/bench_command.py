@@ -87,9 +87,7 @@ def bench(
     else:
         sizes = _parse_sizes(vehicles, "30,60,90")
         rows = [
-            bench_runtime(
-                size, seconds=seconds, per_process=per_process, seed=seed, faults=faults
-            )
+            bench_runtime(size, seconds=seconds, per_process=per_process, seed=seed, faults=faults)
             for size in sizes
         ]
         make_table = runtime_table

@@ -8,10 +8,10 @@ Answers after the deadline indicate a slow machine rather than lost messages. Ti
 time, and SENSE is repeated less often, so that the road slows down and agents keep up. When answers
 arrive in time again, the extra time slowly shrinks.
 
-An agent answers every SENSE, also a repeated one. If it answers fewer than it was sent, messages are
-lost, which waiting does not cure. While they are, SENSE is repeated as soon as no more answers
-arrive, two copies at a time, and a tick lasts little longer than the road needs in real time. An
-agent that answers no SENSE at all, because it hangs, is not evidence of loss.
+An agent answers every SENSE, also a repeated one. If agents answer fewer than they were sent,
+messages are lost. While they are, SENSE is repeated as soon as no more answers arrive, in several
+copies, and a tick lasts no longer than in real time. An agent that answers no SENSE at all, because
+it hangs, is not evidence of loss.
 
 Times are on the node's clock. Each tick counts for at most its deadline; other waits of the road
 (pace, starting agents) do not count as silence.
@@ -112,7 +112,7 @@ class Answers:
 
     @property
     def lossy(self) -> bool:
-        """Whether messages are being lost: agents answer fewer SENSE messages than they are sent."""
+        """Whether messages are lost: agents answer fewer SENSE messages than they are sent."""
         return self._received_before < LOSSY_SHARE * self._asked_before
 
     def agent_up(self, name: Name) -> None:
