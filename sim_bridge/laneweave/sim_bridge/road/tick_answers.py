@@ -43,7 +43,9 @@ LOSSY_TICK = 0.6
 LOSSY_ROUNDS = 6
 """Minimum number of rounds of SENSE for which that deadline has time, on slow networks."""
 COPIES = 3
-"""Copies of a repeated SENSE while messages are lost."""
+"""Maximum number of copies of a repeated SENSE while messages are lost."""
+FEW = 50
+"""Number of messages that a round may have even if the tick began with fewer."""
 _FLOOR = 0.1
 """Minimum wait for further answers, as a multiple of `tick_resend_s`."""
 _ROUND_TRIPS = 1.5
@@ -258,7 +260,11 @@ class Answers:
         if self.lossy and now_s + self._quiet_s > self.deadline_s:
             self.deadline_s = now_s
             return []
-        copies = COPIES if self.lossy else 1
+        copies = 1
+        if self.lossy:
+            # Many messages keep the processors busy, but few rounds of few messages save time.
+            budget = max(FEW, len(self._asked))
+            copies = min(COPIES, max(1, budget // max(1, len(self.awaited))))
         again = [name for name in sorted(self.awaited) for _ in range(copies)]
         self._begin_round(now_s, again)
         return again
