@@ -39,12 +39,9 @@ class Experiment:
     faults: str | None
     """A preset, or a file in `benchmarks/faults`."""
     options: tuple[str, ...] = ()
-    scenario: str | None = None
-    """A file in `benchmarks`."""
 
 
 REAL_TIME = ("--pace", "1")
-SHORT_TICKS = "short-ticks.toml"
 
 
 def demand(volume: int, duration_s: int, operation: str = "formations") -> tuple[str, ...]:
@@ -53,19 +50,17 @@ def demand(volume: int, duration_s: int, operation: str = "formations") -> tuple
     return ("--operation", operation, *flow)
 
 
-def rolling(
-    name: str, faults: str | None, duration_s: int = 200, *, short: bool = False
-) -> Experiment:
+def rolling(name: str, faults: str | None, duration_s: int = 200) -> Experiment:
     """Return an experiment of the rolling operation at 1600 vehicles/(lane h), simulated."""
     options = (*demand(1600, duration_s, "rolling"), "--transport", "simulated")
-    return Experiment(f"rolling-{name}", faults, options, SHORT_TICKS if short else None)
+    return Experiment(f"rolling-{name}", faults, options)
 
 
 EXPERIMENTS = (
     Experiment("undisturbed", None, demand(1600, 200)),
-    Experiment("loss-10", "lossy10", demand(1600, 200), SHORT_TICKS),
-    Experiment("loss-30", "loss-30.toml", demand(1600, 200), SHORT_TICKS),
-    Experiment("loss-50", "lossy50", demand(1600, 200), SHORT_TICKS),
+    Experiment("loss-10", "lossy10", demand(1600, 200)),
+    Experiment("loss-30", "loss-30.toml", demand(1600, 200)),
+    Experiment("loss-50", "lossy50", demand(1600, 200)),
     Experiment("blackout", "blackout", demand(1600, 200)),
     Experiment("blackout-from-start", "blackout-from-start.toml", demand(1600, 200)),
     Experiment("agents-killed", "agents-killed.toml", demand(1600, 300)),
@@ -75,9 +70,9 @@ EXPERIMENTS = (
     Experiment("leader-killed", "leader-killed-50-times.toml", (*demand(1000, 300), *REAL_TIME)),
     Experiment("leader-stopped", "leader-stopped-30-times.toml", (*demand(600, 560), *REAL_TIME)),
     rolling("undisturbed", None),
-    rolling("loss-10", "lossy10", short=True),
-    rolling("loss-30", "loss-30.toml", short=True),
-    rolling("loss-50", "lossy50", short=True),
+    rolling("loss-10", "lossy10"),
+    rolling("loss-30", "loss-30.toml"),
+    rolling("loss-50", "lossy50"),
     rolling("blackout", "blackout"),
     rolling("agents-killed", "agents-killed.toml", 300),
     rolling("everything", "everything"),
@@ -87,8 +82,6 @@ EXPERIMENTS = (
 def run(experiment: Experiment, folder: Path) -> dict[str, Any]:
     """Run an experiment and return its figures."""
     command = [str(Path(sys.executable).parent / "laneweave"), "run", "--no-progress"]
-    if experiment.scenario is not None:
-        command.append(str(HERE / experiment.scenario))
     command += [*experiment.options, "--out", str(folder)]
     if experiment.faults is not None:
         path = HERE / "faults" / experiment.faults

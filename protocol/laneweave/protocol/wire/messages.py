@@ -244,12 +244,12 @@ class Neighbour:
 class Sense:
     """Bridge to one vehicle at each tick: measurements and the state of its motion controller.
 
-    Missing: sent again every `runtime.tick_resend_s` until `runtime.tick_deadline_s`; then the
-    vehicle continues its last trajectory. Duplicated: the agent repeats its answer. Older than the
-    newest tick of the same bridge, or from an earlier bridge: ignored. From a newer bridge, or if
-    only older ones arrive for 0.5 s: the agent discards its state and takes a new incarnation. A
-    message with `left` is repeated for 20 ticks or until the agent's token vanishes; when a run
-    ends, each vehicle on the road receives one.
+    Missing: sent again every `runtime.tick_resend_s` until `runtime.tick_deadline_s`, or at shorter
+    intervals while messages are lost; then the vehicle continues its last trajectory. Duplicated:
+    the agent repeats its answer. Older than the newest tick of the same bridge, or from an earlier
+    bridge: ignored. From a newer bridge, or if only older ones arrive for 0.5 s: the agent discards
+    its state and takes a new incarnation. A message with `left` is repeated for 20 ticks or until
+    the agent's token vanishes; when a run ends, each vehicle on the road receives one.
     """
 
     vehicle: Name

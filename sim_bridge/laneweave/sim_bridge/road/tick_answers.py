@@ -8,10 +8,10 @@ Answers after the deadline indicate a slow machine rather than lost messages. Ti
 time, and SENSE is repeated less often, so that the road slows down and agents keep up. When answers
 arrive in time again, the extra time slowly shrinks.
 
-An agent answers every SENSE, also a repeated one. If it answers fewer than it was sent, messages are
-lost, which waiting does not cure. While they are, SENSE is repeated as soon as no more answers
-arrive, two copies at a time, and a tick lasts little longer than the road needs in real time. An
-agent that answers no SENSE at all, because it hangs, is not evidence of loss.
+An agent answers every SENSE, also a repeated one. If agents answer fewer than they were sent,
+messages are lost. While they are, SENSE is repeated as soon as no more answers arrive, in several
+copies, and a tick lasts no longer than in real time. An agent that answers no SENSE at all, because
+it hangs, is not evidence of loss.
 
 Times are on the node's clock. Each tick counts for at most its deadline; other waits of the road
 (pace, starting agents) do not count as silence.
@@ -43,7 +43,9 @@ LOSSY_TICK = 0.6
 LOSSY_ROUNDS = 6
 """Minimum number of rounds of SENSE for which that deadline has time, on slow networks."""
 COPIES = 3
-"""Copies of a repeated SENSE while messages are lost."""
+"""Maximum number of copies of a repeated SENSE while messages are lost."""
+FEW = 50
+"""Number of messages that a round may have even if the tick began with fewer."""
 _FLOOR = 0.1
 """Minimum wait for further answers, as a multiple of `tick_resend_s`."""
 _ROUND_TRIPS = 1.5
@@ -112,7 +114,7 @@ class Answers:
 
     @property
     def lossy(self) -> bool:
-        """Whether messages are being lost: agents answer fewer SENSE messages than they are sent."""
+        """Whether messages are lost: agents answer fewer SENSE messages than they are sent."""
         return self._received_before < LOSSY_SHARE * self._asked_before
 
     def agent_up(self, name: Name) -> None:
@@ -258,7 +260,11 @@ class Answers:
         if self.lossy and now_s + self._quiet_s > self.deadline_s:
             self.deadline_s = now_s
             return []
-        copies = COPIES if self.lossy else 1
+        copies = 1
+        if self.lossy:
+            # Many messages keep the processors busy, but few rounds of few messages save time.
+            budget = max(FEW, len(self._asked))
+            copies = min(COPIES, max(1, budget // max(1, len(self.awaited))))
         again = [name for name in sorted(self.awaited) for _ in range(copies)]
         self._begin_round(now_s, again)
         return again

@@ -383,6 +383,34 @@ def test_while_messages_are_lost_sense_is_repeated_when_no_more_answers_arrive()
     assert answers.due_resends(answers.resend_s) == wanted
 
 
+@pytest.mark.parametrize(("answered", "copies"), [(0, 2), (3, 2), (4, 3), (19, 3)])
+def test_a_round_of_few_agents_has_several_copies(answered: int, copies: int) -> None:
+    answers = fleet()
+    now_s = lose_half(answers, 20)
+    answers.start_tick(FLEET, now_s, link_up=True)
+    answers.due_resends(now_s)
+    for name in FLEET[:answered]:
+        answers.in_time(name)
+    wanted = [name for name in FLEET[answered:] for _ in range(copies)]
+    assert answers.due_resends(answers.resend_s) == wanted
+
+
+def test_a_round_of_many_agents_has_no_more_messages_than_the_first_one() -> None:
+    answers = fleet()
+    now_s = lose_half(answers, 20)
+    many = [Name(f"v{number:02d}") for number in range(90)]
+    for name in many:
+        answers.agent_up(name)
+    answers.start_tick(many, now_s, link_up=True)
+    answers.due_resends(now_s)
+    for left, sent in ((90, 90), (46, 46), (45, 90), (31, 62), (30, 90), (9, 27)):
+        for name in many[left:]:
+            answers.in_time(name)
+        assert len(answers.due_resends(answers.resend_s)) == sent
+        answers.due_resends(answers.resend_s)
+        answers.deadline_s = now_s + 99.0
+
+
 def test_a_tick_without_time_for_another_round_ends_early() -> None:
     answers = fleet()
     began_s = now_s = lose_half(answers, 20)
