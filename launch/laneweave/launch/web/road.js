@@ -15,7 +15,7 @@ const laneweaveRoad = (() => {
   const MIN_SCALE = 3; // of a whole road, in pixels per metre: narrow pages show more stretches
   const MAX_STRETCHES = 16;
   const WINDOW_M = 150; // length of the road around what is followed, on a wide page
-  const BRIGHT = 125; // brightness above which text on a colour is black
+  const BRIGHT = 127.5; // brightness above which text on a colour is black
   const UNKNOWN = "#8a8f96";
   const LIGHT = {
     asphalt: "#e9eaec",
