@@ -27,7 +27,7 @@ NEUTRAL = "#8a8f96"
 SPEED_SPAN_MPS = 5.0
 """Difference from the lattice speed at which the shade is darkest or lightest."""
 SHADE_STRENGTH = 0.45
-BRIGHT = 125.0
+BRIGHT = 127.5
 """Brightness, of 255, above which text on a colour is black."""
 
 

@@ -285,14 +285,15 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
 def speed_scale(maps: Iterable[MeanSpeeds], set_mps: float) -> tuple[FuncNorm, list[float]]:
     """Return the scale of mean speeds around v_F, and the speeds to label on it.
 
-    It ends at 1, 2 or 5 times a power of ten.
+    It ends at a difference of 1, 2 or 5 times a power of ten, at most v_F.
     """
     from matplotlib.colors import FuncNorm  # noqa: PLC0415 - lazily
 
     off = np.concatenate([np.abs(one.speed_mps.compressed() - set_mps) for one in maps])
     limit_mps = max(MIN_LIMIT_MPS, float(np.percentile(off, LIMIT_PERCENT)) if len(off) else 0.0)
     power = 10.0 ** math.floor(math.log10(limit_mps))
-    limit_mps = power * next(step for step in (1.0, 2.0, 5.0, 10.0) if limit_mps <= step * power)
+    nice_mps = power * next(step for step in (1.0, 2.0, 5.0, 10.0) if limit_mps <= step * power)
+    limit_mps = min(nice_mps, set_mps)
 
     def forward(speed_mps: Floats) -> Floats:
         # Masked bins become NaN, which the scale masks again.

@@ -236,7 +236,8 @@ def _add_path_map(report: _Report, driven: DrivenMap | None) -> None:
         "Relative path map",
         "path_map.png",
         partial(draw_path_map, driven),
-        f"Cells (column, lane) of {driven.vehicles} at the ends of slots, as driven. "
+        f"Cells (column, lane) of {driven.vehicles} at the ends of slots, as driven; columns are "
+        "counted from the rearmost. "
         f"{driven.colours}; bold: moved in the preceding slot. Cost: the sum over the vehicles of "
         "the slot in which they arrive.",
         f"Table of the cells of {driven.name} by vehicle and slot",

@@ -14,7 +14,8 @@ const laneweaveRoad = (() => {
   const NUMBERED_PX = 12; // minimum length of a vehicle that shows the number of its lane
   const MIN_SCALE = 3; // of a whole road, in pixels per metre: narrow pages show more stretches
   const MAX_STRETCHES = 16;
-  const BRIGHT = 125; // brightness above which text on a colour is black
+  const WINDOW_M = 150; // length of the road around what is followed, on a wide page
+  const BRIGHT = 127.5; // brightness above which text on a colour is black
   const UNKNOWN = "#8a8f96";
   const LIGHT = {
     asphalt: "#e9eaec",
@@ -59,9 +60,9 @@ const laneweaveRoad = (() => {
     return Array.from({ length: count }, (_, i) => [(length * i) / count, (length * (i + 1)) / count]);
   }
 
-  /** Return the stretch of a road around a position, shifted into the road at its ends. */
-  function windowAround(length, centre, size) {
-    const half = Math.min(size, length) / 2;
+  /** Return the stretch around a position, shifted into the road at its ends, for a width in px. */
+  function windowAround(length, centre, width) {
+    const half = Math.min(WINDOW_M, width / MIN_SCALE, length) / 2;
     const middle = Math.max(half, Math.min(length - half, centre));
     return [middle - half, middle + half];
   }

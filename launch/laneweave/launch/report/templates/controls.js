@@ -1,6 +1,5 @@
 // Controls of the animated road; requires a browser.
 
-const WINDOW_M = 150; // length of the road shown while following
 
 class Player {
   constructor(box, run) {
@@ -76,7 +75,7 @@ class Player {
     const present = laneweave.allAt(run, this.t);
     const bodies = present.map(([vehicle, state]) => ({ ...state, name: vehicle.name, lane: vehicle.lane, type: vehicle.type }));
     const width = this.painter.canvas.clientWidth;
-    const stretches = laneweave.stretches(run, this.follow, this.t, WINDOW_M, width);
+    const stretches = laneweave.stretches(run, this.follow, this.t, width);
     this.painter.paint(stretches, bodies, [laneweaveClosed.closedParts]);
     this.slider.value = this.t;
     const mean = present.reduce((sum, [, state]) => sum + state.v, 0) / (present.length || 1);

@@ -66,14 +66,14 @@ const laneweave = (() => {
   }
 
   /** Return the stretches [from, to] of the road to draw; `follow` null: the whole road. */
-  function stretches(run, follow, t, windowLength, width) {
+  function stretches(run, follow, t, width) {
     const length = run.road.length_m;
     if (follow === null) return laneweaveRoad.wholeRoad(length, width);
     const state = follow.vehicle ? stateAt(run, follow.vehicle, t) : null;
     const first = follow.vehicle ? follow.vehicle.first * run.step_s : 0;
     let centre = state ? state.s : t < first ? 0 : length;
     if (!follow.vehicle) centre = formationCentre(run, follow.formation, t);
-    return [laneweaveRoad.windowAround(length, centre, windowLength)];
+    return [laneweaveRoad.windowAround(length, centre, width)];
   }
 
   /** Return what can be followed at a time: formations with a vehicle on the road, and vehicles. */

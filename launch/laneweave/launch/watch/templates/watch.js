@@ -3,8 +3,8 @@
 
 const PAINT_MS = 28; // minimum time between two repaints
 const NUMBERS_MS = 200; // minimum time between two updates of the figures
-const WINDOW_M = 150; // length of the road shown while following
 const AHEAD = 40; // frames fetched in advance
+const NBSP = "\u00a0"; // between a number and its unit
 const RETRY_MS = [300, 600, 1200, 2500];
 const PACES = [0.5, 1, 2, 5, 10];
 const CALM = matchMedia("(prefers-reduced-motion: reduce)");
@@ -45,7 +45,6 @@ class Watch {
     this.socket = socket;
     socket.onmessage = (event) => this.take(event.data);
     socket.onclose = () => {
-      if (this.store.end !== null) return;
       this.offlineSince ??= Date.now() / 1000;
       this.store.waiting = false;
       this.showStatus();
@@ -66,8 +65,6 @@ class Watch {
       this.interval = Math.min(250, Math.max(40, now - this.arrived));
       this.arrived = now;
       this.stats.frames += 1;
-    } else if (what === "end") {
-      this.showStatus();
     }
     this.stale = true;
   }
@@ -270,7 +267,8 @@ class Watch {
 
   strips(scene, { t, bodies }) {
     const length = scene.road.length_m;
-    const whole = laneweaveRoad.wholeRoad(length, part("road").clientWidth);
+    const width = part("road").clientWidth;
+    const whole = laneweaveRoad.wholeRoad(length, width);
     if (!this.follow || t === null) return whole;
     if (this.follow.vehicle) {
       const body = bodies.find((one) => one.name === this.follow.vehicle);
@@ -282,7 +280,7 @@ class Watch {
       const [rear, front] = laneweaveRoad.columnsAt(scene, ...this.columns, t);
       this.centre = (rear + front) / 2;
     }
-    return [laneweaveRoad.windowAround(length, this.centre, WINDOW_M)];
+    return [laneweaveRoad.windowAround(length, this.centre, width)];
   }
 
   // --- numbers ----------------------------------------------------------------------------------
@@ -299,11 +297,11 @@ class Watch {
     setText("run", frame.run > 1 ? `run ${frame.run} since the server started` : "");
     const [demanded, entered, , left] = frame.counts ?? [0, 0, 0, 0];
     setText("count", frame.counts ? `${this.picture.bodies.length}` : "–");
-    setText("counts", frame.counts ? `${entered} of ${demanded} entered, ${left} left` : "");
-    const mean = speed === null ? "" : `${speed.toFixed(1)} m/s`;
+    setText("counts", frame.counts ? `${entered} of ${demanded} entered, ${left}${NBSP}left` : "");
+    const mean = speed === null ? "" : `${speed.toFixed(1)}${NBSP}m/s`;
     if (scene.preferences) {
       setText("sorted", knownLane ? `${Math.round((100 * inLane) / knownLane)} %` : "–");
-      setText("speed", mean && `${inLane} of ${knownLane}; mean ${mean}`);
+      setText("speed", mean && `${inLane} of ${knownLane}; mean${NBSP}${mean}`);
     } else {
       setText("sorted", mean || "–");
       setText("speed", "no preferred lanes");
@@ -315,7 +313,7 @@ class Watch {
     const [plannedAt, planned, took, solver, fallback] = frame.plan ?? [];
     const by = solver ? ` by ${solver}${fallback ? " (fallback)" : ""}` : "";
     setText("plan", frame.plan ? `${took.toFixed(1)} ms` : "–");
-    setText("planned", frame.plan ? `${planned} vehicles${by}, at ${plannedAt.toFixed(1)} s` : "");
+    setText("planned", frame.plan ? `${planned} vehicles${by}, at${NBSP}${plannedAt.toFixed(1)}${NBSP}s` : "");
     this.showNews(frame.news);
     this.showTime(frame, setText);
     this.showStatus();
@@ -381,10 +379,7 @@ class Watch {
   showStatus() {
     const frame = this.store.newest;
     let [pill, words] = ["connecting", ""];
-    if (this.store.end !== null) {
-      pill = "ended";
-      words = this.store.end;
-    } else if (this.offlineSince !== null) {
+    if (this.offlineSince !== null) {
       pill = "offline";
       words = `Connection to the server lost at ${clockTime(this.offlineSince)}. Reconnecting.`;
     } else if (this.store.scene && !this.live) {
@@ -396,7 +391,7 @@ class Watch {
         lost: `Connection to the router lost at ${since}. Reconnecting.`,
         waiting: "Connected. No road yet: waiting for a bridge.",
         still: `The road clock stopped at ${since}.`,
-        ended: `The run ended at ${since}${this.leftOf(frame)}. Waiting for the next one.`,
+        ended: `The run ended at ${since}. Waiting for the next one.`,
         live: "",
       }[pill];
     }
@@ -408,10 +403,6 @@ class Watch {
     banner.hidden = !words;
     if (banner.textContent !== words) banner.textContent = words;
     banner.dataset.status = pill;
-  }
-
-  leftOf({ counts }) {
-    return counts ? `: ${counts[3]} of ${counts[0]} vehicles left` : "";
   }
 
   showLegend() {
