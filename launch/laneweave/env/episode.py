@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 
 from laneweave.coordinator.core import CoordinatorCore
@@ -19,6 +20,8 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 STALL_S = 600.0
 """Virtual time after which an episode fails if the road clock does not advance."""
+STRIDE_S = 0.02
+"""Virtual time between checks whether a tick is complete; the next one opens later."""
 
 
 class _AgentStarter:
@@ -96,11 +99,18 @@ class Episode:
         Raises:
             RuntimeError: the road clock has stopped.
         """
-        network, bridge = self.network, self._bridge
         while not self.ended:
-            tick, began_s = bridge.tick, network.now_s
-            network.run(began_s + STALL_S, lambda: bridge.tick != tick or self.ended)
-            if bridge.tick == tick and not self.ended:
-                raise RuntimeError(f"the road clock has stopped at {bridge.t_s:g} s")
+            self._finish_tick()
             if stop():
                 return
+
+    def _finish_tick(self) -> None:
+        """Advance to the time before the next tick, at which all messages have arrived."""
+        network, bridge = self.network, self._bridge
+        tick, began_s = bridge.tick, network.now_s
+        while bridge.tick == tick and not self.ended:
+            network.run(network.now_s + STRIDE_S)
+            if network.now_s - began_s > STALL_S:
+                raise RuntimeError(f"the road clock has stopped at {bridge.t_s:g} s")
+        if bridge.phase is TickPhase.PACE and bridge.wakeup_s is not None:
+            network.run(math.nextafter(bridge.wakeup_s, 0.0))

@@ -22,7 +22,9 @@ class Rewards:
     discomfort: float = -0.001
     """Per m2/s3: integral of the squared acceleration, along and across the road."""
 
-    def of_step(self, seconds: float, *, moved: bool, discomfort: float, left: Trip | None) -> float:
+    def of_step(
+        self, seconds: float, *, moved: bool, discomfort: float, left: Trip | None
+    ) -> float:
         """Return the reward of a step.
 
         Args:
