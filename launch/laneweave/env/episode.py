@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 
+from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.env.record import EpisodeRecord
 from laneweave.launch.run.simulated_roles import SimulatedRoles
@@ -19,6 +22,13 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 STALL_S = 600.0
 """Virtual time after which an episode fails if the road clock does not advance."""
+STRIDE_S = 0.02
+"""Virtual time between checks whether a tick is complete; the next one opens later."""
+
+
+def _no_time() -> float:
+    """Return 0: reading the clock of a thread takes longer than a solve that it measures."""
+    return 0.0
 
 
 class _AgentStarter:
@@ -56,13 +66,15 @@ class Episode:
         self.scenario = scenario
         self.record = EpisodeRecord(scenario)
         self.network = SimulatedNetwork(scenario.seed, skip_codec=True)
-        roles = SimulatedRoles(scenario, self.network, make_coordinator)
+        make_driver = partial(TrackingDriver, stopwatch=_no_time)
+        roles = SimulatedRoles(scenario, self.network, make_coordinator, make_driver)
         self._bridge = BridgeCore(
             scenario,
             BodiesWorld(),
             self.record,
             new_incarnation=roles.incarnations.__next__,
             pace=1.0,
+            stopwatch=_no_time,
             stream=stream,
         )
         self.network.add("starter", _AgentStarter(roles.start_agents), scenario.network.realm)
@@ -96,11 +108,18 @@ class Episode:
         Raises:
             RuntimeError: the road clock has stopped.
         """
-        network, bridge = self.network, self._bridge
         while not self.ended:
-            tick, began_s = bridge.tick, network.now_s
-            network.run(began_s + STALL_S, lambda: bridge.tick != tick or self.ended)
-            if bridge.tick == tick and not self.ended:
-                raise RuntimeError(f"the road clock has stopped at {bridge.t_s:g} s")
+            self._finish_tick()
             if stop():
                 return
+
+    def _finish_tick(self) -> None:
+        """Advance to the time before the next tick, at which all messages have arrived."""
+        network, bridge = self.network, self._bridge
+        tick, began_s = bridge.tick, network.now_s
+        while bridge.tick == tick and not self.ended:
+            network.run(network.now_s + STRIDE_S)
+            if network.now_s - began_s > STALL_S:
+                raise RuntimeError(f"the road clock has stopped at {bridge.t_s:g} s")
+        if bridge.phase is TickPhase.PACE and bridge.wakeup_s is not None:
+            network.run(math.nextafter(bridge.wakeup_s, 0.0))

@@ -21,6 +21,7 @@ from laneweave.coordinator.planning.rolling.requested_moves import is_possible
 from laneweave.protocol.lattice import WAIT, Cell, displacements
 from laneweave.protocol.road_layout import sections_for
 from laneweave.protocol.scenario.fields import READY_LATE_S, Scenario
+from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 Observation = NDArray[np.float32]
@@ -67,7 +68,7 @@ class Observer:
         return len(OWN) + len(PER_CELL) * cells
 
     def observe(
-        self, vehicles: Mapping[str, RoadVehicle], refused: Iterable[str], t_s: float
+        self, vehicles: Mapping[Name, RoadVehicle], refused: Iterable[str], t_s: float
     ) -> dict[str, Observation]:
         """Return the observation of each vehicle at a road time.
 
@@ -84,7 +85,7 @@ class Observer:
         for (column, lane), other in held.items():
             around[column - low, lane, :2] = 1.0, self._to_target(other)
         around[:, :, 2] = self._open_cells(range(low, low + len(around)), t_s)
-        found = {}
+        found: dict[str, Observation] = {}
         for name, vehicle in vehicles.items():
             first = vehicle.cell[0] - self.columns - low
             cells = np.zeros((2 * self.columns + 1, lanes, len(PER_CELL)), np.float32)
@@ -95,12 +96,12 @@ class Observer:
             found[name] = np.clip(values, -1.0, 1.0)
         return found
 
-    def masks(self, vehicles: Mapping[str, RoadVehicle], slot: int) -> dict[str, Mask]:
+    def masks(self, vehicles: Mapping[Name, RoadVehicle], slot: int) -> dict[str, Mask]:
         """Return, per vehicle, 1 for each action that the road and its type allow in a slot.
 
         Requests that conflict with those of others are refused nevertheless.
         """
-        found = {}
+        found: dict[str, Mask] = {}
         for name, vehicle in vehicles.items():
             mask = self.only_hold()
             if vehicle.controller.off_lattice is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import structlog
 from attrs import evolve
 from gymnasium.spaces import Box, Discrete
 from numpy.random import SeedSequence
@@ -69,6 +71,10 @@ def parallel_env(
         settings = load_scenario(None if scenario is None else Path(scenario), **ROLLING)
     if settings.sumo.config:
         raise BadInputError("sumo.config", settings.sumo.config, "none: there is no SUMO here")
+    if not structlog.is_configured():
+        # Else the roles would print lines in each episode.
+        warnings_only = structlog.make_filtering_bound_logger(logging.WARNING)
+        structlog.configure(wrapper_class=warnings_only)
     return VehiclesEnv(settings, rewards or Rewards(), columns, vary_demand=vary_demand)
 
 
@@ -98,7 +104,7 @@ class VehiclesEnv(ParallelEnv[str, Observation, int]):
         self._varies = vary_demand
         count = _bound(scenario) if vary_demand else len(self._stream)
         self.possible_agents = [vehicle_name(number) for number in range(1, count + 1)]
-        self.agents = []
+        self.agents: list[str] = []
         self.moves = self._observer.moves
         """Displacement (columns, lanes) of each action."""
         self._observation_space = Box(-1.0, 1.0, (self._observer.size,), np.float32)

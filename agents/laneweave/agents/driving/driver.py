@@ -8,6 +8,8 @@ independent of the protocol.
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -89,10 +91,17 @@ class Driver(Protocol):
 class TrackingDriver:
     """Driver that tracks a reference at each tick."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        """Make a driver without a reference; call `take_over` first."""
+    def __init__(
+        self, scenario: Scenario, stopwatch: Callable[[], float] = time.thread_time
+    ) -> None:
+        """Make a driver without a reference; call `take_over` first.
+
+        Args:
+            scenario: the scenario of the vehicle's type.
+            stopwatch: clock [s] that measures how long solves take.
+        """
         self._scenario = scenario
-        self._tracker = Tracker(scenario)
+        self._tracker = Tracker(scenario, stopwatch)
         self._reference: Reference | None = None
         self._settling: Reference | None = None
         """The reference with which the vehicle settles in the cell in which it has entered."""

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 
 import numpy as np
 from attrs import define
@@ -60,8 +61,16 @@ class TrackResult:
 class Tracker:
     """Tracks the references of one vehicle."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        """Prepare the program, and the fast path unless `tracking.always_solve` is set."""
+    def __init__(
+        self, scenario: Scenario, stopwatch: Callable[[], float] = time.thread_time
+    ) -> None:
+        """Prepare the program, and the fast path unless `tracking.always_solve` is set.
+
+        Args:
+            scenario: limits, horizon, weights.
+            stopwatch: clock [s] that measures how long solves take.
+        """
+        self._stopwatch = stopwatch
         n = self._n = scenario.horizon_ticks
         self._tick_s = scenario.runtime.tick_s
         self._axis = axis_matrices(self._tick_s)
@@ -90,7 +99,7 @@ class Tracker:
         Raises:
             ValueError: a shape is wrong, a number is NaN, or the state is not finite.
         """
-        start = time.thread_time()
+        start = self._stopwatch()
         shapes = window.states.shape, window.jerks.shape
         if shapes != self._shapes:
             raise ValueError(f"window has shapes {shapes}, not {self._n} ticks")
@@ -108,7 +117,7 @@ class Tracker:
             jerk = self._regulated(error, target, gaps)
             if jerk is not None:
                 program.discard_solution()
-                elapsed_ms = (time.thread_time() - start) * 1e3
+                elapsed_ms = (self._stopwatch() - start) * 1e3
                 return TrackResult(jerk, True, 0, elapsed_ms, 0.0)
             program.write_bounds(error, target.states, target.jerks, target.defect, gaps)
             result = program.solve()
@@ -124,7 +133,7 @@ class Tracker:
             jerk = self._limited(state, target.jerks + program.jerks(result))
         else:
             jerk = np.zeros((self._n, 2))
-        elapsed_ms = (time.thread_time() - start) * 1e3
+        elapsed_ms = (self._stopwatch() - start) * 1e3
         return TrackResult(jerk, usable, iterations, elapsed_ms, result.violation)
 
     def rest(self, state: State, goal: State) -> TrackResult | None:
@@ -135,7 +144,7 @@ class Tracker:
         """
         if self._regulator is None:
             return None
-        start = time.thread_time()
+        start = self._stopwatch()
         # Unrolled, since it runs every tick for every vehicle.
         max_s, max_v, max_a, max_y, max_vy, max_ay = self.unconstrained_errors
         s = state[0] - goal[0]
@@ -158,7 +167,7 @@ class Tracker:
             return None
         self.program.discard_solution()
         jerk = self._regulator.inputs.dot((s, v, a, y, v_y, a_y)).reshape(-1, 2)
-        return TrackResult(jerk, True, 0, (time.thread_time() - start) * 1e3, 0.0)
+        return TrackResult(jerk, True, 0, (self._stopwatch() - start) * 1e3, 0.0)
 
     def _regulated(self, error: State, target: Window, gaps: Gaps) -> Array | None:
         """Return the jerks (N, 2) of the unconstrained solution if all constraints hold."""

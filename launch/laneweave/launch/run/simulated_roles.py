@@ -8,6 +8,7 @@ from itertools import count
 from attrs import define, field
 
 from laneweave.agents.core import AgentCore
+from laneweave.agents.driving.driver import Driver, TrackingDriver
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.launch.faults.specification import ROUTER
@@ -32,6 +33,8 @@ class SimulatedRoles:
     network: SimulatedNetwork
     make_coordinator: Callable[[Name, int, Scenario], CoordinatorCore] = CoordinatorCore
     """Returns the core of a coordinator of this name and incarnation."""
+    make_driver: Callable[[Scenario], Driver] = TrackingDriver
+    """Returns the driver of a vehicle."""
     wrap: Callable[[str, Core, str], Core] = _unchanged
     """Returns the core to run for a role's name, core and kind: faults wrap cores."""
     agents: dict[str, str] = field(factory=dict)
@@ -118,4 +121,4 @@ class SimulatedRoles:
         self.network.add(name, self.wrap(name, core, receiver), self.scenario.network.realm)
 
     def _make_agent(self, vehicle: Name) -> AgentCore:
-        return AgentCore(vehicle, self.incarnations.__next__, self.scenario)
+        return AgentCore(vehicle, self.incarnations.__next__, self.scenario, self.make_driver)

@@ -18,6 +18,7 @@ import structlog
 from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.quick_frozen import quick_frozen
 from laneweave.protocol.runtime.metrics import MetricsSnapshot, NodeMetrics
 from laneweave.protocol.runtime.transport import (
     Delivery,
@@ -54,7 +55,7 @@ class Started:
     """First event of every core."""
 
 
-@frozen
+@quick_frozen
 class Arrived:
     """A valid message arrived."""
 
@@ -133,7 +134,7 @@ Event = (
 )
 
 
-@frozen
+@quick_frozen
 class Send:
     """Publish a message."""
 

@@ -12,10 +12,11 @@ from typing import Protocol
 
 from attrs import frozen
 
+from laneweave.protocol.quick_frozen import quick_frozen
 from laneweave.protocol.wire.topics import Quality
 
 
-@frozen
+@quick_frozen
 class Received:
     """A payload arrived on a key."""
 

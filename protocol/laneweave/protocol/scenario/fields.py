@@ -613,7 +613,7 @@ class Scenario:
     observation: Observation = Observation()
     sumo: SumoSettings = SumoSettings()
 
-    @property
+    @cached_property
     def lattice(self) -> Lattice:
         """The lattice of this scenario."""
         return Lattice(

@@ -81,6 +81,8 @@ class Bounds:
         Raises:
             BadInputError: it is out of bounds.
         """
+        if self._since_s is not None and 0 <= incarnation <= self.incarnation:
+            return  # nearly always; the limit only grows
         limit = self.max_incarnation(now_s)
         if not 0 <= incarnation <= limit:
             raise BadInputError("incarnation", incarnation, f"0 to {limit}")

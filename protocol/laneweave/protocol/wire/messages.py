@@ -1,9 +1,10 @@
 """All messages: senders, receivers, rates, units, and the effect of loss, delay and duplication.
 
-Messages are frozen attrs classes; `codec` encodes them as MessagePack and checks field types when
-decoding, so a core never receives a malformed message. `t_s` is road time [s], the clock that moves
-the lattice; it advances in ticks. A cell is (column, lane) in the lattice frame. The sections of
-docs/PROTOCOL.md on messages are generated from the docstrings of this module.
+Messages are frozen attrs classes, the frequent ones for type checkers only. `codec` encodes them as
+MessagePack and checks field types when decoding, so a core never receives a malformed message.
+`t_s` is road time [s], the clock that moves the lattice; it advances in ticks. A cell is (column,
+lane) in the lattice frame. The sections of docs/PROTOCOL.md on messages are generated from the
+docstrings of this module.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from attrs import field, frozen
 from cattrs import override
 
 from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
+from laneweave.protocol.quick_frozen import quick_frozen
 from laneweave.protocol.road_layout import END_OF_ROAD
 
 Name = NewType("Name", str)
@@ -146,7 +148,7 @@ class Plan:
     """Rolling operation: cells that each vehicle owns once the start gate is open."""
 
 
-@frozen
+@quick_frozen
 class VehicleState:
     """Vehicle to its formation and the coordinators, every tick and at once on every change.
 
@@ -199,7 +201,7 @@ class VehicleState:
     """Rolling operation: newest transfer of its cells. Key on the wire: `deed`."""
 
 
-@frozen
+@quick_frozen
 class Motion:
     """Vehicle to others in its own and both adjacent stretches of columns: its current motion.
 
@@ -227,7 +229,7 @@ class Motion:
     """Tick at which the message was sent."""
 
 
-@frozen
+@quick_frozen
 class Neighbour:
     """Nearest vehicle ahead or behind in a lane, as measured by sensors; part of `Sense`."""
 
@@ -240,7 +242,7 @@ class Neighbour:
     """Acceleration along the road [m/s2]."""
 
 
-@frozen
+@quick_frozen
 class Sense:
     """Bridge to one vehicle at each tick: measurements and the state of its motion controller.
 
@@ -302,7 +304,7 @@ class Sense:
     """Type of the vehicle, which determines its limits."""
 
 
-@frozen
+@quick_frozen
 class Command:
     """Agent to the motion controller of its vehicle (in the bridge), in answer to each `Sense`.
 

@@ -59,11 +59,15 @@ class Parcel(bytes):
     """A message object that is sent in place of its bytes."""
 
     message: object
+    arrived: Arrived | None
+    """The event of its newest arrival, which receivers on one key share."""
+    key: str
+    """Key of the newest arrival."""
 
     def __new__(cls, message: object) -> Parcel:
         """Wrap a message."""
         parcel = super().__new__(cls)
-        parcel.message = message
+        parcel.message, parcel.arrived, parcel.key = message, None, ""
         return parcel
 
 
@@ -79,7 +83,11 @@ class _Reader:
     def __call__(self, key: str, payload: bytes) -> Arrived:
         if not isinstance(payload, Parcel):
             return self._read(key, payload)
-        return Arrived(*self._known(key), payload.message)
+        arrived = payload.arrived
+        if arrived is None or payload.key != key:
+            payload.key = key
+            payload.arrived = arrived = Arrived(*self._known(key), payload.message)
+        return arrived
 
 
 @frozen
