@@ -45,6 +45,7 @@ class Watch {
     this.socket = socket;
     socket.onmessage = (event) => this.take(event.data);
     socket.onclose = () => {
+      if (this.store.end !== null) return;
       this.offlineSince ??= Date.now() / 1000;
       this.store.waiting = false;
       this.showStatus();
@@ -65,6 +66,8 @@ class Watch {
       this.interval = Math.min(250, Math.max(40, now - this.arrived));
       this.arrived = now;
       this.stats.frames += 1;
+    } else if (what === "end") {
+      this.showStatus();
     }
     this.stale = true;
   }
@@ -379,7 +382,10 @@ class Watch {
   showStatus() {
     const frame = this.store.newest;
     let [pill, words] = ["connecting", ""];
-    if (this.offlineSince !== null) {
+    if (this.store.end !== null) {
+      pill = "ended";
+      words = this.store.end;
+    } else if (this.offlineSince !== null) {
       pill = "offline";
       words = `Connection to the server lost at ${clockTime(this.offlineSince)}. Reconnecting.`;
     } else if (this.store.scene && !this.live) {
@@ -391,7 +397,7 @@ class Watch {
         lost: `Connection to the router lost at ${since}. Reconnecting.`,
         waiting: "Connected. No road yet: waiting for a bridge.",
         still: `The road clock stopped at ${since}.`,
-        ended: `The run ended at ${since}. Waiting for the next one.`,
+        ended: `The run ended at ${since}${this.leftOf(frame)}. Waiting for the next one.`,
         live: "",
       }[pill];
     }
@@ -403,6 +409,10 @@ class Watch {
     banner.hidden = !words;
     if (banner.textContent !== words) banner.textContent = words;
     banner.dataset.status = pill;
+  }
+
+  leftOf({ counts }) {
+    return counts ? `: ${counts[3]} of ${counts[0]} vehicles left` : "";
   }
 
   showLegend() {
