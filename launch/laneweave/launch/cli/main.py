@@ -1,7 +1,7 @@
 """The command line `laneweave`.
 
-Exit status: 0 success; 1 the run failed or violated a guarantee; 2 invalid input, reported in one
-line on stderr with the field, its value and the allowed values.
+Exit status: 0 success; 1 the run failed or violated a guarantee; 2 invalid input, reported on
+stderr: one line for each error, with the field, its value and the allowed values.
 
 Importing this module imports no other packages, so that `main` sets up signals first. One thread
 receives SIGINT and forwards it as SIGTERM, because OSQP replaces the SIGINT handler of the process
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 TYPER_INTERRUPTED = 130
 """Exit status of typer after Ctrl-C."""
+MAX_LINES = 20
+"""Maximum number of errors of a file that are printed."""
 SIM_HINT = "the simulation packages: install laneweave[sim]"
 WATCH_HINT = "the web server: install laneweave[watch]"
 INSTALL_HINTS = {
@@ -104,7 +106,9 @@ def _status(arguments: list[str]) -> int:
         result: Any = command.main(
             arguments or ["--help"], prog_name="laneweave", standalone_mode=False
         )
-    except (BadInputError, RefusedError) as error:
+    except BadInputError as error:
+        return _bad_input(*map(str, error.problems))
+    except RefusedError as error:
         return _bad_input(str(error))
     except (typer.Abort, KeyboardInterrupt):
         sys.stderr.write("interrupted\n")
@@ -128,6 +132,9 @@ def _status(arguments: list[str]) -> int:
     return result if isinstance(result, int) else 0
 
 
-def _bad_input(line: str) -> int:
-    sys.stderr.write(" ".join(line.split()) + "\n")
+def _bad_input(*lines: str) -> int:
+    for line in lines[:MAX_LINES]:
+        sys.stderr.write(" ".join(line.split()) + "\n")
+    if len(lines) > MAX_LINES:
+        sys.stderr.write(f"and {len(lines) - MAX_LINES} more errors\n")
     return 2
