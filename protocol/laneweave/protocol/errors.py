@@ -60,7 +60,7 @@ class BadInputError(ValueError):
 
     @property
     def problems(self) -> tuple[BadInputError, ...]:
-        """The errors of single values: this one, or those of a `BadInputErrors`."""
+        """The errors of single values: this one, or several."""
         return (self,)
 
     def __str__(self) -> str:
@@ -78,19 +78,22 @@ class BadInputError(ValueError):
     def within(self, parent: str) -> BadInputError:
         """Return the same error with the field's name prefixed by `parent`."""
         separator = "." if parent and self.field and not self.field.startswith("[") else ""
-        return self._with(f"{parent}{separator}{self.field}", self.place)
+        return self._with(field=f"{parent}{separator}{self.field}")
 
     def at(self, place: str) -> BadInputError:
         """Return the same error with its place in a file, unless it has one."""
-        return self._with(self.field, self.place or place)
+        return self._with(place=self.place or place)
 
-    def _with(self, field: str, place: str) -> BadInputError:
-        return BadInputError(
-            field, self.value, self.allowed, suggestion=self.suggestion, place=place
-        )
+    def suggesting(self, suggestion: str) -> BadInputError:
+        """Return the same error with another suggestion."""
+        return self._with(suggestion=suggestion)
+
+    def _with(self, **changes: str) -> BadInputError:
+        parts = {"field": self.field, "suggestion": self.suggestion, "place": self.place}
+        return BadInputError(value=self.value, allowed=self.allowed, **parts | changes)
 
 
-class BadInputErrors(BadInputError):
+class SeveralBadInputsError(BadInputError):
     """Several values of one input are invalid.
 
     Field, value and message are those of the first error; `problems` has all of them.
@@ -118,17 +121,17 @@ class BadInputErrors(BadInputError):
         more = len(self._problems) - 1
         return f"{self._problems[0]} (and {more} more error{'s' if more > 1 else ''})"
 
-    def __reduce__(self) -> tuple[type[BadInputErrors], tuple[tuple[BadInputError, ...]]]:
+    def __reduce__(self) -> tuple[type[SeveralBadInputsError], tuple[tuple[BadInputError, ...]]]:
         """Return how to copy the error to another process."""
-        return BadInputErrors, (self._problems,)
+        return SeveralBadInputsError, (self._problems,)
 
-    def within(self, parent: str) -> BadInputErrors:
+    def within(self, parent: str) -> SeveralBadInputsError:
         """Return the same errors with the fields' names prefixed by `parent`."""
-        return BadInputErrors([one.within(parent) for one in self._problems])
+        return SeveralBadInputsError([one.within(parent) for one in self._problems])
 
-    def at(self, place: str) -> BadInputErrors:
+    def at(self, place: str) -> SeveralBadInputsError:
         """Return the same errors with their place in a file, unless they have one."""
-        return BadInputErrors([one.at(place) for one in self._problems])
+        return SeveralBadInputsError([one.at(place) for one in self._problems])
 
 
 def combined(errors: Iterable[BadInputError]) -> BadInputError:
@@ -136,9 +139,9 @@ def combined(errors: Iterable[BadInputError]) -> BadInputError:
     first: dict[str, BadInputError] = {}
     for error in errors:
         for problem in error.problems:
-            first.setdefault(problem.field, problem)
+            first.setdefault(one_line(problem.field), problem)
     problems = list(first.values())
-    return BadInputErrors(problems) if len(problems) > 1 else problems[0]
+    return SeveralBadInputsError(problems) if len(problems) > 1 else problems[0]
 
 
 def raise_all(errors: Iterable[BadInputError]) -> None:

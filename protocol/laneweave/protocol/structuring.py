@@ -7,9 +7,11 @@ exception: an int is valid as a float. Unknown keys are errors. Every failure ra
 
 from __future__ import annotations
 
+import copy
+import re
 import sys
 from collections import abc
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import cycle
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -203,7 +205,41 @@ def structure(data: Mapping[str, Any], kind: type[T]) -> T:
         return _CONVERTER.structure(data, kind)
     except Exception as error:  # noqa: BLE001 (hooks and validators may raise anything)
         problems = problems_of(error)
-    raise combined(problems)
+    raise combined(_with_other_tables(problems, kind))
+
+
+def _with_other_tables(problems: Iterable[BadInputError], kind: type) -> Iterator[BadInputError]:
+    """Suggest, for unknown keys without a similar one, the same key of another table."""
+    fields: dict[str, str] = {}
+    for attribute in attrs.fields(kind):
+        fields.setdefault(attribute.alias, attribute.alias)
+        if attrs.has(attribute.type):
+            for inner in attrs.fields(attribute.type):
+                fields.setdefault(inner.alias, f"{attribute.alias}.{inner.alias}")
+    for one in problems:
+        name = fields.get(path_keys(one.field)[-1]) if one.value is UNKNOWN_KEY else None
+        yield one if one.suggestion or name is None else one.suggesting(name)
+
+
+def without(data: Mapping[str, Any], fields: Iterable[str]) -> dict[str, Any]:
+    """Return nested maps and lists without the fields of these paths.
+
+    Raises:
+        LookupError: there is no such field.
+    """
+    copied: dict[str, Any] = copy.deepcopy(dict(data))
+    for field in fields:
+        inner: Any = copied
+        *keys, last = path_keys(field)
+        for key in keys:
+            inner = inner[int(key)] if isinstance(inner, list) else inner[key]
+        del inner[last]
+    return copied
+
+
+def path_keys(field: str) -> tuple[str, ...]:
+    """Return the keys and indices in the path of a field, such as `kill[0].target`."""
+    return tuple(re.findall(r"[^.\[\]]+", field))
 
 
 def as_lists(_: object, __: object, value: object) -> object:

@@ -7,7 +7,8 @@ import json
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +16,7 @@ from typing import Any, Final
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError, Described, combined
+from laneweave.protocol.structuring import path_keys
 
 STDIN: Final = Path("-")
 MAX_TOML_BYTES: Final = 1 << 20
@@ -52,7 +54,7 @@ class SourceFile:
             found = [(0, one) for one in error.problems if one.field in given]
             for one in error.problems:
                 if one.field not in given:
-                    line = _line_of(_keys(one.field), lines)
+                    line = _line_of(path_keys(one.field), lines)
                     found.append((line, one.at(f"{self.name}:{line}" if line else self.name)))
             raise combined(one for _, one in sorted(found, key=lambda item: item[0])) from None
 
@@ -80,13 +82,18 @@ def read_text(path: Path, field: str, kind: str, max_bytes: int) -> str:
     except ValueError as error:  # a NUL in the path
         raise BadInputError(field, str(path), f"a readable file ({error})") from error
     if len(data) > max_bytes:
-        size = Described(f"{str(path)!r}, which is larger")
+        size = Described(f"{shown_name(path)!r}, which is larger")
         raise BadInputError(field, size, f"at most {max_bytes} bytes")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         why = "it is UTF-16" if data[:2] in _UTF_16 else f"byte {error.start} is not"
-        raise BadInputError(field, str(path), f"valid {kind} in UTF-8 ({why})") from error
+        raise BadInputError(field, shown_name(path), f"valid {kind} in UTF-8 ({why})") from error
+
+
+def shown_name(path: Path) -> str:
+    """Return the name of a file in errors."""
+    return "stdin" if path == STDIN else str(path)
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -164,6 +171,19 @@ def _paths(content: Mapping[str, Any]) -> Iterator[Keys]:
                 yield (key, *keys)
 
 
+def unique_keys(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of a JSON text; for `object_pairs_hook` of `json.loads`.
+
+    Raises:
+        ValueError: a key is given more than once. JSON allows it, but only one value has an effect.
+    """
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        counts = Counter(key for key, _ in pairs)
+        raise ValueError(f"key {counts.most_common(1)[0][0]!r} is given more than once")
+    return found
+
+
 _JSON_TOKENS: Final = re.compile(r'"(?:[^"\\]|\\.)*"|[{}\[\],:]|[^\s{}\[\],:"]+')
 
 
@@ -192,10 +212,6 @@ def json_lines(text: str) -> dict[Keys, int]:
             is_key = isinstance(last, str)
             keys[-1] = "" if isinstance(last, str) else last + 1
     return lines
-
-
-def _keys(field: str) -> Keys:
-    return tuple(re.findall(r"[^.\[\]]+", field))
 
 
 def _line_of(keys: Keys, lines: Lines) -> int:
