@@ -175,8 +175,11 @@ def most_similar(name: object, choices: Iterable[object]) -> str:
     """Return the choice that a misspelt name probably means; empty if none is similar."""
     if not isinstance(name, str) or len(name) > MAX_COMPARED:
         return ""
+    wanted = _comparable(name)
     comparable = {_comparable(str(choice)): str(choice) for choice in reversed([*choices])}
-    found = difflib.get_close_matches(_comparable(name), comparable, n=1)
+    found = difflib.get_close_matches(wanted, comparable, n=1)
+    # `volume` for `volume_veh_per_lane_h`
+    found += [one for one in comparable if wanted and one.startswith(f"{wanted}_")]
     return comparable[found[0]] if found else ""
 
 

@@ -209,7 +209,7 @@ def structure(data: Mapping[str, Any], kind: type[T]) -> T:
 
 
 def _with_other_tables(problems: Iterable[BadInputError], kind: type) -> Iterator[BadInputError]:
-    """Suggest, for unknown keys without a similar one, the same key of another table."""
+    """Suggest, for unknown keys that another table has, the key of that table."""
     fields: dict[str, str] = {}
     for attribute in attrs.fields(kind):
         fields.setdefault(attribute.alias, attribute.alias)
@@ -218,7 +218,7 @@ def _with_other_tables(problems: Iterable[BadInputError], kind: type) -> Iterato
                 fields.setdefault(inner.alias, f"{attribute.alias}.{inner.alias}")
     for one in problems:
         name = fields.get(path_keys(one.field)[-1]) if one.value is UNKNOWN_KEY else None
-        yield one if one.suggestion or name is None else one.suggesting(name)
+        yield one if name is None else one.suggesting(name)
 
 
 def without(data: Mapping[str, Any], fields: Iterable[str]) -> dict[str, Any]:

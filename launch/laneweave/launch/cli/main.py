@@ -12,6 +12,7 @@ continuous solving).
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import threading
@@ -67,6 +68,7 @@ def command_line() -> typer.Typer:
     from laneweave.launch.cli import certs_commands, config_commands, role_commands, study_commands
     from laneweave.launch.cli.bench_command import bench
     from laneweave.launch.cli.corridor_command import corridor
+    from laneweave.launch.cli.options import of_no_command
     from laneweave.launch.cli.plan_command import plan
     from laneweave.launch.cli.run_command import run
     from laneweave.launch.cli.simulate_command import simulate
@@ -75,9 +77,9 @@ def command_line() -> typer.Typer:
     app = typer.Typer(
         name="laneweave",
         help="Formation control with lane preference for connected and automated vehicles.",
-        add_completion=False,
         pretty_exceptions_enable=False,
     )
+    app.callback()(of_no_command)
     roles, studies = role_commands, study_commands
     for command in (
         *(run, plan, roles.router, roles.ping, roles.coordinator, roles.agent, roles.bridge),
@@ -115,7 +117,7 @@ def _status(arguments: list[str]) -> int:
         return 1
     except typer.TyperException as error:
         # Unknown option or argument; print one line instead of typer's multi-line report.
-        return _bad_input(getattr(error, "format_message", error.__str__)())
+        return _bad_input(_usage_error(error))
     except BrokenPipeError:
         return 1
     except CommandFailedError as error:
@@ -130,6 +132,20 @@ def _status(arguments: list[str]) -> int:
         sys.stderr.write("interrupted\n")
         return 1
     return result if isinstance(result, int) else 0
+
+
+def _usage_error(error: typer.TyperException) -> str:
+    """Return the line for a wrong command line, with the name that was probably meant."""
+    from laneweave.protocol.errors import most_similar
+
+    line = str(getattr(error, "format_message", error.__str__)()).replace("Value error, ", "")
+    options = getattr(error, "possibilities", None)
+    choice = re.search(r"'([^']*)' is not one of (.*)\.$", line)
+    if options:
+        line, meant = str(getattr(error, "message", line)) + ".", options[0]
+    else:
+        meant = most_similar(choice[1], re.findall("'([^']*)'", choice[2])) if choice else ""
+    return f"{line} Did you mean '{meant}'?" if meant else line
 
 
 def _bad_input(*lines: str) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
@@ -26,7 +27,12 @@ Duration = Annotated[
     float | None, typer.Option("--duration", help="Seconds during which vehicles arrive.")
 ]
 Seeds = Annotated[
-    str, typer.Option("--seeds", metavar="A:B", help="Range of seeds; B is excluded.")
+    str,
+    typer.Option(
+        "--seeds",
+        metavar="A:B",
+        help="Seeds from A to B - 1: 1:4 means 1, 2 and 3; 7:8 means 7 alone.",
+    ),
 ]
 Jobs = Annotated[
     int | None, typer.Option("--jobs", metavar="N", help="Processes; default: one per core.")
@@ -64,6 +70,23 @@ Level = Annotated[
         help="Lowest level to log; default: warning as text, info as JSON.",
     ),
 ]
+
+
+def _print_version(value: bool) -> None:
+    if value:
+        typer.echo(f"laneweave {version('laneweave')}")
+        raise typer.Exit
+
+
+def of_no_command(
+    _: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Show the version, and exit."
+        ),
+    ] = False,
+) -> None:
+    """Formation control with lane preference for connected and automated vehicles."""
 
 
 def load_deployment(config: Path | None, endpoint: str | None, **overrides: object) -> Scenario:
