@@ -104,8 +104,8 @@ def print_outcome(outcome: Outcome, console: Console) -> None:
         table.add_column()
         table.add_column(justify="right")
         trips = outcome.folder / "trips.parquet"
-        preferences = not trips.is_file() or bool(scenario_of(trips).lane_shares)
-        for label, value in summary_rows(summary, preferences=preferences):
+        scenario = scenario_of(trips) if trips.is_file() else None
+        for label, value in summary_rows(summary, scenario):
             table.add_row(label, value)
         console.print(table)
     for problem in outcome.problems:
