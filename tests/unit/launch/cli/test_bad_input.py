@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from laneweave.launch.cli.main import MAX_LINES
+from laneweave.protocol.scenario.deployment_fields import Service
 from support.commands import Here
 
 NOBODY = "unixsock-stream/nobody.sock"
@@ -111,3 +114,113 @@ def test_deadlines_on_the_command_line(laneweave: Here, folder: Path, deadline: 
     request = folder / "request.json"
     request.write_text(json.dumps(REQUEST), encoding="utf-8")
     assert "deadline_s" in laneweave.refused("plan", request, "--deadline", deadline)
+
+
+def written(folder: Path, name: str, content: str | bytes) -> Path:
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("words", "text", "lines"),
+    [
+        (
+            "run FILE",
+            "seed = -1\nraod = 1\n[road]\nlanes = 99\n",
+            ["seed: got -1", "raod: got an unknown key", "road.lanes: got 99"],
+        ),
+        (
+            "run --faults FILE",
+            "[[kill]]\nat_s = -1\n[[pause]]\nfor_s = 0\nat_s = 1\n[[kil]]\n",
+            ["kill[0].at_s: got -1.0", "pause[0].for_s: got 0.0", "kil: got an unknown key"],
+        ),
+        ("config check FILE", "[network]\nlease = 1\nlease_s = 0\n", ["network.lease", "network"]),
+        (
+            "plan FILE --deadline 3 --solver tappa",
+            json.dumps(REQUEST | {"mod": 1, "deadline_s": 0, "solver": "tapa"}, indent=1),
+            ["mod: got an unknown key", "deadline_s: got 0.0", "solver: got 'tapa'"],
+        ),
+    ],
+)
+def test_all_errors_of_a_file_have_a_line_each(
+    laneweave: Here, folder: Path, words: str, text: str, lines: list[str]
+) -> None:
+    written(folder, "FILE", text)
+    status, out, errors = laneweave(*words.split())
+    assert (status, out, len(errors)) == (2, "", len(lines))
+    found = {re.sub(r".*\(FILE:(\d+)\)$", r"\1", error): error for error in errors}
+    assert all(number.isdigit() for number in found)
+    assert len(found) == len(lines)
+    for start in lines:
+        assert any(error.startswith(start) for error in errors), errors
+
+
+def test_only_the_first_errors_of_a_file_are_printed(laneweave: Here, folder: Path) -> None:
+    vehicles = [{"id": f"v{number}", "cell": [99, 0]} for number in range(30)]
+    written(folder, "FILE", json.dumps(REQUEST | {"vehicles": vehicles}))
+    _, _, errors = laneweave("plan", "FILE")
+    assert len(errors) == MAX_LINES + 1
+    assert errors[-1].startswith("and ")
+
+
+@pytest.mark.parametrize("command", ["run", "plan"])
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"\xff\xfe{\x00", "in UTF-8 (it is UTF-16)"),
+        (b"\x00\x01\x02\xff", "in UTF-8 (byte 3 is not)"),
+        (b" " * 2_000_000, "bytes"),
+        (b"{" * 5000, "valid "),
+    ],
+)
+def test_files_that_are_no_text(
+    laneweave: Here, folder: Path, command: str, content: bytes, said: str
+) -> None:
+    assert said in laneweave.refused(command, written(folder, "FILE", content))
+
+
+def test_a_request_given_twice_is_refused(laneweave: Here, folder: Path) -> None:
+    text = json.dumps(REQUEST).replace('"targets"', '"mode": 1, "mode": 2, "targets"')
+    line = laneweave.refused("plan", written(folder, "FILE", text))
+    assert "key 'mode' is given more than once" in line
+
+
+def test_the_size_of_a_request_is_limited_as_by_the_service(laneweave: Here, folder: Path) -> None:
+    limit = Service().max_request_bytes
+    text = json.dumps(REQUEST)
+    assert laneweave("plan", written(folder, "FILE", text.ljust(limit)))[0] == 0
+    line = laneweave.refused("plan", written(folder, "FILE", text.ljust(limit + 1)))
+    assert line.endswith(f"allowed: at most {limit} bytes")
+    small = written(folder, "small.toml", "[service]\nmax_request_bytes = 1024\n")
+    big = written(folder, "FILE", text.ljust(1025))
+    assert "at most 1024 bytes" in laneweave.refused(
+        "plan", big, "--config", small, "--draw-road", "x.png"
+    )
+
+
+def test_a_byte_order_mark_is_read(laneweave: Here, folder: Path) -> None:
+    text = json.dumps(REQUEST, indent=1).replace("\n", "\r\n")
+    request = written(folder, "FILE", b"\xef\xbb\xbf" + text.encode())
+    scenario = written(folder, "x.toml", b"\xef\xbb\xbf[road]\r\nlanes = 9\r\n")
+    assert laneweave("plan", request)[0] == 0
+    assert laneweave.refused("run", scenario).startswith("road.lanes: got 9")
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        ("rum", "'run'"),
+        ("run --sed 1", "'--seed'"),
+        ("run --method formaton", "'formation'"),
+        ("run --faults losy10", "lossy10"),
+        ("simulate --profile gided", "guided"),
+        ("bench plannr", "'planner'"),
+        ("bench planner --families blok", "block"),
+        ("run --solver tapa", "tappa"),
+    ],
+)
+def test_what_was_probably_meant(laneweave: Here, words: str, meant: str) -> None:
+    line = laneweave.refused(*words.split())
+    assert f"id you mean {meant}?" in line
+    assert "Value error" not in line
