@@ -217,7 +217,8 @@ def _with_other_tables(problems: Iterable[BadInputError], kind: type) -> Iterato
             for inner in attrs.fields(attribute.type):
                 fields.setdefault(inner.alias, f"{attribute.alias}.{inner.alias}")
     for one in problems:
-        name = fields.get(path_keys(one.field)[-1]) if one.value is UNKNOWN_KEY else None
+        keys = path_keys(one.field) if one.value is UNKNOWN_KEY else ()
+        name = fields.get(keys[-1]) if keys else None
         yield one if name is None else one.suggesting(name)
 
 
@@ -230,7 +231,7 @@ def without(data: Mapping[str, Any], fields: Iterable[str]) -> dict[str, Any]:
     copied: dict[str, Any] = copy.deepcopy(dict(data))
     for field in fields:
         inner: Any = copied
-        *keys, last = path_keys(field)
+        *keys, last = path_keys(field) or ("",)
         for key in keys:
             inner = inner[int(key)] if isinstance(inner, list) else inner[key]
         del inner[last]
@@ -283,7 +284,7 @@ def problems_of(error: Exception, path: str = "") -> list[BadInputError]:
     if isinstance(error, ForbiddenExtraKeysError):
         known = sorted(attribute.alias for attribute in attrs.fields(error.cl))
         return [
-            unknown_name(name, UNKNOWN_KEY, known).within(path)
+            unknown_name(name or repr(name), UNKNOWN_KEY, known).within(path)
             for name in sorted(error.extra_fields)
         ]
     if isinstance(error, BadInputError):

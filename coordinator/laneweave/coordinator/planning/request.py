@@ -47,6 +47,7 @@ MAX_TARGETS: Final = 400
 MAX_ID_LENGTH: Final = 100
 MAX_DEADLINE_S: Final = 3600.0
 
+_KNOWN_KEYS: Final = "only known keys"
 _NOT_BOTH: Final = "structure or targets, not both"
 
 
@@ -150,6 +151,8 @@ class PlanRequest:
         if data.get("schema") != REQUEST_SCHEMA:
             raise BadInputError("schema", data.get("schema"), repr(REQUEST_SCHEMA))
         problems = [*_json_problems("", data)]
+        if any(one.allowed == _KNOWN_KEYS for one in problems):
+            raise combined(problems)
         if "targets" not in data and "structure" not in data:
             allowed = "a list of cells; or a structure instead"
             problems.append(BadInputError("targets", NO_VALUE, allowed))
@@ -254,7 +257,7 @@ def _json_problems(parent: str, value: object) -> Iterator[BadInputError]:
         for key, item in value.items():
             shown = one_line(str(key), 80) or repr(key)
             if shown != key:
-                yield BadInputError(prefix + shown, item, "only known keys")
+                yield BadInputError(prefix + shown, item, _KNOWN_KEYS)
             elif item is None:
                 yield BadInputError(prefix + key, None, "a value, or no such key")
             elif key != "geometry":

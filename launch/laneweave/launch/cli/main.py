@@ -11,8 +11,8 @@ continuous solving).
 
 from __future__ import annotations
 
+import errno
 import os
-import re
 import signal
 import sys
 import threading
@@ -96,6 +96,7 @@ def _status(arguments: list[str]) -> int:
     app = command_line()
     import typer
 
+    from laneweave.launch.cli.usage_errors import usage_error
     from laneweave.launch.run.logs import log_to_terminal
     from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 
@@ -117,9 +118,14 @@ def _status(arguments: list[str]) -> int:
         return 1
     except typer.TyperException as error:
         # Unknown option or argument; print one line instead of typer's multi-line report.
-        return _bad_input(_usage_error(error))
+        return _bad_input(usage_error(error))
     except BrokenPipeError:
         return 1
+    except OSError as error:
+        if error.errno not in (errno.ENAMETOOLONG, errno.EACCES):
+            raise
+        allowed = f"an accessible file or folder ({error.strerror})"
+        return _bad_input(str(BadInputError("file", error.filename, allowed)))
     except CommandFailedError as error:
         sys.stderr.write(" ".join(str(error).split()) + "\n")
         return 1
@@ -132,20 +138,6 @@ def _status(arguments: list[str]) -> int:
         sys.stderr.write("interrupted\n")
         return 1
     return result if isinstance(result, int) else 0
-
-
-def _usage_error(error: typer.TyperException) -> str:
-    """Return the line for a wrong command line, with the name that was probably meant."""
-    from laneweave.protocol.errors import most_similar
-
-    line = str(getattr(error, "format_message", error.__str__)()).replace("Value error, ", "")
-    options = getattr(error, "possibilities", None)
-    choice = re.search(r"'([^']*)' is not one of (.*)\.$", line)
-    if options:
-        line, meant = str(getattr(error, "message", line)) + ".", options[0]
-    else:
-        meant = most_similar(choice[1], re.findall("'([^']*)'", choice[2])) if choice else ""
-    return f"{line} Did you mean '{meant}'?" if meant else line
 
 
 def _bad_input(*lines: str) -> int:

@@ -208,7 +208,7 @@ def _read(path: Path, max_bytes: int) -> SourceFile:
     except (ValueError, RecursionError) as error:
         raise BadInputError(name, shown, f"valid JSON ({error})") from error
     if not isinstance(data, dict):
-        raise BadInputError(name, type(data).__name__, "a JSON object")
+        raise BadInputError(name, data, "a JSON object")
     return SourceFile(shown, text, data, json_lines)
 
 

@@ -334,10 +334,14 @@ def _unknown_targets(
 
 def _source(choice: Path | str) -> SourceFile:
     path = Path(choice)
-    if path.exists():
+    names = preset_names()
+    try:
+        exists = path.exists()
+    except OSError as error:
+        raise BadInputError("--faults", str(choice), f"a file ({error.strerror})") from error
+    if exists:
         return read_toml_source(path)
-    if str(choice) not in preset_names():
-        names = preset_names()
+    if str(choice) not in names:
         allowed = f"a readable file, or one of {', '.join(names)}"
         raise unknown_name("--faults", str(choice), names, allowed)
     with as_file(_presets().joinpath(f"{choice}.toml")) as preset:

@@ -52,6 +52,8 @@ def _traffic_rows(summary: RunSummary, *, preferences: bool) -> Iterator[Row]:
         share = f"{summary.preferred_percent:.2f} % of {vehicles.left} vehicles"
         yield "left in their preferred lane", share
     counted = "" if times.n is None else f" ({times.n} of {vehicles.demanded} vehicles)"
+    if times.n == 0:
+        yield "travel time, mean", f"none{counted}"
     yield from _numbers(
         ("travel time, mean", times.mean, f" s{counted}"),
         ("travel time, 95th percentile", times.p95, " s"),

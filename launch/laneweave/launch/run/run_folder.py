@@ -22,8 +22,7 @@ def new_folder(out: Path | None, settings: Scenario, method: str) -> Iterator[Pa
     """
     volume = f"{settings.demand.volume_veh_per_lane_h:g}"
     folder = out or timestamped_folder(f"{method}-{volume}-seed{settings.seed}")
-    existed = folder.is_dir()
-    _claim(folder)
+    existed = _claim(folder)
     try:
         yield folder
     except (BadInputError, KeyboardInterrupt):
@@ -45,8 +44,10 @@ def timestamped_folder(prefix: str) -> Path:
     return folder
 
 
-def _claim(folder: Path) -> None:
+def _claim(folder: Path) -> bool:
+    """Create a folder, or claim an empty one; return whether it existed."""
     try:
+        existed = folder.is_dir()
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise BadInputError("--out", str(folder), "a new or empty folder")
@@ -56,3 +57,4 @@ def _claim(folder: Path) -> None:
         raise BadInputError("--out", str(folder), "a new or empty folder") from error
     except OSError as error:
         raise BadInputError("--out", str(folder), f"a folder ({error.strerror})") from error
+    return existed

@@ -698,13 +698,16 @@ def _check_security(scenario: Scenario) -> None:
     secured = security.mode == "mtls"
     endpoints = [("network.endpoint", network.endpoint)] if network.endpoint else []
     endpoints += [("network.listen", endpoint) for endpoint in network.listen]
+    if secured:
+        allowed = "tls/HOST:PORT or quic/HOST:PORT, as security.mode is mtls"
+        raise_all(
+            BadInputError(name, endpoint, allowed)
+            for name, endpoint in endpoints
+            if not is_encrypted(endpoint)
+        )
     for name, endpoint in endpoints:
-        if secured:
-            allowed = "tls/HOST:PORT or quic/HOST:PORT, as security.mode is mtls"
-            _require(is_encrypted(endpoint), name, endpoint, allowed)
-        else:
-            allowed = f"mtls, as {name} is {endpoint}"
-            _require(not is_encrypted(endpoint), "security.mode", "off", allowed)
+        allowed = f"mtls, as {name} is {endpoint}"
+        _require(secured or not is_encrypted(endpoint), "security.mode", "off", allowed)
     if not secured:
         return
     _require(bool(security.folder), "security.folder", "", "the folder of the certificates")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from pathlib import Path
@@ -14,6 +15,7 @@ from laneweave.protocol.scenario.deployment_fields import Service
 from support.commands import Here
 
 NOBODY = "unixsock-stream/nobody.sock"
+LONG = "x" * 5000
 REQUEST: dict[str, Any] = {
     "schema": "laneweave.plan.request/1",
     "grid": {"columns": 4, "lanes": 2},
@@ -76,6 +78,17 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["bench", "planner", "--solver", "magic"], "--solver: got 'magic'"),
         (["report"], "DIR"),
         (["report", "missing"], "DIR: got 'missing'"),
+        (["report", LONG], "file: got 'xxx"),
+        (["certs", "init", LONG], "file: got 'xxx"),
+        (["run", "--out", LONG], "--out: got 'xxx"),
+        (["run", "--faults", LONG], "--faults: got 'xxx"),
+        (["run", "a\0b"], "SCENARIO.toml"),
+        (["run", "--seed", "1e3"], "--seed: got '1e3'; allowed: an integer"),
+        (["run", "--volume", "x"], "--volume: got 'x'; allowed: a number"),
+        (["bench", "planner", "--deadline", "nan"], "--deadline: got 'nan'; allowed: [0.01, 3600]"),
+        (["bench", "runtime", "--seed", "-1"], "--seed: got '-1'; allowed: at least 0"),
+        (["simulate", "--shrink", "."], "--shrink: got '.'"),
+        (["simulate", "--story", "something.txt"], "valid JSON"),
     ],
     ids=lambda value: " ".join(value)[:40] if isinstance(value, list) else "",
 )
@@ -95,16 +108,21 @@ def test_command_lines(laneweave: Here, arguments: list[str], named: str) -> Non
             "[[kill]]\ntarget = 'v9999'\nat_s = 1",
             "name of a vehicle of the run",
         ),
+        ("run FILE", '"a\\nb" = 1', "a b: got an unknown key"),
+        ("run FILE", '"" = 1', "'': got an unknown key"),
         ("plan FILE", "[" * 100_000, "valid JSON"),
+        ("plan FILE", "null", "REQUEST.json: got None; allowed: a JSON object"),
+        ("plan FILE", json.dumps(REQUEST | {"": 1}), "'': got 1; allowed: only known keys"),
+        ("simulate --story FILE", "[" * 100_000, "valid JSON"),
         ("plan FILE", json.dumps(REQUEST | {"targets": [[0.5, 0]]}), "targets[0]"),
         ("plan FILE", json.dumps(REQUEST | {"deadline_s": float("nan")}), "deadline_s"),
     ],
-    ids=range(8),
+    ids=itertools.count(),
 )
 def test_files(laneweave: Here, folder: Path, words: str, text: str, named: str) -> None:
     """One or two errors of each kind of file; the parsers' own tests have the others."""
     (folder / "FILE").write_text(text, encoding="utf-8")
-    out = () if words.startswith("plan") else ("--out", "out")
+    out = ("--out", "out") if words.startswith("run") else ()
     assert named in laneweave.refused(*words.split(), *out)
     assert not (folder / "out").exists()
 
@@ -212,10 +230,10 @@ def test_a_byte_order_mark_is_read(laneweave: Here, folder: Path) -> None:
     [
         ("rum", "'run'"),
         ("run --sed 1", "'--seed'"),
-        ("run --method formaton", "'formation'"),
+        ("run --method formaton", "formation"),
         ("run --faults losy10", "lossy10"),
         ("simulate --profile gided", "guided"),
-        ("bench plannr", "'planner'"),
+        ("bench plannr", "planner"),
         ("bench planner --families blok", "block"),
         ("run --solver tapa", "tappa"),
     ],

@@ -149,6 +149,8 @@ def test_the_table_at_the_end(
 def test_a_mean_says_of_how_many_vehicles_it_is() -> None:
     found = make_summary(travel_time_s={"mean": 71.5, "n": 29}, vehicles={"demanded": 91})
     assert dict(summary_rows(found))["travel time, mean"] == "71.50 s (29 of 91 vehicles)"
+    none = make_summary(travel_time_s={"mean": None, "n": 0}, vehicles={"demanded": 26})
+    assert dict(summary_rows(none))["travel time, mean"] == "none (0 of 26 vehicles)"
     without = make_summary(travel_time_s={"mean": 71.5})
     assert dict(summary_rows(without))["travel time, mean"] == "71.50 s"
 
