@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import reprlib
 from collections.abc import Collection, Iterable, Sequence
+from itertools import islice
 from typing import Final
 
 from attrs import frozen
@@ -13,6 +14,8 @@ _SHORT = reprlib.Repr()
 _SHORT.maxlevel = 4
 _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 12
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 80
+MAX_PROBLEMS = 100
+"""Number of errors of one input after which the rest of it is not examined."""
 MAX_COMPARED = 100
 """Maximum length of a name that is compared with allowed names."""
 
@@ -40,21 +43,28 @@ class BadInputError(ValueError):
     """
 
     def __init__(
-        self, field: str, value: object, allowed: str, *, suggestion: str = "", place: str = ""
+        self,
+        field: str,
+        value: object,
+        allowed: str,
+        *,
+        choices: Collection[object] = (),
+        place: str = "",
     ) -> None:
         """Store the parts of the message, which shows a shortened `value`.
 
         Args:
             field: name of the field, with its path in a file.
-            value: the invalid value.
+            value: the invalid value; `UNKNOWN_KEY` if the last part of `field` is an invalid name.
             allowed: description of the allowed values.
-            suggestion: allowed value that is similar to the invalid one; empty: none.
+            choices: the allowed values, of which the message suggests the most similar one; empty:
+                no suggestion.
             place: file and line of the value; empty: unknown, or not from a file.
         """
         self.field = field
         self.value = value
         self.allowed = allowed
-        self.suggestion = suggestion
+        self.choices = choices
         self.place = place
         super().__init__(field, value, allowed)
 
@@ -62,6 +72,14 @@ class BadInputError(ValueError):
     def problems(self) -> tuple[BadInputError, ...]:
         """The errors of single values: this one, or several."""
         return (self,)
+
+    @property
+    def suggestion(self) -> str:
+        """The choice that was probably meant; empty if none is similar."""
+        if len(self.choices) == 1 and self.value is UNKNOWN_KEY:
+            return str(*self.choices)
+        name = self.field.rpartition(".")[2] if self.value is UNKNOWN_KEY else self.value
+        return most_similar(name, self.choices)
 
     def __str__(self) -> str:
         """Return the message as one line."""
@@ -71,8 +89,9 @@ class BadInputError(ValueError):
             shown = f"a huge {type(self.value).__name__}"
         field, value, allowed = one_line(self.field, 120), one_line(shown, 80), self.allowed
         line = f"{field}: got {value}; allowed: {one_line(allowed)}"
-        if self.suggestion:
-            line += f"; did you mean {one_line(self.suggestion, 80)}?"
+        suggestion = self.suggestion
+        if suggestion:
+            line += f"; did you mean {one_line(suggestion, 80)}?"
         return f"{line} ({one_line(self.place)})" if self.place else line
 
     def within(self, parent: str) -> BadInputError:
@@ -85,12 +104,22 @@ class BadInputError(ValueError):
         return self._with(place=self.place or place)
 
     def suggesting(self, suggestion: str) -> BadInputError:
-        """Return the same error with another suggestion."""
-        return self._with(suggestion=suggestion)
+        """Return the same error of an unknown key with another suggestion."""
+        return self._with(choices=(suggestion,))
 
-    def _with(self, **changes: str) -> BadInputError:
-        parts = {"field": self.field, "suggestion": self.suggestion, "place": self.place}
-        return BadInputError(value=self.value, allowed=self.allowed, **parts | changes)
+    def _with(
+        self,
+        field: str | None = None,
+        place: str | None = None,
+        choices: Collection[object] | None = None,
+    ) -> BadInputError:
+        return BadInputError(
+            self.field if field is None else field,
+            self.value,
+            self.allowed,
+            choices=self.choices if choices is None else choices,
+            place=self.place if place is None else place,
+        )
 
 
 class SeveralBadInputsError(BadInputError):
@@ -103,11 +132,7 @@ class SeveralBadInputsError(BadInputError):
         """Store the errors, at least one."""
         first = problems[0]
         super().__init__(
-            first.field,
-            first.value,
-            first.allowed,
-            suggestion=first.suggestion,
-            place=first.place,
+            first.field, first.value, first.allowed, choices=first.choices, place=first.place
         )
         self._problems = tuple(problems)
 
@@ -145,8 +170,8 @@ def combined(errors: Iterable[BadInputError]) -> BadInputError:
 
 
 def raise_all(errors: Iterable[BadInputError]) -> None:
-    """Raise all errors as one; do nothing if there are none."""
-    problems = [*errors]
+    """Raise the errors, at most `MAX_PROBLEMS`, as one; do nothing if there are none."""
+    problems = [*islice(errors, MAX_PROBLEMS)]
     if problems:
         raise combined(problems)
 
@@ -154,7 +179,7 @@ def raise_all(errors: Iterable[BadInputError]) -> None:
 def unknown_name(
     field: str, value: object, choices: Collection[object], allowed: str = ""
 ) -> BadInputError:
-    """Return the error of a value that is not one of the choices, with the most similar choice.
+    """Return the error of a value that is not one of the choices, which suggests a similar one.
 
     Args:
         field: name of the field.
@@ -162,13 +187,8 @@ def unknown_name(
         choices: the allowed values.
         allowed: description of the allowed values; empty: their list.
     """
-    name = field.rpartition(".")[2] if value is UNKNOWN_KEY else value
-    return BadInputError(
-        field,
-        value,
-        allowed or "one of " + ", ".join(map(str, choices)),
-        suggestion=most_similar(name, choices),
-    )
+    described = allowed or "one of " + ", ".join(map(str, choices))
+    return BadInputError(field, value, described, choices=choices)
 
 
 def most_similar(name: object, choices: Iterable[object]) -> str:

@@ -26,6 +26,7 @@ from cattrs.errors import (
 from cattrs.gen import make_dict_structure_fn
 
 from laneweave.protocol.errors import (
+    MAX_PROBLEMS,
     NO_VALUE,
     UNKNOWN_KEY,
     BadInputError,
@@ -36,8 +37,6 @@ from laneweave.protocol.errors import (
 )
 
 T = TypeVar("T")
-MAX_PROBLEMS = 100
-"""Number of errors of a list or a map after which its other items are not examined."""
 Hook = Callable[[Any, Any], Any]
 NumberOrRange = float | tuple[float, float]
 """A number, or the range from which it is drawn."""
@@ -282,10 +281,10 @@ def problems_of(error: Exception, path: str = "") -> list[BadInputError]:
             for problem in problems_of(inner, path + _step(inner, bool(path)))
         ]
     if isinstance(error, ForbiddenExtraKeysError):
-        known = sorted(attribute.alias for attribute in attrs.fields(error.cl))
+        known = tuple(sorted(attribute.alias for attribute in attrs.fields(error.cl)))
         return [
             unknown_name(name or repr(name), UNKNOWN_KEY, known).within(path)
-            for name in sorted(error.extra_fields)
+            for name in sorted(error.extra_fields)[:MAX_PROBLEMS]
         ]
     if isinstance(error, BadInputError):
         return [one.within(path) for one in error.problems]

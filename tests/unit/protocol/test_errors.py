@@ -91,10 +91,11 @@ def test_errors_go_to_other_processes(error: BadInputError) -> None:
 
 
 def test_an_error_ends_with_a_suggestion_and_its_place() -> None:
-    error = BadInputError("a", "tapa", "tappa", suggestion="tappa", place="x.toml:3")
+    error = BadInputError("a", "tapa", "tappa", choices=("tappa",), place="x.toml:3")
     assert str(error) == "a: got 'tapa'; allowed: tappa; did you mean tappa? (x.toml:3)"
     assert str(error.within("t")) == f"t.{error}"
-    assert str(error.suggesting("b")).endswith("; did you mean b? (x.toml:3)")
+    error = BadInputError("a", UNKNOWN_KEY, "b").suggesting("t.a").at("x.toml:3")
+    assert str(error) == "a: got an unknown key; allowed: b; did you mean t.a? (x.toml:3)"
 
 
 @pytest.mark.parametrize(

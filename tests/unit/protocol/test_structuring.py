@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from attrs import field, frozen
 
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import MAX_PROBLEMS, BadInputError
 from laneweave.protocol.field_validators import within
-from laneweave.protocol.structuring import MAX_PROBLEMS, NumberOrRange, structure, without
+from laneweave.protocol.structuring import NumberOrRange, structure, without
 from support.refusals import refusal
 
 
@@ -168,6 +168,8 @@ def test_all_validators_of_a_class_are_asked() -> None:
 def test_a_long_list_is_examined_up_to_a_number_of_errors() -> None:
     error = refusal(structure, {"count": 1, "parts": [0] * 10_000}, Whole)
     assert len(error.problems) == MAX_PROBLEMS
+    error = refusal(structure, dict.fromkeys(map(str, range(10_000)), 1), Whole)
+    assert len(error.problems) == MAX_PROBLEMS + 1
 
 
 def test_a_key_of_another_table_is_suggested() -> None:

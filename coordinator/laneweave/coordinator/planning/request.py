@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Any, Final
 
 import attrs
@@ -24,6 +25,7 @@ from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.protocol.errors import (
+    MAX_PROBLEMS,
     NO_VALUE,
     UNKNOWN_KEY,
     BadInputError,
@@ -150,7 +152,7 @@ class PlanRequest:
             raise BadInputError("request", data, "an object")
         if data.get("schema") != REQUEST_SCHEMA:
             raise BadInputError("schema", data.get("schema"), repr(REQUEST_SCHEMA))
-        problems = [*_json_problems("", data)]
+        problems = [*islice(_json_problems("", data), MAX_PROBLEMS)]
         if any(one.allowed == _KNOWN_KEYS for one in problems):
             raise combined(problems)
         if "targets" not in data and "structure" not in data:
@@ -162,7 +164,7 @@ class PlanRequest:
         problems += unstructured
         if document is None:
             raise combined(problems)
-        problems += _blocked_problems(document.grid)
+        problems += islice(_blocked_problems(document.grid), MAX_PROBLEMS)
         try:
             request = cls(**document.fields())
         except BadInputError as error:
@@ -241,7 +243,7 @@ def _document(data: Mapping[str, Any]) -> tuple[_Document | None, Sequence[BadIn
         return None, problems
     try:
         return structure(without(data, [one.field for one in problems]), _Document), problems
-    except LookupError:  # a key that looks like a path
+    except (LookupError, BadInputError):  # a key that looks like a path; more than MAX_PROBLEMS
         return None, problems
 
 
@@ -310,13 +312,17 @@ def _wrong_text(field: str, text: str, min_length: int = 0) -> Iterator[BadInput
 
 
 def _problems(request: PlanRequest) -> Iterator[BadInputError]:
-    """Yield all errors of a request; the cells of an impossible grid are not checked."""
+    """Yield all errors of a request, except of items of too long lists, and of cells of no grid."""
     of_grid = [*_size_problems(request.grid)]
     yield from of_grid
     yield from _rule_problems(request)
+    of_counts = [*_wrong_count("vehicles", request.vehicles, MAX_VEHICLES)]
     if request.structure is None:
-        yield from _wrong_count("targets", request.targets, MAX_TARGETS)
-        yield from _repeated("targets", request.targets, "each cell once")
+        of_counts += _wrong_count("targets", request.targets, MAX_TARGETS)
+    yield from of_counts
+    if of_counts:
+        return
+    yield from _repeated("targets", request.targets, "each cell once")
     yield from _vehicle_problems(request)
     if not of_grid:
         yield from _cell_problems(request)
@@ -373,7 +379,6 @@ def _wrong_cell(field: str, cell: Cell, grid: Grid) -> Iterator[BadInputError]:
 def _vehicle_problems(request: PlanRequest) -> Iterator[BadInputError]:
     """Yield the errors of vehicles, except those about the grid."""
     vehicles = request.vehicles
-    yield from _wrong_count("vehicles", vehicles, MAX_VEHICLES)
     for i, vehicle in enumerate(vehicles):
         field = f"vehicles[{i}]"
         yield from _wrong_text(f"{field}.id", vehicle.id, 1)

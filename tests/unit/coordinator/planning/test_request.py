@@ -192,6 +192,18 @@ def test_all_errors_of_a_request_are_reported_at_once() -> None:
     assert problems["solver"].suggestion == "tappa"
 
 
+def test_a_request_is_examined_up_to_a_number_of_errors() -> None:
+    for changes in (
+        {f"key{number:05}": 1 for number in range(5000)},
+        {"targets": [None] * 5000},
+        {"grid": {"columns": 4, "lanes": 2, "blocked": [[9, 9]] * 5000}},
+        {"conflicts": [f"kind {number}" for number in range(5000)]},
+    ):
+        with pytest.raises(BadInputError) as caught:
+            PlanRequest.from_dict(document() | changes)
+        assert 100 <= len(caught.value.problems) <= 205
+
+
 @pytest.mark.parametrize("text", ["a\nb", "\x00", "\x7f", "\u2028", "\u202e", "\ud800"])
 def test_ids_are_printable(text: str) -> None:
     for change, field in (
