@@ -117,7 +117,9 @@ def parse_seeds(text: str) -> range:
     match = re.fullmatch(r"(\d{1,12}):(\d{1,12})", text)
     seeds = range(int(match[1]), int(match[2])) if match else range(0)
     if not 0 < len(seeds) <= MAX_SEEDS:
-        raise BadInputError("--seeds", text, f"A:B with A < B, at most {MAX_SEEDS} seeds")
+        raise BadInputError(
+            "--seeds", text, f"A:B with A < B, seeds A to B - 1, at most {MAX_SEEDS}"
+        )
     return seeds
 
 
