@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from laneweave.launch.deploy.config_check import check_deployment
@@ -44,7 +45,7 @@ def check(
         typer.echo(f"warning: {line}", err=True)
     with read_toml_source(file).located(given=("--name",)):
         raise_all(report.problems)
-    table = Table("what", str(file), show_lines=False)
+    table = Table("what", escape(str(file)), show_lines=False)
     for what, value in report.facts:
-        table.add_row(what, value)
+        table.add_row(what, escape(value))
     Console().print(table)

@@ -21,7 +21,7 @@ MAX_JOBS = 256
 SOLVER_NAMES = " or ".join(SOLVERS)
 
 ScenarioArgument = Annotated[
-    Path | None, typer.Argument(metavar="[SCENARIO.toml]", help="Default: the paper's road.")
+    Path | None, typer.Argument(metavar="SCENARIO.toml", help="Default: the paper's road.")
 ]
 Duration = Annotated[
     float | None, typer.Option("--duration", help="Seconds during which vehicles arrive.")

@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 from attrs import evolve
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from laneweave.launch.cli.options import Config, Endpoint, load_deployment
@@ -141,7 +142,7 @@ def show(found: Status, console: Console) -> None:
     """Print a status as a table."""
     table = Table(show_header=False, box=None, pad_edge=False)
     for row in _rows(found):
-        table.add_row(*row)
+        table.add_row(*map(escape, row))
     console.print(table)
 
 

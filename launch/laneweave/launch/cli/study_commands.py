@@ -121,13 +121,13 @@ def report(
         for folder in folders:
             if not is_sweep(folder):
                 page = report_run(single_run(folder), formation=formation, dpi=REPORT_DPI)
-                Console().print(f"{page}: written", highlight=False, soft_wrap=True)
+                typer.echo(f"{page}: written")
         if len(folders) > 1 or is_sweep(folders[0]):
             if len(folders) == 1:
                 out = folders[0]
             place = out or timestamped_folder("report")
             title = "laneweave: " + ", ".join(folder.resolve().name for folder in folders)
             page = report_comparison(Comparison.of(runs), place, title, formation=formation)
-            Console().print(f"{page}: written", highlight=False, soft_wrap=True)
+            typer.echo(f"{page}: written")
     except OSError as error:
         raise CommandFailedError(f"the report cannot be written: {error}") from error

@@ -8,6 +8,7 @@ from typing import Any
 
 from attrs import evolve, frozen
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from laneweave.launch.faults.failover import Failover
@@ -100,13 +101,13 @@ def print_outcome(outcome: Outcome, console: Console) -> None:
     """Print the results and the problems of a run."""
     summary = outcome.summary
     if summary is not None:
-        table = Table(title=f"laneweave run: {outcome.folder}", show_header=False)
+        table = Table(title=f"laneweave run: {escape(str(outcome.folder))}", show_header=False)
         table.add_column()
         table.add_column(justify="right")
         trips = outcome.folder / "trips.parquet"
         scenario = scenario_of(trips) if trips.is_file() else None
         for label, value in summary_rows(summary, scenario):
-            table.add_row(label, value)
+            table.add_row(label, escape(value))
         console.print(table)
     for problem in outcome.problems:
-        console.print(f"FAILED: {problem}", style="bold red", highlight=False)
+        console.print(f"FAILED: {problem}", style="bold red", highlight=False, markup=False)

@@ -84,7 +84,7 @@ def print_results(points: Sequence[Point], folder: SweepFolder, console: Console
     wanted = [(COUNTED, "sum"), *((column, "mean") for column in columns)]
     found = over_seeds(results_table(done), wanted)
     means = {(row["label"], row["volume_veh_per_lane_h"]): row for row in found}
-    table = Table(title=f"laneweave sweep: {folder.out}")
+    table = Table(title=f"laneweave sweep: {escape(str(folder.out))}")
     table.add_column("label")
     for heading in (
         "veh/(lane h)",

@@ -181,6 +181,19 @@ def test_the_table_names_no_preferred_lanes_on_a_road_without_them(tmp_path: Pat
     assert "preferred lane" not in printed(judge(tmp_path, summary()))
 
 
+def test_names_with_brackets_are_printed_as_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = Path("a[", "b][red]")
+    folder.mkdir(parents=True)
+    outcome = judge(folder, summary(), problems=["the router [/x] ended [bold]"])
+    text = io.StringIO()
+    print_outcome(outcome, Console(file=text, width=400))
+    assert f"laneweave run: {folder}" in text.getvalue()
+    assert "FAILED: the router [/x] ended [bold]\n" in text.getvalue()
+
+
 def test_all_reasons_are_printed(tmp_path: Path) -> None:
     found = summary(overlaps=1, left=4, ending="limit")
     text = printed(judge(tmp_path, found, problems=["the router [9] ended"]))
