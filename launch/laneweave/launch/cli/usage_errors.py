@@ -24,11 +24,12 @@ def usage_error(error: typer.TyperException) -> str:
     similar = getattr(error, "possibilities", None)
     if similar:
         return f"{getattr(error, 'message', line)}. Did you mean '{similar[0]}'?"
-    found = re.match("Invalid value for '([^']*)'", line)
+    found = re.match(r"Invalid value for '([^']*)'(?: \(env var: '(\w*)'\))?", line)
     reasons: list[dict[str, Any]] = getattr(error.__cause__ or error.__context__, "errors", list)()
     if not found or not reasons:
         return line
-    return str(_wrong_value(found[1], reasons[0], getattr(error, "param", None)))
+    name = f"{found[1]} or {found[2]}" if found[2] else found[1]
+    return str(_wrong_value(name, reasons[0], getattr(error, "param", None)))
 
 
 def _wrong_value(name: str, reason: dict[str, Any], parameter: object) -> BadInputError:

@@ -242,3 +242,11 @@ def test_what_was_probably_meant(laneweave: Here, words: str, meant: str) -> Non
     line = laneweave.refused(*words.split())
     assert f"id you mean {meant}?" in line
     assert "Value error" not in line
+
+
+def test_a_wrong_environment_variable_is_named(
+    laneweave: Here, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LANEWEAVE_LOG", "jsn")
+    line = laneweave.refused("coordinator")
+    assert line.startswith("--log or LANEWEAVE_LOG: got 'jsn'; allowed: text, json")
