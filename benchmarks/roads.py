@@ -34,7 +34,8 @@ from laneweave.launch.run.reference_run import ReferenceRun
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.launch.run_methods import FORMATION, METHODS
 from laneweave.protocol.config.participants import coordinator_names
-from laneweave.protocol.config.scenario_files import load_scenario, read_toml
+from laneweave.protocol.config.scenario_files import load_scenario
+from laneweave.protocol.config.source_files import read_toml
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.protocol.summary import read_summary

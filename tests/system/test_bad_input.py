@@ -114,6 +114,33 @@ def test_folders_that_cannot_be_written(lab: Lab, make: Callable[[Path], None], 
         assert f"--out: got '{out}'" in refused(lab, *command.split(), "--out", out)
 
 
+@pytest.mark.parametrize(
+    "command",
+    ["run FILE --seed 1", "sweep FILE", "router --config FILE", "ping --config FILE",
+     "coordinator --config FILE", "agent --config FILE", "bridge --config FILE",
+     "watch --config FILE", "status --config FILE", "config check FILE",
+     "plan REQUEST --config FILE", "certs init certs --config FILE"],
+)  # fmt: skip
+def test_every_command_names_all_errors_of_its_file(lab: Lab, command: str) -> None:
+    text = (
+        "\ufeffseed = -1\r\n[raod]\r\nlanes = 2\r\n[network]\r\nlease_s = 'x'\r\nendpiont = 1\r\n"
+    )
+    file, plan = lab.path("a.toml", text), lab.path("request.json", json.dumps(request()))
+    places = {"FILE": file, "REQUEST": plan}
+    ended = lab.run_forked(*(places.get(word, word) for word in command.split()))
+    assert (ended.status, ended.out) == (2, ""), ended
+    found = [(line.partition(":")[0], line[-2]) for line in ended.complaints]
+    assert found == [
+        ("seed", "1"),
+        ("raod", "2"),
+        ("network.lease_s", "5"),
+        ("network.endpiont", "6"),
+    ]
+    for line, meant in zip(ended.complaints[1::2], ("road", "endpoint"), strict=True):
+        assert f"; did you mean {meant}? (" in line
+    lab.check_nothing_left()
+
+
 def test_the_temporary_folder_is_too_deep_for_sockets(lab: Lab) -> None:
     deep = lab.folder / ("d" * 100)
     deep.mkdir()

@@ -11,7 +11,7 @@ from typing import Any
 
 import attrs
 
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, unknown_name
 
 NAME_PATTERN = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 NAME_RULE = "letters, digits, `_`, `-`, `.`; at least 1, at most 64"
@@ -50,7 +50,8 @@ def one_of(*choices: object) -> Validator:
 
     def check(_: object, attribute: attrs.Attribute[Any], value: object) -> None:
         if value not in choices:
-            raise BadInputError(attribute.name, value, ", ".join(map(str, choices)))
+            allowed = ", ".join(map(str, choices))
+            raise unknown_name(attribute.name, value, choices, allowed)
 
     return check
 

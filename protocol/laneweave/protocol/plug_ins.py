@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from attrs import frozen
 
-from laneweave.protocol.errors import BadInputError, one_line
+from laneweave.protocol.errors import BadInputError, one_line, unknown_name
 from laneweave.protocol.field_validators import NAME_PATTERN
 
 if TYPE_CHECKING:
@@ -85,19 +85,13 @@ class PlugIns:
     def _plug_in(self, name: str, field: str, others: Iterable[str] = ()) -> EntryPoint:
         points = [] if name in self._taken else _entry_points(self.group).get(name, [])
         if not points:
-            raise BadInputError(field, name, self._allowed(name, others))
+            names = tuple(dict.fromkeys([*others, *self.names()]))
+            allowed = f"one of {', '.join(names)}, or the name of a plug-in that is installed"
+            raise unknown_name(field, name, names, allowed)
         if len(points) > 1:
             both = " and ".join(map(_distribution, points))
             raise BadInputError(field, name, f"a {self.kind} of one distribution; {both} have one")
         return points[0]
-
-    def _allowed(self, name: str, others: Iterable[str]) -> str:
-        from difflib import get_close_matches  # noqa: PLC0415
-
-        names = tuple(dict.fromkeys([*others, *self.names()]))
-        meant = get_close_matches(name, names, 1)
-        hint = f" (did you mean {meant[0]}?)" if meant else ""
-        return f"one of {', '.join(names)}, or the name of a plug-in that is installed{hint}"
 
 
 @cache

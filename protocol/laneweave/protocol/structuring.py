@@ -1,15 +1,17 @@
 """Strict conversion of untyped maps (TOML, MessagePack, JSON) into attrs classes, with cattrs.
 
 Values are not coerced: a string is not a number, a bool is not an int, text is not a list. The only
-exception: an int is valid as a float. Unknown keys are errors. Every failure raises one
-`BadInputError` that names the path of the field.
+exception: an int is valid as a float. Unknown keys are errors. Every failure raises a
+`BadInputError` that names the path of the field; with `structure`, it has the errors of all fields.
 """
 
 from __future__ import annotations
 
+import copy
+import re
 import sys
 from collections import abc
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import cycle
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -23,7 +25,16 @@ from cattrs.errors import (
 )
 from cattrs.gen import make_dict_structure_fn
 
-from laneweave.protocol.errors import NO_VALUE, UNKNOWN_KEY, BadInputError, Described
+from laneweave.protocol.errors import (
+    MAX_PROBLEMS,
+    NO_VALUE,
+    UNKNOWN_KEY,
+    BadInputError,
+    Described,
+    combined,
+    raise_all,
+    unknown_name,
+)
 
 T = TypeVar("T")
 Hook = Callable[[Any, Any], Any]
@@ -116,11 +127,15 @@ def _tuple_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a gen
 
     def detailed(value: object, _: type) -> tuple[Any, ...]:
         done: list[Any] = []
-        for item, (hook, part) in zip(parts(value), cycle(hooks)):
+        problems: list[BadInputError] = []
+        for number, (item, (hook, part)) in enumerate(zip(parts(value), cycle(hooks))):
             try:
                 done.append(hook(item, part))
-            except Exception as error:
-                raise first_problem(error).within(f"[{len(done)}]") from error
+            except Exception as error:  # noqa: BLE001 (hooks and validators may raise anything)
+                problems += problems_of(error, f"[{number}]")
+                if len(problems) >= MAX_PROBLEMS:
+                    break
+        raise_all(problems)
         return tuple(done)
 
     if converter.detailed_validation:
@@ -138,11 +153,15 @@ def _dict_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a gene
         if not isinstance(value, Mapping):
             raise BadInputError("", value, "a table")
         done = {}
+        problems: list[BadInputError] = []
         for key, item in value.items():
             try:
                 done[key_hook(key, key_kind)] = value_hook(item, value_kind)
-            except Exception as error:
-                raise first_problem(error).within(f"[{key}]") from error
+            except Exception as error:  # noqa: BLE001 (hooks and validators may raise anything)
+                problems += problems_of(error, f"[{key}]")
+                if len(problems) >= MAX_PROBLEMS:
+                    break
+        raise_all(problems)
         return done
 
     return hook
@@ -162,7 +181,11 @@ def _class_hook(kind: type, converter: Converter) -> Hook:
         for key in value:
             if type(key) is not str:
                 raise BadInputError("", key, "a text as the key of each field")
-        return fields_hook(value, kind)
+        try:
+            return fields_hook(value, kind)
+        except Exception as error:  # noqa: BLE001 (hooks and validators may raise anything)
+            problems = [*problems_of(error), *_invalid_values(value, kind, converter)]
+        raise combined(problems)
 
     # The fast hook rejects the same values, but its errors do not name the field.
     return detailed if converter.detailed_validation else fields_hook
@@ -175,12 +198,48 @@ def structure(data: Mapping[str, Any], kind: type[T]) -> T:
     """Build an instance of the attrs class `kind` from nested maps.
 
     Raises:
-        BadInputError: a value is invalid; the error names the path of the first such value.
+        BadInputError: values are invalid; the error names the paths of all of them.
     """
     try:
         return _CONVERTER.structure(data, kind)
     except Exception as error:  # noqa: BLE001 (hooks and validators may raise anything)
-        raise first_problem(error) from None
+        problems = problems_of(error)
+    raise combined(_with_other_tables(problems, kind))
+
+
+def _with_other_tables(problems: Iterable[BadInputError], kind: type) -> Iterator[BadInputError]:
+    """Suggest, for unknown keys that another table has, the key of that table."""
+    fields: dict[str, str] = {}
+    for attribute in attrs.fields(kind):
+        fields.setdefault(attribute.alias, attribute.alias)
+        if attrs.has(attribute.type):
+            for inner in attrs.fields(attribute.type):
+                fields.setdefault(inner.alias, f"{attribute.alias}.{inner.alias}")
+    for one in problems:
+        keys = path_keys(one.field) if one.value is UNKNOWN_KEY else ()
+        name = fields.get(keys[-1]) if keys else None
+        yield one if name is None else one.suggesting(name)
+
+
+def without(data: Mapping[str, Any], fields: Iterable[str]) -> dict[str, Any]:
+    """Return nested maps and lists without the fields of these paths.
+
+    Raises:
+        LookupError: there is no such field.
+    """
+    copied: dict[str, Any] = copy.deepcopy(dict(data))
+    for field in fields:
+        inner: Any = copied
+        *keys, last = path_keys(field) or ("",)
+        for key in keys:
+            inner = inner[int(key)] if isinstance(inner, list) else inner[key]
+        del inner[last]
+    return copied
+
+
+def path_keys(field: str) -> tuple[str, ...]:
+    """Return the keys and indices in the path of a field, such as `kill[0].target`."""
+    return tuple(re.findall(r"[^.\[\]]+", field))
 
 
 def as_lists(_: object, __: object, value: object) -> object:
@@ -190,24 +249,52 @@ def as_lists(_: object, __: object, value: object) -> object:
     return [as_lists(_, __, item) for item in value] if isinstance(value, tuple) else value
 
 
-def first_problem(error: Exception, path: str = "") -> BadInputError:
-    """Return the first leaf of a cattrs error group as an error that names the field's path."""
+def _invalid_values(
+    data: Mapping[str, Any], kind: type, converter: Converter
+) -> Iterator[BadInputError]:
+    """Yield the errors of all fields of a class whose validators reject their values.
+
+    The constructor, which runs the validators, stops at the first one.
+    """
+    attrs.resolve_types(kind)
+    for attribute in attrs.fields(kind):
+        if attribute.validator is None or attribute.alias not in data:
+            continue
+        try:
+            value = converter.get_structure_hook(attribute.type)(
+                data[attribute.alias], attribute.type
+            )
+        except Exception:  # noqa: BLE001, S112 (reported already)
+            continue
+        try:
+            attribute.validator(None, attribute, value)
+        except Exception as error:  # noqa: BLE001 (validators may raise anything)
+            yield from problems_of(error)
+
+
+def problems_of(error: Exception, path: str = "") -> list[BadInputError]:
+    """Return the leaves of a cattrs error group as errors that name the fields' paths."""
     if isinstance(error, BaseValidationError):
-        for inner in error.exceptions:
-            return first_problem(inner, path + _step(inner, bool(path)))
+        return [
+            problem
+            for inner in error.exceptions
+            for problem in problems_of(inner, path + _step(inner, bool(path)))
+        ]
     if isinstance(error, ForbiddenExtraKeysError):
-        allowed = sorted(attribute.alias for attribute in attrs.fields(error.cl))
-        problem = BadInputError(
-            min(error.extra_fields), UNKNOWN_KEY, "one of " + ", ".join(allowed)
-        )
-        return problem.within(path)
+        known = tuple(sorted(attribute.alias for attribute in attrs.fields(error.cl)))
+        return [
+            unknown_name(name or repr(name), UNKNOWN_KEY, known).within(path)
+            for name in sorted(error.extra_fields)[:MAX_PROBLEMS]
+        ]
     if isinstance(error, BadInputError):
-        return error.within(path)
+        return [one.within(path) for one in error.problems]
     if isinstance(error, KeyError):
-        return BadInputError(path, NO_VALUE, "a value; this field is required")
-    return BadInputError(
-        path, Described("a value of another kind"), str(error) or type(error).__name__
-    )
+        return [BadInputError(path, NO_VALUE, "a value; this field is required")]
+    return [
+        BadInputError(
+            path, Described("a value of another kind"), str(error) or type(error).__name__
+        )
+    ]
 
 
 def _step(error: BaseException, nested: bool) -> str:

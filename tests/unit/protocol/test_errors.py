@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import pytest
 
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import (
+    UNKNOWN_KEY,
+    BadInputError,
+    combined,
+    most_similar,
+    raise_all,
+    unknown_name,
+)
 
 
 @pytest.mark.parametrize(
@@ -48,3 +56,70 @@ def test_within_joins_names() -> None:
     assert joined("kill", "[1].at_s") == "kill[1].at_s"
     assert joined("", "seed") == "seed"
     assert joined("seed", "") == "seed"
+
+
+def several() -> BadInputError:
+    return combined([BadInputError("a", 1, "2"), BadInputError("[0].b", 3, "4")])
+
+
+def test_several_errors_are_one_that_has_them_all() -> None:
+    error = several()
+    assert str(error) == "a: got 1; allowed: 2 (and 1 more error)"
+    assert [str(one) for one in error.problems] == [
+        "a: got 1; allowed: 2",
+        "[0].b: got 3; allowed: 4",
+    ]
+    assert [one.field for one in error.within("t").problems] == ["t.a", "t[0].b"]
+    assert [one.place for one in error.at("x:1").at("x:2").problems] == ["x:1", "x:1"]
+    assert str(combined([*error.problems, error, error])) == str(error)
+
+
+def test_one_error_is_itself() -> None:
+    error = BadInputError("a", 1, "2")
+    assert combined([error]) is error
+    assert error.problems == (error,)
+    raise_all([])
+    with pytest.raises(BadInputError, match=r"^a: got 1; allowed: 2$"):
+        raise_all([error])
+
+
+@pytest.mark.parametrize("error", [several(), BadInputError("a", 1, "2").at("x:1")])
+def test_errors_go_to_other_processes(error: BadInputError) -> None:
+    again = pickle.loads(pickle.dumps(error))  # noqa: S301 (made here)
+    assert (type(again), str(again)) == (type(error), str(error))
+    assert list(map(str, again.problems)) == list(map(str, error.problems))
+
+
+def test_an_error_ends_with_a_suggestion_and_its_place() -> None:
+    error = BadInputError("a", "tapa", "tappa", choices=("tappa",), place="x.toml:3")
+    assert str(error) == "a: got 'tapa'; allowed: tappa; did you mean tappa? (x.toml:3)"
+    assert str(error.within("t")) == f"t.{error}"
+    error = BadInputError("a", UNKNOWN_KEY, "b").suggesting("t.a").at("x.toml:3")
+    assert str(error) == "a: got an unknown key; allowed: b; did you mean t.a? (x.toml:3)"
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("lane", "lanes"),
+        ("LANES", "lanes"),
+        ("lane-width-m", "lane_width_m"),
+        ("volume", "volume_veh_per_lane_h"),
+        ("wings", ""),
+        ("", ""),
+        (3, ""),
+        ("lanes" * 10**5, ""),
+    ],
+)
+def test_the_most_similar_name(name: object, meant: str) -> None:
+    choices = ("lane_width_m", "volume_veh_per_lane_h", "lanes", "s1_m")
+    assert most_similar(name, choices) == meant
+
+
+def test_an_unknown_name() -> None:
+    assert str(unknown_name("solver", "tapa", ("tappa", "branching"))) == (
+        "solver: got 'tapa'; allowed: one of tappa, branching; did you mean tappa?"
+    )
+    assert str(unknown_name("road.lane", UNKNOWN_KEY, ("lanes",), "known keys")) == (
+        "road.lane: got an unknown key; allowed: known keys; did you mean lanes?"
+    )

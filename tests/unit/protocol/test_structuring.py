@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from attrs import field, frozen
 
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import MAX_PROBLEMS, BadInputError
 from laneweave.protocol.field_validators import within
-from laneweave.protocol.structuring import NumberOrRange, structure
+from laneweave.protocol.structuring import NumberOrRange, structure, without
 from support.refusals import refusal
 
 
@@ -128,3 +128,60 @@ def test_the_value_is_not_changed() -> None:
     data = {"count": 1, "table": {"k": [1]}}
     structure(data, Whole)
     assert data == {"count": 1, "table": {"k": [1]}}
+
+
+def test_all_errors_are_reported_at_once() -> None:
+    data = {
+        "count": "x",
+        "flagg": True,
+        "part": {"size": 11, "name": 1},
+        "parts": [{"size": -1}, {"size": 1}, {"name": "c"}, 5],
+        "pair": [1.5, 2],
+        "table": {"a": [1], "b": ["x", 2, "y"]},
+    }
+    problems = refusal(structure, data, Whole).problems
+    assert [one.field for one in problems] == [
+        "count",
+        "part.name",
+        "part.size",
+        "parts[0].size",
+        "parts[2].size",
+        "parts[3]",
+        "pair[0]",
+        "pair[1]",
+        "table[b][0]",
+        "table[b][2]",
+        "flagg",
+    ]
+    assert problems[-1].suggestion == "flag"
+
+
+def test_all_validators_of_a_class_are_asked() -> None:
+    @frozen
+    class Two:
+        a: int = field(validator=within(0, 1))
+        b: int = field(default=0, validator=within(0, 1))
+
+    assert [one.field for one in refusal(structure, {"a": 2, "b": 3}, Two).problems] == ["a", "b"]
+
+
+def test_a_long_list_is_examined_up_to_a_number_of_errors() -> None:
+    error = refusal(structure, {"count": 1, "parts": [0] * 10_000}, Whole)
+    assert len(error.problems) == MAX_PROBLEMS
+    error = refusal(structure, dict.fromkeys(map(str, range(10_000)), 1), Whole)
+    assert len(error.problems) == MAX_PROBLEMS + 1
+
+
+def test_a_key_of_another_table_is_suggested() -> None:
+    assert refusal(structure, {"count": 1, "size": 2}, Whole).suggestion == "part.size"
+    assert refusal(structure, {"count": 1, "part": {"size": 1, "maybe": 2}}, Whole).suggestion == (
+        "maybe"
+    )
+
+
+def test_without_removes_fields() -> None:
+    data = {"a": [{"b": 1, "c": 2}], "d": 3}
+    assert without(data, ["a[0].b", "d"]) == {"a": [{"c": 2}]}
+    assert data == {"a": [{"b": 1, "c": 2}], "d": 3}
+    with pytest.raises(LookupError):
+        without(data, ["a[1].b"])

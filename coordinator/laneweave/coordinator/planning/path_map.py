@@ -37,9 +37,9 @@ class RelativePathMap:
         return sum(final_arrival(row) for row in self.rows)
 
     def __str__(self) -> str:
-        """Return the table as text; column headings number the time points from 1."""
+        """Return the table as text; step 0 is the start, step k the time point after k moves."""
         cells = [[f"({c},{lane})" for c, lane in row] for row in self.rows]
-        header = ["Vehicle ID", *(f"step {k + 1}" for k in range(self.steps + 1))]
+        header = ["Vehicle ID", *(f"step {k}" for k in range(self.steps + 1))]
         # Ids are user input: replace characters that would break the table or control the terminal.
         ids = ["".join(c if c.isprintable() else "?" for c in name) for name in self.ids]
         table = [header, *([name, *row] for name, row in zip(ids, cells, strict=True))]

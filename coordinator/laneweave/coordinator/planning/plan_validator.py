@@ -91,11 +91,11 @@ def _problems_of_vehicle(
         columns = abs(path[step][0] - path[step + 1][0])
         lanes = abs(path[step][1] - path[step + 1][1])
         if (columns + lanes if request.mode == 1 else max(columns, lanes)) > 1:
-            yield f"{name} jumps from {path[step]} to {path[step + 1]} in step {step}"
+            yield f"{name} jumps from {path[step]} to {path[step + 1]} in step {step + 1}"
         elif vehicle.moves is not None and columns + lanes > 0:
             move = path[step + 1][0] - path[step][0], path[step + 1][1] - path[step][1]
             if move not in vehicle.moves:
-                yield f"{name} cannot drive {path[step]} to {path[step + 1]} in step {step}"
+                yield f"{name} cannot drive {path[step]} to {path[step + 1]} in step {step + 1}"
     if not 0 <= target < len(request.targets):
         yield f"{name} is assigned to target {target}, which does not exist"
         return
@@ -119,4 +119,4 @@ def _conflicts(request: PlanRequest, paths: Sequence[Sequence[Cell]]) -> Iterato
             kind = model.kind((a[step], a[step + 1]), (b[step], b[step + 1]))
             if kind is not None:
                 ids = f"{request.vehicles[i].id} and {request.vehicles[j].id}"
-                yield f"{kind} conflict of {ids} in step {step}"
+                yield f"{kind} conflict of {ids} in step {step + 1}"

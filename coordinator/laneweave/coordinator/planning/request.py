@@ -1,14 +1,15 @@
 """A plan request: vehicles, targets and rules, checked on construction.
 
-The JSON form is fixed (`laneweave.plan.request/1`). Every error is a `BadInputError` that names the
-field, the value and what is allowed. Unknown keys are errors, too: a misspelt preference must not
-silently become "any target".
+The JSON form is fixed (`laneweave.plan.request/1`). A `BadInputError` has all errors of a request;
+each names the field, the value and what is allowed. Unknown keys are errors, too: a misspelt
+preference must not silently become "any target".
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Any, Final
 
 import attrs
@@ -23,11 +24,21 @@ from laneweave.coordinator.planning.geometry.conflict_table import conflict_tabl
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import Problem
-from laneweave.protocol.errors import BadInputError, one_line
+from laneweave.protocol.errors import (
+    MAX_PROBLEMS,
+    NO_VALUE,
+    UNKNOWN_KEY,
+    BadInputError,
+    Described,
+    combined,
+    one_line,
+    raise_all,
+    unknown_name,
+)
 from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.lattice import Cell, Mode, displacements
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS, DEFAULT_CONFLICTS
-from laneweave.protocol.structuring import as_lists, structure
+from laneweave.protocol.structuring import as_lists, structure, without
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
 DEFAULT_DEADLINE_S: Final = 4.0
@@ -39,6 +50,7 @@ MAX_TARGETS: Final = 400
 MAX_ID_LENGTH: Final = 100
 MAX_DEADLINE_S: Final = 3600.0
 
+_KNOWN_KEYS: Final = "only known keys"
 _NOT_BOTH: Final = "structure or targets, not both"
 
 
@@ -92,32 +104,9 @@ class PlanRequest:
         """Reject inconsistent requests.
 
         Raises:
-            BadInputError: names the first field that is wrong.
+            BadInputError: names all fields that are wrong.
         """
-        _check_grid(self.grid)
-        if self.mode not in (1, 2):
-            raise BadInputError("mode", self.mode, "1 or 2")
-        for i, kind in enumerate(self.conflicts):
-            if kind not in CONFLICT_KINDS:
-                raise BadInputError(f"conflicts[{i}]", kind, "any of " + ", ".join(CONFLICT_KINDS))
-        _check_unique("conflicts", self.conflicts, "each kind once")
-        if self.geometry is not None and "geometric" not in self.conflicts:
-            allowed = "none, unless geometric is among conflicts"
-            raise BadInputError("geometry", attrs.asdict(self.geometry), allowed)
-        if self.solver is not None and not NAME_PATTERN.fullmatch(self.solver):
-            raise BadInputError("solver", self.solver, f"the name of a solver: {NAME_RULE}")
-        if self.structure is None:
-            _check_count("targets", self.targets, MAX_TARGETS)
-            for i, target in enumerate(self.targets):
-                _check_cell(f"targets[{i}]", target, self.grid)
-            _check_unique("targets", self.targets, "each cell once")
-        _check_vehicles(self)
-        _check_structure(self)
-        if len(self.id) > MAX_ID_LENGTH:
-            raise BadInputError("id", self.id, f"at most {MAX_ID_LENGTH} characters")
-        if not (math.isfinite(self.deadline_s) and 0 < self.deadline_s <= MAX_DEADLINE_S):
-            allowed = f"a number above 0, at most {MAX_DEADLINE_S:g}"
-            raise BadInputError("deadline_s", self.deadline_s, allowed)
+        raise_all(_problems(self))
 
     @property
     def conflict_model(self) -> ConflictModel:
@@ -159,26 +148,31 @@ class PlanRequest:
         """Read the JSON form.
 
         Raises:
-            BadInputError: names the first field that is wrong.
+            BadInputError: names all fields that are wrong.
         """
         if not isinstance(data, Mapping):
             raise BadInputError("request", data, "an object")
         if data.get("schema") != REQUEST_SCHEMA:
             raise BadInputError("schema", data.get("schema"), repr(REQUEST_SCHEMA))
-        _check_json("", data)
+        problems = [*islice(_json_problems("", data), MAX_PROBLEMS)]
+        if any(one.allowed == _KNOWN_KEYS for one in problems):
+            raise combined(problems)
         if "targets" not in data and "structure" not in data:
-            raise BadInputError("targets", None, "a list of cells; or a structure instead")
+            allowed = "a list of cells; or a structure instead"
+            problems.append(BadInputError("targets", NO_VALUE, allowed))
         if "targets" in data and "structure" in data:
-            raise BadInputError("structure", data["structure"], _NOT_BOTH)
-        document = structure(data, _Document)
-        if document.mode not in (1, 2):
-            raise BadInputError("mode", document.mode, "1 or 2")
-        mode: Mode = 1 if document.mode == 1 else 2
-        conflicts = DEFAULT_CONFLICTS[mode] if document.conflicts is None else document.conflicts
-        fields = attrs.asdict(
-            document, recurse=False, filter=lambda field, _: field.name != "schema"
-        )
-        return cls(**fields | {"grid": document.grid.grid(), "mode": mode, "conflicts": conflicts})
+            problems.append(BadInputError("structure", data["structure"], _NOT_BOTH))
+        document, unstructured = _document(data)
+        problems += unstructured
+        if document is None:
+            raise combined(problems)
+        problems += islice(_blocked_problems(document.grid), MAX_PROBLEMS)
+        try:
+            request = cls(**document.fields())
+        except BadInputError as error:
+            raise combined([*problems, error]) from None
+        raise_all(problems)
+        return request
 
     @property
     def ids(self) -> tuple[str, ...]:
@@ -199,16 +193,6 @@ class _GridDocument:
     lanes: int
     blocked: tuple[Cell, ...] = ()
 
-    def grid(self) -> Grid:
-        """Return the grid."""
-        grid = Grid(self.columns, self.lanes)
-        _check_grid(grid)
-        for i, cell in enumerate(self.blocked):
-            if not grid.contains(cell):
-                raise BadInputError(f"grid.blocked[{i}]", cell, "a cell in the grid")
-        _check_unique("grid.blocked", self.blocked, "each cell once")
-        return attrs.evolve(grid, blocked=self.blocked)
-
 
 @attrs.frozen
 class _Document:
@@ -227,122 +211,225 @@ class _Document:
     structure: str | None = None
     lanes: tuple[int, ...] | None = None
 
+    def fields(self) -> dict[str, Any]:
+        """Return the arguments of a `PlanRequest`, which checks them."""
+        given = attrs.asdict(self, recurse=False, filter=lambda field, _: field.name != "schema")
+        if self.conflicts is None:
+            given["conflicts"] = DEFAULT_CONFLICTS.get(self.mode, ())
+        grid = Grid(self.grid.columns, self.grid.lanes)
+        given["grid"] = attrs.evolve(grid, blocked=filter(grid.contains, self.grid.blocked))
+        return given
+
+
+def _document(data: Mapping[str, Any]) -> tuple[_Document | None, Sequence[BadInputError]]:
+    """Return the document of a request, and its errors.
+
+    Errors of unknown keys do not hide the others; None: values have a wrong type or are missing.
+    """
+    try:
+        return structure(data, _Document), ()
+    except BadInputError as error:
+        problems = error.problems
+    if any(one.value is not UNKNOWN_KEY for one in problems):
+        return None, problems
+    try:
+        return structure(without(data, [one.field for one in problems]), _Document), problems
+    except (LookupError, BadInputError):  # a key that looks like a path; more than MAX_PROBLEMS
+        return None, problems
+
 
 def _is_given(attribute: attrs.Attribute[Any], value: object) -> bool:
     """Return whether the JSON form contains a field."""
     return value is not None and value != "" and (attribute.name != "targets" or value != ())
 
 
-def _check_json(parent: str, value: object) -> None:
-    """Outside a geometry, reject nulls and keys that do not fit on one printable line."""
-    items: Any = ()
+def _json_problems(parent: str, value: object) -> Iterator[BadInputError]:
+    """Outside a geometry, yield nulls and keys that do not fit on one printable line."""
     if isinstance(value, Mapping):
         prefix = f"{parent}." if parent else ""
         for key, item in value.items():
             shown = one_line(str(key), 80) or repr(key)
             if shown != key:
-                raise BadInputError(prefix + shown, item, "only known keys")
-        items = ((key, f"{prefix}{key}", item) for key, item in value.items())
+                yield BadInputError(prefix + shown, item, _KNOWN_KEYS)
+            elif item is None:
+                yield BadInputError(prefix + key, None, "a value, or no such key")
+            elif key != "geometry":
+                yield from _json_problems(prefix + key, item)
     elif isinstance(value, list | tuple):
-        items = ((i, f"{parent}[{i}]", item) for i, item in enumerate(value))
-    for key, field, item in items:
-        if item is None:
-            raise BadInputError(field, None, "a value, or no such key")
-        if key != "geometry":
-            _check_json(field, item)
+        for i, item in enumerate(value):
+            if item is None:
+                yield BadInputError(f"{parent}[{i}]", None, "a value, or no such key")
+            else:
+                yield from _json_problems(f"{parent}[{i}]", item)
 
 
-def _check_range(field: str, value: int, low: int, high: int) -> None:
+def _blocked_problems(grid: _GridDocument) -> Iterator[BadInputError]:
+    """Yield the errors of blocked cells, which are a set in a `Grid`."""
+    bare = Grid(grid.columns, grid.lanes)
+    for i, cell in enumerate(() if [*_size_problems(bare)] else grid.blocked):
+        if not bare.contains(cell):
+            yield BadInputError(f"grid.blocked[{i}]", cell, "a cell in the grid")
+    yield from _repeated("grid.blocked", grid.blocked, "each cell once")
+
+
+def _out_of_range(field: str, value: int, low: int, high: int) -> Iterator[BadInputError]:
     if not low <= value <= high:
-        raise BadInputError(field, value, f"a whole number from {low} to {high}")
+        yield BadInputError(field, value, f"a whole number from {low} to {high}")
 
 
-def _check_count(field: str, values: Sequence[object], maximum: int) -> None:
+def _wrong_count(field: str, values: Sequence[object], maximum: int) -> Iterator[BadInputError]:
     if not 1 <= len(values) <= maximum:
-        raise BadInputError(field, f"{len(values)} items", f"1 to {maximum} items")
+        yield BadInputError(field, Described(f"{len(values)} items"), f"1 to {maximum} items")
 
 
-def _check_unique(field: str, values: Sequence[object], allowed: str, name: str = "") -> None:
-    """Reject duplicate values; `name` is the suffix of the field in each item."""
+def _repeated(
+    field: str, values: Sequence[object], allowed: str, name: str = ""
+) -> Iterator[BadInputError]:
+    """Yield duplicate values; `name` is the suffix of the field in each item."""
     first: dict[object, int] = {}
     for i, value in enumerate(values):
         if first.setdefault(value, i) != i:
             other = f"{field}[{first[value]}]"
-            raise BadInputError(f"{field}[{i}]{name}", value, f"{allowed}; {other} has it, too")
+            yield BadInputError(f"{field}[{i}]{name}", value, f"{allowed}; {other} has it, too")
 
 
-def _check_grid(grid: Grid) -> None:
-    _check_range("grid.columns", grid.columns, 1, MAX_COLUMNS)
-    _check_range("grid.lanes", grid.lanes, 1, MAX_LANES)
+def _wrong_text(field: str, text: str, min_length: int = 0) -> Iterator[BadInputError]:
+    """Yield the error of an id that is too long, or that would control the terminal."""
+    if not min_length <= len(text) <= MAX_ID_LENGTH:
+        allowed = f"{min_length or 'at most'}{' to' if min_length else ''} {MAX_ID_LENGTH}"
+        yield BadInputError(field, text, f"{allowed} characters")
+    elif not text.isprintable():
+        yield BadInputError(field, text, "printable characters")
+
+
+def _problems(request: PlanRequest) -> Iterator[BadInputError]:
+    """Yield all errors of a request, except of items of too long lists, and of cells of no grid."""
+    of_grid = [*_size_problems(request.grid)]
+    yield from of_grid
+    yield from _rule_problems(request)
+    of_counts = [*_wrong_count("vehicles", request.vehicles, MAX_VEHICLES)]
+    if request.structure is None:
+        of_counts += _wrong_count("targets", request.targets, MAX_TARGETS)
+    yield from of_counts
+    if of_counts:
+        return
+    yield from _repeated("targets", request.targets, "each cell once")
+    yield from _vehicle_problems(request)
+    if not of_grid:
+        yield from _cell_problems(request)
+        yield from _structure_problems(request)
+
+
+def _size_problems(grid: Grid) -> Iterator[BadInputError]:
+    yield from _out_of_range("grid.columns", grid.columns, 1, MAX_COLUMNS)
+    yield from _out_of_range("grid.lanes", grid.lanes, 1, MAX_LANES)
+
+
+def _rule_problems(request: PlanRequest) -> Iterator[BadInputError]:
+    """Yield the errors of everything but grid, vehicles and targets."""
+    if request.mode not in (1, 2):
+        yield BadInputError("mode", request.mode, "1 or 2")
+    for i, kind in enumerate(request.conflicts):
+        if kind not in CONFLICT_KINDS:
+            allowed = "any of " + ", ".join(CONFLICT_KINDS)
+            yield unknown_name(f"conflicts[{i}]", kind, CONFLICT_KINDS, allowed)
+    yield from _repeated("conflicts", request.conflicts, "each kind once")
+    if request.geometry is not None and "geometric" not in request.conflicts:
+        allowed = "none, unless geometric is among conflicts"
+        yield BadInputError("geometry", attrs.asdict(request.geometry), allowed)
+    if request.solver is not None and not NAME_PATTERN.fullmatch(request.solver):
+        yield BadInputError("solver", request.solver, f"the name of a solver: {NAME_RULE}")
+    yield from _wrong_text("id", request.id)
+    if not (math.isfinite(request.deadline_s) and 0 < request.deadline_s <= MAX_DEADLINE_S):
+        allowed = f"a number above 0, at most {MAX_DEADLINE_S:g}"
+        yield BadInputError("deadline_s", request.deadline_s, allowed)
+
+
+def _cell_problems(request: PlanRequest) -> Iterator[BadInputError]:
+    """Yield the errors of cells and lanes."""
+    grid = request.grid
     for cell in sorted(grid.blocked):
         if not grid.contains(cell):
-            raise BadInputError("grid.blocked", cell, "cells in the grid")
+            yield BadInputError("grid.blocked", cell, "cells in the grid")
+    for i, target in enumerate(request.targets if request.structure is None else ()):
+        yield from _wrong_cell(f"targets[{i}]", target, grid)
+    for i, vehicle in enumerate(request.vehicles):
+        yield from _wrong_cell(f"vehicles[{i}].cell", vehicle.cell, grid)
+        if vehicle.lane is not None:
+            yield from _out_of_range(f"vehicles[{i}].lane", vehicle.lane, 0, grid.lanes - 1)
 
 
-def _check_cell(field: str, cell: Cell, grid: Grid) -> None:
+def _wrong_cell(field: str, cell: Cell, grid: Grid) -> Iterator[BadInputError]:
     if not grid.contains(cell):
         allowed = f"column 0 to {grid.columns - 1}, lane 0 to {grid.lanes - 1}"
-        raise BadInputError(field, cell, allowed)
-    if not grid.is_free(cell):
-        raise BadInputError(field, cell, "a cell that is not blocked")
+        yield BadInputError(field, cell, allowed)
+    elif not grid.is_free(cell):
+        yield BadInputError(field, cell, "a cell that is not blocked")
 
 
-def _check_vehicles(request: PlanRequest) -> None:
+def _vehicle_problems(request: PlanRequest) -> Iterator[BadInputError]:
+    """Yield the errors of vehicles, except those about the grid."""
     vehicles = request.vehicles
-    _check_count("vehicles", vehicles, MAX_VEHICLES)
     for i, vehicle in enumerate(vehicles):
         field = f"vehicles[{i}]"
-        if not 1 <= len(vehicle.id) <= MAX_ID_LENGTH:
-            raise BadInputError(f"{field}.id", vehicle.id, f"1 to {MAX_ID_LENGTH} characters")
-        _check_cell(f"{field}.cell", vehicle.cell, request.grid)
-        if vehicle.lane is not None:
-            if vehicle.eligible is not None:
-                allowed = "lane or eligible, not both"
-                raise BadInputError(f"{field}.eligible", vehicle.eligible, allowed)
-            _check_range(f"{field}.lane", vehicle.lane, 0, request.grid.lanes - 1)
+        yield from _wrong_text(f"{field}.id", vehicle.id, 1)
+        if vehicle.lane is not None and vehicle.eligible is not None:
+            allowed = "lane or eligible, not both"
+            yield BadInputError(f"{field}.eligible", vehicle.eligible, allowed)
         eligible = vehicle.eligible or ()
         for k, target in enumerate(eligible if request.structure is None else ()):
-            _check_range(f"{field}.eligible[{k}]", target, 0, len(request.targets) - 1)
-        _check_unique(f"{field}.eligible", eligible, "each target once")
-        _check_moves(f"{field}.moves", vehicle.moves or (), request.mode)
-    _check_unique("vehicles", [vehicle.id for vehicle in vehicles], "unique ids", ".id")
-    _check_unique("vehicles", [vehicle.cell for vehicle in vehicles], "separate cells", ".cell")
+            last = len(request.targets) - 1
+            yield from _out_of_range(f"{field}.eligible[{k}]", target, 0, last)
+        yield from _repeated(f"{field}.eligible", eligible, "each target once")
+        if request.mode in (1, 2):
+            yield from _wrong_moves(f"{field}.moves", vehicle.moves or (), request.mode)
+    yield from _repeated("vehicles", [vehicle.id for vehicle in vehicles], "unique ids", ".id")
+    cells = [vehicle.cell for vehicle in vehicles]
+    yield from _repeated("vehicles", cells, "separate cells", ".cell")
 
 
-def _check_moves(field: str, moves: Sequence[Cell], mode: Mode) -> None:
+def _wrong_moves(field: str, moves: Sequence[Cell], mode: Mode) -> Iterator[BadInputError]:
     possible = displacements(mode)[1:]
     for k, move in enumerate(moves):
         if move not in possible:
             allowed = f"one of {', '.join(map(str, possible))}, a move of mode {mode}"
-            raise BadInputError(f"{field}[{k}]", move, allowed)
-    _check_unique(field, moves, "each move once")
+            yield BadInputError(f"{field}[{k}]", move, allowed)
+    yield from _repeated(field, moves, "each move once")
 
 
-def _check_structure(request: PlanRequest) -> None:
+def _structure_problems(request: PlanRequest) -> Iterator[BadInputError]:
     name, lanes = request.structure, request.structure_lanes
     if name is None:
         if request.lanes is not None:
-            raise BadInputError("lanes", request.lanes, "none, unless a structure is given")
+            yield BadInputError("lanes", request.lanes, "none, unless a structure is given")
         return
+    found = [*_wrong_structure(request)]
+    yield from found
+    preferred = [vehicle.lane for vehicle in request.vehicles]
+    lacking = None if found else shortage(name, lanes, request.grid, preferred)
+    if lacking is not None:
+        allowed = f"a structure with a free cell for each vehicle; {lacking}"
+        yield BadInputError("structure", name, allowed)
+
+
+def _wrong_structure(request: PlanRequest) -> Iterator[BadInputError]:
+    """Yield the errors of a structure and its lanes, and of vehicles that do not fit to it."""
+    name, lanes = request.structure, request.structure_lanes
     if name not in STRUCTURES:
-        raise BadInputError("structure", name, "one of " + ", ".join(STRUCTURES))
+        yield unknown_name("structure", name, STRUCTURES)
     if request.targets:
-        raise BadInputError("structure", name, _NOT_BOTH)
-    _check_count("lanes", lanes, MAX_LANES)
+        yield BadInputError("structure", name, _NOT_BOTH)
+    yield from _wrong_count("lanes", lanes, MAX_LANES)
     for i, lane in enumerate(lanes):
-        _check_range(f"lanes[{i}]", lane, 0, request.grid.lanes - 1)
-    _check_unique("lanes", lanes, "each lane once")
+        yield from _out_of_range(f"lanes[{i}]", lane, 0, request.grid.lanes - 1)
+    yield from _repeated("lanes", lanes, "each lane once")
     for i, vehicle in enumerate(request.vehicles):
         if vehicle.eligible is not None:
             allowed = "lane, or neither: a structure's targets have no indices yet"
-            raise BadInputError(f"vehicles[{i}].eligible", vehicle.eligible, allowed)
+            yield BadInputError(f"vehicles[{i}].eligible", vehicle.eligible, allowed)
         if vehicle.moves is not None:
             allowed = "none: any vehicle may get any place of a structure"
-            raise BadInputError(f"vehicles[{i}].moves", vehicle.moves, allowed)
+            yield BadInputError(f"vehicles[{i}].moves", vehicle.moves, allowed)
         if vehicle.lane is not None and vehicle.lane not in lanes:
             allowed = "one of the structure's lanes " + ", ".join(map(str, lanes))
-            raise BadInputError(f"vehicles[{i}].lane", vehicle.lane, allowed)
-    lacking = shortage(name, lanes, request.grid, [vehicle.lane for vehicle in request.vehicles])
-    if lacking is not None:
-        allowed = f"a structure with a free cell for each vehicle; {lacking}"
-        raise BadInputError("structure", name, allowed)
+            yield BadInputError(f"vehicles[{i}].lane", vehicle.lane, allowed)

@@ -149,10 +149,11 @@ def machine() -> dict[str, Any]:
 
 def runtime_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Return the results of `bench_runtime` as a table."""
-    table = Table("vehicles", "per process", "faults", "real-time factor", "tick p50 / p99 ms")
+    table = Table("vehicles", "per process", "faults", "real-time factor", "tick ms p50", "p99")
     for role in ROLES:
         table.add_column(f"{role} CPU ms/tick")
-    table.add_column("agents' memory MiB (each)")
+    table.add_column("agents' memory MiB")
+    table.add_column("each")
     for row in rows:
         cpu, memory = row["cpu_ms_per_tick"], row["memory_mib"].get("agent", {})
         table.add_row(
@@ -160,9 +161,10 @@ def runtime_table(rows: Sequence[dict[str, Any]]) -> Table:
             str(row["vehicles_per_process"]),
             row["faults"] or "none",
             f"{row['real_time_factor']:.2f}",
-            f"{row['tick_ms']['p50']:.1f} / {row['tick_ms']['p99']:.1f}",
+            *(f"{row['tick_ms'][name]:.1f}" for name in ("p50", "p99")),
             *(f"{cpu.get(role, 0.0):.2f}" for role in ROLES),
-            f"{memory.get('total', 0.0):.0f} ({memory.get('each', 0.0):.1f})",
+            f"{memory.get('total', 0.0):.0f}",
+            f"{memory.get('each', 0.0):.1f}",
         )
     return table
 

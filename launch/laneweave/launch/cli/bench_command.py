@@ -12,7 +12,7 @@ from rich.console import Console
 
 from laneweave.launch.cli.options import SOLVER_NAMES
 from laneweave.protocol.config.scenario_files import load_scenario
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, unknown_name
 
 
 class Benchmark(StrEnum):
@@ -74,9 +74,10 @@ def bench(
     if what is Benchmark.planner:
         checked_solver(solver, "--solver")
         sizes, chosen = _parse_sizes(vehicles, "6,9,12,18,24,36"), families.split(",")
-        if not set(chosen) <= set(FAMILIES):
-            allowed = f"some of {', '.join(FAMILIES)}, separated by commas"
-            raise BadInputError("--families", families, allowed)
+        for family in chosen:
+            if family not in FAMILIES:
+                allowed = f"some of {', '.join(FAMILIES)}, separated by commas"
+                raise unknown_name("--families", family, FAMILIES, allowed)
         found = bench_planner(
             sizes, chosen, instances=instances, seed=seed, deadline_s=deadline, solver=solver
         )

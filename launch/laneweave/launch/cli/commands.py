@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from importlib import import_module
-from typing import Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -102,6 +102,28 @@ COMMANDS = {
     "config": CommandEntry("config_commands", "app", "Check a configuration."),
 }
 """All commands in the order of the help page."""
+
+
+def _print_version(value: bool) -> None:
+    if value:
+        from importlib.metadata import version
+
+        typer.echo(f"laneweave {version('laneweave')}")
+        raise typer.Exit
+
+
+def before_command(
+    _: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Show the version, and exit."
+        ),
+    ] = False,
+) -> None:
+    """Formation control with lane preference for connected and automated vehicles."""
+    from laneweave.launch.run.logs import log_to_terminal
+
+    log_to_terminal()
 
 
 class LazyGroup(TyperGroup):

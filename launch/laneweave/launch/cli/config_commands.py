@@ -7,16 +7,17 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from laneweave.launch.deploy.config_check import check_deployment
 from laneweave.protocol.config.scenario_files import load_scenario
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.config.source_files import read_toml_source
+from laneweave.protocol.errors import BadInputError, raise_all
 from laneweave.protocol.wire.identities import Identity, parse_identity
 from laneweave.protocol.wire.topics import Party
 
 app = typer.Typer(help="Check a configuration.", add_completion=False)
-BAD_INPUT = 2
 
 
 @app.callback()
@@ -42,11 +43,9 @@ def check(
     report = check_deployment(settings, identity)
     for line in report.warnings:
         typer.echo(f"warning: {line}", err=True)
-    for line in report.problems:
-        typer.echo(" ".join(line.split()), err=True)
-    if report.problems:
-        raise typer.Exit(BAD_INPUT)
-    table = Table("what", str(file), show_lines=False)
+    with read_toml_source(file).located(given=("--name",)):
+        raise_all(report.problems)
+    table = Table("what", escape(str(file)), show_lines=False)
     for what, value in report.facts:
-        table.add_row(what, value)
+        table.add_row(what, escape(value))
     Console().print(table)

@@ -71,7 +71,7 @@ def _list(sumocfg: Path, folder: Path) -> None:
         raise BadInputError(
             "SUMOCFG", str(sumocfg), "a network with a chain of edges of 500 m with two lanes"
         )
-    table = Table(title=f"corridors of {sumocfg.name}")
+    table = Table(title=f"corridors of {escape(sumocfg.name)}")
     # Names are to be copied, however narrow the terminal is.
     table.add_column("--corridor", min_width=max(len(one.name) for one in found))
     for column in ("edges", "lanes", "m", "m/s", "ramps", "exits", "veh/h"):

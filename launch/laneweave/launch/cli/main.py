@@ -1,7 +1,7 @@
 """The command line `laneweave`.
 
-Exit status: 0 success; 1 the run failed or violated a guarantee; 2 invalid input, reported in one
-line on stderr with the field, its value and the allowed values.
+Exit status: 0 success; 1 the run failed or violated a guarantee; 2 invalid input, reported on
+stderr: one line for each error, with the field, its value and the allowed values.
 
 Importing this module imports no other packages, so that `main` sets up signals first. One thread
 receives SIGINT and forwards it as SIGTERM, because OSQP replaces the SIGINT handler of the process
@@ -11,6 +11,7 @@ continuous solving).
 
 from __future__ import annotations
 
+import errno
 import gc
 import os
 import signal
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 TYPER_INTERRUPTED = 130
 """Exit status of typer after Ctrl-C."""
+MAX_LINES = 20
+"""Maximum number of errors of a file that are printed."""
 SIM_HINT = "the simulation packages: install laneweave[sim]"
 WATCH_HINT = "the web server: install laneweave[watch]"
 INSTALL_HINTS = {
@@ -68,23 +71,16 @@ def command_line() -> typer.Typer:
     """Return the command line with all commands; a command is imported when it is used."""
     import typer
 
-    from laneweave.launch.cli.commands import LazyGroup
+    from laneweave.launch.cli.commands import LazyGroup, before_command
 
     app = typer.Typer(
         cls=LazyGroup,
         name="laneweave",
         help="Formation control with lane preference for connected and automated vehicles.",
-        add_completion=False,
         pretty_exceptions_enable=False,
     )
-    app.callback()(_before_command)
+    app.callback()(before_command)
     return app
-
-
-def _before_command() -> None:
-    from laneweave.launch.run.logs import log_to_terminal
-
-    log_to_terminal()
 
 
 def _status(arguments: list[str]) -> int:
@@ -92,6 +88,7 @@ def _status(arguments: list[str]) -> int:
     app = command_line()
     import typer
 
+    from laneweave.launch.cli.usage_errors import usage_error
     from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
     from laneweave.protocol.runtime.processes import raise_interrupts, stop_signal_received
 
@@ -103,13 +100,15 @@ def _status(arguments: list[str]) -> int:
         result: Any = command.main(
             arguments or ["--help"], prog_name="laneweave", standalone_mode=False
         )
-    except (BadInputError, RefusedError) as error:
+    except BadInputError as error:
+        return _bad_input(*map(str, error.problems))
+    except RefusedError as error:
         return _bad_input(str(error))
     except (typer.Abort, KeyboardInterrupt):
         return _interrupted()
     except typer.TyperException as error:
         # Unknown option or argument; print one line instead of typer's multi-line report.
-        return _bad_input(getattr(error, "format_message", error.__str__)())
+        return _bad_input(usage_error(error))
     except BrokenPipeError:
         return 1
     except CommandFailedError as error:
@@ -118,14 +117,30 @@ def _status(arguments: list[str]) -> int:
             return _interrupted()
         sys.stderr.write(" ".join(str(error).split()) + "\n")
         return 1
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("laneweave"):
+    except (OSError, ModuleNotFoundError) as error:
+        problem = _problem(error)
+        if problem is None:
             raise
-        hint = INSTALL_HINTS.get((error.name or "").partition(".")[0], SIM_HINT)
-        return _bad_input(f"{error.name}: not installed ({hint})")
+        return _bad_input(problem)
     if result == TYPER_INTERRUPTED:
         return _interrupted()
     return result if isinstance(result, int) else 0
+
+
+def _problem(error: OSError | ModuleNotFoundError) -> str | None:
+    """Return what the user can mend: a path or a missing package; None: an error in laneweave."""
+    from laneweave.protocol.errors import BadInputError
+
+    if isinstance(error, OSError):
+        if error.errno not in (errno.ENAMETOOLONG, errno.EACCES):
+            return None
+        allowed = f"an accessible file or folder ({error.strerror})"
+        return str(BadInputError("file", error.filename, allowed))
+    name = error.name or ""
+    if name.startswith("laneweave"):
+        return None
+    hint = INSTALL_HINTS.get(name.partition(".")[0], SIM_HINT)
+    return f"{name}: not installed ({hint})"
 
 
 def _interrupted() -> int:
@@ -133,6 +148,9 @@ def _interrupted() -> int:
     return 1
 
 
-def _bad_input(line: str) -> int:
-    sys.stderr.write(" ".join(line.split()) + "\n")
+def _bad_input(*lines: str) -> int:
+    for line in lines[:MAX_LINES]:
+        sys.stderr.write(" ".join(line.split()) + "\n")
+    if len(lines) > MAX_LINES:
+        sys.stderr.write(f"and {len(lines) - MAX_LINES} more errors\n")
     return 2

@@ -19,13 +19,18 @@ MAX_JOBS = 256
 SOLVER_NAMES = ", ".join(SOLVERS) + " or a plug-in"
 
 ScenarioArgument = Annotated[
-    Path | None, typer.Argument(metavar="[SCENARIO.toml]", help="Default: the paper's road.")
+    Path | None, typer.Argument(metavar="SCENARIO.toml", help="Default: the paper's road.")
 ]
 Duration = Annotated[
     float | None, typer.Option("--duration", help="Seconds during which vehicles arrive.")
 ]
 Seeds = Annotated[
-    str, typer.Option("--seeds", metavar="A:B", help="Range of seeds; B is excluded.")
+    str,
+    typer.Option(
+        "--seeds",
+        metavar="A:B",
+        help="Seeds from A to B - 1: 1:4 means 1, 2 and 3; 7:8 means 7 alone.",
+    ),
 ]
 Jobs = Annotated[
     int | None, typer.Option("--jobs", metavar="N", help="Processes; default: one per core.")
@@ -95,7 +100,9 @@ def parse_seeds(text: str) -> range:
     match = re.fullmatch(r"(\d{1,12}):(\d{1,12})", text)
     seeds = range(int(match[1]), int(match[2])) if match else range(0)
     if not 0 < len(seeds) <= MAX_SEEDS:
-        raise BadInputError("--seeds", text, f"A:B with A < B, at most {MAX_SEEDS} seeds")
+        raise BadInputError(
+            "--seeds", text, f"A:B with A < B, seeds A to B - 1, at most {MAX_SEEDS}"
+        )
     return seeds
 
 

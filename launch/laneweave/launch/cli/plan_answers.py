@@ -6,13 +6,20 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import attrs
 
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.library.plans import plan
+from laneweave.protocol.config.source_files import (
+    SourceFile,
+    json_lines,
+    read_text,
+    shown_name,
+    unique_keys,
+)
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.scenario.fields import Scenario
 
@@ -71,8 +78,9 @@ def answer_request(
 ) -> None:
     """Read a request; make, print and draw its plan. With `access`, a coordinator makes the plan.
 
-    `drawing` shows the relative coordinate system, `road_drawing` the road of `scenario`. `wait_s`
-    is the time to wait for a coordinator. `deadline_s` and `solver` override the request's values.
+    `drawing` shows the relative coordinate system, `road_drawing` the road of `scenario`, which
+    also has the maximum size of a request. `wait_s` is the time to wait for a coordinator.
+    `deadline_s` and `solver` override the request's values.
 
     Raises:
         BadInputError: the request is unreadable or invalid, no coordinator is reachable, or a
@@ -83,12 +91,13 @@ def answer_request(
     """
     if not 0 <= wait_s <= MAX_WAIT_S:
         raise BadInputError("--wait", wait_s, f"[0, {MAX_WAIT_S:g}]")
-    request = _request(path, deadline_s, solver)
+    settings = scenario or Scenario()
+    request = _request(path, deadline_s, solver, settings)
     drawers = []
     if drawing is not None:
         drawers.append(_checked_drawer(drawing))
     if road_drawing is not None:
-        drawers.append(_checked_road_drawer(road_drawing, scenario or Scenario(), request.mode))
+        drawers.append(_checked_road_drawer(road_drawing, settings, request.mode))
     response = plan(request) if access is None else _ask(access, request, wait_s)
     if as_table:
         sys.stdout.write(_table(request, response))
@@ -101,10 +110,18 @@ def answer_request(
             draw(request, response)
         except OSError as error:
             raise CommandFailedError(f"{out}: cannot be drawn: {error}") from error
+        _report_drawing(out)
 
 
-def explain_request(path: Path, deadline_s: float | None, drawing: Path | None = None) -> None:
+def explain_request(
+    path: Path,
+    deadline_s: float | None,
+    drawing: Path | None = None,
+    scenario: Scenario | None = None,
+) -> None:
     """Read a request, run TAPPA on it, then print and draw its steps.
+
+    `scenario` has the maximum size of a request.
 
     Raises:
         BadInputError: the request is unreadable or invalid, or the drawing cannot be written or is
@@ -120,7 +137,7 @@ def explain_request(path: Path, deadline_s: float | None, drawing: Path | None =
         if drawing.suffix.lower() != ".png":
             raise BadInputError("--draw", str(drawing), "a file that ends with .png, for --explain")
         check_drawing(drawing)
-    explanation = explain(_request(path, deadline_s).resolved())
+    explanation = explain(_request(path, deadline_s, None, scenario or Scenario()).resolved())
     sys.stdout.write(explanation_text(explanation))
     if drawing is not None:
         from laneweave.launch.drawing.tappa_process import draw_explanation
@@ -129,15 +146,24 @@ def explain_request(path: Path, deadline_s: float | None, drawing: Path | None =
             draw_explanation(explanation, drawing)
         except OSError as error:
             raise CommandFailedError(f"{drawing}: cannot be drawn: {error}") from error
+        _report_drawing(drawing)
 
 
-def _request(path: Path, deadline_s: float | None, solver: str | None = None) -> PlanRequest:
-    data = _read(path)
-    if deadline_s is not None:
-        data["deadline_s"] = deadline_s
-    if solver is not None:
-        data["solver"] = solver
-    return PlanRequest.from_dict(data)
+def _report_drawing(file: Path) -> None:
+    """Say where a drawing is, on stderr: the plan on stdout stays valid JSON."""
+    sys.stderr.write(f"drawing: {file}\n")
+
+
+def _request(
+    path: Path, deadline_s: float | None, solver: str | None, settings: Scenario
+) -> PlanRequest:
+    """Read a request; its own values are checked even if an option overrides them."""
+    file = _read(path, settings.service.max_request_bytes)
+    with file.located():
+        request = PlanRequest.from_dict(file.tables)
+    given = {"deadline_s": deadline_s, "solver": solver}
+    given = {name: value for name, value in given.items() if value is not None}
+    return PlanRequest.from_dict(file.tables | given) if given else request
 
 
 _Drawer = tuple[Callable[[PlanRequest, PlanResponse], None], Path]
@@ -174,19 +200,16 @@ def _table(request: PlanRequest, response: PlanResponse) -> str:
     return f"{line}\n\n{response.path_map(request.ids)}\n"
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path, max_bytes: int) -> SourceFile:
+    name = "REQUEST.json"
+    text, shown = read_text(path, name, "JSON", max_bytes), shown_name(path)
     try:
-        text = sys.stdin.read() if str(path) == "-" else path.read_text(encoding="utf-8")
-        data = json.loads(text)
-    except OSError as error:
-        raise BadInputError(
-            "REQUEST.json", str(path), f"a readable file ({error.strerror})"
-        ) from error
+        data = json.loads(text, object_pairs_hook=unique_keys)
     except (ValueError, RecursionError) as error:
-        raise BadInputError("REQUEST.json", str(path), f"valid JSON ({error})") from error
+        raise BadInputError(name, shown, f"valid JSON ({error})") from error
     if not isinstance(data, dict):
-        raise BadInputError("REQUEST.json", type(data).__name__, "a JSON object")
-    return data
+        raise BadInputError(name, data, "a JSON object")
+    return SourceFile(shown, text, data, json_lines)
 
 
 def _ask(access: Access, request: PlanRequest, wait_s: float) -> PlanResponse:

@@ -90,7 +90,7 @@ def plan(
             raise BadInputError("--solver", solver, "tappa, for --explain")
         if draw_road is not None:
             raise BadInputError("--draw-road", str(draw_road), "only without --explain")
-        explain_request(request, deadline, draw)
+        explain_request(request, deadline, draw, settings)
         return
     if access is None and wait:
         raise BadInputError("--wait", wait, "only with --connect or --config")

@@ -98,7 +98,7 @@ def run(
         typer.Option("--compare", help="Also let SUMO drive alone, and compare (with --sumocfg)."),
     ] = False,
     gui: Annotated[
-        bool, typer.Option("--gui", help="Show the run in sumo-gui (pip install 'laneweave[gui]').")
+        bool, typer.Option("--gui", help="Show the run in sumo-gui (extra: gui).")
     ] = False,
     out: RunFolder = None,
     pace: Annotated[

@@ -61,7 +61,7 @@ def simulate(
 
     if story is not None:
         _run_story(Story.read(story), verbose=verbose)
-    if shrink is not None and not shrink.parent.is_dir():
+    if shrink is not None and (shrink.is_dir() or not shrink.parent.is_dir()):
         raise BadInputError("--shrink", str(shrink), "a file in an existing folder")
     chosen = profiles.profiles_named(profile)
     numbers, count = parse_seeds(seeds), check_jobs(jobs)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import json
 import time
+from collections.abc import Iterator
 from enum import StrEnum
 from typing import Annotated
 
 import typer
 from attrs import evolve
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from laneweave.launch.cli.options import Config, Endpoint, load_deployment
@@ -140,56 +142,59 @@ def show(found: Status, console: Console) -> None:
     """Print a status as a table."""
     table = Table(show_header=False, box=None, pad_edge=False)
     for row in _rows(found):
-        table.add_row(*row)
+        table.add_row(*map(escape, row))
     console.print(table)
 
 
-def _rows(found: Status) -> list[tuple[str, str]]:
-    plans, road, vehicles = found.plans, found.road, found.vehicles
-    leader = "none" if found.leader is None else f"{found.leader}, term {found.term}"
+def _rows(found: Status) -> Iterator[tuple[str, str]]:
+    """Yield names and values; what was not seen has no row."""
+    yield "health", "healthy" if found.healthy else "not healthy"
+    yield "realm", found.realm
+    yield "endpoint", found.endpoint
+    yield "listened", f"{found.listened_s:.1f} s"
+    yield "leader", found.leader or "none"
+    if found.term is not None:
+        yield "term", f"{found.term}"
     if len(found.claims) > 1:
-        leader += f"; {len(found.claims)} claim to lead: {', '.join(found.claims)}"
-    in_force = f"{plans.in_force} in force"
+        yield "claim to lead", ", ".join(found.claims)
+    for one in found.candidates:
+        yield f"candidate {one.coordinator}", _candidate(one)
+    yield from _road_rows(found)
+    for topic, rate in found.messages_per_s.items():
+        yield f"{topic} messages", f"{rate:.1f}/s"
+    for topic, share in (("clock", found.loss.clock), ("state", found.loss.state)):
+        if share is not None:
+            yield f"{topic} messages lost", f"{100 * share:.1f} %"
+
+
+def _road_rows(found: Status) -> Iterator[tuple[str, str]]:
+    plans, road, vehicles = found.plans, found.road, found.vehicles
+    yield "plans in force", f"{plans.in_force}"
     if plans.operation is not None:
-        in_force += f", {plans.operation} operation"
+        yield "operation", plans.operation
     if plans.formations is not None:
-        in_force += (
-            f", {plans.formations_with_plan} of {plans.formations} closed formations have one"
-        )
-    rows = [
-        ("health", "healthy" if found.healthy else "not healthy"),
-        ("realm", f"{found.realm} at {found.endpoint}, {found.listened_s:.1f} s"),
-        ("leader", leader),
-        ("candidates", "; ".join(map(_candidate, found.candidates)) or "none"),
-        ("plans", in_force),
-    ]
+        with_plan = f"{plans.formations_with_plan} of {plans.formations}"
+        yield "closed formations with a plan", with_plan
     if road is None:
-        rows.append(("road", "none"))
-    else:
-        pace = "ended" if road.ended else f"pace {road.pace or 0.0:.1f}"
-        counts = (
-            f"{road.on_road} on the road, {road.entered} entered, {road.left} left, "
-            f"{road.demanded} demanded"
-        )
-        drivers = (
-            f"{vehicles.attended} attended, {vehicles.unattended} unattended, "
-            f"{vehicles.unheard} not heard from; {vehicles.agents} agents"
-        )
-        rows += [("road", f"{road.t_s:.1f} s, {pace}; {counts}"), ("vehicles", drivers)]
-    rates = ", ".join(f"{topic} {rate:.1f}" for topic, rate in found.messages_per_s.items())
-    rows.append(("messages/s", rates or "none"))
-    loss = found.loss
-    rows.append(("loss", f"clock {_percent(loss.clock)}, state {_percent(loss.state)}"))
-    return rows
+        yield "road", "none"
+        return
+    yield "road", "ended" if road.ended else "advances"
+    yield "road time", f"{road.t_s:.1f} s"
+    if not road.ended:
+        yield "pace", f"{road.pace or 0.0:.1f}"
+    yield "vehicles demanded", f"{road.demanded}"
+    yield "vehicles entered", f"{road.entered}"
+    yield "vehicles left", f"{road.left}"
+    yield "vehicles on the road", f"{road.on_road}"
+    yield "with an agent", f"{vehicles.attended}"
+    yield "without an agent", f"{vehicles.unattended}"
+    yield "not heard from", f"{vehicles.unheard}"
+    yield "agents", f"{vehicles.agents}"
 
 
 def _candidate(one: Coordinator) -> str:
     if one.heard_s_ago is None:
-        return f"{one.coordinator} not heard from"
+        return "not heard from"
     leads = ", claims to lead" if one.leading else ""
     token = "" if one.token else ", without a token"
-    return f"{one.coordinator} term {one.term}, {one.heard_s_ago:.2f} s ago{leads}{token}"
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f} %"
+    return f"term {one.term}, heard {one.heard_s_ago:.2f} s ago{leads}{token}"

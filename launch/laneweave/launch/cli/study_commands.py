@@ -134,7 +134,7 @@ def report(
                     dpi=REPORT_DPI,
                     file_format=figures,
                 )
-                Console().print(f"{page}: written", highlight=False, soft_wrap=True)
+                typer.echo(f"{page}: written")
         if len(folders) > 1 or is_sweep(folders[0]):
             if len(folders) == 1:
                 out = folders[0]
@@ -147,6 +147,6 @@ def report(
                 formation=formation,
                 file_format=figures,
             )
-            Console().print(f"{page}: written", highlight=False, soft_wrap=True)
+            typer.echo(f"{page}: written")
     except OSError as error:
         raise CommandFailedError(f"the report cannot be written: {error}") from error

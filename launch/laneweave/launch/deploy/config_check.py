@@ -26,9 +26,9 @@ from laneweave.protocol.wire.topics import Party
 
 @define
 class Report:
-    """Result of a check; problems and warnings are lines of text."""
+    """Result of a check; warnings are lines of text."""
 
-    problems: list[str] = field(factory=list)
+    problems: list[BadInputError] = field(factory=list)
     warnings: list[str] = field(factory=list)
     facts: list[tuple[str, str]] = field(factory=list)
     """Names and values of effective settings."""
@@ -55,10 +55,10 @@ def _check_network(scenario: Scenario, report: Report) -> None:
         try:
             check_endpoint(endpoint, name)
         except BadInputError as error:
-            report.problems.append(str(error))
+            report.problems += error.problems
     if link_of(network.endpoint) not in map(link_of, network.listens_at):
         allowed = f"an endpoint with the protocol and the options of {network.endpoint}, too"
-        report.problems.append(str(BadInputError("network.listen", list(network.listen), allowed)))
+        report.problems.append(BadInputError("network.listen", list(network.listen), allowed))
     if network.listen and host_of(network.endpoint) in EVERYWHERE:
         report.warnings.append(
             f"network.endpoint: {network.endpoint} is not reachable by other roles"
@@ -85,7 +85,7 @@ def _check_moves(scenario: Scenario, report: Report) -> None:
     try:
         check_moves(scenario)
     except BadInputError as error:
-        report.problems.append(str(error))
+        report.problems += error.problems
 
 
 def _listens_to_other_hosts(scenario: Scenario) -> bool:
@@ -116,7 +116,7 @@ def _check_role(
     if scenario.security.mode == "off":
         return
     if identity not in set(identities_of(scenario)):
-        report.problems.append(str(BadInputError("--name", name, KNOWN_RULE)))
+        report.problems.append(BadInputError("--name", name, KNOWN_RULE))
         return
     if identity.party is not Party.ROUTER:
         count = sum(len(rule.keys) for rule in rules_of(identity, scenario))
@@ -136,7 +136,7 @@ def _check_files(
         assert credentials is not None  # noqa: S101 (the deployment is secured)
         found = examine(credentials, identity.common_name, "" if host in EVERYWHERE else host)
     except BadInputError as error:
-        report.problems.append(str(error))
+        report.problems += error.problems
         return
     until = dt.datetime.fromtimestamp(found.valid_until_s, dt.UTC)
     report.warnings += found.warnings

@@ -233,8 +233,7 @@ def _title(response: PlanResponse) -> str:
 
 
 def _label_time(axes: Axes, steps: int) -> None:
-    name = "start" if steps == 0 else f"after {steps} step{'s' if steps > 1 else ''}"
-    axes.set_title(name, fontsize=8, pad=3.5, color=INK)
+    axes.set_title(f"step {steps}", fontsize=8, pad=3.5, color=INK)
 
 
 def _draw_lattice(axes: Axes, request: PlanRequest) -> None:

@@ -24,8 +24,8 @@ IMPROVED = (
 )
 
 _COUNTING = (
-    "Targets, steps and nodes count from 1 as in the paper, cells (column, lane) from 0 as in "
-    "requests."
+    "Targets and nodes count from 1 as in the paper, cells (column, lane) from 0 as in requests. "
+    "Step 0 is the start, step 1 the end of the first move."
 )
 
 

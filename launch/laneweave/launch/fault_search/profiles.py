@@ -13,7 +13,7 @@ from typing import Any
 
 from attrs import frozen
 
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import unknown_name
 from laneweave.protocol.structuring import structure
 
 Span = tuple[int, int]
@@ -100,5 +100,6 @@ def profiles_named(name: str) -> tuple[Profile, ...]:
     if name == GUIDED:
         return tuple(profile for profile in PROFILES.values() if profile.event_kinds)
     if name not in PROFILES:
-        raise BadInputError("--profile", name, ", ".join((GUIDED, *PROFILES)))
+        names = (GUIDED, *PROFILES)
+        raise unknown_name("--profile", name, names, ", ".join(names))
     return (PROFILES[name],)

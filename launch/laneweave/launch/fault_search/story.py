@@ -12,11 +12,18 @@ from attrs import frozen
 from laneweave.launch.fault_search.events.faults import FaultEvent, draw_events
 from laneweave.launch.fault_search.profiles import Profile
 from laneweave.launch.fault_search.setup import Setup
+from laneweave.protocol.config.source_files import (
+    SourceFile,
+    json_lines,
+    read_text,
+    unique_keys,
+)
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.structuring import strict_converter, structure
 from laneweave.protocol.wire.messages import Name
 
 SCHEMA = "laneweave.story/1"
+MAX_BYTES = 1 << 24
 NEW_PREFERENCES_S = (0.8, 3.0)
 """Range of intervals at which the preferred lanes change during the fault phase."""
 
@@ -68,13 +75,15 @@ class Story:
         Raises:
             BadInputError: the file cannot be read, or is not a story.
         """
+        text = read_text(path, "story", "JSON", MAX_BYTES)
         try:
-            table = json.loads(path.read_text("utf-8"))
-        except (OSError, ValueError) as error:
-            raise BadInputError("story", str(path), f"a readable JSON file ({error})") from error
+            table = json.loads(text, object_pairs_hook=unique_keys)
+        except (ValueError, RecursionError) as error:
+            raise BadInputError("story", str(path), f"valid JSON ({error})") from error
         if not isinstance(table, dict) or table.pop("schema", None) != SCHEMA:
             raise BadInputError("story", str(path), f'a file with "schema": "{SCHEMA}"')
-        return structure(table, cls)
+        with SourceFile(str(path), text, table, json_lines).located():
+            return structure(table, cls)
 
     def text(self) -> str:
         """Return the story as JSON."""

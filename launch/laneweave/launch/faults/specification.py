@@ -7,9 +7,8 @@ preset files, which are selected by name.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Collection, Iterator
-from importlib.resources import files
+from importlib.resources import as_file, files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,8 +17,8 @@ import attrs
 from attrs import field, frozen
 from attrs.validators import optional
 
-from laneweave.protocol.config.scenario_files import read_toml
-from laneweave.protocol.errors import NO_VALUE, BadInputError
+from laneweave.protocol.config.source_files import SourceFile, read_toml_source
+from laneweave.protocol.errors import NO_VALUE, BadInputError, raise_all, unknown_name
 from laneweave.protocol.field_validators import one_of, within
 from laneweave.protocol.runtime.message_faults import SENDERS, MessageRule
 from laneweave.protocol.structuring import NumberOrRange, structure
@@ -314,25 +313,39 @@ def load_faults(
     """
     if choice is None:
         return FaultSpec()
-    specification = structure(_tables(choice), FaultSpec)
+    source = _source(choice)
+    with source.located():
+        specification = structure(source.tables, FaultSpec)
+        raise_all(_unknown_targets(specification, coordinators, vehicles))
+    return specification
+
+
+def _unknown_targets(
+    specification: FaultSpec, coordinators: Collection[str], vehicles: Collection[str] | None
+) -> Iterator[BadInputError]:
+    """Yield an error for each target that the run does not have."""
     kinds = (LEADER, *coordinators, COORDINATOR, ROUTER, AGENT)
     for name, fault in specification.role_faults():
         known = fault.target in kinds
         if not known and vehicles is not None and fault.target not in vehicles:
             allowed = f"{', '.join(kinds)}, or the name of a vehicle of the run"
-            raise BadInputError(f"{name}.target", fault.target, allowed)
-    return specification
+            yield unknown_name(f"{name}.target", fault.target, kinds, allowed)
 
 
-def _tables(choice: Path | str) -> dict[str, Any]:
+def _source(choice: Path | str) -> SourceFile:
     path = Path(choice)
-    if path.exists():
-        return read_toml(path)
-    if str(choice) not in preset_names():
-        presets = ", ".join(preset_names())
-        raise BadInputError("--faults", str(choice), f"a readable file, or one of {presets}")
-    text = _presets().joinpath(f"{choice}.toml").read_text(encoding="utf-8")
-    return tomllib.loads(text)
+    names = preset_names()
+    try:
+        exists = path.exists()
+    except OSError as error:
+        raise BadInputError("--faults", str(choice), f"a file ({error.strerror})") from error
+    if exists:
+        return read_toml_source(path)
+    if str(choice) not in names:
+        allowed = f"a readable file, or one of {', '.join(names)}"
+        raise unknown_name("--faults", str(choice), names, allowed)
+    with as_file(_presets().joinpath(f"{choice}.toml")) as preset:
+        return read_toml_source(preset)
 
 
 def _presets() -> Traversable:

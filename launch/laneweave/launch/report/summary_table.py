@@ -1,137 +1,165 @@
-"""The result table of a run, printed when the run ends and included in its report."""
+"""The result table of a run, printed when the run ends and included in its report.
+
+Each row has one value; values that a run does not have get no row.
+"""
 
 from __future__ import annotations
 
 import statistics
 from collections import Counter
+from collections.abc import Iterator
 
-from laneweave.protocol.scenario.fields import COMFORT_MPS2
-from laneweave.protocol.summary import Planning, RunSummary, Safety
+from laneweave.protocol.scenario.fields import COMFORT_MPS2, ROLLING_SOLVER, Scenario
+from laneweave.protocol.summary import Planning, RunSummary
 
-NO_PREFERENCES = "no preferred lanes"
-MAX_LISTED = 5
-"""Maximum number of recovery times that are listed individually."""
+Row = tuple[str, str]
+"""Name of a figure, and its value with unit."""
 
 
-def summary_rows(summary: RunSummary, *, preferences: bool = True) -> list[tuple[str, str]]:
-    """Return the rows (figure, value) of a run's table.
+def summary_rows(summary: RunSummary, scenario: Scenario | None = None) -> list[Row]:
+    """Return the rows of a run's table.
 
     Args:
         summary: summary of the run.
-        preferences: whether vehicles have preferred lanes.
+        scenario: scenario of the run; None: unknown, such as of a run without trips.
     """
-    return [
-        *_traffic_rows(summary, preferences=preferences),
-        *_control_rows(summary),
-        *_fault_rows(summary),
-    ]
+    preferences = scenario is None or bool(scenario.lane_shares)
+    rows = [*_demand_rows(summary, scenario), *_traffic_rows(summary, preferences=preferences)]
+    rows += _safety_rows(summary)
+    if summary.planning.plans or summary.tracking.solves or summary.failover.leader_changes:
+        rows += [*_planning_rows(summary.planning), *_control_rows(summary)]
+    return [*rows, *_runtime_rows(summary), *_fault_rows(summary)]
 
 
-def _traffic_rows(summary: RunSummary, *, preferences: bool) -> list[tuple[str, str]]:
-    vehicles, safety, travel_s = summary.vehicles, summary.safety, summary.travel_time_s
-    tracking, share = summary.tracking, (summary.preferred_percent or 0.0) / 100.0
-    preferred = f"{vehicles.on_preferred_lane} ({share:.2%})" if preferences else NO_PREFERENCES
-    low, high = _text(safety.min_accel_mps2), _text(safety.max_accel_mps2)
-    return [
-        ("demand", f"{summary.volume_veh_per_lane_h:g} vehicles/(lane h), seed {summary.seed}"),
-        ("simulated time", f"{summary.simulated_s:.1f} s"),
-        ("vehicles left / entered", f"{vehicles.left} / {vehicles.entered}"),
-        *_outside_rows(summary),
-        ("maximum at one time", f"{vehicles.peak}"),
-        ("in their preferred lane", preferred),
-        ("travel time mean / p95 / max", _join(travel_s.mean, travel_s.p95, travel_s.max) + " s"),
-        ("ticks driven without an agent", _count(tracking.hold_law_ticks)),
-        ("ticks of emergency braking", _count(tracking.emergency_ticks)),
-        ("overlaps", f"{safety.overlaps} (SUMO reports {safety.sumo_collisions})"),
-        (
-            "smallest gap, smallest headway",
-            f"{_text(safety.min_gap_m)} m, {_text(safety.min_headway_s)} s",
-        ),
-        ("acceleration", f"{low} to {high} m/s2{_discomfort(safety)}"),
-    ]
+def _demand_rows(summary: RunSummary, scenario: Scenario | None) -> Iterator[Row]:
+    yield "demand", f"{summary.volume_veh_per_lane_h:g} vehicles/(lane h)"
+    if scenario is not None:
+        yield "arrivals during", f"{scenario.demand.duration_s:g} s"
+    yield "vehicles demanded", f"{summary.vehicles.demanded}"
+    yield "seed", f"{summary.seed}"
 
 
-def _outside_rows(summary: RunSummary) -> list[tuple[str, str]]:
-    """Return the row of vehicles that a complete run has left outside; none: no row."""
-    outside = summary.vehicles.demanded - summary.vehicles.entered
-    if not outside or summary.ending != "complete":
-        return []
-    return [("never entered", f"{outside}: did not come to the corridor, or exit full")]
+def _traffic_rows(summary: RunSummary, *, preferences: bool) -> Iterator[Row]:
+    vehicles, times = summary.vehicles, summary.travel_time_s
+    yield "simulated time", f"{summary.simulated_s:.1f} s"
+    yield "vehicles entered", f"{vehicles.entered}"
+    yield "vehicles left", f"{vehicles.left}"
+    outside = vehicles.demanded - vehicles.entered
+    if outside and summary.ending == "complete":
+        yield "never entered: did not come to the corridor, or exit full", f"{outside}"
+    yield "most vehicles at one time", f"{vehicles.peak}"
+    if preferences and summary.preferred_percent is not None:
+        share = f"{summary.preferred_percent:.2f} % of {vehicles.left} vehicles"
+        yield "left in their preferred lane", share
+    counted = "" if times.n is None else f" ({times.n} of {vehicles.demanded} vehicles)"
+    if times.n == 0:
+        yield "travel time, mean", f"none{counted}"
+    yield from _numbers(
+        ("travel time, mean", times.mean, f" s{counted}"),
+        ("travel time, 95th percentile", times.p95, " s"),
+        ("travel time, maximum", times.max, " s"),
+    )
 
 
-def _discomfort(safety: Safety) -> str:
-    """Return a remark about uncomfortable accelerations; empty if there were none."""
-    found = (safety.min_accel_mps2, safety.max_accel_mps2)
-    if all(value is None or round(abs(value), 2) <= COMFORT_MPS2 for value in found):
-        return ""
-    return f", beyond comfort ({COMFORT_MPS2:g} m/s2)"
+def _safety_rows(summary: RunSummary) -> Iterator[Row]:
+    safety, tracking = summary.safety, summary.tracking
+    yield "overlaps of bodies", f"{safety.overlaps}"
+    yield "collisions reported by SUMO", f"{safety.sumo_collisions}"
+    yield from _numbers(
+        ("smallest gap", safety.min_gap_m, " m"),
+        ("smallest headway", safety.min_headway_s, " s"),
+        ("lowest acceleration", safety.min_accel_mps2, _accel_unit(safety.min_accel_mps2)),
+        ("highest acceleration", safety.max_accel_mps2, _accel_unit(safety.max_accel_mps2)),
+    )
+    yield from _counts(
+        ("ticks of emergency braking", tracking.emergency_ticks),
+        ("ticks driven without an agent", tracking.hold_law_ticks),
+    )
 
 
-def _control_rows(summary: RunSummary) -> list[tuple[str, str]]:
-    planning, tracking, runtime = summary.planning, summary.tracking, summary.runtime
-    plan_ms, failover = planning.solve_ms, summary.failover
-    osqp, unconstrained = _count(tracking.osqp_solves), _count(tracking.unconstrained_steps)
-    return [
-        (
-            "plans, proven optimal",
-            f"{planning.plans}, {planning.optimal}, up to {planning.largest_formation} vehicles",
-        ),
-        ("plans by solver", _by_solver(planning)),
-        ("planning time p50 / p95 / max", _join(plan_ms.p50, plan_ms.p95, plan_ms.max) + " ms"),
-        ("tracking by OSQP / unconstrained", f"{osqp} / {unconstrained} ticks"),
-        ("tracking CPU p50 / p99", _join(tracking.solve_ms.p50, tracking.solve_ms.p99) + " ms"),
-        ("tick p50 / p99", _join(runtime.tick_ms.p50, runtime.tick_ms.p99) + " ms"),
-        (
-            "real-time factor",
-            f"{runtime.real_time_factor:.2f} ({runtime.processes or '?'} processes)",
-        ),
-        ("leader changes", f"{failover.leader_changes}{_recoveries(failover.recovery_s)}"),
-    ]
+def _accel_unit(value: float | None) -> str:
+    """Return the unit of an acceleration, with a remark if it is uncomfortable."""
+    if value is None or round(abs(value), 2) <= COMFORT_MPS2:
+        return " m/s2"
+    return f" m/s2, beyond comfort ({COMFORT_MPS2:g} m/s2)"
 
 
-def _recoveries(seconds: list[float]) -> str:
-    """Return the leaderless periods in brackets or, if there are many, their statistics."""
-    if not seconds:
-        return ""
-    if len(seconds) <= MAX_LISTED:
-        return f" ({', '.join(f'{each:.3f} s' for each in seconds)})"
-    return f" (p50 {statistics.median(seconds):.3f}, max {max(seconds):.3f} s without)"
+def _planning_rows(planning: Planning) -> Iterator[Row]:
+    """Yield the rows of plans; those of the rolling operation are never proven optimal."""
+    yield "plans", f"{planning.plans}"
+    if not planning.plans:
+        return
+    by_solver = planning.by_solver or {}
+    provable = planning.plans - by_solver.get(ROLLING_SOLVER, 0)
+    if provable:
+        yield "plans proven optimal", f"{planning.optimal} of {provable}"
+        yield "largest formation", f"{planning.largest_formation} vehicles"
+    for solver, plans in by_solver.items():
+        if plans:
+            yield f"plans by {solver}", f"{plans}"
+    if planning.fallbacks is not None and provable:
+        yield "plans by a fallback", f"{planning.fallbacks}"
+    yield from _numbers(
+        ("planning time, median", planning.solve_ms.p50, " ms"),
+        ("planning time, 95th percentile", planning.solve_ms.p95, " ms"),
+        ("planning time, maximum", planning.solve_ms.max, " ms"),
+    )
 
 
-def _by_solver(planning: Planning) -> str:
-    """Return the number of plans by each solver; "-" for summaries from earlier versions."""
-    if planning.by_solver is None:
-        return "-"
-    made = [f"{solver} {plans}" for solver, plans in planning.by_solver.items() if plans]
-    return f"{', '.join(made) or '-'} ({planning.fallbacks} fallbacks)"
+def _control_rows(summary: RunSummary) -> Iterator[Row]:
+    tracking, failover = summary.tracking, summary.failover
+    yield from _counts(
+        ("ticks tracked with OSQP", tracking.osqp_solves),
+        ("ticks tracked unconstrained", tracking.unconstrained_steps),
+    )
+    yield from _numbers(
+        ("tracking CPU time, median", tracking.solve_ms.p50, " ms"),
+        ("tracking CPU time, 99th percentile", tracking.solve_ms.p99, " ms"),
+    )
+    yield "leader changes", f"{failover.leader_changes}"
+    seconds = failover.recovery_s
+    if seconds:
+        number = f"{len(seconds)} time{'s' if len(seconds) > 1 else ''}"
+        yield "time without leader, median", f"{statistics.median(seconds):.3f} s ({number})"
+        yield "time without leader, maximum", f"{max(seconds):.3f} s"
 
 
-def _fault_rows(summary: RunSummary) -> list[tuple[str, str]]:
+def _runtime_rows(summary: RunSummary) -> Iterator[Row]:
+    runtime = summary.runtime
+    yield from _numbers(
+        ("tick, median", runtime.tick_ms.p50, " ms"),
+        ("tick, 99th percentile", runtime.tick_ms.p99, " ms"),
+        ("real-time factor", runtime.real_time_factor, ""),
+    )
+    yield from _counts(("processes", runtime.processes))
+
+
+def _fault_rows(summary: RunSummary) -> Iterator[Row]:
     faults = summary.faults
     if faults is None:
-        return []
+        return
     verbs = Counter(
         verb for one in faults["injected"] for verb in ("killed", "paused") if verb in one
     )
-    rows = [
-        ("processes killed, paused", f"{verbs['killed']}, {verbs['paused']}"),
-        ("messages lost to faults", f"{summary.messages.dropped_by_faults}"),
-    ]
+    yield "processes killed", f"{verbs['killed']}"
+    yield "processes paused", f"{verbs['paused']}"
+    yield "messages lost to faults", f"{summary.messages.dropped_by_faults:,}"
     methods = faults["partition_methods"]
     if methods:
         how = ", ".join(dict.fromkeys(methods.values()))
         why = faults.get("why_no_namespaces")
-        rows.append(("partitions implemented by", f"{how} ({why})" if why else how))
-    return rows
+        yield "partitions implemented by", f"{how} ({why})" if why else how
 
 
-def _join(*values: float | None) -> str:
-    return " / ".join(map(_text, values))
+def _numbers(*rows: tuple[str, float | None, str]) -> Iterator[Row]:
+    """Yield the rows (name, value, unit) with a value."""
+    for name, value, unit in rows:
+        if value is not None:
+            yield name, f"{value:.2f}{unit}"
 
 
-def _text(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
-
-
-def _count(value: int | None) -> str:
-    return "-" if value is None else f"{value:,}"
+def _counts(*rows: tuple[str, int | None]) -> Iterator[Row]:
+    """Yield the rows (name, count) with a count."""
+    for name, count in rows:
+        if count is not None:
+            yield name, f"{count:,}"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
+import pyarrow as pa
 from attrs import frozen
 
 from laneweave.launch.recordings.results_over_seeds import (
@@ -22,6 +23,7 @@ _Column = tuple[str, str, str, int]
 _TRAFFIC: Final[tuple[_Column, ...]] = (
     ("runs", "runs", "", 0),
     ("travel time mean (s)", "travel_time_s_mean", "mean", 2),
+    ("of vehicles", "travel_time_s_n", "sum", 0),
     ("p95 (s)", "travel_time_s_p95", "mean", 2),
     ("throughput (veh/(lane·h))", "throughput_veh_per_lane_h", "mean", 0),
     ("in the preferred lane (%)", PREFERRED, "mean", 2),
@@ -34,7 +36,6 @@ _SAFETY: Final[tuple[_Column, ...]] = (
     ("real-time factor", "runtime_real_time_factor", "min", 1),
 )
 _PLANNING: Final[tuple[_Column, ...]] = (
-    ("solvers", "solvers", "", 0),
     ("largest formation", "planning_largest_formation", "max", 0),
     ("plans", "planning_plans", "sum", 0),
     ("fallbacks", "planning_fallbacks", "sum", 0),
@@ -64,24 +65,27 @@ def tables_of(comparison: Comparison) -> list[Table]:
     results, traffic = results_table(comparison.runs), _TRAFFIC
     if not any(run.scenario.lane_shares for run in comparison.runs):
         traffic = tuple(column for column in _TRAFFIC if column[1] != PREFERRED)
-    columns = (*_TRAFFIC, *_SAFETY, *_PLANNING)
+    by_solver = tuple(_solver_columns(results))
+    columns = (*_TRAFFIC, *_SAFETY, *_PLANNING, *by_solver)
     wanted = [(column, function) for _, column, function, _ in columns if function]
     wanted += [(column, "stddev") for column, function in wanted if function == "mean"]
-    wanted += [(name, "sum") for name in results.column_names if name.startswith(_BY_SOLVER)]
-    rows = [row | {"solvers": _solvers(row)} for row in over_seeds(results, wanted)]
+    rows = over_seeds(results, wanted)
     planned = [row for row in rows if row["planning_plans_sum"]]
     return [
         _table(rows, traffic, "Means over the seeds ± standard deviation."),
         _table(rows, _SAFETY, "Extremes or sums over the seeds."),
-        _table(planned, _PLANNING, "Planning: sums over the seeds; sizes and times are maxima."),
+        _table(
+            planned,
+            (*by_solver, *_PLANNING),
+            "Planning: sums over the seeds; sizes and times are maxima.",
+        ),
         failed_table(comparison),
     ]
 
 
 def run_table(run: Run) -> Table:
     """Return the table of one run."""
-    preferences = bool(run.scenario.lane_shares)
-    rows = summary_rows(run.summary, preferences=preferences) if run.summary else []
+    rows = summary_rows(run.summary, run.scenario) if run.summary else []
     caption = "Results of the run; all values are in summary.json."
     return Table(("", "value"), [("method", run.label), *rows], caption, 2)
 
@@ -118,11 +122,8 @@ def _cell(row: Mapping[str, Any], wanted: _Column) -> str:
     return text if deviation is None else f"{text} ± {deviation:.{digits}f}"
 
 
-def _solvers(row: Mapping[str, Any]) -> str:
-    """Return the number of plans by each solver."""
-    plans = {
-        name.removeprefix(_BY_SOLVER).removesuffix("_sum"): count
-        for name, count in row.items()
-        if name.startswith(_BY_SOLVER) and count
-    }
-    return ", ".join(f"{name} {count}" for name, count in sorted(plans.items())) or "-"
+def _solver_columns(results: pa.Table) -> Iterator[_Column]:
+    """Yield a column for each solver that made a plan."""
+    for name in sorted(results.column_names):
+        if name.startswith(_BY_SOLVER) and any(results[name].to_pylist()):
+            yield f"plans by {name.removeprefix(_BY_SOLVER)}", name, "sum", 0

@@ -9,6 +9,7 @@ from typing import Any
 
 from attrs import evolve, frozen
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from laneweave.coordinator.planning.plug_ins.registry import PLANNERS
@@ -151,16 +152,16 @@ def print_outcome(outcome: Outcome, console: Console) -> None:
     """Print the results and the problems of a run; on stderr, that it was interrupted."""
     summary = outcome.summary
     if summary is not None:
-        table = Table(title=f"laneweave run: {outcome.folder}", show_header=False)
+        table = Table(title=f"laneweave run: {escape(str(outcome.folder))}", show_header=False)
         table.add_column()
         table.add_column(justify="right")
         trips = outcome.folder / "trips.parquet"
-        preferences = not trips.is_file() or bool(scenario_of(trips).lane_shares)
-        for label, value in summary_rows(summary, preferences=preferences):
-            table.add_row(label, value)
+        scenario = scenario_of(trips) if trips.is_file() else None
+        for label, value in summary_rows(summary, scenario):
+            table.add_row(label, escape(value))
         console.print(table)
     for problem in outcome.problems:
-        console.print(f"FAILED: {problem}", style="bold red", highlight=False)
+        console.print(f"FAILED: {problem}", style="bold red", highlight=False, markup=False)
     if outcome.interrupted and summary is not None:
         t_s, folder = summary.simulated_s, outcome.folder
         sys.stderr.write(f"interrupted at {t_s:.1f} s of road time; the data so far: {folder}\n")

@@ -39,8 +39,7 @@ def new_folder(out: Path | None, settings: Scenario, method: str) -> Iterator[Pa
     """
     volume = f"{settings.demand.volume_veh_per_lane_h:g}"
     folder = out or timestamped_folder(f"{method}-{volume}-seed{settings.seed}")
-    existed = folder.is_dir()
-    log = _claim(folder)
+    existed, log = _claim(folder)
     try:
         yield folder
     except (BadInputError, RefusedError, KeyboardInterrupt):
@@ -64,9 +63,13 @@ def timestamped_folder(prefix: str) -> Path:
     return folder
 
 
-def _claim(folder: Path) -> int:
-    """Lock the log of a folder and empty the folder; return the log's descriptor."""
+def _claim(folder: Path) -> tuple[bool, int]:
+    """Lock the log of a folder and empty the folder.
+
+    Returns whether it existed, and the log's descriptor.
+    """
     try:
+        existed = folder.is_dir()
         folder.mkdir(parents=True, exist_ok=True)
         if not _is_unused(folder):
             raise BadInputError("--out", str(folder), FOLDER_RULE)
@@ -87,7 +90,7 @@ def _claim(folder: Path) -> int:
         raise BadInputError("--out", str(folder), FOLDER_RULE) from error
     except OSError as error:
         raise BadInputError("--out", str(folder), f"a folder ({error.strerror})") from error
-    return log
+    return existed, log
 
 
 def _lock(descriptor: int, kind: int) -> None:

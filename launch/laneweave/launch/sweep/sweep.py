@@ -19,6 +19,8 @@ from laneweave.launch.sweep.folder import SweepFolder
 from laneweave.launch.sweep.points import Point, volume_text
 from laneweave.protocol.errors import CommandFailedError
 
+COUNTED = "travel_time_s_n"
+"""Number of vehicles of which the mean travel time is given."""
 Runner = Callable[[Sequence[Point], Path], Generator[PointResult, None, None]]
 """Function that runs points in a folder and yields results; closing the generator stops them."""
 
@@ -79,11 +81,20 @@ def print_results(points: Sequence[Point], folder: SweepFolder, console: Console
     runs = [folder.runs[point.name] for point in points]
     done = [folder.runs[point.name] for point in points if folder.is_finished(point)]
     columns = ("travel_time_s_mean", "throughput_veh_per_lane_h", PREFERRED)
-    found = over_seeds(results_table(done), [(column, "mean") for column in columns])
+    wanted = [(COUNTED, "sum"), *((column, "mean") for column in columns)]
+    found = over_seeds(results_table(done), wanted)
     means = {(row["label"], row["volume_veh_per_lane_h"]): row for row in found}
-    table = Table(title=f"laneweave sweep: {folder.out}")
+    table = Table(title=f"laneweave sweep: {escape(str(folder.out))}")
     table.add_column("label")
-    for heading in ("veh/(lane h)", "done", "failed", "travel time", "throughput", "in lane"):
+    for heading in (
+        "veh/(lane h)",
+        "done",
+        "failed",
+        "vehicles",
+        "travel time",
+        "throughput",
+        "in lane",
+    ):
         table.add_column(heading, justify="right")
     for (label, volume), count in Counter(
         (run.label, run.volume_veh_per_lane_h) for run in runs
@@ -93,7 +104,12 @@ def print_results(points: Sequence[Point], folder: SweepFolder, console: Console
             "-" if row.get(f"{column}_mean") is None else f"{row[f'{column}_mean']:.2f}{unit}"
             for column, unit in zip(columns, (" s", "", " %"), strict=True)
         ]
-        counts = (str(row["runs"]), str(count - row["runs"]))
+        counted = row.get(f"{COUNTED}_sum")
+        counts = (
+            str(row["runs"]),
+            str(count - row["runs"]),
+            "-" if counted is None else str(counted),
+        )
         table.add_row(label, volume_text(volume), *counts, *figures)
     console.print(table)
     for run in runs:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from operator import attrgetter, ge, gt, le, lt
 from typing import Any
 
 import attrs
 
 from laneweave.protocol.config.participants import identities_of, max_vehicles
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, raise_all
 from laneweave.protocol.field_validators import is_encrypted
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, end_exit
 from laneweave.protocol.scenario.fields import (
@@ -60,34 +60,27 @@ def check_scenario(scenario: Scenario) -> None:
     """Check the fields against each other.
 
     Raises:
-        BadInputError: a field violates a rule; the error names the first such field.
+        BadInputError: fields violate rules.
     """
-    for check in (
-        _check_types,
-        _check_lanes,
-        _check_motion,
-        _check_closures,
-        _check_entrances,
-        _check_dead_ends,
-        _check_exits,
-        _check_capacity,
-        _check_destinations,
-        _check_structures,
-        _check_timing,
-        _check_braking,
-        _check_settling,
-        _check_sumo,
-        _check_security,
-    ):
-        check(scenario)
+    raise_all(scenario_problems(scenario))
 
 
-def check_effects(data: Mapping[str, Any], scenario: Scenario) -> None:
-    """Check that each value in a file has an effect in the resulting scenario.
+def scenario_problems(scenario: Scenario) -> Iterator[BadInputError]:
+    """Yield errors of fields that contradict each other.
 
-    Raises:
-        BadInputError: a value has no effect; the error names the first such field.
+    Checks of the road use what the checks before them have established, so that only the first
+    error about the road is found; likewise for the motion of vehicles.
     """
+    for group in _CHECKS:
+        try:
+            for check in group:
+                check(scenario)
+        except BadInputError as error:
+            yield error
+
+
+def effect_problems(data: Mapping[str, Any], scenario: Scenario) -> Iterator[BadInputError]:
+    """Yield an error for each value in a file that has no effect in the resulting scenario."""
     formation, given = scenario.formation, data.get("formation", {})
     by_vehicles = formation.closes_by_vehicles
     for fields, has_effect, allowed in (
@@ -97,8 +90,9 @@ def check_effects(data: Mapping[str, Any], scenario: Scenario) -> None:
         (("join",), formation.max_joined > 1, "none, unless formation.max_joined is above 1"),
         (("block_columns",), not by_vehicles, 'none, unless formation.close is "columns"'),
     ):
-        for name in fields:
-            _require(name not in given or has_effect, f"formation.{name}", given.get(name), allowed)
+        if not has_effect:
+            for name in given.keys() & set(fields):
+                yield BadInputError(f"formation.{name}", given[name], allowed)
 
 
 def _require(ok: bool, name: str, value: object, allowed: str) -> None:
@@ -108,11 +102,12 @@ def _require(ok: bool, name: str, value: object, allowed: str) -> None:
 
 def _compare(scenario: Scenario, comparisons: Iterable[_Comparison]) -> None:
     """Check each field against its limit."""
-    for name, relation, limit, meaning in comparisons:
-        value = attrgetter(name)(scenario)
-        _require(
-            _RELATIONS[relation](value, limit), name, value, f"{relation} {limit:g}: {meaning}"
-        )
+    values = [(one, attrgetter(one[0])(scenario)) for one in comparisons]
+    raise_all(
+        BadInputError(name, value, f"{relation} {limit:g}: {meaning}")
+        for (name, relation, limit, meaning), value in values
+        if not _RELATIONS[relation](value, limit)
+    )
 
 
 def _check_lanes(scenario: Scenario) -> None:
@@ -573,17 +568,10 @@ def _check_structures(scenario: Scenario) -> None:
 
 
 def _check_timing(scenario: Scenario) -> None:
-    network, runtime, formation = scenario.network, scenario.runtime, scenario.formation
+    """Check the durations of moves."""
+    runtime, formation = scenario.runtime, scenario.formation
     shortest_s, longest_s = scenario.cycles_s
     longest_move_s = longest_s - formation.slack_s
-    heartbeat_s, silent_s = network.heartbeat_s, runtime.agent_silent_s
-    _compare(
-        scenario,
-        [
-            ("network.election_s", "more than", 2 * heartbeat_s, "twice network.heartbeat_s"),
-            ("network.lease_s", "more than", heartbeat_s, "network.heartbeat_s"),
-        ],
-    )
     for name, value in (
         ("cycle_s", shortest_s),
         ("cycle_s", longest_s),
@@ -604,11 +592,18 @@ def _check_timing(scenario: Scenario) -> None:
         f"long enough for the longest T_F, {longest_s:g} s, to have at most {MAX_HORIZON_TICKS} "
         "ticks",
     )
+
+
+def _check_periods(scenario: Scenario) -> None:
+    """Check the periods and timeouts of processes."""
+    heartbeat_s, silent_s = scenario.network.heartbeat_s, scenario.runtime.agent_silent_s
+    deadline_s = scenario.runtime.tick_deadline_s
     what = "runtime.agent_silent_s, so a lost session is detected before its agent counts as silent"
-    deadline_s = runtime.tick_deadline_s
     _compare(
         scenario,
         [
+            ("network.election_s", "more than", 2 * heartbeat_s, "twice network.heartbeat_s"),
+            ("network.lease_s", "more than", heartbeat_s, "network.heartbeat_s"),
             ("runtime.tick_resend_s", "less than", deadline_s, "runtime.tick_deadline_s"),
             ("runtime.tick_deadline_s", "at most", silent_s, "runtime.agent_silent_s"),
             ("network.lease_s", "at most", silent_s, what),
@@ -703,13 +698,16 @@ def _check_security(scenario: Scenario) -> None:
     secured = security.mode == "mtls"
     endpoints = [("network.endpoint", network.endpoint)] if network.endpoint else []
     endpoints += [("network.listen", endpoint) for endpoint in network.listen]
+    if secured:
+        allowed = "tls/HOST:PORT or quic/HOST:PORT, as security.mode is mtls"
+        raise_all(
+            BadInputError(name, endpoint, allowed)
+            for name, endpoint in endpoints
+            if not is_encrypted(endpoint)
+        )
     for name, endpoint in endpoints:
-        if secured:
-            allowed = "tls/HOST:PORT or quic/HOST:PORT, as security.mode is mtls"
-            _require(is_encrypted(endpoint), name, endpoint, allowed)
-        else:
-            allowed = f"mtls, as {name} is {endpoint}"
-            _require(not is_encrypted(endpoint), "security.mode", "off", allowed)
+        allowed = f"mtls, as {name} is {endpoint}"
+        _require(secured or not is_encrypted(endpoint), "security.mode", "off", allowed)
     if not secured:
         return
     _require(bool(security.folder), "security.folder", "", "the folder of the certificates")
@@ -729,3 +727,26 @@ def _check_security(scenario: Scenario) -> None:
             name,
             f"at most {MAX_COMMON_NAME} characters: it is the common name of a certificate",
         )
+
+
+_CHECKS = (
+    (
+        _check_types,
+        _check_lanes,
+        _check_motion,
+        _check_closures,
+        _check_entrances,
+        _check_dead_ends,
+        _check_exits,
+        _check_capacity,
+        _check_destinations,
+        _check_structures,
+        _check_timing,
+        _check_braking,
+        _check_settling,
+    ),
+    (_check_periods,),
+    (_check_sumo,),
+    (_check_security,),
+)
+"""Groups of checks, of which none depends on the others."""

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import copy
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import attrs
 
-from laneweave.protocol.config.cross_checks import check_effects, check_scenario
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.config.cross_checks import (
+    check_scenario,
+    effect_problems,
+    scenario_problems,
+)
+from laneweave.protocol.config.source_files import read_toml_source
+from laneweave.protocol.errors import BadInputError, raise_all
 from laneweave.protocol.scenario.deployment_fields import Security
 from laneweave.protocol.scenario.fields import PAPERS_FORMATIONS, Scenario
 from laneweave.protocol.structuring import structure
@@ -26,22 +30,29 @@ def load_scenario(path: Path | None, **overrides: object) -> Scenario:
             `table__field` names a field of a table.
 
     Raises:
-        BadInputError: the file cannot be read or is not TOML; a value is invalid, or has no effect
-            in combination with the other values of the file.
+        BadInputError: the file cannot be read or is not TOML; values are invalid, even if an
+            override replaces them, or have no effect in combination with the other values of the
+            file. The error has all of them, with their lines.
     """
-    data: dict[str, Any] = {}
-    if path is not None:
-        data = read_toml(path)
-        _resolve_paths(data, path)
-        check_effects(data, parse_scenario(data))
-    return scenario_of(data, **overrides)
+    if path is None:
+        return scenario_of({}, **overrides)
+    file = read_toml_source(path)
+    _resolve_paths(file.tables, path)
+    with file.located():
+        scenario = _structured(file.tables)
+        raise_all([*effect_problems(file.tables, scenario), *scenario_problems(scenario)])
+    given = {name.replace("__", ".") for name, value in overrides.items() if value is not None}
+    if not given:
+        return scenario
+    with file.located(given):
+        return scenario_of(file.tables, **overrides)
 
 
 def scenario_of(tables: Mapping[str, Any], **overrides: object) -> Scenario:
     """Return the scenario of nested tables, with overrides as in `load_scenario`.
 
     Raises:
-        BadInputError: a value is invalid.
+        BadInputError: values are invalid.
     """
     data = copy.deepcopy(dict(tables))
     for name, value in overrides.items():
@@ -67,30 +78,19 @@ def _resolve_paths(data: dict[str, Any], path: Path) -> None:
                 fields[key] = str(path.parent / value)
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Raises:
-        BadInputError: the file cannot be read or is not TOML.
-    """
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise BadInputError("file", str(path), f"a readable file ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        # Not UTF-8, not TOML, a NUL in the path, too many digits, nested too deep.
-        raise BadInputError("file", str(path), f"valid TOML ({error})") from error
-
-
 def parse_scenario(data: Mapping[str, Any]) -> Scenario:
     """Build a scenario from nested tables and check it.
 
     Raises:
-        BadInputError: a field is unknown, has a wrong type or value, or contradicts another field.
+        BadInputError: fields are unknown, have a wrong type or value, or contradict each other.
     """
-    scenario = structure(_with_current_names(data), Scenario)
+    scenario = _structured(data)
     check_scenario(scenario)
     return scenario
+
+
+def _structured(data: Mapping[str, Any]) -> Scenario:
+    return structure(_with_current_names(data), Scenario)
 
 
 def _with_current_names(data: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -17,7 +17,7 @@ import attrs
 from attrs import field, frozen
 from attrs.validators import optional
 
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import unknown_name
 from laneweave.protocol.field_validators import NAME_PATTERN, key_part, one_of, within
 from laneweave.protocol.lattice import Cell, Lattice, displacements
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, open_sections
@@ -113,7 +113,8 @@ def solver_of_event(kind: str, data: Mapping[str, Any]) -> str | None:
 def _conflict_kinds(_: object, attribute: attrs.Attribute[Any], value: Sequence[str]) -> None:
     for kind in value:
         if kind not in CONFLICT_KINDS:
-            raise BadInputError(attribute.name, kind, "any of " + ", ".join(CONFLICT_KINDS))
+            allowed = "any of " + ", ".join(CONFLICT_KINDS)
+            raise unknown_name(attribute.name, kind, CONFLICT_KINDS, allowed)
 
 
 @frozen

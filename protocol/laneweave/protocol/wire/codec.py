@@ -13,7 +13,7 @@ import msgpack
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
-from laneweave.protocol.structuring import first_problem, strict_converter
+from laneweave.protocol.structuring import problems_of, strict_converter
 from laneweave.protocol.wire.messages import Ballot, Name
 from laneweave.protocol.wire.topics import TOPICS
 
@@ -156,4 +156,4 @@ def _explain(body: dict[str, Any], kind: type) -> object:
     try:
         return _DETAILED.structure(body, kind)
     except Exception as error:
-        raise first_problem(error).within(kind.__name__) from error
+        raise problems_of(error)[0].within(kind.__name__) from error

@@ -209,7 +209,7 @@ def test_targets_of_another_structure_are_detected() -> None:
         ({"structure": 3}, "structure: got 3; allowed: a string"),
         ({"targets": [[0, 0]]}, "allowed: structure or targets, not both"),
         ({"targets": []}, "allowed: structure or targets, not both"),
-        ({"lanes": []}, "lanes: got '0 items'; allowed: 1 to 16 items"),
+        ({"lanes": []}, "lanes: got 0 items; allowed: 1 to 16 items"),
         ({"lanes": 1}, "lanes: got 1; allowed: a list"),
         ({"lanes": [0, 3]}, "lanes[1]: got 3; allowed: a whole number from 0 to 2"),
         ({"lanes": [[0]]}, "lanes[0]: got [0]; allowed: an integer"),

@@ -21,7 +21,7 @@ def test_paths_are_padded_with_their_last_cell() -> None:
 def test_text() -> None:
     path_map = RelativePathMap.padded(["1", "lorry"], [[(0, 0), (1, 0)], [(10, 2)]])
     assert str(path_map) == (
-        "Vehicle ID  step 1  step 2\n1           (0,0)   (1,0)\nlorry       (10,2)  (10,2)"
+        "Vehicle ID  step 0  step 1\n1           (0,0)   (1,0)\nlorry       (10,2)  (10,2)"
     )
 
 

@@ -48,16 +48,16 @@ BAD: list[tuple[tuple[int, ...], tuple[tuple[Cell, ...], ...], str]] = [
     ((0, 0), (A, ((1, 1), (1, 0), (2, 0))), "both assigned"),
     ((0, 7), GOOD, "does not exist"),
     ((0, -1), GOOD, "does not exist"),
-    (ASSIGNMENT, (A, ((1, 1), (1, 0), (1, 1))), "node conflict of a and b in step 0"),
+    (ASSIGNMENT, (A, ((1, 1), (1, 0), (1, 1))), "node conflict of a and b in step 1"),
     (
         ASSIGNMENT,
         (((0, 0), (1, 0), (1, 1)), ((1, 1), (1, 1), (1, 0))),
-        "edge conflict of a and b in step 1",
+        "edge conflict of a and b in step 2",
     ),
     (
         ASSIGNMENT,
         (((0, 0), (1, 0), (1, 1)), ((1, 1), (1, 1), (1, 2))),
-        "special-1 conflict of a and b in step 1",
+        "special-1 conflict of a and b in step 2",
     ),
 ]
 
@@ -76,7 +76,7 @@ def test_closing_moves_three_columns_apart_are_compared(mode: Mode, kinds: tuple
     targets = ((1, 0), (2, 0))
     request = PlanRequest(Grid(4, 1), mode, (*kinds, "closing"), vehicles, targets)
     found = problems_of_paths(request, (0, 1), paths)
-    assert found == ["closing conflict of a and b in step 0"]
+    assert found == ["closing conflict of a and b in step 1"]
     free = PlanRequest(Grid(4, 1), mode, kinds, vehicles, targets)
     assert problems_of_paths(free, (0, 1), paths) == []
 
@@ -88,7 +88,7 @@ def test_vehicles_make_only_moves_that_they_can_drive() -> None:
 
     assert problems_of_paths(with_moves((0, 1)), ASSIGNMENT, GOOD) == []
     found = problems_of_paths(with_moves((0, -1), (1, 0)), ASSIGNMENT, GOOD)
-    assert found == ["b cannot drive (1, 1) to (1, 2) in step 0"]
+    assert found == ["b cannot drive (1, 1) to (1, 2) in step 1"]
 
 
 def test_oblique_moves_belong_to_mode_2() -> None:

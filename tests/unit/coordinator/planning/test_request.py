@@ -160,6 +160,63 @@ def test_errors_name_the_wrong_field(change: Callable[[Document], None], field: 
     assert "\n" not in message
 
 
+def test_all_errors_of_a_request_are_reported_at_once() -> None:
+    wrong = document()
+    for change in (
+        _set("conflict", to=["node"]),
+        _set("grid", "blocked", to=[[0, 2], [9, 9]]),
+        _set("vehicles", 0, "id", to="\x1b[2J"),
+        _set("vehicles", 0, "lane", to=7),
+        _set("vehicles", 1, "cell", to=[-1, 0]),
+        _set("targets", 2, to=[4, 3]),
+        _set("solver", to="tapa"),
+        _set("deadline_s", to=-1),
+        _set("id", to="a\nb"),
+    ):
+        change(wrong)
+    with pytest.raises(BadInputError) as caught:
+        PlanRequest.from_dict(wrong)
+    problems = {one.field: one for one in caught.value.problems}
+    assert set(problems) == {
+        "conflict",
+        "grid.blocked[1]",
+        "vehicles[0].id",
+        "vehicles[0].lane",
+        "vehicles[1].cell",
+        "targets[2]",
+        "solver",
+        "deadline_s",
+        "id",
+    }
+    assert problems["conflict"].suggestion == "conflicts"
+    assert problems["solver"].suggestion == "tappa"
+
+
+def test_a_request_is_examined_up_to_a_number_of_errors() -> None:
+    for changes in (
+        {f"key{number:05}": 1 for number in range(5000)},
+        {"targets": [None] * 5000},
+        {"grid": {"columns": 4, "lanes": 2, "blocked": [[9, 9]] * 5000}},
+        {"conflicts": [f"kind {number}" for number in range(5000)]},
+    ):
+        with pytest.raises(BadInputError) as caught:
+            PlanRequest.from_dict(document() | changes)
+        assert 100 <= len(caught.value.problems) <= 205
+
+
+@pytest.mark.parametrize("text", ["a\nb", "\x00", "\x7f", "\u2028", "\u202e", "\ud800"])
+def test_ids_are_printable(text: str) -> None:
+    for change, field in (
+        (_set("id", to=text), "id"),
+        (_set("vehicles", 0, "id", to=text), "vehicles[0].id"),
+    ):
+        wrong = document()
+        change(wrong)
+        with pytest.raises(BadInputError, match="allowed: printable characters") as caught:
+            PlanRequest.from_dict(wrong)
+        assert caught.value.field == field
+
+
 @pytest.mark.parametrize("value", [None, [], "request", 1, True])
 def test_a_request_is_an_object(value: object) -> None:
     with pytest.raises(BadInputError):

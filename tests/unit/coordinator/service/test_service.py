@@ -704,11 +704,17 @@ def test_a_repeated_request_waits_for_the_plan_under_way(desk: Desk) -> None:
     assert desk.service.metrics.repeated_total == 2
 
 
-def test_any_text_may_be_an_id(desk: Desk) -> None:
-    first = desk.ask(named("\ud800"))
+def test_any_printable_text_may_be_an_id(desk: Desk) -> None:
+    first = desk.ask(named("Übung 1, 試験"))
     desk.work()
-    again = desk.ask(named("\ud800"))
+    again = desk.ask(named("Übung 1, 試験"))
     assert desk.answer(first) == desk.answer(again)
+
+
+@pytest.mark.parametrize("name", ["a\nb", "\x1b[2J", "\x00", "\u202e", "\ud800"])
+def test_an_id_that_would_control_a_terminal_is_refused(desk: Desk, name: str) -> None:
+    refusal = desk.answer(desk.ask(named(name)))
+    assert (refusal["code"], refusal["field"]) == (INVALID, "id")
 
 
 def test_a_failure_is_not_kept(desk: Desk) -> None:

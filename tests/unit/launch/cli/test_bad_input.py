@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from laneweave.launch.cli.main import MAX_LINES
+from laneweave.protocol.scenario.deployment_fields import Service
 from support.commands import Here
 
 NOBODY = "unixsock-stream/nobody.sock"
+LONG = "x" * 5000
 REQUEST: dict[str, Any] = {
     "schema": "laneweave.plan.request/1",
     "grid": {"columns": 4, "lanes": 2},
@@ -79,6 +84,17 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["bench", "planner", "--solver", "magic"], "--solver: got 'magic'"),
         (["report"], "DIR"),
         (["report", "missing"], "DIR: got 'missing'"),
+        (["report", LONG], "file: got 'xxx"),
+        (["certs", "init", LONG], "file: got 'xxx"),
+        (["run", "--out", LONG], "--out: got 'xxx"),
+        (["run", "--faults", LONG], "--faults: got 'xxx"),
+        (["run", "a\0b"], "SCENARIO.toml"),
+        (["run", "--seed", "1e3"], "--seed: got '1e3'; allowed: an integer"),
+        (["run", "--volume", "x"], "--volume: got 'x'; allowed: a number"),
+        (["bench", "planner", "--deadline", "nan"], "--deadline: got 'nan'; allowed: [0.01, 3600]"),
+        (["bench", "runtime", "--seed", "-1"], "--seed: got '-1'; allowed: at least 0"),
+        (["simulate", "--shrink", "."], "--shrink: got '.'"),
+        (["simulate", "--story", "something.txt"], "valid JSON"),
     ],
     ids=lambda value: " ".join(value)[:40] if isinstance(value, list) else "",
 )
@@ -98,16 +114,21 @@ def test_command_lines(laneweave: Here, arguments: list[str], named: str) -> Non
             "[[kill]]\ntarget = 'v9999'\nat_s = 1",
             "name of a vehicle of the run",
         ),
+        ("run FILE", '"a\\nb" = 1', "a b: got an unknown key"),
+        ("run FILE", '"" = 1', "'': got an unknown key"),
         ("plan FILE", "[" * 100_000, "valid JSON"),
+        ("plan FILE", "null", "REQUEST.json: got None; allowed: a JSON object"),
+        ("plan FILE", json.dumps(REQUEST | {"": 1}), "'': got 1; allowed: only known keys"),
+        ("simulate --story FILE", "[" * 100_000, "valid JSON"),
         ("plan FILE", json.dumps(REQUEST | {"targets": [[0.5, 0]]}), "targets[0]"),
         ("plan FILE", json.dumps(REQUEST | {"deadline_s": float("nan")}), "deadline_s"),
     ],
-    ids=range(8),
+    ids=itertools.count(),
 )
 def test_files(laneweave: Here, folder: Path, words: str, text: str, named: str) -> None:
     """One or two errors of each kind of file; the parsers' own tests have the others."""
     (folder / "FILE").write_text(text, encoding="utf-8")
-    out = () if words.startswith("plan") else ("--out", "out")
+    out = ("--out", "out") if words.startswith("run") else ()
     assert named in laneweave.refused(*words.split(), *out)
     assert not (folder / "out").exists()
 
@@ -117,3 +138,121 @@ def test_deadlines_on_the_command_line(laneweave: Here, folder: Path, deadline: 
     request = folder / "request.json"
     request.write_text(json.dumps(REQUEST), encoding="utf-8")
     assert "deadline_s" in laneweave.refused("plan", request, "--deadline", deadline)
+
+
+def written(folder: Path, name: str, content: str | bytes) -> Path:
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("words", "text", "lines"),
+    [
+        (
+            "run FILE",
+            "seed = -1\nraod = 1\n[road]\nlanes = 99\n",
+            ["seed: got -1", "raod: got an unknown key", "road.lanes: got 99"],
+        ),
+        (
+            "run --faults FILE",
+            "[[kill]]\nat_s = -1\n[[pause]]\nfor_s = 0\nat_s = 1\n[[kil]]\n",
+            ["kill[0].at_s: got -1.0", "pause[0].for_s: got 0.0", "kil: got an unknown key"],
+        ),
+        ("config check FILE", "[network]\nlease = 1\nlease_s = 0\n", ["network.lease", "network"]),
+        (
+            "plan FILE --deadline 3 --solver tappa",
+            json.dumps(REQUEST | {"mod": 1, "deadline_s": 0, "solver": "tapa"}, indent=1),
+            ["mod: got an unknown key", "deadline_s: got 0.0", "solver: got 'tapa'"],
+        ),
+    ],
+)
+def test_all_errors_of_a_file_have_a_line_each(
+    laneweave: Here, folder: Path, words: str, text: str, lines: list[str]
+) -> None:
+    written(folder, "FILE", text)
+    status, out, errors = laneweave(*words.split())
+    assert (status, out, len(errors)) == (2, "", len(lines))
+    found = {re.sub(r".*\(FILE:(\d+)\)$", r"\1", error): error for error in errors}
+    assert all(number.isdigit() for number in found)
+    assert len(found) == len(lines)
+    for start in lines:
+        assert any(error.startswith(start) for error in errors), errors
+
+
+def test_only_the_first_errors_of_a_file_are_printed(laneweave: Here, folder: Path) -> None:
+    vehicles = [{"id": f"v{number}", "cell": [99, 0]} for number in range(30)]
+    written(folder, "FILE", json.dumps(REQUEST | {"vehicles": vehicles}))
+    _, _, errors = laneweave("plan", "FILE")
+    assert len(errors) == MAX_LINES + 1
+    assert errors[-1].startswith("and ")
+
+
+@pytest.mark.parametrize("command", ["run", "plan"])
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"\xff\xfe{\x00", "in UTF-8 (it is UTF-16)"),
+        (b"\x00\x01\x02\xff", "in UTF-8 (byte 3 is not)"),
+        (b" " * 2_000_000, "bytes"),
+        (b"{" * 5000, "valid "),
+    ],
+)
+def test_files_that_are_no_text(
+    laneweave: Here, folder: Path, command: str, content: bytes, said: str
+) -> None:
+    assert said in laneweave.refused(command, written(folder, "FILE", content))
+
+
+def test_a_request_given_twice_is_refused(laneweave: Here, folder: Path) -> None:
+    text = json.dumps(REQUEST).replace('"targets"', '"mode": 1, "mode": 2, "targets"')
+    line = laneweave.refused("plan", written(folder, "FILE", text))
+    assert "key 'mode' is given more than once" in line
+
+
+def test_the_size_of_a_request_is_limited_as_by_the_service(laneweave: Here, folder: Path) -> None:
+    limit = Service().max_request_bytes
+    text = json.dumps(REQUEST)
+    assert laneweave("plan", written(folder, "FILE", text.ljust(limit)))[0] == 0
+    line = laneweave.refused("plan", written(folder, "FILE", text.ljust(limit + 1)))
+    assert line.endswith(f"allowed: at most {limit} bytes")
+    small = written(folder, "small.toml", "[service]\nmax_request_bytes = 1024\n")
+    big = written(folder, "FILE", text.ljust(1025))
+    assert "at most 1024 bytes" in laneweave.refused(
+        "plan", big, "--config", small, "--draw-road", "x.png"
+    )
+
+
+def test_a_byte_order_mark_is_read(laneweave: Here, folder: Path) -> None:
+    text = json.dumps(REQUEST, indent=1).replace("\n", "\r\n")
+    request = written(folder, "FILE", b"\xef\xbb\xbf" + text.encode())
+    scenario = written(folder, "x.toml", b"\xef\xbb\xbf[road]\r\nlanes = 9\r\n")
+    assert laneweave("plan", request)[0] == 0
+    assert laneweave.refused("run", scenario).startswith("road.lanes: got 9")
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        ("rum", "'run'"),
+        ("run --sed 1", "'--seed'"),
+        ("run --method formaton", "formation"),
+        ("run --faults losy10", "lossy10"),
+        ("simulate --profile gided", "guided"),
+        ("bench plannr", "planner"),
+        ("bench planner --families blok", "block"),
+        ("run --solver tapa", "tappa"),
+    ],
+)
+def test_what_was_probably_meant(laneweave: Here, words: str, meant: str) -> None:
+    line = laneweave.refused(*words.split())
+    assert f"id you mean {meant}?" in line
+    assert "Value error" not in line
+
+
+def test_a_wrong_environment_variable_is_named(
+    laneweave: Here, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LANEWEAVE_LOG", "jsn")
+    line = laneweave.refused("coordinator")
+    assert line.startswith("--log or LANEWEAVE_LOG: got 'jsn'; allowed: text, json")

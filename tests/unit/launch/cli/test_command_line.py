@@ -3,11 +3,13 @@
 import json
 import tempfile
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
-from laneweave.launch.cli.options import check_pace
+from laneweave.launch.cli.main import _status
+from laneweave.launch.cli.options import check_pace, parse_seeds
 from laneweave.launch.run import run_folder
 from laneweave.launch.run.local_run import MAX_TEMPORARY_BYTES, check_temporary_folder
 from laneweave.launch.run.logs import last_error
@@ -15,6 +17,7 @@ from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
+from support.commands import Here
 
 
 def new_folder(out: Path | None, settings: Scenario | None = None) -> Path:
@@ -113,3 +116,29 @@ def test_the_last_error_of_a_process(tmp_path: Path) -> None:
     assert last_error(path, "bridge") == "E: z"
     assert last_error(path, "c1") == "no router"
     assert last_error(path, "c2") == ""
+
+
+def test_the_version_is_that_of_the_package(laneweave: Here) -> None:
+    assert laneweave("--version") == (0, f"laneweave {version('laneweave')}\n", [])
+
+
+@pytest.mark.parametrize(
+    ("words", "found"), [("laneweave pla", "plan"), ("laneweave run --meth", "--method")]
+)
+def test_the_shell_completes(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, words: str, found: str
+) -> None:
+    monkeypatch.setenv("_LANEWEAVE_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", words)
+    monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
+    with pytest.raises(SystemExit, match="0"):
+        _status([])
+    assert capsys.readouterr() == (f"{found}\n", "")
+
+
+def test_ranges_of_seeds_are_explained(laneweave: Here) -> None:
+    for command in ("sweep", "simulate"):
+        _, out, _ = laneweave(command, "--help")
+        assert "1:4 means 1, 2 and 3" in " ".join(out.replace("│", " ").split())
+    assert list(parse_seeds("1:4")) == [1, 2, 3]
+    assert list(parse_seeds("7:8")) == [7]

@@ -51,7 +51,7 @@ def test_certificates_for_a_deployment(laneweave: Here, config: Path) -> None:
         assert (status, errors) == (0, []), (role, errors)
         assert "valid until" in out
     report = check_deployment(load_scenario(config), parse_identity("router"), {})
-    assert report.problems == report.warnings == []
+    assert (report.problems, report.warnings) == ([], [])
 
 
 def test_an_authority_is_replaced_only_on_request(laneweave: Here, tmp_path: Path) -> None:
@@ -150,6 +150,7 @@ def test_all_problems_are_reported_at_once(laneweave: Here, tmp_path: Path) -> N
     assert (status, out) == (2, "")
     problems = [line for line in errors if not line.startswith("warning: ")]
     assert [line.partition(":")[0] for line in problems] == ["network.endpoint", "network.listen"]
+    assert [line[-len("toml:2)") :] for line in problems] == ["toml:2)", "toml:3)"]
 
 
 @pytest.mark.parametrize(
@@ -165,7 +166,7 @@ def test_both_ends_of_a_link_have_its_protocol_and_options(
 ) -> None:
     text = f'network.endpoint = "{endpoint}"\nnetwork.listen = ["{listen}"]'
     problems = checked(text, None, tmp_path).problems
-    assert [problem.partition(":")[0] for problem in problems] == [] if fits else ["network.listen"]
+    assert [problem.field for problem in problems] == [] if fits else ["network.listen"]
 
 
 def test_a_file_that_does_not_load(laneweave: Here, tmp_path: Path) -> None:
@@ -183,7 +184,7 @@ def test_a_file_that_does_not_load(laneweave: Here, tmp_path: Path) -> None:
     ],
 )
 def test_wrong_files_of_a_role_are_reported(tmp_path: Path, identity: str, problem: str) -> None:
-    (found,) = checked(DEPLOYMENT, identity, tmp_path).problems
+    found = str(*checked(DEPLOYMENT, identity, tmp_path).problems)
     assert problem in found
 
 

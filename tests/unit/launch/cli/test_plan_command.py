@@ -38,6 +38,16 @@ def test_an_unknown_solver_is_refused(laneweave: Here, tmp_path: Path) -> None:
     assert line == f"solver: got 'magic'; allowed: {allowed}"
 
 
+def test_the_table_counts_steps_from_the_start(laneweave: Here, tmp_path: Path) -> None:
+    path = request_file(tmp_path)
+    _, out, _ = laneweave("plan", path, "--format", "table")
+    assert ", 3 steps, " in out
+    assert out.splitlines()[2].split("  ")[1:] == [f"step {step}" for step in range(4)]
+    _, explained, _ = laneweave("plan", path, "--explain")
+    assert out.splitlines()[2] in explained
+    assert "Step 0 is the start" in explained
+
+
 def test_the_table_names_the_solver(laneweave: Here, tmp_path: Path) -> None:
     path = request_file(tmp_path, conflicts=["edge"])
     for solver, said in (("tappa", "tappa"), ("branching", "tappa (fallback)")):
@@ -50,9 +60,11 @@ def test_the_table_names_the_solver(laneweave: Here, tmp_path: Path) -> None:
     "path", sorted(CASE_STUDY.parent.glob("*.json")), ids=lambda path: path.stem
 )
 def test_the_examples_are_planned_and_drawn(laneweave: Here, path: Path, tmp_path: Path) -> None:
-    _, out, _ = laneweave("plan", path, "--draw", tmp_path / "plan.png")
+    picture = tmp_path / "plan.png"
+    _, out, errors = laneweave("plan", path, "--draw", picture)
     assert json.loads(out)["status"] == "optimal"
-    assert (tmp_path / "plan.png").exists()
+    assert picture.exists()
+    assert errors == [f"drawing: {picture}"]
 
 
 def request_file(folder: Path, **changes: object) -> str:

@@ -66,7 +66,7 @@ def test_a_panel_per_time_point_shows_all_vehicles() -> None:
         shown = [cell_of(body) for body in bodies(axes).values()]
         assert shown == [path[time] for path in PATHS]
     assert figure.get_suptitle() == "optimal, cost 7, lower bound 6, 3 steps"
-    assert [axes.get_title() for axes in figure.axes[:2]] == ["start", "after 1 step"]
+    assert [axes.get_title() for axes in figure.axes[:2]] == ["step 0", "step 1"]
     # Arrows show the next moves.
     arrows = [
         sum(isinstance(patch, FancyArrowPatch) for patch in axes.patches) for axes in figure.axes

@@ -60,7 +60,7 @@ def test_the_command_runs_a_story(tmp_path: Path) -> None:
 
 
 def test_a_story_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="readable JSON"):
+    with pytest.raises(BadInputError, match="a readable file"):
         Story.read(tmp_path / "missing.json")
 
 

@@ -219,8 +219,8 @@ def test_planning_times_of_a_comparison(swept: Path) -> None:
         summary=make_summary(planning={"by_solver": by_solver, "fallbacks": 1, "plans": 5}),
     )
     *_, planning, _ = tables_of(Comparison.of(runs))
-    assert [row[2] for row in planning.rows][-1] == "branching 1, tappa 4"
-    assert planning.rows[-1][3:] == ["6", "5", "1", "5.0", "10.0", "12.0"]
+    assert planning.headings[2:4] == ("plans by branching", "plans by tappa")
+    assert planning.rows[-1][2:] == ["1", "4", "6", "5", "1", "5.0", "10.0", "12.0"]
     runs[-1] = evolve(runs[-1], summary=make_summary(planning={"plans": 0}))
     *_, without, _ = tables_of(Comparison.of(runs))
     assert len(without.rows) == len(planning.rows) - 1

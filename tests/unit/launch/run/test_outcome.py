@@ -13,7 +13,7 @@ from laneweave.launch.cli.corridor_command import corridor_tables
 from laneweave.launch.faults.failover import Failover
 from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.run.outcome import Outcome, complete_summary, print_outcome
-from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
 from laneweave.protocol.summary import RunSummary, write_summary
 from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 from laneweave.sim_bridge.recording.trips import metadata_of, trips_table
@@ -91,7 +91,7 @@ def test_vehicles_that_stay_outside_do_not_fail_a_complete_run(tmp_path: Path) -
     pq.write_table(trips_table([], 0.0, metadata_of(of_sumo)), tmp_path / "trips.parquet")
     outside = judge(tmp_path, summary(entered=3, left=3))
     assert outside.exit_status == 0
-    assert "2: did not come to the corridor, or exit full" in printed(outside)
+    assert "never entered: did not come to the corridor, or exit full" in printed(outside)
     assert "never entered" not in printed(judge(tmp_path, summary()))
     stopped = judge(tmp_path, summary(entered=3, left=3, ending="limit"))
     assert stopped.problems[1] == "2 of 5 vehicles did not leave the road"
@@ -144,25 +144,81 @@ def printed(outcome: Outcome) -> str:
 
 
 @pytest.mark.parametrize(
-    ("found", "more", "shown"),
+    ("found", "more", "row"),
     [
-        (summary(), {"processes": None}, "(? processes)"),
-        (summary(), {}, "17 / 50,383 ticks"),
-        (summary(), {"failover": Failover(1.0, [0.25], [0.5])}, "(0.250 s)"),
-        (summary(), {"failover": MANY_RECOVERIES}, "(p50 0.350, max 0.900 s without)"),
-        (summary(left=0, measured=None), {}, "- / - / - s"),
-        (summary(left=0, measured=None), {}, "0 (0.00%)"),
+        (summary(), {}, ("processes", "9")),
+        (summary(), {}, ("ticks tracked unconstrained", "50,383")),
+        (summary(), {}, ("vehicles demanded", "5")),
+        (summary(), {}, ("left in their preferred lane", "100.00 % of 5 vehicles")),
+        (
+            summary(),
+            {"failover": Failover(1.0, [0.25], [0.5])},
+            ("time without leader, median", "0.250 s (1 time)"),
+        ),
+        (
+            summary(),
+            {"failover": MANY_RECOVERIES},
+            ("time without leader, median", "0.350 s (6 times)"),
+        ),
+        (summary(), {"failover": MANY_RECOVERIES}, ("time without leader, maximum", "0.900 s")),
     ],
 )
 def test_the_table_at_the_end(
-    tmp_path: Path, found: RunSummary, more: dict[str, Any], shown: str
+    tmp_path: Path, found: RunSummary, more: dict[str, Any], row: tuple[str, str]
 ) -> None:
-    assert shown in printed(judge(tmp_path, found, **more))
+    outcome = judge(tmp_path, found, **more)
+    assert outcome.summary is not None
+    assert row in summary_rows(outcome.summary)
+    name, value = row
+    assert any(name in line and value in line for line in printed(outcome).splitlines())
+
+
+def test_a_mean_says_of_how_many_vehicles_it_is() -> None:
+    found = make_summary(travel_time_s={"mean": 71.5, "n": 29}, vehicles={"demanded": 91})
+    assert dict(summary_rows(found))["travel time, mean"] == "71.50 s (29 of 91 vehicles)"
+    none = make_summary(travel_time_s={"mean": None, "n": 0}, vehicles={"demanded": 26})
+    assert dict(summary_rows(none))["travel time, mean"] == "none (0 of 26 vehicles)"
+    without = make_summary(travel_time_s={"mean": 71.5})
+    assert dict(summary_rows(without))["travel time, mean"] == "71.50 s"
+
+
+def test_the_table_has_no_row_without_a_value(tmp_path: Path) -> None:
+    rows = dict(summary_rows(summary(left=0, measured=None)))
+    unknown = ("travel time", "smallest", "acceleration", "preferred lane")
+    assert [name for name in rows if any(part in name for part in unknown)] == []
+    assert all(value and "-" not in value for value in rows.values())
+    assert " - " not in printed(judge(tmp_path, summary(left=0, measured=None)))
+
+
+def test_the_table_of_a_reference_method_has_no_plans() -> None:
+    found = make_summary(method="rule", planning={"plans": 0}, tracking={"solves": 0})
+    names = [name for name, _ in summary_rows(found)]
+    assert [name for name in names if "plan" in name or "leader" in name or "track" in name] == []
+    assert "real-time factor" in names
+
+
+def test_the_table_says_how_long_vehicles_arrived() -> None:
+    rows = dict(summary_rows(summary(), load_scenario(None, demand__duration_s=40.0)))
+    assert rows["arrivals during"] == "40 s"
+    assert rows["vehicles demanded"] == "5"
 
 
 def test_the_table_names_no_preferred_lanes_on_a_road_without_them(tmp_path: Path) -> None:
     pq.write_table(trips_table([], 0.0, metadata_of(DROP)), tmp_path / "trips.parquet")
-    assert "no preferred lanes" in printed(judge(tmp_path, summary()))
+    assert "preferred lane" not in printed(judge(tmp_path, summary()))
+
+
+def test_names_with_brackets_are_printed_as_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = Path("a[", "b][red]")
+    folder.mkdir(parents=True)
+    outcome = judge(folder, summary(), problems=["the router [/x] ended [bold]"])
+    text = io.StringIO()
+    print_outcome(outcome, Console(file=text, width=400))
+    assert f"laneweave run: {folder}" in text.getvalue()
+    assert "FAILED: the router [/x] ended [bold]\n" in text.getvalue()
 
 
 def test_all_reasons_are_printed(tmp_path: Path) -> None:
@@ -179,31 +235,39 @@ def test_all_reasons_are_printed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "shown"),
     [
-        ({}, "-"),
-        ({"by_solver": {"tappa": 0, "branching": 0}, "fallbacks": 0}, "- (0 fallbacks)"),
+        ({"optimal": 0}, {"plans": "5", "plans proven optimal": "0 of 5"}),
+        ({"by_solver": {"rolling": 5}, "optimal": 0, "fallbacks": 0}, {"plans by rolling": "5"}),
         (
-            {"by_solver": {"tappa": 7, "branching": 2, "rolling": 0}, "fallbacks": 2},
-            "tappa 7, branching 2 (2 fallbacks)",
+            {"by_solver": {"tappa": 3, "branching": 2}, "fallbacks": 2, "optimal": 4},
+            {
+                "plans proven optimal": "4 of 5",
+                "plans by tappa": "3",
+                "plans by branching": "2",
+                "plans by a fallback": "2",
+            },
         ),
+        ({"plans": 0, "by_solver": {"tappa": 0, "branching": 0}, "fallbacks": 0}, {"plans": "0"}),
     ],
-    ids=["old", "none", "some"],
+    ids=["old", "rolling", "formations", "none"],
 )
-def test_the_table_says_which_solvers_planned(more: dict[str, Any], shown: str) -> None:
-    found = make_summary(planning=more)
-    assert dict(summary_rows(found))["plans by solver"] == shown
+def test_the_table_says_which_solvers_planned(more: dict[str, Any], shown: dict[str, str]) -> None:
+    found = make_summary(planning={"plans": 5} | more)
+    rows = {name: value for name, value in summary_rows(found) if name.startswith("plans")}
+    assert rows == {"plans": "5"} | shown
 
 
 @pytest.mark.parametrize(
     ("low", "high", "said"),
     [
-        (-3.004, 3.0, "-3.00 to 3.00 m/s2"),
-        (-3.01, 2.0, "-3.01 to 2.00 m/s2, beyond comfort (3 m/s2)"),
-        (-1.0, 4.8, "-1.00 to 4.80 m/s2, beyond comfort (3 m/s2)"),
-        (None, None, "- to - m/s2"),
+        (-3.004, 3.0, ("-3.00 m/s2", "3.00 m/s2")),
+        (-3.01, 2.0, ("-3.01 m/s2, beyond comfort (3 m/s2)", "2.00 m/s2")),
+        (-1.0, 4.8, ("-1.00 m/s2", "4.80 m/s2, beyond comfort (3 m/s2)")),
+        (None, None, (None, None)),
     ],
 )
 def test_accelerations_that_are_not_comfortable(
-    low: float | None, high: float | None, said: str
+    low: float | None, high: float | None, said: tuple[str | None, str | None]
 ) -> None:
     found = make_summary(safety={"min_accel_mps2": low, "max_accel_mps2": high})
-    assert dict(summary_rows(found))["acceleration"] == said
+    rows = dict(summary_rows(found))
+    assert (rows.get("lowest acceleration"), rows.get("highest acceleration")) == said

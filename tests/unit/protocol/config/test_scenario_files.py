@@ -180,3 +180,73 @@ def test_an_override_of_a_table_that_is_none_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.toml"
     path.write_text("demand = 5", encoding="utf-8")
     assert refusal(load_scenario, path, demand__duration_s=1.0).field == "demand"
+
+
+def refused_lines(folder: Path, text: str, **overrides: object) -> list[str]:
+    """Return the errors of a scenario file."""
+    path = folder / "x.toml"
+    path.write_text(text, encoding="utf-8")
+    return [
+        str(one).replace(str(path), path.name)
+        for one in refusal(load_scenario, path, **overrides).problems
+    ]
+
+
+def test_all_errors_of_a_file_are_reported_with_their_lines(tmp_path: Path) -> None:
+    text = """\
+seed = -1
+[road]
+lane = 2
+lanes = 9
+[[road.closures]]
+from_m = 1.0
+[formation]
+operation = "roling"
+"""
+    assert [line.rpartition("; allowed")[0] for line in refused_lines(tmp_path, text)] == [
+        "seed: got -1",
+        "road.lane: got an unknown key",
+        "road.lanes: got 9",
+        "road.closures[0].lane: got no value",
+        "formation.operation: got 'roling'",
+    ]
+    ends = [line.rpartition("; ")[2].rpartition("(")[2] for line in refused_lines(tmp_path, text)]
+    assert ends == ["x.toml:1)", "x.toml:3)", "x.toml:4)", "x.toml:5)", "x.toml:8)"]
+
+
+def test_contradictions_are_reported_at_once(tmp_path: Path) -> None:
+    text = """\
+[formation]
+max_columns = 3
+sort_in_s2 = true
+close = "columns"
+gap_m = 2.0
+[network]
+lease_s = 0.4
+election_s = 0.6
+heartbeat_s = 0.4
+"""
+    fields = [line.partition(":")[0] for line in refused_lines(tmp_path, text)]
+    assert fields == [
+        "formation.max_columns",
+        "formation.sort_in_s2",
+        "formation.gap_m",
+        "network.lease_s",
+        "network.election_s",
+    ]
+
+
+def test_a_value_that_an_override_replaces_is_checked(tmp_path: Path) -> None:
+    (line,) = refused_lines(tmp_path, "[road]\nlanes = 3\n[demand]\nduration_s = 0\n")
+    assert line.endswith("(x.toml:4)")
+    again = refused_lines(tmp_path, "[demand]\nduration_s = 0\n", demand__duration_s=5.0)
+    assert again == ["demand.duration_s: got 0.0; allowed: (0, 86400] (x.toml:2)"]
+
+
+def test_an_invalid_override_has_no_line(tmp_path: Path) -> None:
+    (line,) = refused_lines(tmp_path, "[demand]\nduration_s = 5\n", demand__duration_s=0.0)
+    assert line == "demand.duration_s: got 0.0; allowed: (0, 86400]"
+    # The file's value contradicts that of the option.
+    (line,) = refused_lines(tmp_path, "[demand]\nlane_shares = [1, 1, 1]\n", road__lanes=2, seed=2)
+    assert line.startswith("demand.lane_shares: got ")
+    assert line.endswith("(x.toml:2)")

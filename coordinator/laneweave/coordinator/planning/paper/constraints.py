@@ -79,9 +79,9 @@ class Constraint(NamedTuple):
     def notation(self, table: MoveTable, name: str) -> str:
         """Return the paper's notation, extended for the constraints of the improvements.
 
-        Steps count from 1, cells as in requests from 0. {S | edges, step, id}: none of these
-        edges; {U | edges, step, id}: one of these; {A | step, id}: arrived for good before
-        this step; {B | step, id}: not arrived for good before it.
+        The first move is in step 1, and cells count from 0 as in requests. {S | edges, step, id}:
+        none of these edges; {U | edges, step, id}: one of these; {A | step, id}: arrived for good
+        before this step; {B | step, id}: not arrived for good before it.
         """
         end = f"{self.step + 1}, {name}}}"
         if self.arrived is not None:

@@ -109,7 +109,7 @@ def test_relative_path_map_of_the_root(problem: Problem) -> None:
     n1 = _nodes(problem)[0]
     cells = problem.cells_of(Solution(_assignments()[0].targets, n1.paths))
     assert str(RelativePathMap.padded(["1", "2", "3", "4", "5"], cells)).splitlines() == [
-        "Vehicle ID  step 1  step 2  step 3",
+        "Vehicle ID  step 0  step 1  step 2",
         "1           (0,0)   (0,0)   (0,0)",
         "2           (0,2)   (1,1)   (2,0)",
         "3           (1,1)   (0,2)   (0,2)",
