@@ -1,0 +1,143 @@
+"""The reference of the Python interface in API.md, from the docstrings of the public names.
+
+Static analysis, as other tools do it, does not see the public names: `laneweave` imports each of
+them on first use, and the five packages below it come from five folders.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import textwrap
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from typing import Any
+
+import attrs
+from griffe import Docstring, Parser
+
+import laneweave
+
+HEADINGS = {
+    "parameters": "Arguments",
+    "attributes": "Attributes",
+    "raises": "Errors",
+    "returns": "Returns",
+    "yields": "Yields",
+}
+"""Heading of each kind of list in a docstring."""
+ELSEWHERE = {
+    "laneweave.Scenario": "[SCENARIO.md](SCENARIO.md#all-fields) lists all fields.",
+    "laneweave.RunSummary": "[RESULT_FILES.md](RESULT_FILES.md) lists all fields.",
+}
+"""Classes whose fields another page describes."""
+
+
+def api_reference() -> str:
+    """Return a section for each public name of `laneweave`."""
+    return "\n\n".join(
+        _section(f"laneweave.{name}", getattr(laneweave, name)) for name in sorted(laneweave.__all__)
+    )
+
+
+def _section(name: str, value: object) -> str:
+    if inspect.isclass(value):
+        return "\n\n".join(_class_parts(name, value))
+    if callable(value):
+        return f"## {name}\n\n{_signature(name, value)}\n\n{_text(value)}"
+    return f"## {name}\n\nThe version of the installed package, as text."
+
+
+def documented(node: ast.Module | ast.ClassDef) -> Iterator[tuple[str, str]]:
+    """Yield the annotated names of a module or class, each with the docstring below it."""
+    for statement, below in zip(node.body, [*node.body[1:], None], strict=True):
+        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+            text = ""
+            if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+                text = " ".join(str(below.value.value).split()).removesuffix(".")
+            yield statement.target.id, text
+
+
+def _class_parts(name: str, kind: type) -> Iterator[str]:
+    yield f"## {name}"
+    yield _text(kind)
+    if name in ELSEWHERE:
+        yield ELSEWHERE[name]
+        return
+    if attrs.has(kind):
+        yield _fields(kind)
+    elif not issubclass(kind, BaseException):
+        yield _signature(name, kind)
+    for member, found in vars(kind).items():
+        inner = found.__func__ if isinstance(found, (classmethod, staticmethod)) else found
+        if member.startswith("_") or not inspect.getdoc(inner):
+            continue
+        if isinstance(inner, (property, cached_property)):
+            yield f"### {name}.{member}\n\n{_text(inner)}"
+        elif inspect.isfunction(inner):
+            yield f"### {name}.{member}\n\n{_signature(member, inner)}\n\n{_text(inner)}"
+
+
+def _fields(kind: type) -> str:
+    (node,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    assert isinstance(node, ast.ClassDef)
+    meanings = dict(documented(node))
+    annotations = {
+        one.target.id: ast.unparse(one.annotation)
+        for one in node.body
+        if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name)
+    }
+    rows = [
+        f"| `{one.name}` | `{_cell(annotations[one.name])}` | {_cell(meanings[one.name])} |"
+        for one in attrs.fields(kind)
+        if one.name in annotations and not one.name.startswith("_")
+    ]
+    return "\n".join(["| field | type | meaning |", "|---|---|---|", *rows])
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def _signature(name: str, value: Callable[..., Any]) -> str:
+    """Return a call with its parameters, one a line where they are many."""
+    signature = inspect.signature(value)
+    parameters = [one for one in signature.parameters.values() if one.name not in ("self", "cls")]
+    text = str(signature.replace(parameters=parameters)).replace("'", "")
+    line = f"{name}{text}"
+    if len(line) > 90:
+        inner, _, result = text[1:].rpartition(")")
+        line = f"{name}(\n" + "".join(f"    {one},\n" for one in _split(inner)) + f"){result}"
+    return f"```python\n{line}\n```"
+
+
+def _split(parameters: str) -> Iterator[str]:
+    """Yield the parameters of a signature; commas in brackets do not separate."""
+    depth = begin = 0
+    for place, letter in enumerate(parameters):
+        depth += (letter in "([{") - (letter in ")]}")
+        if letter == "," and depth == 0:
+            yield parameters[begin:place].strip()
+            begin = place + 1
+    yield parameters[begin:].strip()
+
+
+def _text(value: object) -> str:
+    """Return a docstring as Markdown, with its lists of arguments, results and errors."""
+    parts = []
+    for section in Docstring(inspect.getdoc(value) or "", parser=Parser.google).parse():
+        kind = section.kind.value
+        if kind in HEADINGS:
+            lines = [f"- {_item(one)}" for one in section.value]
+            parts.append(f"**{HEADINGS[kind]}**\n\n" + "\n".join(lines))
+        elif kind == "text":
+            parts.append(section.value)
+        else:
+            raise ValueError(f"{value}: no heading for the docstring's section {kind!r}")
+    return "\n\n".join(parts)
+
+
+def _item(one: Any) -> str:
+    name = getattr(one, "name", "") or getattr(one, "annotation", "") or ""
+    text = " ".join(one.description.split())
+    return f"`{name}`: {text}" if name else text

@@ -1,0 +1,115 @@
+"""Hooks of the site: pages from outside of docs/, links to files of the repository, diagrams.
+
+A link in a document names a file of the repository by a relative path, so that it works in any
+repository browser. The site contains the home page (README.md), the changelog and the guide for
+contributors as pages, and every other file that a page links to as a page of its own in
+`repository/`. A link to a file that does not exist stays as it is, so that a strict build fails.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = {
+    "README.md": "index.md",
+    "CHANGELOG.md": "CHANGELOG.md",
+    "CONTRIBUTING.md": "CONTRIBUTING.md",
+}
+"""Files in the root that are pages of the navigation, each with the address of its page."""
+LANGUAGES = {".py": "python", ".toml": "toml", ".yaml": "yaml", ".json": "json"}
+MERMAID = "site/mermaid.tiny.js"
+
+_FENCE = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
+_TARGET = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)\s#]+)")
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that come from outside of docs/."""
+    documents = {
+        f"docs/{file.src_uri}": Path(config.docs_dir, file.src_uri)
+        for file in files.documentation_pages()
+    }
+    documents |= {name: ROOT / name for name in PAGES}
+    pages = dict.fromkeys(PAGES)
+    waiting = list(documents)
+    while waiting:
+        source = waiting.pop()
+        if source.endswith(".md"):
+            for target in _repository_files((ROOT / source).read_text(encoding="utf-8"), source):
+                if target not in pages and not target.startswith("docs/"):
+                    pages[target] = None
+                    waiting.append(target)
+    for source in pages:
+        text = (ROOT / source).read_text(encoding="utf-8")
+        if not source.endswith(".md"):
+            language = LANGUAGES.get(Path(source).suffix, "text")
+            text = f"# {source}\n\n````{language}\n{text}````\n"
+        files.append(File.generated(config, _address(source), content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Return the page with the addresses of pages in place of paths in the repository."""
+    source = _source(page.file.src_uri)
+    if not source.endswith(".md"):
+        return markdown
+
+    def address(match: re.Match[str]) -> str:
+        target = _resolved(source, match[1])
+        if not (ROOT / target).is_file():
+            return match[1]
+        return os.path.relpath(_address(target), PurePosixPath(page.file.src_uri).parent)
+
+    parts = _FENCE.split(markdown)
+    parts[::2] = [_TARGET.sub(address, part) for part in parts[::2]]
+    return "".join(parts)
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """Load the script of the diagrams, from the site itself, in pages that have one."""
+    if 'class="mermaid"' not in output:
+        return output
+    depth = page.file.dest_uri.count("/")
+    return output.replace("</head>", f'<script src="{"../" * depth}{MERMAID}"></script></head>')
+
+
+def _repository_files(text: str, source: str) -> Iterator[str]:
+    """Yield the files of the repository to which a document links."""
+    for part in _FENCE.split(text)[::2]:
+        for target in _TARGET.findall(part):
+            resolved = _resolved(source, target)
+            if (ROOT / resolved).is_file():
+                yield resolved
+
+
+def _resolved(source: str, target: str) -> str:
+    """Return the path in the repository of a link's target."""
+    return os.path.normpath(PurePosixPath(source).parent / target)
+
+
+def _address(source: str) -> str:
+    """Return the address in the site of a file of the repository."""
+    if source in PAGES:
+        return PAGES[source]
+    if source.startswith("docs/"):
+        return source.removeprefix("docs/")
+    return f"repository/{source}" if source.endswith(".md") else f"repository/{source}.md"
+
+
+def _source(address: str) -> str:
+    """Return the file of the repository that a page shows."""
+    roots = {page: name for name, page in PAGES.items()}
+    if address in roots:
+        return roots[address]
+    if address.startswith("repository/"):
+        source = address.removeprefix("repository/")
+        return source if (ROOT / source).is_file() else source.removesuffix(".md")
+    return f"docs/{address}"
