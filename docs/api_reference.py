@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 import textwrap
 from collections.abc import Callable, Iterator
 from functools import cached_property
@@ -28,7 +29,7 @@ HEADINGS = {
 """Heading of each kind of list in a docstring."""
 ELSEWHERE = {
     "laneweave.Scenario": "[SCENARIO.md](SCENARIO.md#all-fields) lists all fields.",
-    "laneweave.RunSummary": "[RESULT_FILES.md](RESULT_FILES.md) lists all fields.",
+    "laneweave.RunSummary": "[RUNS.md](RUNS.md#what-a-run-writes) describes the file.",
 }
 """Classes whose fields another page describes."""
 
@@ -88,11 +89,15 @@ def _fields(kind: type) -> str:
         if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name)
     }
     rows = [
-        f"| `{one.name}` | `{_cell(annotations[one.name])}` | {_cell(meanings[one.name])} |"
-        for one in attrs.fields(kind)
-        if one.name in annotations and not one.name.startswith("_")
+        [f"`{name}`", f"`{_cell(annotations[name])}`", _cell(meanings[name])]
+        for name in (one.name for one in attrs.fields(kind))
+        if name in annotations and not name.startswith("_")
     ]
-    return "\n".join(["| field | type | meaning |", "|---|---|---|", *rows])
+    head = ["field", "type", "meaning"]
+    if not any(meaning for *_, meaning in rows):  # the class docstring describes its fields
+        head, rows = head[:2], [row[:2] for row in rows]
+    cells = "\n".join(f"| {' | '.join(line)} |" for line in [head, *rows])
+    return cells.replace("\n", "\n" + "|---" * len(head) + "|\n", 1)
 
 
 def _cell(text: str) -> str:
@@ -124,17 +129,22 @@ def _split(parameters: str) -> Iterator[str]:
 
 def _text(value: object) -> str:
     """Return a docstring as Markdown, with its lists of arguments, results and errors."""
-    parts = []
-    for section in Docstring(inspect.getdoc(value) or "", parser=Parser.google).parse():
+    paragraphs = (inspect.getdoc(value) or "").split("\n\n")
+    return "\n\n".join(part for paragraph in paragraphs for part in _parts(paragraph))
+
+
+def _parts(paragraph: str) -> Iterator[str]:
+    if re.match(r"[a-z_]+(, [a-z_]+)*: ", paragraph):  # lines such as `cost, steps: meaning`
+        lines = re.sub(r"\n +", " ", paragraph).splitlines()
+        yield "\n".join(re.sub(r"^([\w, ]+):", r"- `\1`:", line) for line in lines)
+        return
+    for section in Docstring(paragraph, parser=Parser.google).parse(warnings=False):
         kind = section.kind.value
-        if kind in HEADINGS:
-            lines = [f"- {_item(one)}" for one in section.value]
-            parts.append(f"**{HEADINGS[kind]}**\n\n" + "\n".join(lines))
-        elif kind == "text":
-            parts.append(section.value)
+        if kind == "text":
+            yield section.value
         else:
-            raise ValueError(f"{value}: no heading for the docstring's section {kind!r}")
-    return "\n\n".join(parts)
+            items = [f"- {_item(one)}" for one in section.value]
+            yield f"**{HEADINGS[kind]}**\n\n" + "\n".join(items)
 
 
 def _item(one: Any) -> str:

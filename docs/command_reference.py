@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator
-from enum import Enum
 from typing import Any
 
 import typer
@@ -15,66 +14,29 @@ NAME = "laneweave"
 
 
 def command_reference() -> str:
-    """Return a section for each command: help text, usage, arguments and options."""
+    """Return a section for each command: what it does, its arguments and options."""
     program: Any = typer.main.get_command(command_line())
     context = program.make_context(NAME, [], resilient_parsing=True)
-    return "\n\n".join(
-        section
-        for name in program.list_commands(context)
-        for section in _sections(program.get_command(context, name), f"{NAME} {name}", context)
-    )
+    return "\n\n".join(_sections(program, context, level=2))
 
 
-def _sections(command: Any, name: str, parent: Any) -> Iterator[str]:
-    """Yield the section of a command, or those of the commands of a group."""
-    context = command.context_class(command, parent=parent, info_name=name.rpartition(" ")[2])
-    if hasattr(command, "list_commands"):
-        yield f"## {name}\n\n{_text(command.help)}"
-        for inner in command.list_commands(context):
-            for section in _sections(command.get_command(context, inner), f"{name} {inner}", context):
-                yield f"#{section}"
-        return
-    parameters = [one for one in command.params if not getattr(one, "hidden", False)]
-    arguments = [one for one in parameters if one.param_type_name == "argument"]
-    options = [one for one in parameters if one.param_type_name == "option"]
-    usage = " ".join([name, *(_metavar(one, context) for one in arguments)])
-    parts = [f"## {name}", _text(command.help), f"```text\n{usage} [OPTIONS]\n```"]
-    if arguments:
-        rows = [[f"`{_metavar(one, context)}`", _text(one.help)] for one in arguments]
-        parts.append(_table(["argument", "meaning"], rows))
-    if options:
-        rows = [[_option(one, context), _default(one), _text(one.help)] for one in options]
-        parts.append(_table(["option", "default", "meaning"], rows))
-    yield "\n\n".join(parts)
+def _sections(group: Any, context: Any, level: int) -> Iterator[str]:  # noqa: ANN401
+    """Yield the sections of the commands of a group, and of the groups in it."""
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        inner = type(context)(command, parent=context, info_name=name)
+        parts = [f"{'#' * level} {inner.command_path}", inspect.cleandoc(command.help or "")]
+        if hasattr(command, "list_commands"):
+            yield "\n\n".join(parts)
+            yield from _sections(command, inner, level + 1)
+            continue
+        parts.append(f"```text\n{command.get_usage(inner).removeprefix('Usage: ')}\n```")
+        records = [parameter.get_help_record(inner) for parameter in command.params]
+        rows = [f"| `{_cell(what)}` | {_cell(text)} |" for what, text in filter(None, records)]
+        if rows:
+            parts.append("\n".join(["| option | meaning |", "|---|---|", *rows]))
+        yield "\n\n".join(parts)
 
 
-def _table(heads: list[str], rows: list[list[str]]) -> str:
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines).replace("| --- ", "|---")
-
-
-def _text(help_text: str | None) -> str:
-    """Return a help text as one paragraph for a table or a section."""
-    paragraphs = inspect.cleandoc(help_text or "").split("\n\n")
-    return "<br>".join(" ".join(one.split()) for one in paragraphs).replace("|", "\\|")
-
-
-def _metavar(parameter: Any, context: Any) -> str:
-    return str(parameter.make_metavar(context))
-
-
-def _option(option: Any, context: Any) -> str:
-    names = "/".join([*option.opts, *option.secondary_opts])
-    if not option.is_flag:
-        names += f" {_metavar(option, context)}"
-    shown = f"`{names}`".replace("|", "\\|")
-    return f"{shown} (or `{option.envvar}`)" if option.envvar else shown
-
-
-def _default(option: Any) -> str:
-    value = option.default
-    if isinstance(value, Enum):
-        value = value.value
-    if value is None or callable(value) or isinstance(value, (bool, list, tuple)) or value == "":
-        return ""
-    return f"`{value}`"
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")

@@ -27,7 +27,7 @@ if __name__ == "__main__":  # same paths as `pythonpath` in pyproject.toml
 
 
 import roads
-from api_reference import documented
+from api_reference import api_reference, documented
 from command_reference import command_reference
 from conflict_drawing import counts, draw_conflicts
 from evaluation.evidence import read_evidence
@@ -742,6 +742,7 @@ def parts() -> dict[str, str]:
         "topics": _topics(),
         "messages": _messages(),
         "events": _events(),
+        "api": api_reference(),
         "commands": command_reference(),
         "decisions": _decisions(),
         "scenario fields": _scenario_fields(),

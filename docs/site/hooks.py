@@ -26,6 +26,10 @@ PAGES = {
 """Files in the root that are pages of the navigation, each with the address of its page."""
 LANGUAGES = {".py": "python", ".toml": "toml", ".yaml": "yaml", ".json": "json"}
 MERMAID = "site/mermaid.tiny.js"
+"""Script that draws the diagrams (MIT licence, beside it)."""
+SEARCH = "site/iframe-worker.js"
+"""Script with which the search works in local files (MIT licence, beside it)."""
+SEARCH_FROM_NETWORK = "https://unpkg.com/iframe-worker/shim"
 
 _FENCE = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
 _TARGET = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)\s#]+)")
@@ -73,12 +77,22 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     return "".join(parts)
 
 
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Put each diagram into a box that scrolls on small screens."""
+    return re.sub(r'(<pre class="mermaid">.*?</pre>)', r'<div class="wide">\1</div>', html, flags=re.S)
+
+
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """Load the script of the diagrams, from the site itself, in pages that have one."""
-    if 'class="mermaid"' not in output:
-        return output
-    depth = page.file.dest_uri.count("/")
-    return output.replace("</head>", f'<script src="{"../" * depth}{MERMAID}"></script></head>')
+    """Load scripts from the site itself: that of the search, and in pages with diagrams theirs."""
+    top = "../" * page.file.dest_uri.count("/")
+    if 'class="mermaid"' in output:
+        output = output.replace("</head>", f'<script src="{top}{MERMAID}"></script></head>')
+    return output.replace(SEARCH_FROM_NETWORK, top + SEARCH)
+
+
+def on_post_template(output: str, template_name: str, config: MkDocsConfig) -> str:
+    """Load the script of the search from the site in the page for unknown addresses."""
+    return output.replace(SEARCH_FROM_NETWORK, f"/{SEARCH}")
 
 
 def _repository_files(text: str, source: str) -> Iterator[str]:
