@@ -28,8 +28,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt hatchling editables
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-build-isolation -c constraints.txt -e '.[dev]'
-	find coordinator -name '*.nb[ci]' -delete
-	$(BIN)/python -c 'from laneweave.coordinator.planning.solve import warm_up; warm_up()'
+	$(BIN)/laneweave compile
 	touch $@
 
 demo: $(STAMP) ## run lane sorting on the paper's road, one process per vehicle

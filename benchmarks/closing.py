@@ -19,7 +19,8 @@ import numpy as np
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.exact.arrays import move_arrays
-from laneweave.coordinator.planning.solve import plan, warm_up
+from laneweave.coordinator.planning.kernels import BRANCHING
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.planner import FAMILIES
 from laneweave.protocol.lattice import Cell
 
@@ -92,7 +93,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, default=OUT, help="output file")
     out: Path = parser.parse_args().json
-    warm_up()
+    BRANCHING.load()
     results = []
     for row in rows():
         results.append(row)

@@ -27,8 +27,9 @@ from laneweave.coordinator.planning.conflict_kinds import PAPER_KINDS, ConflictM
 from laneweave.coordinator.planning.exact.cliques import clique_patterns
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
+from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.request import PlanRequest
-from laneweave.coordinator.planning.solve import plan, warm_up
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.lattice import displacements
 from laneweave.protocol.scenario.fields import Scenario
@@ -159,7 +160,7 @@ def main() -> None:
     if given.only:
         results: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
     else:
-        warm_up()
+        BRANCHING.load()
         results = {"table_ms": table_times_ms(), "results": []}
         for vehicles in VEHICLES:
             for row in measured(vehicles):

@@ -19,11 +19,12 @@ import attrs
 import numpy as np
 
 from laneweave.coordinator.planning.budget import Budget
+from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.paper.cbs import Improvements
 from laneweave.coordinator.planning.paper.tappa import Tappa
 from laneweave.coordinator.planning.request import PlanRequest
-from laneweave.coordinator.planning.solve import MAX_NODES, plan, warm_up
+from laneweave.coordinator.planning.solve import MAX_NODES, plan
 from laneweave.launch.bench.request_families import TRAFFIC_KINDS, block_request, traffic_request
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "planner-switches.json"
@@ -93,7 +94,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, default=OUT, metavar="FILE", help="output file")
     options = parser.parse_args()
-    warm_up()
+    BRANCHING.load()
     rows = []
     for family in FAMILIES:
         for name, improvements in switch_settings():

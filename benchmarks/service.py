@@ -50,9 +50,10 @@ import attrs
 import numpy as np
 from attrs import define, field, frozen
 
+from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.coordinator.planning.solve import plan, warm_up
+from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.service.client import AsyncPlanClient, PlanClient, PlanError
 from laneweave.coordinator.service.format import JSON
 from laneweave.launch.bench.request_families import formation_request
@@ -196,7 +197,7 @@ async def with_clients(
 
 def alone() -> dict[str, Any]:
     """Measure the solver by itself."""
-    warm_up()
+    BRANCHING.load()
     requests = [instance(seed, SIZES) for seed in range(REQUESTS)]
     wall_s, cpu_s = time.perf_counter(), time.process_time()
     for request in requests:
@@ -510,10 +511,10 @@ def main() -> None:
         rate = found["alone"]["rate_per_s"]
         found["load"] = [load(workers, rate) for workers in (1, 2)]
     if options.only in (None, "half"):
-        warm_up()
+        BRANCHING.load()
         found["half"] = [half(1, SIZES, 300), half(2, SIZES, 300), half(1, SMALL, 1000)]
     if options.only in (None, "loss"):
-        warm_up()
+        BRANCHING.load()
         found["loss"] = loss()
     found |= {
         name: measure()

@@ -24,6 +24,7 @@ from attrs import field, frozen
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
+from laneweave.coordinator.planning.kernels import ROLLING
 from laneweave.coordinator.planning.rolling.path_search import StreamPlanner
 from laneweave.coordinator.planning.rolling.problem import (
     StreamCosts,
@@ -32,7 +33,6 @@ from laneweave.coordinator.planning.rolling.problem import (
     StreamVehicle,
 )
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
-from laneweave.coordinator.planning.solve import warm_up
 from laneweave.coordinator.rolling.checked_planner import REWARD, stream_road
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.road_layout import LaneSection
@@ -366,7 +366,7 @@ def main() -> None:
     )
     parser.add_argument("--json", type=Path, default=OUT, help="output file")
     options = parser.parse_args()
-    warm_up()
+    ROLLING.load()
     results = {}
     if options.json.exists():
         rows_before = json.loads(options.json.read_text(encoding="utf-8"))

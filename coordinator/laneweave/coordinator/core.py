@@ -13,6 +13,7 @@ from laneweave.coordinator.election import Election
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.formations.operation import FormationsOperation
 from laneweave.coordinator.operation import LogEntry, Operation
+from laneweave.coordinator.planning.response import PlanFunction
 from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
 from laneweave.coordinator.rolling.operation import RollingOperation
@@ -103,6 +104,7 @@ class CoordinatorCore:
         make_planner: Callable[[Scenario], Planner] = stream_planner,
         workers: int = 1,
         transfer_rules: RuleBook = TRANSFER_RULES,
+        plan: PlanFunction = plan,
     ) -> None:
         """Create a candidate that has received no messages yet.
 
@@ -114,6 +116,7 @@ class CoordinatorCore:
             make_planner: returns the planner of the rolling operation.
             workers: number of client requests to answer concurrently.
             transfer_rules: rules for cell transfers; tests replace some.
+            plan: answers requests, in other processes or threads.
         """
         self.name = name
         self.scenario = scenario
@@ -140,13 +143,14 @@ class CoordinatorCore:
         self._next_heartbeat_s = 0.0
         self._next_report_s = 0.0
         self._wakeup_s: float | None = None
-        self.operation = self._make_operation(rules, transfer_rules, make_planner)
+        self.operation = self._make_operation(rules, transfer_rules, make_planner, plan)
 
     def _make_operation(
         self,
         rules: RuleBook,
         transfer_rules: RuleBook,
         make_planner: Callable[[Scenario], Planner],
+        plan: PlanFunction,
     ) -> Operation:
         scenario = self.scenario
         if scenario.formation.rolling:

@@ -6,14 +6,23 @@ import contextlib
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import ClassVar
 
-import structlog
+from attrs import frozen
 
 from laneweave.coordinator.core import CoordinatorCore
-from laneweave.coordinator.planning.solve import warm_up
+from laneweave.coordinator.planning.kernels import BRANCHING, ROLLING, BackgroundCompilation
+from laneweave.coordinator.planning.solve import plan, prepare
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
-from laneweave.protocol.runtime.metrics import Observe, unobserved
+from laneweave.protocol.runtime.metrics import (
+    MetricsSnapshot,
+    Observe,
+    Source,
+    metric,
+    unobserved,
+)
 from laneweave.protocol.runtime.worker_pool import WorkerPool
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
@@ -21,10 +30,16 @@ from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.messages import Name
 
-log = structlog.get_logger(__name__)
 
-WARN_AFTER_S = 8.0
-"""Time until a warning; loading the planner takes 1 to 2 s, compiling it nearly a minute."""
+@frozen
+class SolverMetrics:
+    """Solvers of a coordinator."""
+
+    ABOUT: ClassVar[str] = "solver"
+
+    available: Mapping[str, int] = metric(
+        "1 if the solver can be used, 0 while it is being compiled", label="solver"
+    )
 
 
 def run_coordinator(
@@ -37,7 +52,8 @@ def run_coordinator(
 ) -> None:
     """Run a coordinator candidate until SIGINT or SIGTERM.
 
-    The planner is loaded first, so that a leader can plan at once.
+    If branching is not compiled, it is compiled in another process, and TAPPA makes all plans until
+    then. A candidate of the rolling operation has no other planner, so it first waits for this one.
 
     Args:
         scenario: road and deployment.
@@ -48,16 +64,42 @@ def run_coordinator(
             loaded, instead of starting new ones at its first request.
 
     Raises:
-        BadInputError: no router answers at the scenario's endpoint.
+        BadInputError: no router answers at the scenario's endpoint, or there is no such solver.
+        CacheError: the rolling planner cannot be compiled.
     """
-    with _exits_on_sigterm(), _warns_when_slow():
-        warm_up()
+    prepare(scenario.formation.solver, "formation.solver")
+    with _exits_on_sigterm():
+        if scenario.formation.rolling:
+            ROLLING.load()
+        BRANCHING.load_if_compiled()
     workers = scenario.service.workers or max(1, len(os.sched_getaffinity(0)) - 1)
-    core = CoordinatorCore(Name(name), Incarnations()(), scenario, workers=workers)
-    with contextlib.closing(WorkerPool(workers, warm_up)) as pool:
+    core = CoordinatorCore(
+        Name(name),
+        Incarnations()(),
+        scenario,
+        workers=workers,
+        plan=partial(plan, compiled_only=True),
+    )
+    with contextlib.closing(WorkerPool(workers, _load_branching)) as pool:
         if fork_workers:
-            pool.fork()
-        run_core(wrap(core), access_of(scenario, f"coordinator.{name}"), pool, observe)
+            pool.fork()  # before the compilation starts a thread
+        with contextlib.closing(BackgroundCompilation(BRANCHING)):
+            access = access_of(scenario, f"coordinator.{name}")
+            run_core(wrap(core), access, pool, partial(_observe_solvers, observe))
+
+
+def _load_branching() -> None:
+    BRANCHING.load_if_compiled()
+
+
+def _observe_solvers(observe: Observe, source: Source) -> None:
+    """Register a metrics source, with the metrics of the solvers added."""
+
+    def snapshots() -> Iterator[MetricsSnapshot]:
+        yield from source()
+        yield SolverMetrics({"tappa": 1, BRANCHING.name: int(BRANCHING.loaded)})
+
+    observe(snapshots)
 
 
 @contextlib.contextmanager
@@ -84,17 +126,3 @@ def _exits_on_sigterm() -> Iterator[None]:
         signal.set_wakeup_fd(descriptor)
         signal.signal(signal.SIGTERM, handler)
         os.close(writer)  # ends the thread
-
-
-@contextlib.contextmanager
-def _warns_when_slow() -> Iterator[None]:
-    """Warn if the planner has to be compiled rather than just loaded."""
-    timer = threading.Timer(
-        WARN_AFTER_S, log.warning, ("compiling the planner once; this takes about a minute",)
-    )
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()

@@ -24,8 +24,9 @@ from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.protocol.errors import BadInputError, one_line
+from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.lattice import Cell, Mode, displacements
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS, DEFAULT_CONFLICTS, SOLVERS
+from laneweave.protocol.scenario.fields import CONFLICT_KINDS, DEFAULT_CONFLICTS
 from laneweave.protocol.structuring import as_lists, structure
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
@@ -70,7 +71,8 @@ class PlanRequest:
     structure: one of `STRUCTURES` (`formation_structures`); its cells are the targets.
     lanes: lanes of the structure; None: all.
     geometry: defines the conflict kind `geometric`; None: footprints.
-    solver: one of `SOLVERS`; None: the planner's default.
+    solver: name of a solver, built in or a plug-in where the request is answered; None: the
+        default there.
     id: a service answers a repeated id with the same response; empty: no id.
     """
 
@@ -102,8 +104,8 @@ class PlanRequest:
         if self.geometry is not None and "geometric" not in self.conflicts:
             allowed = "none, unless geometric is among conflicts"
             raise BadInputError("geometry", attrs.asdict(self.geometry), allowed)
-        if self.solver is not None:
-            checked_solver(self.solver)
+        if self.solver is not None and not NAME_PATTERN.fullmatch(self.solver):
+            raise BadInputError("solver", self.solver, f"the name of a solver: {NAME_RULE}")
         if self.structure is None:
             _check_count("targets", self.targets, MAX_TARGETS)
             for i, target in enumerate(self.targets):
@@ -187,17 +189,6 @@ class PlanRequest:
         """Return the JSON form."""
         fields = attrs.asdict(self, filter=_is_given, value_serializer=as_lists)
         return {"schema": REQUEST_SCHEMA, **fields}
-
-
-def checked_solver(name: str, field: str = "solver") -> str:
-    """Return the name of an existing solver.
-
-    Raises:
-        BadInputError: no solver has this name.
-    """
-    if name not in SOLVERS:
-        raise BadInputError(field, name, "one of " + ", ".join(SOLVERS))
-    return name
 
 
 @attrs.frozen

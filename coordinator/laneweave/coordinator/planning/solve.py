@@ -1,4 +1,4 @@
-"""Answer a request with the selected solver; fall back to the other one."""
+"""Answer a request with the selected solver; fall back to others."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from typing import Final
 import attrs
 
 from laneweave.coordinator.planning.budget import DEFAULT_MEMORY_MB, Budget, BudgetSpentError, Clock
+from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.paper.assignments import Weights
-from laneweave.coordinator.planning.paper.tappa import Tappa
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.plan_validator import problems_of_response
+from laneweave.coordinator.planning.plug_ins.registry import PLANNERS, PlanLimits, checked_solver
 from laneweave.coordinator.planning.problem import Problem, Search
-from laneweave.coordinator.planning.request import PlanRequest, checked_solver
+from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse, Status
 from laneweave.coordinator.planning.shortest_paths import without_needless_moves
 from laneweave.protocol.scenario.fields import DEFAULT_SOLVER
@@ -27,6 +28,8 @@ TAPPA_SHARE: Final = 0.75
 With six to eight vehicles, TAPPA needs 3 to 5 s of CPU for 15,000 nodes, its share of a scenario's
 default limit; branching needs 0.1 s for such formations (95th percentile), at most 0.6 s.
 """
+PLUG_IN_SHARE: Final = 0.5
+"""Share of the deadline for a planner of a user; if it fails, built-in solvers need the rest."""
 MAX_NODES: Final = 500_000
 """Node limit that keeps TAPPA's trees below about 1 GB; reaching it takes minutes."""
 
@@ -48,6 +51,7 @@ def plan(
     weights: Weights | None = None,
     solver: str | None = None,
     fallback: bool = True,
+    compiled_only: bool = False,
     clock: Clock = time.monotonic,
 ) -> PlanResponse:
     """Answer one request; check the plan with `plan_validator`.
@@ -60,13 +64,18 @@ def plan(
         max_memory_mb: limit on the arrays of branch and bound. When it is reached, the other
             solver continues; a path set that is not proven optimal has status `feasible`.
         weights: weights that make the formation relative distance a lower bound on steps.
-        solver: one of `SOLVERS`, overriding the request's; if neither names one, the default.
+        solver: name of a solver or plug-in, overriding the request's; if neither names one, the
+            default.
         fallback: branching continues when TAPPA has spent `TAPPA_SHARE`, and the cheaper path set
             is returned; False: TAPPA may spend the whole budget. A solver that cannot handle the
-            request at all is always replaced by the other one.
+            request at all, or a plug-in without a valid plan, is always replaced by others.
+        compiled_only: without the compiled kernels of branching, TAPPA answers instead; False: they
+            are compiled when they are needed, so that the plan does not depend on them.
         clock: returns the time [s].
 
     Raises:
+        BadInputError: there is no such solver, or it cannot be loaded.
+        CacheError: the kernels cannot be compiled, see `kernels`.
         RuntimeError: the plan is invalid because of an error in the planner.
     """
     started = clock()
@@ -76,12 +85,15 @@ def plan(
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
     problem = request.problem()
     order = _order(requested, problem, fallback=fallback)
+    if compiled_only and BRANCHING.known_missing:
+        order = tuple(name for name in order if name != BRANCHING.name) or ("tappa",)
     results: list[_Result] = []
     for name in order:
-        if name == "branching":
-            began = clock()
-            _warm_up_branching()
-            started += clock() - began  # loading compiled code is not part of planning
+        began = clock()
+        available = _load(name, compiled_only=compiled_only)
+        started += clock() - began  # loading code is not part of planning
+        if not available:
+            continue
         is_limited = name == "tappa" and order[-1] != name
         share = TAPPA_SHARE if is_limited else 1.0
         left = nodes - sum(result.nodes for result in results)
@@ -91,7 +103,10 @@ def plan(
             max_memory_mb=max_memory_mb,
             clock=clock,
         )
-        results.append(_solve(name, problem, request, weights, budget))
+        limits = PlanLimits(
+            max(PLUG_IN_SHARE * (started + request.deadline_s - clock()), 0.0), math.ceil(left)
+        )
+        results.append(_solve(name, problem, request, weights, budget, limits))
         if results[-1].found.finished or not (results[-1].found.aborted or is_limited):
             break
     response = _response(request, problem, requested, results, started, clock)
@@ -105,6 +120,8 @@ def plan(
 
 def _order(requested: str, problem: Problem, *, fallback: bool) -> tuple[str, ...]:
     """Return the solvers in the order in which to run them."""
+    if not PLANNERS.is_built_in(requested):
+        return (requested, *_order("tappa", problem, fallback=fallback))
     if problem.table.model.vehicles_share_cells:
         return ("tappa",)
     if requested == "tappa":
@@ -112,19 +129,38 @@ def _order(requested: str, problem: Problem, *, fallback: bool) -> tuple[str, ..
     return (requested, "tappa")
 
 
+def _load(solver: str, *, compiled_only: bool) -> bool:
+    """Load a solver; return whether it is available."""
+    if solver != BRANCHING.name:
+        prepare(solver)
+    elif compiled_only:
+        return BRANCHING.load_if_compiled()
+    else:
+        BRANCHING.load()
+    return True
+
+
 def _solve(
-    solver: str, problem: Problem, request: PlanRequest, weights: Weights, budget: Budget
+    solver: str,
+    problem: Problem,
+    request: PlanRequest,
+    weights: Weights,
+    budget: Budget,
+    limits: PlanLimits,
 ) -> _Result:
-    """Run one solver until it finishes, aborts or has spent its budget."""
+    """Run one solver until it finishes, aborts or has spent its budget.
+
+    A plug-in has `limits`, which leave a part of the budget to other solvers.
+    """
     found = Search()
     with suppress(BudgetSpentError):
         search: Search
-        if solver == "branching":
-            from laneweave.coordinator.planning.exact.branching import Branching  # noqa: PLC0415
-
-            search = Branching(problem, request.choices(), budget)
+        if PLANNERS.is_built_in(solver):
+            search = PLANNERS.load(solver, "solver")(request, problem, weights, budget)
         else:
-            search = Tappa(request, problem, weights, budget)
+            from laneweave.coordinator.planning.plug_ins.search import PluggedInSearch  # noqa: PLC0415
+
+            search = PluggedInSearch(solver, request, problem, limits, budget)
         search.run()
         found = Search(**attrs.asdict(search, recurse=False))
     return _Result(solver, budget.nodes, found)
@@ -142,7 +178,8 @@ def _response(
     searches = [result.found for result in results]
     found = [search.best for search in reversed(searches) if search.best is not None]
     best = min(found, key=lambda solution: solution.cost, default=None)
-    if best is not None and not any(search.has_fewest_moves for search in searches):
+    is_own = PLANNERS.is_built_in(results[-1].solver)  # paths of a plug-in stay as they are
+    if best is not None and is_own and not any(search.has_fewest_moves for search in searches):
         budget = Budget(deadline=started + request.deadline_s, clock=clock)
         best = without_needless_moves(problem, best, budget)
     cells = [] if best is None else problem.cells_of(best)
@@ -172,15 +209,14 @@ def _status(*, found: bool, finished: bool) -> Status:
     return "infeasible" if finished else "timeout"
 
 
-def warm_up() -> None:
-    """Load the compiled parts of all planners (1 s); compile them if they are not cached (60 s)."""
-    from laneweave.coordinator.planning.rolling import path_search as stream  # noqa: PLC0415 (numba is slow to load)
+def prepare(solver: str, field: str = "solver") -> None:
+    """Check that a solver exists; start the process of a plug-in, which imports it.
 
-    _warm_up_branching()
-    stream.warm_up()
+    Raises:
+        BadInputError: `field` names no solver, or one that cannot be loaded.
+    """
+    checked_solver(solver, field)
+    if not PLANNERS.is_built_in(solver):
+        from laneweave.coordinator.planning.plug_ins.process import load_planner  # noqa: PLC0415
 
-
-def _warm_up_branching() -> None:
-    from laneweave.coordinator.planning.exact import branching  # noqa: PLC0415
-
-    branching.warm_up()
+        load_planner(solver, field)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
-from laneweave.coordinator.planning.rolling.path_search import StreamPlanner
+from laneweave.coordinator.planning.kernels import ROLLING
 from laneweave.coordinator.planning.rolling.problem import (
     StreamCosts,
     StreamPlan,
@@ -51,7 +51,14 @@ def checked(road: StreamRoad, planner: Planner) -> Planner:
 
 
 def stream_planner(scenario: Scenario) -> Planner:
-    """Return the checked planner for a scenario's road."""
+    """Return the checked planner for a scenario's road; compile it if necessary (`kernels`).
+
+    Raises:
+        CacheError: it cannot be compiled.
+    """
+    from laneweave.coordinator.planning.rolling.path_search import StreamPlanner  # noqa: PLC0415 (numba is slow to load)
+
+    ROLLING.load()
     road = stream_road(scenario)
     costs = StreamCosts(forward=REWARD if scenario.formation.reward_drift else 0.0)
     return checked(road, StreamPlanner(road, costs, scenario.seed).plan)

@@ -16,6 +16,7 @@ from typing import ClassVar
 import attrs
 from attrs import frozen
 
+from laneweave.coordinator.planning.plug_ins.registry import checked_solver
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
 from laneweave.coordinator.service.answers import CachedAnswer, CachedAnswers
@@ -224,6 +225,8 @@ class PlanningService:
                 "request", f"{len(payload)} bytes or more", f"at most {max_bytes} bytes"
             )
         request = PlanRequest.from_dict(form.read(payload))
+        if request.solver is not None:
+            checked_solver(request.solver)
         if request.deadline_s > self._settings.max_deadline_s:
             allowed = f"at most {self._settings.max_deadline_s:g} at this service"
             raise BadInputError("deadline_s", request.deadline_s, allowed)

@@ -15,9 +15,10 @@ import attrs
 import numpy as np
 from rich.table import Table
 
+from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.coordinator.planning.solve import plan, warm_up
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import (
     TRAFFIC_KINDS,
     block_request,
@@ -89,7 +90,7 @@ def bench_planner(
     Yields:
         One row per family and size.
     """
-    warm_up()
+    BRANCHING.load()
     for family in families:
         for size in vehicles:
             requests = [

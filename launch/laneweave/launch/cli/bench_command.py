@@ -60,7 +60,7 @@ def bench(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Benchmark runs with 30, 60 and 90 vehicles, plans for 6 to 36 vehicles, or the tracker."""
-    from laneweave.coordinator.planning.request import checked_solver
+    from laneweave.coordinator.planning.plug_ins.registry import checked_solver
     from laneweave.launch.bench.planner import FAMILIES, bench_planner, planner_table
     from laneweave.launch.bench.runtime import bench_runtime, machine, runtime_table
     from laneweave.launch.bench.tracker import bench_tracker, tracker_table

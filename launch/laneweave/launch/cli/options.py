@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 
 from laneweave.launch.run.logs import LogFormat, LogLevel
-from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import SOLVERS, Scenario
 
@@ -77,6 +76,8 @@ def load_deployment(config: Path | None, endpoint: str | None, **overrides: obje
     Raises:
         BadInputError: the file is invalid, or no endpoint is given.
     """
+    from laneweave.protocol.config.scenario_files import load_scenario
+
     settings = load_scenario(config, network__endpoint=endpoint, **overrides)
     if not settings.network.endpoint:
         raise BadInputError(

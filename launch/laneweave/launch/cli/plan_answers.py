@@ -6,26 +6,19 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from laneweave.coordinator.planning.paper.explanation import explain
+from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
-from laneweave.coordinator.service.client import (
-    ABSENT_S,
-    PlanClient,
-    PlanError,
-    RequestRefusedError,
-    ServiceUnavailableError,
-    client_access,
-)
-from laneweave.launch.drawing.tappa_text import explanation_text
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.security.connection import Access
+
+if TYPE_CHECKING:
+    from laneweave.protocol.security.connection import Access
 
 MAX_WAIT_S = 3600.0
 ANSWER_MARGIN_S = 8.0
@@ -51,10 +44,14 @@ def access_for(
     if config is not None:
         if realm is not None:
             raise BadInputError("--realm", realm, "only without --config, which has network.realm")
+        from laneweave.coordinator.service.client import client_access
+
         return client_access(config, client or "plan", endpoint)
     if client is not None:
         raise BadInputError("--client", client, "only with --config")
     if endpoint is not None:
+        from laneweave.protocol.security.connection import Access
+
         return Access(endpoint) if realm is None else Access(endpoint, realm)
     if realm is not None:
         raise BadInputError("--realm", realm, "only with --connect")
@@ -93,7 +90,11 @@ def answer_request(
         drawers.append(_checked_drawer(drawing))
     if road_drawing is not None:
         drawers.append(_checked_road_drawer(road_drawing, scenario or Scenario(), request.mode))
-    response = plan(request) if access is None else _ask(access, request, wait_s)
+    if access is None:
+        # An answer must not wait for a compilation that was not asked for.
+        response = plan(request, compiled_only=request.solver != BRANCHING.name)
+    else:
+        response = _ask(access, request, wait_s)
     if as_table:
         sys.stdout.write(_table(request, response))
     else:
@@ -115,6 +116,9 @@ def explain_request(path: Path, deadline_s: float | None, drawing: Path | None =
             not a PNG file.
         CommandFailedError: writing the drawing failed.
     """
+    from laneweave.coordinator.planning.paper.explanation import explain
+    from laneweave.launch.drawing.tappa_text import explanation_text
+
     if drawing is not None:
         from laneweave.launch.drawing.plan import check_drawing
 
@@ -191,6 +195,14 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _ask(access: Access, request: PlanRequest, wait_s: float) -> PlanResponse:
+    from laneweave.coordinator.service.client import (
+        ABSENT_S,
+        PlanClient,
+        PlanError,
+        RequestRefusedError,
+        ServiceUnavailableError,
+    )
+
     timeout_s = request.deadline_s + ANSWER_MARGIN_S + wait_s
     access = attrs.evolve(access, connect_timeout_s=max(wait_s, access.connect_timeout_s))
     try:

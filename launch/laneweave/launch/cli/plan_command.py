@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from laneweave.launch.cli.options import SOLVER_NAMES
-from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.fields import Scenario
 
 
 class OutputFormat(StrEnum):
@@ -79,7 +79,7 @@ def plan(
     """Answer one plan request, in this process or with a running coordinator."""
     from laneweave.launch.cli.plan_answers import access_for, answer_request, explain_request
 
-    settings = load_scenario(config)
+    settings = Scenario() if config is None else _loaded(config)
     # A file without an endpoint describes only the road.
     road_only = draw_road is not None and not (connect or settings.network.endpoint)
     access = access_for(connect, realm, None if road_only else config, client)
@@ -105,3 +105,9 @@ def plan(
         scenario=settings,
         wait_s=wait,
     )
+
+
+def _loaded(config: Path) -> Scenario:
+    from laneweave.protocol.config.scenario_files import load_scenario
+
+    return load_scenario(config)

@@ -17,6 +17,7 @@ from typing import Any
 import attrs
 from attrs import define, field
 
+from laneweave.coordinator.planning.kernels import KERNELS
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.network_namespaces import ENDPOINT, HUB, LISTEN, open_network
 from laneweave.launch.faults.shared_counters import MessageFaults, SharedBoard
@@ -109,7 +110,9 @@ class LocalRun:
             BadInputError: the run is not possible in this environment.
         """
         check_temporary_folder()
-        context = fork_server()
+        formation = self.scenario.formation
+        needed = "rolling" if formation.rolling else formation.solver
+        context = fork_server({needed} & KERNELS.keys())
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
             stop_signals(self._request_stop),

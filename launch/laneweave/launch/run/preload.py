@@ -1,6 +1,6 @@
 """Preparation of the fork server before its first fork; only the fork server imports this module.
 
-Importing this module loads libraries and the compiled parts of the planners, generates the code
+Importing this module loads libraries and the planners that are compiled, generates the code
 that converts messages and scenarios, and computes the reference motions for the default limits,
 once for all role processes. It starts no thread and opens no session or file. Finally it excludes
 all objects from garbage collection: a collection writes to every object that it visits, so each
@@ -13,7 +13,7 @@ import os
 
 import laneweave.coordinator.process  # noqa: F401
 from laneweave.agents import process as agents
-from laneweave.coordinator.planning import solve
+from laneweave.coordinator.planning.kernels import KERNELS
 from laneweave.launch.run.roles import LAUNCHER, tune_garbage_collector
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.runtime.processes import die_with_parent, outlive_parent
@@ -24,6 +24,7 @@ from laneweave.protocol.wire import codec
 die_with_parent(int(os.environ.pop(LAUNCHER)))
 codec.warm_up()
 agents.warm_up(parse_scenario({}))
-solve.warm_up()
+for kernels in KERNELS.values():
+    kernels.load_if_compiled()
 outlive_parent()
 tune_garbage_collector()

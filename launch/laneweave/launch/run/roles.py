@@ -16,7 +16,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
@@ -25,7 +25,7 @@ from typing import Any
 import structlog
 
 from laneweave.launch.faults.namespace_processes import join_namespace
-from laneweave.launch.run.logs import log_to_file
+from laneweave.launch.run.logs import log_to_file, log_to_terminal
 from laneweave.launch.run.run_folder import LOG_FILE
 from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.config.scenario_files import parse_scenario
@@ -61,14 +61,17 @@ def tune_garbage_collector() -> None:
     gc.set_threshold(GC_THRESHOLD)
 
 
-def fork_server() -> ForkServerContext:
+def fork_server(solvers: Collection[str] = ()) -> ForkServerContext:
     """Return a context that forks processes from a server, once the server is prepared.
 
-    If the planners must be compiled, this takes a minute; Ctrl-C ends the wait and the server.
     Linear algebra is limited to one thread per process, because many processes share few cores.
 
+    Args:
+        solvers: solvers, as in `KERNELS`, that must be compiled before this returns. Compiling one
+            takes half a minute; Ctrl-C ends the wait and the server.
+
     Raises:
-        CommandFailedError: the server has exited.
+        CommandFailedError: the server has exited, or a solver cannot be compiled.
     """
     for name in THREAD_LIMITS:
         os.environ.setdefault(name, "1")
@@ -86,10 +89,24 @@ def fork_server() -> ForkServerContext:
         del os.environ[LAUNCHER]
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     # Starting it waits for the server; at this point Ctrl-C still raises KeyboardInterrupt.
-    first = context.Process(target=int, name="processes")
+    first = context.Process(target=_compile, args=(tuple(solvers),), name="processes")
     _start(first)
     first.join()
+    if first.exitcode:
+        names = ", ".join(solvers)
+        raise CommandFailedError(f"{names}: cannot be compiled; `laneweave compile` says why")
     return context
+
+
+def _compile(solvers: Sequence[str]) -> None:
+    """Compile solvers unless the fork server has loaded them; runs in a process of its own."""
+    from laneweave.coordinator.planning.kernels import KERNELS
+
+    die_with_parent()
+    die_with_supervisor()
+    log_to_terminal()
+    for solver in solvers:
+        KERNELS[solver].load()
 
 
 def start_role(

@@ -18,7 +18,7 @@ from attrs import field, frozen
 from attrs.validators import optional
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.field_validators import key_part, one_of, within
+from laneweave.protocol.field_validators import NAME_PATTERN, key_part, one_of, within
 from laneweave.protocol.lattice import Cell, Lattice, displacements
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, open_sections
 from laneweave.protocol.scenario.deployment_fields import (
@@ -85,7 +85,8 @@ PAPERS_FORMATIONS: Mapping[str, object] = MappingProxyType(
 """Values of the table `formation` that the former `operation = "paper"` selects."""
 
 SOLVERS: Final = ("tappa", "branching")
-"""`tappa`: the paper's algorithm. `branching`: branch and bound, for large formations."""
+"""Built-in solvers. `tappa`: the paper's algorithm. `branching`: branch and bound, for large
+formations. Coordinators may have others (`laneweave.coordinator.planning.plug_ins`)."""
 DEFAULT_SOLVER: Final = "tappa"
 ROLLING_SOLVER: Final = "rolling"
 """Name of the rolling operation's planner in counts of plans by solver."""
@@ -106,7 +107,7 @@ def solver_of_event(kind: str, data: Mapping[str, Any]) -> str | None:
     if kind == STREAM_PLANNED:
         return ROLLING_SOLVER
     solver = data.get("solver")
-    return str(solver) if solver in SOLVERS else None
+    return solver if isinstance(solver, str) and NAME_PATTERN.fullmatch(solver) else None
 
 
 def _conflict_kinds(_: object, attribute: attrs.Attribute[Any], value: Sequence[str]) -> None:
@@ -287,8 +288,9 @@ class FormationSettings:
     """l_s of the formation relative distance."""
     weight_oblique: int | None = field(default=None, validator=one_of(None, 0, 1, 2))
     """l_o of the formation relative distance; None: the number of steps of an oblique edge."""
-    solver: str = field(default=DEFAULT_SOLVER, validator=one_of(*SOLVERS))
-    """Solver of formations, and of service requests that do not name one."""
+    solver: str = field(default=DEFAULT_SOLVER, validator=key_part)
+    """Solver of formations, and of service requests that do not name one: built in, or a plug-in
+    that the coordinators have installed."""
     planning_deadline_s: float | None = field(
         default=None, validator=optional(within(0.01, 3600.0))
     )

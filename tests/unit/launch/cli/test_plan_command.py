@@ -34,7 +34,8 @@ def test_the_option_goes_before_the_file_and_the_file_before_the_default(
 
 def test_an_unknown_solver_is_refused(laneweave: Here, tmp_path: Path) -> None:
     line = laneweave.refused("plan", request_file(tmp_path), "--solver", "magic")
-    assert line == "solver: got 'magic'; allowed: one of tappa, branching"
+    allowed = "one of tappa, branching, or the name of a plug-in that is installed"
+    assert line == f"solver: got 'magic'; allowed: {allowed}"
 
 
 def test_the_table_names_the_solver(laneweave: Here, tmp_path: Path) -> None:

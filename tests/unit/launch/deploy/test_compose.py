@@ -122,7 +122,7 @@ def test_images_have_what_their_role_needs_and_nothing_large_beside_it(service: 
     assert needed <= extras(service) <= known - {"all", "dev", "dask"}
     assert not extras(service) & (LARGE - needed)
     assert SERVICES[service]["image"] == f"laneweave-{SERVICES[service]['build']['target']}"
-    compiles = "warm_up()" in instructions(service)
+    compiles = "laneweave compile" in instructions(service)
     assert compiles == (role(service) == "coordinator")
 
 

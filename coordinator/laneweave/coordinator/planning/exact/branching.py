@@ -26,7 +26,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -48,6 +47,7 @@ from laneweave.coordinator.planning.exact.multipliers_kernel import (
 from laneweave.coordinator.planning.exact.negotiation import Negotiation
 from laneweave.coordinator.planning.exact.reachability import explore
 from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.problem import Problem, Search, Solution
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.shortest_paths import without_needless_moves
@@ -72,20 +72,19 @@ _EXPLORE_NODES, _EXPLORE_MOVES, _MAX_EXPLORE_MOVES, _GROWTH = 16, 5_000, 1_500_0
 """Nodes after which the joint search is tried if no path set is known, and the initial and maximum
 limit on its joint moves; nodes and limit grow by the factor `_GROWTH`."""
 _TIE_NODES = 10
-_WARM_UP_WORK = 8
+_CALL_WORK = 8
 _BYTES_PER_S = 1_000_000_000
 """Approximate speed at which arrays are filled."""
 
 
-@cache
-def warm_up() -> None:
-    """Load the compiled code; compile it if it is not cached (half a minute)."""
+def call_kernels() -> None:
+    """Call every kernel, which loads or compiles it; see `kernels`."""
     # Two vehicles that swap cells: an instance that needs branching.
     vehicles = (VehicleRequest("a", (0, 0), lane=1), VehicleRequest("b", (0, 1), lane=0))
     request = PlanRequest(Grid(2, 2), 1, ("geometric",), vehicles, ((0, 0), (0, 1)))
     branching = Branching(request.problem(), request.choices(), Budget())
     branching.run()
-    branching.negotiate(branching.relaxation(_SPARE_STEPS), _WARM_UP_WORK)
+    branching.negotiate(branching.relaxation(_SPARE_STEPS), _CALL_WORK)
 
 
 class Branching(Search):
@@ -376,3 +375,13 @@ class Branching(Search):
 def _doubled(nodes: Stack) -> Stack:
     """Return a stack of twice the size."""
     return Stack(*(np.concatenate([array, np.zeros_like(array)]) for array in nodes))
+
+
+def new_search(
+    request: PlanRequest,
+    problem: Problem,
+    weights: Weights,  # noqa: ARG001 (as for TAPPA)
+    budget: Budget,
+) -> Search:
+    """Return the search of branch and bound for a request."""
+    return Branching(problem, request.choices(), budget)

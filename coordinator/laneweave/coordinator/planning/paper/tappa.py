@@ -149,3 +149,8 @@ class Tappa(Search):
         if self.best_cost <= self.joint_bound:
             return -math.inf
         return self.best_cost if self._improvements.cutoff else math.inf
+
+
+def new_search(request: PlanRequest, problem: Problem, weights: Weights, budget: Budget) -> Search:
+    """Return the search of TAPPA for a request, with all improvements."""
+    return Tappa(request, problem, weights, budget)

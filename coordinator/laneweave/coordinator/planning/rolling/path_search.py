@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Mapping, Sequence
-from functools import cache
 from itertools import chain
 
 import numpy as np
@@ -36,9 +35,8 @@ from laneweave.coordinator.planning.rolling.problem import (
 from laneweave.protocol.lattice import Cell
 
 
-@cache
-def warm_up() -> None:
-    """Load the compiled code; compile it if it is not cached (half a minute)."""
+def call_kernels() -> None:
+    """Call every kernel, which loads or compiles it; see `kernels`."""
     road = StreamRoad(2, 15.0, 60.0, (0.0, 600.0), 600.0, 5.0)
     # Two vehicles that swap lanes.
     vehicles = [StreamVehicle("a", (5, 0), 1), StreamVehicle("b", (5, 1), 0)]
