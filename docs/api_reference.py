@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import Any
 
 import attrs
-from griffe import Docstring, Parser
+from griffe import Docstring, DocstringElement, Parser
 
 import laneweave
 
@@ -37,7 +37,8 @@ ELSEWHERE = {
 def api_reference() -> str:
     """Return a section for each public name of `laneweave`."""
     return "\n\n".join(
-        _section(f"laneweave.{name}", getattr(laneweave, name)) for name in sorted(laneweave.__all__)
+        _section(f"laneweave.{name}", getattr(laneweave, name))
+        for name in sorted(laneweave.__all__)
     )
 
 
@@ -80,8 +81,8 @@ def _class_parts(name: str, kind: type) -> Iterator[str]:
 
 
 def _fields(kind: type) -> str:
-    (node,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
-    assert isinstance(node, ast.ClassDef)
+    tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
+    node = next(node for node in tree.body if isinstance(node, ast.ClassDef))
     meanings = dict(documented(node))
     annotations = {
         one.target.id: ast.unparse(one.annotation)
@@ -147,7 +148,7 @@ def _parts(paragraph: str) -> Iterator[str]:
             yield f"**{HEADINGS[kind]}**\n\n" + "\n".join(items)
 
 
-def _item(one: Any) -> str:
+def _item(one: DocstringElement) -> str:
     name = getattr(one, "name", "") or getattr(one, "annotation", "") or ""
     text = " ".join(one.description.split())
     return f"`{name}`: {text}" if name else text

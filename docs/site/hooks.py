@@ -31,6 +31,7 @@ SEARCH = "site/iframe-worker.js"
 """Script with which the search works in local files (MIT licence, beside it)."""
 SEARCH_FROM_NETWORK = "https://unpkg.com/iframe-worker/shim"
 
+_DIAGRAM = re.compile(r'(<pre class="mermaid">.*?</pre>)', re.DOTALL)
 _FENCE = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
 _TARGET = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)\s#]+)")
 
@@ -60,7 +61,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     """Return the page with the addresses of pages in place of paths in the repository."""
     source = _source(page.file.src_uri)
     if not source.endswith(".md"):
@@ -77,12 +78,12 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     return "".join(parts)
 
 
-def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+def on_page_content(html: str, **_: object) -> str:
     """Put each diagram into a box that scrolls on small screens."""
-    return re.sub(r'(<pre class="mermaid">.*?</pre>)', r'<div class="wide">\1</div>', html, flags=re.S)
+    return _DIAGRAM.sub(r'<div class="wide">\1</div>', html)
 
 
-def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+def on_post_page(output: str, page: Page, **_: object) -> str:
     """Load scripts from the site itself: that of the search, and in pages with diagrams theirs."""
     top = "../" * page.file.dest_uri.count("/")
     if 'class="mermaid"' in output:
@@ -90,7 +91,7 @@ def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
     return output.replace(SEARCH_FROM_NETWORK, top + SEARCH)
 
 
-def on_post_template(output: str, template_name: str, config: MkDocsConfig) -> str:
+def on_post_template(output: str, **_: object) -> str:
     """Load the script of the search from the site in the page for unknown addresses."""
     return output.replace(SEARCH_FROM_NETWORK, f"/{SEARCH}")
 

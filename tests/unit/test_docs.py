@@ -8,7 +8,7 @@ import json
 import re
 import shlex
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -110,6 +110,7 @@ def code(text: str) -> str:
 
 
 # --- docs/SCENARIO.md: every field of a scenario -------------------------------------------------
+
 
 def test_scenario_fields_have_a_meaning() -> None:
     assert meanings_in(scenario_table({})) == {name: MISSING for name, _ in scenario_fields()}
