@@ -23,7 +23,7 @@ def command_reference() -> str:
 def _sections(group: Any, context: Any, level: int) -> Iterator[str]:  # noqa: ANN401
     """Yield the sections of the commands of a group, and of the groups in it."""
     for name in group.list_commands(context):
-        command = group.get_command(context, name)
+        command = group.commands[name]  # `get_command` may know only the name and the help
         inner = type(context)(command, parent=context, info_name=name)
         parts = [f"{'#' * level} {inner.command_path}", inspect.cleandoc(command.help or "")]
         if hasattr(command, "list_commands"):

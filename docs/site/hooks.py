@@ -33,6 +33,7 @@ SEARCH_FROM_NETWORK = "https://unpkg.com/iframe-worker/shim"
 
 _DIAGRAM = re.compile(r'(<pre class="mermaid">.*?</pre>)', re.DOTALL)
 _FENCE = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
+_NAMED = re.compile(r"\[([A-Z_]+\.md)\](?=\(([^)\s#]+))")
 _TARGET = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)\s#]+)")
 
 
@@ -62,7 +63,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
-    """Return the page with the addresses of pages in place of paths in the repository."""
+    """Return the page with addresses and titles of pages in place of paths in the repository."""
     source = _source(page.file.src_uri)
     if not source.endswith(".md"):
         return markdown
@@ -73,8 +74,15 @@ def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
             return match[1]
         return os.path.relpath(_address(target), PurePosixPath(page.file.src_uri).parent)
 
+    def title(match: re.Match[str]) -> str:
+        target = ROOT / _resolved(source, match[2])
+        if not target.is_file():
+            return match[0]
+        heading = target.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+        return f'["{heading}"]'
+
     parts = _FENCE.split(markdown)
-    parts[::2] = [_TARGET.sub(address, part) for part in parts[::2]]
+    parts[::2] = [_TARGET.sub(address, _NAMED.sub(title, part)) for part in parts[::2]]
     return "".join(parts)
 
 

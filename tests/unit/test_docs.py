@@ -330,6 +330,21 @@ def commands(text: str) -> Iterator[str]:
     yield from re.findall(r"`(laneweave [^`\n]+)`", FENCE.sub("", text))
 
 
+def test_all_options_are_in_the_reference() -> None:
+    program: Any = typer.main.get_command(command_line())
+    sections = {"laneweave": program}
+    while sections:
+        name, command = sections.popitem()
+        for inner, found in getattr(command, "commands", {}).items():
+            sections[f"{name} {inner}"] = found
+        if hasattr(command, "commands"):
+            continue
+        level = "#" * len(name.split())
+        part = section(read("COMMANDS.md"), f"{level} {name}")
+        options = [one.opts[0] for one in command.params if one.param_type_name == "option"]
+        assert [option for option in options if f"`{option}" not in part] == [], name
+
+
 @each_document
 def test_commands_exist(path: Path) -> None:
     program = typer.main.get_command(command_line())

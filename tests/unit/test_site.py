@@ -104,6 +104,7 @@ def test_the_site_builds_without_a_warning(pages: dict[str, str]) -> None:
     assert "Two commands" in pages["index.html"]
     assert "veh_per_lane_h" in pages["repository/scenarios/demo.toml.html"]
     assert 'href="repository/scenarios/demo.toml.html"' in pages["index.html"]
+    assert '<a href="PROTOCOL.html">"Protocol"</a>' in pages["SAFETY.html"]
 
 
 @needs_mkdocs
