@@ -38,6 +38,7 @@ from laneweave.coordinator.core import CoordinatorMetrics
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.planning.paper.explanation import explain
 from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.process import SolverMetrics
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.coordinator.service.server import ServiceMetrics
 from laneweave.launch.drawing.tappa_process import draw_explanation
@@ -97,6 +98,7 @@ SNAPSHOTS: dict[type[MetricsSnapshot], str] = {
     NodeMetrics: "every role but the router",
     CoordinatorMetrics: "coordinator",
     ServiceMetrics: "coordinator",
+    SolverMetrics: "coordinator",
     AgentMetrics: "agent",
     BridgeMetrics: "bridge",
     RouterMetrics: "router",

@@ -38,7 +38,7 @@ class SolverMetrics:
     ABOUT: ClassVar[str] = "solver"
 
     available: Mapping[str, int] = metric(
-        "1 if the solver can be used, 0 while it is being compiled", label="solver"
+        "1 if the solver can be used, 0 if it is not compiled", label="solver"
     )
 
 
