@@ -29,7 +29,7 @@ HEADINGS = {
 """Heading of each kind of list in a docstring."""
 ELSEWHERE = {
     "laneweave.Scenario": "[SCENARIO.md](SCENARIO.md#all-fields) lists all fields.",
-    "laneweave.RunSummary": "[RUNS.md](RUNS.md#what-a-run-writes) describes the file.",
+    "laneweave.RunSummary": "[RESULT_FILES.md](RESULT_FILES.md#summaryjson) lists all fields.",
 }
 """Classes whose fields another page describes."""
 

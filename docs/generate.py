@@ -44,6 +44,7 @@ from laneweave.coordinator.service.server import ServiceMetrics
 from laneweave.launch.drawing.tappa_process import draw_explanation
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.observe.metrics_server import PROCESS, PROCESS_MEANING
+from laneweave.launch.recordings.results_over_seeds import RESULTS
 from laneweave.protocol.runtime.metrics import (
     MetricsSnapshot,
     NodeMetrics,
@@ -52,11 +53,13 @@ from laneweave.protocol.runtime.metrics import (
 )
 from laneweave.protocol.security.access_control import READING, SENDING, Flow, rights_on
 from laneweave.protocol.state_machine import Function, RuleBook
+from laneweave.protocol.summary import described
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, ExecutionPhase
 from laneweave.protocol.wire import events, messages
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import TOPICS, Exchange, Party, Topic
 from laneweave.sim_bridge.core import BridgeMetrics
+from laneweave.sim_bridge.recording.columns import TICKS, TRAJECTORIES, TRIPS, Table
 from scenario_reference import meanings_in, scenario_table
 from support.planted_bugs import BUGS
 from support.unseen_bugs import UNSEEN
@@ -227,6 +230,33 @@ def _events() -> str:
     for name, text in documented(_syntax(events)):
         if isinstance(getattr(events, name), str):
             lines.append(f"| `{getattr(events, name)}` | {text} |")
+    return "\n".join(lines)
+
+
+def _columns(table: Table) -> str:
+    """Return the table of a Parquet file's columns."""
+    lines = ["| column | type | unit | frame | meaning |", "|---|---|---|---|---|"]
+    lines += [
+        f"| `{one.name}` | {one.type} | {one.unit} | {one.frame} | {one.meaning} |"
+        for one in table.columns
+    ]
+    return "\n".join(lines)
+
+
+def _summary_fields() -> str:
+    """Return the table of the fields of summary.json."""
+    lines = ["| field | unit | meaning |", "|---|---|---|"]
+    lines += [f"| `{path}` | {unit} | {meaning} |" for path, unit, meaning in described()]
+    return "\n".join(lines)
+
+
+def _event_fields() -> str:
+    """Return the data of each kind of event, and the meaning of each field."""
+    lines = ["| `kind` | data |", "|---|---|"]
+    for kind, names in events.FIELDS.items():
+        lines.append(f"| `{kind}` | {', '.join(f'`{name}`' for name in names)} |")
+    lines += ["", "| key | meaning |", "|---|---|"]
+    lines += [f"| `{name}` | {meaning} |" for name, meaning in events.MEANINGS.items()]
     return "\n".join(lines)
 
 
@@ -773,6 +803,12 @@ def parts() -> dict[str, str]:
         "roads over Zenoh": _road_processes(),
         "roads with reference methods": _road_references(),
         "metrics": _metrics(),
+        "trajectories": _columns(TRAJECTORIES),
+        "trips": _columns(TRIPS),
+        "ticks": _columns(TICKS),
+        "summary": _summary_fields(),
+        "results": _columns(RESULTS),
+        "event fields": _event_fields(),
         "rights": rights_table(),
         "hosts": _hosts(),
         "links": _links(),

@@ -7,8 +7,8 @@ example when one falls back into a cell while another leaves it.
 Slots differ between plans. The ticks examined are those before a vehicle begins a move, and one per
 shortest T_F. The vehicles examined in these ticks are at rest: they have been on the road for at
 least `formation.settle_s`, and either are about to begin a move or have been in the same cell for
-at least the longest time of a move. Lanes and distances are the true ones of the bodies, so that a
-body outside its cell is detected.
+at least the longest time of a move. Lanes and distances are those of the bodies, so that a body
+outside its cell is detected.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 from attrs import frozen
 
-from laneweave.launch.recordings.trajectories import OFF_LATTICE, Bools, Floats, Ints, Tracks
+from laneweave.launch.recordings.trajectories import NO_LATTICE, Bools, Floats, Ints, Tracks
 from laneweave.protocol.scenario.fields import Scenario
 
 TOLERANCE_M: Final = 0.3
@@ -52,12 +52,12 @@ def lattice_spacing(tracks: Tracks, scenario: Scenario) -> LatticeSpacing:
     lattice = scenario.lattice
     ticks = np.rint(tracks.t_s / scenario.runtime.tick_s).astype(np.int64)
     rows = np.flatnonzero(_settled(tracks, ticks, scenario))
-    lane = np.floor(tracks.y_m[rows] / lattice.lane_width_m).astype(np.int64)
+    lane = tracks.lane[rows]
     order = np.lexsort((tracks.s_m[rows], lane, ticks[rows]))
     rows, lane = rows[order], lane[order]
     follows = (np.diff(ticks[rows]) == 0) & (np.diff(lane) == 0)
     spacing_m = np.diff(tracks.s_m[rows])[follows]
-    rest_m = lattice.speed_mps * tracks.t_s[rows] + lattice.pitch_m * tracks.column[rows]
+    rest_m = lattice.speed_mps * tracks.t_s[rows] + lattice.pitch_m * tracks.reserved_column[rows]
     off_m = np.abs(tracks.s_m[rows] - rest_m)
     return LatticeSpacing(
         least_m=round(float(spacing_m.min()), 3) if len(spacing_m) else None,
@@ -81,7 +81,7 @@ def _settled(tracks: Tracks, ticks: Ints, scenario: Scenario) -> Bools:
     min_held_s = np.where(about_to_move, shortest_s, longest_s) - formation.slack_s
     rests: Bools = held_s >= min_held_s - 0.5 * tick_s
     rests &= on_road_s >= formation.settle_s - 0.5 * tick_s
-    rests &= tracks.column != OFF_LATTICE
+    rests &= tracks.reserved_column != NO_LATTICE
     return rests & at_end
 
 

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pyarrow.parquet import read_table
 
 from laneweave.launch.cli.corridor_command import corridor_tables
-from laneweave.launch.recordings.trajectories import read_trips
+from laneweave.launch.recordings.trajectories import read_trajectories, read_trips
 from laneweave.launch.report.corridor_comparison import compare
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
@@ -47,7 +46,7 @@ def standing_vehicle(depart_s: int, at_m: int, stop: str) -> str:
 
 def read_rows(folder: Path) -> dict[tuple[str, int], tuple[float, float]]:
     """Return position and speed of each vehicle by tick."""
-    columns = read_table(folder / "trajectories.parquet").to_pydict()
+    columns = read_trajectories(folder, ["vehicle", "t_s", "s_m", "speed_mps"]).to_pydict()
     keys = zip(columns["vehicle"], (round(t_s / 0.1) for t_s in columns["t_s"]), strict=True)
     return dict(zip(keys, zip(columns["s_m"], columns["speed_mps"], strict=True), strict=True))
 

@@ -1,4 +1,8 @@
-"""Recordings as earlier versions left them: without events that say which columns are whose."""
+"""Recordings as earlier versions left them.
+
+No events say which columns are whose, and trajectories have the first schema: without number,
+lateral speed and preferred lane; `column` and `lane` are the reserved cell.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +10,24 @@ import json
 import shutil
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 
-from laneweave.sim_bridge.recording.trips import SCENARIO_KEY
+from laneweave.sim_bridge.recording.columns import SCENARIO_KEY, SCHEMA_KEY, Metadata
 
 NEWER_FIELDS = ("entry", "close", "max_columns")
 """Fields of `formation` that earlier versions did not have."""
+FIRST_SCHEMA = {
+    "t_s": "t_s",
+    "vehicle": "vehicle",
+    "s_m": "s_m",
+    "y_m": "y_m",
+    "speed_mps": "speed_mps",
+    "accel_mps2": "accel_mps2",
+    "reserved_column": "column",
+    "reserved_lane": "lane",
+}
+"""Today's names of the columns of the first schema of trajectories, and their names then."""
 
 
 def older_recording(recorded: Path, folder: Path) -> Path:
@@ -32,6 +48,8 @@ def older_recording(recorded: Path, folder: Path) -> Path:
     for name in ("trajectories", "trips"):
         path = folder / f"{name}.parquet"
         table = pq.read_table(path)
+        if name == "trajectories":
+            table = first_schema(table)
         metadata = dict(table.schema.metadata)
         scenario = json.loads(metadata[SCENARIO_KEY])
         formation = scenario["formation"]
@@ -41,3 +59,12 @@ def older_recording(recorded: Path, folder: Path) -> Path:
         metadata[SCENARIO_KEY] = json.dumps(scenario).encode()
         pq.write_table(table.replace_schema_metadata(metadata), path)
     return folder
+
+
+def first_schema(table: pa.Table) -> pa.Table:
+    """Return trajectories as the first version of the schema had them."""
+    chosen = table.select(list(FIRST_SCHEMA)).rename_columns(list(FIRST_SCHEMA.values()))
+    fields = [field.remove_metadata() for field in chosen.schema]
+    found = table.schema.metadata or {}
+    metadata: Metadata = {key: text for key, text in found.items() if key != SCHEMA_KEY}
+    return pa.table(chosen.columns, schema=pa.schema(fields, metadata))

@@ -25,12 +25,13 @@ def make_tracks(t_s: ArrayLike, count: int, **values: Sequence[ArrayLike]) -> Tr
         rows = [np.broadcast_to(value, len(times_s)) for value in values.get(name, (0,) * count)]
         return np.concatenate([np.empty(0), *rows]).astype(kind)
 
-    floats = {name: column(name, float) for name in ("s_m", "y_m", "speed_mps", "accel_mps2")}
+    kinds: dict[str, type] = dict.fromkeys(
+        ("s_m", "y_m", "speed_mps", "lateral_speed_mps", "accel_mps2"), float
+    )
+    kinds |= dict.fromkeys(("column", "lane", "reserved_column", "reserved_lane"), np.int64)
     return Tracks(
         names=tuple(f"v{number}" for number in range(count)),
         starts=len(times_s) * np.arange(count + 1),
         t_s=np.tile(times_s, count),
-        **floats,
-        column=column("column", np.int64),  # type: ignore[arg-type]
-        lane=column("lane", np.int64),  # type: ignore[arg-type]
+        **{name: column(name, kind) for name, kind in kinds.items()},  # type: ignore[arg-type]
     )

@@ -9,6 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from laneweave.protocol.summary import RunSummary
+from laneweave.protocol.wire.events import COMMON_FIELDS, FIELDS
+from laneweave.sim_bridge.recording.columns import TRAJECTORIES
 from support.harness import (
     DEMAND,
     Ended,
@@ -54,12 +56,14 @@ def test_a_run_leaves_all_its_files(finished_run: FinishedRun, name: str) -> Non
     assert len(vehicles) == found["vehicles"]["demanded"]
     assert all(trip["on_preferred_lane"] for trip in vehicles.values())
     rows = pq.read_table(folder / "trajectories.parquet")
-    assert set(rows.column_names) >= {
-        *("t_s", "vehicle", "s_m", "y_m", "speed_mps", "accel_mps2", "column", "lane")
-    }
+    assert rows.column_names == TRAJECTORIES.names
+    # A move reserves its target while the body is still in the old lane.
+    assert not rows["lane"].equals(rows["reserved_lane"])
     assert set(rows["vehicle"].unique().to_pylist()) == set(vehicles)
     assert {event["vehicle"] for event in events(folder, "left")} == set(vehicles)
-    assert all({"t_s", "kind", "role"} <= event.keys() for event in events(folder))
+    for event in events(folder):
+        assert {"t_s", "kind", "role"} <= event.keys()
+        assert event.keys() <= {*COMMON_FIELDS, *FIELDS[event["kind"]]}
     assert len(plans(folder)) == found["planning"]["plans"]
     for picture in ("travel_time", "speed", "road"):
         assert (folder / f"{picture}.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"

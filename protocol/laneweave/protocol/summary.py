@@ -8,11 +8,12 @@ not apply.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import attrs
-from attrs import frozen
+from attrs import field, frozen
 from cattrs import Converter
 
 from laneweave.protocol.errors import BadInputError
@@ -22,169 +23,243 @@ SUMMARY_FILE = "summary.json"
 SCHEMA = "laneweave.summary/1"
 
 
+def about(meaning: str, unit: str = "") -> dict[str, str]:
+    """Return the metadata of a field of the summary: what it means, and its unit.
+
+    docs/RESULT_FILES.md and the columns of a sweep's results.parquet are described with them.
+    """
+    return {"meaning": meaning, "unit": unit}
+
+
 @frozen(kw_only=True)
 class VehicleCounts:
     """Vehicle counts."""
 
-    demanded: int
-    entered: int
-    left: int
-    on_preferred_lane: int
-    """Vehicles that left the road in their preferred lane."""
-    peak: int
-    """Maximum number of vehicles on the road at once."""
-    at_destination: int | None = None
-    """Vehicles that left by the exit that they wanted, and in their preferred lane if any."""
-    left_off_lane: int | None = None
-    left_unattended: int | None = None
+    demanded: int = field(metadata=about("vehicles that have arrived at an entrance"))
+    entered: int = field(metadata=about("vehicles that have entered the road"))
+    left: int = field(metadata=about("vehicles that have left it"))
+    on_preferred_lane: int = field(
+        metadata=about(
+            "vehicles that left by their destination, and in their preferred lane if any"
+        )
+    )
+    peak: int = field(metadata=about("maximum number of vehicles on the road at once"))
+    at_destination: int | None = field(
+        default=None, metadata=about("the same as on_preferred_lane")
+    )
+    left_off_lane: int | None = field(
+        default=None, metadata=about("vehicles that left elsewhere or in another lane")
+    )
+    left_unattended: int | None = field(
+        default=None, metadata=about("vehicles that left with a caretaker in charge")
+    )
 
 
 @frozen(kw_only=True)
 class TripTimes:
     """Means of the counted vehicles of one entrance or one destination [s]."""
 
-    n: int
-    """Number of counted vehicles."""
-    mean: float
-    delay: float
-    """Excess over the time at v_F from the entrance to the destination."""
+    n: int = field(metadata=about("number of counted vehicles"))
+    mean: float = field(metadata=about("mean travel time", "s"))
+    delay: float = field(
+        metadata=about("mean excess over the time at v_F from the entrance to the destination", "s")
+    )
 
 
 @frozen(kw_only=True)
 class TravelTime:
     """Travel times of the counted vehicles [s]; None: no vehicle was counted."""
 
-    mean: float | None
-    p50: float | None
-    p95: float | None
-    max: float | None
-    n: int | None = None
-    """Number of counted vehicles."""
-    by_destination: dict[str, TripTimes] | None = None
-    """By the name of the exit by which they wanted to leave; `end`: the end of the road."""
-    by_entrance: dict[str, TripTimes] | None = None
-    """By the name of the entrance; `main`: the start of the road."""
-    by_type: dict[str, TripTimes] | None = None
-    """By the type of vehicle; `car`: those that the scenario's table `vehicle` describes."""
+    mean: float | None = field(metadata=about("mean travel time of the counted vehicles", "s"))
+    p50: float | None = field(metadata=about("median", "s"))
+    p95: float | None = field(metadata=about("95th percentile", "s"))
+    max: float | None = field(metadata=about("longest travel time", "s"))
+    n: int | None = field(default=None, metadata=about("number of counted vehicles"))
+    by_destination: dict[str, TripTimes] | None = field(
+        default=None,
+        metadata=about("by the exit by which they want to leave (end: the end of the road)"),
+    )
+    by_entrance: dict[str, TripTimes] | None = field(
+        default=None, metadata=about("by entrance (main: the start of the road)")
+    )
+    by_type: dict[str, TripTimes] | None = field(
+        default=None, metadata=about("by type of vehicle (car: the scenario's table vehicle)")
+    )
 
 
 @frozen(kw_only=True)
 class Safety:
     """Counts and extremes over all vehicles and ticks; None: nothing was measured."""
 
-    overlaps: int
-    """Pairs of bodies that intersected at some tick; closed parts of lanes count as bodies."""
-    sumo_collisions: int
-    min_gap_m: float | None
-    min_headway_s: float | None
-    emergency_brakes: int
-    max_accel_mps2: float | None
-    min_accel_mps2: float | None
-    max_jerk_mps3: float | None
+    overlaps: int = field(
+        metadata=about(
+            "pairs of bodies that intersected at some tick; closed parts of lanes count as bodies"
+        )
+    )
+    sumo_collisions: int = field(
+        metadata=about("pairs of vehicles for which SUMO reported a collision")
+    )
+    min_gap_m: float | None = field(
+        metadata=about(
+            "minimum bumper-to-bumper gap of two vehicles whose bodies overlap laterally", "m"
+        )
+    )
+    min_headway_s: float | None = field(
+        metadata=about("minimum of such a gap over the speed of the vehicle behind", "s")
+    )
+    emergency_brakes: int = field(
+        metadata=about("episodes of braking with more than 90 % of the limit")
+    )
+    max_accel_mps2: float | None = field(metadata=about("maximum acceleration", "m/s2"))
+    min_accel_mps2: float | None = field(
+        metadata=about("minimum acceleration: hardest braking", "m/s2")
+    )
+    max_jerk_mps3: float | None = field(
+        metadata=about(
+            "maximum of the change of acceleration between two ticks over their distance", "m/s3"
+        )
+    )
 
 
 @frozen(kw_only=True)
 class PlanningMs:
     """Planning times [ms]."""
 
-    p50: float | None
-    p95: float | None
-    max: float | None
+    p50: float | None = field(metadata=about("median", "ms"))
+    p95: float | None = field(metadata=about("95th percentile", "ms"))
+    max: float | None = field(metadata=about("longest time", "ms"))
 
 
 @frozen(kw_only=True)
 class DurationMs:
     """Durations [ms]."""
 
-    p50: float | None
-    p99: float | None
+    p50: float | None = field(metadata=about("median", "ms"))
+    p99: float | None = field(metadata=about("99th percentile", "ms"))
 
 
 @frozen(kw_only=True)
 class Planning:
     """Plan counts over all coordinators."""
 
-    plans: int
-    optimal: int
-    largest_formation: int
-    by_solver: dict[str, int] | None = None
-    fallbacks: int | None = None
-    solve_ms: PlanningMs
+    plans: int = field(metadata=about("plans that were made"))
+    optimal: int = field(metadata=about("plans whose cost is proven optimal"))
+    largest_formation: int = field(metadata=about("maximum number of vehicles in a plan"))
+    by_solver: dict[str, int] | None = field(default=None, metadata=about("plans by solver"))
+    fallbacks: int | None = field(
+        default=None,
+        metadata=about(
+            "plans that another solver made: the chosen one reached its share of nodes or time"
+        ),
+    )
+    solve_ms: PlanningMs = field(metadata=about("time to make a plan", "ms"))
 
 
 @frozen(kw_only=True)
 class Tracking:
     """Solve counts of agents, and counts of fallbacks."""
 
-    solves: int
-    osqp_solves: int | None = None
-    unconstrained_steps: int | None = None
-    unusable: int
-    hold_law_ticks: int | None = None
-    emergency_ticks: int | None = None
-    missed_ticks: int | None = None
-    caretaker_takeovers: int | None = None
-    agent_takeovers: int | None = None
-    solve_ms: DurationMs
+    solves: int = field(metadata=about("ticks at which an agent tracked a reference"))
+    osqp_solves: int | None = field(default=None, metadata=about("solves with OSQP"))
+    unconstrained_steps: int | None = field(
+        default=None, metadata=about("solves whose unconstrained optimum met all constraints")
+    )
+    unusable: int = field(metadata=about("solves without a usable solution"))
+    hold_law_ticks: int | None = field(
+        default=None, metadata=about("ticks in which the hold law drove a body, without a command")
+    )
+    emergency_ticks: int | None = field(default=None, metadata=about("ticks of emergency braking"))
+    missed_ticks: int | None = field(
+        default=None,
+        metadata=about("answers of agents that were missing at the deadline of their tick"),
+    )
+    caretaker_takeovers: int | None = field(
+        default=None, metadata=about("times that a caretaker took charge of a vehicle")
+    )
+    agent_takeovers: int | None = field(
+        default=None,
+        metadata=about("times that an agent took charge from a caretaker or an earlier agent"),
+    )
+    solve_ms: DurationMs = field(metadata=about("CPU time of a solve", "ms"))
 
 
 @frozen(kw_only=True)
 class RuntimeFigures:
     """Process counts, and the speed of the run."""
 
-    real_time_factor: float
-    wall_s: float
-    processes: int | None
-    """Maximum number of processes at once; None: unknown."""
-    vehicles_per_process: int
-    tick_ms: DurationMs
+    real_time_factor: float = field(metadata=about("road time over wall time"))
+    wall_s: float = field(metadata=about("wall time of the run", "s"))
+    processes: int | None = field(
+        metadata=about("maximum number of processes at once; null: unknown")
+    )
+    vehicles_per_process: int = field(metadata=about("vehicles per agent process"))
+    tick_ms: DurationMs = field(metadata=about("wall time of a tick", "ms"))
 
 
 @frozen(kw_only=True)
 class Messages:
     """Message counts over all processes."""
 
-    published: int
-    dropped_by_faults: int
-    rejected: int | None = None
+    published: int = field(metadata=about("messages published by all processes"))
+    dropped_by_faults: int = field(metadata=about("messages dropped by injected faults"))
+    rejected: int | None = field(
+        default=None, metadata=about("malformed messages that were received")
+    )
 
 
 @frozen(kw_only=True)
 class LeaderChanges:
     """Leadership changes."""
 
-    leader_changes: int
-    recovery_s: list[float]
-    """Leaderless periods [s]; with injected faults: from each leader fault until another candidate
-    led."""
-    plan_recovery_s: list[float] | None = None
-    """Times from each leader fault until the next plan was in force [s]."""
+    leader_changes: int = field(metadata=about("times that another candidate became leader"))
+    recovery_s: list[float] = field(
+        metadata=about(
+            "periods without a leader; with injected faults: from each fault of a leader until "
+            "another candidate led",
+            "s",
+        )
+    )
+    plan_recovery_s: list[float] | None = field(
+        default=None,
+        metadata=about("times from each leader fault until the next plan was in force", "s"),
+    )
 
 
 @frozen(kw_only=True)
 class RunSummary:
     """The content of `summary.json`."""
 
-    schema: str
-    method: str
-    seed: int
-    volume_veh_per_lane_h: float
-    lanes: int
-    road_m: float
-    simulated_s: float
+    schema: str = field(metadata=about("name and number of the schema"))
+    method: str = field(metadata=about("value of laneweave run --method"))
+    seed: int = field(metadata=about("seed of the scenario"))
+    volume_veh_per_lane_h: float = field(metadata=about("demand per lane", "veh/(lane h)"))
+    lanes: int = field(metadata=about("number of lanes"))
+    road_m: float = field(metadata=about("length of the road", "m"))
+    simulated_s: float = field(metadata=about("road time at the end", "s"))
     vehicles: VehicleCounts
     travel_time_s: TravelTime
-    throughput_veh_per_lane_h: float | None
+    throughput_veh_per_lane_h: float | None = field(
+        metadata=about(
+            "vehicles that leave between the first and the last counted one; null: undefined",
+            "veh/(lane h)",
+        )
+    )
     safety: Safety
-    ending: str | None = None
-    """`complete`, `interrupted` or `limit`."""
+    ending: str | None = field(
+        default=None,
+        metadata=about(
+            "complete: all demanded vehicles have left; limit: runtime.max_road_s was reached; "
+            "interrupted: the run was stopped, or something failed"
+        ),
+    )
     planning: Planning
     tracking: Tracking
     runtime: RuntimeFigures
     messages: Messages
     failover: LeaderChanges
-    faults: dict[str, Any] | None = None
-    """Injected faults; None: the run has no fault file."""
+    faults: dict[str, Any] | None = field(
+        default=None, metadata=about("injected faults, by kind; absent without a fault file")
+    )
 
     @classmethod
     def from_json(cls, data: object) -> RunSummary:
@@ -207,6 +282,24 @@ class RunSummary:
         """Percentage of the departed vehicles that left in their preferred lane."""
         left = self.vehicles.left
         return 100.0 * self.vehicles.on_preferred_lane / left if left else None
+
+
+def described(kind: type = RunSummary, prefix: str = "") -> Iterator[tuple[str, str, str]]:
+    """Yield (path, unit, meaning) of each field that contains a value, parts separated by dots.
+
+    `*` in a path stands for the name of an entrance, a destination or a type of vehicle.
+    """
+    for one in attrs.fields(attrs.resolve_types(kind)):
+        unit, meaning = one.metadata.get("unit", ""), one.metadata.get("meaning", "")
+        inner = [part for part in (one.type, *get_args(one.type)) if isinstance(part, type)]
+        tables = [part for part in inner if attrs.has(part)]
+        mapped = [part for own in get_args(one.type) for part in get_args(own) if attrs.has(part)]
+        if tables or mapped:
+            outer = f"{prefix}{one.name}." + ("" if tables else "*.")
+            for path, own_unit, own in described((tables or mapped)[0], outer):
+                yield path, own_unit, f"{meaning}: {own}" if meaning else own
+        else:
+            yield f"{prefix}{one.name}", unit, meaning
 
 
 def read_summary(folder: Path) -> RunSummary | None:

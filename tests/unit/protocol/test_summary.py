@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from attrs import evolve
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.summary import RunSummary, read_summary, write_summary
+from laneweave.protocol.summary import RunSummary, described, read_summary, write_summary
 from support.summaries import make_summary
 
 
@@ -45,3 +47,23 @@ def test_a_missing_summary_is_none(tmp_path: Path) -> None:
     assert read_summary(tmp_path) is None
     with pytest.raises(BadInputError, match=r"summary\.json"):
         RunSummary.from_json({"schema": "laneweave.summary/1"})
+
+
+def test_every_field_is_described() -> None:
+    found = {path: (unit, meaning) for path, unit, meaning in described()}
+    assert all(meaning for _, meaning in found.values())
+    assert found["travel_time_s.by_type.*.delay"][0] == "s"
+    assert found["planning.solve_ms.p95"] == ("ms", "time to make a plan: 95th percentile")
+
+    def leaves(tables: dict[str, Any], prefix: str = "") -> Iterator[str]:
+        for key, value in tables.items():
+            if isinstance(value, dict):
+                yield from leaves(value, f"{prefix}{key}.")
+            else:
+                yield f"{prefix}{key}"
+
+    assert set(leaves(make_summary().to_json())) <= found.keys()
+    units = {"s": "s", "m": "m", "mps2": "m/s2", "mps3": "m/s3", "veh_per_lane_h": "veh/(lane h)"}
+    for path, (unit, _) in found.items():
+        expected = next((own for end, own in units.items() if path.endswith(f"_{end}")), unit)
+        assert unit == expected, path

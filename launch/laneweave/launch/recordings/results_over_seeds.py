@@ -6,6 +6,7 @@ A sweep writes the table as `results.parquet`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,22 @@ import pyarrow.parquet as pq
 
 from laneweave.launch.recordings.runs import Run
 from laneweave.protocol.files import write_atomically
+from laneweave.protocol.summary import described
+from laneweave.sim_bridge.recording.columns import SCHEMA_KEY, Column, Table
 
-SCHEMA_KEY, SCHEMA = b"laneweave.schema", b"laneweave.sweep.results/1"
+RESULTS = Table(
+    "laneweave.sweep.results/1",
+    (
+        Column("label", pa.string(), "label of the sweep: a method with its settings"),
+        Column("method", pa.string(), "value of laneweave run --method"),
+        Column("volume_veh_per_lane_h", pa.float64(), "demand per lane", "veh/(lane h)"),
+        Column("seed", pa.int64(), "seed of the scenario"),
+        Column("status", pa.string(), "done or failed"),
+        Column("reason", pa.string(), "why the run failed; empty: it is done"),
+        Column("wall_s", pa.float64(), "run time of the run's process", "s", nullable=True),
+    ),
+)
+"""One row per run; columns with the numbers of the summaries follow."""
 KEYS = ["label", "volume_veh_per_lane_h"]
 """Columns whose values are the same for runs that differ only in their seeds."""
 PREFERRED = "preferred_percent"
@@ -30,7 +45,7 @@ def results_table(runs: Iterable[Run]) -> pa.Table:
     Counts are integers, other numbers floats; missing numbers are null.
     """
     listed = list(runs)
-    arrays = {
+    arrays: dict[str, pa.Array[Any]] = {
         "label": pa.array([run.label for run in listed], pa.string()),
         "method": pa.array([run.method for run in listed], pa.string()),
         KEYS[1]: pa.array([run.volume_veh_per_lane_h for run in listed], pa.float64()),
@@ -39,13 +54,16 @@ def results_table(runs: Iterable[Run]) -> pa.Table:
         "reason": pa.array([run.reason for run in listed], pa.string()),
         "wall_s": pa.array([run.wall_s for run in listed], pa.float64()),
     }
+    fields = [column.field for column in RESULTS.columns]
     flat = [_figures(run) for run in listed]
     for name in dict.fromkeys(name for one in flat for name in one if name not in arrays):
         values = [one.get(name) for one in flat]
         counts = all(isinstance(value, int) for value in values if value is not None)
         known = any(value is not None for value in values)
         arrays[name] = pa.array(values, pa.int64() if counts and known else pa.float64())
-    return pa.table(arrays).replace_schema_metadata({SCHEMA_KEY: SCHEMA})
+        unit, meaning = _described(name)
+        fields.append(Column(name, arrays[name].type, meaning, unit, nullable=True).field)
+    return pa.table(arrays, schema=pa.schema(fields, {SCHEMA_KEY: RESULTS.schema}))
 
 
 def write_results(runs: Iterable[Run], path: Path) -> None:
@@ -88,6 +106,18 @@ def flatten(tables: Mapping[str, Any], separator: str) -> dict[str, Any]:
         else:
             flat[key] = value
     return flat
+
+
+def _described(name: str) -> tuple[str, str]:
+    """Return unit and meaning of a column with a number of the summaries."""
+    if name == PREFERRED:
+        return "%", "share of the departed vehicles that left in their preferred lane"
+    for path, unit, meaning in described():
+        # The rest of a column's name is a name from the scenario, or a key of a table.
+        pattern = re.escape(path.replace(".", "_")).replace(r"\*", ".+") + "(_.+)?"
+        if re.fullmatch(pattern, name):
+            return unit, meaning
+    return "", name
 
 
 def _figures(run: Run) -> dict[str, float | int | None]:

@@ -16,7 +16,7 @@ from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import RunSummary, read_summary
-from laneweave.sim_bridge.recording.trips import SCENARIO_KEY
+from laneweave.sim_bridge.recording.columns import SCENARIO_KEY
 
 SWEEP_FILE, POINT_FILE = "sweep.json", "point.json"
 """Files that identify the folders of sweeps and of their points."""

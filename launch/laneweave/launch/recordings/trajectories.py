@@ -1,24 +1,49 @@
-"""Trajectories of a run, as arrays sorted by vehicle, and trips of a run."""
+"""Trajectories of a run, as a table or as arrays sorted by vehicle, and trips of a run.
+
+All readers of trajectories.parquet use this module. It returns recordings of earlier versions, too,
+with the columns of `sim_bridge.recording.columns.TRAJECTORIES`. In the first schema, `column` and
+`lane` were the reserved cell; the cell of the body follows from its position, the lateral speed
+from differences of positions, and the preferred lane from the trip.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from attrs import frozen
 from numpy.typing import NDArray
 
-from laneweave.launch.recordings.runs import TRAJECTORIES, not_a_run
+from laneweave.launch.recordings.runs import TRAJECTORIES as FILE
+from laneweave.launch.recordings.runs import not_a_run, scenario_of
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Lattice
+from laneweave.sim_bridge.recording.columns import SCHEMA_KEY, TRAJECTORIES
+from laneweave.sim_bridge.recording.trajectories import body_cells
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-OFF_LATTICE = np.iinfo(np.int64).min
-"""Value of `Tracks.column` for a vehicle off the lattice."""
+NO_LATTICE = np.iinfo(np.int64).min
+"""Value of columns and reserved lanes of `Tracks` where the method has no lattice."""
+_FLOATS = ("s_m", "y_m", "speed_mps", "lateral_speed_mps", "accel_mps2")
+_COLUMNS, _LANES = ("column", "reserved_column"), ("lane", "reserved_lane")
+_FIRST_SCHEMA = ("t_s", "vehicle", "s_m", "y_m", "speed_mps", "accel_mps2", "column", "lane")
+_SOURCES = {
+    "column": ("t_s", "s_m", "y_m", "column"),
+    "lane": ("t_s", "s_m", "y_m", "column"),
+    "lateral_speed_mps": ("t_s", "vehicle", "y_m"),
+    "reserved_column": ("column",),
+    "reserved_lane": ("column", "lane"),
+    "preferred_lane": ("vehicle",),
+}
+"""Columns of the first schema from which others follow."""
 
 
 @frozen
@@ -33,10 +58,16 @@ class Tracks:
     s_m: Floats
     y_m: Floats
     speed_mps: Floats
+    lateral_speed_mps: Floats
     accel_mps2: Floats
     column: Ints
-    """Column of the cell, or `OFF_LATTICE`."""
+    """Column in which the body is, or `NO_LATTICE`."""
     lane: Ints
+    """Lane in which the centre of the body is."""
+    reserved_column: Ints
+    """Column of the cell that the vehicle holds or moves to, or `NO_LATTICE`."""
+    reserved_lane: Ints
+    """Lane of that cell, or `NO_LATTICE`."""
 
     @property
     def vehicle(self) -> Ints:
@@ -45,9 +76,9 @@ class Tracks:
 
     @property
     def changed(self) -> Bools:
-        """Whether the vehicle's cell in each row differs from its cell in the previous row."""
+        """Whether the vehicle's reserved cell in each row differs from that in the previous row."""
         changed = np.zeros(len(self.t_s), dtype=np.bool_)
-        changed[1:] = (np.diff(self.column) != 0) | (np.diff(self.lane) != 0)
+        changed[1:] = (np.diff(self.reserved_column) != 0) | (np.diff(self.reserved_lane) != 0)
         changed[self.starts[:-1]] = False
         return changed
 
@@ -70,33 +101,104 @@ def read_trips(folder: Path) -> dict[str, dict[str, Any]]:
     return {trip["vehicle"]: trip for trip in pq.read_table(folder / "trips.parquet").to_pylist()}
 
 
+def read_trajectories(folder: Path, columns: Sequence[str] | None = None) -> pa.Table:
+    """Return the trajectories of a run in the order of the file: by time.
+
+    Args:
+        folder: folder of the run, of this or of an earlier version.
+        columns: names of the columns to read; None: all of `columns.TRAJECTORIES`.
+
+    Raises:
+        BadInputError: there is no such column, or the trajectories cannot be read.
+    """
+    names = TRAJECTORIES.names if columns is None else list(columns)
+    for name in names:
+        if name not in TRAJECTORIES.names:
+            raise BadInputError("columns", name, "any of " + ", ".join(TRAJECTORIES.names))
+    try:
+        schema = (pq.read_schema(folder / FILE).metadata or {}).get(SCHEMA_KEY)
+        if schema is None:
+            return _from_first_schema(folder, names)
+        if schema.decode() != TRAJECTORIES.schema:
+            wanted = f"a recording with schema {TRAJECTORIES.schema} or an earlier one"
+            raise BadInputError(FILE, schema.decode(), wanted)
+        return pq.read_table(folder / FILE, columns=names)
+    except (OSError, ValueError, KeyError) as error:
+        raise not_a_run(folder, error) from error
+
+
+def _from_first_schema(folder: Path, names: Sequence[str]) -> pa.Table:
+    """Return columns of a recording without schema number; see the module's docstring."""
+    sources = [source for name in names for source in _SOURCES.get(name, (name,))]
+    wanted = [name for name in _FIRST_SCHEMA if name in sources]
+    table = pq.read_table(folder / FILE, columns=wanted).combine_chunks()
+    found: dict[str, Any] = {name: table[name] for name in wanted}
+    if "reserved_column" in names:
+        found["reserved_column"] = table["column"]
+    if "reserved_lane" in names:
+        no_column = table["column"].is_null()
+        found["reserved_lane"] = pc.if_else(no_column, pa.scalar(None, pa.int8()), table["lane"])
+    if "lateral_speed_mps" in names:
+        found["lateral_speed_mps"] = _lateral_speeds(table)
+    if "preferred_lane" in names:
+        preferred = {name: trip["preferred_lane"] for name, trip in read_trips(folder).items()}
+        vehicles = map(str, table["vehicle"].to_pylist())
+        found["preferred_lane"] = [preferred.get(name) for name in vehicles]
+    if "column" in names or "lane" in names:
+        lattice: Lattice = scenario_of(folder / FILE).lattice
+        t_s, s_m, y_m = (
+            table[name].to_numpy().astype(np.float64) for name in ("t_s", "s_m", "y_m")
+        )
+        columns, found["lane"] = body_cells(t_s, s_m, y_m, lattice)
+        no_lattice = np.asarray(table["column"].is_null())
+        found["column"] = pa.array(columns, mask=no_lattice)
+    whole = TRAJECTORIES.arrow_schema(pq.read_schema(folder / FILE).metadata)
+    chosen = pa.schema([field for field in whole if field.name in names])
+    schema = chosen.with_metadata(whole.metadata or {})
+    arrays = [
+        found[field.name].cast(field.type)
+        if isinstance(found[field.name], pa.ChunkedArray)
+        else pa.array(found[field.name], field.type)
+        for field in schema
+    ]
+    return pa.table(arrays, schema=schema).select(list(names))
+
+
+def _lateral_speeds(table: pa.Table) -> pa.Array[Any]:
+    """Return lateral speeds from differences of y; null for vehicles with a single row."""
+    vehicle = table["vehicle"].combine_chunks().dictionary_encode().indices.to_numpy()
+    t_s, y_m = (table[name].to_numpy().astype(np.float64) for name in ("t_s", "y_m"))
+    speeds = np.full(len(t_s), np.nan)
+    order = np.lexsort((t_s, vehicle))
+    bounds = np.flatnonzero(np.diff(vehicle[order])) + 1
+    for rows in np.split(order, bounds):
+        if len(rows) > 1:
+            speeds[rows] = np.gradient(y_m[rows], t_s[rows])
+    return pa.array(speeds, pa.float32(), mask=np.isnan(speeds))
+
+
 def read_tracks(folder: Path) -> Tracks:
     """Return the trajectories of a run.
 
     Raises:
         BadInputError: the trajectories cannot be read.
     """
-    columns = ["vehicle", "t_s", "s_m", "y_m", "speed_mps", "accel_mps2", "column", "lane"]
-    try:
-        table = pq.read_table(folder / TRAJECTORIES, columns=columns)
-    except (OSError, ValueError, KeyError) as error:
-        raise not_a_run(folder, error) from error
+    table = read_trajectories(folder, ["t_s", "vehicle", *_FLOATS, *_COLUMNS, *_LANES])
     codes = table["vehicle"].combine_chunks().dictionary_encode()
     names = [str(name) for name in codes.dictionary.to_pylist()]
     vehicle = codes.indices.to_numpy(zero_copy_only=False).astype(np.int64)
     t_s = table["t_s"].to_numpy().astype(np.float64)
     order = np.lexsort((t_s, vehicle))
     counts = np.bincount(vehicle, minlength=len(names))
-    values = {
-        name: table[name].to_numpy()[order].astype(np.float64)
-        for name in ("s_m", "y_m", "speed_mps", "accel_mps2")
+    values: dict[str, Any] = {
+        name: table[name].to_numpy()[order].astype(np.float64) for name in _FLOATS
     }
-    column = pc.fill_null(pc.cast(table["column"], "int64"), int(OFF_LATTICE)).to_numpy()
+    for name in (*_COLUMNS, *_LANES):
+        column = pc.fill_null(pc.cast(table[name], "int64"), int(NO_LATTICE)).to_numpy()
+        values[name] = column[order].astype(np.int64)
     return Tracks(
         names=tuple(names),
         starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         t_s=t_s[order],
         **values,
-        column=column[order].astype(np.int64),
-        lane=table["lane"].to_numpy()[order].astype(np.int64),
     )

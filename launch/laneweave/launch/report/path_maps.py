@@ -22,7 +22,7 @@ from laneweave.launch.drawing.figures import INK, write
 from laneweave.launch.formation_columns import FormationColumns
 from laneweave.launch.recordings.formations import read_events, recorded_formations
 from laneweave.launch.recordings.runs import Run
-from laneweave.launch.recordings.trajectories import OFF_LATTICE, Floats, Tracks, read_trips
+from laneweave.launch.recordings.trajectories import NO_LATTICE, Floats, Tracks, read_trips
 from laneweave.launch.report.style import SMALL_TEXT, picture
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
@@ -114,7 +114,7 @@ def _map_of(
     formation: FormationColumns, members: list[tuple[int, int]], tracks: Tracks, run: Run
 ) -> DrivenMap | None:
     parts = [tracks.rows(number) for number, _ in members]
-    if any((tracks.column[part] == OFF_LATTICE).any() for part in parts):
+    if any((tracks.reserved_column[part] == NO_LATTICE).any() for part in parts):
         return None
     changes_s = [float(t_s) for part in parts for t_s in tracks.t_s[part][tracks.changed[part]]]
     tick_s = run.scenario.runtime.tick_s
@@ -129,7 +129,8 @@ def _map_of(
         # Row of the vehicle at or before each time.
         places = np.searchsorted(tracks.t_s[part], times_s, side="right") - 1
         places = np.maximum(places, 0)
-        columns, lanes = tracks.column[part][places] - formation.rear, tracks.lane[part][places]
+        columns = tracks.reserved_column[part][places] - formation.rear
+        lanes = tracks.reserved_lane[part][places]
         cells.append(tuple(zip(columns.tolist(), lanes.tolist(), strict=True)))
     # Order of the paper's table: from front to rear, then from right to left.
     order = sorted(range(len(cells)), key=lambda row: (-cells[row][0][0], cells[row][0][1]))

@@ -135,13 +135,16 @@ def default_stretch_m(scenario: Scenario) -> tuple[float, float]:
 
 def _pose(tracks: Tracks, number: int, t_s: float) -> tuple[float, float, float, float] | None:
     """Return (s m, y m, heading rad, speed m/s) of a vehicle; None if it is not on the road."""
-    times_s, y_m = tracks.t_s[tracks.rows(number)], tracks.y_m[tracks.rows(number)]
+    times_s = tracks.t_s[tracks.rows(number)]
     if not times_s[0] - 1e-6 <= t_s <= times_s[-1] + 1e-6:
         return None
     at = np.array([t_s])
-    place = [float(tracks.sampled(number, name, at)[0]) for name in ("s_m", "y_m", "speed_mps")]
-    lateral_mps = np.interp(t_s, times_s, np.gradient(y_m, times_s)) if len(y_m) > 1 else 0.0
-    return place[0], place[1], float(np.arctan2(lateral_mps, max(place[2], 0.1))), place[2]
+    names = ("s_m", "y_m", "speed_mps", "lateral_speed_mps")
+    s_m, y_m, speed_mps, lateral_mps = (
+        float(tracks.sampled(number, name, at)[0]) for name in names
+    )
+    heading = np.arctan2(np.nan_to_num(lateral_mps), max(speed_mps, 0.1))
+    return s_m, y_m, float(heading), speed_mps
 
 
 def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -> None:

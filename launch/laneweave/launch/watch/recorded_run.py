@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from laneweave.launch.formation_columns import Formations
 from laneweave.launch.recordings.formations import closed_formations
 from laneweave.launch.recordings.runs import Run, not_a_run, single_run
-from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks, read_tracks, read_trips
+from laneweave.launch.recordings.trajectories import NO_LATTICE, Tracks, read_tracks, read_trips
 from laneweave.launch.run_methods import FORMATION
 from laneweave.launch.watch.frames import MOVING, EventFeed, Row, compact, plan_row, scene_of
 from laneweave.protocol.lattice import Cell
@@ -122,8 +122,12 @@ class Recording:
         for place, vehicle in self._rows[first:last]:
             name = tracks.names[vehicle]
             trip = self._trips.get(name, {})
-            column, lane = int(tracks.column[place]), int(tracks.lane[place])
-            cell: Cell | None = None if column == OFF_LATTICE else (column, lane)
+            column, lane = int(tracks.reserved_column[place]), int(tracks.reserved_lane[place])
+            cell: Cell | None = None
+            if column == NO_LATTICE:
+                lane = int(tracks.lane[place])
+            else:
+                cell = column, lane
             if cell is not None and self._lane_ends.has_passed(cell, t_s):
                 cell = None
             y_m = float(tracks.y_m[place])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 LEADER_ELECTED: Final = "leader-elected"
@@ -67,3 +68,89 @@ RUN_ENDED: Final = "run-ended"
 
 PLAN_EVENTS: Final = (PLAN_MADE, STREAM_PLANNED)
 """Events that report a plan for a formation or for the whole stream."""
+
+FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
+    LEADER_ELECTED: ("term",),
+    LEADER_STEPPED_DOWN: ("term",),
+    LEADER: ("coordinator", "term"),
+    PLAN_MADE: (
+        *("formation", "vehicles", "status", "cost", "lower_bound", "steps", "solve_ms"),
+        *("assignments_tried", "nodes_expanded", "solver", "fallback", "t0_s", "slot_s"),
+    ),
+    STREAM_PLANNED: (
+        *("slot", "vehicles", "missed", "moves", "ballots", "largest", "status", "solve_ms"),
+    ),
+    PLAN_IN_FORCE: ("formation", "slot", "closed_s"),
+    PLANNING_FAILED: ("formation", "slot", "status", "error"),
+    PLANNING_LATE: ("slot",),
+    TRANSFER_ABORTED: ("roster", "why"),
+    STRUCTURE_TOO_LATE: ("formation", "stage"),
+    STRUCTURE_IMPOSSIBLE: ("formation", "stage", "why"),
+    FORMATION_TOO_LATE: ("formation",),
+    FORMATIONS_JOINED: ("formations", "why"),
+    ROOM_AWAITED: ("formation",),
+    NEIGHBOURS_AWAITED: ("formation", "slots"),
+    LANE_OUT_OF_REACH: ("formation", "vehicles"),
+    FORMATION_CLOSED: ("formation", "vehicles", "columns"),
+    ENTERED: ("vehicle", "lane", "preferred_lane", "destination", "formation"),
+    LEFT: ("vehicle", "lane", "exit", "on_preferred_lane"),
+    LEFT_OFF_LANE: ("vehicle", "lane", "exit", "preferred_lane", "destination", "attended"),
+    LEFT_LATTICE: ("vehicle", "lane"),
+    MISSED_EXIT: ("vehicle", "lane"),
+    DRIVES_OUT: ("vehicle", "lane"),
+    ENTERED_LATTICE: ("vehicle", "lane"),
+    AGENT_MISSING: ("vehicle",),
+    AGENT_SILENT: ("vehicle",),
+    CARETAKER_TOOK_OVER: ("vehicle", "reason"),
+    AGENT_TOOK_OVER: ("vehicle", "previous"),
+    OVERLAP: ("vehicles",),
+    RUN_ENDED: ("ending",),
+}
+"""Data of each event, beside `COMMON_FIELDS`."""
+COMMON_FIELDS: Final = ("t_s", "kind", "role", "name")
+"""Keys of every line; `name` is absent from events of the bridge."""
+MEANINGS: Final[Mapping[str, str]] = {
+    "t_s": "road time [s]",
+    "kind": "kind of the event",
+    "role": "role of the sender: bridge or coordinator",
+    "name": "name of the coordinator",
+    "term": "term of the leader",
+    "coordinator": "name of the leader",
+    "formation": "number of the formation; of joined ones, of the foremost",
+    "formations": "numbers of the joined formations",
+    "vehicles": "number of vehicles in the plan; in other events, names of the vehicles",
+    "status": "as in the response to a plan request",
+    "cost": "sum over the vehicles of the number of steps until the final arrival",
+    "lower_bound": "proven lower bound of the cost",
+    "steps": "number of steps of the plan",
+    "solve_ms": "time to make the plan [ms]",
+    "assignments_tried": "number of assignments that the solver tried",
+    "nodes_expanded": "number of nodes that the solver expanded",
+    "solver": "name of the solver",
+    "fallback": "whether it planned in place of the chosen solver",
+    "t0_s": "road time at which the first step begins [s]",
+    "slot_s": "T_F: duration of a step [s]",
+    "slot": "number of the slot of the rolling operation",
+    "slots": "number of slots in which the plan pauses",
+    "missed": "number of vehicles that the plan leaves off their preferred lanes",
+    "moves": "number of moves in the slot",
+    "ballots": "number of cell transfers in the slot",
+    "largest": "maximum number of vehicles in a cell transfer",
+    "closed_s": "road time at which the formation closed, or the snapshot was taken [s]",
+    "error": "why there is no plan",
+    "roster": "names of the vehicles of the cell transfer",
+    "why": "reason",
+    "stage": "number of the driving structure on the road",
+    "columns": "rearmost and foremost column of the formation",
+    "vehicle": "name of the vehicle",
+    "lane": "lane; 0 is the rightmost",
+    "preferred_lane": "lane in which the vehicle wants to leave; -1: any",
+    "destination": "name of the exit by which the vehicle wants to leave; end: end of the road",
+    "exit": "name of the exit by which the vehicle left; end: end of the road",
+    "on_preferred_lane": "whether the vehicle left where it wanted to",
+    "attended": "whether its agent was in charge, not a caretaker",
+    "reason": "why the agent was not in charge",
+    "previous": "who was in charge before: caretaker or agent",
+    "ending": "as in summary.json",
+}
+"""What each field means."""

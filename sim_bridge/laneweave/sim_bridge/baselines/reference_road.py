@@ -62,9 +62,8 @@ class ReferenceVehicle:
         return self.s_m, self.speed_mps, self.accel_mps2, self.y_m, self.lateral_speed_mps, 0.0
 
     @property
-    def cell(self) -> tuple[None, int]:
-        """(None, lane), since there are no columns."""
-        return None, self.lane
+    def cell(self) -> None:
+        """None, since the vehicle reserves no cells."""
 
     @property
     def rung_ticks(self) -> Mapping[Rung, int]:

@@ -1,6 +1,6 @@
 """The record of a run: its files, and the results of all roles in `summary.json`.
 
-    trajectories.parquet   one row per vehicle per tick
+    trajectories.parquet   one row per vehicle and tick
     trips.parquet          one row per demanded vehicle
     ticks.parquet          one row per tick
     events.jsonl           one JSON object per line, flushed line by line
@@ -9,8 +9,8 @@ The Parquet files are written in row groups during the run, and can be read afte
 the record stores only what is on the road or not written yet, however long the run is. The summary
 is computed from the files when the run ends.
 
-The metadata of the first two files contain the scenario as JSON (key `SCENARIO_KEY`), so that
-figures can be drawn from these files alone.
+The metadata of the first two files contain the scenario as JSON (`columns.SCENARIO_KEY`), so that
+figures can be drawn from these files alone. The columns are declared in the module `columns`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from typing import Protocol
 import pyarrow as pa
 from attrs import define, field
 
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import END_OF_ROAD, Exits, LaneSection
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import (
@@ -84,8 +85,8 @@ class RecordedVehicle(Protocol):
         """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""
 
     @property
-    def cell(self) -> tuple[int | None, int]:
-        """(column, lane) that the vehicle holds or moves to; column None: off the lattice."""
+    def cell(self) -> Cell | None:
+        """Cell that the vehicle holds or moves to; None: the method has no lattice."""
 
     @property
     def rung_ticks(self) -> Mapping[Rung, int]:
@@ -132,6 +133,7 @@ class RunRecord:
         self._trajectories = Trajectories(
             folder / "trajectories.parquet",
             metadata,
+            scenario.lattice,
             max(own.vehicle.min_accel_mps2 for own in scenario.types.values()),
             self._min_accel_of if scenario.vehicle_type else None,
         )
@@ -374,6 +376,7 @@ class RunRecord:
 
 
 def _sample(vehicle: RecordedVehicle) -> Sample:
-    s_m, v_mps, a_mps2, y_m, _, _ = vehicle.state
-    column, lane = vehicle.cell
-    return (vehicle.name, s_m, y_m, v_mps, a_mps2, column, lane)
+    s_m, v_mps, a_mps2, y_m, v_y_mps, _ = vehicle.state
+    reserved = vehicle.cell or (None, None)
+    preferred_lane = vehicle.arrival.preferred_lane
+    return (vehicle.name, s_m, y_m, v_mps, v_y_mps, a_mps2, *reserved, preferred_lane)

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from laneweave.protocol.summary import DurationMs
+from laneweave.sim_bridge.recording.columns import TICKS
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 from laneweave.sim_bridge.recording.trips import percentiles_of
 
 ROWS_PER_GROUP = 3000
 """Number of rows that are written together."""
-_COLUMNS: list[pa.Field[Any]] = [
-    pa.field("t_s", pa.float64()),
-    pa.field("on_road", pa.int32()),
-    pa.field("tick_ms", pa.float32()),
-]
 
 
 class Ticks:
@@ -28,7 +23,7 @@ class Ticks:
     def __init__(self, path: Path) -> None:
         """Open the file."""
         self._path = path
-        self._file = GrowingParquet(path, pa.schema(_COLUMNS))
+        self._file = GrowingParquet(path, TICKS.arrow_schema())
         self._rows: list[tuple[float, int, float]] = []
         """Buffered rows."""
 
@@ -55,6 +50,7 @@ class Ticks:
             return
         columns, self._rows = zip(*self._rows, strict=True), []
         arrays = [
-            pa.array(column, field.type) for column, field in zip(columns, _COLUMNS, strict=True)
+            pa.array(values, column.type)
+            for values, column in zip(columns, TICKS.columns, strict=True)
         ]
         self._file.append(pa.RecordBatch.from_arrays(arrays, schema=self._file.schema))

@@ -1,4 +1,4 @@
-"""Trajectories: one row per vehicle per tick in `trajectories.parquet`, and extreme values."""
+"""Trajectories: one row per vehicle and tick in `trajectories.parquet`, and extreme values."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
+from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.summary import Safety
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
+from laneweave.sim_bridge.recording.columns import TRAJECTORIES, Metadata
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
-from laneweave.sim_bridge.recording.trips import Metadata, finite
+from laneweave.sim_bridge.recording.trips import finite
 
 ROWS_PER_GROUP = 100_000
 """Number of rows that are written together."""
@@ -21,22 +25,34 @@ TICKS_PER_GROUP = 3000
 EMERGENCY_SHARE = 0.9
 """Fraction of the braking limit beyond which braking counts as emergency braking."""
 
-_COLUMNS: list[pa.Field[Any]] = [
-    pa.field("t_s", pa.float64(), nullable=False),
-    pa.field("vehicle", pa.string(), nullable=False),
-    pa.field("s_m", pa.float32(), nullable=False),
-    pa.field("y_m", pa.float32(), nullable=False),
-    pa.field("speed_mps", pa.float32(), nullable=False),
-    pa.field("accel_mps2", pa.float32(), nullable=False),
-    pa.field("column", pa.int32()),
-    pa.field("lane", pa.int8(), nullable=False),
-]
+Sample = tuple[str, float, float, float, float, float, int | None, int | None, int]
+"""(vehicle, s [m], y [m], speed [m/s], lateral speed [m/s], acceleration [m/s2], reserved column,
+reserved lane, preferred lane).
 
-Sample = tuple[str, float, float, float, float, int | None, int]
-"""(vehicle, s [m], y [m], speed [m/s], acceleration [m/s2], column or None off the lattice, lane).
-
-s: front bumper; y: centre of the body from the right road edge; column and lane: cell.
+s: front bumper; y: centre of the body from the right road edge; reserved cell: None without a
+lattice.
 """
+_SAMPLED = [name for name in TRAJECTORIES.names if name not in ("t_s", "column", "lane")]
+"""Columns of the values of a sample."""
+
+
+def body_cells(
+    t_s: NDArray[np.float64],
+    s_m: NDArray[np.float64],
+    y_m: NDArray[np.float64],
+    lattice: Lattice,
+) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
+    """Return the columns and lanes in which bodies are; all arrays have shape (rows,).
+
+    Args:
+        t_s: road times [s].
+        s_m: positions of the front bumpers [m].
+        y_m: centres of the bodies, from the right road edge [m].
+        lattice: the lattice.
+    """
+    columns = np.rint((s_m - lattice.speed_mps * t_s) / lattice.pitch_m).astype(np.int32)
+    lanes = np.clip(np.floor(y_m / lattice.lane_width_m), 0, lattice.lanes - 1)
+    return columns, lanes.astype(np.int8)
 
 
 class Trajectories:
@@ -46,6 +62,7 @@ class Trajectories:
         self,
         path: Path,
         metadata: Metadata,
+        lattice: Lattice,
         min_accel_mps2: float,
         min_accel_of: Callable[[str], float] | None = None,
     ) -> None:
@@ -54,6 +71,7 @@ class Trajectories:
         Args:
             path: the file.
             metadata: its metadata.
+            lattice: the lattice of the scenario.
             min_accel_mps2: braking limit of the type that brakes least.
             min_accel_of: returns the braking limit of a vehicle; None: it is that of all.
         """
@@ -61,10 +79,13 @@ class Trajectories:
         """Maximum number of vehicles on the road at a tick."""
         self._file = GrowingParquet(
             path,
-            pa.schema(_COLUMNS, metadata),
-            use_dictionary=["t_s", "vehicle", "column", "lane"],
-            use_byte_stream_split=["s_m", "y_m", "speed_mps", "accel_mps2"],
+            TRAJECTORIES.arrow_schema(metadata),
+            use_dictionary=[one.name for one in TRAJECTORIES.columns if one.type != pa.float32()],
+            use_byte_stream_split=[
+                one.name for one in TRAJECTORIES.columns if one.type == pa.float32()
+            ],
         )
+        self._lattice = lattice
         self._times: list[float] = []
         self._rows: list[Sample] = []
         """Buffered rows; `_times` contains their times."""
@@ -83,7 +104,7 @@ class Trajectories:
     def tick(self, t_s: float, rows: list[Sample]) -> None:
         """Record all vehicles on the road; called once per tick."""
         brake_mps2, last_accels, dt_s = self._brake_mps2, self._last_accels, t_s - self._last_s
-        accels = {row[0]: row[4] for row in rows}
+        accels = {row[0]: row[5] for row in rows}
         for vehicle, accel in accels.items():
             last = last_accels.get(vehicle)
             if last is not None and dt_s > 0.0:
@@ -141,9 +162,13 @@ class Trajectories:
         self._buffered_ticks = 0
         if not self._rows:
             return
-        columns = [self._times, *zip(*self._rows, strict=True)]
+        samples = dict(zip(_SAMPLED, zip(*self._rows, strict=True), strict=True))
+        values: dict[str, Any] = {"t_s": np.array(self._times), **samples}
         self._times, self._rows = [], []
-        arrays = [
-            pa.array(column, field.type) for column, field in zip(columns, _COLUMNS, strict=True)
-        ]
+        s_m, y_m = np.array(values["s_m"]), np.array(values["y_m"])
+        columns, lanes = body_cells(values["t_s"], s_m, y_m, self._lattice)
+        no_lattice = np.array([one is None for one in values["reserved_column"]])
+        values |= {"column": pa.array(columns, mask=no_lattice), "lane": lanes}
+        values |= {"s_m": s_m.astype(np.float32), "y_m": y_m.astype(np.float32)}
+        arrays = [pa.array(values[one.name], one.type) for one in TRAJECTORIES.columns]
         self._file.append(pa.RecordBatch.from_arrays(arrays, schema=self._file.schema))

@@ -20,37 +20,14 @@ from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.protocol.summary import TravelTime, TripTimes
 from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.recording.columns import SCENARIO_KEY, TRIPS, Metadata
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 from laneweave.sim_bridge.road.demand import Arrival
 
-Metadata = dict[bytes | str, bytes | str]
-SCENARIO_KEY = b"laneweave.scenario"
-"""Key of the scenario in the metadata of a run's Parquet files."""
 ROWS_PER_GROUP = 500
 """Number of rows that are written together."""
 WARM_UP_S = 60.0
 """Road time from which drawn vehicles that enter are counted; until then the road fills up."""
-
-_COLUMNS: list[pa.Field[Any]] = [
-    pa.field("vehicle", pa.string(), nullable=False),
-    pa.field("arrival_lane", pa.int8(), nullable=False),
-    pa.field("preferred_lane", pa.int8(), nullable=False),
-    pa.field("final_lane", pa.int8()),
-    pa.field("on_preferred_lane", pa.bool_()),
-    pa.field("demanded_s", pa.float64(), nullable=False),
-    pa.field("entered_s", pa.float64()),
-    pa.field("left_s", pa.float64()),
-    pa.field("travel_time_s", pa.float64()),
-    pa.field("entry_delay_s", pa.float64()),
-    pa.field("formation", pa.int32()),
-    pa.field("counted", pa.bool_(), nullable=False),
-    pa.field("entrance", pa.string(), nullable=False),
-    pa.field("destination", pa.string(), nullable=False),
-    pa.field("exit", pa.string()),
-    pa.field("free_flow_s", pa.float64(), nullable=False),
-    pa.field("vehicle_type", pa.string(), nullable=False),
-    pa.field("sumo_id", pa.string()),
-]
 
 
 @define
@@ -112,7 +89,7 @@ def metadata_of(scenario: Scenario) -> Metadata:
 def trips_table(trips: Iterable[Trip], last_arrival_s: float, metadata: Metadata) -> pa.Table:
     """Return the table of trips; `last_arrival_s` is the road time of the last arrival."""
     rows = [trip.row(last_arrival_s) for trip in trips]
-    return pa.Table.from_pylist(rows, schema=pa.schema(_COLUMNS, metadata))
+    return pa.Table.from_pylist(rows, schema=TRIPS.arrow_schema(metadata))
 
 
 class Trips:
@@ -122,7 +99,7 @@ class Trips:
         """Open the file."""
         self._path = path
         self._metadata = metadata
-        self._file = GrowingParquet(path, pa.schema(_COLUMNS, metadata))
+        self._file = GrowingParquet(path, TRIPS.arrow_schema(metadata))
         self._trips: dict[Name, Trip] = {}
         """Trips that are not written yet, in order of arrival."""
         self._last_arrival_s = -math.inf

@@ -8,7 +8,7 @@ from attrs import evolve
 
 from evaluation.lattice_points import TOLERANCE_M, lattice_spacing
 from evaluation.points import slow_stretch, within_limits
-from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks
+from laneweave.launch.recordings.trajectories import NO_LATTICE, Tracks
 from laneweave.protocol.config.scenario_files import load_scenario
 from support.tracks import make_tracks
 
@@ -29,7 +29,7 @@ def parked(*vehicles: Vehicle) -> Tracks:
         s_m=[LATTICE.speed_mps * t_s + LATTICE.pitch_m * c + ahead_m for c, _, ahead_m in vehicles],
         y_m=[LATTICE.cell_y_m(lane) for _, lane, _ in vehicles],
         speed_mps=[LATTICE.speed_mps] * len(vehicles),
-        column=[column for column, _, _ in vehicles],
+        reserved_column=[column for column, _, _ in vehicles],
         lane=[lane for _, lane, _ in vehicles],
     )
 
@@ -38,12 +38,12 @@ def moved(tracks: Tracks, vehicle: int, slot: int, column: int) -> Tracks:
     """Return tracks in which a vehicle moves to another column in a slot."""
     rows = tracks.rows(vehicle)
     begin, end = rows.start + 40 * slot, rows.start + 40 * (slot + 1)
-    columns, s_m = tracks.column.copy(), tracks.s_m.copy()
+    columns, s_m = tracks.reserved_column.copy(), tracks.s_m.copy()
     steps = column - int(columns[begin])
     columns[begin + 1 : rows.stop] = column
     s_m[begin:end] += np.linspace(0.0, steps * LATTICE.pitch_m, 40)
     s_m[end : rows.stop] += steps * LATTICE.pitch_m
-    return evolve(tracks, column=columns, s_m=s_m)
+    return evolve(tracks, reserved_column=columns, s_m=s_m)
 
 
 def test_spacing_is_from_front_to_front_on_a_lane() -> None:
@@ -99,7 +99,7 @@ def test_vehicles_that_have_just_entered_do_not_count() -> None:
 def test_without_a_lattice_no_distance_is_examined() -> None:
     tracks = parked((0, 0, 0.0), (1, 0, -9.0))
     found = lattice_spacing(
-        evolve(tracks, column=np.full_like(tracks.column, OFF_LATTICE)), SCENARIO
+        evolve(tracks, reserved_column=np.full_like(tracks.reserved_column, NO_LATTICE)), SCENARIO
     )
     assert (found.least_m, found.pairs, found.worst_off_m) == (None, 0, None)
     assert lattice_spacing(make_tracks(np.empty(0), 0), SCENARIO).pairs == 0

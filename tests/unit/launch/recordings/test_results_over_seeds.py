@@ -61,3 +61,15 @@ def test_counts_are_integers() -> None:
     table = results_table([run(1, make_summary()), run(2, None)])
     assert table.schema.field("vehicles_left").type == pa.int64()
     assert table.schema.field("road_m").type == pa.float64()
+
+
+def test_columns_say_what_they_contain() -> None:
+    times = {"by_entrance": {"main": {"n": 9, "mean": 70.0, "delay": 2.0}}}
+    own = make_summary(travel_time_s=times, planning={"by_solver": {"tappa": 3}})
+    about = {field.name: field.metadata or {} for field in results_table([run(1, own)]).schema}
+    for name, metadata in about.items():
+        assert metadata[b"meaning"].decode() != name
+    assert about["travel_time_s_by_entrance_main_mean"][b"unit"] == b"s"
+    assert about["safety_max_jerk_mps3"][b"unit"] == b"m/s3"
+    assert about[PREFERRED][b"unit"] == b"%"
+    assert about["planning_by_solver_tappa"][b"meaning"] == b"plans by solver"

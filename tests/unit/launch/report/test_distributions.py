@@ -165,7 +165,9 @@ def formations_of_two_lengths(folder: Path) -> tuple[Run, Tracks]:
         slot = np.clip(np.floor((t_s - start_s) / slot_s + 1e-6) + 1, 0, 2).astype(int)
         columns.append(np.array([column for column, _ in path])[slot])
         lanes.append(np.array([lane for _, lane in path])[slot])
-    driven = evolve(make_tracks(t_s, 4, column=columns, lane=lanes), names=tuple(cells))
+    driven = evolve(
+        make_tracks(t_s, 4, reserved_column=columns, reserved_lane=lanes), names=tuple(cells)
+    )
     trips = {
         "vehicle": list(cells),
         "preferred_lane": [path[-1][1] for _, path, _, _ in cells.values()],

@@ -48,15 +48,16 @@ def record(folder: Path, scenario: Scenario, trips: Sequence[Trip]) -> None:
     folder.mkdir(exist_ok=True)
     last_arrival_s = max((trip.arrival.t_s for trip in trips), default=0.0)
     pq.write_table(trips_table(trips, last_arrival_s, metadata), folder / "trips.parquet")
-    with closing(Trajectories(folder / "trajectories.parquet", metadata, -9.0)) as trajectories:
+    path, lattice = folder / "trajectories.parquet", scenario.lattice
+    with closing(Trajectories(path, metadata, lattice, -9.0)) as trajectories:
         for tick in range(1300):
             samples: list[Sample] = []
             for number, trip in enumerate(trips):
                 s_m = 15.0 * (0.1 * tick - (trip.entered_s or 0.0))
                 if 0.0 <= s_m < 1000.0:
-                    y_m, column = (trip.arrival.lane + 0.5) * 3.5, -number
-                    in_column = column if trip.formation is not None else None
-                    samples.append((f"v{number}", s_m, y_m, 15.0, 0.0, in_column, 0))
+                    y_m, preferred = (trip.arrival.lane + 0.5) * 3.5, trip.arrival.preferred_lane
+                    cell = (None, None) if trip.formation is None else (-number, 0)
+                    samples.append((f"v{number}", s_m, y_m, 15.0, 0.0, 0.0, *cell, preferred))
             trajectories.tick(0.1 * tick, samples)
 
 

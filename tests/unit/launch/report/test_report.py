@@ -107,7 +107,7 @@ def test_of_a_run(laneweave: Here, swept: Path, tmp_path: Path) -> None:
 def test_of_a_run_without_formations(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(swept / "formation-1000-1", folder)
-    for file, name in (("trips.parquet", "formation"), ("trajectories.parquet", "column")):
+    for file, name in (("trips.parquet", "formation"), ("trajectories.parquet", "reserved_column")):
         whole = pq.read_table(folder / file)
         place = whole.schema.get_field_index(name)
         nothing = pa.nulls(whole.num_rows, whole.schema.field(name).type)

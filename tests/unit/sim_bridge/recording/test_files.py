@@ -17,6 +17,15 @@ from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording import trajectories as trajectories_module
 from laneweave.sim_bridge.recording import trips as trips_module
+from laneweave.sim_bridge.recording.columns import (
+    ROAD,
+    SCHEMA_KEY,
+    TICKS,
+    TRAJECTORIES,
+    TRIPS,
+    Table,
+)
+from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import (
     Trip,
@@ -29,6 +38,7 @@ from laneweave.sim_bridge.recording.trips import (
 from laneweave.sim_bridge.road.demand import Arrival
 
 METADATA = metadata_of(Scenario())
+LATTICE = Scenario().lattice
 
 
 def trip(
@@ -54,7 +64,7 @@ def table(*trips: Trip) -> pa.Table:
 
 @pytest.fixture
 def trajectories(tmp_path: Path) -> Trajectories:
-    return Trajectories(tmp_path / "trajectories.parquet", METADATA, -10.0)
+    return Trajectories(tmp_path / "trajectories.parquet", METADATA, LATTICE, -10.0)
 
 
 def test_trajectories_come_back(
@@ -67,20 +77,66 @@ def test_trajectories_come_back(
         for tick in range(40):
             samples: list[Sample] = []
             for n in range(tick % 5):
-                s_m, y_m, speed, accel = map(float, rng.uniform(0, 10, 4))
-                samples.append((f"v{n}", s_m, y_m, speed, accel, -n if n else None, n % 3))
+                s_m, y_m, speed, across, accel = map(float, rng.uniform(0, 10, 5))
+                cell = (-n, n % 3) if n else (None, None)
+                samples.append((f"v{n}", s_m, y_m, speed, across, accel, *cell, 2 - n % 3))
             trajectories.tick(0.1 * tick, samples)
             expected += [(0.1 * tick, *sample) for sample in samples]
     file = pq.ParquetFile(tmp_path / "trajectories.parquet")
     assert file.num_row_groups > 2
     found = file.read()
-    names = ["t_s", "vehicle", "s_m", "y_m", "speed_mps", "accel_mps2", "column", "lane"]
-    assert found.column_names == names
+    floats = ["s_m", "y_m", "speed_mps", "lateral_speed_mps", "accel_mps2"]
+    names = ["t_s", "vehicle", *floats, "reserved_column", "reserved_lane", "preferred_lane"]
+    assert {*found.column_names} == {*names, "column", "lane"}
     rows = list(zip(*(found[name].to_pylist() for name in names), strict=True))
     for row, wanted in zip(rows, expected, strict=True):
         assert row[:2] == wanted[:2]
-        assert row[2:6] == pytest.approx(wanted[2:6], rel=1e-6)
-        assert row[6:] == wanted[6:]
+        assert row[2:7] == pytest.approx(wanted[2:7], rel=1e-6)
+        assert row[7:] == wanted[7:]
+
+
+@pytest.mark.parametrize("passed", [0.45, 0.55])
+def test_column_and_lane_are_those_of_the_body_during_a_move(
+    trajectories: Trajectories, tmp_path: Path, passed: float
+) -> None:
+    """A vehicle moves from cell (-2, 1) to (-3, 2); each coordinate changes half-way."""
+    s_m = LATTICE.cell_s_m(-2, 40.0) - passed * LATTICE.pitch_m
+    y_m = LATTICE.cell_y_m(1) + passed * LATTICE.lane_width_m
+    with closing(trajectories):
+        trajectories.tick(40.0, [("a", s_m, y_m, 14.0, 1.2, 0.0, -3, 2, 0)])
+    (row,) = pq.read_table(tmp_path / "trajectories.parquet").to_pylist()
+    assert (row["column"], row["lane"]) == ((-2, 1) if passed < 0.5 else (-3, 2))
+    assert (row["reserved_column"], row["reserved_lane"]) == (-3, 2)
+    assert row["lateral_speed_mps"] == pytest.approx(1.2)
+
+
+def test_without_a_lattice_there_are_no_columns(trajectories: Trajectories, tmp_path: Path) -> None:
+    with closing(trajectories):
+        trajectories.tick(40.0, [("a", 100.0, 5.0, 14.0, 0.0, 0.0, None, None, 0)])
+    (row,) = pq.read_table(tmp_path / "trajectories.parquet").to_pylist()
+    assert (row["column"], row["reserved_column"]) == (None, None)
+    assert (row["lane"], row["reserved_lane"]) == (1, None)
+
+
+@pytest.mark.parametrize("declared", [TRAJECTORIES, TRIPS, TICKS], ids=lambda one: one.schema)
+def test_files_describe_their_columns(declared: Table, tmp_path: Path) -> None:
+    path = tmp_path / "file.parquet"
+    GrowingParquet(path, declared.arrow_schema({"other": "kept"})).close()
+    found = pq.read_schema(path)
+    metadata = found.metadata or {}
+    assert metadata[SCHEMA_KEY].decode() == declared.schema
+    assert metadata[b"other"] == b"kept"
+    for column, field in zip(declared.columns, found, strict=True):
+        assert (field.name, field.type, field.nullable) == (
+            column.name,
+            column.type,
+            column.nullable,
+        )
+        assert (field.metadata or {})[b"meaning"].decode() == column.meaning
+        assert (field.metadata or {}).get(b"unit", b"").decode() == column.unit
+        unit = {"s": "s", "ms": "ms", "m": "m", "mps": "m/s", "mps2": "m/s2"}
+        assert column.unit == unit.get(column.name.rpartition("_")[2], "")
+        assert ("position" in column.meaning) <= (column.frame == ROAD)
 
 
 def test_trips_have_every_state() -> None:
@@ -182,7 +238,7 @@ def test_few_rows_are_written_after_some_time(
     monkeypatch.setattr(trajectories_module, "TICKS_PER_GROUP", 4)
     with closing(trajectories):
         for tick in range(6):
-            trajectories.tick(0.1 * tick, [("a", 0.0, 1.0, 15.0, 0.0, None, 0)])
+            trajectories.tick(0.1 * tick, [("a", 0.0, 1.0, 15.0, 0.0, 0.0, None, None, 0)])
         assert pq.read_table(tmp_path / "trajectories.parquet").num_rows == 4
 
 
@@ -209,7 +265,9 @@ def test_safety_is_the_worst_of_the_run(trajectories: Trajectories) -> None:
 def test_emergency_brakes_are_counted_by_episode(trajectories: Trajectories) -> None:
     accels = {"a": [0.0, -9.5, -10.0, -8.0, -9.1, 0.0], "b": [0.0, 1.0, 1.5, 1.5, -8.9, -9.0]}
     for tick in range(6):
-        rows: list[Sample] = [(v, 0.0, 1.0, 15.0, accels[v][tick], None, 0) for v in accels]
+        rows: list[Sample] = [
+            (v, 0.0, 1.0, 15.0, 0.0, accels[v][tick], None, None, 0) for v in accels
+        ]
         trajectories.tick(0.1 * tick, rows)
     safety = trajectories.safety()
     assert trajectories.peak == 2

@@ -17,8 +17,8 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
+from laneweave.sim_bridge.recording.columns import SCENARIO_KEY
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
-from laneweave.sim_bridge.recording.trips import SCENARIO_KEY
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -239,9 +239,9 @@ def test_positions_and_overlaps_are_recorded(record: RunRecord, tmp_path: Path) 
     (event,) = read_events(tmp_path, "overlap")
     assert (event["vehicles"], event["t_s"]) == (list(pair), 0.1)
     rows = pq.read_table(tmp_path / "trajectories.parquet").to_pylist()
-    assert [(row["vehicle"], row["column"], row["lane"]) for row in rows] == [
-        (name, -2, 0) for _ in range(3) for name in pair
-    ]
+    cells = [(row["vehicle"], row["reserved_column"], row["reserved_lane"]) for row in rows]
+    assert cells == [(name, -2, 0) for _ in range(3) for name in pair]
+    assert {(row["lane"], row["preferred_lane"]) for row in rows} == {(0, 1)}
 
 
 def test_ticks_are_timed(record: RunRecord, tmp_path: Path) -> None:
