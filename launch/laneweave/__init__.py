@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from laneweave.coordinator.planning.request import PlanRequest
     from laneweave.coordinator.planning.response import PlanResponse
     from laneweave.coordinator.service.client import PlanClient
+    from laneweave.launch.library.plans import plan
+    from laneweave.launch.library.recorded_run import RecordedRun, load_run
+    from laneweave.launch.library.runs import RunFailedError, load_scenario, run
     from laneweave.protocol.errors import BadInputError
     from laneweave.protocol.scenario.fields import Scenario
     from laneweave.protocol.summary import RunSummary
@@ -32,9 +35,15 @@ __all__ = (
     "PlanClient",
     "PlanRequest",
     "PlanResponse",
+    "RecordedRun",
+    "RunFailedError",
     "RunSummary",
     "Scenario",
     "__version__",
+    "load_run",
+    "load_scenario",
+    "plan",
+    "run",
 )
 
 _MODULES = {
@@ -42,8 +51,14 @@ _MODULES = {
     "PlanClient": "laneweave.coordinator.service.client",
     "PlanRequest": "laneweave.coordinator.planning.request",
     "PlanResponse": "laneweave.coordinator.planning.response",
+    "RecordedRun": "laneweave.launch.library.recorded_run",
+    "RunFailedError": "laneweave.launch.library.runs",
     "RunSummary": "laneweave.protocol.summary",
     "Scenario": "laneweave.protocol.scenario.fields",
+    "load_run": "laneweave.launch.library.recorded_run",
+    "load_scenario": "laneweave.launch.library.runs",
+    "plan": "laneweave.launch.library.plans",
+    "run": "laneweave.launch.library.runs",
 }
 """Module of each public name."""
 

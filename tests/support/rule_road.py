@@ -13,6 +13,7 @@ from laneweave.protocol.road_layout import END_OF_ROAD, Exits
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
 from laneweave.sim_bridge.baselines.rule_based import RuleTraffic
+from laneweave.sim_bridge.baselines.rules import Rules
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies
 from laneweave.sim_bridge.road.demand import Arrival
 from support.bridge_bench import PlainWorld, arrival
@@ -60,7 +61,7 @@ class RuleRoad:
         world = PlainWorld()
         self._exits = Exits(self.scenario.sections, self.scenario.road.length_m)
         self.entrance = Entrance(self.scenario)
-        self.traffic = RuleTraffic(self.scenario, world)
+        self.traffic = RuleTraffic(self.scenario, world, Rules(self.scenario))
         for one in self.vehicles:
             self.traffic._vehicles[one.name] = one
             self.traffic._lanes.enter(one, one.lane)

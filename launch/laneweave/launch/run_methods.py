@@ -1,4 +1,4 @@
-"""Control methods, and their labelled variants for sweeps."""
+"""Control methods, those of users among them, and their labelled variants for sweeps."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from attrs import field, frozen
 
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.plug_ins import PlugIns
 from laneweave.protocol.scenario.fields import PAPERS_FORMATIONS, FormationSettings, Scenario
 
 FORMATION: Final = "formation"
@@ -122,7 +123,35 @@ METHODS: Final[dict[str, LabelledMethod]] = {
     ),
     "sl2015-cooperative": LabelledMethod(LC2013, _SUMO_COOPERATIVE | {"lc2013.model": "SL2015"}),
 }
-"""Methods by label, in the order of tables and figures."""
+"""Built-in methods by label, in the order of tables and figures."""
+
+REFERENCE_METHODS: Final = PlugIns(
+    kind="method",
+    group="laneweave.methods",
+    built_in={
+        RULE: "laneweave.sim_bridge.baselines.rule_based:RuleMethod",
+        LC2013: "laneweave.sim_bridge.baselines.lc2013:Lc2013Method",
+    },
+    reserved=frozenset(METHODS),
+)
+"""All reference methods: each is a `ReferenceMethod`. The label of a plug-in is its name."""
+
+
+def labelled(label: str) -> LabelledMethod:
+    """Return the method of a label; a label that is not built in is the name of a plug-in."""
+    return METHODS.get(label) or LabelledMethod(label)
+
+
+def checked_method(name: str, field_name: str) -> str:
+    """Return the name of a method that is built in, or a plug-in that is installed.
+
+    Raises:
+        BadInputError: there is no such method.
+    """
+    if name != FORMATION:
+        REFERENCE_METHODS.checked(name, field_name, (FORMATION,))
+    return name
+
 
 _READ_BY_ALL = ("schema", "seed", "road", "demand", "vehicle", "runtime", "formation.speed_mps")
 """Tables and fields of a scenario that every method may read."""
@@ -137,6 +166,8 @@ def affects(field_name: str, method: str) -> bool:
         return False
     if method == FORMATION:
         return table not in (RULE, LC2013)
+    if not REFERENCE_METHODS.is_built_in(method):
+        return True  # nothing is known about a plug-in
     return table == method or table in _READ_BY_ALL or field_name in _READ_BY_ALL
 
 
@@ -149,7 +180,7 @@ def parse_methods(text: str) -> tuple[str, ...]:
     labels = tuple(text.split(","))
     for number, label in enumerate(labels):
         if label not in METHODS:
-            raise BadInputError("--methods", label, "some of " + ", ".join(METHODS))
+            REFERENCE_METHODS.checked(label, "--methods", METHODS)
         if label in labels[:number]:
             raise BadInputError("--methods", text, f"{label} only once")
     return labels

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -41,14 +41,19 @@ class PlugIns:
         """Return whether a name is built in."""
         return name in self.built_in
 
-    def checked(self, name: str, field: str) -> str:
+    def checked(self, name: str, field: str, others: Iterable[str] = ()) -> str:
         """Return the name of an existing implementation, which is not imported.
 
+        Args:
+            name: the name.
+            field: field or option that contains it.
+            others: other names that are allowed there, for the message.
+
         Raises:
-            BadInputError: `field` names no implementation, or one that two distributions have.
+            BadInputError: there is no such implementation, or two distributions have it.
         """
         if not self.is_built_in(name):
-            self._plug_in(name, field)
+            self._plug_in(name, field, others)
         return name
 
     def origin(self, name: str) -> str:
@@ -77,19 +82,19 @@ class PlugIns:
     def _taken(self) -> frozenset[str]:
         return self.reserved | self.built_in.keys()
 
-    def _plug_in(self, name: str, field: str) -> EntryPoint:
+    def _plug_in(self, name: str, field: str, others: Iterable[str] = ()) -> EntryPoint:
         points = [] if name in self._taken else _entry_points(self.group).get(name, [])
         if not points:
-            raise BadInputError(field, name, self._allowed(name))
+            raise BadInputError(field, name, self._allowed(name, others))
         if len(points) > 1:
             both = " and ".join(map(_distribution, points))
             raise BadInputError(field, name, f"a {self.kind} of one distribution; {both} have one")
         return points[0]
 
-    def _allowed(self, name: str) -> str:
+    def _allowed(self, name: str, others: Iterable[str]) -> str:
         from difflib import get_close_matches  # noqa: PLC0415
 
-        names = self.names()
+        names = tuple(dict.fromkeys([*others, *self.names()]))
         meant = get_close_matches(name, names, 1)
         hint = f" (did you mean {meant[0]}?)" if meant else ""
         return f"one of {', '.join(names)}, or the name of a plug-in that is installed{hint}"

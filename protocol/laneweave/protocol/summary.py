@@ -260,6 +260,15 @@ class RunSummary:
     faults: dict[str, Any] | None = field(
         default=None, metadata=about("injected faults, by kind; absent without a fault file")
     )
+    plug_ins: list[str] | None = field(
+        default=None,
+        metadata=about(
+            "name and version of the distributions whose plug-ins made plans or drove the "
+            "vehicles; absent without one"
+        ),
+    )
+    folder: Path | None = field(default=None, eq=False)
+    """Folder of the run, which is not part of the file."""
 
     @classmethod
     def from_json(cls, data: object) -> RunSummary:
@@ -290,6 +299,8 @@ def described(kind: type = RunSummary, prefix: str = "") -> Iterator[tuple[str, 
     `*` in a path stands for the name of an entrance, a destination or a type of vehicle.
     """
     for one in attrs.fields(attrs.resolve_types(kind)):
+        if Path in get_args(one.type):  # not part of the file
+            continue
         unit, meaning = one.metadata.get("unit", ""), one.metadata.get("meaning", "")
         inner = [part for part in (one.type, *get_args(one.type)) if isinstance(part, type)]
         tables = [part for part in inner if attrs.has(part)]
@@ -305,7 +316,8 @@ def described(kind: type = RunSummary, prefix: str = "") -> Iterator[tuple[str, 
 def read_summary(folder: Path) -> RunSummary | None:
     """Return the summary in a run's folder; None if it is missing or invalid."""
     try:
-        return RunSummary.from_json(json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8")))
+        data = json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+        return attrs.evolve(RunSummary.from_json(data), folder=folder)
     except (OSError, ValueError):
         return None
 
@@ -317,6 +329,8 @@ def write_summary(folder: Path, summary: RunSummary) -> None:
 
 
 def _is_written(one: attrs.Attribute[Any], value: object) -> bool:
+    if isinstance(value, Path):
+        return False
     return one.default is attrs.NOTHING or value is not None
 
 

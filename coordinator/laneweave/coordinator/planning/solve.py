@@ -209,14 +209,21 @@ def _status(*, found: bool, finished: bool) -> Status:
     return "infeasible" if finished else "timeout"
 
 
-def prepare(solver: str, field: str = "solver") -> None:
+def prepare(solver: str, field: str = "solver", *, keep: bool = True) -> None:
     """Check that a solver exists; start the process of a plug-in, which imports it.
 
+    Args:
+        solver: name of the solver.
+        field: field or option that contains it.
+        keep: whether the process goes on, for plans of this process.
+
     Raises:
-        BadInputError: `field` names no solver, or one that cannot be loaded.
+        BadInputError: there is no such solver, or it cannot be loaded.
     """
     checked_solver(solver, field)
     if not PLANNERS.is_built_in(solver):
-        from laneweave.coordinator.planning.plug_ins.process import load_planner  # noqa: PLC0415
+        from laneweave.coordinator.planning.plug_ins import process  # noqa: PLC0415
 
-        load_planner(solver, field)
+        process.load_planner(solver, field)
+        if not keep:
+            process.end_planner(solver)

@@ -16,7 +16,7 @@ from laneweave.protocol.scenario.fields import SOLVERS, Scenario
 
 MAX_SEEDS = 10_000_000
 MAX_JOBS = 256
-SOLVER_NAMES = " or ".join(SOLVERS)
+SOLVER_NAMES = ", ".join(SOLVERS) + " or a plug-in"
 
 ScenarioArgument = Annotated[
     Path | None, typer.Argument(metavar="[SCENARIO.toml]", help="Default: the paper's road.")

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.coordinator.planning.solve import plan
+from laneweave.launch.library.plans import plan
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.scenario.fields import Scenario
 
@@ -90,11 +89,7 @@ def answer_request(
         drawers.append(_checked_drawer(drawing))
     if road_drawing is not None:
         drawers.append(_checked_road_drawer(road_drawing, scenario or Scenario(), request.mode))
-    if access is None:
-        # An answer must not wait for a compilation that was not asked for.
-        response = plan(request, compiled_only=request.solver != BRANCHING.name)
-    else:
-        response = _ask(access, request, wait_s)
+    response = plan(request) if access is None else _ask(access, request, wait_s)
     if as_table:
         sys.stdout.write(_table(request, response))
     else:

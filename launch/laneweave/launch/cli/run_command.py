@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -21,15 +21,10 @@ from laneweave.launch.cli.options import (
     reject_unused_options,
     shows_progress,
 )
-from laneweave.launch.run.run_folder import new_folder
-from laneweave.launch.run_methods import FORMATION, LC2013, RULE
+from laneweave.launch.run_methods import FORMATION, LC2013, RULE, checked_method
 from laneweave.protocol.config.scenario_files import load_scenario, scenario_of
 from laneweave.protocol.errors import NO_VALUE, BadInputError
 from laneweave.protocol.scenario.fields import Scenario
-
-if TYPE_CHECKING:
-    from laneweave.launch.run.outcome import Outcome
-
 
 COMPARED_ROUTES = 4
 """Number of pairs of entrance and destination whose trips are printed."""
@@ -40,14 +35,6 @@ class Transport(StrEnum):
 
     zenoh = "zenoh"
     simulated = "simulated"
-
-
-class Method(StrEnum):
-    """Method that controls the vehicles."""
-
-    formation = FORMATION
-    rule = RULE
-    lc2013 = LC2013
 
 
 class Operation(StrEnum):
@@ -66,8 +53,11 @@ def run(
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of all random draws.")] = None,
     duration: Duration = None,
     method: Annotated[
-        Method, typer.Option("--method", help="Method that controls the vehicles.")
-    ] = Method.formation,
+        str,
+        typer.Option(
+            "--method", metavar="NAME", help=f"{FORMATION}, {RULE}, {LC2013}, or a plug-in."
+        ),
+    ] = FORMATION,
     operation: Annotated[
         Operation | None,
         typer.Option("--operation", help="Default: formation.operation of the scenario."),
@@ -128,19 +118,18 @@ def run(
         raise BadInputError("--compare", "given", "none without a SUMO simulation (--sumocfg)")
     check_pace(pace)
     show = shows_progress(no_progress)
-    if method is Method.formation:
+    checked_method(method, "--method")
+    if method == FORMATION:
         if settings.formation.rolling:
             reject_unused_options("with the rolling operation", solver=solver)
-        simulated = transport is Transport.simulated
-        if simulated:
+        if transport is Transport.simulated:
             reject_unused_options("with --transport simulated", pace=pace)
-        outcome = _run_formations(settings, out, faults, pace, simulated=simulated, show=show)
     else:
         allowed = "formation with a SUMO simulation; --compare adds SUMO alone"
         if settings.sumo.config:
-            raise BadInputError("--method", method.value, allowed)
+            raise BadInputError("--method", method, allowed)
         reject_unused_options(
-            f"with --method {method.value}",
+            f"with --method {method}",
             operation=operation,
             solver=solver,
             vehicles_per_process=vehicles_per_process,
@@ -150,10 +139,18 @@ def run(
             transport=transport,
             gui=gui or None,
         )
-        outcome = _run_reference(settings, out, method, show=show)
-
+    from laneweave.launch.library.runs import perform_run
     from laneweave.launch.run.outcome import print_outcome
 
+    outcome = perform_run(
+        settings,
+        out=out,
+        method=method,
+        transport=None if transport is None else transport.value,
+        faults=faults,
+        pace=pace,
+        show_progress=show,
+    )
     print_outcome(outcome, Console())
     if outcome.summary is not None:
         from laneweave.launch.report.report import draw_report
@@ -206,39 +203,3 @@ def corridor_scenario(
             sumocfg, corridor, Path(folder), Scenario().seed if seed is None else seed
         )
     return corridor_tables(found, sumocfg, corridor)
-
-
-def _run_formations(
-    settings: Scenario,
-    out: Path | None,
-    faults: str | None,
-    pace: float | None,
-    *,
-    simulated: bool,
-    show: bool,
-) -> Outcome:
-    from laneweave.agents.driving.trajectory import check_moves
-    from laneweave.launch.faults.specification import load_faults
-    from laneweave.launch.run.local_run import LocalRun
-    from laneweave.protocol.config.participants import coordinator_names
-    from laneweave.sim_bridge.road_sources import demanded
-
-    check_moves(settings)
-    vehicles = {arrival.vehicle for arrival in demanded(settings)}
-    specification = load_faults(faults, coordinator_names(settings), vehicles)
-    with new_folder(out, settings, FORMATION) as folder:
-        if simulated:
-            from laneweave.launch.run.roles import tune_garbage_collector
-            from laneweave.launch.run.simulated_run import SimulatedRun
-
-            tune_garbage_collector()
-            return SimulatedRun(settings, folder, faults=specification, show_progress=show).run()
-        return LocalRun(settings, folder, specification, show, pace).run()
-
-
-def _run_reference(settings: Scenario, out: Path | None, method: Method, *, show: bool) -> Outcome:
-    from laneweave.launch.run.reference_run import ReferenceRun, check_reference
-
-    check_reference(settings, method.value)
-    with new_folder(out, settings, method.value) as folder:
-        return ReferenceRun(settings, folder, method.value, show_progress=show).run()

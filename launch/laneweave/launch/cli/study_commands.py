@@ -30,7 +30,10 @@ VOLUMES = "1000,1150,1300,1450,1600"
 def sweep(
     scenario: ScenarioArgument = None,
     methods: Annotated[
-        str, typer.Option("--methods", metavar="LIST", help=f"Some of {', '.join(METHODS)}.")
+        str,
+        typer.Option(
+            "--methods", metavar="LIST", help=f"Some of {', '.join(METHODS)}, and plug-ins."
+        ),
     ] = "formation",
     volumes: Annotated[
         str, typer.Option("--volumes", metavar="LIST", help="Vehicles per lane per hour.")

@@ -40,6 +40,8 @@ class Run:
     """Reason for the failure; empty: success."""
     wall_s: float | None = None
     """Run time of the run's process; None: unknown."""
+    plug_in: str = ""
+    """Distribution and version of a method that is a plug-in; empty: none, or unknown."""
 
     @property
     def status(self) -> str:
@@ -190,6 +192,7 @@ def write_point(run: Run, folder: Path) -> None:
         "status": run.status,
         "reason": run.reason,
         "wall_s": run.wall_s,
+        "plug_in": run.plug_in,
         "scenario": to_tables(run.scenario),
     }
     (folder / POINT_FILE).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
@@ -206,6 +209,7 @@ def _read_point(path: Path) -> Run:
             summary=read_summary(path.parent),
             reason=str(data["reason"]),
             wall_s=float(data["wall_s"]),
+            plug_in=str(data.get("plug_in", "")),
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise BadInputError(str(path), "invalid", f"the record of a point ({error})") from error

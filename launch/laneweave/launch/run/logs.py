@@ -51,6 +51,12 @@ def log_role(role: str, name: str, form: LogFormat, level: LogLevel | None) -> N
     )
 
 
+def log_by_default() -> None:
+    """Write warnings and errors to stderr, unless the program has configured structlog itself."""
+    if not structlog.is_configured():
+        log_to_terminal()
+
+
 def log_to_terminal(level: LogLevel = LogLevel.warning) -> None:
     """Write log entries of at least `level` to stderr, one readable line each."""
     structlog.configure(

@@ -10,9 +10,11 @@ from attrs import evolve, frozen
 from rich.console import Console
 from rich.table import Table
 
+from laneweave.coordinator.planning.plug_ins.registry import PLANNERS
 from laneweave.launch.faults.failover import Failover
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.report.summary_table import summary_rows
+from laneweave.launch.run_methods import REFERENCE_METHODS
 from laneweave.protocol.summary import RunSummary, read_summary, write_summary
 
 
@@ -67,11 +69,20 @@ def complete_summary(
         messages=evolve(summary.messages, dropped_by_faults=dropped),
         failover=measured,
         faults=faults if faults is not None else summary.faults,
+        plug_ins=_plug_ins(summary) or None,
     )
     write_summary(folder, summary)
     trips = folder / "trips.parquet"
     of_sumo = trips.is_file() and bool(scenario_of(trips).sumo.config)
     return Outcome(folder, summary, (*problems, *_violations(summary, of_sumo=of_sumo)))
+
+
+def _plug_ins(summary: RunSummary) -> list[str]:
+    """Return the distributions whose plug-ins a run has used."""
+    origins = [REFERENCE_METHODS.origin(summary.method)]
+    planners = summary.planning.by_solver or {}
+    origins += [PLANNERS.origin(name) for name, plans in planners.items() if plans]
+    return sorted({origin for origin in origins if origin})
 
 
 def _violations(summary: RunSummary, *, of_sumo: bool) -> list[str]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from attrs import define
@@ -13,14 +11,12 @@ from attrs import define
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
-from laneweave.launch.run_methods import RULE
+from laneweave.launch.run_methods import REFERENCE_METHODS
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.baselines.lc2013 import Lc2013Traffic, check_lc2013
-from laneweave.sim_bridge.baselines.reference_road import ReferenceRoad, Traffic
-from laneweave.sim_bridge.baselines.rule_based import RuleTraffic, check_rule
+from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod
+from laneweave.sim_bridge.baselines.reference_road import ReferenceRoad
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
-from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
-from laneweave.sim_bridge.sumo.traffic import SumoTraffic
 
 PROGRESS_EVERY_TICKS = 50
 
@@ -38,7 +34,8 @@ class ReferenceRun:
         """Run the scenario and return its outcome."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
-            self._traffic() as traffic,
+            tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as folder,
+            reference_method(self.method).open(self.scenario, Path(folder)) as traffic,
             RunProgress(self.scenario, show=self.show_progress) as progress,
         ):
             record = RunRecord(self.folder, self.scenario, self.method, time.perf_counter)
@@ -52,24 +49,15 @@ class ReferenceRun:
                 record.close(road.t_s, road.ending or Ending.INTERRUPTED)
         return complete_summary(self.folder, problems=(), processes=1)
 
-    @contextmanager
-    def _traffic(self) -> Iterator[Traffic]:
-        with tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as folder:
-            if self.method == RULE:
-                with SumoWorld(self.scenario, Path(folder)) as world:
-                    yield RuleTraffic(self.scenario, world)
-            else:
-                with SumoTraffic(self.scenario, Path(folder)) as sumo:
-                    yield Lc2013Traffic(self.scenario, sumo)
 
-
-def check_reference(scenario: Scenario, method: str) -> None:
-    """Check that a reference method supports a scenario.
+def reference_method(name: str, field_name: str = "method") -> ReferenceMethod:
+    """Return a reference method.
 
     Raises:
-        BadInputError: the method does not support the value of a field.
+        BadInputError: there is no such method, or a plug-in cannot be loaded.
     """
-    if method == RULE:
-        check_rule(scenario)
-    else:
-        check_lc2013(scenario)
+    found = REFERENCE_METHODS.load(name, field_name)
+    if not isinstance(found, ReferenceMethod):
+        allowed = f"a ReferenceMethod; that of {REFERENCE_METHODS.origin(name)} is none"
+        raise BadInputError(field_name, name, allowed)
+    return found

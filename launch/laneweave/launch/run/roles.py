@@ -16,10 +16,11 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import structlog
@@ -59,6 +60,18 @@ def tune_garbage_collector() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(GC_THRESHOLD)
+
+
+@contextlib.contextmanager
+def tuned_garbage_collector() -> Iterator[None]:
+    """Tune the garbage collector as above for a run in a process that does other things, too."""
+    thresholds = gc.get_threshold()
+    tune_garbage_collector()
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
+        gc.unfreeze()
 
 
 def fork_server(solvers: Collection[str] = ()) -> ForkServerContext:
@@ -137,10 +150,25 @@ def start_role(
 
 def _start(process: ForkServerProcess) -> None:
     try:
-        process.start()
+        with _main_module_hidden():
+            process.start()
     except (EOFError, OSError) as error:
         reason = str(error) or "the fork server has ended"
         raise CommandFailedError(f"cannot start {process.name}: {reason}") from error
+
+
+@contextlib.contextmanager
+def _main_module_hidden() -> Iterator[None]:
+    """Keep a new process from importing the main module of this one, such as a user's script.
+
+    Roles need nothing from it, and a script that calls `laneweave.run` would start more runs.
+    """
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, Any]) -> None:

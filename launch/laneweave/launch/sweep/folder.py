@@ -30,7 +30,7 @@ from laneweave.launch.recordings.runs import (
     sweep_runs,
     write_point,
 )
-from laneweave.launch.run_methods import METHODS, affects
+from laneweave.launch.run_methods import REFERENCE_METHODS, affects, labelled
 from laneweave.launch.sweep.execution import LOG_FILE, PointResult, kept_files
 from laneweave.launch.sweep.points import Point, with_volume
 from laneweave.protocol.config.scenario_files import to_tables
@@ -99,11 +99,15 @@ class SweepFolder:
             BadInputError: a setting that affects the method of a point differs.
         """
         for name, run in self._runs.items():
-            labelled = METHODS.get(run.label)
-            if labelled is None or labelled.method != run.method:
+            method = labelled(run.label)
+            if method.method != run.method:
                 raise BadInputError("--out", str(self.out), f"a folder without {run.label}")
+            installed = REFERENCE_METHODS.origin(run.method)
+            if installed and run.plug_in and installed != run.plug_in:
+                allowed = f"{run.plug_in}, which made {self.out / name}; or a new folder"
+                raise BadInputError(f"version of {run.label}", installed, allowed)
             wanted = evolve(with_volume(base, run.volume_veh_per_lane_h), seed=run.scenario.seed)
-            expected = flatten(to_tables(labelled.settings(wanted)), ".")
+            expected = flatten(to_tables(method.settings(wanted)), ".")
             recorded = flatten(to_tables(run.scenario), ".")
             where = f"as recorded in {self.out / name}; other settings require a new folder"
             for field in dict.fromkeys([*recorded, *expected]):
@@ -137,6 +141,7 @@ class SweepFolder:
             summary=read_summary(result.folder),
             reason="; ".join(result.problems),
             wall_s=round(result.wall_s, 3),
+            plug_in=REFERENCE_METHODS.origin(point.method),
         )
         kept = (*kept_files(point), LOG_FILE) if result.problems else kept_files(point)
         try:

@@ -7,7 +7,14 @@ from collections.abc import Sequence
 from attrs import evolve, frozen
 
 from laneweave.agents.driving.trajectory import check_moves
-from laneweave.launch.run_methods import METHODS, KeepTrajectories
+from laneweave.coordinator.planning.plug_ins.registry import checked_solver
+from laneweave.launch.run.reference_run import reference_method
+from laneweave.launch.run_methods import (
+    FORMATION,
+    REFERENCE_METHODS,
+    KeepTrajectories,
+    labelled,
+)
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
@@ -81,8 +88,9 @@ def plan_points(
     for label in labels:
         for volume in volumes:
             try:
-                scenario = with_volume(METHODS[label].settings(base), volume)
+                scenario = with_volume(labelled(label).settings(base), volume)
                 check_moves(scenario)
+                _check_plug_ins(scenario, labelled(label).method)
             except BadInputError as error:
                 field = f"{error.field} ({label})"
                 raise BadInputError(field, error.value, error.allowed) from error
@@ -93,10 +101,22 @@ def plan_points(
         KeepTrajectories.all: seeds,
     }[keep]
     return tuple(
-        Point(label, METHODS[label].method, evolve(scenario, seed=seed), seed in kept)
+        Point(label, labelled(label).method, evolve(scenario, seed=seed), seed in kept)
         for seed in seeds
         for label, scenario in settings
     )
+
+
+def _check_plug_ins(scenario: Scenario, method: str) -> None:
+    """Check that the plug-in of a method or planner exists, and supports the scenario.
+
+    Raises:
+        BadInputError: it does not.
+    """
+    if method == FORMATION:
+        checked_solver(scenario.formation.solver, "formation.solver")
+    elif not REFERENCE_METHODS.is_built_in(method):
+        reference_method(method, "--methods").check(scenario)
 
 
 def with_volume(scenario: Scenario, volume_veh_per_lane_h: float) -> Scenario:

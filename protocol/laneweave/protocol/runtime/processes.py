@@ -7,6 +7,7 @@ import ctypes
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 
 _PR_SET_PDEATHSIG = 1
@@ -37,8 +38,12 @@ def _set_death_signal(number: int) -> None:
 def stop_signals(stop: Callable[[], None]) -> Iterator[None]:
     """Call `stop` on SIGINT and SIGTERM until the block ends.
 
+    Outside the main thread, signals are left to the main thread, which receives all of them.
     `stop` must neither take a lock nor log, since the interrupted code may hold the same lock.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
 
     def on_signal(_number: int, _frame: object) -> None:
         stop()

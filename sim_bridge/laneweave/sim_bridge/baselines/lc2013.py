@@ -7,14 +7,31 @@ lane changes are disabled unless the scenario allows them everywhere.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
+from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod
+from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle, Traffic
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.sumo.road_edges import lane_end_m
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
+
+
+class Lc2013Method(ReferenceMethod):
+    """SUMO's own driving."""
+
+    def check(self, scenario: Scenario) -> None:
+        """Check that SUMO can drive the vehicles; see `check_lc2013`."""
+        check_lc2013(scenario)
+
+    @contextmanager
+    def open(self, scenario: Scenario, folder: Path) -> Iterator[Traffic]:
+        """Yield traffic that SUMO drives."""
+        with SumoTraffic(scenario, folder) as sumo:
+            yield Lc2013Traffic(scenario, sumo)
 
 
 class Lc2013Traffic:

@@ -7,26 +7,48 @@ has constant lateral speed within the slip limit, or is instantaneous.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
+from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod
+from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle, Traffic
 from laneweave.sim_bridge.baselines.rules import Lanes, Rules, priority, safe_change_m
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 from laneweave.sim_bridge.world_interface import World
 
 _ROUNDING_M = 1e-9
 
 
+class RuleMethod(ReferenceMethod):
+    """The rule-based method; subclasses may have other rules."""
+
+    def check(self, scenario: Scenario) -> None:
+        """Check that vehicles can follow the rules; see `check_rule`."""
+        check_rule(scenario)
+
+    @contextmanager
+    def open(self, scenario: Scenario, folder: Path) -> Iterator[Traffic]:
+        """Yield traffic that follows the rules, displayed by SUMO."""
+        with SumoWorld(scenario, folder) as world:
+            yield RuleTraffic(scenario, world, self.rules(scenario))
+
+    def rules(self, scenario: Scenario) -> Rules:
+        """Return the rules for a scenario."""
+        return Rules(scenario)
+
+
 class RuleTraffic:
     """The vehicles on the road, moved by the rules; a `Traffic`."""
 
-    def __init__(self, scenario: Scenario, world: World) -> None:
+    def __init__(self, scenario: Scenario, world: World, rules: Rules) -> None:
         """Begin with an empty road in an empty world."""
         self._world = world
-        self._rules = Rules(scenario)
+        self._rules = rules
         self._lanes = Lanes(scenario.road.lanes)
         self._vehicles: dict[str, ReferenceVehicle] = {}
         self._limits = scenario.vehicle

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from laneweave.launch.run.outcome import Outcome
-from laneweave.launch.run.reference_run import ReferenceRun, check_reference
+from laneweave.launch.run.reference_run import ReferenceRun, reference_method
 from laneweave.launch.run_methods import LC2013, RULE
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.scenario.fields import Scenario
@@ -36,7 +36,7 @@ def scenario(volume: float = 600.0, seed: int = 1, **tables: dict[str, Any]) -> 
 
 
 def finished(settings: Scenario, folder: Path, method: str) -> Outcome:
-    check_reference(settings, method)
+    reference_method(method).check(settings)
     return ReferenceRun(settings, folder, method, show_progress=False).run()
 
 

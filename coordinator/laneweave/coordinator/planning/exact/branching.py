@@ -47,7 +47,6 @@ from laneweave.coordinator.planning.exact.multipliers_kernel import (
 from laneweave.coordinator.planning.exact.negotiation import Negotiation
 from laneweave.coordinator.planning.exact.reachability import explore
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.problem import Problem, Search, Solution
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.shortest_paths import without_needless_moves
@@ -380,7 +379,7 @@ def _doubled(nodes: Stack) -> Stack:
 def new_search(
     request: PlanRequest,
     problem: Problem,
-    weights: Weights,  # noqa: ARG001 (as for TAPPA)
+    weights: object,  # noqa: ARG001 (of TAPPA)
     budget: Budget,
 ) -> Search:
     """Return the search of branch and bound for a request."""

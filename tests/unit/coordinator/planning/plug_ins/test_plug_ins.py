@@ -137,13 +137,14 @@ def test_a_planner_that_was_killed_is_asked_again(
 def test_a_planner_keeps_its_process_and_gets_its_limits(install: Install) -> None:
     body = "assert limits.max_nodes == 500, limits\nassert 1700 < limits.deadline_s <= 1800\n"
     planner(install, f"{body}return {OPTIMAL}")
+    children = []
     for _ in range(2):
         assert plan(REQUEST, solver="own", max_nodes=500).solver == "own"
-        child = process._process_of("own")._process
-        assert child is not None
-        identifier = child.pid
-    assert child.pid == identifier
-    assert child.poll() is None
+        children.append(process._process_of("own")._process)
+    first, second = children
+    assert first is second
+    assert first is not None
+    assert first.poll() is None
 
 
 def test_a_class_is_instantiated_once(install: Install) -> None:

@@ -1,0 +1,101 @@
+"""The files of a finished run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from attrs import frozen
+
+from laneweave.launch.recordings.runs import not_a_run, scenario_of
+from laneweave.launch.recordings.trajectories import read_trajectories
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.summary import RunSummary, read_summary
+
+
+@frozen
+class RecordedRun:
+    """A finished run; its tables are read from the folder at each call.
+
+    Tables are those of pyarrow: `table.to_pandas()` returns a DataFrame, `table["s_m"].to_numpy()`
+    one column. The columns are explained in docs/RUNS.md.
+    """
+
+    folder: Path
+    summary: RunSummary
+    """Content of `summary.json`."""
+    scenario: Scenario
+    """The scenario with which the run was made."""
+
+    def trips(self) -> pa.Table:
+        """Return one row per vehicle: arrival, lanes, times.
+
+        Raises:
+            BadInputError: the file cannot be read.
+        """
+        return self._table("trips.parquet")
+
+    def trajectories(self, columns: Sequence[str] | None = None) -> pa.Table:
+        """Return the recorded states of all vehicles, in the order of time.
+
+        Args:
+            columns: names of the columns to read; None: all.
+
+        Raises:
+            BadInputError: there is no such column, or the file cannot be read; sweeps keep the
+                trajectories of some runs only.
+        """
+        return read_trajectories(self.folder, columns)
+
+    def ticks(self) -> pa.Table:
+        """Return one row per tick of the bridge: vehicles on the road, duration.
+
+        Raises:
+            BadInputError: the file cannot be read; sweeps do not keep it.
+        """
+        return self._table("ticks.parquet")
+
+    def events(self, kind: str | None = None) -> list[dict[str, Any]]:
+        """Return the events in the order of time: `t_s`, `kind`, and the data of their kind.
+
+        Args:
+            kind: kind of the events, such as `plan-made`; None: all.
+
+        Raises:
+            BadInputError: the file cannot be read.
+        """
+        try:
+            with (self.folder / "events.jsonl").open(encoding="utf-8") as lines:
+                events = [json.loads(line) for line in lines]
+        except (OSError, ValueError) as error:
+            raise not_a_run(self.folder, error) from error
+        return [event for event in events if kind is None or event["kind"] == kind]
+
+    def _table(self, name: str) -> pa.Table:
+        try:
+            return pq.read_table(self.folder / name)
+        except (OSError, ValueError) as error:
+            raise not_a_run(self.folder, error) from error
+
+
+def load_run(folder: Path | str) -> RecordedRun:
+    """Return the run in a folder, which `laneweave run` or a sweep has written.
+
+        trips = laneweave.load_run("runs/demo").trips().to_pandas()
+
+    Raises:
+        BadInputError: the folder is not that of a finished run.
+    """
+    folder = Path(folder)
+    summary = read_summary(folder)
+    if summary is None:
+        raise not_a_run(folder, "its summary.json is missing or incomplete")
+    try:
+        scenario = scenario_of(folder / "trips.parquet")
+    except (OSError, ValueError) as error:
+        raise not_a_run(folder, error) from error
+    return RecordedRun(folder, summary, scenario)
