@@ -109,7 +109,7 @@ def _signature(name: str, value: Callable[..., Any]) -> str:
     """Return a call with its parameters, one a line where they are many."""
     signature = inspect.signature(value)
     parameters = [one for one in signature.parameters.values() if one.name not in ("self", "cls")]
-    text = str(signature.replace(parameters=parameters)).replace("'", "")
+    text = re.sub(r"(: |-> )'([^']*)'", r"\1\2", str(signature.replace(parameters=parameters)))
     line = f"{name}{text}"
     if len(line) > 90:
         inner, _, result = text[1:].rpartition(")")
@@ -131,7 +131,8 @@ def _split(parameters: str) -> Iterator[str]:
 def _text(value: object) -> str:
     """Return a docstring as Markdown, with its lists of arguments, results and errors."""
     paragraphs = (inspect.getdoc(value) or "").split("\n\n")
-    return "\n\n".join(part for paragraph in paragraphs for part in _parts(paragraph))
+    text = "\n\n".join(part for paragraph in paragraphs for part in _parts(paragraph))
+    return re.sub(r"docs/([A-Z_]+\.md)", r"[\1](\1)", text)
 
 
 def _parts(paragraph: str) -> Iterator[str]:
@@ -139,7 +140,11 @@ def _parts(paragraph: str) -> Iterator[str]:
         lines = re.sub(r"\n +", " ", paragraph).splitlines()
         yield "\n".join(re.sub(r"^([\w, ]+):", r"- `\1`:", line) for line in lines)
         return
-    for section in Docstring(paragraph, parser=Parser.google).parse(warnings=False):
+    if paragraph.startswith("    "):
+        yield f"```python\n{textwrap.dedent(paragraph)}\n```"
+        return
+    # `Docstring` removes the indentation that all lines but the first one have.
+    for section in Docstring(f"\n{paragraph}", parser=Parser.google).parse(warnings=False):
         kind = section.kind.value
         if kind == "text":
             yield section.value

@@ -22,7 +22,7 @@ class RecordedRun:
     """A finished run; its tables are read from the folder at each call.
 
     Tables are those of pyarrow: `table.to_pandas()` returns a DataFrame, `table["s_m"].to_numpy()`
-    one column. The columns are explained in docs/RUNS.md.
+    one column. docs/RESULT_FILES.md explains the columns.
     """
 
     folder: Path
