@@ -50,6 +50,12 @@ def test_the_readme_is_short() -> None:
     assert len(lines) <= MAX_README_LINES
 
 
+def test_make_site_fails_on_warnings() -> None:
+    # `--quiet` would hide the warnings from `--strict`, too.
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert re.search(r"^site:.*\n\t.*/mkdocs build --strict$", makefile, re.MULTILINE)
+
+
 def test_every_page_is_in_the_navigation_once() -> None:
     listed = list(pages_of(list(navigation().values())))
     outside = ["index.md", "CHANGELOG.md", "CONTRIBUTING.md"]
