@@ -4,7 +4,7 @@ A method is a `ReferenceMethod`, named by an entry point of the group `laneweave
 `laneweave run --method NAME` and `laneweave sweep --methods NAME,rule` use it. There are three ways
 to write one, the shortest first:
 
-- a subclass of `RuleMethod` with other `Rules`: when vehicles change lanes, and how fast they drive;
+- a subclass of `RuleMethod` with other `Rules`: when vehicles change lanes, their speeds;
 - SUMO drives, with other commands or parameters: see `Lc2013Traffic`;
 - a `Traffic` of one's own.
 """

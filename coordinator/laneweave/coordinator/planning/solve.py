@@ -16,6 +16,7 @@ from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.plan_validator import problems_of_response
 from laneweave.coordinator.planning.plug_ins.registry import PLANNERS, PlanLimits, checked_solver
+from laneweave.coordinator.planning.plug_ins.search import PluggedInSearch
 from laneweave.coordinator.planning.problem import Problem, Search
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse, Status
@@ -158,9 +159,9 @@ def _solve(
         if PLANNERS.is_built_in(solver):
             search = PLANNERS.load(solver, "solver")(request, problem, weights, budget)
         else:
-            from laneweave.coordinator.planning.plug_ins.search import PluggedInSearch  # noqa: PLC0415
+            from laneweave.coordinator.planning.plug_ins.process import ask_planner  # noqa: PLC0415
 
-            search = PluggedInSearch(solver, request, problem, limits, budget)
+            search = PluggedInSearch(solver, request, problem, limits, budget, ask_planner)
         search.run()
         found = Search(**attrs.asdict(search, recurse=False))
     return _Result(solver, budget.nodes, found)

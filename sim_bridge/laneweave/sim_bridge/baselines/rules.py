@@ -168,7 +168,9 @@ class Rules:
     def __init__(self, scenario: Scenario) -> None:
         """Read the parameters from the tables `rule`, `road`, `formation` and `vehicle`."""
         self.following = Following(scenario)
-        self._wanted = WantedLanes(scenario)
+        """Car following."""
+        self.wanted = WantedLanes(scenario)
+        """The lanes that vehicles want."""
         rule, road = scenario.rule, scenario.road
         self._sorting_start_m = road.sorting_start_m
         self._sorting_m = road.s3_m
@@ -199,11 +201,11 @@ class Rules:
         )
         slowing: dict[ReferenceVehicle, float] = {}
         for vehicle in unsorted:
-            wanted = self._wanted.of(vehicle)
+            wanted = self.wanted.of(vehicle)
             if wanted.lane == vehicle.lane:
                 continue
             lane = vehicle.lane + (1 if wanted.lane > vehicle.lane else -1)
-            if not self._wanted.may_enter(vehicle, lane):
+            if not self.wanted.may_enter(vehicle, lane):
                 continue
             slowed = list(self._slowed(vehicle, *lanes.neighbours(vehicle, lane)))
             if not slowed:
@@ -236,7 +238,7 @@ class Rules:
 
     def has_finished(self, vehicle: ReferenceVehicle) -> bool:
         """Return whether a vehicle has completed all lane changes."""
-        return vehicle.previous_lane is None and self._wanted.of(vehicle).lane == vehicle.lane
+        return vehicle.previous_lane is None and self.wanted.of(vehicle).lane == vehicle.lane
 
     def slow_speed_mps(self, s_m: float, end_m: float) -> float:
         """Return v_slow, the speed of a vehicle that slows down for others (rule 3).
@@ -256,7 +258,7 @@ class Rules:
         speed decreases linearly over the distance d_stop before that point. A yielding vehicle in
         the next lane stops farther back, so that a gap opens.
         """
-        wanted = self._wanted.of(vehicle)
+        wanted = self.wanted.of(vehicle)
         remaining = abs(wanted.lane - vehicle.lane)
         if remaining == 0 and not wanted.stops:
             return self._speed_mps

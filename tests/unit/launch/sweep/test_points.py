@@ -116,7 +116,7 @@ def test_too_many_points() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--methods", "magic"], "--methods: got 'magic'; allowed: some of formation"),
+        (["--methods", "magic"], "--methods: got 'magic'; allowed: one of formation"),
         (["--volumes", "1000,x"], "--volumes: got 'x'; allowed: comma-separated numbers"),
         (["--seeds", "3"], "--seeds: got '3'; allowed: A:B with A < B"),
         (["--jobs", "0"], "--jobs: got 0; allowed: [1, 256]"),

@@ -25,10 +25,16 @@ import structlog
 from attrs import define, field
 
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.plug_ins.registry import PLANNERS, Paths, PlanLimits, Planner
+from laneweave.coordinator.planning.plug_ins.registry import (
+    PLANNERS,
+    Paths,
+    PlainPaths,
+    PlanLimits,
+    Planner,
+    PlannerFailedError,
+)
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.protocol.errors import BadInputError, one_line
-from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.processes import die_with_parent
 
 log = structlog.get_logger(__name__)
@@ -48,12 +54,6 @@ _PROGRAM: Final = (
     f"from {__name__} import serve; serve(int(sys.argv[2]), sys.argv[3], int(sys.argv[4]))"
 )
 
-CheckedPaths = tuple[tuple[Cell, ...], ...]
-
-
-class PlannerFailedError(Exception):
-    """A planner returned no paths; the message says why."""
-
 
 def load_planner(name: str, solver_field: str = "solver") -> None:
     """Start the process of a planner, unless it runs; it imports the planner.
@@ -69,9 +69,7 @@ def end_planner(name: str) -> None:
     _process_of(name).close()
 
 
-def ask_planner(
-    name: str, request: PlanRequest, limits: PlanLimits, budget: Budget
-) -> CheckedPaths:
+def ask_planner(name: str, request: PlanRequest, limits: PlanLimits, budget: Budget) -> PlainPaths:
     """Return the paths that a planner makes for a request, as tuples of integers.
 
     Args:
@@ -108,7 +106,7 @@ class _PlannerProcess:
         with self._lock:
             self._start(solver_field)
 
-    def ask(self, request: PlanRequest, limits: PlanLimits, budget: Budget) -> CheckedPaths:
+    def ask(self, request: PlanRequest, limits: PlanLimits, budget: Budget) -> PlainPaths:
         """See `ask_planner`."""
         with self._lock:
             if time.monotonic() < self._resume_s:
@@ -128,7 +126,7 @@ class _PlannerProcess:
             if answer is None:
                 raise self._failed(f"killed: no answer within {limits.deadline_s:.3g} s")
             self._kills = 0
-            paths: CheckedPaths | None
+            paths: PlainPaths | None
             paths, error = answer
             if paths is None:
                 raise PlannerFailedError(error)
@@ -260,7 +258,7 @@ def serve(descriptor: int, name: str, parent: int) -> None:
         connection.send((paths, reason))
 
 
-def _plain(paths: Paths | None) -> CheckedPaths | None:
+def _plain(paths: Paths | None) -> PlainPaths | None:
     """Return paths as tuples of integers, which the parent can read without the plug-in's types."""
     if paths is None:
         return None

@@ -20,6 +20,14 @@ path is shorter than that of others waits in its last cell.
 """
 
 
+PlainPaths = tuple[tuple[Cell, ...], ...]
+"""Paths as tuples of integers."""
+
+
+class PlannerFailedError(Exception):
+    """A planner returned no valid paths; the message says why."""
+
+
 @frozen
 class PlanLimits:
     """How long a planner may take."""

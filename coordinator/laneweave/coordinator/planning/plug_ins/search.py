@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import structlog
 
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.plan_validator import problems_of_paths
-from laneweave.coordinator.planning.plug_ins.process import PlannerFailedError, ask_planner
-from laneweave.coordinator.planning.plug_ins.registry import PlanLimits
+from laneweave.coordinator.planning.plug_ins.registry import (
+    PlainPaths,
+    PlanLimits,
+    PlannerFailedError,
+)
 from laneweave.coordinator.planning.problem import Problem, Search, Solution
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.protocol.lattice import Cell
@@ -26,7 +29,13 @@ class PluggedInSearch(Search):
     """The search of a planner of a user; aborts if there is no valid plan."""
 
     def __init__(
-        self, name: str, request: PlanRequest, problem: Problem, limits: PlanLimits, budget: Budget
+        self,
+        name: str,
+        request: PlanRequest,
+        problem: Problem,
+        limits: PlanLimits,
+        budget: Budget,
+        ask: Callable[[str, PlanRequest, PlanLimits, Budget], PlainPaths],
     ) -> None:
         """Prepare the search.
 
@@ -36,6 +45,7 @@ class PluggedInSearch(Search):
             problem: the same request in the form that the searches use.
             limits: limits of the planner.
             budget: budget of the whole plan, so that built-in solvers have time left.
+            ask: asks the planner for paths.
         """
         super().__init__()
         self._name = name
@@ -43,12 +53,13 @@ class PluggedInSearch(Search):
         self._problem = problem
         self._limits = limits
         self._budget = budget
+        self._ask = ask
 
     def run(self) -> None:
         """Ask the planner, and check its plan."""
         self.aborted = True
         try:
-            paths = ask_planner(self._name, self._request, self._limits, self._budget)
+            paths = self._ask(self._name, self._request, self._limits, self._budget)
             self.best = _solution(self._request, self._problem, paths)
         except (PlannerFailedError, BudgetSpentError) as error:
             reason = str(error) or "it spent the budget"
