@@ -12,6 +12,7 @@ import re
 import textwrap
 from collections.abc import Callable, Iterator
 from functools import cached_property
+from types import ModuleType
 from typing import Any
 
 import attrs
@@ -34,20 +35,26 @@ ELSEWHERE = {
 """Classes whose fields another page describes."""
 
 
-def api_reference() -> str:
-    """Return a section for each public name of `laneweave`."""
+def api_reference(module: ModuleType) -> str:
+    """Return a section for each public name of a module."""
+    name = module.__name__
     return "\n\n".join(
-        _section(f"laneweave.{name}", getattr(laneweave, name))
-        for name in sorted(laneweave.__all__)
+        _section(f"{name}.{one}", getattr(module, one)) for one in sorted(module.__all__)
     )
 
 
 def _section(name: str, value: object) -> str:
-    if inspect.isclass(value):
+    public = name.rpartition(".")[2]
+    if name != f"laneweave.{public}" and public in laneweave.__all__:
+        return f"## {name}\n\nThe same as [laneweave.{public}](API.md#laneweave{public.lower()})."
+    if inspect.isclass(value) and not hasattr(value, "__args__"):
         return "\n\n".join(_class_parts(name, value))
-    if callable(value):
+    if inspect.isfunction(value):
         return f"## {name}\n\n{_signature(name, value)}\n\n{_text(value)}"
-    return f"## {name}\n\nThe version of the installed package, as text."
+    if isinstance(value, str):
+        return f"## {name}\n\nThe version of the installed package, as text."
+    alias = re.sub(r"\b(?:[a-z_]+\.)+(?=[A-Z])", "", str(value))
+    return f"## {name}\n\n```python\n{alias}\n```"
 
 
 def documented(node: ast.Module | ast.ClassDef) -> Iterator[tuple[str, str]]:
@@ -68,10 +75,12 @@ def _class_parts(name: str, kind: type) -> Iterator[str]:
         return
     if attrs.has(kind):
         yield _fields(kind)
-    elif not issubclass(kind, BaseException):
+    elif not issubclass(kind, BaseException) and not getattr(kind, "_is_protocol", False):
         yield _signature(name, kind)
     for member, found in vars(kind).items():
         inner = found.__func__ if isinstance(found, (classmethod, staticmethod)) else found
+        if member == "__call__" and inspect.isfunction(inner):
+            yield f"{_signature(name, inner)}\n\n{_text(inner)}"
         if member.startswith("_") or not inspect.getdoc(inner):
             continue
         if isinstance(inner, (property, cached_property)):
@@ -138,7 +147,7 @@ def _text(value: object) -> str:
 def _parts(paragraph: str) -> Iterator[str]:
     if re.match(r"[a-z_]+(, [a-z_]+)*: ", paragraph):  # lines such as `cost, steps: meaning`
         lines = re.sub(r"\n +", " ", paragraph).splitlines()
-        yield "\n".join(re.sub(r"^([\w, ]+):", r"- `\1`:", line) for line in lines)
+        yield "\n".join(re.sub(r"^([\w, -]+):", r"- `\1`:", line) for line in lines)
         return
     if paragraph.startswith("    "):
         yield f"```python\n{textwrap.dedent(paragraph)}\n```"

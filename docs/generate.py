@@ -26,12 +26,14 @@ if __name__ == "__main__":  # same paths as `pythonpath` in pyproject.toml
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 
+import laneweave
 import roads
 from api_reference import api_reference, documented
 from command_reference import command_reference
 from conflict_drawing import counts, draw_conflicts
 from evaluation.evidence import read_evidence
 from evaluation.tables import document_parts
+from laneweave import methods, planners
 from laneweave.agents.host import AgentMetrics
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.core import CoordinatorMetrics
@@ -774,7 +776,9 @@ def parts() -> dict[str, str]:
         "topics": _topics(),
         "messages": _messages(),
         "events": _events(),
-        "api": api_reference(),
+        "api": api_reference(laneweave),
+        "api of planners": api_reference(planners),
+        "api of methods": api_reference(methods),
         "commands": command_reference(),
         "decisions": _decisions(),
         "scenario fields": _scenario_fields(),
