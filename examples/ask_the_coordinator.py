@@ -7,10 +7,9 @@ this endpoint.
 
 import sys
 
-from laneweave.coordinator.planning.request import PlanRequest
-from laneweave.coordinator.service.client import PlanClient, PlanError
+import laneweave
 
-request = PlanRequest.from_dict(
+request = laneweave.PlanRequest.from_dict(
     {
         "schema": "laneweave.plan.request/1",
         "grid": {"columns": 6, "lanes": 3},
@@ -25,10 +24,10 @@ request = PlanRequest.from_dict(
 )
 
 endpoint = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"
-with PlanClient(endpoint) as client:
+with laneweave.PlanClient(endpoint) as client:
     try:
         plan = client.plan(request, timeout_s=5.0)
-    except (PlanError, TimeoutError) as error:
+    except (laneweave.PlanError, TimeoutError) as error:
         raise SystemExit(f"no plan: {error}") from None
 
 print(f"{plan.status}: cost {plan.cost}, {plan.steps} steps, {plan.solve_ms:.1f} ms")

@@ -12,7 +12,7 @@ from collections import deque
 
 from laneweave.planners import Cell, Paths, PlanLimits, PlanRequest, displacements
 
-ATTEMPTS = 50
+ATTEMPTS = 20
 """Maximum number of orders of the vehicles."""
 
 

@@ -20,7 +20,7 @@ __path__[:] = extend_path([], __name__)
 if TYPE_CHECKING:
     from laneweave.coordinator.planning.request import PlanRequest
     from laneweave.coordinator.planning.response import PlanResponse
-    from laneweave.coordinator.service.client import PlanClient
+    from laneweave.coordinator.service.client import PlanClient, PlanError
     from laneweave.launch.library.plans import plan
     from laneweave.launch.library.recorded_run import RecordedRun, load_run
     from laneweave.launch.library.runs import RunFailedError, load_scenario, run
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = (
     "BadInputError",
     "PlanClient",
+    "PlanError",
     "PlanRequest",
     "PlanResponse",
     "RecordedRun",
@@ -49,6 +50,7 @@ __all__ = (
 _MODULES = {
     "BadInputError": "laneweave.protocol.errors",
     "PlanClient": "laneweave.coordinator.service.client",
+    "PlanError": "laneweave.coordinator.service.client",
     "PlanRequest": "laneweave.coordinator.planning.request",
     "PlanResponse": "laneweave.coordinator.planning.response",
     "RecordedRun": "laneweave.launch.library.recorded_run",
