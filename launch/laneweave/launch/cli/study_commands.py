@@ -18,6 +18,7 @@ from laneweave.launch.cli.options import (
     check_jobs,
     parse_seeds,
 )
+from laneweave.launch.drawing.figures import FigureFormat
 from laneweave.launch.run.run_folder import timestamped_folder
 from laneweave.launch.run_methods import METHODS, KeepTrajectories
 from laneweave.protocol.config.scenario_files import load_scenario
@@ -112,6 +113,10 @@ def report(
             help="Folder for a comparison; default: a new one in runs/.",
         ),
     ] = None,
+    figures: Annotated[
+        FigureFormat,
+        typer.Option("--figures", help="Format of figures; SVG and PDF: beside those of the page."),
+    ] = FigureFormat.PNG,
 ) -> None:
     """Write figures and a page for each finished run, and for a sweep or several runs together."""
     from laneweave.launch.recordings.runs import Comparison, is_sweep, runs_of, single_run
@@ -123,14 +128,25 @@ def report(
     try:
         for folder in folders:
             if not is_sweep(folder):
-                page = report_run(single_run(folder), formation=formation, dpi=REPORT_DPI)
+                page = report_run(
+                    single_run(folder),
+                    formation=formation,
+                    dpi=REPORT_DPI,
+                    file_format=figures,
+                )
                 Console().print(f"{page}: written", highlight=False, soft_wrap=True)
         if len(folders) > 1 or is_sweep(folders[0]):
             if len(folders) == 1:
                 out = folders[0]
             place = out or timestamped_folder("report")
             title = "laneweave: " + ", ".join(folder.resolve().name for folder in folders)
-            page = report_comparison(Comparison.of(runs), place, title, formation=formation)
+            page = report_comparison(
+                Comparison.of(runs),
+                place,
+                title,
+                formation=formation,
+                file_format=figures,
+            )
             Console().print(f"{page}: written", highlight=False, soft_wrap=True)
     except OSError as error:
         raise CommandFailedError(f"the report cannot be written: {error}") from error

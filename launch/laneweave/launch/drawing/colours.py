@@ -1,27 +1,34 @@
-"""Colours and names of lanes and vehicles, for figures and the live page."""
+"""Colours and names of lanes and vehicles, for figures and the live page.
+
+The colours are those of Okabe and Ito (Color Universal Design, 2008), which readers with a colour
+vision deficiency can tell apart. Lanes also have their numbers wherever they have colours.
+"""
 
 from __future__ import annotations
 
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 
-_THREE_LANES = ("#2f6fc4", "#3f9b4f", "#cf3f3a")
-"""The paper's colours from right to left: blue, green, red."""
+_THREE_LANES = ("#0072b2", "#f0e442", "#d55e00")
+"""From right to left: blue, yellow, vermilion. These three differ most: at least 34 CIELAB units
+for each kind of dichromat, the paper's blue, green and red at least 13."""
 _MORE_LANES = (
-    "#2f6fc4",
-    "#e08b27",
-    "#3f9b4f",
-    "#8a5bb5",
-    "#cf3f3a",
-    "#7a5c4d",
-    "#d46fae",
-    "#808080",
+    "#0072b2",
+    "#e69f00",
+    "#009e73",
+    "#cc79a7",
+    "#d55e00",
+    "#56b4e9",
+    "#f0e442",
+    "#3b3b3b",
 )
 NEUTRAL = "#8a8f96"
 """Colour of vehicles whose preferred lane is unknown; `web/road.js` uses the same."""
 SPEED_SPAN_MPS = 5.0
 """Difference from the lattice speed at which the shade is darkest or lightest."""
 SHADE_STRENGTH = 0.45
+BRIGHT = 127.5
+"""Brightness, of 255, above which text on a colour is black."""
 
 
 def lane_colours(lanes: int) -> tuple[str, ...]:
@@ -50,14 +57,24 @@ def vehicle_colour(lanes: int, preferred_lane: int) -> str:
     return colours[preferred_lane % len(colours)]
 
 
+def text_colour(colour: str) -> str:
+    """Return black or white, whichever is legible on a colour; `web/road.js` does the same."""
+    red, green, blue = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
+    return "#000000" if 0.3 * red + 0.59 * green + 0.11 * blue > BRIGHT else "#ffffff"
+
+
 def vehicle_legend(scenario: Scenario) -> tuple[tuple[str, str], ...]:
-    """Return the colours of vehicles and their meanings, from the left lane."""
+    """Return the colours of vehicles and their meanings, from the left lane.
+
+    The meaning begins with the number that is written on the vehicles.
+    """
     lanes = scenario.road.lanes
     if not scenario.lane_shares:
         exits = tuple(
-            (vehicle_colour(lanes, scenario.exit_lane(one.name)), f"leaves by {one.name}")
+            (vehicle_colour(lanes, lane), f"{lane}: leaves by {one.name}")
             for one in scenario.exit
+            for lane in (scenario.exit_lane(one.name),)
         )
         return (*exits, (NEUTRAL, "leaves at the end" if exits else "no preferred lane"))
-    entries = zip(lane_colours(lanes), lane_names(lanes), strict=True)
-    return tuple((colour, f"prefers {name}") for colour, name in entries)[::-1]
+    words = (f"{lane}: prefers {name}" for lane, name in enumerate(lane_names(lanes)))
+    return tuple(zip(lane_colours(lanes), words, strict=True))[::-1]

@@ -5,6 +5,7 @@ matplotlib is imported when the first figure is drawn, so that the command line 
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.text import Text
+
+
+class FigureFormat(StrEnum):
+    """Formats of the figures of reports; SVG and PDF, for papers, are vector graphics."""
+
+    PNG = "png"
+    SVG = "svg"
+    PDF = "pdf"
+
 
 DPI = 150
 INK, FAINT_INK = "#30343a", "#6a7078"
@@ -35,7 +45,9 @@ def save(figure: Figure, out: Path, dpi: float) -> None:
     if (layout := figure.get_layout_engine()) is not None:
         layout.execute(figure)
         figure.set_layout_engine("none")
-    figure.savefig(out, dpi=dpi)
+    # Without the date, equal figures are equal files.
+    dated = {".svg": "Date", ".pdf": "CreationDate"}.get(out.suffix)
+    figure.savefig(out, dpi=dpi, metadata={dated: None} if dated else None)
 
 
 def write(

@@ -21,6 +21,7 @@ from matplotlib.text import Text
 
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.launch.drawing.colours import text_colour
 from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save, write
 from laneweave.protocol.errors import BadInputError
 
@@ -173,7 +174,7 @@ class _Vehicles:
             body.set(fc=colours[choice], ec=INK, lw=0.6, label=vehicle.id)
             axes.add_patch(body)
             drawn.bodies.append(body)
-            label = write(axes, (0, 0), name, size_pt, color=_ink_on(colours[choice]), zorder=5)
+            label = write(axes, (0, 0), name, size_pt, color=text_colour(colours[choice]), zorder=5)
             label.set(ha="center", va="center_baseline")
             drawn.labels.append(label)
         drawn.move([vehicle.cell for vehicle in request.vehicles])
@@ -311,12 +312,6 @@ def _colour(team: int) -> str:
     parts = to_rgb(_PALETTE[number])
     mixed = [(1 - strength) * part + strength * grey for part in parts]
     return to_hex((mixed[0], mixed[1], mixed[2]))
-
-
-def _ink_on(colour: str) -> str:
-    """Return a text colour that is readable on a background colour."""
-    red, green, blue = to_rgb(colour)
-    return "#ffffff" if 0.3 * red + 0.59 * green + 0.11 * blue < 0.5 else "#000000"
 
 
 def _limited_dpi(figure: Figure, dpi: float, max_pixels: float) -> float:

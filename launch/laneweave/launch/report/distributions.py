@@ -18,6 +18,7 @@ from laneweave.launch.report.style import (
     REFERENCE,
     explain_empty_axes,
     label_colours,
+    label_dashes,
     legend_above,
     picture,
     spread_evenly,
@@ -163,7 +164,7 @@ def _draw(
 ) -> None:
     labels = list(dict.fromkeys(label for label, _ in counted))
     volumes = spread_evenly(sorted({volume for _, volume in counted}))
-    colours, single = label_colours(labels), len(volumes) == 1
+    colours, dashes, single = label_colours(labels), label_dashes(labels), len(volumes) == 1
     # With one volume, put the quantities side by side, because one column would be too tall.
     size_in = (3.2 * len(quantities), 3.0)
     if not single:
@@ -176,7 +177,8 @@ def _draw(
         for axes, (quantity, volume) in zip(panels.flat, keys, strict=True):
             for label in labels:
                 if (label, volume) in counted:
-                    _draw_one(axes, counted[label, volume], quantity, label, colours[label])
+                    style = {"color": colours[label], "linestyle": dashes[label], "label": label}
+                    _draw_one(axes, counted[label, volume], quantity, style)
             if not axes.lines:
                 explain_empty_axes(axes, "no trajectories")
             axes.axvline(_set_value(quantity, scenario), zorder=1, **REFERENCE)
@@ -190,8 +192,8 @@ def _draw(
             legend_above(figure)
 
 
-def _draw_one(axes: Axes, counts: Counts, quantity: Quantity, label: str, colour: str) -> None:
-    style: dict[str, Any] = {"color": colour, "linewidth": 1.4, "label": label}
+def _draw_one(axes: Axes, counts: Counts, quantity: Quantity, style: dict[str, Any]) -> None:
+    style |= {"linewidth": 1.4}
     if quantity.exceedance:
         shares = counts.exceedance(quantity)
         axes.plot(quantity.edges[:-1][shares > 0.0], shares[shares > 0.0], **style)

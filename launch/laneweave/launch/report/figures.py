@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from laneweave.launch.report.style import (
     SMALL_TEXT,
     explain_empty_axes,
     label_colours,
+    label_markers,
     legend_above,
     picture,
     spread_evenly,
@@ -28,6 +30,7 @@ from laneweave.launch.report.style import (
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.colors import FuncNorm
 
 JAMMED = 1.25
 """Travel times with an upper quartile above this multiple of the lowest median count as jammed."""
@@ -41,6 +44,11 @@ CLOSED_WIDTH = 0.025
 """Width of the marks of closed parts, as a share of the width of the axes."""
 BIN_M, BIN_S = 20.0, 5.0
 """Bin sizes for mean speeds."""
+LIMIT_PERCENT, MIN_LIMIT_MPS = 98.0, 0.5
+"""The scale of speeds ends at this percentile of the differences from v_F, at least at the second
+value [m/s]."""
+NO_VEHICLE = "#c4c8ce"
+"""Colour of bins without vehicles; white means v_F."""
 
 
 def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
@@ -127,6 +135,7 @@ def _draw_boxes(axes: Axes, times_s: Mapping[str, Sequence[Floats]]) -> None:
     """Draw the boxes of each label by volume, and a line through their means."""
     volumes = len(next(iter(times_s.values())))
     all_places, colours = _places(len(times_s), volumes), label_colours(times_s)
+    markers = label_markers(times_s)
     for places, (label, times) in zip(all_places, times_s.items(), strict=True):
         colour = colours[label]
         axes.boxplot(
@@ -143,7 +152,8 @@ def _draw_boxes(axes: Axes, times_s: Mapping[str, Sequence[Floats]]) -> None:
             flierprops={"marker": ".", "markersize": 2.5, "markeredgecolor": colour},
         )
         means = [float(np.mean(one)) if len(one) else np.nan for one in times]
-        axes.plot(places, means, "o-", color=colour, markersize=3.5, linewidth=1.3, zorder=3)
+        style: dict[str, Any] = {"marker": markers[label], "markersize": 4, "linewidth": 1.3}
+        axes.plot(places, means, color=colour, zorder=3, **style)
 
 
 def _travel_times(runs: Iterable[Run]) -> Floats:
@@ -199,6 +209,7 @@ def _draw_seeds(
     The dots of labels are shifted sideways, because labels may have the same values.
     """
     colours, labels, nothing = label_colours(comparison.labels), comparison.labels, True
+    markers = label_markers(labels)
     for number, label in enumerate(labels):
         shift = (number - 0.5 * (len(labels) - 1)) * apart
         means, spreads = [], []
@@ -211,14 +222,20 @@ def _draw_seeds(
             place = [volume + shift] * len(found)
             axes.plot(place, found, ".", color=colours[label], markersize=4, alpha=0.45)
         places = np.array(comparison.volumes) + shift
-        style: dict[str, Any] = {"marker": "o", "markersize": 4.5, "linewidth": 1.5, "capsize": 3}
+        style: dict[str, Any] = {"markersize": 5, "linewidth": 1.5, "capsize": 3}
+        style["marker"] = markers[label]
         axes.errorbar(places, means, spreads, color=colours[label], label=label, **style)
     if nothing:
         explain_empty_axes(axes, "runs too short to count vehicles")
 
 
 def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
-    """Draw the mean speed over space and time, in a panel per label and volume."""
+    """Draw the mean speed over space and time, in a panel per label and volume.
+
+    Colours diverge from v_F, with one scale for all panels: the difference from v_F has a
+    square-root scale, so that small waves show beside jams, up to the percentile `LIMIT_PERCENT` of
+    all bins; the ends of the bar are for bins beyond it.
+    """
     labels, volumes = comparison.labels, spread_evenly(comparison.volumes)
     shown = {
         (label, volume): comparison.representative(label, volume)
@@ -226,15 +243,15 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
         for volume in volumes
     }
     maps = {key: mean_speeds(run) for key, run in shown.items() if run is not None}
-    fastest_mps = [float(one.speed_mps.max()) for one in maps.values() if one.speed_mps.count()]
-    set_mps = [1.2 * run.scenario.formation.speed_mps for run in shown.values() if run is not None]
+    set_mps = next(run.scenario.formation.speed_mps for run in shown.values() if run is not None)
+    norm, ticks = speed_scale(maps.values(), set_mps)
     width_in, height_in = 1.5 + 2.05 * max(2, len(volumes)), 0.75 + 1.75 * len(labels)
     with picture(width_in, height_in, out, dpi) as figure:
         panels = figure.subplots(len(labels), len(volumes), sharex=True, sharey=True, squeeze=False)
         for axes, ((label, volume), run) in zip(panels.flat, shown.items(), strict=True):
             axes.grid(visible=False)
             axes.spines[:].set_visible(True)
-            axes.set_facecolor("#f2f3f5")
+            axes.set_facecolor(NO_VEHICLE)
             if label == labels[0]:
                 axes.set_title(volume_title(volume))
             if volume == volumes[0]:
@@ -242,25 +259,53 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
             if run is None:
                 explain_empty_axes(axes, "no trajectories")
                 continue
-            one, top_mps = maps[label, volume], max(fastest_mps + set_mps)
+            one = maps[label, volume]
             mesh = axes.pcolormesh(
                 one.edges_s,
                 one.edges_m,
                 one.speed_mps,
-                cmap="inferno",
-                vmin=0.0,
-                vmax=top_mps,
+                cmap="RdBu",
+                norm=norm,
                 rasterized=True,
             )
             start_m = run.scenario.road.sorting_start_m
-            axes.axhline(start_m, color="white", linewidth=0.7, linestyle="--")
+            axes.axhline(start_m, color=INK, linewidth=0.7, linestyle="--")
             _mark_closed_parts(axes, run)
         axes.set_xlim(0.0, max(one.edges_s[-1] for one in maps.values()))
         axes.set_ylim(0.0, max(one.edges_m[-1] for one in maps.values()))
         figure.supxlabel("time (s)", fontsize=9)
         figure.supylabel("position on the road (m)", fontsize=9)
-        bar = figure.colorbar(mesh, ax=panels, pad=0.012, aspect=22 * len(labels), fraction=0.03)
-        bar.set_label("mean speed (m/s)")
+        style: dict[str, Any] = {"aspect": 22 * len(labels), "fraction": 0.03, "extend": "both"}
+        bar = figure.colorbar(mesh, ax=panels, pad=0.012, extendfrac=0.04, **style)
+        bar.set_ticks(ticks, labels=[f"{one:.4g}" for one in ticks])
+        bar.minorticks_off()
+        bar.set_label(f"mean speed (m/s)\nwhite: $v_F$ = {set_mps:g} m/s")
+
+
+def speed_scale(maps: Iterable[MeanSpeeds], set_mps: float) -> tuple[FuncNorm, list[float]]:
+    """Return the scale of mean speeds around v_F, and the speeds to label on it.
+
+    It ends at a difference of 1, 2 or 5 times a power of ten, at most v_F.
+    """
+    from matplotlib.colors import FuncNorm  # noqa: PLC0415 - lazily
+
+    off = np.concatenate([np.abs(one.speed_mps.compressed() - set_mps) for one in maps])
+    limit_mps = max(MIN_LIMIT_MPS, float(np.percentile(off, LIMIT_PERCENT)) if len(off) else 0.0)
+    power = 10.0 ** math.floor(math.log10(limit_mps))
+    nice_mps = power * next(step for step in (1.0, 2.0, 5.0, 10.0) if limit_mps <= step * power)
+    limit_mps = min(nice_mps, set_mps)
+
+    def forward(speed_mps: Floats) -> Floats:
+        # Masked bins become NaN, which the scale masks again.
+        share = (np.ma.filled(speed_mps, np.nan) - set_mps) / limit_mps
+        return np.asarray(np.sign(share) * np.sqrt(np.abs(share)))
+
+    def inverse(place: Floats) -> Floats:
+        return np.asarray(set_mps + limit_mps * np.sign(place) * np.square(place))
+
+    norm = FuncNorm((forward, inverse), set_mps - limit_mps, set_mps + limit_mps)
+    shares = (-1.0, -0.5, -0.1, 0.0, 0.1, 0.5, 1.0)
+    return norm, [set_mps + share * limit_mps for share in shares]
 
 
 def _mark_closed_parts(axes: Axes, run: Run) -> None:
@@ -269,7 +314,7 @@ def _mark_closed_parts(axes: Axes, run: Run) -> None:
     for part in closed_parts(run.scenario):
         axes.axhspan(part.from_m, part.to_m, xmax=CLOSED_WIDTH, hatch="//////", zorder=2.5, **style)
         for s_m in (part.from_m, part.to_m):
-            axes.axhline(s_m, color="white", linewidth=0.7, linestyle=":", zorder=2.4)
+            axes.axhline(s_m, color=INK, linewidth=0.7, linestyle=":", zorder=2.4)
 
 
 @frozen

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -62,11 +63,17 @@ class Section:
     animations: Sequence[Animation] = ()
 
 
+def keep_units(text: str) -> str:
+    """Return text in which a number stays on one line with its unit and its deviation."""
+    return re.sub(r"(?<=\d) (?=[^\W\d]|%|±|\()|(?<=±) ", "\u00a0", text)
+
+
 def render_page(title: str, lead: str, sections: Sequence[Section]) -> str:
     """Return the HTML of a page; text is escaped."""
     environment = Environment(
         loader=PackageLoader(_PACKAGE), autoescape=True, undefined=StrictUndefined
     )
+    environment.filters["keep_units"] = keep_units
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     # Several scripts contain "use strict"; only the first one has an effect.
     scripts = road_script() + closed_parts_script() + _file("player.js") + _file("controls.js")

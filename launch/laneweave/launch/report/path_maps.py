@@ -44,7 +44,10 @@ class DrivenMap:
 
     formation: int
     rolling: bool
-    """Whether the run had no formations; the vehicles are then those that entered in a block."""
+    """Whether the run had no formations; the vehicles are then those that entered in some columns,
+    `columns`."""
+    columns: tuple[int, int]
+    """Rearmost and foremost column."""
     path_map: RelativePathMap
     """Path map with columns relative to the formation's rearmost column."""
     preferred_lanes: tuple[int, ...]
@@ -59,13 +62,15 @@ class DrivenMap:
     @property
     def name(self) -> str:
         """Name of the formation in figures."""
-        return f"{'block' if self.rolling else 'formation'} {self.formation}"
+        if self.rolling:
+            return f"columns {self.columns[0]} to {self.columns[1]}"
+        return f"formation {self.formation}"
 
     @property
     def vehicles(self) -> str:
         """Description of the vehicles."""
         if self.rolling:
-            return "the vehicles that entered in the columns of a block"
+            return f"the vehicles that entered in {self.name}"
         return "a formation's vehicles"
 
     @property
@@ -137,6 +142,7 @@ def _map_of(
     return DrivenMap(
         formation.number,
         run.scenario.formation.rolling,
+        (formation.rear, formation.front),
         RelativePathMap(
             tuple(tracks.names[members[row][0]] for row in order),
             tuple(cells[row] for row in order),

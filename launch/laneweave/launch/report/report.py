@@ -12,7 +12,7 @@ from pathlib import Path
 from attrs import define, field
 
 from laneweave.launch.drawing.closed_parts import describe_closed_parts
-from laneweave.launch.drawing.figures import DPI
+from laneweave.launch.drawing.figures import DPI, FigureFormat
 from laneweave.launch.recordings.runs import Comparison, Run, single_run
 from laneweave.launch.recordings.trajectories import read_tracks
 from laneweave.launch.report import distributions, figures
@@ -30,7 +30,8 @@ PAPER_STRETCH_M = (500.0, 800.0)
 TRAVEL_CAPTION = (
     "Travel times of the counted vehicles of all seeds, including the wait at the entrance. Boxes: "
     "quartiles and median; whiskers: at most 1.5 interquartile ranges; dots and lines: means. The "
-    "axis is broken if only some methods jam."
+    "axis is broken if only some methods jam. Dashed, free flow: time at v_F from the start of the "
+    "road to its end, without waiting."
 )
 FLOW_CAPTION = (
     "Left: rate at which vehicles pass the end of the road, between the first and the last "
@@ -39,7 +40,9 @@ FLOW_CAPTION = (
 )
 SPEED_CAPTION = (
     "Mean speed in bins of 20 m and 5 s, in the first run with trajectories of each method and "
-    "volume. Grey: no vehicle. Dashed: start of lane sorting."
+    "volume. White: v_F; red: slower; blue: faster; grey: no vehicle. Scale of all panels: square "
+    "root of the difference from v_F, up to its 98th percentile over all bins, rounded up. Dashed: "
+    "start of lane sorting."
 )
 SPEED_CLOSED_CAPTION = " Hatched, between dotted lines: positions at which a lane is closed."
 SPACING_CAPTION = (
@@ -62,6 +65,8 @@ class _Report:
     figures: Path
     """Folder of the pictures."""
     dpi: int
+    file_format: FigureFormat
+    """Format of the figures beside the PNG files of the page."""
     names: Mapping[str, str] = field(factory=dict)
     """File names of pictures in the report of a single run, by name in a comparison."""
     sections: list[Section] = field(factory=list)
@@ -72,6 +77,8 @@ class _Report:
         """Draw a picture and return it in a list."""
         path = self.figures / self.names.get(name, name)
         draw(path, self.dpi)
+        if self.file_format is not FigureFormat.PNG:
+            draw(path.with_suffix(f".{self.file_format}"), self.dpi)
         return [Picture(path, self.dpi, caption, alt)]
 
     def add(
@@ -93,7 +100,13 @@ def draw_report(folder: Path) -> None:
         raise CommandFailedError(f"{folder}: the report cannot be written: {error}") from error
 
 
-def report_run(run: Run, *, formation: int | None = None, dpi: int = DPI) -> Path:
+def report_run(
+    run: Run,
+    *,
+    formation: int | None = None,
+    dpi: int = DPI,
+    file_format: FigureFormat = FigureFormat.PNG,
+) -> Path:
     """Write pictures and page of a run to its folder; return the path of the page.
 
     For arguments and errors see `report_comparison`.
@@ -109,13 +122,18 @@ def report_run(run: Run, *, formation: int | None = None, dpi: int = DPI) -> Pat
     )
     names = {"travel_times.png": "travel_time.png", "speeds.png": "speed.png"}
     names[f"road-{run.label}.png"] = "road.png"
-    report = _Report(run.folder, dpi, names)
+    report = _Report(run.folder, dpi, file_format, names)
     sections = _sections(Comparison((run,), ()), report, formation)
     return write_page(title, lead, sections, run.folder)
 
 
 def report_comparison(
-    comparison: Comparison, out: Path, title: str, *, formation: int | None = None
+    comparison: Comparison,
+    out: Path,
+    title: str,
+    *,
+    formation: int | None = None,
+    file_format: FigureFormat = FigureFormat.PNG,
 ) -> Path:
     """Write pictures and page of several runs; return the path of the page.
 
@@ -124,6 +142,7 @@ def report_comparison(
         out: folder of the page and of the folder `figures`.
         title: title of the page.
         formation: formation whose path map is drawn; None: the one with the most moves.
+        file_format: format of the figures; SVG and PDF are written beside the PNG files.
 
     Raises:
         BadInputError: the run has no such formation.
@@ -137,7 +156,7 @@ def report_comparison(
         f"{runs} runs of {', '.join(comparison.labels)}; {len(comparison.failed)} failed.",
         roads.pop() if len(roads) == 1 else "The runs differ in the closed parts of lanes.",
     )
-    sections = _sections(comparison, _Report(out / "figures", REPORT_DPI), formation)
+    sections = _sections(comparison, _Report(out / "figures", REPORT_DPI, file_format), formation)
     return write_page(title, lead, sections, out)
 
 
@@ -153,6 +172,9 @@ def _sections(comparison: Comparison, report: _Report, formation: int | None) ->
         if not several or _has_formations(run)
     )
     driven = next(maps, None)
+    if shown:
+        animations = [Animation(animation_data(run, tracks, _title(run))) for run, tracks in shown]
+        report.sections.append(Section("The moving road", animations=animations))
     report.sections.append(Section("Results", tables=tables_of(comparison)))
     report.add(
         "Travel time",
@@ -182,8 +204,6 @@ def _sections(comparison: Comparison, report: _Report, formation: int | None) ->
         report.sections.append(Section("Snapshots", pictures=pictures))
         _add_path_map(report, driven)
         _add_distributions(report, comparison, busiest[0])
-        animations = [Animation(animation_data(run, tracks, _title(run))) for run, tracks in shown]
-        report.sections.append(Section("Animation", animations=animations))
     return report.sections
 
 
@@ -194,7 +214,9 @@ def _snapshots(report: _Report, run: Run) -> list[Picture]:
     preferences = bool(run.scenario.lane_shares)
     caption = _sentences(
         f"{_title(run)}. Four times at intervals of the shortest T_F.",
-        "Colours show the preferred lanes;" if preferences else "Vehicles have no preferred lanes;",
+        "Colours and numbers on vehicles show the preferred lanes (0: rightmost);"
+        if preferences
+        else "Vehicles have no preferred lanes;",
         "faster vehicles are lighter.",
         "Hatched: closed; thick line: stop line before it." if run.scenario.road.closures else "",
     )
@@ -214,7 +236,8 @@ def _add_path_map(report: _Report, driven: DrivenMap | None) -> None:
         "Relative path map",
         "path_map.png",
         partial(draw_path_map, driven),
-        f"Cells (column, lane) of {driven.vehicles} at the ends of slots, as driven. "
+        f"Cells (column, lane) of {driven.vehicles} at the ends of slots, as driven; columns are "
+        "counted from the rearmost. "
         f"{driven.colours}; bold: moved in the preceding slot. Cost: the sum over the vehicles of "
         "the slot in which they arrive.",
         f"Table of the cells of {driven.name} by vehicle and slot",

@@ -18,6 +18,7 @@ from laneweave.launch.drawing.colours import (
     NEUTRAL,
     SHADE_STRENGTH,
     SPEED_SPAN_MPS,
+    text_colour,
     vehicle_colour,
     vehicle_legend,
 )
@@ -44,6 +45,8 @@ _ACROSS_SCALE, _LONG_ACROSS_SCALE = 1.8, 2.1
 the second one is for stretches longer than `_LONG_M`."""
 _LONG_M = 450.0
 _MAX_LEGEND_COLUMNS = 7
+_MIN_LANE_PT, _MAX_LANE_PT = 4.0, 6.5
+"""Sizes of the numbers of lanes on vehicles; smaller ones are not written."""
 _HEADROOM_M = 4.5
 """Space above the road for formation numbers."""
 _MAX_STRETCH_M, _MAX_CLOSED_M, _BEYOND_M = 740.0, 120.0, 50.0
@@ -61,9 +64,9 @@ def road_snapshots(
 ) -> None:
     """Draw a stretch of road at given times, one strip below another.
 
-    Vehicles have the colour of their preferred lane; faster vehicles are lighter. Left lanes are on
-    top, and traffic moves to the right. The columns of formations are in alternating shades of
-    grey, with the formation numbers above the road. Closed parts of lanes are hatched.
+    Vehicles have colour and number of their preferred lane; faster vehicles are lighter. Left lanes
+    are on top, and traffic moves to the right. The columns of formations are in alternating shades
+    of grey, with the formation numbers above the road. Closed parts of lanes are hatched.
 
     Args:
         folder: folder of the run.
@@ -88,6 +91,7 @@ def road_snapshots(
     length_m = stretch_m[1] - stretch_m[0]
     across = _ACROSS_SCALE if length_m <= _LONG_M else _LONG_ACROSS_SCALE
     strip_in = across * (width_in - 0.9) * road_m / length_m
+    width_pt = 72.0 * (width_in - 0.9)
     with picture(width_in, 0.9 + len(times) * (strip_in + 0.06), out, dpi) as figure:
         strips = figure.subplots(len(times), 1, sharex=True, squeeze=False)[:, 0]
         for axes, t_s in zip(strips, times, strict=True):
@@ -102,7 +106,7 @@ def road_snapshots(
                     if preferred == ANY_LANE:
                         preferred = exits.get(trip.get("destination", ""), ANY_LANE)
                     own = scenario.types[trip.get("vehicle_type", CAR)]
-                    _draw_vehicle(axes, pose, preferred, own)
+                    _draw_vehicle(axes, pose, preferred, own, across * width_pt / length_m)
         strips[-1].tick_params(axis="x", bottom=True, labelbottom=True)
         strips[-1].set_xlabel("position on the road (m)")
         _draw_legend(figure, scenario)
@@ -233,9 +237,23 @@ def _draw_formations(
 
 
 def _draw_vehicle(
-    axes: Axes, pose: tuple[float, float, float, float], preferred: int, scenario: Scenario
+    axes: Axes,
+    pose: tuple[float, float, float, float],
+    preferred: int,
+    scenario: Scenario,
+    scale_pt_per_m: float,
 ) -> None:
-    """Draw the body of a vehicle, of the type that a scenario describes, with a pale windscreen."""
+    """Draw the body of a vehicle with the number of its preferred lane.
+
+    A small vehicle, or one without a preferred lane, has a pale windscreen instead.
+
+    Args:
+        axes: axes of the strip.
+        pose: (s m, y m, heading rad, speed m/s).
+        preferred: preferred lane, or `ANY_LANE`.
+        scenario: scenario of the vehicle's type.
+        scale_pt_per_m: scale across the road.
+    """
     from matplotlib.patches import Polygon  # noqa: PLC0415 - lazily
 
     s_m, y_m, heading, speed_mps = pose
@@ -253,7 +271,16 @@ def _draw_vehicle(
     axes.add_patch(
         Polygon(shape(-0.5, 0.5, 0.5), facecolor=colour, edgecolor=INK, linewidth=0.5, zorder=3)
     )
-    axes.add_patch(Polygon(shape(0.12, 0.3, 0.36), facecolor="#ffffffb0", linewidth=0.0, zorder=4))
+    size_pt = min(_MAX_LANE_PT, 0.95 * width_m * scale_pt_per_m)
+    if preferred == ANY_LANE or size_pt < _MIN_LANE_PT:
+        glass: dict[str, Any] = {"facecolor": "#ffffffb0", "linewidth": 0.0}
+        axes.add_patch(Polygon(shape(0.12, 0.3, 0.36), zorder=4, **glass))
+        return
+    shown = text_colour("#" + "".join(f"{round(255 * part):02x}" for part in colour))
+    style: dict[str, Any] = {"ha": "center", "va": "center_baseline", "clip_on": True, "zorder": 5}
+    axes.text(
+        centre[0], centre[1], f"{preferred}", fontsize=size_pt, color=shown, weight="bold", **style
+    )
 
 
 def _draw_legend(figure: Figure, scenario: Scenario) -> None:

@@ -15,18 +15,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PALETTE: Final = (
-    "#2f6fc4",
-    "#12438c",
-    "#7db4e6",
-    "#1f9e89",
-    "#e0992f",
-    "#cf3f3a",
-    "#8a5bb5",
-    "#7a5c4d",
-    "#d46fae",
+    "#0072b2",
+    "#00436b",
+    "#56b4e9",
+    "#009e73",
+    "#8f8500",
+    "#cc79a7",
+    "#d55e00",
+    "#e69f00",
+    "#7d3600",
+    "#000000",
     "#808890",
-    "#a8a13a",
 )
+"""Colours of Okabe and Ito without their yellow, which is faint on white, and darker ones."""
+_MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h")
+_DASHES: Final = ("-", "--", "-.", (0, (1, 1.2)), (0, (6, 1.5, 1, 1.5, 1, 1.5)))
 _STYLE: Final[Any] = {
     "axes.axisbelow": True,
     "axes.edgecolor": "#b6bbc2",
@@ -47,6 +50,9 @@ _STYLE: Final[Any] = {
     "ytick.color": INK,
     "ytick.labelsize": 8,
     "ytick.major.size": 3,
+    # Text in vector graphics: TrueType fonts in PDF, which journals ask for; paths in SVG.
+    "pdf.fonttype": 42,
+    "svg.hashsalt": "laneweave",
 }
 REFERENCE: Final[dict[str, Any]] = {"color": "#8a9099", "linewidth": 1.0, "linestyle": "--"}
 """Style of lines for limits and nominal values."""
@@ -77,6 +83,17 @@ def label_colours(labels: Iterable[str]) -> dict[str, str]:
     free = [colour for colour in reversed(_PALETTE) if colour not in chosen.values()] or ["#808890"]
     others = [label for label in dict.fromkeys(labels) if label not in chosen]
     return chosen | {label: free[number % len(free)] for number, label in enumerate(others)}
+
+
+def label_markers(labels: Iterable[str]) -> dict[str, str]:
+    """Return a marker for each label; labels in `METHODS` always have the same ones."""
+    known = dict.fromkeys([*METHODS, *labels])
+    return {label: _MARKERS[number % len(_MARKERS)] for number, label in enumerate(known)}
+
+
+def label_dashes(labels: Iterable[str]) -> dict[str, Any]:
+    """Return a line style for each label, by its place among the labels."""
+    return {label: _DASHES[number % len(_DASHES)] for number, label in enumerate(labels)}
 
 
 def spread_evenly(volumes: Sequence[float]) -> tuple[float, ...]:

@@ -11,6 +11,11 @@ const laneweaveRoad = (() => {
   const ABOVE_PX = 13; // for names of vehicles in the left lane
   const GAP_PX = 30; // below each stretch, for the scale in metres
   const NAMED_FROM = 6; // minimum scale at which names are drawn, in pixels per metre
+  const NUMBERED_PX = 12; // minimum length of a vehicle that shows the number of its lane
+  const MIN_SCALE = 3; // of a whole road, in pixels per metre: narrow pages show more stretches
+  const MAX_STRETCHES = 16;
+  const WINDOW_M = 150; // length of the road around what is followed, on a wide page
+  const BRIGHT = 127.5; // brightness above which text on a colour is black
   const UNKNOWN = "#8a8f96";
   const LIGHT = {
     asphalt: "#e9eaec",
@@ -41,15 +46,23 @@ const laneweaveRoad = (() => {
     return `rgb(${mixed.join(",")})`;
   }
 
-  /** Split a whole road into stretches [from, to], which are drawn below each other. */
-  function wholeRoad(length) {
-    const count = Math.max(1, Math.min(6, Math.round(length / 250)));
+  /** Return black or white, whichever is legible on a colour `rgb(...)`. */
+  function textColour(colour) {
+    const [red, green, blue] = colour.match(/\d+/g).map(Number);
+    return 0.3 * red + 0.59 * green + 0.11 * blue > BRIGHT ? "#000000" : "#ffffff";
+  }
+
+  /** Split a whole road into stretches [from, to], drawn below each other in a width in pixels. */
+  function wholeRoad(length, width) {
+    const wide = Math.min(6, Math.round(length / 250));
+    const narrow = Math.min(MAX_STRETCHES, Math.ceil((length * MIN_SCALE) / Math.max(1, width)));
+    const count = Math.max(1, wide, narrow);
     return Array.from({ length: count }, (_, i) => [(length * i) / count, (length * (i + 1)) / count]);
   }
 
-  /** Return the stretch of a road around a position, shifted into the road at its ends. */
-  function windowAround(length, centre, size) {
-    const half = Math.min(size, length) / 2;
+  /** Return the stretch around a position, shifted into the road at its ends, for a width in px. */
+  function windowAround(length, centre, width) {
+    const half = Math.min(WINDOW_M, width / MIN_SCALE, length) / 2;
     const middle = Math.max(half, Math.min(length - half, centre));
     return [middle - half, middle + half];
   }
@@ -229,7 +242,15 @@ const laneweaveRoad = (() => {
       else pen.fill();
       pen.stroke();
       pen.setLineDash([]);
-      if (!body.faint) {
+      const numbered = body.lane >= 0 && length * scale >= NUMBERED_PX;
+      if (numbered && !body.faint) {
+        const high = Math.round(Math.max(9, Math.min(15, 0.95 * width * scale * ACROSS)));
+        pen.fillStyle = textColour(this.colour(body.lane, body.v));
+        pen.font = `600 ${high}px system-ui, sans-serif`;
+        pen.textAlign = "center";
+        pen.textBaseline = "middle";
+        pen.fillText(body.lane, this.x(centreS), this.y(centreY) + 0.5);
+      } else if (!body.faint) {
         pen.fillStyle = theme.glass;
         path(0.12, 0.3, 0.36);
         pen.fill();
@@ -244,5 +265,5 @@ const laneweaveRoad = (() => {
     }
   }
 
-  return { ACROSS, LIGHT, DARK, shade, wholeRoad, windowAround, columnsAt, sizeOf, line, Painter };
+  return { ACROSS, LIGHT, DARK, shade, textColour, wholeRoad, windowAround, columnsAt, sizeOf, line, Painter };
 })();

@@ -69,7 +69,7 @@ def test_the_legend_of_vehicles() -> None:
     shares = evolve(DROP, demand=evolve(DROP.demand, lane_shares=(0.0, 1.0, 1.0)))
     for scenario in (Scenario(), shares):
         meanings = [words for _, words in vehicle_legend(scenario)]
-        assert meanings == ["prefers left", "prefers middle", "prefers right"]
+        assert meanings == ["2: prefers left", "1: prefers middle", "0: prefers right"]
         assert [colour for colour, _ in vehicle_legend(scenario)][::-1] == list(lane_colours(3))
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from laneweave.launch.drawing.colours import lane_colours, text_colour
 from laneweave.launch.recordings.runs import Run, single_run
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.launch.report import animation
@@ -131,8 +132,24 @@ def test_the_player_follows_formations(run: Run, tracks: Tracks, *, longer: bool
     for (_, rear, front), centre_m in zip(data["formations"][:2], centres, strict=True):
         rear_m = lattice.cell_s_m(rear, 20.0) - run.scenario.vehicle.length_m
         assert centre_m == pytest.approx(0.5 * (rear_m + lattice.cell_s_m(front, 20.0)))
-    names = in_node("laneweave.followable(run, 3).map((one) => one.name)", data)
-    assert names == ["formation 0", "formation 1", "formation 2"]
+
+
+@needs_node
+def test_the_player_offers_what_is_on_the_road(run: Run, tracks: Tracks) -> None:
+    data = animation_data(run, tracks, "")
+    for t_s in (10.0, 30.0):
+        names = in_node(f"laneweave.followable(run, {t_s}).map((one) => one.name)", data)
+        present = {
+            name
+            for number, name in enumerate(tracks.names)
+            if tracks.t_s[tracks.rows(number)][0] <= t_s <= tracks.t_s[tracks.rows(number)][-1]
+        }
+        formations = [name for name in names if name.startswith("formation ")]
+        assert set(names) - set(formations) == present
+        assert len(names) == len(set(names))
+        known = {one["name"]: one["formation"] for one in data["vehicles"]}
+        expected = {f"formation {known[name]}" for name in present if known[name] is not None}
+        assert set(formations) == expected
 
 
 @needs_node
@@ -140,15 +157,15 @@ def test_the_player_shows_the_whole_road_or_a_window_on_it(run: Run, tracks: Tra
     data = animation_data(run, tracks, "")
     length_m = run.scenario.road.length_m
     expression = (
-        "[laneweave.stretches(run, null, 5, 80),"
-        " ...[0, 15, 500].map((t) => laneweave.stretches(run, {formation: 0}, t, 80)[0]),"
-        " laneweave.stretches(run, {vehicle: run.vehicles[0]}, 500, 80)[0]]"
+        "[laneweave.stretches(run, null, 5, 240),"
+        " ...[0, 15, 500].map((t) => laneweave.stretches(run, {formation: 0}, t, 240)[0]),"
+        " laneweave.stretches(run, {vehicle: run.vehicles[0]}, 500, 240)[0]]"
     )
     whole, *windows = in_node(expression, data)
     assert whole[0][0] == 0.0
     assert whole[-1][1] == length_m
     for begin_m, end_m in windows:
-        assert end_m - begin_m == 80.0
+        assert end_m - begin_m == 80.0  # 3 px/m
         assert 0.0 <= begin_m < end_m <= length_m
     assert windows[0][0] == 0.0
     assert windows[2] == windows[3] == [length_m - 80.0, length_m]
@@ -165,3 +182,22 @@ def test_the_player_shades_as_the_pictures_do(run: Run, tracks: Tracks) -> None:
         shown = in_node(call, data)
         expected = ",".join(str(round(255 * part)) for part in _shade("#2f6fc4", over_mps))
         assert shown == f"rgb({expected})"
+
+
+@needs_node
+def test_narrow_pages_show_more_stretches(run: Run, tracks: Tracks) -> None:
+    data = animation_data(run, tracks, "")
+    call = "[1200, 380, 60].map((width) => laneweaveRoad.wholeRoad(1000, width))"
+    wide, narrow, tiny = in_node(call, data)
+    assert [len(one) for one in (wide, narrow, tiny)] == [4, 8, 16]
+    for stretches in (wide, narrow, tiny):
+        assert [begin for begin, _ in stretches[1:]] == [end for _, end in stretches[:-1]]
+
+
+@needs_node
+def test_text_is_legible_on_all_colours(run: Run, tracks: Tracks) -> None:
+    data = animation_data(run, tracks, "")
+    for colour in (*lane_colours(3), *lane_colours(8)):
+        red, green, blue = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
+        shown = in_node(f"laneweaveRoad.textColour('rgb({red},{green},{blue})')", data)
+        assert shown == text_colour(colour)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from attrs import evolve
@@ -14,8 +15,15 @@ from PIL import Image
 
 from laneweave.launch.drawing.closed_parts import CLOSED_FILL
 from laneweave.launch.drawing.colours import NEUTRAL, lane_colours
+from laneweave.launch.drawing.figures import FigureFormat
 from laneweave.launch.recordings.runs import Comparison, Run, scenario_of
-from laneweave.launch.report.figures import draw_flows, draw_speeds, draw_travel_times
+from laneweave.launch.report.figures import (
+    MeanSpeeds,
+    draw_flows,
+    draw_speeds,
+    draw_travel_times,
+    speed_scale,
+)
 from laneweave.launch.report.report import report_run
 from laneweave.launch.report.snapshots import default_stretch_m, road_snapshots
 from laneweave.launch.report.tables import run_table, tables_of
@@ -187,11 +195,45 @@ def test_runs_side_by_side(tmp_path: Path) -> None:
     assert is_picture(tmp_path / "new folder" / "box.png")
 
 
-def test_lanes_are_coloured_as_in_the_paper() -> None:
-    blue, green, red = lane_colours(3)
-    assert (lane_colours(1), lane_colours(2)) == ((blue,), (blue, red))
-    assert green not in lane_colours(2)
-    assert len(set(lane_colours(8))) == 8
+def speeds(*rows: tuple[float | None, ...]) -> MeanSpeeds:
+    """Return mean speeds by bin; None: no vehicle."""
+    values = np.ma.masked_invalid(np.array(rows, dtype=float))
+    edges = [np.arange(size + 1.0) for size in values.shape]
+    return MeanSpeeds(edges[0], edges[1], values)
+
+
+def test_speeds_diverge_from_the_speed_of_the_lattice() -> None:
+    some = speeds((15.0, 15.2, 14.8, None), (15.0,) * 4)
+    norm, ticks = speed_scale([some], 15.0)
+    assert (norm.vmin, norm.vmax) == (14.5, 15.5)  # the minimum
+    assert ticks[len(ticks) // 2] == 15.0
+    places = norm(some.speed_mps)
+    assert places[0, 0] == pytest.approx(0.5)
+    assert places[0, 1] - 0.5 == pytest.approx(0.5 - places[0, 2]) == pytest.approx(0.5 * 0.4**0.5)
+    assert places.mask.tolist() == some.speed_mps.mask.tolist()
+
+
+def test_the_scale_of_speeds_ends_at_a_percentile() -> None:
+    """A single bin does not decide about the colours of all others."""
+    calm = speeds((14.0, 16.0) * 100, (15.0,) * 200)
+    jam = speeds((0.0,) + (15.0,) * 199)
+    assert speed_scale([calm, jam], 15.0)[0].vmax == 16.0
+    assert speed_scale([jam, speeds((3.0,) * 50)], 15.0)[0].vmin == 0.0
+
+
+@pytest.mark.parametrize(
+    ("file_format", "begin"), [(FigureFormat.SVG, b"<?xml"), (FigureFormat.PDF, b"%PDF")]
+)
+def test_figures_for_papers_are_vector_graphics(
+    tmp_path: Path, file_format: FigureFormat, begin: bytes
+) -> None:
+    out = tmp_path / f"heat.{file_format}"
+    runs = comparison(make_run(tmp_path / "run"))
+    draw_speeds(runs, out, dpi=60)
+    first = out.read_bytes()
+    assert first.startswith(begin)
+    draw_speeds(runs, out, dpi=60)
+    assert out.read_bytes() == first
 
 
 @pytest.mark.slow

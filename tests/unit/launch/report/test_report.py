@@ -16,7 +16,7 @@ from PIL import Image
 
 from laneweave.launch.drawing.road_scene import road_scene
 from laneweave.launch.recordings.runs import POINT_FILE, Comparison, runs_of
-from laneweave.launch.report.page import Animation, Section, render_page
+from laneweave.launch.report.page import Animation, Section, keep_units, render_page
 from laneweave.launch.report.tables import Table, tables_of
 from laneweave.protocol.scenario.fields import Scenario
 from support.commands import Here
@@ -96,8 +96,9 @@ def test_of_a_sweep(laneweave: Here, swept: Path, tmp_path: Path) -> None:
 def test_of_a_run(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(swept / "formation-1600-1", folder)
-    assert laneweave("report", folder, "--formation", 2)[0] == 0
+    assert laneweave("report", folder, "--formation", 2, "--figures", "svg")[0] == 0
     assert {path.name for path in folder.glob("*.png")} == RUN_FIGURES
+    assert {path.with_suffix(".png").name for path in folder.glob("*.svg")} == RUN_FIGURES
     reader = check_page(folder / "report.html", len(RUN_FIGURES))
     assert "laneweave run: run" in reader.texts
     assert len(reader.data) == 1
@@ -223,3 +224,17 @@ def test_planning_times_of_a_comparison(swept: Path) -> None:
     runs[-1] = evolve(runs[-1], summary=make_summary(planning={"plans": 0}))
     *_, without, _ = tables_of(Comparison.of(runs))
     assert len(without.rows) == len(planning.rows) - 1
+
+
+@pytest.mark.parametrize(
+    ("text", "kept"),
+    [
+        ("66.01 / 67.35 s", "66.01 / 67.35_s"),
+        ("9.88 m, 0.94 s", "9.88_m, 0.94_s"),
+        ("70.1 ± 0.3", "70.1_±_0.3"),
+        ("91 (100.00 %)", "91_(100.00_%)"),
+        ("no preferred lanes", "no preferred lanes"),
+    ],
+)
+def test_numbers_stay_on_a_line_with_their_units(text: str, kept: str) -> None:
+    assert keep_units(text) == kept.replace("_", "\u00a0")

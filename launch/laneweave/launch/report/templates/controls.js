@@ -1,7 +1,5 @@
 // Controls of the animated road; requires a browser.
 
-const WINDOW_M = 150; // length of the road shown while following
-const MAX_FOLLOWED = 400;
 
 class Player {
   constructor(box, run) {
@@ -31,14 +29,28 @@ class Player {
     part("pace").addEventListener("change", (event) => {
       this.pace = Number(event.target.value);
     });
-    const choices = laneweave.followable(this.run, MAX_FOLLOWED);
-    const view = part("view");
-    for (const choice of choices) view.add(new Option(`follow ${choice.name}`));
-    view.addEventListener("change", () => {
-      this.follow = view.selectedIndex > 0 ? choices[view.selectedIndex - 1] : null;
-      if (this.follow) this.t = laneweave.arrivalTime(this.run, this.follow);
+    this.view = part("view");
+    this.choices = [];
+    for (const event of ["pointerdown", "focus"]) this.view.addEventListener(event, () => this.listViews());
+    this.view.addEventListener("change", () => {
+      this.follow = this.choices[this.view.selectedIndex - 1] ?? null;
       this.draw();
     });
+    this.listViews();
+  }
+
+  /** List what is on the road as options of the view, and what is followed. */
+  listViews() {
+    const { follow } = this;
+    this.choices = laneweave.followable(this.run, this.t);
+    let chosen = this.choices.findIndex(({ name }) => name === follow?.name);
+    if (follow && chosen < 0) {
+      this.choices.unshift(follow);
+      chosen = 0;
+    }
+    const options = this.choices.map(({ name }) => new Option(`follow ${name}`));
+    this.view.replaceChildren(new Option("whole road"), ...options);
+    this.view.selectedIndex = chosen + 1;
   }
 
   toggle() {
@@ -62,7 +74,8 @@ class Player {
     const { run } = this;
     const present = laneweave.allAt(run, this.t);
     const bodies = present.map(([vehicle, state]) => ({ ...state, name: vehicle.name, lane: vehicle.lane, type: vehicle.type }));
-    const stretches = laneweave.stretches(run, this.follow, this.t, WINDOW_M);
+    const width = this.painter.canvas.clientWidth;
+    const stretches = laneweave.stretches(run, this.follow, this.t, width);
     this.painter.paint(stretches, bodies, [laneweaveClosed.closedParts]);
     this.slider.value = this.t;
     const mean = present.reduce((sum, [, state]) => sum + state.v, 0) / (present.length || 1);

@@ -66,34 +66,26 @@ const laneweave = (() => {
   }
 
   /** Return the stretches [from, to] of the road to draw; `follow` null: the whole road. */
-  function stretches(run, follow, t, windowLength) {
+  function stretches(run, follow, t, width) {
     const length = run.road.length_m;
-    if (follow === null) return laneweaveRoad.wholeRoad(length);
+    if (follow === null) return laneweaveRoad.wholeRoad(length, width);
     const state = follow.vehicle ? stateAt(run, follow.vehicle, t) : null;
     const first = follow.vehicle ? follow.vehicle.first * run.step_s : 0;
     let centre = state ? state.s : t < first ? 0 : length;
     if (!follow.vehicle) centre = formationCentre(run, follow.formation, t);
-    return [laneweaveRoad.windowAround(length, centre, windowLength)];
+    return [laneweaveRoad.windowAround(length, centre, width)];
   }
 
-  /** Return the formations that can be followed, or the vehicles if there are none. */
-  function followable(run, max) {
-    const shown = new Set(run.vehicles.map((vehicle) => vehicle.formation));
-    const formations = run.formations.map(([number]) => number).filter((number) => shown.has(number));
-    if (formations.length > 0) {
-      return formations
-        .slice(0, max)
-        .map((formation) => ({ name: `formation ${formation}`, formation }));
-    }
-    return run.vehicles.slice(0, max).map((vehicle) => ({ name: vehicle.name, vehicle }));
+  /** Return what can be followed at a time: formations with a vehicle on the road, and vehicles. */
+  function followable(run, t) {
+    const present = allAt(run, t).map(([vehicle]) => vehicle);
+    const shown = new Set(present.map((vehicle) => vehicle.formation));
+    const formations = run.formations
+      .map(([number]) => number)
+      .filter((number) => shown.has(number))
+      .map((formation) => ({ name: `formation ${formation}`, formation }));
+    return [...formations, ...present.map((vehicle) => ({ name: vehicle.name, vehicle }))];
   }
 
-  /** Return the time at which the followed formation reaches lane sorting, or the vehicle enters. */
-  function arrivalTime(run, follow) {
-    if (follow.vehicle) return follow.vehicle.first * run.step_s;
-    const ahead = run.road.sorting_start_m - 20 - formationCentre(run, follow.formation, 0);
-    return Math.max(0, Math.min(run.end_s, ahead / run.lattice.speed_mps));
-  }
-
-  return { unpack, decode, stateAt, allAt, formationCentre, stretches, followable, arrivalTime };
+  return { unpack, decode, stateAt, allAt, formationCentre, stretches, followable };
 })();

@@ -102,7 +102,6 @@ const laneweaveLayers = (() => {
       const { pen, scene } = painter;
       const { pitch_m: pitch, speed_mps: speed } = scene.lattice;
       const width = scene.road.lane_width_m;
-      pen.lineWidth = 1.5;
       for (const body of bodies) {
         const target = body.target || body.hold;
         if (!target || body.faint) continue;
@@ -112,13 +111,17 @@ const laneweaveLayers = (() => {
         if (!painter.shows(Math.min(s, body.s) - length, Math.max(s, body.s))) continue;
         const half = length / 2;
         const [x1, y1] = [painter.x(s - half), painter.y(y)];
-        pen.strokeStyle = pen.fillStyle = ownColour(painter, body);
-        laneweaveRoad.line(pen, painter.x(body.s - half), painter.y(body.y), x1, y1);
-        pen.beginPath();
-        pen.arc(x1, y1, 4, 0, 2 * Math.PI);
         pen.fillStyle = painter.theme.asphalt;
+        // A dark edge keeps light colours visible.
+        for (const [colour, px] of [["#30343a", 3.5], [ownColour(painter, body), 2]]) {
+          pen.strokeStyle = colour;
+          pen.lineWidth = px;
+          laneweaveRoad.line(pen, painter.x(body.s - half), painter.y(body.y), x1, y1);
+          pen.beginPath();
+          pen.arc(x1, y1, 4, 0, 2 * Math.PI);
+          pen.stroke();
+        }
         pen.fill();
-        pen.stroke();
       }
     };
   }
@@ -128,7 +131,7 @@ const laneweaveLayers = (() => {
     const odd = laneweaveFrames.UNATTENDED | laneweaveFrames.OVERDUE;
     return (painter) => {
       const { pen, scene } = painter;
-      pen.strokeStyle = "#e08b27";
+      pen.strokeStyle = "#cc79a7";
       pen.lineWidth = 2;
       for (const body of bodies) {
         const [length] = laneweaveRoad.sizeOf(scene, body);

@@ -3,8 +3,8 @@
 
 const PAINT_MS = 28; // minimum time between two repaints
 const NUMBERS_MS = 200; // minimum time between two updates of the figures
-const WINDOW_M = 150; // length of the road shown while following
 const AHEAD = 40; // frames fetched in advance
+const NBSP = "\u00a0"; // between a number and its unit
 const RETRY_MS = [300, 600, 1200, 2500];
 const PACES = [0.5, 1, 2, 5, 10];
 const CALM = matchMedia("(prefers-reduced-motion: reduce)");
@@ -267,18 +267,20 @@ class Watch {
 
   strips(scene, { t, bodies }) {
     const length = scene.road.length_m;
-    if (!this.follow || t === null) return laneweaveRoad.wholeRoad(length);
+    const width = part("road").clientWidth;
+    const whole = laneweaveRoad.wholeRoad(length, width);
+    if (!this.follow || t === null) return whole;
     if (this.follow.vehicle) {
       const body = bodies.find((one) => one.name === this.follow.vehicle);
       this.centre = body ? body.s : (this.centre ?? length);
     } else {
       const found = this.current.formations.find(([number]) => number === this.follow.formation);
       if (found) this.columns = found.slice(1);
-      if (!this.columns) return laneweaveRoad.wholeRoad(length);
+      if (!this.columns) return whole;
       const [rear, front] = laneweaveRoad.columnsAt(scene, ...this.columns, t);
       this.centre = (rear + front) / 2;
     }
-    return [laneweaveRoad.windowAround(length, this.centre, WINDOW_M)];
+    return [laneweaveRoad.windowAround(length, this.centre, width)];
   }
 
   // --- numbers ----------------------------------------------------------------------------------
@@ -295,11 +297,11 @@ class Watch {
     setText("run", frame.run > 1 ? `run ${frame.run} since the server started` : "");
     const [demanded, entered, , left] = frame.counts ?? [0, 0, 0, 0];
     setText("count", frame.counts ? `${this.picture.bodies.length}` : "–");
-    setText("counts", frame.counts ? `${entered} of ${demanded} entered, ${left} left` : "");
-    const mean = speed === null ? "" : `${speed.toFixed(1)} m/s`;
+    setText("counts", frame.counts ? `${entered} of ${demanded} entered, ${left}${NBSP}left` : "");
+    const mean = speed === null ? "" : `${speed.toFixed(1)}${NBSP}m/s`;
     if (scene.preferences) {
       setText("sorted", knownLane ? `${Math.round((100 * inLane) / knownLane)} %` : "–");
-      setText("speed", mean && `${inLane} of ${knownLane}; mean ${mean}`);
+      setText("speed", mean && `${inLane} of ${knownLane}; mean${NBSP}${mean}`);
     } else {
       setText("sorted", mean || "–");
       setText("speed", "no preferred lanes");
@@ -311,7 +313,7 @@ class Watch {
     const [plannedAt, planned, took, solver, fallback] = frame.plan ?? [];
     const by = solver ? ` by ${solver}${fallback ? " (fallback)" : ""}` : "";
     setText("plan", frame.plan ? `${took.toFixed(1)} ms` : "–");
-    setText("planned", frame.plan ? `${planned} vehicles${by}, at ${plannedAt.toFixed(1)} s` : "");
+    setText("planned", frame.plan ? `${planned} vehicles${by}, at${NBSP}${plannedAt.toFixed(1)}${NBSP}s` : "");
     this.showNews(frame.news);
     this.showTime(frame, setText);
     this.showStatus();
@@ -404,7 +406,7 @@ class Watch {
   }
 
   showLegend() {
-    const { legend, road, lattice, rolling } = this.store.scene;
+    const { legend, road, lattice, preferences, rolling } = this.store.scene;
     const entry = (style, words) => {
       const span = document.createElement("span");
       if (style) {
@@ -418,6 +420,7 @@ class Watch {
     };
     const own = legend.map(([colour, words]) => entry({ kind: "car", colour }, words));
     const rest = [
+      ...(preferences ? [entry(null, "number: preferred lane, 0 is the rightmost")] : []),
       entry(null, `darker: slower than ${lattice.speed_mps} m/s; lighter: faster`),
       entry({ kind: "cell" }, this.live && rolling ? "cells that a vehicle owns; framed: its hold cell" : "hold cell of a vehicle"),
       entry({ kind: "target" }, "target of a vehicle"),
