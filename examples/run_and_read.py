@@ -26,7 +26,7 @@ for minute, speeds in enumerate(mean_mps.T):
     print(f"minute {minute}: {np.nanmean(speeds):.2f} m/s")
 
 # Rows are in the order of time.
-lanes: dict[str, list[int]] = {}
+lanes: dict[object, list[object]] = {}
 for vehicle, lane in zip(rows["vehicle"].to_pylist(), rows["lane"].to_pylist(), strict=True):
     if lanes.setdefault(vehicle, [lane])[-1] != lane:
         lanes[vehicle].append(lane)

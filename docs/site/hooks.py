@@ -2,7 +2,7 @@
 
 A link in a document names a file of the repository by a relative path, so that it works in any
 repository browser. The site contains the home page (README.md), the changelog and the guide for
-contributors as pages, and every other file that a page links to as a page of its own in
+contributors as pages. Every other file or folder that a page links to is a page of its own in
 `repository/`. A link to a file that does not exist stays as it is, so that a strict build fails.
 """
 
@@ -32,7 +32,7 @@ SEARCH = "site/iframe-worker.js"
 SEARCH_FROM_NETWORK = "https://unpkg.com/iframe-worker/shim"
 
 _DIAGRAM = re.compile(r'(<pre class="mermaid">.*?</pre>)', re.DOTALL)
-_FENCE = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
+_FENCE = re.compile(r"(^````.*?^````$|^```.*?^```$)", re.MULTILINE | re.DOTALL)
 _NAMED = re.compile(r"\[([A-Z_]+\.md)\](?=\(([^)\s#]+))")
 _TARGET = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)\s#]+)")
 
@@ -48,29 +48,22 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     waiting = list(documents)
     while waiting:
         source = waiting.pop()
-        if source.endswith(".md"):
-            for target in _repository_files((ROOT / source).read_text(encoding="utf-8"), source):
-                if target not in pages and not target.startswith("docs/"):
-                    pages[target] = None
-                    waiting.append(target)
+        for target in _linked(_markdown(source), source):
+            if target not in pages and not target.startswith("docs/"):
+                pages[target] = None
+                waiting.append(target)
     for source in pages:
-        text = (ROOT / source).read_text(encoding="utf-8")
-        if not source.endswith(".md"):
-            language = LANGUAGES.get(Path(source).suffix, "text")
-            text = f"# {source}\n\n````{language}\n{text}````\n"
-        files.append(File.generated(config, _address(source), content=text))
+        files.append(File.generated(config, _address(source), content=_markdown(source)))
     return files
 
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     """Return the page with addresses and titles of pages in place of paths in the repository."""
     source = _source(page.file.src_uri)
-    if not source.endswith(".md"):
-        return markdown
 
     def address(match: re.Match[str]) -> str:
         target = _resolved(source, match[1])
-        if not (ROOT / target).is_file():
+        if not (ROOT / target).exists():
             return match[1]
         return os.path.relpath(_address(target), PurePosixPath(page.file.src_uri).parent)
 
@@ -104,35 +97,52 @@ def on_post_template(output: str, **_: object) -> str:
     return output.replace(SEARCH_FROM_NETWORK, f"/{SEARCH}")
 
 
-def _repository_files(text: str, source: str) -> Iterator[str]:
-    """Yield the files of the repository to which a document links."""
+def _markdown(source: str) -> str:
+    """Return a file or folder of the repository as a page."""
+    path = ROOT / source
+    if path.is_dir():
+        names = sorted(one.relative_to(path).as_posix() for one in path.rglob("*.*"))
+        shown = [name for name in names if (path / name).suffix in {".md", *LANGUAGES}]
+        return f"# {source}\n\n" + "".join(f"- [{name}]({name})\n" for name in shown)
+    text = path.read_text(encoding="utf-8")
+    if source.endswith(".md"):
+        return text
+    return f"# {source}\n\n````{LANGUAGES.get(path.suffix, 'text')}\n{text}````\n"
+
+
+def _linked(text: str, source: str) -> Iterator[str]:
+    """Yield the files and folders of the repository to which a page links."""
     for part in _FENCE.split(text)[::2]:
         for target in _TARGET.findall(part):
             resolved = _resolved(source, target)
-            if (ROOT / resolved).is_file():
+            if (ROOT / resolved).exists():
                 yield resolved
 
 
 def _resolved(source: str, target: str) -> str:
     """Return the path in the repository of a link's target."""
-    return os.path.normpath(PurePosixPath(source).parent / target)
+    folder = source if (ROOT / source).is_dir() else PurePosixPath(source).parent
+    return os.path.normpath(PurePosixPath(folder) / target)
 
 
 def _address(source: str) -> str:
-    """Return the address in the site of a file of the repository."""
+    """Return the address in the site of a file or folder of the repository."""
     if source in PAGES:
         return PAGES[source]
     if source.startswith("docs/"):
         return source.removeprefix("docs/")
+    if (ROOT / source).is_dir():
+        return f"repository/{source}/index.md"
     return f"repository/{source}" if source.endswith(".md") else f"repository/{source}.md"
 
 
 def _source(address: str) -> str:
-    """Return the file of the repository that a page shows."""
+    """Return the file or folder of the repository that a page shows."""
     roots = {page: name for name, page in PAGES.items()}
     if address in roots:
         return roots[address]
     if address.startswith("repository/"):
-        source = address.removeprefix("repository/")
-        return source if (ROOT / source).is_file() else source.removesuffix(".md")
+        path = address.removeprefix("repository/")
+        found = (path, path.removesuffix(".md"), path.removesuffix("/index.md"))
+        return next(one for one in found if (ROOT / one).exists())
     return f"docs/{address}"
