@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from pathlib import Path
 
 import pytest
 
 import laneweave
-from support.commands import python
+from support.commands import python, run
 
 ROOT = Path(__file__).resolve().parents[3]
 FRONT_DOOR = ROOT / "launch" / "laneweave" / "__init__.py"
@@ -53,3 +54,39 @@ print(*(name for name in sys.modules if name.split(".")[0] in ("attrs", "numpy",
 """
     done = python(program)
     assert (done.returncode, done.stdout.split()) == (0, ["laneweave"]), done.stderr
+
+
+@pytest.mark.slow
+def test_a_wheel_is_typed_for_users(tmp_path: Path) -> None:
+    """Build and install the wheel, and check a user's program elsewhere."""
+    pip, site = (sys.executable, "-m", "pip"), tmp_path / "site"
+    options = ("--no-deps", "--no-build-isolation", "--no-index", "-q")
+    done = run(*pip, "install", *options, "--target", site, ROOT)
+    assert done.returncode == 0, done.stderr
+    inits = [path.parent.name for path in site.glob("laneweave/**/__init__.py")]
+    assert inits.count("laneweave") == 1
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import laneweave\n"
+        "reveal_type(laneweave.run(seed=3))\n"
+        "reveal_type(laneweave.plan({}).cost)\n"
+        "reveal_type(laneweave.load_run('x').events('plan-made'))\n"
+        "laneweave.run(method=7)\n",
+        encoding="utf-8",
+    )
+    environment = {"MYPYPATH": str(site), "PATH": "", "HOME": str(tmp_path)}
+    checks = ("--strict", "--follow-imports=silent", "--ignore-missing-imports")
+    done = run(sys.executable, "-m", "mypy", *checks, program, cwd=tmp_path, env=environment)
+    types = re.findall(r'Revealed type is "(.*)"', done.stdout)
+    assert types == [
+        "laneweave.protocol.summary.RunSummary",
+        "int | None",
+        "list[dict[str, Any]]",
+    ], done.stdout
+    (error,) = (line for line in done.stdout.splitlines() if ": error:" in line)
+    assert 'incompatible type "int"; expected "str"' in error
+    done = run(
+        sys.executable, "-c", "import laneweave; print(laneweave.plan.__module__)",
+        cwd=tmp_path, env=environment | {"PYTHONPATH": str(site)},
+    )  # fmt: skip
+    assert done.stdout == "laneweave.launch.library.plans\n", done.stderr
