@@ -37,8 +37,9 @@ class Page:
         return self.driver.execute_script(f"return {script}")
 
     def text(self, identity: str) -> str:
-        """Return the text of an element."""
-        return str(self.run(f"document.getElementById('{identity}').textContent"))
+        """Return the text of an element, with plain spaces."""
+        text = str(self.run(f"document.getElementById('{identity}').textContent"))
+        return text.replace("\u00a0", " ")
 
     def click(self, identity: str) -> None:
         """Click on an element, which must be visible."""
