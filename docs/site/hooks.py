@@ -39,13 +39,8 @@ _TARGET = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)\s#]+)")
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that come from outside of docs/."""
-    documents = {
-        f"docs/{file.src_uri}": Path(config.docs_dir, file.src_uri)
-        for file in files.documentation_pages()
-    }
-    documents |= {name: ROOT / name for name in PAGES}
     pages = dict.fromkeys(PAGES)
-    waiting = list(documents)
+    waiting = [*pages, *(f"docs/{file.src_uri}" for file in files.documentation_pages())]
     while waiting:
         source = waiting.pop()
         for target in _linked(_markdown(source), source):
