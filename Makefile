@@ -16,7 +16,7 @@ export OPENBLAS_NUM_THREADS := 1
 # Keep compiled modules: every process of a run would otherwise compile the project again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-unit test-full containers evaluation evaluation-faults docs check format clean install help
+.PHONY: demo test test-unit test-full containers evaluation evaluation-faults docs site check format clean install help
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 19
@@ -66,6 +66,9 @@ evaluation-faults: $(STAMP) ## run the experiments of "Under faults" in docs/EVA
 
 docs: $(STAMP) ## update the generated parts of the documents
 	$(BIN)/python docs/generate.py
+
+site: $(STAMP) ## build the website of the documents in build/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 clean: ## remove everything that these targets create
 	rm -rf $(VENV) runs build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

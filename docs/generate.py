@@ -26,10 +26,14 @@ if __name__ == "__main__":  # same paths as `pythonpath` in pyproject.toml
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 
+import laneweave
 import roads
+from api_reference import api_reference, documented
+from command_reference import command_reference
 from conflict_drawing import counts, draw_conflicts
 from evaluation.evidence import read_evidence
 from evaluation.tables import document_parts
+from laneweave import methods, planners
 from laneweave.agents.host import AgentMetrics
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.core import CoordinatorMetrics
@@ -58,6 +62,7 @@ from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import TOPICS, Exchange, Party, Topic
 from laneweave.sim_bridge.core import BridgeMetrics
 from laneweave.sim_bridge.recording.columns import TICKS, TRAJECTORIES, TRIPS, Table
+from scenario_reference import meanings_in, scenario_table
 from support.planted_bugs import BUGS
 from support.unseen_bugs import UNSEEN
 
@@ -89,6 +94,8 @@ LONG = DOCS / "evidence" / "long-run.json"
 """Memory of long runs, by `benchmarks/long_run.py`."""
 STABILITY = DOCS / "evidence" / "stability.json"
 """Output of `benchmarks/stability.py`."""
+DECISIONS = DOCS / "adr"
+SCENARIO = DOCS / "SCENARIO.md"
 CONFLICTS = DOCS / "images" / "conflict-table.png"
 CASE = DOCS / "examples" / "case-study.json"
 SOLVING = DOCS / "images" / "solving-process.png"
@@ -214,7 +221,7 @@ def _messages() -> str:
         if isinstance(node, ast.ClassDef):
             lines = [f"### {node.name}\n\n{ast.get_docstring(node)}\n"]
             lines += ["| Field | Meaning |", "|---|---|"]
-            lines += [f"| `{name}` | {text} |" for name, text in _documented(node)]
+            lines += [f"| `{name}` | {text} |" for name, text in documented(node)]
             sections.append("\n".join(lines))
     return "\n\n".join(sections)
 
@@ -222,7 +229,7 @@ def _messages() -> str:
 def _events() -> str:
     """Return the table of events that roles log."""
     lines = ["| Event | Meaning |", "|---|---|"]
-    for name, text in _documented(_syntax(events)):
+    for name, text in documented(_syntax(events)):
         if isinstance(getattr(events, name), str):
             lines.append(f"| `{getattr(events, name)}` | {text} |")
     return "\n".join(lines)
@@ -259,14 +266,21 @@ def _syntax(module: ModuleType) -> ast.Module:
     return ast.parse(inspect.getsource(module))
 
 
-def _documented(node: ast.Module | ast.ClassDef) -> Iterator[tuple[str, str]]:
-    """Yield the annotated names of a module or class, each with the docstring below it."""
-    for statement, below in zip(node.body, [*node.body[1:], None], strict=True):
-        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
-            text = ""
-            if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
-                text = " ".join(str(below.value.value).split()).removesuffix(".")
-            yield statement.target.id, text
+def _decisions() -> str:
+    """Return the list of decisions: the titles of their pages, numbered."""
+    titles = {
+        path: path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+        for path in sorted(DECISIONS.glob("[0-9]*.md"))
+    }
+    return "\n".join(
+        "{}. [{}](adr/{})".format(*title.split(". ", 1), path.name)
+        for path, title in titles.items()
+    )
+
+
+def _scenario_fields() -> str:
+    """Return the table of scenario fields, with the meanings that the document has now."""
+    return scenario_table(meanings_in(SCENARIO.read_text(encoding="utf-8")))
 
 
 def _planted_bugs() -> str:
@@ -762,6 +776,12 @@ def parts() -> dict[str, str]:
         "topics": _topics(),
         "messages": _messages(),
         "events": _events(),
+        "api": api_reference(laneweave),
+        "api of planners": api_reference(planners),
+        "api of methods": api_reference(methods),
+        "commands": command_reference(),
+        "decisions": _decisions(),
+        "scenario fields": _scenario_fields(),
         "vehicle rules": _rule_table(VEHICLE_RULES),
         "vehicle phases": _phase_diagram(VEHICLE_RULES, ExecutionPhase.FREE),
         "leader rules": _rule_table(LEADER_RULES),

@@ -5,11 +5,10 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import json
-import math
 import re
 import shlex
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -36,14 +35,22 @@ from laneweave.launch.faults.specification import (
 )
 from laneweave.launch.observe.status import SCHEMA, Status
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
-from laneweave.protocol.field_validators import HOST_PORT_RULE, NAME_RULE
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.runtime.message_faults import MessageRule
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS, Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.codec import KINDS
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, pose_of
 from laneweave.sim_bridge.recording.run_record import Ending
+from scenario_reference import (
+    MISSING,
+    default_of,
+    limits_of,
+    meanings_in,
+    range_of,
+    scenario_fields,
+    scenario_table,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -98,126 +105,23 @@ def rows(text: str) -> list[list[str]]:
     return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines[2:]]
 
 
-def line(cells: list[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
 def code(text: str) -> str:
     return text.strip("`")
 
 
 # --- docs/SCENARIO.md: every field of a scenario -------------------------------------------------
 
-UNITS = {
-    "veh_per_lane_h": "vehicles/(lane h)",
-    "mps3": "m/s3",
-    "mps2": "m/s2",
-    "mps": "m/s",
-    "m": "m",
-    "s": "s",
-    "ticks": "ticks",
-}
 
-
-def scenario_table(meanings: Mapping[str, str]) -> str:
-    """Return the table of all scenario fields; the meanings come from the document itself."""
-    table = [line(["Field", "Default", "Unit", "Allowed", "Meaning"]), "|---|---|---|---|---|"]
-    for name, attribute in _scenario_fields():
-        cells = [_default(attribute), _unit(name), _allowed(attribute), meanings.get(name, "?")]
-        table.append(line([f"`{name}`", *cells]))
-    return "\n".join(table)
-
-
-def _scenario_fields() -> Iterator[tuple[str, attrs.Attribute[Any]]]:
-    for outer in attrs.fields(Scenario):
-        kind: type = type(outer.default)
-        if attrs.has(kind):
-            for inner in attrs.fields(kind):
-                yield f"{outer.name}.{inner.name}", inner
-        else:
-            yield outer.name, outer
-
-
-def _default(attribute: attrs.Attribute[Any]) -> str:
-    value = attribute.default
-    if value is attrs.NOTHING:
-        return "required"
-    if value is None:
-        return "not set"
-    if isinstance(value, tuple):
-        return f"`{json.dumps(list(value))}`"
-    if isinstance(value, attrs.Factory(dict).__class__):
-        return "`{}`"
-    return f"`{json.dumps(value)}`"
-
-
-def _unit(name: str) -> str:
-    return next((unit for end, unit in UNITS.items() if name.endswith(f"_{end}")), "")
-
-
-def _allowed(attribute: attrs.Attribute[Any]) -> str:
-    if attribute.validator is None:
-        # Parsing a scenario resolves the annotations from text to types, with their modules.
-        kind = attribute.type.__name__ if attribute.type in (str, bool) else str(attribute.type)
-        kinds = {
-            "str": "text",
-            "tuple[float, ...]": "list of numbers",
-            "tuple[str, ...]": "list of texts",
-            "bool": "`true`, `false`",
-            "tuple[Closure, ...]": "list of tables",
-            "tuple[DestinationShare, ...]": "list of tables",
-            "tuple[Entrance, ...]": "list of tables",
-            "tuple[Exit, ...]": "list of tables",
-            "tuple[VehicleType, ...]": "list of tables",
-            "tuple[DrivingStructure, ...]": "list of tables",
-        }
-        return kinds[re.sub(r"[a-z]+\.", "", kind)]
-    found = _limits(attribute)
-    if "choices" in found:
-        return ", ".join(f"`{json.dumps(one)}`" for one in found["choices"] if one is not None)
-    if "low" in found:
-        return _range(found)
-    rules = {
-        "key_part": NAME_RULE,
-        "host_port": HOST_PORT_RULE,
-        "key_parts": f"list of names: {NAME_RULE}",
-        "_fleets": "table of shards `I/N` or lists of vehicles, by name",
-        "_conflict_kinds": "any of " + ", ".join(f"`{kind}`" for kind in CONFLICT_KINDS),
-    }
-    return rules[getattr(attribute.validator, "__name__", "")]
-
-
-def _limits(attribute: attrs.Attribute[Any]) -> Mapping[str, Any]:
-    # For an optional field: the rule for its values.
-    rule = getattr(attribute.validator, "validator", attribute.validator)
-    return {} if rule is None else inspect.getclosurevars(rule).nonlocals
-
-
-def _range(limits: Mapping[str, Any]) -> str:
-    bracket = "(" if limits["open_low"] else "["
-    return f"{bracket}{_number(limits['low'])}, {_number(limits['high'])}]"
-
-
-def _number(value: float) -> str:
-    if isinstance(value, int) and value > 2**53:
-        return f"2^{math.ceil(math.log2(value))} - 1"
-    return f"{value:.10g}"
-
-
-def test_table_of_scenario_fields() -> None:
-    part = section(read("SCENARIO.md"), "## All fields")
-    found = rows(part)
-    meanings = {code(cells[0]): cells[-1] for cells in found}
-    expected = scenario_table(meanings)
-    shown = "\n".join(text for text in part.splitlines() if text.startswith("|"))
-    assert shown == expected, f"expected table in SCENARIO.md:\n\n{expected}\n"
-    missing = [name for name, _ in _scenario_fields() if meanings[name] in ("", "?")]
+def test_scenario_fields_have_a_meaning() -> None:
+    assert meanings_in(scenario_table({})) == {name: MISSING for name, _ in scenario_fields()}
+    meanings = meanings_in(section(read("SCENARIO.md"), "## All fields"))
+    missing = [name for name, _ in scenario_fields() if meanings[name] in ("", MISSING)]
     assert not missing, f"fields without a meaning: {missing}"
 
 
 def test_rules_between_fields_name_existing_fields() -> None:
     part = section(read("SCENARIO.md"), "## Rules between fields")
-    known = {name for name, _ in _scenario_fields()}
+    known = {name for name, _ in scenario_fields()}
     named = set(re.findall(r"`([a-z]+\.[a-z_0-9]+)`", part))
     assert named
     assert named <= known
@@ -241,9 +145,9 @@ def test_tables_of_faults(heading: str, kind: type) -> None:
     fields = attrs.fields_dict(kind)
     assert shown.keys() == fields.keys()
     for name, (default, allowed, meaning) in shown.items():
-        limits = _limits(fields[name])
-        assert default == _default(fields[name]), name
-        assert "low" not in limits or allowed == _range(limits), name
+        limits = limits_of(fields[name])
+        assert default == default_of(fields[name]), name
+        assert "low" not in limits or allowed == range_of(limits), name
         assert meaning, name
 
 
@@ -426,6 +330,21 @@ def commands(text: str) -> Iterator[str]:
     yield from re.findall(r"`(laneweave [^`\n]+)`", FENCE.sub("", text))
 
 
+def test_all_options_are_in_the_reference() -> None:
+    program: Any = typer.main.get_command(command_line())
+    sections = {"laneweave": program}
+    while sections:
+        name, command = sections.popitem()
+        for inner, found in getattr(command, "commands", {}).items():
+            sections[f"{name} {inner}"] = found
+        if hasattr(command, "commands"):
+            continue
+        level = "#" * len(name.split())
+        part = section(read("COMMANDS.md"), f"{level} {name}")
+        options = [one.opts[0] for one in command.params if one.param_type_name == "option"]
+        assert [option for option in options if f"`{option}" not in part] == [], name
+
+
 @each_document
 def test_commands_exist(path: Path) -> None:
     program = typer.main.get_command(command_line())
@@ -502,4 +421,4 @@ def test_decisions_are_listed_and_have_three_parts() -> None:
     for path in decisions:
         headings = HEADING.findall(path.read_text(encoding="utf-8"))
         assert headings[1:] == ["Context", "Decision", "Consequences"], path.name
-        assert f"adr/{path.name}" in read("ARCHITECTURE.md"), f"{path.name} is not listed"
+        assert f"](adr/{path.name})" in read("DECISIONS.md"), f"{path.name} is not listed"
