@@ -310,7 +310,7 @@ def test_a_run_is_watched_to_its_end(lab: Lab, page: Page, road: Path) -> None:
     run, address = start_watched_run(lab, road, *DEMAND, "--watch-listen", "127.0.0.1:0")
     page.open(address)
     page.wait_until(lambda: page.text("pill") == "live")
-    page.wait_until(lambda: int(page.text("count")) > 3)
+    page.wait_until(lambda: len(page.run(PLACES)) > 3)
     first = page.run(PLACES)
     page.wait_until(lambda: moved_m(first, page.run(PLACES)) > 20.0)
     page.wait_until(lambda: page.text("pill") == "ended")
@@ -329,7 +329,9 @@ def test_a_run_is_watched_to_its_end(lab: Lab, page: Page, road: Path) -> None:
     assert left > 10
 
 
-PLACES = "Object.fromEntries(laneweaveWatch.picture.bodies.map((one) => [one.name, one.s]))"
+PLACES = (
+    "Object.fromEntries((laneweaveWatch.picture?.bodies ?? []).map((one) => [one.name, one.s]))"
+)
 
 
 def moved_m(before: dict[str, float], after: dict[str, float]) -> float:

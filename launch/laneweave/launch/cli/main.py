@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import errno
 import gc
-import os
 import signal
 import sys
 import threading
@@ -62,9 +61,13 @@ def main() -> None:
 
 
 def _forward_interrupts() -> None:
-    while True:
+    # Python handles signals in the main thread. One that the kernel delivers to this thread would
+    # not wake the main thread from a system call.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGHUP})
+    main_thread = threading.main_thread().ident
+    while main_thread is not None:
         signal.sigwait({signal.SIGINT})
-        os.kill(os.getpid(), signal.SIGTERM)
+        signal.pthread_kill(main_thread, signal.SIGTERM)
 
 
 def command_line() -> typer.Typer:
