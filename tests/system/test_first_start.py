@@ -135,3 +135,16 @@ def test_a_run_that_needs_a_solver_waits_for_it(
     assert f"solver={options[1]}" in ended.err
     lab.check_nothing_left()
     assert not (lab.folder / "out").exists()
+
+
+def test_a_run_whose_solver_cannot_be_compiled_says_why(lab: Lab, road: Path) -> None:
+    ended = lab.run(
+        *("run", road, *DEMAND, "--operation", "rolling", "--out", "out"),
+        NUMBA_CACHE_DIR="/proc/none",
+        NUMBA_CACHE_LOCATOR_CLASSES="UserProvidedCacheLocator",
+    )
+
+    assert ended.status == 1
+    (line,) = ended.complaints
+    assert line.startswith("rolling: cannot be compiled: ")
+    assert "NUMBA_CACHE_DIR" in line

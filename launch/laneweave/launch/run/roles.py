@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from multiprocessing import forkserver, resource_tracker
+from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
 from types import ModuleType
@@ -102,24 +103,30 @@ def fork_server(solvers: Collection[str] = ()) -> ForkServerContext:
         del os.environ[LAUNCHER]
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     # Starting it waits for the server; at this point Ctrl-C still raises KeyboardInterrupt.
-    first = context.Process(target=_compile, args=(tuple(solvers),), name="processes")
-    _start(first)
-    first.join()
-    if first.exitcode:
-        names = ", ".join(solvers)
-        raise CommandFailedError(f"{names}: cannot be compiled; `laneweave compile` says why")
+    problems, sender = context.Pipe(duplex=False)
+    with problems, sender:
+        first = context.Process(target=_compile, args=(tuple(solvers), sender), name="processes")
+        _start(first)
+        first.join()
+        if first.exitcode:
+            reason = problems.recv() if problems.poll() else f"status {first.exitcode}"
+            raise CommandFailedError(f"{', '.join(solvers)}: cannot be compiled: {reason}")
     return context
 
 
-def _compile(solvers: Sequence[str]) -> None:
+def _compile(solvers: Sequence[str], problems: Connection) -> None:
     """Compile solvers unless the fork server has loaded them; runs in a process of its own."""
-    from laneweave.coordinator.planning.kernels import KERNELS
+    from laneweave.coordinator.planning.kernels import KERNELS, CacheError
 
     die_with_parent()
     die_with_supervisor()
     log_to_terminal()
-    for solver in solvers:
-        KERNELS[solver].load()
+    try:
+        for solver in solvers:
+            KERNELS[solver].load()
+    except CacheError as error:
+        problems.send(str(error))
+        sys.exit(1)
 
 
 def start_role(
