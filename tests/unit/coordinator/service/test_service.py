@@ -235,6 +235,7 @@ def spoiled(*path: str | int, value: object) -> dict[str, Any]:
         (spoiled("vehicles", 1, "cell", value=[0, 0]), "vehicles[1].cell"),
         (spoiled("deadline_s", value=float("nan")), "deadline_s"),
         (spoiled("deadline_s", value=601.0), "deadline_s"),
+        (spoiled("solver", value="magic"), "solver"),
     ],
 )
 def test_a_malformed_request_is_refused_with_the_fields_name(

@@ -107,20 +107,21 @@ def test_what_a_planner_prints_is_not_in_the_output(
     assert capfd.readouterr() == ("", "hello\n")
 
 
-def test_a_planner_that_hangs_is_killed_and_paused(install: Install) -> None:
+def test_a_planner_that_hangs_is_killed_and_paused(
+    install: Install, capfd: pytest.CaptureFixture[str]
+) -> None:
     planner(install, "while True: pass")
     prepare("own")
     hung = process._process_of("own")._process
     assert hung is not None
+    request = attrs.evolve(REQUEST, deadline_s=3.0)
     began = time.monotonic()
-    request = attrs.evolve(REQUEST, deadline_s=1.0)
     assert replaced(plan(request, solver="own"))
-    assert PLUG_IN_SHARE <= time.monotonic() - began < request.deadline_s
+    assert time.monotonic() - began >= PLUG_IN_SHARE * request.deadline_s
     assert hung.poll() is not None
-    # The next request is not delayed.
-    began = time.monotonic()
+    # The next request is not delayed: the planner is not asked.
     assert replaced(plan(request, solver="own"))
-    assert time.monotonic() - began < PLUG_IN_SHARE
+    assert "paused" in "".join(capfd.readouterr())
 
 
 def test_a_planner_that_was_killed_is_asked_again(
