@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from random import Random
+from typing import Any
 
 import attrs
 import pytest
@@ -20,7 +21,9 @@ FORWARD, BACK, LEFT, RIGHT = (1, 0), (-1, 0), (0, 1), (0, -1)
 
 
 def grant(
-    requests: dict[Cell, Cell], blocked: tuple[Cell, ...] = (), **changes: object
+    requests: dict[Cell, Cell],
+    blocked: tuple[Cell, ...] = (),
+    **changes: Any,  # noqa: ANN401 (fields of the vehicles)
 ) -> set[Cell]:
     """Return the cells whose vehicles get their requests; a request of (0, 0) is none."""
     vehicles = [attrs.evolve(StreamVehicle(f"{cell}", cell, 0), **changes) for cell in requests]
