@@ -158,11 +158,14 @@ class AgentHost:
     def _on_message(self, event: Arrived, now_s: float) -> list[Effect]:
         message = event.message
         if isinstance(message, VehicleState):
-            effects = []
+            effects, changed = [], False
             for agent in self._agents.values():
-                if message.formation in agent.wanted_states:
+                wanted = agent.wanted_states
+                if message.formation in wanted:
                     effects += agent.handle(event, now_s)
-            self._update_subscriptions(effects)
+                    changed = changed or agent.wanted_states != wanted
+            if changed:
+                self._update_subscriptions(effects)
             return effects
         if isinstance(message, Census):
             effects = self._on_census(message, now_s)

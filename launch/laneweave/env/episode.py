@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import count
 
+from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import TrackingDriver
+from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.env.record import EpisodeRecord
-from laneweave.launch.run.simulated_roles import SimulatedRoles
-from laneweave.protocol.runtime.node import Arrived, Effect, Event, Listen, Started
+from laneweave.protocol.config.participants import coordinator_names
+from laneweave.protocol.runtime.node import Core
+from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
-from laneweave.protocol.wire.messages import Census, Name
-from laneweave.protocol.wire.topics import CENSUS
+from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.bodies_world import BodiesWorld
 from laneweave.sim_bridge.core import BridgeCore, TickPhase
 from laneweave.sim_bridge.road.demand import Arrival
@@ -31,24 +34,8 @@ def _no_time() -> float:
     return 0.0
 
 
-class _AgentStarter:
-    """Core that starts the agents of announced vehicles, as the launcher does."""
-
-    wakeup_s = None
-
-    def __init__(self, start_agents: Callable[[Census], None]) -> None:
-        self._start_agents = start_agents
-
-    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
-        del now_s
-        if isinstance(event, Started):
-            yield Listen(CENSUS)
-        elif isinstance(event, Arrived):
-            self._start_agents(event.message)
-
-
 class Episode:
-    """A simulated run: coordinators, agents and the bridge, from the first tick to the last."""
+    """A simulated run: coordinators, one process with all agents, and the bridge."""
 
     def __init__(
         self,
@@ -66,21 +53,28 @@ class Episode:
         self.scenario = scenario
         self.record = EpisodeRecord(scenario)
         self.network = SimulatedNetwork(scenario.seed, skip_codec=True)
-        make_driver = partial(TrackingDriver, stopwatch=_no_time)
-        roles = SimulatedRoles(scenario, self.network, make_coordinator, make_driver)
+        self._incarnations = count(1)
         self._bridge = BridgeCore(
             scenario,
             BodiesWorld(),
             self.record,
-            new_incarnation=roles.incarnations.__next__,
+            new_incarnation=self._incarnations.__next__,
             pace=1.0,
             stopwatch=_no_time,
             stream=stream,
         )
-        self.network.add("starter", _AgentStarter(roles.start_agents), scenario.network.realm)
-        for name in roles.coordinators:
-            roles.start(name)
-        roles.add("bridge", self._bridge, "bridge")
+        agents = AgentHost(
+            self._make_agent, next(self._incarnations), scenario.runtime, shard=Shard(0, 1)
+        )
+        cores: dict[str, Core] = {
+            name: make_coordinator(Name(name), 1, scenario) for name in coordinator_names(scenario)
+        }
+        for name, core in (cores | {"agents": agents, "bridge": self._bridge}).items():
+            self.network.add(name, core, scenario.network.realm)
+
+    def _make_agent(self, vehicle: Name) -> AgentCore:
+        make_driver = partial(TrackingDriver, stopwatch=_no_time)
+        return AgentCore(vehicle, self._incarnations.__next__, self.scenario, make_driver)
 
     @property
     def vehicles(self) -> Mapping[Name, RoadVehicle]:

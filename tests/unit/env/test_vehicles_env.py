@@ -174,7 +174,9 @@ def test_no_action_makes_bodies_overlap(
     assert env.record.overlaps == []
     assert min(closest_m) > 0.5
     assert env.record.planning_errors == []
-    assert env.record.events["plan-in-force"] > 0
+    assert env.record.events["stream-planned"] > 5
+    if policy is any_move:
+        assert env.record.events["plan-in-force"] > 0  # `into_others` may get nothing at all
     assert {*env.record.trips} == {*env.possible_agents}
     assert all(trip.left_s is not None for trip in env.record.trips.values())
 

@@ -78,7 +78,7 @@ class ObservedRoad:
             if known is not None and state.t_s < known.t_s:
                 self._keep_before(state)
             return False
-        if known is not None and age(state) < age(known):
+        if known is not None and _is_older(state, known):
             self._before.pop(name, None)  # no longer shown either
         elif known is not None and state.t_s > known.t_s:
             self._keep_before(known)
@@ -115,8 +115,15 @@ class ObservedRoad:
 
     def _keep_before(self, state: VehicleState) -> None:
         before = self._before.get(state.vehicle)
-        if before is None or age(before) < age(state):
+        if before is None or _is_older(before, state):
             self._before[state.vehicle] = state
+
+
+def _is_older(state: VehicleState, other: VehicleState) -> bool:
+    """Return whether a state was sent earlier than another one of the same vehicle."""
+    if state.incarnation == other.incarnation and state.t_s != other.t_s:
+        return state.t_s < other.t_s  # as `age`, which takes longer
+    return age(state) < age(other)
 
 
 def _at(t_s: float, newest: _Message | None, before: _Message | None) -> _Message | None:

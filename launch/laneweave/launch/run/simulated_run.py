@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from attrs import define, field
 
+from laneweave.agents.core import AgentCore
+from laneweave.agents.host import AgentHost
+from laneweave.coordinator.core import CoordinatorCore
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.shared_counters import LocalBoard
-from laneweave.launch.faults.specification import FaultSpec
+from laneweave.launch.faults.specification import ROUTER, FaultSpec
 from laneweave.launch.observe.observer import TOPICS
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
-from laneweave.launch.run.simulated_roles import SimulatedRoles
 from laneweave.launch.run_methods import FORMATION
+from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.runtime.message_faults import FaultyCore
 from laneweave.protocol.runtime.node import Arrived, Core, Effect, Event, Listen, Started
 from laneweave.protocol.runtime.processes import stop_signals
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
+from laneweave.protocol.wire.messages import Census, Name
 from laneweave.sim_bridge.core import BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road_sources import open_road
@@ -35,6 +40,7 @@ STRIDE_S = 0.02
 
 The network may run for this long after the bridge has ended, without effect on the results."""
 PROGRESS_EVERY_TICKS = 20
+AGENT_PREFIX = "agent-"
 
 
 class _ObserverCore:
@@ -56,6 +62,55 @@ class _ObserverCore:
 
 
 @define
+class SimulatedRoles:
+    """The roles of a simulated run by name; implements `RoleControl`."""
+
+    network: SimulatedNetwork
+    coordinators: tuple[str, ...]
+    start: Callable[[str], None]
+    """Starts a coordinator or agent by name."""
+    agents: dict[str, str] = field(factory=dict)
+    """Agent name of each vehicle that is announced, or on the road, or has a running agent."""
+    _router_runs: bool = True
+
+    @property
+    def running(self) -> Collection[str]:
+        """Names of the running roles."""
+        router = (ROUTER,) if self._router_runs else ()
+        roles = (*self.coordinators, *self.agents.values())
+        return [*(name for name in roles if name in self.network), *router]
+
+    def agent_of(self, vehicle: str) -> str | None:
+        """Return the agent of a vehicle, or None before it is started."""
+        return self.agents.get(vehicle)
+
+    def kill(self, name: str) -> None:
+        """Kill a role immediately, without clean-up."""
+        if name == ROUTER:
+            self._router_runs = False
+            self.network.lose_router()
+        else:
+            self.network.kill(name)
+
+    def pause(self, name: str) -> None:
+        """Suspend a role."""
+        self.network.pause(name)
+
+    def resume(self, name: str) -> None:
+        """Resume a role if it still exists."""
+        if name in self.network:
+            self.network.resume(name)
+
+    def restart(self, name: str) -> None:
+        """Restart a killed role."""
+        if name == ROUTER:
+            self._router_runs = True
+            self.network.restore_router()
+        else:
+            self.start(name)
+
+
+@define
 class SimulatedRun:
     """A run over the simulated network; call `run` once."""
 
@@ -70,8 +125,13 @@ class SimulatedRun:
     _roles: SimulatedRoles = field(init=False)
     _injection: FaultInjection | None = None
     _board: LocalBoard = field(factory=LocalBoard)
+    _handled_census: Census | None = None
+    """Census for which agents were last started."""
     _injected_road_s: float = -1.0
     """Road time at which faults were last applied."""
+    _incarnations: Iterator[int] = field(factory=lambda: count(1))
+    """Unique incarnation numbers for agents and caretakers."""
+    _coordinator_incarnations: Iterator[int] = field(factory=lambda: count(1))
     _problems: list[str] = field(factory=list)
     _stop: bool = False
 
@@ -86,7 +146,7 @@ class SimulatedRun:
         self.faults.check_simulated()
         self.folder.mkdir(parents=True, exist_ok=True)
         network = SimulatedNetwork(scenario.seed, self.conditions, skip_codec=True)
-        self._roles = SimulatedRoles(scenario, network, wrap=self._with_faults)
+        self._roles = SimulatedRoles(network, coordinator_names(scenario), self._start)
         if self.faults:
             self._injection = FaultInjection(
                 self.faults, scenario.seed, self._roles, self.conditions.lease_s
@@ -101,7 +161,7 @@ class SimulatedRun:
                 scenario,
                 road.world,
                 record,
-                new_incarnation=self._roles.incarnations.__next__,
+                new_incarnation=self._incarnations.__next__,
                 pace=1.0,
                 stream=road.stream,
                 outside_traffic=road.outside_traffic,
@@ -131,8 +191,8 @@ class SimulatedRun:
         realm = self.scenario.network.realm
         network.add("watcher", _ObserverCore(self._view, self._start_agents), realm)
         for name in self._roles.coordinators:
-            self._roles.start(name)
-        self._roles.add("bridge", bridge, "bridge")
+            self._start(name)
+        self._add("bridge", bridge, "bridge")
         shown = advanced_tick = 0
         advanced_s = 0.0
         while bridge.phase is not TickPhase.ENDED and network.queue and not self._stop:
@@ -160,12 +220,39 @@ class SimulatedRun:
             injection.step(road_s, now_s, self._view)
 
     def _start_agents(self) -> None:
-        self._roles.start_agents(self._view.census)
+        """Start the agents of newly announced vehicles, and forget those of departed ones."""
+        roles, census = self._roles, self._view.census
+        if census is None or census is self._handled_census:
+            return
+        self._handled_census = census
+        listed = {announced.vehicle for announced in census.announced}
+        listed |= {entry.vehicle for entry in census.on_road}
+        for vehicle, name in list(roles.agents.items()):
+            if vehicle not in listed and name not in roles.network:
+                del roles.agents[vehicle]
+        for announced in census.announced:
+            if announced.vehicle not in roles.agents:
+                roles.agents[announced.vehicle] = f"{AGENT_PREFIX}{announced.vehicle}"
+                self._start(roles.agents[announced.vehicle])
 
-    def _with_faults(self, name: str, core: Core, receiver: str) -> Core:
-        """Return the core that drops messages as the faults require."""
+    def _start(self, name: str) -> None:
+        """Start or restart a coordinator or an agent."""
+        if name in self._roles.coordinators:
+            incarnation = next(self._coordinator_incarnations)
+            core = CoordinatorCore(Name(name), incarnation, self.scenario)
+            self._add(name, core, "coordinator")
+        else:
+            vehicle = Name(name.removeprefix(AGENT_PREFIX))
+            incarnation, runtime = next(self._incarnations), self.scenario.runtime
+            host = AgentHost(self._make_agent, incarnation, runtime, [vehicle])
+            self._add(name, host, "vehicle")
+
+    def _add(self, name: str, core: Core, receiver: str) -> None:
         injection = self._injection
-        if injection is None:
-            return core
-        rules, seed = injection.message_rules(), injection.seed_of_start(name)
-        return FaultyCore(core, rules, self._board, receiver=receiver, seed=seed)
+        if injection is not None:
+            rules, seed = injection.message_rules(), injection.seed_of_start(name)
+            core = FaultyCore(core, rules, self._board, receiver=receiver, seed=seed)
+        self._roles.network.add(name, core, self.scenario.network.realm)
+
+    def _make_agent(self, vehicle: Name) -> AgentCore:
+        return AgentCore(vehicle, self._incarnations.__next__, self.scenario)

@@ -33,7 +33,7 @@ from laneweave.protocol.runtime.transport import (
 )
 from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import Name, Report
-from laneweave.protocol.wire.topics import SERVICE, Keys, Topic
+from laneweave.protocol.wire.topics import SERVICE, Keys, Topic, key_of
 
 log = structlog.get_logger(__name__)
 
@@ -390,7 +390,7 @@ class Node:
             )
         if message is not self._encoded[0]:
             self._encoded = message, self._write(message)
-        key = self._keys.key(topic, **effect.parameters)
+        key = key_of(self._keys.realm, topic.pattern, **effect.parameters)
         self._transport.publish(key, self._encoded[1], topic.quality)
 
     def _execute(self, effect: Effect) -> None:

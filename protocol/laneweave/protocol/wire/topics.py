@@ -217,7 +217,7 @@ class Keys:
         Raises:
             BadInputError: a parameter is not valid as one part of a key.
         """
-        return _key(self.realm, topic.pattern, **parameters)
+        return key_of(self.realm, topic.pattern, **parameters)
 
     def all_of(self, topic: Topic, **given: object) -> str:
         """Return the expression for all keys of a topic with the given parameters."""
@@ -239,7 +239,8 @@ _PATTERNS = tuple((topic, tuple(topic.pattern.split("/"))) for topic in TOPICS)
 
 # `typed`, because 1, 1.0 and True are equal but have different texts.
 @lru_cache(maxsize=_MEMO, typed=True)
-def _key(realm: str, pattern: str, /, **parameters: object) -> str:
+def key_of(realm: str, pattern: str, /, **parameters: object) -> str:
+    """Return the key of a topic's pattern in a realm; see `Keys.key`."""
     texts = {name: str(value) for name, value in parameters.items()}
     for name, text in texts.items():
         if text != "*" and not NAME_PATTERN.fullmatch(text):

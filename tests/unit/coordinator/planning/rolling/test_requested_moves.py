@@ -20,7 +20,11 @@ MODE_2 = attrs.evolve(ROAD, mode=2, model=ConflictModel(("geometric",)))
 FORWARD, BACK, LEFT, RIGHT = (1, 0), (-1, 0), (0, 1), (0, -1)
 
 
-def grant(requests: dict[Cell, Cell], blocked: tuple[Cell, ...] = (), **changes: Any) -> set[Cell]:  # noqa: ANN401 (fields of any type)
+def grant(
+    requests: dict[Cell, Cell],
+    blocked: tuple[Cell, ...] = (),
+    **changes: Any,  # noqa: ANN401 (fields of the vehicles)
+) -> set[Cell]:
     """Return the cells whose vehicles get their requests; a request of (0, 0) is none."""
     vehicles = [attrs.evolve(StreamVehicle(f"{cell}", cell, 0), **changes) for cell in requests]
     planner = RequestPlanner(ROAD)
