@@ -349,10 +349,10 @@ def test_all_options_are_in_the_reference() -> None:
 def test_commands_exist(path: Path) -> None:
     program = typer.main.get_command(command_line())
     subcommands: dict[str, Any] = getattr(program, "commands", {})
-    options = {"--help", *(name for one in program.params for name in one.opts)}
+    without_command = {"--help", *(name for one in program.params for name in one.opts)}
     for command in commands(path.read_text(encoding="utf-8")):
         words = shlex.split(command, comments=True)[1:]
-        if not words or words[0].isupper() or words[0] in options:
+        if not words or words[0].isupper() or words[0] in without_command:
             continue
         assert words[0] in subcommands, command
         subcommand = subcommands[words[0]]

@@ -12,14 +12,7 @@ import attrs
 
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.launch.library.plans import plan
-from laneweave.protocol.config.source_files import (
-    SourceFile,
-    json_lines,
-    read_text,
-    shown_name,
-    unique_keys,
-)
+from laneweave.launch.library.plans import plan, read_request
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.scenario.fields import Scenario
 
@@ -92,7 +85,7 @@ def answer_request(
     if not 0 <= wait_s <= MAX_WAIT_S:
         raise BadInputError("--wait", wait_s, f"[0, {MAX_WAIT_S:g}]")
     settings = scenario or Scenario()
-    request = _request(path, deadline_s, solver, settings)
+    request = _request(path, deadline_s, solver, settings, with_solver=access is None)
     drawers = []
     if drawing is not None:
         drawers.append(_checked_drawer(drawing))
@@ -155,15 +148,21 @@ def _report_drawing(file: Path) -> None:
 
 
 def _request(
-    path: Path, deadline_s: float | None, solver: str | None, settings: Scenario
+    path: Path,
+    deadline_s: float | None,
+    solver: str | None,
+    settings: Scenario,
+    *,
+    with_solver: bool = True,
 ) -> PlanRequest:
-    """Read a request; its own values are checked even if an option overrides them."""
-    file = _read(path, settings.service.max_request_bytes)
-    with file.located():
-        request = PlanRequest.from_dict(file.tables)
-    given = {"deadline_s": deadline_s, "solver": solver}
-    given = {name: value for name, value in given.items() if value is not None}
-    return PlanRequest.from_dict(file.tables | given) if given else request
+    return read_request(
+        path,
+        settings.service.max_request_bytes,
+        field="REQUEST.json",
+        with_solver=with_solver,
+        deadline_s=deadline_s,
+        solver=solver,
+    )
 
 
 _Drawer = tuple[Callable[[PlanRequest, PlanResponse], None], Path]
@@ -198,18 +197,6 @@ def _table(request: PlanRequest, response: PlanResponse) -> str:
         f"{response.status}, cost {response.cost}, {bound}, {response.steps} steps, planned by {by}"
     )
     return f"{line}\n\n{response.path_map(request.ids)}\n"
-
-
-def _read(path: Path, max_bytes: int) -> SourceFile:
-    name = "REQUEST.json"
-    text, shown = read_text(path, name, "JSON", max_bytes), shown_name(path)
-    try:
-        data = json.loads(text, object_pairs_hook=unique_keys)
-    except (ValueError, RecursionError) as error:
-        raise BadInputError(name, shown, f"valid JSON ({error})") from error
-    if not isinstance(data, dict):
-        raise BadInputError(name, data, "a JSON object")
-    return SourceFile(shown, text, data, json_lines)
 
 
 def _ask(access: Access, request: PlanRequest, wait_s: float) -> PlanResponse:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,20 @@ import attrs
 
 from laneweave.coordinator.planning import solve
 from laneweave.coordinator.planning.kernels import BRANCHING
+from laneweave.coordinator.planning.plug_ins.registry import checked_solver
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.run.logs import log_by_default
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.config.source_files import (
+    SourceFile,
+    json_lines,
+    read_text,
+    shown_name,
+    unique_keys,
+)
+from laneweave.protocol.errors import BadInputError, raise_all
+from laneweave.protocol.field_validators import NAME_PATTERN
+from laneweave.protocol.scenario.deployment_fields import Service
 
 
 def plan(
@@ -41,19 +51,60 @@ def plan(
         BadInputError: the request is unreadable or invalid, or there is no such solver.
     """
     log_by_default()
-    if not isinstance(request, PlanRequest):
-        data = request if isinstance(request, Mapping) else _read(Path(request))
-        request = PlanRequest.from_dict(data)
+    if isinstance(request, Path | str):
+        max_bytes = Service().max_request_bytes
+        request = read_request(Path(request), max_bytes, field="request", with_solver=True)
+    elif not isinstance(request, PlanRequest):
+        request = PlanRequest.from_dict(request)
     if deadline_s is not None:
         request = attrs.evolve(request, deadline_s=deadline_s)
     requested = solver or request.solver
     return solve.plan(request, solver=solver, compiled_only=requested != BRANCHING.name)
 
 
-def _read(path: Path) -> object:
+def read_request(
+    path: Path, max_bytes: int, *, field: str, with_solver: bool, **overrides: object
+) -> PlanRequest:
+    """Return the request in a JSON file.
+
+    Args:
+        path: the file; `STDIN`: standard input.
+        max_bytes: maximum size.
+        field: name of the file in errors.
+        with_solver: whether its solver must be installed here.
+        **overrides: values of the request to replace, which are checked all the same; None keeps
+            the value.
+
+    Raises:
+        BadInputError: the file cannot be read, or the request is invalid; names all its errors.
+    """
+    file = _read(path, max_bytes, field)
+    with file.located():
+        raise_all(_problems(file.tables, with_solver=with_solver))
+        request = PlanRequest.from_dict(file.tables)
+    given = {name: value for name, value in overrides.items() if value is not None}
+    return PlanRequest.from_dict(file.tables | given) if given else request
+
+
+def _problems(data: Mapping[str, Any], *, with_solver: bool) -> Iterator[BadInputError]:
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise BadInputError("request", str(path), f"a readable file ({error.strerror})") from error
+        PlanRequest.from_dict(data)
+    except BadInputError as error:
+        yield from error.problems
+    solver = data.get("solver")
+    if with_solver and isinstance(solver, str) and NAME_PATTERN.fullmatch(solver):
+        try:
+            checked_solver(solver)
+        except BadInputError as error:
+            yield error
+
+
+def _read(path: Path, max_bytes: int, field: str) -> SourceFile:
+    text, shown = read_text(path, field, "JSON", max_bytes), shown_name(path)
+    try:
+        data = json.loads(text, object_pairs_hook=unique_keys)
     except (ValueError, RecursionError) as error:
-        raise BadInputError("request", str(path), f"valid JSON ({error})") from error
+        raise BadInputError(field, shown, f"valid JSON ({error})") from error
+    if not isinstance(data, dict):
+        raise BadInputError(field, data, "a JSON object")
+    return SourceFile(shown, text, data, json_lines)
