@@ -2,8 +2,8 @@
 
     python benchmarks/environment.py [--episodes 10] [--policy lane|random|hold]
 
-`lane` moves towards the preferred lane; `random` makes any allowed move at any time, so that half of
-the vehicles move at any time. Prints road time by CPU time, and the number of overlaps.
+`lane` moves towards the preferred lane; `random` makes any allowed move in each slot, so that half
+of the vehicles move at any time. Prints road time by CPU time, and the number of overlaps.
 """
 
 from __future__ import annotations
