@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from laneweave.coordinator.planning.rolling.problem import StreamRoad, StreamVehicle
 from laneweave.coordinator.planning.rolling.requested_moves import is_possible
-from laneweave.protocol.lattice import WAIT, Cell, displacements
+from laneweave.protocol.lattice import Cell, displacements, footprint
 from laneweave.protocol.road_layout import sections_for
 from laneweave.protocol.scenario.fields import READY_LATE_S, Scenario
 from laneweave.protocol.wire.messages import Name
@@ -97,17 +97,21 @@ class Observer:
         return found
 
     def masks(self, vehicles: Mapping[Name, RoadVehicle], slot: int) -> dict[str, Mask]:
-        """Return, per vehicle, 1 for each action that the road and its type allow in a slot.
+        """Return, per vehicle, 1 for each move in a slot that may be granted.
 
+        The road and its type allow the move, and it needs no cell that another vehicle holds.
         Requests that conflict with those of others are refused nevertheless.
         """
+        held = {one.cell for one in vehicles.values() if one.controller.off_lattice is None}
         found: dict[str, Mask] = {}
         for name, vehicle in vehicles.items():
             mask = self.only_hold()
             if vehicle.controller.off_lattice is None:
                 planned = self._planned(name, vehicle, slot)
+                cell = planned.cell
                 for number, move in enumerate(self.moves):
-                    if move != WAIT and is_possible(self.road, slot, planned, move):
+                    entered = footprint(cell, (cell[0] + move[0], cell[1] + move[1])) - {cell}
+                    if entered.isdisjoint(held) and is_possible(self.road, slot, planned, move):
                         mask[number] = 1
             found[name] = mask
         return found
