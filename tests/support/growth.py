@@ -6,6 +6,7 @@ import gc
 import re
 from collections import deque
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,20 +17,20 @@ from attrs import define, field
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
-from laneweave.protocol.transports.simulated import network
 from laneweave.sim_bridge import core as bridge
 from laneweave.sim_bridge.recording import reports, ticks, trajectories, trips
 
 BOUNDS: tuple[tuple[ModuleType, str], ...] = (
     (bridge, "REPORT_TICKS"),
-    (network, "_CACHE_SIZE"),
     (reports, "MAX_SENDERS"),
     (ticks, "ROWS_PER_GROUP"),
     (trajectories, "TICKS_PER_GROUP"),
     (trips, "ROWS_PER_GROUP"),
 )
-"""Sizes of buffers and caches, which would otherwise still grow during a short run."""
+"""Sizes of buffers, which would otherwise still grow during a short run."""
 SMALL = 10
+_Cache = type(lru_cache(id))
+"""Class of functions with a cache, whose entries the collector knows as a dictionary."""
 PER_VEHICLE = 0.12
 """Entries for each vehicle that passed from which a container counts as growing: fewer than one for
 each formation."""
@@ -81,6 +82,10 @@ def _unbounded_containers() -> Iterator[Any]:
     # The collector does not know dictionaries of numbers and texts: find them in other objects.
     found = {id(one): one for one in (*objects, *gc.get_referents(*objects)) if _is_unbounded(one)}
     found.pop(id(vars(re)["_cache"]), None)
+    for one in objects:
+        if isinstance(one, _Cache) and one.cache_parameters()["maxsize"] is not None:
+            for entries in gc.get_referents(one):
+                found.pop(id(entries), None)
     yield from found.values()
 
 
@@ -101,7 +106,7 @@ def growth_of(
 
     Args:
         folder: folder of the run.
-        patch: reduces the sizes of buffers and caches.
+        patch: reduces the sizes of buffers.
         formation: fields of the scenario's formation.
         first_s: road time of the first measurement.
         phase_s: time between measurements, longer than a vehicle is announced or on the road.

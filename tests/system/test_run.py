@@ -74,7 +74,7 @@ def test_a_run_prints_a_table_and_nothing_else(finished_run: FinishedRun) -> Non
 
     out = (folder / "stdout.txt").read_text(encoding="utf-8")
     assert "in their preferred lane" in out
-    assert "(100.00%)" in out
+    assert "100.00 % of" in out
     assert "FAILED" not in out
     err = (folder / "stderr.txt").read_text(encoding="utf-8")
     assert Ended(0, out, err).complaints == []

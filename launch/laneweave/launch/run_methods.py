@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from attrs import field, frozen
 
@@ -12,6 +12,9 @@ from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.plug_ins import PlugIns
 from laneweave.protocol.scenario.fields import PAPERS_FORMATIONS, FormationSettings, Scenario
+
+if TYPE_CHECKING:
+    from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod
 
 FORMATION: Final = "formation"
 """Formation control by agents and coordinators."""
@@ -140,6 +143,21 @@ REFERENCE_METHODS: Final = PlugIns(
 def labelled(label: str) -> LabelledMethod:
     """Return the method of a label; a label that is not built in is the name of a plug-in."""
     return METHODS.get(label) or LabelledMethod(label)
+
+
+def reference_method(name: str, field_name: str = "method") -> ReferenceMethod:
+    """Return a reference method.
+
+    Raises:
+        BadInputError: there is no such method, or a plug-in cannot be loaded.
+    """
+    from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod  # noqa: PLC0415 (needs extra `sim`)
+
+    found = REFERENCE_METHODS.load(name, field_name)
+    if not isinstance(found, ReferenceMethod):
+        allowed = f"a ReferenceMethod; that of {REFERENCE_METHODS.origin(name)} is none"
+        raise BadInputError(field_name, name, allowed)
+    return found
 
 
 def checked_method(name: str, field_name: str) -> str:

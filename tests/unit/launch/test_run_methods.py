@@ -9,7 +9,6 @@ import pytest
 from attrs import evolve
 
 from laneweave.launch.recordings.runs import Run, write_point
-from laneweave.launch.run.reference_run import reference_method
 from laneweave.launch.run_methods import (
     FORMATION,
     METHODS,
@@ -18,6 +17,7 @@ from laneweave.launch.run_methods import (
     checked_method,
     labelled,
     parse_methods,
+    reference_method,
 )
 from laneweave.launch.sweep.folder import SweepFolder
 from laneweave.protocol.errors import BadInputError

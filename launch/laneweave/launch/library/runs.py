@@ -16,11 +16,11 @@ from laneweave.launch.report.report import draw_report
 from laneweave.launch.run.local_run import LocalRun, StartPage
 from laneweave.launch.run.logs import log_by_default
 from laneweave.launch.run.outcome import Outcome
-from laneweave.launch.run.reference_run import ReferenceRun, reference_method
+from laneweave.launch.run.reference_run import ReferenceRun
 from laneweave.launch.run.roles import tuned_garbage_collector
 from laneweave.launch.run.run_folder import new_folder
 from laneweave.launch.run.simulated_run import SimulatedRun
-from laneweave.launch.run_methods import FORMATION, checked_method
+from laneweave.launch.run_methods import FORMATION, checked_method, reference_method
 from laneweave.protocol.config import scenario_files
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.errors import BadInputError, CommandFailedError

@@ -16,6 +16,9 @@ WINDOW_S = 20.0
 """Wall-clock time over which the pace is measured: it falls while the road fills."""
 MIN_WINDOW_S = 5.0
 """Shortest measurement of the pace."""
+SAMPLE_S = 0.5
+"""Wall-clock time between the measurements that are kept."""
+MAX_SAMPLES = int(WINDOW_S / SAMPLE_S) + 3
 EARLY_S, WAITED_S = 3.0, 15.0
 """Road time or wall-clock time after which a run may be reported as slow."""
 SLOW = 0.9
@@ -30,11 +33,13 @@ class PaceMeter:
     """Expected road time of the whole run."""
     began: tuple[float, float] | None = None
     """First measurement; None: none yet."""
-    _measured: deque[tuple[float, float]] = field(factory=deque)
+    _measured: deque[tuple[float, float]] = field(factory=lambda: deque(maxlen=MAX_SAMPLES))
     """(wall-clock time, road time)."""
 
     def add(self, now_s: float, road_s: float) -> None:
         """Add a measurement; road time must not decrease."""
+        if len(self._measured) > 1 and now_s - self._measured[-2][0] < SAMPLE_S:
+            self._measured.pop()
         self._measured.append((now_s, road_s))
         self.began = self.began or self._measured[0]
         while now_s - self._measured[0][0] > WINDOW_S:

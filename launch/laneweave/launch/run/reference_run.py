@@ -10,12 +10,10 @@ from attrs import define
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
-from laneweave.launch.run_methods import REFERENCE_METHODS
-from laneweave.protocol.errors import BadInputError
+from laneweave.launch.run_methods import reference_method
 from laneweave.protocol.runtime.processes import stop_signals
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod
 from laneweave.sim_bridge.baselines.reference_road import ReferenceRoad
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 
@@ -58,16 +56,3 @@ class ReferenceRun:
 
     def _request_stop(self) -> None:
         self._stop = True
-
-
-def reference_method(name: str, field_name: str = "method") -> ReferenceMethod:
-    """Return a reference method.
-
-    Raises:
-        BadInputError: there is no such method, or a plug-in cannot be loaded.
-    """
-    found = REFERENCE_METHODS.load(name, field_name)
-    if not isinstance(found, ReferenceMethod):
-        allowed = f"a ReferenceMethod; that of {REFERENCE_METHODS.origin(name)} is none"
-        raise BadInputError(field_name, name, allowed)
-    return found

@@ -8,12 +8,12 @@ from attrs import evolve, frozen
 
 from laneweave.agents.driving.trajectory import check_moves
 from laneweave.coordinator.planning.plug_ins.registry import checked_solver
-from laneweave.launch.run.reference_run import reference_method
 from laneweave.launch.run_methods import (
     FORMATION,
     REFERENCE_METHODS,
     KeepTrajectories,
     labelled,
+    reference_method,
 )
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError

@@ -9,8 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from laneweave.launch.run.outcome import Outcome
-from laneweave.launch.run.reference_run import ReferenceRun, reference_method
-from laneweave.launch.run_methods import LC2013, RULE
+from laneweave.launch.run.reference_run import ReferenceRun
+from laneweave.launch.run_methods import LC2013, RULE, reference_method
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines import reference_road as road
