@@ -118,6 +118,7 @@ def test_a_run_of_formations_does_not_wait_for_a_solver(lab: Lab, road: Path) ->
     assert plans["by_solver"]["tappa"] == plans["plans"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("options", [("--operation", "rolling"), ("--solver", "branching")])
 def test_a_run_that_needs_a_solver_waits_for_it(
     lab: Lab, road: Path, options: tuple[str, str]

@@ -80,7 +80,7 @@ def follow(lab: Lab, document: str) -> list[str]:
     return printed
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_tutorial(lab: Lab, clone: Path) -> None:
     first, speeds, changes, volumes = follow(lab, "TUTORIAL.md")
 
