@@ -22,7 +22,11 @@ ScenarioArgument = Annotated[
     Path | None, typer.Argument(metavar="SCENARIO.toml", help="Default: the paper's road.")
 ]
 Duration = Annotated[
-    float | None, typer.Option("--duration", help="Seconds during which vehicles arrive.")
+    float | None,
+    typer.Option(
+        "--duration",
+        help="Seconds during which vehicles arrive. Travel times leave out the first 60 s.",
+    ),
 ]
 Seeds = Annotated[
     str,

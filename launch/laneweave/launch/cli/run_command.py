@@ -110,7 +110,11 @@ def run(
         typer.Option("--endpoint", help="Endpoint of the router; default: network.endpoint."),
     ] = None,
     watch: Annotated[
-        bool, typer.Option("--watch", help="Serve a page that shows the road during the run.")
+        bool,
+        typer.Option(
+            "--watch",
+            help="Serve a page that shows the road during the run, in real time without --pace.",
+        ),
     ] = False,
     watch_listen: Annotated[
         str | None,
@@ -178,7 +182,10 @@ def run(
     def warn(line: str) -> None:
         typer.echo(line, err=True)
 
-    with _live_page(watch_listen, shown=watch or watch_listen is not None) as page:
+    shown = watch or watch_listen is not None
+    if shown and pace is None:
+        pace = min(1.0, settings.runtime.max_pace)
+    with _live_page(watch_listen, shown=shown) as page:
         outcome = perform_run(
             settings,
             out=out,

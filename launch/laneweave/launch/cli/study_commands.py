@@ -67,6 +67,7 @@ def sweep(
     from laneweave.launch.sweep.folder import SweepFolder
     from laneweave.launch.sweep.points import parse_volumes, plan_points
     from laneweave.launch.sweep.sweep import Runner, print_results, run_sweep
+    from laneweave.sim_bridge.recording.trips import WARM_UP_S
 
     base = load_scenario(scenario, demand__duration_s=duration)
     points = plan_points(
@@ -76,6 +77,9 @@ def sweep(
         parse_seeds(seeds),
         keep_trajectories,
     )
+    if base.demand.duration_s <= WARM_UP_S:
+        warning = f"{base.demand.duration_s:g} s of arrivals give no travel times"
+        typer.echo(f"{warning}, which leave out the first {WARM_UP_S:g} s", err=True)
     run: Runner
     if dask is None:
         run = partial(run_locally, workers=check_jobs(jobs))
