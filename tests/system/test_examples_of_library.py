@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping
+from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -122,12 +123,13 @@ def test_methods_of_a_user_are_swept_and_reported(
     command(installed, "sweep", scenario, *points, "--out", sweep, "--no-progress")
     point = json.loads((sweep / "mobil-1600-1" / "point.json").read_text(encoding="utf-8"))
     assert (point["method"], point["plug_in"]) == ("mobil", "laneweave-mobil 0.1.0")
-    # The method changes lanes in its own way.
+    # Each method changes lanes in its own way.
     found = {
         name: laneweave.load_run(sweep / f"{name}-1600-1").trajectories()
-        for name in ("mobil", "rule")
+        for name in ("mobil", "mobil-polite", "rule")
     }
-    assert not found["mobil"].equals(found["rule"])
+    for one, other in combinations(found.values(), 2):
+        assert not one.equals(other)
 
     # Reports need no plug-in.
     command(os.environ, "report", sweep)

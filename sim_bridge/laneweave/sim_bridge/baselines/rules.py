@@ -71,11 +71,19 @@ class Following:
 
         Behind a much slower vehicle d_R alone is not sufficient.
         """
-        distance_m = ahead_s_m - s_m
-        if distance_m < self.gap_m(speed_mps):
+        if ahead_s_m - s_m < self.gap_m(speed_mps):
             return False
+        return self.can_stop(s_m, speed_mps, ahead_s_m, ahead_speed_mps)
+
+    def can_stop(
+        self, s_m: float, speed_mps: float, ahead_s_m: float, ahead_speed_mps: float
+    ) -> bool:
+        """Return whether a vehicle can stop behind another if both brake with full deceleration.
+
+        A lane change without this on both sides can end in an overlap.
+        """
         stopping_m = (speed_mps**2 - ahead_speed_mps**2) / (2.0 * self._braking_mps2)
-        return stopping_m <= distance_m - self._min_distance_m
+        return max(stopping_m, 0.0) <= ahead_s_m - s_m - self._min_distance_m
 
     def speed_mps(
         self, s_m: float, speed_mps: float, ahead_s_m: float, ahead_speed_mps: float
@@ -184,7 +192,8 @@ class Rules:
     def sort(self, lanes: Lanes) -> dict[ReferenceVehicle, float]:
         """Apply rules 2 and 3 to all vehicles off the lane that they want, by priority.
 
-        A lane change occupies the gap in the new lane at once.
+        A vehicle changes lanes if `accepts` allows it; otherwise those in `yielding` slow down. A
+        lane change occupies the gap in the new lane at once.
 
         Returns:
             The vehicles that slow down, to let another vehicle in or to get in behind it, and the
@@ -207,23 +216,39 @@ class Rules:
             lane = vehicle.lane + (1 if wanted.lane > vehicle.lane else -1)
             if not self.wanted.may_enter(vehicle, lane):
                 continue
-            slowed = list(self._slowed(vehicle, *lanes.neighbours(vehicle, lane)))
-            if not slowed:
+            if self.accepts(vehicle, lane, lanes):
                 lanes.begin_change(vehicle, lane)
                 if self._change_m == 0.0:
                     lanes.end_change(vehicle)
-            for one in slowed:
+                continue
+            for one in self.yielding(vehicle, lane, lanes):
                 slowing[one] = min(wanted.end_m, slowing.get(one, wanted.end_m))
         return slowing
 
-    def _slowed(
-        self,
-        vehicle: ReferenceVehicle,
-        ahead: ReferenceVehicle | None,
-        behind: ReferenceVehicle | None,
-    ) -> Iterator[ReferenceVehicle]:
-        """Yield the vehicles that must slow down before a vehicle can change lanes."""
+    def accepts(self, vehicle: ReferenceVehicle, lane: int, lanes: Lanes) -> bool:
+        """Return whether a vehicle may begin a change to the next lane now (rule 2).
+
+        Every lane change is decided here. Methods with another criterion override this.
+        """
         is_safe = self.following.is_safe
+        ahead, behind = lanes.neighbours(vehicle, lane)
+        if ahead is not None and not is_safe(
+            vehicle.s_m, vehicle.speed_mps, ahead.s_m, ahead.speed_mps
+        ):
+            return False
+        return behind is None or is_safe(
+            behind.s_m, behind.speed_mps, vehicle.s_m, vehicle.speed_mps
+        )
+
+    def yielding(
+        self, vehicle: ReferenceVehicle, lane: int, lanes: Lanes
+    ) -> Iterator[ReferenceVehicle]:
+        """Yield the vehicles that slow down until a vehicle can change to the next lane (rule 3).
+
+        These are vehicles with too small a gap ahead, also if `accepts` has another criterion.
+        """
+        is_safe = self.following.is_safe
+        ahead, behind = lanes.neighbours(vehicle, lane)
         if ahead is not None and not is_safe(
             vehicle.s_m, vehicle.speed_mps, ahead.s_m, ahead.speed_mps
         ):

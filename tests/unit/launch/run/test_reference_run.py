@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
+import importlib
+import re
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from laneweave.launch.run import reference_run
 from laneweave.launch.run.outcome import Outcome
-from laneweave.launch.run.reference_run import ReferenceRun
+from laneweave.launch.run.reference_run import ReferenceRun, Standstill
 from laneweave.launch.run_methods import LC2013, RULE, reference_method
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines import reference_road as road
+from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod
+from laneweave.sim_bridge.baselines.reference_road import ReferenceVehicle
+from laneweave.sim_bridge.baselines.rule_based import RuleMethod
+from laneweave.sim_bridge.baselines.rules import Rules
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from support.bridge_bench import read_events, read_summary
 from support.commands import Here
 
+EXAMPLE = Path(__file__).resolve().parents[4] / "examples" / "method-plugin"
 METHODS = (RULE, LC2013)
 each_method = pytest.mark.parametrize("method", METHODS)
 
@@ -118,6 +128,76 @@ def test_a_run_that_does_not_end_is_ended(tmp_path: Path, method: str) -> None:
     outcome = finished(scenario(runtime={"max_road_s": 15.0}), tmp_path, method)
     assert outcome.exit_status == 1
     assert read_summary(tmp_path)["ending"] == Ending.LIMIT.value
+
+
+class Standing(Rules):
+    """Rules of vehicles that stop before S3."""
+
+    def approach_speed_mps(self, vehicle: ReferenceVehicle) -> float:
+        return 0.0 if vehicle.s_m > 40.0 else super().approach_speed_mps(vehicle)
+
+
+class StandingMethod(RuleMethod):
+    """A method whose vehicles never leave."""
+
+    def rules(self, scenario: Scenario) -> Rules:
+        return Standing(scenario)
+
+
+def use_methods(monkeypatch: pytest.MonkeyPatch, **methods: ReferenceMethod) -> None:
+    """Let runs find methods that are not installed."""
+    monkeypatch.setattr(reference_run, "reference_method", methods.__getitem__)
+
+
+def test_a_run_whose_vehicles_stand_forever_has_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_methods(monkeypatch, rule=StandingMethod())
+    outcome = ReferenceRun(scenario(), tmp_path, RULE, show_progress=False).run()
+    assert outcome.exit_status == 1
+    assert not outcome.interrupted
+    assert re.fullmatch(
+        r"\d+ vehicles have stood still since \d+ s of road time", outcome.problems[0]
+    )
+    found = read_summary(tmp_path)
+    assert found["ending"] == Ending.INTERRUPTED.value
+    assert found["vehicles"]["entered"] > 0
+    assert 300.0 <= found["simulated_s"] < 400.0
+    assert columns(tmp_path, "trajectories")["vehicle"]
+
+
+def test_an_empty_road_and_slow_vehicles_are_no_standstill() -> None:
+    standstill = Standstill()
+    assert standstill.problem(1000.0, ()) is None
+    slow = ReferenceVehicle(Arrival("v0001", 0, 2, 0.0), 0.0, 10.0, 0.0, 1.5, 0)
+    for t_s in range(1000, 2000, 100):
+        slow.s_m += 0.06
+        assert standstill.problem(float(t_s), (slow,)) is None
+    assert standstill.problem(2500.0, (slow,)) is not None
+
+
+def trajectories_of_example(
+    settings: Scenario, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> dict[str, pa.Table]:
+    """Run the methods of examples/method-plugin and the built-in rules."""
+    monkeypatch.syspath_prepend(EXAMPLE)
+    example = importlib.import_module("laneweave_mobil")
+    methods = {"mobil": example.Mobil(), "polite": example.POLITE, RULE: RuleMethod()}
+    found = {}
+    for name, method in methods.items():
+        use_methods(monkeypatch, rule=method)
+        outcome = ReferenceRun(settings, folder / name, RULE, show_progress=False).run()
+        assert outcome.problems == ()
+        found[name] = pq.read_table(folder / name / "trajectories.parquet")
+    return found
+
+
+def test_the_example_decides_on_lane_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = trajectories_of_example(scenario(1500.0), tmp_path, monkeypatch)
+    for one, other in combinations(found.values(), 2):
+        assert not one.equals(other)
 
 
 @each_method
