@@ -22,10 +22,12 @@ from laneweave.launch.report.figures import (
     draw_flows,
     draw_speeds,
     draw_travel_times,
+    shares_differ,
     speed_scale,
 )
 from laneweave.launch.report.report import report_run
 from laneweave.launch.report.snapshots import default_stretch_m, road_snapshots
+from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.report.tables import run_table, tables_of
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.road_layout import ANY_LANE
@@ -151,14 +153,32 @@ def test_snapshots_show_the_first_closed_part(
 
 def test_the_share_in_the_preferred_lane_is_left_out_without_preferences(tmp_path: Path) -> None:
     widths = []
+    summary = make_summary(vehicles={"on_preferred_lane": 99})
     for scenario in (Scenario(), DROP):
-        run = Run(tmp_path, "rolling", "formation", scenario, make_summary())
+        run = Run(tmp_path, "rolling", "formation", scenario, summary)
         draw_flows(Comparison.of([run]), tmp_path / "flows.png", dpi=60)
         with Image.open(tmp_path / "flows.png") as image:
             widths.append(image.width)
         headings = tables_of(Comparison.of([run, evolve(run, label="other")]))[0].headings
         assert ("in the preferred lane (%)" in headings) == (scenario is not DROP)
     assert widths[1] == widths[0] // 2
+
+
+def test_the_share_in_the_preferred_lane_is_left_out_where_all_left_in_it(tmp_path: Path) -> None:
+    for vehicles, differ in ((100, False), (99, True)):
+        summary = make_summary(vehicles={"on_preferred_lane": vehicles})
+        run = Run(tmp_path, "rolling", "formation", Scenario(), summary)
+        assert shares_differ(Comparison.of([run])) == differ
+
+
+def test_technical_rows_of_a_run_are_folded(tmp_path: Path) -> None:
+    run = Run(tmp_path, "rolling", "formation", Scenario(), make_summary())
+    shown, folded = tables_of(Comparison.of([run]))
+    assert not shown.folded
+    assert folded.folded
+    rows = [("method", run.label), *summary_rows(make_summary(), Scenario())]
+    assert sorted(rows) == sorted([*shown.rows, *folded.rows])
+    assert "tick, median" in dict(folded.rows)
 
 
 def test_the_table_of_a_run_without_preferences(tmp_path: Path) -> None:
