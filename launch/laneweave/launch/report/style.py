@@ -28,7 +28,7 @@ _PALETTE: Final = (
     "#808890",
 )
 """Colours of Okabe and Ito without their yellow, which is faint on white, and darker ones."""
-_OTHERS: Final = ("#e6007e", "#6a1fd0", "#74b800", "#c00020", "#00a8b5")
+_OTHERS: Final = ("#e6007e", "#74b800", "#6a1fd0", "#c00020", "#00a8b5")
 """Colours of labels without a colour of their own, such as plug-ins."""
 _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h")
 _DASHES: Final = ("-", "--", "-.", (0, (1, 1.2)), (0, (6, 1.5, 1, 1.5, 1, 1.5)))
