@@ -19,6 +19,7 @@ from laneweave.launch.report.style import (
     explain_empty_axes,
     label_colours,
     label_dashes,
+    label_widths,
     legend_above,
     picture,
     spread_evenly,
@@ -164,7 +165,8 @@ def _draw(
 ) -> None:
     labels = list(dict.fromkeys(label for label, _ in counted))
     volumes = spread_evenly(sorted({volume for _, volume in counted}))
-    colours, dashes, single = label_colours(labels), label_dashes(labels), len(volumes) == 1
+    colours, dashes, widths = label_colours(labels), label_dashes(labels), label_widths(labels)
+    single = len(volumes) == 1
     # With one volume, put the quantities side by side, because one column would be too tall.
     size_in = (3.2 * len(quantities), 3.0)
     if not single:
@@ -178,6 +180,7 @@ def _draw(
             for label in labels:
                 if (label, volume) in counted:
                     style = {"color": colours[label], "linestyle": dashes[label], "label": label}
+                    style["linewidth"] = widths[label]
                     _draw_one(axes, counted[label, volume], quantity, style)
             if not axes.lines:
                 explain_empty_axes(axes, "no trajectories")
@@ -193,7 +196,6 @@ def _draw(
 
 
 def _draw_one(axes: Axes, counts: Counts, quantity: Quantity, style: dict[str, Any]) -> None:
-    style |= {"linewidth": 1.4}
     if quantity.exceedance:
         shares = counts.exceedance(quantity)
         axes.plot(quantity.edges[:-1][shares > 0.0], shares[shares > 0.0], **style)

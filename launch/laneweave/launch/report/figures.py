@@ -22,6 +22,7 @@ from laneweave.launch.report.style import (
     explain_empty_axes,
     label_colours,
     label_markers,
+    label_widths,
     legend_above,
     picture,
     spread_evenly,
@@ -168,12 +169,12 @@ def _travel_times(runs: Iterable[Run]) -> Floats:
 def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
     """Draw throughput and the share of vehicles in the preferred lane against the demand.
 
-    The share is left out if vehicles have no preferred lanes.
+    The share is left out if vehicles have no preferred lanes, or all left in theirs.
     """
     volumes = np.array(comparison.volumes)
     range_veh_per_lane_h = float(np.ptp(volumes)) or 400.0
     span = volumes[[0, -1]] + np.array([-0.06, 0.06]) * range_veh_per_lane_h
-    panels = 2 if any(run.scenario.lane_shares for run in comparison.runs) else 1
+    panels = 2 if shares_differ(comparison) else 1
     with picture(4.6 * panels, 3.7, out, dpi) as figure:
         shown = figure.subplots(1, panels, squeeze=False)[0]
         left = shown[0]
@@ -193,6 +194,12 @@ def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
         legend_above(figure)
 
 
+def shares_differ(comparison: Comparison) -> bool:
+    """Return whether vehicles have preferred lanes, and not all are known to have left in them."""
+    percents = [run.preferred_percent for run in comparison.runs if run.scenario.lane_shares]
+    return any(percent is None or percent < 100.0 for percent in percents)
+
+
 def _throughput(run: Run) -> float | None:
     return run.summary.throughput_veh_per_lane_h if run.summary else None
 
@@ -209,7 +216,7 @@ def _draw_seeds(
     The dots of labels are shifted sideways, because labels may have the same values.
     """
     colours, labels, nothing = label_colours(comparison.labels), comparison.labels, True
-    markers = label_markers(labels)
+    markers, widths = label_markers(labels), label_widths(labels)
     for number, label in enumerate(labels):
         shift = (number - 0.5 * (len(labels) - 1)) * apart
         means, spreads = [], []
@@ -222,7 +229,8 @@ def _draw_seeds(
             place = [volume + shift] * len(found)
             axes.plot(place, found, ".", color=colours[label], markersize=4, alpha=0.45)
         places = np.array(comparison.volumes) + shift
-        style: dict[str, Any] = {"markersize": 5, "linewidth": 1.5, "capsize": 3}
+        style: dict[str, Any] = {"markersize": 5, "linewidth": widths[label], "capsize": 3}
+        style["elinewidth"] = 1.5
         style["marker"] = markers[label]
         axes.errorbar(places, means, spreads, color=colours[label], label=label, **style)
     if nothing:

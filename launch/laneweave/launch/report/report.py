@@ -35,8 +35,8 @@ TRAVEL_CAPTION = (
 )
 FLOW_CAPTION = (
     "Left: rate at which vehicles pass the end of the road, between the first and the last "
-    "counted one. Right: share of vehicles that left in their preferred lanes, if they have any. "
-    "Small dots: runs; bars: standard deviations over seeds."
+    "counted one. Right: share of vehicles that left in their preferred lanes, unless they have "
+    "none or all did. Small dots: runs; bars: standard deviations over seeds."
 )
 SPEED_CAPTION = (
     "Mean speed in bins of 20 m and 5 s, in the first run with trajectories of each method and "
@@ -213,7 +213,7 @@ def _snapshots(report: _Report, run: Run) -> list[Picture]:
     stretch_m = PAPER_STRETCH_M if fits and not run.scenario.road.closures else None
     preferences = bool(run.scenario.lane_shares)
     caption = _sentences(
-        f"{_title(run)}. Four times at intervals of the shortest T_F.",
+        f"{_title(run)}. Four times, every {run.scenario.cycles_s[0]:g} s.",
         "Colours and numbers on vehicles show the preferred lanes (0: rightmost);"
         if preferences
         else "Vehicles have no preferred lanes;",

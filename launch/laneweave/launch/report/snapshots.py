@@ -47,6 +47,10 @@ _LONG_M = 450.0
 _MAX_LEGEND_COLUMNS = 7
 _MIN_LANE_PT, _MAX_LANE_PT = 4.0, 6.5
 """Sizes of the numbers of lanes on vehicles; smaller ones are not written."""
+_JUMP_MPS = 2.8
+"""Lateral speed above which a vehicle jumps to another lane; as in `player.js`."""
+_MAX_HEADING = 0.35
+"""Maximum angle between a vehicle and the road in the picture [rad]."""
 _HEADROOM_M = 4.5
 """Space above the road for formation numbers."""
 _MAX_STRETCH_M, _MAX_CLOSED_M, _BEYOND_M = 740.0, 120.0, 50.0
@@ -147,7 +151,16 @@ def _pose(tracks: Tracks, number: int, t_s: float) -> tuple[float, float, float,
     s_m, y_m, speed_mps, lateral_mps = (
         float(tracks.sampled(number, name, at)[0]) for name in names
     )
-    heading = np.arctan2(np.nan_to_num(lateral_mps), max(speed_mps, 0.1))
+    lateral_mps = np.nan_to_num(lateral_mps)
+    after = int(np.clip(np.searchsorted(times_s, t_s), 1, max(1, len(times_s) - 1)))
+    if len(times_s) > 1:
+        ys_m, ends_s = tracks.y_m[tracks.rows(number)][after - 1 : after + 1], times_s[after - 1 :]
+        if abs(ys_m[1] - ys_m[0]) > _JUMP_MPS * (ends_s[1] - ends_s[0]):
+            # An instantaneous lane change: before it or after it, and never in between.
+            y_m, lateral_mps = float(ys_m[int(t_s - ends_s[0] > ends_s[1] - t_s)]), 0.0
+    if abs(lateral_mps) > _JUMP_MPS:
+        lateral_mps = 0.0
+    heading = np.clip(np.arctan2(lateral_mps, max(speed_mps, 0.1)), -_MAX_HEADING, _MAX_HEADING)
     return s_m, y_m, float(heading), speed_mps
 
 

@@ -28,6 +28,8 @@ _PALETTE: Final = (
     "#808890",
 )
 """Colours of Okabe and Ito without their yellow, which is faint on white, and darker ones."""
+_OTHERS: Final = ("#e6007e", "#74b800", "#6a1fd0", "#c00020", "#00a8b5")
+"""Colours of labels without a colour of their own, such as plug-ins."""
 _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h")
 _DASHES: Final = ("-", "--", "-.", (0, (1, 1.2)), (0, (6, 1.5, 1, 1.5, 1, 1.5)))
 _STYLE: Final[Any] = {
@@ -74,14 +76,16 @@ def picture(width_in: float, height_in: float, out: Path, dpi: float) -> Iterato
 
 
 def label_colours(labels: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each label; labels in `METHODS` always have the same colours.
+    """Return a colour for each label; the first ones in `METHODS` always have the same colours.
 
-    Other labels get unused colours, which repeat if there are too few.
+    Other labels get colours of their own, then unused ones, which repeat if there are too few.
     """
     colours = dict(zip(METHODS, _PALETTE, strict=False))
     chosen = {label: colours[label] for label in labels if label in colours}
-    free = [colour for colour in reversed(_PALETTE) if colour not in chosen.values()] or ["#808890"]
+    unused = (colour for colour in reversed(_PALETTE) if colour not in chosen.values())
+    free = [*_OTHERS, *unused]
     others = [label for label in dict.fromkeys(labels) if label not in chosen]
+    others.sort(key=lambda label: label in METHODS)
     return chosen | {label: free[number % len(free)] for number, label in enumerate(others)}
 
 
@@ -94,6 +98,13 @@ def label_markers(labels: Iterable[str]) -> dict[str, str]:
 def label_dashes(labels: Iterable[str]) -> dict[str, Any]:
     """Return a line style for each label, by its place among the labels."""
     return {label: _DASHES[number % len(_DASHES)] for number, label in enumerate(labels)}
+
+
+def label_widths(labels: Iterable[str]) -> dict[str, float]:
+    """Return a line width for each label; later lines are thinner, so that none hides another."""
+    places = {label: place for place, label in enumerate(dict.fromkeys(labels))}
+    step = min(1.1, 4.0 / max(1, len(places) - 1))
+    return {label: 1.3 + step * (len(places) - 1 - place) for label, place in places.items()}
 
 
 def spread_evenly(volumes: Sequence[float]) -> tuple[float, ...]:

@@ -15,18 +15,18 @@ from laneweave.launch.recordings.results_over_seeds import (
     results_table,
 )
 from laneweave.launch.recordings.runs import Comparison, Run
-from laneweave.launch.report.summary_table import summary_rows
+from laneweave.launch.report.summary_table import Row, summary_rows
 
 _Column = tuple[str, str, str, int]
 """Heading, column of the results, aggregation over seeds (empty: text), number of decimals."""
 
 _TRAFFIC: Final[tuple[_Column, ...]] = (
     ("runs", "runs", "", 0),
+    ("in the preferred lane (%)", PREFERRED, "mean", 2),
     ("travel time mean (s)", "travel_time_s_mean", "mean", 2),
-    ("of vehicles", "travel_time_s_n", "sum", 0),
+    ("counted", "travel_time_s_n", "sum", 0),
     ("p95 (s)", "travel_time_s_p95", "mean", 2),
     ("throughput (veh/(lane·h))", "throughput_veh_per_lane_h", "mean", 0),
-    ("in the preferred lane (%)", PREFERRED, "mean", 2),
 )
 _SAFETY: Final[tuple[_Column, ...]] = (
     ("smallest gap (m)", "safety_min_gap_m", "min", 2),
@@ -44,6 +44,19 @@ _PLANNING: Final[tuple[_Column, ...]] = (
     ("max (ms)", "planning_solve_ms_max", "max", 1),
 )
 _BY_SOLVER: Final = "planning_by_solver_"
+_TECHNICAL: Final = (
+    "leader changes",
+    "messages",
+    "partitions",
+    "planning time",
+    "plans by",
+    "processes",
+    "real-time factor",
+    "tick",
+    "time without leader",
+    "tracking",
+)
+"""Beginnings of the names of the rows in `technical_table`."""
 
 
 @frozen
@@ -56,12 +69,14 @@ class Table:
     caption: str
     text_columns: int = 1
     """Number of leading columns with text; the others are numbers."""
+    folded: bool = False
+    """Whether the page shows only the caption until it is clicked."""
 
 
 def tables_of(comparison: Comparison) -> list[Table]:
     """Return the tables of a report on a single run, or on several runs side by side."""
     if len(comparison.runs) == 1 and not comparison.failed:
-        return [run_table(comparison.runs[0])]
+        return [run_table(comparison.runs[0]), technical_table(comparison.runs[0])]
     results, traffic = results_table(comparison.runs), _TRAFFIC
     if not any(run.scenario.lane_shares for run in comparison.runs):
         traffic = tuple(column for column in _TRAFFIC if column[1] != PREFERRED)
@@ -72,7 +87,11 @@ def tables_of(comparison: Comparison) -> list[Table]:
     rows = over_seeds(results, wanted)
     planned = [row for row in rows if row["planning_plans_sum"]]
     return [
-        _table(rows, traffic, "Means over the seeds ± standard deviation."),
+        _table(
+            rows,
+            traffic,
+            "Means over the seeds ± standard deviation; counted: vehicles of the travel times.",
+        ),
         _table(rows, _SAFETY, "Extremes or sums over the seeds."),
         _table(
             planned,
@@ -84,10 +103,20 @@ def tables_of(comparison: Comparison) -> list[Table]:
 
 
 def run_table(run: Run) -> Table:
-    """Return the table of one run."""
-    rows = summary_rows(run.summary, run.scenario) if run.summary else []
+    """Return the table of one run, without the rows of `technical_table`."""
+    rows = [row for row in _rows(run) if not row[0].startswith(_TECHNICAL)]
     caption = "Results of the run; all values are in summary.json."
     return Table(("", "value"), [("method", run.label), *rows], caption, 2)
+
+
+def technical_table(run: Run) -> Table:
+    """Return the folded table of how one run was computed."""
+    rows = [row for row in _rows(run) if row[0].startswith(_TECHNICAL)]
+    return Table(("", "value"), rows, "Planning, tracking and run time", 2, folded=True)
+
+
+def _rows(run: Run) -> list[Row]:
+    return summary_rows(run.summary, run.scenario) if run.summary else []
 
 
 def failed_table(comparison: Comparison) -> Table:

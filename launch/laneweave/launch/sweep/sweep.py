@@ -7,6 +7,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from pathlib import Path
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -21,6 +22,14 @@ from laneweave.protocol.errors import CommandFailedError
 
 COUNTED = "travel_time_s_n"
 """Number of vehicles of which the mean travel time is given."""
+HEADINGS = ("volume", "in lane\n(%)", "travel\ntime (s)", "throughput", "counted", "runs")
+"""Headings of the console's table, after that of the labels."""
+CAPTION = (
+    "Means over the seeds. volume, throughput: veh/(lane h); in lane: share that left in the "
+    "preferred lane; counted: vehicles of the mean travel time; runs: finished/all."
+)
+WIDEST = 1000
+"""Maximum width of the console's table, in characters."""
 Runner = Callable[[Sequence[Point], Path], Generator[PointResult, None, None]]
 """Function that runs points in a folder and yields results; closing the generator stops them."""
 
@@ -80,38 +89,30 @@ def print_results(points: Sequence[Point], folder: SweepFolder, console: Console
     """Print a sweep's means over its seeds, and why runs failed."""
     runs = [folder.runs[point.name] for point in points]
     done = [folder.runs[point.name] for point in points if folder.is_finished(point)]
-    columns = ("travel_time_s_mean", "throughput_veh_per_lane_h", PREFERRED)
+    columns = (PREFERRED, "travel_time_s_mean", "throughput_veh_per_lane_h")
     wanted = [(COUNTED, "sum"), *((column, "mean") for column in columns)]
     found = over_seeds(results_table(done), wanted)
     means = {(row["label"], row["volume_veh_per_lane_h"]): row for row in found}
-    table = Table(title=f"laneweave sweep: {escape(str(folder.out))}")
-    table.add_column("label")
-    for heading in (
-        "veh/(lane h)",
-        "done",
-        "failed",
-        "vehicles",
-        "travel time",
-        "throughput",
-        "in lane",
-    ):
-        table.add_column(heading, justify="right")
+    table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, collapse_padding=True)
+    table.add_column("label", no_wrap=True)
+    for heading in HEADINGS:
+        table.add_column(heading, justify="right", no_wrap=True)
     for (label, volume), count in Counter(
         (run.label, run.volume_veh_per_lane_h) for run in runs
     ).items():
         row = means.get((label, volume), {"runs": 0})
-        figures = [
-            "-" if row.get(f"{column}_mean") is None else f"{row[f'{column}_mean']:.2f}{unit}"
-            for column, unit in zip(columns, (" s", "", " %"), strict=True)
-        ]
+        values = [row.get(f"{column}_mean") for column in columns]
+        figures = ["-" if value is None else f"{value:.2f}" for value in values]
         counted = row.get(f"{COUNTED}_sum")
-        counts = (
-            str(row["runs"]),
-            str(count - row["runs"]),
-            "-" if counted is None else str(counted),
+        number = "-" if counted is None else str(counted)
+        table.add_row(
+            escape(label), volume_text(volume), *figures, number, f"{row['runs']}/{count}"
         )
-        table.add_row(label, volume_text(volume), *counts, *figures)
-    console.print(table)
+    # On a narrow console, lines are longer than the console rather than values shortened.
+    table.width = console.measure(table, options=console.options.update(width=WIDEST)).maximum
+    console.print(f"laneweave sweep: {escape(str(folder.out))}", highlight=False, soft_wrap=True)
+    console.print(table, crop=False)
+    console.print(CAPTION, highlight=False, style="dim")
     for run in runs:
         if run.reason:
             line = f"FAILED: {run.folder.name}: {run.reason}"

@@ -29,7 +29,8 @@ from laneweave.launch.report.distributions import (
 )
 from laneweave.launch.report.figures import _break
 from laneweave.launch.report.path_maps import _arrived, driven_map
-from laneweave.launch.report.style import label_colours, spread_evenly
+from laneweave.launch.report.style import label_colours, label_widths, spread_evenly
+from laneweave.launch.run_methods import METHODS
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import ANY_LANE
@@ -226,6 +227,16 @@ def test_a_label_has_the_same_colour_beside_any_others() -> None:
     several = label_colours(["formation", "paper-12", "mine", "yours"])
     assert several["paper-12"] == alone
     assert len(set(several.values())) == 4
+
+
+def test_other_labels_are_neither_grey_nor_brown() -> None:
+    colours = label_colours([*METHODS, "mine", "yours"])
+    assert not {"#808890", "#7d3600"} & {colours["mine"], colours["yours"]}
+
+
+def test_later_lines_are_thinner() -> None:
+    widths = list(label_widths(["formation", "rolling", "rule"]).values())
+    assert widths == sorted(set(widths), reverse=True)
 
 
 def test_volumes_that_fit_side_by_side() -> None:

@@ -22,10 +22,12 @@ from laneweave.launch.report.figures import (
     draw_flows,
     draw_speeds,
     draw_travel_times,
+    shares_differ,
     speed_scale,
 )
 from laneweave.launch.report.report import report_run
-from laneweave.launch.report.snapshots import default_stretch_m, road_snapshots
+from laneweave.launch.report.snapshots import _MAX_HEADING, _pose, default_stretch_m, road_snapshots
+from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.report.tables import run_table, tables_of
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.road_layout import ANY_LANE
@@ -36,6 +38,7 @@ from laneweave.sim_bridge.road.demand import Arrival
 from support.closed_lanes import DROP
 from support.commands import loads
 from support.summaries import make_summary
+from support.tracks import make_tracks
 
 
 def make_run(folder: Path, lanes: int = 3, vehicles: int = 12, *, lattice: bool = True) -> Path:
@@ -151,14 +154,54 @@ def test_snapshots_show_the_first_closed_part(
 
 def test_the_share_in_the_preferred_lane_is_left_out_without_preferences(tmp_path: Path) -> None:
     widths = []
+    summary = make_summary(vehicles={"on_preferred_lane": 99})
     for scenario in (Scenario(), DROP):
-        run = Run(tmp_path, "rolling", "formation", scenario, make_summary())
+        run = Run(tmp_path, "rolling", "formation", scenario, summary)
         draw_flows(Comparison.of([run]), tmp_path / "flows.png", dpi=60)
         with Image.open(tmp_path / "flows.png") as image:
             widths.append(image.width)
         headings = tables_of(Comparison.of([run, evolve(run, label="other")]))[0].headings
         assert ("in the preferred lane (%)" in headings) == (scenario is not DROP)
     assert widths[1] == widths[0] // 2
+
+
+def test_a_vehicle_is_not_tilted_by_an_instantaneous_lane_change() -> None:
+    t_s, y_m = np.array([0.0, 0.1, 0.2]), np.array([1.6, 1.6, 4.8])
+    tracks = make_tracks(
+        t_s,
+        1,
+        s_m=[20.0 * t_s],
+        y_m=[y_m],
+        speed_mps=[20.0],
+        lateral_speed_mps=[np.array([0.0, 0.0, 32.0])],
+    )
+    poses = [_pose(tracks, 0, at_s) for at_s in (0.1, 0.14, 0.16, 0.2)]
+    assert [pose[1:3] for pose in poses if pose] == [(1.6, 0.0), (1.6, 0.0), (4.8, 0.0), (4.8, 0.0)]
+
+
+def test_the_angle_of_a_slow_vehicle_is_limited() -> None:
+    t_s = np.array([0.0, 0.1, 0.2])
+    tracks = make_tracks(t_s, 1, y_m=[1.0 + t_s], speed_mps=[0.5], lateral_speed_mps=[1.0])
+    pose = _pose(tracks, 0, 0.1)
+    assert pose is not None
+    assert pose[2] == _MAX_HEADING
+
+
+def test_the_share_in_the_preferred_lane_is_left_out_where_all_left_in_it(tmp_path: Path) -> None:
+    for vehicles, differ in ((100, False), (99, True)):
+        summary = make_summary(vehicles={"on_preferred_lane": vehicles})
+        run = Run(tmp_path, "rolling", "formation", Scenario(), summary)
+        assert shares_differ(Comparison.of([run])) == differ
+
+
+def test_technical_rows_of_a_run_are_folded(tmp_path: Path) -> None:
+    run = Run(tmp_path, "rolling", "formation", Scenario(), make_summary())
+    shown, folded = tables_of(Comparison.of([run]))
+    assert not shown.folded
+    assert folded.folded
+    rows = [("method", run.label), *summary_rows(make_summary(), Scenario())]
+    assert sorted(rows) == sorted((*row,) for row in (*shown.rows, *folded.rows))
+    assert "tick, median" in {row[0] for row in folded.rows}
 
 
 def test_the_table_of_a_run_without_preferences(tmp_path: Path) -> None:

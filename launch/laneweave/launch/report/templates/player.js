@@ -3,6 +3,9 @@
 // laneweave/launch/web/road.js. Times in s, lengths in m.
 
 const laneweave = (() => {
+  const JUMP_MPS = 2.8; // lateral speed above which a vehicle jumps; as in snapshots.py
+  const MAX_SLOPE = 0.35;
+
   /** Decode little-endian integers of `bytes` bytes from base64. */
   function unpack(text, bytes) {
     const raw = Uint8Array.from(atob(text), (char) => char.charCodeAt(0));
@@ -39,11 +42,14 @@ const laneweave = (() => {
     const mix = (column) => column[a] + share * (column[b] - column[a]);
     const ds = (run.s[b] - run.s[a]) * run.units.s_m;
     const dy = (run.y[b] - run.y[a]) * run.units.y_m;
+    // An instantaneous lane change is before or after the jump, and never in between.
+    const jumps = Math.abs(dy) > JUMP_MPS * run.step_s;
+    const slope = ds > 0.05 && !jumps ? dy / ds : 0;
     return {
       s: mix(run.s) * run.units.s_m,
-      y: mix(run.y) * run.units.y_m,
+      y: (jumps ? run.y[share < 0.5 ? a : b] : mix(run.y)) * run.units.y_m,
       v: mix(run.v) * run.units.speed_mps,
-      slope: ds > 0.05 ? dy / ds : 0,
+      slope: Math.min(Math.max(slope, -MAX_SLOPE), MAX_SLOPE),
     };
   }
 
