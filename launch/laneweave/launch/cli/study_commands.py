@@ -77,9 +77,6 @@ def sweep(
         parse_seeds(seeds),
         keep_trajectories,
     )
-    if base.demand.duration_s <= WARM_UP_S:
-        warning = f"{base.demand.duration_s:g} s of arrivals give no travel times"
-        typer.echo(f"{warning}, which leave out the first {WARM_UP_S:g} s", err=True)
     run: Runner
     if dask is None:
         run = partial(run_locally, workers=check_jobs(jobs))
@@ -91,6 +88,9 @@ def sweep(
         run = partial(run_on_dask, address=dask)
     with SweepFolder(out or timestamped_folder("sweep")) as folder:
         folder.check_settings(base)
+        if base.demand.duration_s <= WARM_UP_S:
+            warning = f"{base.demand.duration_s:g} s of arrivals give no travel times"
+            typer.echo(f"{warning}, which leave out the first {WARM_UP_S:g} s", err=True)
         failed = run_sweep(points, folder, run, show=not no_progress)
         print_results(points, folder, Console())
     sys.stdout.flush()

@@ -36,7 +36,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _sweep(out: Path) -> None:
     done = sweep(short_road(out.parent), out, *LISTS, "--jobs", 2)
     assert done.returncode == 0, done.stderr
-    assert len(done.stderr.splitlines()) == 4
+    warning, *points = done.stderr.splitlines()
+    assert warning == "8 s of arrivals give no travel times, which leave out the first 60 s"
+    assert len(points) == 4
 
 
 def test_the_files_of_a_sweep(whole: Path) -> None:
@@ -74,6 +76,7 @@ def test_an_interrupted_sweep_is_continued(whole: Path, scenario: Path, tmp_path
         text=True,
     )
     assert process.stderr is not None
+    assert "no travel times" in process.stderr.readline()
     assert ": done in " in process.stderr.readline()
     children = running_points(process.pid)
     process.send_signal(signal.SIGTERM)
