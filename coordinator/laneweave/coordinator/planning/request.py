@@ -303,7 +303,10 @@ def _wrong_text(field: str, text: str, min_length: int = 0) -> Iterator[BadInput
 
 
 def _problems(request: PlanRequest) -> Iterator[BadInputError]:
-    """Yield all errors of a request, except of items of too long lists, and of cells of no grid."""
+    """Yield all errors of a request.
+
+    Items of lists that are too long are not checked, nor are cells if the grid is invalid.
+    """
     of_grid = [*_size_problems(request.grid)]
     yield from of_grid
     yield from _rule_problems(request)

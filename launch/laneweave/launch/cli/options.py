@@ -123,16 +123,6 @@ def check_jobs(jobs: int | None) -> int:
     return jobs
 
 
-def check_pace(pace: float | None) -> None:
-    """Check the option `--pace`.
-
-    Raises:
-        BadInputError: the pace is out of range.
-    """
-    if pace is not None and not 0.01 <= pace <= 1000:
-        raise BadInputError("--pace", pace, "[0.01, 1000]")
-
-
 def reject_unused_options(where: str, **options: object) -> None:
     """Reject options that would have no effect.
 

@@ -23,7 +23,6 @@ from laneweave.launch.cli.options import (
     Metrics,
     RunFolder,
     Solver,
-    check_pace,
     load_deployment,
     reject_unused_options,
 )
@@ -33,7 +32,7 @@ from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.runtime.processes import stop_signal_received
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.fields import Scenario, check_pace
 from laneweave.protocol.security.access_control import access_of
 
 log = structlog.get_logger(__name__)
@@ -143,7 +142,7 @@ def bridge(
     from laneweave.launch.run.outcome import complete_summary, print_outcome
     from laneweave.sim_bridge.process import run_bridge
 
-    check_pace(pace)
+    check_pace(pace, "--pace")
     settings = load_deployment(config, endpoint, observation__metrics=metrics)
     with (
         _as_role("bridge", "bridge", settings, log_format, log_level) as observe,

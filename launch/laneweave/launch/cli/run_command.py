@@ -18,7 +18,6 @@ from laneweave.launch.cli.options import (
     RunFolder,
     ScenarioArgument,
     Solver,
-    check_pace,
     reject_unused_options,
     shows_progress,
 )
@@ -26,7 +25,7 @@ from laneweave.launch.run_methods import FORMATION, LC2013, RULE, checked_method
 from laneweave.protocol.config.scenario_files import load_scenario, scenario_of
 from laneweave.protocol.errors import NO_VALUE, BadInputError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.fields import Scenario, check_pace
 
 if TYPE_CHECKING:
     from laneweave.launch.run.live_page import LivePage
@@ -144,7 +143,7 @@ def run(
     settings = scenario_of(tables, **overrides) if tables else load_scenario(scenario, **overrides)
     if compare and not settings.sumo.config:
         raise BadInputError("--compare", "given", "none without a SUMO simulation (--sumocfg)")
-    check_pace(pace)
+    check_pace(pace, "--pace")
     show = shows_progress(no_progress)
     checked_method(method, "--method")
     live = {"watch": "given" if watch else None, "watch_listen": watch_listen}

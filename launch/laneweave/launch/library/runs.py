@@ -24,7 +24,7 @@ from laneweave.launch.run_methods import FORMATION, checked_method, reference_me
 from laneweave.protocol.config import scenario_files
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.errors import BadInputError, CommandFailedError
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.fields import Scenario, check_pace
 from laneweave.protocol.summary import RunSummary
 from laneweave.sim_bridge.road_sources import demanded
 
@@ -177,11 +177,9 @@ def _check_arguments(
     checked_method(method, "method")
     if transport not in (None, ZENOH, SIMULATED):
         raise BadInputError("transport", transport, f"{ZENOH} or {SIMULATED}")
-    if pace is not None:
-        if not 0.01 <= pace <= 1000:
-            raise BadInputError("pace", pace, "[0.01, 1000]")
-        if transport == SIMULATED:
-            raise BadInputError("pace", pace, f"none with transport {SIMULATED}")
+    check_pace(pace, "pace")
+    if pace is not None and transport == SIMULATED:
+        raise BadInputError("pace", pace, f"none with transport {SIMULATED}")
     if method != FORMATION:
         for name, value in (("transport", transport), ("faults", faults), ("pace", pace)):
             if value is not None:

@@ -17,7 +17,7 @@ import attrs
 from attrs import field, frozen
 from attrs.validators import optional
 
-from laneweave.protocol.errors import unknown_name
+from laneweave.protocol.errors import BadInputError, unknown_name
 from laneweave.protocol.field_validators import NAME_PATTERN, key_part, one_of, within
 from laneweave.protocol.lattice import Cell, Lattice, displacements
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, open_sections
@@ -70,8 +70,8 @@ FORMATION_CLOSING_MPS = 8.0
 brake from it in nearly all scenarios."""
 SLACK_S = 0.2
 """Part of T_F without motion if `formation.move_s` is not set."""
-HIGHEST_PACE = 1000.0
-"""Upper bound of `runtime.max_pace`."""
+LOWEST_PACE, HIGHEST_PACE = 0.01, 1000.0
+"""Bounds of `runtime.max_pace`."""
 LONGEST_ROAD_M = 60_000.0
 """Upper bound on positions on the road: the sum of those of its three segments."""
 MAX_HORIZON_TICKS = 200
@@ -100,6 +100,16 @@ CONFLICT_KINDS = (
     "geometric",
     "closing",
 )
+
+
+def check_pace(pace: float | None, name: str) -> None:
+    """Check a pace that replaces `runtime.max_pace`; None: it replaces nothing.
+
+    Raises:
+        BadInputError: the pace is out of range; names the option or argument `name`.
+    """
+    if pace is not None and not LOWEST_PACE <= pace <= HIGHEST_PACE:
+        raise BadInputError(name, pace, f"[{LOWEST_PACE:g}, {HIGHEST_PACE:g}]")
 
 
 def solver_of_event(kind: str, data: Mapping[str, Any]) -> str | None:
@@ -560,7 +570,7 @@ class Runtime:
     """Maximum wait at the entrance for a vehicle's agent (wall-clock seconds)."""
     announce_s: float = field(default=6.0, validator=within(0.0, 600.0))
     """Time by which announcements precede arrivals, so that agents can start (road seconds)."""
-    max_pace: float = field(default=10.0, validator=within(0.01, HIGHEST_PACE))
+    max_pace: float = field(default=10.0, validator=within(LOWEST_PACE, HIGHEST_PACE))
     """Maximum road seconds per wall-clock second. Network and planning take wall-clock time, which
     must be short compared with the time between a plan and its start."""
     coordinators: int = field(default=3, validator=within(1, 9))

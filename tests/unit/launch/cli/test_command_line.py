@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 from laneweave.launch.cli.main import _status
-from laneweave.launch.cli.options import check_pace, parse_seeds
+from laneweave.launch.cli.options import parse_seeds
 from laneweave.launch.run import run_folder
 from laneweave.launch.run.local_run import MAX_TEMPORARY_BYTES, check_temporary_folder
 from laneweave.launch.run.logs import last_error
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.fields import Scenario, check_pace
 from support.commands import Here
 
 
@@ -79,13 +79,13 @@ def test_a_run_that_fails_later_keeps_its_files(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("pace", [None, 0.01, 1, 1000])
 def test_paces(pace: float | None) -> None:
-    check_pace(pace)
+    check_pace(pace, "--pace")
 
 
 @pytest.mark.parametrize("pace", [0, -1, 1001, float("nan"), float("inf")])
 def test_impossible_paces(pace: float) -> None:
     with pytest.raises(BadInputError, match="--pace"):
-        check_pace(pace)
+        check_pace(pace, "--pace")
 
 
 def test_coordinators_are_numbered() -> None:
