@@ -22,7 +22,7 @@ from laneweave.protocol.config.source_files import (
     shown_name,
     unique_keys,
 )
-from laneweave.protocol.errors import BadInputError, raise_all
+from laneweave.protocol.errors import BadInputError, combined, raise_all
 from laneweave.protocol.field_validators import NAME_PATTERN
 from laneweave.protocol.scenario.deployment_fields import Service
 
@@ -80,19 +80,24 @@ def read_request(
     """
     file = _read(path, max_bytes, field)
     with file.located():
-        raise_all(_problems(file.tables, with_solver=with_solver))
-        request = PlanRequest.from_dict(file.tables)
+        request = _checked_request(file.tables, with_solver=with_solver)
     given = {name: value for name, value in overrides.items() if value is not None}
     return PlanRequest.from_dict(file.tables | given) if given else request
 
 
-def _problems(data: Mapping[str, Any], *, with_solver: bool) -> Iterator[BadInputError]:
+def _checked_request(data: Mapping[str, Any], *, with_solver: bool) -> PlanRequest:
+    of_solver = [*_solver_problems(data)] if with_solver else []
     try:
-        PlanRequest.from_dict(data)
+        request = PlanRequest.from_dict(data)
     except BadInputError as error:
-        yield from error.problems
+        raise combined([*error.problems, *of_solver]) from None
+    raise_all(of_solver)
+    return request
+
+
+def _solver_problems(data: Mapping[str, Any]) -> Iterator[BadInputError]:
     solver = data.get("solver")
-    if with_solver and isinstance(solver, str) and NAME_PATTERN.fullmatch(solver):
+    if isinstance(solver, str) and NAME_PATTERN.fullmatch(solver):
         try:
             checked_solver(solver)
         except BadInputError as error:

@@ -19,34 +19,34 @@ class Record(Protocol):
         """Number of answers that were missing at their tick's deadline."""
 
     def event(self, t_s: float, kind: str, /, **data: object) -> None:
-        """Take an event from the bridge."""
+        """Record an event from the bridge."""
 
     def on_demanded(self, arrival: Arrival) -> None:
-        """Take the arrival of a vehicle."""
+        """Record the arrival of a vehicle."""
 
     def on_entered(self, vehicle: RecordedVehicle) -> None:
-        """Take a vehicle that has entered the road."""
+        """Record a vehicle that has entered the road."""
 
     def on_closed(self, closed: ClosedFormation, members: Sequence[Name]) -> None:
-        """Take a closed formation."""
+        """Record a closed formation."""
 
     def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
-        """Take a vehicle that has left the road since the last tick."""
+        """Record a vehicle that has left the road since the last tick."""
 
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
-        """Take that a vehicle has left the lattice at a dead end, or comes back."""
+        """Record that a vehicle has left the lattice at a dead end, or comes back."""
 
     def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
-        """Take a vehicle that is still on the road at the end."""
+        """Record a vehicle that is still on the road at the end."""
 
     def on_missed(self, agents: int) -> None:
-        """Take the number of answers that were missing at a tick's deadline."""
+        """Record the number of answers that were missing at a tick's deadline."""
 
     def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
-        """Take that a caretaker has taken charge of a vehicle."""
+        """Record that a caretaker has taken charge of a vehicle."""
 
     def on_agent_took_over(self, t_s: float, vehicle: Name, previous: str) -> None:
-        """Take that an agent has taken charge of a vehicle."""
+        """Record that an agent has taken charge of a vehicle."""
 
     def on_positions(
         self,
@@ -57,19 +57,19 @@ class Record(Protocol):
         collisions: Iterable[tuple[str, str]],
         gaps: MinGaps,
     ) -> None:
-        """Take positions, overlaps, collisions and gaps after a tick."""
+        """Record positions, overlaps, collisions and gaps after a tick."""
 
     def on_tick(self, t_s: float, on_road: int, duration_s: float) -> None:
-        """Take the duration of a tick."""
+        """Record the duration of a tick."""
 
     def on_event(self, event: LogEvent) -> None:
-        """Take an event from another role."""
+        """Record an event from another role."""
 
     def on_report(self, report: Report) -> None:
-        """Take the counters of a role."""
+        """Record the counters of a role."""
 
     def on_heartbeat(self, heartbeat: Heartbeat, t_s: float, now_s: float) -> None:
-        """Take a heartbeat of a coordinator."""
+        """Record a heartbeat of a coordinator."""
 
     def close(self, t_s: float, ending: Ending) -> None:
         """End the record; only the first call has an effect."""
