@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, Protocol
 
 import attrs
@@ -276,6 +276,13 @@ def core_metrics(core: Core) -> Iterable[MetricsSnapshot]:
     return metrics
 
 
+_REMEMBERED = 128
+"""Number of decoded messages that a node remembers: while messages are lost, SENSE and COMMAND are
+repeated, and decoding them takes longer than handling the repetition."""
+_REMEMBERED_BYTES = 2048
+"""Maximum size of a message that is remembered, so that no sender can fill the memory."""
+
+
 class Node:
     """Driver of one core over one transport."""
 
@@ -314,7 +321,7 @@ class Node:
         self._transport = transport
         self._keys = keys
         self._submit = submit
-        self._read = read or partial(read_message, keys)
+        self._read = read or partial(read_message, keys, decode=_remembering_decode())
         self._write = write
         self._encoded: tuple[object, bytes] = (None, b"")
         """Last encoded message and its bytes, reused because a plan goes to several vehicles."""
@@ -434,6 +441,17 @@ def read_message(
     if topic.kind is None:
         raise BadInputError("key", key, "a topic that carries messages")
     return Arrived(topic, parameters, decode(payload, topic.kind))
+
+
+def _remembering_decode() -> Callable[[bytes, type], object]:
+    """Return `decode` with a memory for small messages, which are immutable."""
+    remembered = lru_cache(_REMEMBERED)(decode)
+
+    def decode_or_recall(payload: bytes, kind: type) -> object:
+        small = len(payload) <= _REMEMBERED_BYTES
+        return remembered(payload, kind) if small else decode(payload, kind)
+
+    return decode_or_recall
 
 
 def _key_of(keys: Keys, event: Event) -> str:

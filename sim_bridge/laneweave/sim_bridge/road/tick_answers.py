@@ -34,6 +34,9 @@ _STRETCH, _RELAX = 1.5, 0.98
 """Multipliers of the deadline's factor after ticks with too many late answers, and after others."""
 _LATE_AGENTS = 0.05
 """Fraction of agents that may be late before the deadline is increased."""
+_LATE_AGENTS_LOSSY = 1.0 / 3.0
+"""The same while messages are lost: ticks then end while answers to repeated SENSE are under way,
+so some agents are late on a fast machine, too."""
 LATE_SHARE = 2.0
 """Multiple of `agent_silent_s` after which an agent that always answers late is replaced."""
 LOSSY_SHARE = 0.9
@@ -197,7 +200,8 @@ class Answers:
         self._without_answer = set(self._without_message)
         self._any_message = False
         self.awaited = set() if self.all_silent else self._without_message - self.silent
-        slow = len(self._late) > _LATE_AGENTS * len(self.up)
+        share = _LATE_AGENTS_LOSSY if self.lossy else _LATE_AGENTS
+        slow = len(self._late) > share * len(self.up)
         self._stretch *= _STRETCH if slow else _RELAX
         self._stretch = min(max(self._stretch, 1.0), MAX_STRETCH)
         self._late.clear()

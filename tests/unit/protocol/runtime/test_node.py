@@ -52,7 +52,7 @@ from laneweave.protocol.runtime.transport import (
 )
 from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.codec import MAX_BYTES, decode, encode
-from laneweave.protocol.wire.messages import Heartbeat, Name, Report, RoadClock
+from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report, RoadClock
 from support.node_recorder import Recorder, at_start
 
 KEYS = topics.Keys("r")
@@ -124,6 +124,24 @@ def bench() -> Bench:
 def test_deliveries_become_events(bench: Bench, delivery: Delivery, event: Event) -> None:
     bench.node.deliver(delivery, 1.0)
     assert bench.core.events == [(1.0, event)]
+
+
+def test_a_repeated_message_is_decoded_once_and_arrives_each_time(bench: Bench) -> None:
+    other = evolve(BEAT, term=3)
+    for beat in (BEAT, other, BEAT):
+        bench.node.deliver(Received(BEAT_KEY, encode(beat)), 1.0)
+    first, second, third = (event.message for _, event in bench.core.events)
+    assert (first, second) == (BEAT, other)
+    assert third is first
+
+
+def test_a_large_message_is_not_remembered(bench: Bench) -> None:
+    event = LogEvent(Name("bridge"), Name("b"), 0.0, Name("x"), {"text": "x" * 3000})
+    for _ in range(2):
+        bench.node.deliver(Received("laneweave/r/event/bridge/b", encode(event)), 1.0)
+    first, second = (event.message for _, event in bench.core.events)
+    assert first == second
+    assert first is not second
 
 
 def test_a_core_may_refuse_what_it_receives(bench: Bench) -> None:

@@ -444,3 +444,21 @@ def test_a_second_answer_to_a_tick_is_not_late() -> None:
             answers.late(name)
     answers.start_tick(FLEET, 99.0, link_up=True)
     assert answers.deadline_s == pytest.approx(99.0 + DEADLINE_S)
+
+
+@pytest.mark.parametrize(("late", "more_time"), [(6, False), (7, True)])
+def test_while_messages_are_lost_ticks_get_more_time_if_a_third_is_late(
+    late: int,
+    more_time: bool,  # noqa: FBT001
+) -> None:
+    answers = fleet()
+    now_s = lose_half(answers, 20)
+    answers.start_tick(FLEET, now_s, link_up=True)
+    answers.close()
+    for name in FLEET[:late]:
+        answers.late(name)
+    answers.start_tick(FLEET, now_s, link_up=True)
+    assert answers.lossy
+    usual_s = LOSSY_TICK * TICK_S
+    assert (answers.deadline_s - now_s > 1.4 * usual_s) is more_time
+    assert answers.deadline_s - now_s >= 0.99 * usual_s
