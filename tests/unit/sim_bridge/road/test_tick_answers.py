@@ -449,7 +449,7 @@ def test_a_second_answer_to_a_tick_is_not_late() -> None:
 @pytest.mark.parametrize(("late", "more_time"), [(6, False), (7, True)])
 def test_while_messages_are_lost_ticks_get_more_time_if_a_third_is_late(
     late: int,
-    more_time: bool,  # noqa: FBT001
+    more_time: bool,
 ) -> None:
     answers = fleet()
     now_s = lose_half(answers, 20)
