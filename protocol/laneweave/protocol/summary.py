@@ -151,7 +151,8 @@ class Planning:
     fallbacks: int | None = field(
         default=None,
         metadata=about(
-            "plans that another solver made: the chosen one reached its share of nodes or time"
+            "plans that another solver made, because the chosen one found none in its share of "
+            "nodes or time, or, as a plug-in, none that was valid"
         ),
     )
     solve_ms: PlanningMs = field(metadata=about("time to make a plan", "ms"))

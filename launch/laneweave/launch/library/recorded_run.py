@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from attrs import frozen
 
-from laneweave.launch.recordings.runs import not_a_run, scenario_of
+from laneweave.launch.recordings.runs import not_a_run, scenario_of, unreadable
 from laneweave.launch.recordings.trajectories import read_trajectories
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import RunSummary, read_summary
@@ -79,7 +79,7 @@ class RecordedRun:
         try:
             return pq.read_table(self.folder / name)
         except (OSError, ValueError) as error:
-            raise not_a_run(self.folder, error) from error
+            raise unreadable(self.folder, name, error) from error
 
 
 def load_run(folder: Path | str) -> RecordedRun:

@@ -15,7 +15,7 @@ from laneweave.launch.run_methods import rank
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.summary import RunSummary, read_summary
+from laneweave.protocol.summary import SUMMARY_FILE, RunSummary, read_summary
 from laneweave.sim_bridge.recording.columns import SCENARIO_KEY
 
 SWEEP_FILE, POINT_FILE = "sweep.json", "point.json"
@@ -218,3 +218,11 @@ def _read_point(path: Path) -> Run:
 def not_a_run(folder: Path, why: object) -> BadInputError:
     """Return the error for a folder that is not that of a finished run."""
     return BadInputError("DIR", str(folder), f"the folder of a finished run ({why})")
+
+
+def unreadable(folder: Path, file: str, why: object) -> BadInputError:
+    """Return the error for a recording of a run that cannot be read."""
+    if (folder / SUMMARY_FILE).is_file() and not (folder / file).exists():
+        kept = "a run that kept this file; trajectories in a sweep: --keep-trajectories all"
+        return BadInputError(file, f"none in {folder}", kept)
+    return not_a_run(folder, why)

@@ -20,7 +20,7 @@ from attrs import frozen
 from numpy.typing import NDArray
 
 from laneweave.launch.recordings.runs import TRAJECTORIES as FILE
-from laneweave.launch.recordings.runs import not_a_run, scenario_of
+from laneweave.launch.recordings.runs import scenario_of, unreadable
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Lattice
 from laneweave.sim_bridge.recording.columns import SCHEMA_KEY, TRAJECTORIES
@@ -124,7 +124,7 @@ def read_trajectories(folder: Path, columns: Sequence[str] | None = None) -> pa.
             raise BadInputError(FILE, schema.decode(), wanted)
         return pq.read_table(folder / FILE, columns=names)
     except (OSError, ValueError, KeyError) as error:
-        raise not_a_run(folder, error) from error
+        raise unreadable(folder, FILE, error) from error
 
 
 def _from_first_schema(folder: Path, names: Sequence[str]) -> pa.Table:

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 
 from laneweave.protocol.scenario.fields import COMFORT_MPS2, ROLLING_SOLVER, Scenario
-from laneweave.protocol.summary import Planning, RunSummary
+from laneweave.protocol.summary import Planning, RunSummary, Safety
 
 Row = tuple[str, str]
 """Name of a figure, and its value with unit."""
@@ -25,7 +25,7 @@ def summary_rows(summary: RunSummary, scenario: Scenario | None = None) -> list[
     """
     preferences = scenario is None or bool(scenario.lane_shares)
     rows = [*_demand_rows(summary, scenario), *_traffic_rows(summary, preferences=preferences)]
-    rows += _safety_rows(summary)
+    rows += _safety_rows(summary.safety)
     if summary.planning.plans or summary.tracking.solves or summary.failover.leader_changes:
         rows += [*_planning_rows(summary.planning), *_control_rows(summary)]
     return [*rows, *_runtime_rows(summary), *_fault_rows(summary)]
@@ -61,8 +61,7 @@ def _traffic_rows(summary: RunSummary, *, preferences: bool) -> Iterator[Row]:
     )
 
 
-def _safety_rows(summary: RunSummary) -> Iterator[Row]:
-    safety, tracking = summary.safety, summary.tracking
+def _safety_rows(safety: Safety) -> Iterator[Row]:
     yield "overlaps of bodies", f"{safety.overlaps}"
     yield "collisions reported by SUMO", f"{safety.sumo_collisions}"
     yield from _numbers(
@@ -71,10 +70,7 @@ def _safety_rows(summary: RunSummary) -> Iterator[Row]:
         ("lowest acceleration", safety.min_accel_mps2, _accel_unit(safety.min_accel_mps2)),
         ("highest acceleration", safety.max_accel_mps2, _accel_unit(safety.max_accel_mps2)),
     )
-    yield from _counts(
-        ("ticks of emergency braking", tracking.emergency_ticks),
-        ("ticks driven without an agent", tracking.hold_law_ticks),
-    )
+    yield "emergency brakes", f"{safety.emergency_brakes:,}"
 
 
 def _accel_unit(value: float | None) -> str:
@@ -109,6 +105,8 @@ def _planning_rows(planning: Planning) -> Iterator[Row]:
 def _control_rows(summary: RunSummary) -> Iterator[Row]:
     tracking, failover = summary.tracking, summary.failover
     yield from _counts(
+        ("ticks of emergency braking", tracking.emergency_ticks),
+        ("ticks driven without an agent", tracking.hold_law_ticks),
         ("ticks tracked with OSQP", tracking.osqp_solves),
         ("ticks tracked unconstrained", tracking.unconstrained_steps),
     )

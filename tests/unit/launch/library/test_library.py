@@ -90,6 +90,9 @@ def test_a_run_is_read(tmp_path: Path) -> None:
     assert recorded.ticks().num_rows > 100
     with pytest.raises(laneweave.BadInputError, match="columns: got 'magic'"):
         recorded.trajectories(["magic"])
+    (tmp_path / "run" / "trajectories.parquet").unlink()
+    with pytest.raises(laneweave.BadInputError, match="--keep-trajectories all"):
+        recorded.trajectories()
     for missing in (tmp_path, tmp_path / "gone"):
         with pytest.raises(laneweave.BadInputError, match="the folder of a finished run"):
             laneweave.load_run(missing)
