@@ -117,7 +117,7 @@ def growth_of(
     at_s = tuple(first_s + phase_s * number for number in range(phases + 1))
     scenario = parse_scenario(
         {
-            "road": {"s1_m": 20.0, "s2_m": 20.0, "s3_m": 160.0},
+            "road": {"s1_m": 20.0, "s2_m": 20.0, "s3_m": 200.0},
             "demand": {"volume_veh_per_lane_h": 1600.0, "duration_s": at_s[-1]},
             "formation": dict(formation),
         }
