@@ -401,7 +401,7 @@ def test_two_runs_do_not_share_an_endpoint(lab: Lab) -> None:
     assert second.err.startswith("network.endpoint: got 'unixsock-stream/router.sock'")
     assert not (lab.folder / "second").exists()
     first.send_signal(signal.SIGTERM)
-    assert lab.finish(first, END_S).complaints[0].startswith("interrupted at ")
+    assert lab.finish(first, END_S).complaints[0].startswith("interrupted")
     lab.check_nothing_left()
 
 

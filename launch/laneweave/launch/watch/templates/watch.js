@@ -23,7 +23,7 @@ class Watch {
     this.pace = 1;
     this.stale = true; // repaint even if the time has not changed
     this.painted = 0;
-    this.counted = 0;
+    this.counted = -Infinity; // the first picture comes with its numbers
     this.tries = 0;
     this.offlineSince = null;
     this.arrived = 0;
@@ -309,9 +309,12 @@ class Watch {
       setText("sorted", mean || "–");
       setText("speed", "no preferred lanes");
     }
-    setText("leader", frame.leader ? `${frame.leader[0]}, term ${frame.leader[1]}` : "none");
-    part("leader").classList.toggle("bad", !frame.leader);
-    this.showCandidates(frame.candidates);
+    // After the end of a run, nothing is missing.
+    const ended = frame === store.newest && (store.end !== null || frame.status === "ended");
+    const noLeader = ended ? "–" : "none";
+    setText("leader", frame.leader ? `${frame.leader[0]}, term ${frame.leader[1]}` : noLeader);
+    part("leader").classList.toggle("bad", !frame.leader && !ended);
+    this.showCandidates(ended ? [] : frame.candidates);
     this.showLoss(frame.loss, scene.losses, setText);
     const [plannedAt, planned, took, solver, fallback] = frame.plan ?? [];
     const by = solver ? ` by ${solver}${fallback ? " (fallback)" : ""}` : "";
@@ -434,11 +437,14 @@ class Watch {
       entry(null, `darker: slower than ${lattice.speed_mps} m/s; lighter: faster`),
       entry({ kind: "cell" }, this.live && rolling ? "cells that a vehicle owns; framed: its hold cell" : "hold cell of a vehicle"),
       entry({ kind: "target" }, "target of a vehicle"),
-      ...(rolling ? [] : [entry({ kind: "block" }, "columns of a formation")]),
+      ...(rolling ? [] : [entry({ kind: "block" }, "columns of a formation, with its number")]),
     ];
     if (this.live) {
       rest.push(entry({ kind: "ghost" }, "not heard from: expected position"));
       rest.push(entry({ kind: "odd" }, "without agent, or overdue"));
+    }
+    if (road.sorting_start_m > 0 && road.sorting_start_m < road.length_m) {
+      rest.push(entry({ kind: "sorting" }, "lane sorting begins"));
     }
     if (road.closed.length > 0) {
       rest.push(entry({ kind: "closed" }, "closed"), entry({ kind: "stop-line" }, "stop line"));
