@@ -74,7 +74,7 @@ def _snapshots(label: str, description: str) -> _Figure:
         f"evaluation-road-{label}.png",
         f"Four strips of road from 500 to 800 m, {label}",
         f"The road from 500 to 800 m at 1600 veh/(lane h), {description}: four instants, 4 s "
-        "apart. Colours show preferred lanes; faster vehicles are lighter.",
+        "apart. Colours and numbers show preferred lanes; faster vehicles are lighter.",
     )
     return _Figure(picture, (label,), (SHOWN_VOLUME,), _draw_snapshots, traced=True)
 
@@ -117,7 +117,8 @@ _FIGURES: Final = (
         Picture(
             "evaluation-speeds.png",
             "Heat maps of mean speed over time and position",
-            "Mean speed over space and time, seed 1. Dashed: lane sorting begins.",
+            "Mean speed over space and time, seed 1. White: v_F; red: slower; blue: faster; grey: "
+            "no vehicle. Dashed: lane sorting begins.",
         ),
         ("formations", "paper-6", "rule", "rule-net"),
         PAPER_VOLUMES[1:],

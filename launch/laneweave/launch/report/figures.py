@@ -120,7 +120,7 @@ def _break_axis(upper: Axes, lower: Axes, break_s: float) -> None:
     upper.set_ylim(break_s, top_s)
     upper.spines["bottom"].set_visible(False)
     upper.tick_params(axis="x", bottom=False, labelbottom=False)
-    upper.set_ylabel("jams (s)")
+    upper.set_ylabel("travel time\nin jams (s)", fontsize="small")
     slash: dict[str, Any] = {"marker": [(-1.0, -0.5), (1.0, 0.5)], "markersize": 9, "color": INK}
     upper.plot([0.0], [0.0], transform=upper.transAxes, clip_on=False, **slash)
     lower.plot([0.0], [1.0], transform=lower.transAxes, clip_on=False, **slash)
@@ -180,7 +180,7 @@ def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
         left = shown[0]
         left.plot(span, span, zorder=0, **REFERENCE)
         text = "dashed: throughput = demand"
-        left.annotate(text, (0.97, 0.04), xycoords="axes fraction", ha="right", **SMALL_TEXT)
+        left.annotate(text, (0.03, 0.96), xycoords="axes fraction", va="top", **SMALL_TEXT)
         left.set_ylabel("throughput (veh/(lane·h))")
         for axes, value in zip(shown, (_throughput, _preferred_percent), strict=False):
             _draw_seeds(axes, comparison, value, 0.012 * range_veh_per_lane_h)

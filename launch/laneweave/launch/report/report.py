@@ -31,12 +31,12 @@ TRAVEL_CAPTION = (
     "Travel times of the counted vehicles of all seeds, including the wait at the entrance. Boxes: "
     "quartiles and median; whiskers: at most 1.5 interquartile ranges; dots and lines: means. The "
     "axis is broken if only some methods jam. Dashed, free flow: time at v_F from the start of the "
-    "road to its end, without waiting."
+    "road to its end, without waiting; vehicles that catch up with a cell ahead take less."
 )
 FLOW_CAPTION = (
-    "Left: rate at which vehicles pass the end of the road, between the first and the last "
-    "counted one. Right: share of vehicles that left in their preferred lanes, unless they have "
-    "none or all did. Small dots: runs; bars: standard deviations over seeds."
+    "Throughput: rate at which vehicles pass the end of the road, between the first and the last "
+    "counted one; if a jam holds up the first one, it can exceed the demand. Left in the preferred "
+    "lane: shown if not all vehicles did. Small dots: runs; bars: standard deviations over seeds."
 )
 SPEED_CAPTION = (
     "Mean speed in bins of 20 m and 5 s, in the first run with trajectories of each method and "
@@ -213,7 +213,8 @@ def _snapshots(report: _Report, run: Run) -> list[Picture]:
     stretch_m = PAPER_STRETCH_M if fits and not run.scenario.road.closures else None
     preferences = bool(run.scenario.lane_shares)
     caption = _sentences(
-        f"{_title(run)}. Four times, every {run.scenario.cycles_s[0]:g} s.",
+        f"{_title(run)}. The four times, {run.scenario.cycles_s[0]:g} s apart, at "
+        "which the most vehicles change lanes.",
         "Colours and numbers on vehicles show the preferred lanes (0: rightmost);"
         if preferences
         else "Vehicles have no preferred lanes;",

@@ -121,15 +121,16 @@ def volume_title(volume_veh_per_lane_h: float) -> str:
 
 
 def legend_above(figure: Figure) -> None:
-    """Draw one legend above all panels."""
+    """Draw one legend above all panels, with at most six columns, fewer in a narrow figure."""
     entries: dict[str, Any] = {}
     for axes in figure.axes:
         handles, labels = axes.get_legend_handles_labels()
         entries = dict(zip(labels, handles, strict=True)) | entries
-    if entries:
-        figure.legend(
-            entries.values(), entries, loc="outside upper center", ncols=min(6, len(entries))
-        )
+    for columns in range(min(6, len(entries)), 0, -1):
+        legend = figure.legend(entries.values(), entries, loc="outside upper center", ncols=columns)
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            break
+        legend.remove()
 
 
 def explain_empty_axes(axes: Axes, text: str) -> None:

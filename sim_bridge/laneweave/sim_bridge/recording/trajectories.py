@@ -118,7 +118,7 @@ class Trajectories:
         self._last_s, self._last_accels = t_s, accels
         self._min_accel_mps2 = min(self._min_accel_mps2, *accels.values(), math.inf)
         self._max_accel_mps2 = max(self._max_accel_mps2, *accels.values(), -math.inf)
-        self._times += [t_s] * len(rows)
+        self._times += [round(t_s, 6)] * len(rows)
         self._rows += rows
         self.peak = max(self.peak, len(rows))
         self._buffered_ticks += 1

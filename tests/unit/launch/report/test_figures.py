@@ -27,6 +27,7 @@ from laneweave.launch.report.figures import (
 )
 from laneweave.launch.report.report import report_run
 from laneweave.launch.report.snapshots import _MAX_HEADING, _pose, default_stretch_m, road_snapshots
+from laneweave.launch.report.style import legend_above, picture
 from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.report.tables import run_table, tables_of
 from laneweave.protocol.config.scenario_files import parse_scenario
@@ -284,3 +285,15 @@ def test_figures_for_papers_are_vector_graphics(
 def test_matplotlib_is_imported_only_to_draw() -> None:
     for module in ("figures", "snapshots"):
         assert not loads(f"laneweave.launch.report.{module}", "matplotlib")
+
+
+@pytest.mark.parametrize("width_in", [3.0, 4.6, 9.2])
+def test_a_legend_is_not_wider_than_its_figure(tmp_path: Path, width_in: float) -> None:
+    with picture(width_in, 3.7, tmp_path / "legend.png", 100) as figure:
+        axes = figure.subplots()
+        for number in range(9):
+            axes.plot([0.0, 1.0], [0.0, number], label=f"formations-{number}")
+        legend_above(figure)
+        (legend,) = figure.legends
+        assert legend.get_window_extent().width <= figure.bbox.width
+        assert len(legend.get_texts()) == 9

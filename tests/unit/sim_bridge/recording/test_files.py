@@ -81,7 +81,7 @@ def test_trajectories_come_back(
                 cell = (-n, n % 3) if n else (None, None)
                 samples.append((f"v{n}", s_m, y_m, speed, across, accel, *cell, 2 - n % 3))
             trajectories.tick(0.1 * tick, samples)
-            expected += [(0.1 * tick, *sample) for sample in samples]
+            expected += [(round(0.1 * tick, 6), *sample) for sample in samples]
     file = pq.ParquetFile(tmp_path / "trajectories.parquet")
     assert file.num_row_groups > 2
     found = file.read()
