@@ -74,7 +74,7 @@ def _snapshots(label: str, description: str) -> _Figure:
         f"evaluation-road-{label}.png",
         f"Four strips of road from 500 to 800 m, {label}",
         f"The road from 500 to 800 m at 1600 veh/(lane h), {description}: four instants, 4 s "
-        "apart. Colours and numbers show preferred lanes; faster vehicles are lighter.",
+        "apart. Colours and numbers on vehicles show preferred lanes; faster vehicles are lighter.",
     )
     return _Figure(picture, (label,), (SHOWN_VOLUME,), _draw_snapshots, traced=True)
 
@@ -86,8 +86,9 @@ _FIGURES: Final = (
             "Box plots of travel times at the paper's volumes",
             "Travel times at the paper's volumes: formations of at most six vehicles, with the "
             "default and with the paper's settings, and two interpretations of the paper's rules. "
-            "Boxes: quartiles over the vehicles of all seeds; lines: means. The axis is broken "
-            "where a method congests.",
+            "Boxes: quartiles over the vehicles of all seeds; whiskers: at most 1.5 interquartile "
+            "ranges; small dots: vehicles beyond them; large markers and lines: means. The axis "
+            "is broken where a method congests.",
         ),
         ("formations", "paper-6", "rule", "rule-net"),
         PAPER_VOLUMES,
@@ -107,7 +108,9 @@ _FIGURES: Final = (
         Picture(
             "evaluation-flows.png",
             "Throughput and share in the preferred lane against the demand",
-            "Throughput and share in the preferred lane. Dots are runs, bars standard deviations.",
+            "Throughput between the first and the last counted vehicle, and share in the preferred "
+            "lane. Small dots: runs; markers and bars: means and standard deviations over the "
+            "seeds.",
         ),
         LABELS,
         VOLUMES,
@@ -118,7 +121,7 @@ _FIGURES: Final = (
             "evaluation-speeds.png",
             "Heat maps of mean speed over time and position",
             "Mean speed over space and time, seed 1. White: v_F; red: slower; blue: faster; grey: "
-            "no vehicle. Dashed: lane sorting begins.",
+            "no vehicle. Dashed: start of lane sorting.",
         ),
         ("formations", "paper-6", "rule", "rule-net"),
         PAPER_VOLUMES[1:],
@@ -127,14 +130,14 @@ _FIGURES: Final = (
     ),
     _snapshots("formations", "formations of at most six"),
     _snapshots("paper-6", "the paper's formations of at most six"),
-    _snapshots("rule", "the rules, d_R front to front"),
-    _snapshots("rule-net", "the rules, d_R as a net gap"),
+    _snapshots("rule", "the rules, d_R front to front, with instantaneous lane changes"),
+    _snapshots("rule-net", "the rules, d_R as a net gap, with instantaneous lane changes"),
     _Figure(
         Picture(
             "evaluation-spacing.png",
             "Distributions of spacing and time headway at 1600",
-            "Spacing and time headway at 1600 veh/(lane h), front bumper to front bumper. Dashed: "
-            "d_F, and the time that it takes at v_F.",
+            "Spacing and time headway at 1600 veh/(lane h), front bumper to front bumper. "
+            "Thin grey dashed lines: d_F, and the time that it takes at v_F.",
         ),
         ("formations", "rolling", "rule", "lc2013"),
         (SHOWN_VOLUME,),

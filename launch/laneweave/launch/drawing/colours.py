@@ -6,6 +6,9 @@ vision deficiency can tell apart. Lanes also have their numbers wherever they ha
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 
@@ -49,6 +52,11 @@ def lane_names(lanes: int) -> tuple[str, ...]:
     return tuple(f"lane {lane}" for lane in range(lanes))
 
 
+def _in_words(name: str) -> str:
+    """Return the name of a lane in a sentence."""
+    return name if "lane" in name else f"the {name} lane"
+
+
 def vehicle_colour(lanes: int, preferred_lane: int) -> str:
     """Return the colour of vehicles with a preferred lane; `ANY_LANE`: without one."""
     if preferred_lane == ANY_LANE:
@@ -63,15 +71,43 @@ def text_colour(colour: str) -> str:
     return "#000000" if 0.3 * red + 0.59 * green + 0.11 * blue > BRIGHT else "#ffffff"
 
 
-def vehicle_legend(scenario: Scenario) -> tuple[tuple[str, str], ...]:
+def has_preferences(scenario: Scenario) -> bool:
+    """Return whether vehicles have preferred lanes or exits; colours then show these."""
+    return bool(scenario.lane_shares or scenario.exit)
+
+
+def trip_lane(scenario: Scenario, trip: Mapping[str, Any]) -> int:
+    """Return the lane whose colour a recorded vehicle has, or `ANY_LANE`.
+
+    This is its preferred lane or that of its exit; in a scenario without both, the lane in which it
+    arrived.
+    """
+    if not has_preferences(scenario):
+        return int(trip.get("arrival_lane", ANY_LANE))
+    preferred = int(trip.get("preferred_lane", ANY_LANE))
+    if preferred == ANY_LANE and trip.get("destination") in {one.name for one in scenario.exit}:
+        return scenario.exit_lane(trip["destination"])
+    return preferred
+
+
+def exit_in_words(name: str) -> str:
+    """Return the name of an exit in a sentence; SUMO's names may be numbers."""
+    return name if any(map(str.isalpha, name)) else f"exit {name}"
+
+
+def vehicle_legend(scenario: Scenario, *, recorded: bool = False) -> tuple[tuple[str, str], ...]:
     """Return the colours of vehicles and their meanings, from the left lane.
 
-    The meaning begins with the number that is written on the vehicles.
+    The meaning begins with the number that is written on the vehicles, if there is one. The lanes
+    of arrival are known of `recorded` vehicles only.
     """
     lanes = scenario.road.lanes
+    if recorded and not has_preferences(scenario):
+        arrived = (f"arrived in {_in_words(name)}" for name in lane_names(lanes))
+        return tuple(zip(lane_colours(lanes), arrived, strict=True))[::-1]
     if not scenario.lane_shares:
         exits = tuple(
-            (vehicle_colour(lanes, lane), f"{lane}: leaves by {one.name}")
+            (vehicle_colour(lanes, lane), f"{lane}: leaves by {exit_in_words(one.name)}")
             for one in scenario.exit
             for lane in (scenario.exit_lane(one.name),)
         )

@@ -145,6 +145,8 @@ def _new_panels(
     panels = list(figure.subplots(rows, panel_columns, squeeze=False).flat)
     for axes in panels[count:]:
         axes.remove()
+    panels[0].set_ylabel("lane", fontsize=7, labelpad=1, color=FAINT_INK)
+    panels[0].set_xlabel("column", fontsize=7, labelpad=1, color=FAINT_INK)
     for axes in panels[:count]:
         axes.set_xlim(-0.5, grid.columns - 0.5)
         axes.set_ylim(-0.5 * _LANE_HEIGHT, (grid.lanes - 0.5) * _LANE_HEIGHT)

@@ -189,7 +189,7 @@ def road_figure(picture: _Picture) -> Figure:
     count = min(steps, MAX_INSTANTS - 1) + 1
     instants = [round(number * steps / max(1, count - 1)) for number in range(count)]
     road_in = picture.lanes * _LANE_IN
-    figure = new_figure(_WIDTH_IN, 0.75 + count * (road_in + _ROAD_GAP_IN) + 0.4 + _TIMES_IN)
+    figure = new_figure(_WIDTH_IN, 0.9 + count * (road_in + _ROAD_GAP_IN) + 0.4 + _TIMES_IN)
     figure.suptitle(picture.title, fontsize=10, color=INK)
     heights_in = [count * (road_in + _ROAD_GAP_IN) + 0.4, _TIMES_IN]
     roads, times = figure.subfigures(2, 1, squeeze=False, height_ratios=heights_in)[:, 0]
@@ -257,7 +257,7 @@ class _Body:
             color=INK,
             va="center_baseline",
             parse_math=False,
-            path_effects=[withStroke(linewidth=2.0, foreground=_ROAD)],
+            path_effects=[withStroke(linewidth=3.5, foreground=_ROAD)],
             zorder=4,
         )
         return cls(shape, label)
@@ -312,8 +312,14 @@ def _label_vehicles(
             color=INK,
             va=alignment,
             parse_math=False,
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
             annotation_clip=False,
         )
+
+
+def _plain(name: str) -> str:
+    """Return a name in which a dollar sign does not start a formula."""
+    return name.replace("$", r"\$")
 
 
 def _title(response: PlanResponse, drive: Drive) -> str:
@@ -322,14 +328,14 @@ def _title(response: PlanResponse, drive: Drive) -> str:
     if not response.paths:
         return f"{response.status}: the start"
     title = (
-        f"{response.status}, cost {response.cost}, {response.steps} steps of "
-        f"{slot_s:g} s at {formation.speed_mps:g} m/s, columns of {formation.gap_m:g} m"
+        f"{response.status}, cost {response.cost}, {response.steps} steps of {slot_s:g} s at "
+        f"v$_F$ = {formation.speed_mps:g} m/s, d$_F$ = {formation.gap_m:g} m"
     )
     if drive.overlaps:
-        pairs = ", ".join(f"{one} and {other}" for one, other in drive.overlaps)
-        return f"{title}; bodies overlap, as its conflict kinds allow: {pairs}"
+        pairs = ", ".join(f"{_plain(one)} and {_plain(other)}" for one, other in drive.overlaps)
+        return f"{title}\nThe plan's conflict kinds allow that bodies overlap: {pairs}"
     if math.isfinite(drive.min_gap_m):
-        return f"{title}; shortest gap {drive.min_gap_m:.1f} m"
+        return f"{title}; shortest gap between bodies {drive.min_gap_m:.1f} m"
     return title
 
 

@@ -9,6 +9,7 @@ from laneweave.launch.drawing.colours import (
     NEUTRAL,
     SHADE_STRENGTH,
     SPEED_SPAN_MPS,
+    has_preferences,
     lane_colours,
     vehicle_legend,
 )
@@ -16,8 +17,11 @@ from laneweave.launch.web import text_of
 from laneweave.protocol.scenario.fields import Scenario
 
 
-def road_scene(scenario: Scenario) -> dict[str, Any]:
-    """Return the road, bodies, lattice and colours in the format that the scripts read."""
+def road_scene(scenario: Scenario, *, recorded: bool = False) -> dict[str, Any]:
+    """Return the road, bodies, lattice and colours in the format that the scripts read.
+
+    For `recorded`, see `vehicle_legend`.
+    """
     road, formation, closed = scenario.road, scenario.formation, closed_parts(scenario)
     return {
         "road": {
@@ -35,8 +39,8 @@ def road_scene(scenario: Scenario) -> dict[str, Any]:
         "shade": {"span_mps": SPEED_SPAN_MPS, "strength": SHADE_STRENGTH},
         "colours": list(lane_colours(road.lanes)),
         "neutral": NEUTRAL,
-        "preferences": bool(scenario.lane_shares or scenario.exit),
-        "legend": [list(entry) for entry in vehicle_legend(scenario)],
+        "preferences": has_preferences(scenario),
+        "legend": [list(entry) for entry in vehicle_legend(scenario, recorded=recorded)],
     }
 
 

@@ -7,6 +7,7 @@ matplotlib.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -26,9 +27,15 @@ MAX_ASSIGNMENTS: Final = 6
 MAX_LAYERS, MAX_PER_LAYER, MAX_ENTRIES = 3, 5, 4
 MAX_MAPS: Final = 3
 
-_WIDTH_IN, _MARGIN_IN, _TITLE_IN, _CHAIN_IN, _HEADING_IN = 12.0, 0.25, 0.55, 1.75, 0.4
+_WIDTH_IN, _MARGIN_IN, _TITLE_IN, _CHAIN_IN, _HEADING_IN = 12.0, 0.25, 0.75, 1.75, 0.4
 _LAYER_GAP_IN, _LINE_IN, _PAD_IN = 0.45, 0.165, 0.09
 _RADIUS_IN = 0.34
+_SUBSCRIPTS: Final = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+_KEY: Final = (
+    "circles: assignments A_k and their costs C_k; rectangles: their best path sets P_k and the "
+    "costs C'_k of these, with a thick edge for the best one; in brackets: the target of each "
+    "vehicle"
+)
 _SPACING: Final = 1.5
 """Line spacing that makes lines `_LINE_IN` high."""
 _COLOURS: Final = {"expanded": "#f1f2f4", "solution": "#cdebd9", "open": "#fbf3dc"}
@@ -64,19 +71,27 @@ def explanation_figure(explanation: Explanation) -> Figure:
     axes.set_axis_off()
     axes.set_xlim(0, _WIDTH_IN)
     axes.set_ylim(height_in, 0)
-    write(axes, (_MARGIN_IN, 0.25), f"Ended: {explanation.stop_reason}", 11)
+    write(axes, (_MARGIN_IN, 0.25), f"Ended: {_formula(explanation.stop_reason)}", 11)
+    write(axes, (_MARGIN_IN, 0.5), _formula(_KEY), _SMALL, color=FAINT_INK)
     _draw_chain(axes, explanation, best, _TITLE_IN)
     if best is None:
         return figure
     top_in = _TITLE_IN + _CHAIN_IN
     k, assignment = best
-    heading = f"Constraint tree of A_{k}, {len(assignment.nodes)} nodes"
+    heading = _formula(f"Constraint tree of A_{k}, {len(assignment.nodes)} nodes")
     write(axes, (_MARGIN_IN, top_in), heading, _NORMAL)
     shown = f"{trees_shown(explanation)}; green: solution, yellow: still in T at the end"
     write(axes, (_MARGIN_IN, top_in + 0.18), shown, _SMALL, color=FAINT_INK)
     _draw_tree(axes, assignment, layers, top_in + _HEADING_IN)
-    _draw_maps(axes, maps, top_in + tree_in + 1.5 * _HEADING_IN)
+    count = f"{len(maps)} of {len(assignment.nodes)} nodes" if maps else ""
+    _draw_maps(axes, maps, count, top_in + tree_in + 1.5 * _HEADING_IN)
     return figure
+
+
+def _formula(text: str) -> str:
+    """Return text with the indices, primes and relations of formulas."""
+    shown = re.sub(r"_(\d+)", lambda found: found[1].translate(_SUBSCRIPTS), text)
+    return shown.replace("_k", "ₖ").replace("'", "\u2032").replace(">=", "≥")
 
 
 def _best_assignment(
@@ -101,12 +116,13 @@ def _draw_chain(
     y = top_in + _RADIUS_IN + 0.1
     for k, one in enumerate(shown, start=1):
         x = 0.9 + pitch_in * (k - 1)
-        _draw_circle(axes, (x, y), f"A_{k}\nC_{k} = {one.cost}", mfc=_ASSIGNMENT)
+        _draw_circle(axes, (x, y), _formula(f"A_{k}\nC_{k} = {one.cost}"), mfc=_ASSIGNMENT)
         axes.annotate("", (x + pitch_in - _RADIUS_IN, y), (x + _RADIUS_IN, y), arrowprops=_ARROW)
         below = y + _RADIUS_IN
         axes.annotate("", (x, below + 0.3), (x, below), arrowprops=_ARROW)
         found = one.best_cost is not None
         label = f"P_{k}: C'_{k} = {number(one.best_cost)}" if found else "none below C'*"
+        label = _formula(label)
         is_best = found and best is not None and best[0] == k
         box = _box(_PATHS, edge=_BEST if is_best else INK, bold=is_best)
         write(axes, (x, below + 0.4), label, _SMALL, ha="center", bbox=box)
@@ -117,7 +133,7 @@ def _draw_chain(
     elif explanation.next_cost is None:
         text = "end"
     else:
-        text = f"A_{k}\nC_{k} = {explanation.next_cost:g}"
+        text = _formula(f"A_{k}\nC_{k} = {explanation.next_cost:g}")
     _draw_circle(axes, (0.9 + pitch_in * len(shown), y), text, mfc="white")
 
 
@@ -148,7 +164,7 @@ def _layers(nodes: Sequence[ExplainedNode]) -> list[Layer]:
 
 
 def _node_lines(node: ExplainedNode) -> list[str]:
-    lines = [f"N_{node.number}    L_{node.number} = {node.cost}"]
+    lines = [_formula(f"N_{node.number}    L_{node.number} = {node.cost}")]
     lines.append(f"constraint {_short(node.constraint)}" if node.constraint else "no constraints")
     lines.append("conflicts" if node.conflicts else "no conflicts")
     lines += map(_short, node.conflicts[:MAX_ENTRIES])
@@ -208,12 +224,14 @@ def _map_lines(node: ExplainedNode) -> list[str]:
     return str(node.path_map).splitlines()
 
 
-def _draw_maps(axes: Axes, nodes: Sequence[ExplainedNode], top_in: float) -> None:
-    """Draw relative path maps side by side, in a size that fits."""
+def _draw_maps(axes: Axes, nodes: Sequence[ExplainedNode], count: str, top_in: float) -> None:
+    """Draw relative path maps side by side, in a size that fits; `count` says of how many nodes."""
     pitch_in = (_WIDTH_IN - 2 * _MARGIN_IN) / max(1, len(nodes))
     for i, node in enumerate(nodes):
         left = _MARGIN_IN + i * pitch_in
-        write(axes, (left, top_in), f"Relative path map of N_{node.number}", _NORMAL)
+        shown = f" ({count})" if i == 0 else ""
+        heading = _formula(f"Relative path map of N_{node.number}") + shown
+        write(axes, (left, top_in), heading, _NORMAL)
         lines = _map_lines(node)
         size_pt = min(_SMALL, 72 * (pitch_in - 0.3) / (0.62 * max(map(len, lines))))
         table = write(axes, (left, top_in + 0.14), "\n".join(lines), size_pt, va="top")

@@ -32,6 +32,8 @@ Bools = NDArray[np.bool_]
 
 NO_LATTICE = np.iinfo(np.int64).min
 """Value of columns and reserved lanes of `Tracks` where the method has no lattice."""
+JUMP_MPS = 2.8
+"""Lateral speed above which a vehicle jumps to another lane; as in `player.js`."""
 _FLOATS = ("s_m", "y_m", "speed_mps", "lateral_speed_mps", "accel_mps2")
 _COLUMNS, _LANES = ("column", "reserved_column"), ("lane", "reserved_lane")
 _FIRST_SCHEMA = ("t_s", "vehicle", "s_m", "y_m", "speed_mps", "accel_mps2", "column", "lane")

@@ -15,12 +15,12 @@ from typing import Any, Final
 import numpy as np
 from attrs import frozen
 
+from laneweave.launch.drawing.colours import trip_lane
 from laneweave.launch.drawing.road_scene import road_scene
 from laneweave.launch.formation_columns import Formations
 from laneweave.launch.recordings.formations import closed_formations
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import Floats, Tracks, read_trips
-from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.wire.messages import CAR
 
 FORMAT: Final = "laneweave.animation/1"
@@ -48,7 +48,7 @@ def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
         "end_s": round(samples.end_s, 3),
         # When the first vehicle reaches the end of the road.
         "start_s": round(min(scenario.free_flow_s, 0.5 * samples.end_s), 3),
-        **road_scene(scenario),
+        **road_scene(scenario, recorded=True),
         "formations": [[one.number, one.rear, one.front] for one in reversed(formations.listed)],
         "vehicles": samples.vehicles,
         "units": units,
@@ -96,7 +96,7 @@ def _sample(run: Run, tracks: Tracks, formations: Formations) -> _Samples:
         vehicles.append(
             {
                 "name": tracks.names[number],
-                "lane": int(trip.get("preferred_lane", ANY_LANE)),
+                "lane": trip_lane(run.scenario, trip),
                 "type": trip.get("vehicle_type", CAR),
                 "formation": trip["formation"] if trip.get("formation") in known else None,
                 "first": first,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 from attrs import field, frozen
 
-from laneweave.launch.recordings.trajectories import Bools, Floats, Tracks
+from laneweave.launch.recordings.trajectories import JUMP_MPS, Bools, Floats, Tracks
 from laneweave.launch.report.style import (
     REFERENCE,
     explain_empty_axes,
@@ -67,7 +67,7 @@ JERK: Final = Quantity("jerk", "m/s³", np.linspace(0.0, 20.0, 201), exceedance=
 LATERAL: Final = Quantity(
     "lateral acceleration", "m/s²", np.linspace(0.0, 5.0, 201), exceedance=True
 )
-"""Second difference quotient of the lateral position."""
+"""Second difference quotient of the lateral position, without instantaneous lane changes."""
 
 
 @frozen
@@ -102,7 +102,8 @@ def count(tracks: Tracks, scenario: Scenario) -> Counts:
     dt_s = np.where(same, np.diff(tracks.t_s), 1.0)
     jerk = np.abs(np.diff(tracks.accel_mps2) / dt_s)[same]
     lateral_mps = np.diff(tracks.y_m) / dt_s
-    both = same[1:] & same[:-1]
+    jumps = np.abs(lateral_mps) > JUMP_MPS
+    both = same[1:] & same[:-1] & ~jumps[1:] & ~jumps[:-1]
     lateral_mps2 = np.abs(np.diff(lateral_mps) / dt_s[1:])[both]
     values = {
         SPACING: spacing_m,
@@ -148,6 +149,8 @@ Counted = Mapping[tuple[str, float], Counts]
 
 MIN_SHARE = 1e-5
 """Lower limit of the exceedance scale."""
+SHOWN_SHARE = 1.3
+"""End of the axis of a quantity with a limit, as a multiple of the limit."""
 
 
 def draw_spacings(counted: Counted, scenario: Scenario, out: Path, dpi: int) -> None:
@@ -184,7 +187,10 @@ def _draw(
                     _draw_one(axes, counted[label, volume], quantity, style)
             if not axes.lines:
                 explain_empty_axes(axes, "no trajectories")
-            axes.axvline(_set_value(quantity, scenario), zorder=1, **REFERENCE)
+            value = _set_value(quantity, scenario)
+            axes.axvline(value, zorder=1, **REFERENCE)
+            if quantity.exceedance:
+                axes.set_xlim(0.0, min(quantity.edges[-1], SHOWN_SHARE * value))
             axes.set_xlabel(f"{quantity.name} ({quantity.unit})")
             if volume == volumes[0]:
                 share = "time with more" if quantity.exceedance else "vehicles with less"
@@ -200,7 +206,7 @@ def _draw_one(axes: Axes, counts: Counts, quantity: Quantity, style: dict[str, A
         shares = counts.exceedance(quantity)
         axes.plot(quantity.edges[:-1][shares > 0.0], shares[shares > 0.0], **style)
         axes.set_yscale("log")
-        axes.set(ylim=(MIN_SHARE, 1.3), xlim=(0.0, quantity.edges[-1]))
+        axes.set_ylim(MIN_SHARE, 1.3)
     else:
         axes.plot(quantity.edges[1:-1], counts.cumulative(quantity), **style)
         axes.set(ylim=(0.0, 1.03), xlim=(0.0, quantity.edges[-2]))

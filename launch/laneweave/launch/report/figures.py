@@ -241,8 +241,8 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
     """Draw the mean speed over space and time, in a panel per label and volume.
 
     Colours diverge from v_F, with one scale for all panels: the difference from v_F has a
-    square-root scale, so that small waves show beside jams, up to the percentile `LIMIT_PERCENT` of
-    all bins; the ends of the bar are for bins beyond it.
+    square-root scale, so that small waves show beside jams. On each side of v_F it ends at the
+    percentile `LIMIT_PERCENT` of the bins on that side; the ends of the bar are for bins beyond it.
     """
     labels, volumes = comparison.labels, spread_evenly(comparison.volumes)
     shown = {
@@ -293,27 +293,35 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
 def speed_scale(maps: Iterable[MeanSpeeds], set_mps: float) -> tuple[FuncNorm, list[float]]:
     """Return the scale of mean speeds around v_F, and the speeds to label on it.
 
-    It ends at a difference of 1, 2 or 5 times a power of ten, at most v_F.
+    Each side ends at a difference of 1, 2 or 5 times a power of ten, the slower one at most at 0.
     """
     from matplotlib.colors import FuncNorm  # noqa: PLC0415 - lazily
 
-    off = np.concatenate([np.abs(one.speed_mps.compressed() - set_mps) for one in maps])
-    limit_mps = max(MIN_LIMIT_MPS, float(np.percentile(off, LIMIT_PERCENT)) if len(off) else 0.0)
-    power = 10.0 ** math.floor(math.log10(limit_mps))
-    nice_mps = power * next(step for step in (1.0, 2.0, 5.0, 10.0) if limit_mps <= step * power)
-    limit_mps = min(nice_mps, set_mps)
+    off_mps = np.concatenate([one.speed_mps.compressed() - set_mps for one in maps])
+    slower_mps = min(_nice_limit(-off_mps[off_mps < 0.0]), set_mps)
+    faster_mps = _nice_limit(off_mps[off_mps > 0.0])
 
     def forward(speed_mps: Floats) -> Floats:
         # Masked bins become NaN, which the scale masks again.
-        share = (np.ma.filled(speed_mps, np.nan) - set_mps) / limit_mps
+        over_mps = np.ma.filled(speed_mps, np.nan) - set_mps
+        share = over_mps / np.where(over_mps < 0.0, slower_mps, faster_mps)
         return np.asarray(np.sign(share) * np.sqrt(np.abs(share)))
 
     def inverse(place: Floats) -> Floats:
+        limit_mps = np.where(np.asarray(place) < 0.0, slower_mps, faster_mps)
         return np.asarray(set_mps + limit_mps * np.sign(place) * np.square(place))
 
-    norm = FuncNorm((forward, inverse), set_mps - limit_mps, set_mps + limit_mps)
-    shares = (-1.0, -0.5, -0.1, 0.0, 0.1, 0.5, 1.0)
-    return norm, [set_mps + share * limit_mps for share in shares]
+    norm = FuncNorm((forward, inverse), set_mps - slower_mps, set_mps + faster_mps)
+    slower = [set_mps - share * slower_mps for share in (1.0, 0.5, 0.1)]
+    return norm, [*slower, *(set_mps + share * faster_mps for share in (0.0, 0.1, 0.5, 1.0))]
+
+
+def _nice_limit(off_mps: Floats) -> float:
+    """Return 1, 2 or 5 times a power of ten, not below the percentile of the differences."""
+    limit_mps = float(np.percentile(off_mps, LIMIT_PERCENT)) if len(off_mps) else 0.0
+    limit_mps = max(MIN_LIMIT_MPS, limit_mps)
+    power = 10.0 ** math.floor(math.log10(limit_mps))
+    return float(power * next(step for step in (1.0, 2.0, 5.0, 10.0) if limit_mps <= step * power))
 
 
 def _mark_closed_parts(axes: Axes, run: Run) -> None:

@@ -61,6 +61,8 @@ class Section:
     tables: Sequence[Table] = ()
     pictures: Sequence[Picture] = ()
     animations: Sequence[Animation] = ()
+    note: str = ""
+    """A sentence above the pictures."""
 
 
 def keep_units(text: str) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from attrs import frozen
 
 from laneweave.coordinator.planning.path_map import RelativePathMap
-from laneweave.launch.drawing.colours import lane_colours, vehicle_colour
+from laneweave.launch.drawing.colours import lane_colours, text_colour, vehicle_colour
 from laneweave.launch.drawing.figures import INK, write
 from laneweave.launch.formation_columns import FormationColumns
 from laneweave.launch.recordings.formations import read_events, recorded_formations
@@ -82,8 +82,8 @@ class DrivenMap:
                 "end of the road"
             )
         return (
-            "The box before a name has the colour of the preferred lane; cells have the colour of "
-            "their lane, strong if it is the preferred one"
+            "The box before a name shows the preferred lane (0: rightmost); cells have the colour "
+            "of their lane, strong if it is the preferred one"
         )
 
 
@@ -220,7 +220,7 @@ def draw_path_map(driven: DrivenMap, out: Path, dpi: int) -> None:
 
 
 def _draw_row(axes: Axes, row: int, driven: DrivenMap) -> None:
-    """Draw a vehicle's row: a mark in the colour of its preferred lane, its name, its cells."""
+    """Draw a vehicle's row: its preferred lane, its name, its cells."""
     from matplotlib.patches import FancyBboxPatch, Rectangle  # noqa: PLC0415 - lazily
 
     colours, arrived = lane_colours(driven.lanes), driven.arrived[row]
@@ -230,6 +230,8 @@ def _draw_row(axes: Axes, row: int, driven: DrivenMap) -> None:
     if preferred != ANY_LANE:
         colour = vehicle_colour(driven.lanes, preferred)
         axes.add_patch(FancyBboxPatch((-1.25, row + 0.2), 0.3, 0.6, fc=colour, **style))
+        own: dict[str, Any] = {"color": text_colour(colour), "ha": "center"}
+        write(axes, (-1.1, row + 0.5), str(preferred), _SIZE_PT - 1.0, **own)
     shown = name if len(name) <= _MAX_NAME else name[: _MAX_NAME - 1] + "…"
     write(axes, (-0.85, row + 0.5), shown, _SIZE_PT)
     for point, (cell, before) in enumerate(zip(cells, (cells[0], *cells), strict=False)):

@@ -12,50 +12,81 @@ from pathlib import Path
 from attrs import define, field
 
 from laneweave.launch.drawing.closed_parts import describe_closed_parts
+from laneweave.launch.drawing.colours import has_preferences
 from laneweave.launch.drawing.figures import DPI, FigureFormat
 from laneweave.launch.recordings.runs import Comparison, Run, single_run
-from laneweave.launch.recordings.trajectories import read_tracks
+from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.launch.report import distributions, figures
 from laneweave.launch.report.animation import animation_data
 from laneweave.launch.report.page import Animation, Picture, Section, write_page
 from laneweave.launch.report.path_maps import DrivenMap, draw_path_map, driven_map
-from laneweave.launch.report.snapshots import road_snapshots
+from laneweave.launch.report.snapshots import changes_gradually, road_snapshots
 from laneweave.launch.report.tables import tables_of
 from laneweave.protocol.errors import CommandFailedError
+from laneweave.sim_bridge.recording.trips import WARM_UP_S
 
 REPORT_DPI = 300
 PAPER_STRETCH_M = (500.0, 800.0)
 """Stretch of road in the paper's snapshots (Section 5.2.3) [m]."""
 
-TRAVEL_CAPTION = (
-    "Travel times of the counted vehicles of all seeds, including the wait at the entrance. Boxes: "
-    "quartiles and median; whiskers: at most 1.5 interquartile ranges; dots and lines: means. The "
-    "axis is broken if only some methods jam. Dashed, free flow: time at v_F from the start of the "
-    "road to its end, without waiting; vehicles that catch up with a cell ahead take less."
+TOO_SHORT = (
+    "No vehicle counts for these results: the runs are too short. A vehicle counts if it entered "
+    f"after the warm-up of {WARM_UP_S:g} s and left while others were still arriving."
 )
-FLOW_CAPTION = (
-    "Throughput: rate at which vehicles pass the end of the road, between the first and the last "
-    "counted one; if a jam holds up the first one, it can exceed the demand. Left in the preferred "
-    "lane: shown if not all vehicles did. Small dots: runs; bars: standard deviations over seeds."
+SPEED_CLOSED_CAPTION = "Hatched, between dotted lines: positions at which a lane is closed."
+STEADY_CAPTION = (
+    f"Samples from {WARM_UP_S:g} s to the end of the demand, or of the whole run if that time is "
+    "too short."
 )
-SPEED_CAPTION = (
-    "Mean speed in bins of 20 m and 5 s, in the first run with trajectories of each method and "
-    "volume. White: v_F; red: slower; blue: faster; grey: no vehicle. Scale of all panels: square "
-    "root of the difference from v_F, up to its 98th percentile over all bins, rounded up. Dashed: "
-    "start of lane sorting."
-)
-SPEED_CLOSED_CAPTION = " Hatched, between dotted lines: positions at which a lane is closed."
 SPACING_CAPTION = (
     "Spacing: distance between the front bumpers of successive vehicles in a lane, sampled every "
     "second. Time headway: spacing divided by the speed of the following, moving vehicle. "
-    "Dashed: pitch d_F of the lattice, and the headway d_F / v_F. Samples from 60 s to the end of "
-    "the demand, or of the whole run if that time is too short."
+    "Thin grey dashed lines: pitch d_F of the lattice, and the headway d_F / v_F. " + STEADY_CAPTION
 )
 COMFORT_CAPTION = (
-    "Share of the driving time above each value. Dashed: limits of the vehicles. Jerk: difference "
-    "quotient of the acceleration; lateral acceleration: second difference quotient of the lateral "
-    "position. Samples from the same period as for spacings."
+    "Share of the driving time above each value; values beyond the axes are not shown. Thin grey "
+    "dashed lines: limits of the vehicles that laneweave drives; those that SUMO drives have no "
+    "limit of jerk. Jerk: difference quotient of the acceleration; lateral acceleration: second "
+    "difference quotient of the lateral position, without instantaneous lane changes. "
+    + STEADY_CAPTION
 )
+
+
+def travel_caption(*, several: bool) -> str:
+    """Return the caption of the travel times of several runs, or of one."""
+    return _sentences(
+        f"Travel times of the counted vehicles{' of all seeds' * several}, including the wait at "
+        "the entrance. Boxes: quartiles and median; whiskers: at most 1.5 interquartile ranges; "
+        "small dots: vehicles beyond the whiskers.",
+        "Large markers and lines: means. The axis is broken if only some methods jam."
+        if several
+        else "Large marker: mean.",
+        "Dashed, free flow: time at v_F from the start of the road to its end, without waiting; "
+        "vehicles that catch up with a cell ahead take less.",
+    )
+
+
+def flow_caption(*, shares: bool) -> str:
+    """Return the caption of the throughput, with or without the shares in the preferred lane."""
+    return _sentences(
+        "Throughput: rate at which vehicles pass the end of the road, between the first and the "
+        "last counted one. Over this short time arrivals can be denser than on average, and a jam "
+        "can hold up the first vehicle, so that the throughput exceeds the demand.",
+        "Left in the preferred lane: share of the counted vehicles." if shares else "",
+        "Small dots: runs; markers: means over the seeds; bars: standard deviations over the "
+        "seeds.",
+    )
+
+
+def speed_caption(*, several: bool) -> str:
+    """Return the caption of the mean speeds of several runs, or of one."""
+    return _sentences(
+        "Mean speed in bins of 20 m and 5 s"
+        + (", in the first run with trajectories of each method and volume." if several else "."),
+        "White: v_F; red: slower; blue: faster; grey: no vehicle. Scale: square root of the "
+        "difference from v_F, on each side up to its 98th percentile, rounded up.",
+        "Dashed: start of lane sorting.",
+    )
 
 
 @define
@@ -166,62 +197,76 @@ def _sections(comparison: Comparison, report: _Report, formation: int | None) ->
     busiest = [run for run in map(comparison.busiest, comparison.labels) if run is not None]
     shown = [(run, read_tracks(run.folder)) for run in busiest]
     # Do this first, because it raises an error for an unknown formation.
-    maps = (
-        driven_map(run, tracks, formation)
-        for run, tracks in shown
-        if not several or _has_formations(run)
-    )
-    driven = next(maps, None)
+    example = next((one for one in shown if not several or _has_formations(one[0])), None)
+    driven = driven_map(*example, formation) if example else None
     if shown:
         animations = [Animation(animation_data(run, tracks, _title(run))) for run, tracks in shown]
         report.sections.append(Section("The moving road", animations=animations))
     report.sections.append(Section("Results", tables=tables_of(comparison)))
-    report.add(
-        "Travel time",
-        "travel_times.png",
-        partial(figures.draw_travel_times, comparison),
-        TRAVEL_CAPTION,
-        "Box plots of travel times by method and traffic volume",
-    )
-    if several:
-        report.add(
-            "Throughput and lanes",
-            "flows.png",
-            partial(figures.draw_flows, comparison),
-            FLOW_CAPTION,
-            "Throughput and share in the preferred lane against traffic volume",
-        )
+    summaries = [run.summary for run in comparison.runs if run.summary is not None]
+    if any(one.travel_time_s.mean is not None for one in summaries):
+        _add_results(report, comparison, several=several)
+    else:
+        report.sections.append(Section("Travel time", note=TOO_SHORT))
     if busiest:
         closed = any(run.scenario.road.closures for run in busiest)
         report.add(
             "Speed over space and time",
             "speeds.png",
             partial(figures.draw_speeds, comparison),
-            SPEED_CAPTION + SPEED_CLOSED_CAPTION * closed,
+            _sentences(speed_caption(several=several), SPEED_CLOSED_CAPTION * closed),
             "Heat maps of mean speed over time and position, one for each method and volume",
         )
-        pictures = [one for run in busiest for one in _snapshots(report, run)]
+        pictures = [one for run, tracks in shown for one in _snapshots(report, run, tracks)]
         report.sections.append(Section("Snapshots", pictures=pictures))
-        _add_path_map(report, driven)
+        if example and driven:
+            _add_path_map(report, driven, _title(example[0]))
         _add_distributions(report, comparison, busiest[0])
     return report.sections
 
 
-def _snapshots(report: _Report, run: Run) -> list[Picture]:
+def _add_results(report: _Report, comparison: Comparison, *, several: bool) -> None:
+    """Add travel times and, of several runs, throughput."""
+    report.add(
+        "Travel time",
+        "travel_times.png",
+        partial(figures.draw_travel_times, comparison),
+        travel_caption(several=several),
+        "Box plots of travel times by method and traffic volume",
+    )
+    if several:
+        shares = figures.shares_differ(comparison)
+        report.add(
+            "Throughput and lanes" if shares else "Throughput",
+            "flows.png",
+            partial(figures.draw_flows, comparison),
+            flow_caption(shares=shares),
+            f"Throughput{' and share in the preferred lane' * shares} against traffic volume",
+        )
+
+
+def _snapshots(report: _Report, run: Run, tracks: Tracks) -> list[Picture]:
     # A comparison shows the paper's stretch for all methods, if the road is long enough.
     fits = not report.names and run.scenario.road.length_m >= PAPER_STRETCH_M[1]
     stretch_m = PAPER_STRETCH_M if fits and not run.scenario.road.closures else None
-    preferences = bool(run.scenario.lane_shares)
+    preferences = has_preferences(run.scenario)
     caption = _sentences(
-        f"{_title(run)}. The four times, {run.scenario.cycles_s[0]:g} s apart, at "
-        "which the most vehicles change lanes.",
-        "Colours and numbers on vehicles show the preferred lanes (0: rightmost);"
+        f"{_title(run)}. The four times, {run.scenario.cycles_s[0]:g} s apart, at which the most "
+        "vehicles "
+        + (
+            "change lanes."
+            if changes_gradually(tracks, run.scenario)
+            else "are on this stretch; lane changes of this method are instantaneous."
+        ),
+        "Colours and numbers on vehicles show the preferred lanes (0: rightmost) and exits;"
+        if run.scenario.exit
+        else "Colours and numbers on vehicles show the preferred lanes (0: rightmost);"
         if preferences
-        else "Vehicles have no preferred lanes;",
+        else "Colours show the lane in which a vehicle arrived;",
         "faster vehicles are lighter.",
         "Hatched: closed; thick line: stop line before it." if run.scenario.road.closures else "",
     )
-    coloured = " coloured by preferred lane" if preferences else ""
+    coloured = f" coloured by {'preferred lane' if preferences else 'lane of arrival'}"
     return report.draw(
         f"road-{run.label}.png",
         lambda path, dpi: road_snapshots(run.folder, path, stretch_m=stretch_m, dpi=dpi),
@@ -230,15 +275,13 @@ def _snapshots(report: _Report, run: Run) -> list[Picture]:
     )
 
 
-def _add_path_map(report: _Report, driven: DrivenMap | None) -> None:
-    if driven is None:
-        return
+def _add_path_map(report: _Report, driven: DrivenMap, title: str) -> None:
     report.add(
         "Relative path map",
         "path_map.png",
         partial(draw_path_map, driven),
-        f"Cells (column, lane) of {driven.vehicles} at the ends of slots, as driven; columns are "
-        "counted from the rearmost. "
+        f"{title}. Cells (column, lane) of {driven.vehicles} at the ends of slots, as driven; "
+        "columns are counted from the rearmost. "
         f"{driven.colours}; bold: moved in the preceding slot. Cost: the sum over the vehicles of "
         "the slot in which they arrive.",
         f"Table of the cells of {driven.name} by vehicle and slot",

@@ -18,7 +18,10 @@ from laneweave.launch.drawing.colours import (
     NEUTRAL,
     SHADE_STRENGTH,
     SPEED_SPAN_MPS,
+    exit_in_words,
+    has_preferences,
     text_colour,
+    trip_lane,
     vehicle_colour,
     vehicle_legend,
 )
@@ -26,8 +29,14 @@ from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK
 from laneweave.launch.formation_columns import Formations
 from laneweave.launch.recordings.formations import closed_formations
 from laneweave.launch.recordings.runs import scenario_of
-from laneweave.launch.recordings.trajectories import Floats, Tracks, read_tracks, read_trips
-from laneweave.launch.report.style import picture
+from laneweave.launch.recordings.trajectories import (
+    JUMP_MPS,
+    Floats,
+    Tracks,
+    read_tracks,
+    read_trips,
+)
+from laneweave.launch.report.style import fitted_legend, picture
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import CAR
@@ -44,13 +53,12 @@ _ACROSS_SCALE, _LONG_ACROSS_SCALE = 1.8, 2.1
 """Scale across the road relative to the scale along it, because lanes would be too thin otherwise;
 the second one is for stretches longer than `_LONG_M`."""
 _LONG_M = 450.0
-_MAX_LEGEND_COLUMNS = 7
 _MIN_LANE_PT, _MAX_LANE_PT = 4.0, 6.5
 """Sizes of the numbers of lanes on vehicles; smaller ones are not written."""
-_JUMP_MPS = 2.8
-"""Lateral speed above which a vehicle jumps to another lane; as in `player.js`."""
 _MAX_HEADING = 0.35
 """Maximum angle between a vehicle and the road in the picture [rad]."""
+_BETWEEN = 0.25
+"""Distance from the lane centre, in lane widths, from which a vehicle is between two lanes."""
 _HEADROOM_M = 4.5
 """Space above the road for formation numbers."""
 _MAX_STRETCH_M, _MAX_CLOSED_M, _BEYOND_M = 740.0, 120.0, 50.0
@@ -68,7 +76,8 @@ def road_snapshots(
 ) -> None:
     """Draw a stretch of road at given times, one strip below another.
 
-    Vehicles have colour and number of their preferred lane; faster vehicles are lighter. Left lanes
+    Vehicles have colour and number of their preferred lane, or else the colour of the lane in which
+    they arrived; faster vehicles are lighter. Left lanes
     are on top, and traffic moves to the right. The columns of formations are in alternating shades
     of grey, with the formation numbers above the road. Closed parts of lanes are hatched.
 
@@ -88,32 +97,36 @@ def road_snapshots(
     if not times:
         times = _instants(tracks, scenario, stretch_m)
     trips = read_trips(folder)
-    exits = {one.name: one.lanes[0] for one in scenario.exit}
     formations = closed_formations(folder, scenario)
     beyond_m = 2.0 * scenario.longest_body_m
     width_in, road_m = 9.6, road.lanes * road.lane_width_m + _HEADROOM_M
+    road_m += _below_m(scenario) - 0.5
     length_m = stretch_m[1] - stretch_m[0]
     across = _ACROSS_SCALE if length_m <= _LONG_M else _LONG_ACROSS_SCALE
     strip_in = across * (width_in - 0.9) * road_m / length_m
-    width_pt = 72.0 * (width_in - 0.9)
+    scale_pt_per_m = across * 72.0 * (width_in - 0.9) / length_m
     with picture(width_in, 0.9 + len(times) * (strip_in + 0.06), out, dpi) as figure:
+        shaded = False
         strips = figure.subplots(len(times), 1, sharex=True, squeeze=False)[:, 0]
         for axes, t_s in zip(strips, times, strict=True):
             _draw_road(axes, scenario, stretch_m)
-            _draw_formations(axes, scenario, stretch_m, formations, t_s)
+            shaded |= _draw_formations(axes, scenario, stretch_m, formations, t_s)
             axes.set_ylabel(f"{t_s:g} s", rotation=0, ha="right", va="center", fontsize=10)
             for number, name in enumerate(tracks.names):
                 pose = _pose(tracks, number, t_s)
                 if pose is not None and stretch_m[0] <= pose[0] <= stretch_m[1] + beyond_m:
                     trip = trips.get(name, {})
-                    preferred = trip.get("preferred_lane", ANY_LANE)
-                    if preferred == ANY_LANE:
-                        preferred = exits.get(trip.get("destination", ""), ANY_LANE)
                     own = scenario.types[trip.get("vehicle_type", CAR)]
-                    _draw_vehicle(axes, pose, preferred, own, across * width_pt / length_m)
+                    _draw_vehicle(axes, pose, trip_lane(scenario, trip), own, scale_pt_per_m)
         strips[-1].tick_params(axis="x", bottom=True, labelbottom=True)
         strips[-1].set_xlabel("position on the road (m)")
-        _draw_legend(figure, scenario)
+        starts = stretch_m[0] < road.sorting_start_m < stretch_m[1]
+        _draw_legend(figure, scenario, starts=starts, shaded=shaded)
+
+
+def changes_gradually(tracks: Tracks, scenario: Scenario) -> bool:
+    """Return whether vehicles move across the road; SUMO's ones jump from lane to lane."""
+    return bool(np.any(_off_centre(tracks, scenario) > _BETWEEN))
 
 
 def default_stretch_m(scenario: Scenario) -> tuple[float, float]:
@@ -155,13 +168,18 @@ def _pose(tracks: Tracks, number: int, t_s: float) -> tuple[float, float, float,
     after = int(np.clip(np.searchsorted(times_s, t_s), 1, max(1, len(times_s) - 1)))
     if len(times_s) > 1:
         ys_m, ends_s = tracks.y_m[tracks.rows(number)][after - 1 : after + 1], times_s[after - 1 :]
-        if abs(ys_m[1] - ys_m[0]) > _JUMP_MPS * (ends_s[1] - ends_s[0]):
+        if abs(ys_m[1] - ys_m[0]) > JUMP_MPS * (ends_s[1] - ends_s[0]):
             # An instantaneous lane change: before it or after it, and never in between.
             y_m, lateral_mps = float(ys_m[int(t_s - ends_s[0] > ends_s[1] - t_s)]), 0.0
-    if abs(lateral_mps) > _JUMP_MPS:
+    if abs(lateral_mps) > JUMP_MPS:
         lateral_mps = 0.0
     heading = np.clip(np.arctan2(lateral_mps, max(speed_mps, 0.1)), -_MAX_HEADING, _MAX_HEADING)
     return s_m, y_m, float(heading), speed_mps
+
+
+def _below_m(scenario: Scenario) -> float:
+    """Return the space below the road, for the names of exits to the right."""
+    return 4.5 if any(min(one.lanes) < scenario.road.lanes / 2 for one in scenario.exit) else 0.5
 
 
 def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -> None:
@@ -169,7 +187,7 @@ def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -
     road = scenario.road
     width_m = road.lanes * road.lane_width_m
     axes.set_xlim(*stretch_m)
-    axes.set_ylim(-0.5, width_m + _HEADROOM_M - 0.5)
+    axes.set_ylim(-_below_m(scenario), width_m + _HEADROOM_M - 0.5)
     axes.fill_between(stretch_m, 0.0, width_m, color=_ASPHALT, linewidth=0.0, zorder=0)
     for border in range(road.lanes + 1):
         edge = border in (0, road.lanes)
@@ -205,16 +223,16 @@ def _draw_closed_parts(axes: Axes, scenario: Scenario) -> None:
         axes.plot([from_m, to_m], [lane * width_m] * 2, color=INK, linewidth=1.6, zorder=2)
     for one in scenario.exit:
         for lane in one.lanes:
-            # Where a ramp follows in the same lane, its vehicles must not be hidden.
-            before = lane in scenario.shared_exit_lanes
-            place = (one.at_m + (-2.0 if before else 2.0), (lane + 0.5) * width_m)
-            axes.annotate(
-                f"{one.name} →" if before else f"→ {one.name}",
-                place,
-                ha="right" if before else "left",
-                va="center",
+            # Beside the road, where it hides no vehicle.
+            below = lane < scenario.road.lanes / 2
+            y_m = -0.4 if below else scenario.road.lanes * width_m + 0.35
+            axes.text(
+                one.at_m,
+                y_m,
+                f"{exit_in_words(one.name)} →",
+                ha="right",
+                va="top" if below else "bottom",
                 fontsize=8,
-                zorder=1.6,
                 clip_on=True,
             )
 
@@ -225,17 +243,18 @@ def _draw_formations(
     stretch_m: tuple[float, float],
     formations: Formations,
     t_s: float,
-) -> None:
-    """Shade the columns of formations, and write their numbers above the road."""
+) -> bool:
+    """Shade the columns of formations, with numbers above the road; return whether any is shown."""
     lattice = scenario.lattice
     width_m = lattice.lanes * lattice.lane_width_m
-    margin_m = 0.5 * (lattice.pitch_m - scenario.vehicle.length_m)
+    margin_m, shaded = 0.5 * (lattice.pitch_m - scenario.vehicle.length_m), False
     for place, formation in enumerate(formations.listed):
         rear_m = lattice.cell_s_m(formation.rear, t_s) - scenario.vehicle.length_m - margin_m
         front_m = lattice.cell_s_m(formation.front, t_s) + margin_m
         shown = (max(rear_m, stretch_m[0]), min(front_m, stretch_m[1]))
         if shown[0] >= shown[1]:
             continue
+        shaded = True
         axes.fill_between(shown, 0.0, width_m, color=_OWNED[place % 2], linewidth=0.0, zorder=0.5)
         if shown[1] - shown[0] > 0.3 * (front_m - rear_m):
             axes.text(
@@ -247,23 +266,24 @@ def _draw_formations(
                 fontsize=6.5,
                 color=FAINT_INK,
             )
+    return shaded
 
 
 def _draw_vehicle(
     axes: Axes,
     pose: tuple[float, float, float, float],
-    preferred: int,
+    lane: int,
     scenario: Scenario,
     scale_pt_per_m: float,
 ) -> None:
-    """Draw the body of a vehicle with the number of its preferred lane.
+    """Draw the body of a vehicle in the colour of a lane, with the number of its preferred lane.
 
     A small vehicle, or one without a preferred lane, has a pale windscreen instead.
 
     Args:
         axes: axes of the strip.
         pose: (s m, y m, heading rad, speed m/s).
-        preferred: preferred lane, or `ANY_LANE`.
+        lane: see `trip_lane`.
         scenario: scenario of the vehicle's type.
         scale_pt_per_m: scale across the road.
     """
@@ -279,30 +299,40 @@ def _draw_vehicle(
         box = np.array([[rear, -half], [front, -half], [front, half], [rear, half]])
         return np.asarray((box * [length_m, width_m]) @ turn + centre, dtype=np.float64)
 
-    own_colour = vehicle_colour(scenario.road.lanes, preferred)
+    own_colour = vehicle_colour(scenario.road.lanes, lane)
     colour = _shade(own_colour, speed_mps - scenario.formation.speed_mps)
     axes.add_patch(
         Polygon(shape(-0.5, 0.5, 0.5), facecolor=colour, edgecolor=INK, linewidth=0.5, zorder=3)
     )
     size_pt = min(_MAX_LANE_PT, 0.95 * width_m * scale_pt_per_m)
-    if preferred == ANY_LANE or size_pt < _MIN_LANE_PT:
+    if lane == ANY_LANE or not has_preferences(scenario) or size_pt < _MIN_LANE_PT:
         glass: dict[str, Any] = {"facecolor": "#ffffffb0", "linewidth": 0.0}
         axes.add_patch(Polygon(shape(0.12, 0.3, 0.36), zorder=4, **glass))
         return
+    first_m, last_m = axes.get_xlim()
+    if not first_m < s_m - length_m or not s_m < last_m:
+        return  # half a number is worse than none
     shown = text_colour("#" + "".join(f"{round(255 * part):02x}" for part in colour))
     style: dict[str, Any] = {"ha": "center", "va": "center_baseline", "clip_on": True, "zorder": 5}
     axes.text(
-        centre[0], centre[1], f"{preferred}", fontsize=size_pt, color=shown, weight="bold", **style
+        centre[0], centre[1], f"{lane}", fontsize=size_pt, color=shown, weight="bold", **style
     )
 
 
-def _draw_legend(figure: Figure, scenario: Scenario) -> None:
-    """Draw the legend of colours above the strips."""
+def _draw_legend(figure: Figure, scenario: Scenario, *, starts: bool, shaded: bool) -> None:
+    """Draw the legend of colours and marks above the strips.
+
+    Args:
+        figure: the figure.
+        scenario: scenario of the run.
+        starts: whether the strips show the start of lane sorting.
+        shaded: whether they show columns of formations.
+    """
     from matplotlib.lines import Line2D  # noqa: PLC0415 - lazily
     from matplotlib.patches import Patch  # noqa: PLC0415 - lazily
 
     speed_mps = scenario.formation.speed_mps
-    entries: list[tuple[Any, str]] = [*vehicle_legend(scenario)]
+    entries: list[tuple[Any, str]] = [*vehicle_legend(scenario, recorded=True)]
     for over_mps, word in ((-SPEED_SPAN_MPS, "slower"), (SPEED_SPAN_MPS, "faster")):
         entries.append((_shade(NEUTRAL, over_mps), f"{word} than {speed_mps:g} m/s"))
     handles: list[Patch | Line2D] = [
@@ -313,14 +343,16 @@ def _draw_legend(figure: Figure, scenario: Scenario) -> None:
     if any(part.line_m is not None for part in closed_parts(scenario)):
         style: dict[str, Any] = {"marker": "|", "markersize": 9, "markeredgewidth": 1.6}
         handles.append(Line2D([], [], color=INK, linewidth=0.0, label="stop line", **style))
-    figure.legend(
-        handles=handles,
-        loc="outside upper center",
-        ncols=min(len(handles), _MAX_LEGEND_COLUMNS),
-        fontsize=8,
-        handlelength=1.6,
-        columnspacing=1.6,
-    )
+    if shaded:
+        handles.append(Patch(fc=_OWNED[1], label="columns of a formation"))
+    if starts:
+        line: dict[str, Any] = {"marker": "$\u22ee$", "markersize": 9, "markeredgewidth": 0.0}
+        handles.append(
+            Line2D([], [], color=INK, linewidth=0.0, label="lane sorting begins", **line)
+        )
+    if ramp_edges(scenario):
+        handles.append(Line2D([], [], color=INK, linewidth=1.6, label="edge of a ramp"))
+    fitted_legend(figure, handles, fontsize=8, handlelength=1.6, columnspacing=1.6)
 
 
 def _shade(colour: str, over_mps: float) -> tuple[float, float, float]:
@@ -334,17 +366,22 @@ def _shade(colour: str, over_mps: float) -> tuple[float, float, float]:
     return (mixed[0], mixed[1], mixed[2])
 
 
+def _off_centre(tracks: Tracks, scenario: Scenario) -> Floats:
+    """Return the distance of each sample from the nearest lane centre, in lane widths."""
+    lanes = tracks.y_m / scenario.road.lane_width_m
+    return np.asarray(np.abs(lanes - np.floor(lanes) - 0.5))
+
+
 def _instants(tracks: Tracks, scenario: Scenario, stretch_m: tuple[float, float]) -> list[float]:
     """Return four times, spaced by the shortest T_F, at which the most vehicles change lanes.
 
     Fewer are returned if the recording ends earlier. A vehicle on the stretch is weighted by its
     distance from the nearest lane centre, plus a small constant.
     """
-    t_s, s_m, y_m = tracks.t_s, tracks.s_m, tracks.y_m
+    t_s, s_m = tracks.t_s, tracks.s_m
     if not len(t_s):
         return [0.0]
-    tick_s, width_m = scenario.runtime.tick_s, scenario.road.lane_width_m
-    off_centre = np.abs(y_m / width_m - np.floor(y_m / width_m) - 0.5)
+    tick_s, off_centre = scenario.runtime.tick_s, _off_centre(tracks, scenario)
     inside = (s_m >= stretch_m[0]) & (s_m <= stretch_m[1])
     ticks = np.rint(t_s / tick_s).astype(np.int64)
     seen = np.bincount(ticks, weights=inside * (off_centre + 1e-3))

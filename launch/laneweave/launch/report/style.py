@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -62,6 +63,8 @@ SMALL_TEXT: Final[dict[str, Any]] = {"fontsize": 7.5, "color": FAINT_INK}
 """Style of small text."""
 MAX_COLUMNS: Final = 6
 """Maximum number of volumes side by side."""
+MAX_ENTRIES: Final = 7
+"""Maximum number of entries in a row of a legend."""
 
 
 @contextlib.contextmanager
@@ -121,15 +124,21 @@ def volume_title(volume_veh_per_lane_h: float) -> str:
 
 
 def legend_above(figure: Figure) -> None:
-    """Draw one legend above all panels, with at most six columns, fewer in a narrow figure."""
+    """Draw one legend above all panels, with an entry for each label."""
     entries: dict[str, Any] = {}
     for axes in figure.axes:
         handles, labels = axes.get_legend_handles_labels()
         entries = dict(zip(labels, handles, strict=True)) | entries
-    for columns in range(min(6, len(entries)), 0, -1):
-        legend = figure.legend(entries.values(), entries, loc="outside upper center", ncols=columns)
-        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
-            break
+    fitted_legend(figure, list(entries.values()), labels=list(entries))
+
+
+def fitted_legend(figure: Figure, handles: Sequence[Any], **style: Any) -> None:  # noqa: ANN401
+    """Draw a legend above all panels, in the smallest number of rows that fit."""
+    for rows in range(max(1, math.ceil(len(handles) / MAX_ENTRIES)), len(handles) + 1):
+        style |= {"loc": "outside upper center", "ncols": math.ceil(len(handles) / rows)}
+        legend = figure.legend(handles=handles, **style)
+        if rows == len(handles) or legend.get_window_extent().width <= figure.bbox.width:
+            return
         legend.remove()
 
 

@@ -32,7 +32,7 @@ def summary_rows(summary: RunSummary, scenario: Scenario | None = None) -> list[
 
 
 def _demand_rows(summary: RunSummary, scenario: Scenario | None) -> Iterator[Row]:
-    yield "demand", f"{summary.volume_veh_per_lane_h:g} vehicles/(lane h)"
+    yield "demand", f"{summary.volume_veh_per_lane_h:g} veh/(lane h)"
     if scenario is not None:
         yield "arrivals during", f"{scenario.demand.duration_s:g} s"
     yield "vehicles demanded", f"{summary.vehicles.demanded}"

@@ -246,7 +246,7 @@ def scene_of(scenario: Scenario, kind: str, title: str, step_s: float) -> dict[s
         "kind": kind,
         "title": title,
         "step_s": step_s,
-        **road_scene(scenario),
+        **road_scene(scenario, recorded=kind == "recorded"),
         "rolling": scenario.formation.rolling,
         "losses": None,
     }

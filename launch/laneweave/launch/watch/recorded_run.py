@@ -16,6 +16,7 @@ import numpy as np
 from attrs import frozen
 from numpy.typing import NDArray
 
+from laneweave.launch.drawing.colours import trip_lane
 from laneweave.launch.formation_columns import Formations
 from laneweave.launch.recordings.formations import closed_formations
 from laneweave.launch.recordings.runs import Run, not_a_run, single_run
@@ -23,7 +24,6 @@ from laneweave.launch.recordings.trajectories import NO_LATTICE, Tracks, read_tr
 from laneweave.launch.run_methods import FORMATION
 from laneweave.launch.watch.frames import MOVING, EventFeed, Row, compact, plan_row, scene_of
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.wire.events import ENTERED, FORMATIONS_JOINED, LEADER, LEFT
 from laneweave.protocol.wire.messages import CAR
@@ -76,7 +76,7 @@ class Recording:
         self.last = int(self._numbers[-1]) + 1 if len(self._numbers) else 0
         self._demands_s = np.sort([float(trip["demanded_s"]) for trip in self._trips.values()])
         self._times_s = [moment.t_s for moment in self._moments]
-        volume = f"{run.volume_veh_per_lane_h:g} vehicles/(lane h)"
+        volume = f"{run.volume_veh_per_lane_h:g} veh/(lane·h)"
         title = f"{run.label}, {volume}, seed {run.scenario.seed}"
         self.scene = scene_of(run.scenario, "recorded", title, self._step_s) | {
             "losses": _losses(run),
@@ -141,7 +141,7 @@ class Recording:
                 s_m=float(tracks.s_m[place]),
                 y_m=y_m,
                 speed_mps=float(tracks.speed_mps[place]),
-                preferred_lane=int(trip.get("preferred_lane", ANY_LANE)),
+                preferred_lane=trip_lane(scenario, trip),
                 formation=formation.number if formation and formation.closed_s <= t_s else -1,
                 hold=cell,
                 target=None,

@@ -8,8 +8,9 @@
 
 const laneweaveRoad = (() => {
   const ACROSS = 1.8; // scale across the road relative to the scale along it
-  const ABOVE_PX = 13; // for names of vehicles in the left lane
-  const GAP_PX = 30; // below each stretch, for the scale in metres
+  const ABOVE_PX = 14; // for names above the left lane
+  const GAP_PX = 42; // below each stretch, for the scale in metres and the names above the next one
+  const METRES_PX = 12; // minimum distance between two labels of the scale
   const NAMED_FROM = 6; // minimum scale at which names are drawn, in pixels per metre
   const NUMBERED_PX = 12; // minimum length of a vehicle that shows the number of its lane
   const MIN_SCALE = 3; // of a whole road, in pixels per metre: narrow pages show more stretches
@@ -94,9 +95,10 @@ const laneweaveRoad = (() => {
       this.theme = theme;
     }
 
-    /** Draw stretches of the road with layers, and bodies on top of them. */
-    paint(strips, bodies, layers = []) {
+    /** Draw stretches of the road with layers, and bodies on top; the body `followed` has a ring. */
+    paint(strips, bodies, layers = [], followed = null) {
       const { canvas, scene } = this;
+      this.followed = followed;
       const width = canvas.clientWidth;
       if (width === 0) return;
       this.scale = width / (strips[0][1] - strips[0][0]);
@@ -169,7 +171,9 @@ const laneweaveRoad = (() => {
       pen.clip();
       for (const layer of layers) layer(this);
       for (const body of bodies) {
-        if (this.shows(body.s - sizeOf(this.scene, body)[0], body.s)) this.body(body);
+        if (!this.shows(body.s - sizeOf(this.scene, body)[0], body.s)) continue;
+        this.body(body);
+        if (body.name === this.followed) this.ring(body);
       }
     }
 
@@ -201,15 +205,22 @@ const laneweaveRoad = (() => {
     }
 
     metres() {
-      const { pen, theme, from, to, roadPx } = this;
+      const { pen, theme, from, to, roadPx, width } = this;
       const every = to - from > 400 ? 100 : to - from > 200 ? 50 : 20;
       pen.fillStyle = theme.faint;
       pen.font = "11px system-ui, sans-serif";
       pen.textBaseline = "top";
+      pen.textAlign = "left";
+      let free = 0; // a label that would touch the one before it is left out
       for (let mark = Math.ceil(from / every) * every; mark <= to; mark += every) {
-        pen.fillRect(this.x(mark) - 0.5, roadPx, 1, 4);
-        pen.textAlign = mark - from < 10 ? "left" : to - mark < 10 ? "right" : "center";
-        pen.fillText(`${mark} m`, this.x(mark), roadPx + 6);
+        const x = this.x(mark);
+        pen.fillRect(x - 0.5, roadPx, 1, 4);
+        const label = `${mark} m`;
+        const long = pen.measureText(label).width;
+        const left = Math.max(0, Math.min(width - long, x - long / 2));
+        if (left < free) continue;
+        pen.fillText(label, left, roadPx + 6);
+        free = left + long + METRES_PX;
       }
     }
 
@@ -242,7 +253,7 @@ const laneweaveRoad = (() => {
       else pen.fill();
       pen.stroke();
       pen.setLineDash([]);
-      const numbered = body.lane >= 0 && length * scale >= NUMBERED_PX;
+      const numbered = this.scene.preferences && body.lane >= 0 && length * scale >= NUMBERED_PX;
       if (numbered && !body.faint) {
         const high = Math.round(Math.max(9, Math.min(15, 0.95 * width * scale * ACROSS)));
         pen.fillStyle = textColour(this.colour(body.lane, body.v));
@@ -255,12 +266,27 @@ const laneweaveRoad = (() => {
         path(0.12, 0.3, 0.36);
         pen.fill();
       }
-      if (scale > NAMED_FROM) {
+      if (scale > NAMED_FROM || body.name === this.followed) {
         pen.fillStyle = theme.ink;
         pen.font = "10px system-ui, sans-serif";
         pen.textAlign = "center";
         pen.textBaseline = "bottom";
         pen.fillText(body.name, this.x(centreS), this.y(centreY + 0.5 * width) - 2);
+      }
+    }
+
+    /** Draw a dark ring with a light edge around the body that is followed. */
+    ring(body) {
+      const { pen, theme, scale } = this;
+      const [length, width] = sizeOf(this.scene, body);
+      const [long, wide] = [length * scale + 10, width * scale * ACROSS + 10];
+      const corner = [this.x(body.s - length / 2) - long / 2, this.y(body.y) - wide / 2];
+      for (const [colour, px] of [[theme.asphalt, 4], [theme.ink, 2]]) {
+        pen.strokeStyle = colour;
+        pen.lineWidth = px;
+        pen.beginPath();
+        pen.roundRect(...corner, long, wide, 7);
+        pen.stroke();
       }
     }
   }

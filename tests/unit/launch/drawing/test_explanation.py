@@ -46,7 +46,7 @@ def test_large_trees_are_the_improved_ones_and_are_cut_short() -> None:
     assert "more nodes" in text
     texts = {text.get_text() for axes in explanation_figure(told).axes for text in axes.texts}
     assert any("more nodes are not drawn" in text for text in texts)
-    assert any(text.startswith("A_1\n") for text in texts)
+    assert any(text.startswith("A₁\n") for text in texts)
 
 
 def test_a_picture_without_a_plan_shows_the_first_tree() -> None:

@@ -107,7 +107,7 @@ def test_a_panel_for_each_instant_shows_all_bodies_where_they_are(driven: Drive)
     ends = [path[-1][0] * SCENARIO.formation.gap_m for path in PLAN.paths]
     assert [float(line[-1]) for line in relative_m] == pytest.approx(ends, abs=0.2)
     assert {text.get_text() for text in across.texts} >= {"3, 4", "5", "1, 2"}
-    assert "bodies overlap, as its conflict kinds allow: 2 and 3" in figure.get_suptitle()
+    assert "conflict kinds allow that bodies overlap: 2 and 3" in figure.get_suptitle()
 
 
 def test_long_plans_are_drawn_at_some_instants() -> None:

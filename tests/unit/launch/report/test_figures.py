@@ -25,7 +25,7 @@ from laneweave.launch.report.figures import (
     shares_differ,
     speed_scale,
 )
-from laneweave.launch.report.report import report_run
+from laneweave.launch.report.report import TOO_SHORT, report_comparison, report_run
 from laneweave.launch.report.snapshots import _MAX_HEADING, _pose, default_stretch_m, road_snapshots
 from laneweave.launch.report.style import legend_above, picture
 from laneweave.launch.report.summary_table import summary_rows
@@ -131,8 +131,9 @@ def test_pictures_show_closed_parts_and_vehicles_without_preferences(tmp_path: P
     draw_all(folder)
     road_snapshots(folder, folder / "road.png", times=[90.0, 100.0, 110.0], dpi=150)
     shown = colours_of(folder / "road.png")
-    assert {rgb(NEUTRAL), rgb(CLOSED_FILL)} <= shown
-    assert not shown & {rgb(colour) for colour in lane_colours(3)}
+    # Vehicles have the colours of the lanes in which they arrived.
+    assert {rgb(CLOSED_FILL), *map(rgb, lane_colours(3)[1:])} <= shown
+    assert rgb(NEUTRAL) not in shown
     draw_speeds(comparison(folder), folder / "heat.png", dpi=150)
     assert rgb(CLOSED_FILL) in colours_of(folder / "heat.png")
 
@@ -215,15 +216,31 @@ def test_the_table_of_a_run_without_preferences(tmp_path: Path) -> None:
 def test_the_page_of_a_run_describes_closed_parts(tmp_path: Path) -> None:
     folder = make_run_without_preferences(tmp_path)
     page = report_run(Run(folder, "rolling", "formation", DROP, make_summary()), dpi=50)
-    text = page.read_text(encoding="utf-8")
+    text = page.read_text(encoding="utf-8").replace("\u00a0", " ")
     assert "The right lane is closed from 800 m to the end of the road." in text
     assert "Vehicles have no preferred lanes." in text
     assert "strong if the lane is open from there to the end of the road" in text
     assert "prefers" not in text.partition("<script")[0]
     assert '<i class="closed"></i>closed' in text
     data = json.loads(text.partition('id="animation-0">')[2].partition("</script>")[0])
-    assert {vehicle["lane"] for vehicle in data["vehicles"]} == {ANY_LANE}
+    assert {vehicle["lane"] for vehicle in data["vehicles"]} == {1, 2}
+    assert "arrived in the middle lane" in text
     assert data["road"]["closed"] == [[0, 800.0, 1000.0]]
+    assert (folder / "travel_time.png").exists()
+
+
+def test_the_page_of_several_runs_shows_results_over_methods(tmp_path: Path) -> None:
+    runs = []
+    for label in ("first", "second"):
+        folder = make_run(tmp_path / label)
+        scenario = scenario_of(folder / "trips.parquet")
+        runs.append(Run(folder, label, "formation", scenario, make_summary()))
+    page = report_comparison(Comparison.of(runs), tmp_path / "out", "two runs")
+    text = page.read_text(encoding="utf-8")
+    assert {"travel_times.png", "flows.png"} <= {path.name for path in page.parent.rglob("*.png")}
+    assert "means over the seeds" in text
+    assert "<h2>Throughput</h2>" in text  # everybody left in the preferred lane
+    assert TOO_SHORT not in text
 
 
 def test_given_times_and_stretch_and_resolution(tmp_path: Path) -> None:

@@ -76,7 +76,8 @@ class Player {
     const bodies = present.map(([vehicle, state]) => ({ ...state, name: vehicle.name, lane: vehicle.lane, type: vehicle.type }));
     const width = this.painter.canvas.clientWidth;
     const stretches = laneweave.stretches(run, this.follow, this.t, width);
-    this.painter.paint(stretches, bodies, [laneweaveClosed.closedParts]);
+    const followed = this.follow?.vehicle?.name ?? null;
+    this.painter.paint(stretches, bodies, [laneweaveClosed.closedParts], followed);
     this.slider.value = this.t;
     const mean = present.reduce((sum, [, state]) => sum + state.v, 0) / (present.length || 1);
     const speed = present.length ? `, mean ${mean.toFixed(1)} m/s` : "";

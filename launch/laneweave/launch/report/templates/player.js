@@ -3,7 +3,7 @@
 // laneweave/launch/web/road.js. Times in s, lengths in m.
 
 const laneweave = (() => {
-  const JUMP_MPS = 2.8; // lateral speed above which a vehicle jumps; as in snapshots.py
+  const JUMP_MPS = 2.8; // lateral speed above which a vehicle jumps; as in trajectories.py
   const MAX_SLOPE = 0.35;
 
   /** Decode little-endian integers of `bytes` bytes from base64. */

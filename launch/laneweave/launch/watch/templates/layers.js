@@ -31,9 +31,9 @@ const laneweaveLayers = (() => {
   /** Draw the hold cells of vehicles with a frame, their other owned cells without. */
   function cells(bodies, t) {
     return (painter) => {
-      const { pen } = painter;
+      const { pen, theme } = painter;
       for (const body of bodies) {
-        pen.fillStyle = pen.strokeStyle = ownColour(painter, body);
+        pen.fillStyle = ownColour(painter, body);
         pen.globalAlpha = 0.09;
         for (const cell of body.owned) {
           if (!onStrip(painter, cell[0], t)) continue;
@@ -44,9 +44,13 @@ const laneweaveLayers = (() => {
         if (body.hold && onStrip(painter, body.hold[0], t)) {
           rounded(pen, cellBox(painter, body.hold, t), 1.5);
           pen.fill();
-          pen.globalAlpha = 0.65;
-          pen.lineWidth = 1;
-          pen.stroke();
+          // A dark line beside the coloured one keeps light colours visible.
+          for (const [colour, px, alpha] of [[theme.ink, 2.2, 0.45], [ownColour(painter, body), 1.2, 1]]) {
+            pen.strokeStyle = colour;
+            pen.globalAlpha = alpha;
+            pen.lineWidth = px;
+            pen.stroke();
+          }
         }
       }
       pen.globalAlpha = 1;

@@ -11,6 +11,7 @@ const CALM = matchMedia("(prefers-reduced-motion: reduce)");
 const NIGHT = matchMedia("(prefers-color-scheme: dark)");
 
 const part = (id) => document.getElementById(id);
+const count = (number) => number.toLocaleString("en").replaceAll(",", "\u202f"); // groups of three digits
 const clockTime = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour12: false });
 
 class Watch {
@@ -89,7 +90,8 @@ class Watch {
     document.title = `${scene.title} · laneweave`;
     part("title").textContent = scene.title;
     part("cells-name").textContent = this.live || !scene.rolling ? "cells" : "held cells";
-    part("sorted-name").textContent = scene.preferences ? "In their lane" : "Mean speed";
+    part("sorted").parentElement.hidden = !scene.preferences;
+    part("loss-name").textContent = scene.losses ? "Message loss, whole run" : "Message loss";
     part("paces").hidden = this.live;
     if (!this.live && this.place === null) {
       this.place = this.store.first;
@@ -258,7 +260,7 @@ class Watch {
       if (part("targets").checked) layers.push(laneweaveLayers.targets(bodies, t));
       layers.push(laneweaveLayers.marks(bodies));
     }
-    painter.paint(this.strips(scene, picture), bodies, layers);
+    painter.paint(this.strips(scene, picture), bodies, layers, this.follow?.vehicle ?? null);
     this.stats.paints += 1;
     const shown = next ? next.n : frame.n;
     if (shown !== this.lastShown) {
@@ -301,14 +303,9 @@ class Watch {
     const [demanded, entered, , left] = frame.counts ?? [0, 0, 0, 0];
     setText("count", frame.counts ? `${this.picture.bodies.length}` : "–");
     setText("counts", frame.counts ? `${entered} of ${demanded} entered, ${left}${NBSP}left` : "");
-    const mean = speed === null ? "" : `${speed.toFixed(1)}${NBSP}m/s`;
-    if (scene.preferences) {
-      setText("sorted", knownLane ? `${Math.round((100 * inLane) / knownLane)} %` : "–");
-      setText("speed", mean && `${inLane} of ${knownLane}; mean${NBSP}${mean}`);
-    } else {
-      setText("sorted", mean || "–");
-      setText("speed", "no preferred lanes");
-    }
+    setText("speed", speed === null ? "" : `mean speed ${speed.toFixed(1)}${NBSP}m/s`);
+    setText("sorted", knownLane ? `${Math.round((100 * inLane) / knownLane)} %` : "–");
+    setText("sorted-counts", knownLane ? `${inLane} of ${knownLane} vehicles` : "");
     // After the end of a run, nothing is missing.
     const ended = frame === store.newest && (store.end !== null || frame.status === "ended");
     const noLeader = ended ? "–" : "none";
@@ -343,11 +340,11 @@ class Watch {
     if (losses) {
       const { published, dropped_by_faults: dropped } = losses;
       setText("loss", published ? `${((100 * dropped) / published).toFixed(2)} %` : "–");
-      setText("losses", published ? `${dropped} dropped by faults, ${published} published` : "");
+      setText("losses", published ? `${count(dropped)} of ${count(published)} dropped by faults` : "");
       return;
     }
     setText("loss", loss ? `${((100 * loss[1]) / loss[0]).toFixed(2)} %` : "–");
-    setText("losses", loss ? `${loss[1]} of ${loss[0]} states` : "no states expected yet");
+    setText("losses", loss ? `${count(loss[1])} of ${count(loss[0])} states` : "no states expected yet");
     part("loss").classList.toggle("bad", loss !== null && loss[1] > 0.05 * loss[0]);
   }
 
