@@ -153,7 +153,9 @@ def _parts(paragraph: str) -> Iterator[str]:
         yield f"```python\n{textwrap.dedent(paragraph)}\n```"
         return
     # `Docstring` removes the indentation that all lines but the first one have.
-    for section in Docstring(f"\n{paragraph}", parser=Parser.google).parse(warnings=False):
+    for section in Docstring(f"\n{paragraph}", parser=Parser.google).parse(
+        warnings=False, returns_multiple_items=False
+    ):
         kind = section.kind.value
         if kind == "text":
             yield section.value

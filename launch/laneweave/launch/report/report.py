@@ -31,7 +31,7 @@ PAPER_STRETCH_M = (500.0, 800.0)
 
 TOO_SHORT = (
     "No vehicle counts for these results: the runs are too short. A vehicle counts if it entered "
-    f"after the warm-up of {WARM_UP_S:g} s and left while others were still arriving."
+    f"after the warm-up of {WARM_UP_S:g} s, and before the last arrival, and has left."
 )
 SPEED_CLOSED_CAPTION = "Hatched, between dotted lines: positions at which a lane is closed."
 STEADY_CAPTION = (

@@ -32,7 +32,7 @@ def summary_rows(summary: RunSummary, scenario: Scenario | None = None) -> list[
 
 
 def _demand_rows(summary: RunSummary, scenario: Scenario | None) -> Iterator[Row]:
-    yield "demand", f"{summary.volume_veh_per_lane_h:g} veh/(lane h)"
+    yield "demand", f"{summary.volume_veh_per_lane_h:g} veh/(lane·h)"
     if scenario is not None:
         yield "arrivals during", f"{scenario.demand.duration_s:g} s"
     yield "vehicles demanded", f"{summary.vehicles.demanded}"
@@ -76,8 +76,8 @@ def _safety_rows(safety: Safety) -> Iterator[Row]:
 def _accel_unit(value: float | None) -> str:
     """Return the unit of an acceleration, with a remark if it is uncomfortable."""
     if value is None or round(abs(value), 2) <= COMFORT_MPS2:
-        return " m/s2"
-    return f" m/s2, beyond comfort ({COMFORT_MPS2:g} m/s2)"
+        return " m/s²"
+    return f" m/s², beyond comfort ({COMFORT_MPS2:g} m/s²)"
 
 
 def _planning_rows(planning: Planning) -> Iterator[Row]:

@@ -15,6 +15,7 @@ const laneweaveRoad = (() => {
   const NUMBERED_PX = 12; // minimum length of a vehicle that shows the number of its lane
   const MIN_SCALE = 3; // of a whole road, in pixels per metre: narrow pages show more stretches
   const MAX_STRETCHES = 16;
+  const RING_PX = 5; // between the body that is followed and its ring
   const WINDOW_M = 150; // length of the road around what is followed, on a wide page
   const BRIGHT = 127.5; // brightness above which text on a colour is black
   const UNKNOWN = "#8a8f96";
@@ -266,12 +267,13 @@ const laneweaveRoad = (() => {
         path(0.12, 0.3, 0.36);
         pen.fill();
       }
-      if (scale > NAMED_FROM || body.name === this.followed) {
+      const followed = body.name === this.followed;
+      if (scale > NAMED_FROM || followed) {
         pen.fillStyle = theme.ink;
-        pen.font = "10px system-ui, sans-serif";
+        pen.font = `${followed ? "600 " : ""}10px system-ui, sans-serif`;
         pen.textAlign = "center";
         pen.textBaseline = "bottom";
-        pen.fillText(body.name, this.x(centreS), this.y(centreY + 0.5 * width) - 2);
+        pen.fillText(body.name, this.x(centreS), this.y(centreY + 0.5 * width) - (followed ? 2 + RING_PX : 2));
       }
     }
 
@@ -279,7 +281,7 @@ const laneweaveRoad = (() => {
     ring(body) {
       const { pen, theme, scale } = this;
       const [length, width] = sizeOf(this.scene, body);
-      const [long, wide] = [length * scale + 10, width * scale * ACROSS + 10];
+      const [long, wide] = [length * scale + 2 * RING_PX, width * scale * ACROSS + 2 * RING_PX];
       const corner = [this.x(body.s - length / 2) - long / 2, this.y(body.y) - wide / 2];
       for (const [colour, px] of [[theme.asphalt, 4], [theme.ink, 2]]) {
         pen.strokeStyle = colour;

@@ -72,7 +72,13 @@ TRAJECTORIES = Table(
     (
         Column("t_s", pa.float64(), "road time", "s"),
         Column("vehicle", pa.string(), "name of the vehicle"),
-        Column("s_m", pa.float32(), "position of the front bumper", "m", ROAD),
+        Column(
+            "s_m",
+            pa.float32(),
+            "position of the front bumper, until it passes the end of the road",
+            "m",
+            ROAD,
+        ),
         Column("y_m", pa.float32(), "position of the centre of the body", "m", ROAD),
         Column("speed_mps", pa.float32(), "speed along the road", "m/s", ROAD),
         Column(

@@ -125,6 +125,60 @@ def test_the_pages_draw_closed_parts_on_the_canvas_only() -> None:
     assert 5 < len(inside) < 20  # lines that are visible
 
 
+LABELS = """
+const calls = [];
+const pen = new Proxy({}, {
+  get: (_, name) => name === "measureText"
+    ? (text) => ({ width: 6 * text.length })
+    : (...values) => calls.push([name, ...values]),
+  set: () => true,
+});
+const canvas = { clientWidth: data.width, style: {}, getContext: () => pen };
+globalThis.window = { devicePixelRatio: 1 };
+const painter = new laneweaveRoad.Painter(canvas, data.scene);
+const body = { name: "v1", lane: 0, s: 600, y: 1.75, v: 15, slope: 0, type: "car" };
+const bodies = [body, { ...body, name: "v2", s: 700 }];
+painter.paint(laneweaveRoad.wholeRoad(1000, data.width), bodies, [], "v2");
+const shown = ["fillText", "roundRect", "translate"];
+console.log(JSON.stringify(calls.filter(([name]) => shown.includes(name))));
+"""
+
+
+def painted(width_px: int) -> list[list[Any]]:
+    """Return texts, rings and starts of stretches of a road with two vehicles, one followed."""
+    program = road_script() + "\nconst data = JSON.parse(require('fs').readFileSync(0));" + LABELS
+    scene = {"scene": road_scene(Scenario()), "width": width_px}
+    found: list[list[Any]] = printed_json(program, scene)
+    return found
+
+
+@needs_node
+@pytest.mark.parametrize("width_px", [320, 396, 420, 900, 1280])
+def test_labels_of_the_scale_do_not_touch(width_px: int) -> None:
+    stretches: list[list[tuple[float, str]]] = []
+    for name, *values in painted(width_px):
+        if name == "translate":
+            stretches.append([])
+        elif name == "fillText" and str(values[0]).endswith(" m"):
+            stretches[-1].append((values[1], values[0]))
+    assert len(stretches) >= 4
+    for labels in stretches:
+        assert len(labels) >= 2
+        ends_px = [0.0] + [left + 6 * len(text) for left, text in labels]
+        assert all(left >= end for end, (left, _) in zip(ends_px, labels, strict=False))
+        assert ends_px[-1] <= width_px
+
+
+@needs_node
+def test_the_followed_vehicle_has_a_ring_and_a_name() -> None:
+    calls = painted(1280)
+    ring = [name for name, *_ in calls].index("roundRect")
+    texts = [values[0] for name, *values in calls if name == "fillText"]
+    assert "v2" in texts[: ring + 1]
+    assert "v1" not in texts  # names of all vehicles need more room
+    assert sum(name == "roundRect" for name, *_ in calls) == 2  # with its light edge
+
+
 @needs_node
 def test_the_pages_draw_stop_lines() -> None:
     assert DROP_M - ROOM_M == 750.0

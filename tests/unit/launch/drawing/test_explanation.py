@@ -56,4 +56,4 @@ def test_a_picture_without_a_plan_shows_the_first_tree() -> None:
     )
     request = PlanRequest(Grid(2, 1), 1, ("node", "edge"), vehicles, ((0, 0), (1, 0)))
     texts = {t.get_text() for axes in explanation_figure(explain(request)).axes for t in axes.texts}
-    assert "none below C'*" in texts
+    assert "none below C\u2032*" in texts

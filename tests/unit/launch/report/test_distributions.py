@@ -95,6 +95,13 @@ def test_decelerations_jerks_and_lateral_accelerations() -> None:
     assert centres(counts, LATERAL) == pytest.approx([1.0125], abs=1e-3)
 
 
+def test_instantaneous_lane_changes_have_no_lateral_acceleration() -> None:
+    y_m = np.where(T_S < 5.0, 1.75, 5.25)
+    counts = count(tracks((0.0, y_m, 10.0, 0.0)), SHORT)
+    assert centres(counts, LATERAL) == [0.013]  # the first bin
+    assert counts.of[LATERAL.name].sum() == 99 - 2  # without the two differences over the change
+
+
 def test_only_steady_traffic_is_counted_where_there_is_some() -> None:
     late = tracks((0.0, 1.75, 10.0, 0.0))
     scenario = load_scenario(None, demand__duration_s=80.0)

@@ -26,7 +26,13 @@ from laneweave.launch.report.figures import (
     speed_scale,
 )
 from laneweave.launch.report.report import TOO_SHORT, report_comparison, report_run
-from laneweave.launch.report.snapshots import _MAX_HEADING, _pose, default_stretch_m, road_snapshots
+from laneweave.launch.report.snapshots import (
+    _MAX_HEADING,
+    _pose,
+    changes_gradually,
+    default_stretch_m,
+    road_snapshots,
+)
 from laneweave.launch.report.style import legend_above, picture
 from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.report.tables import run_table, tables_of
@@ -281,6 +287,23 @@ def test_the_scale_of_speeds_ends_at_a_percentile() -> None:
     jam = speeds((0.0,) + (15.0,) * 199)
     assert speed_scale([calm, jam], 15.0)[0].vmax == 16.0
     assert speed_scale([jam, speeds((3.0,) * 50)], 15.0)[0].vmin == 0.0
+    # Each side has its own end, so that the strongest colours of both are used.
+    norm, ticks = speed_scale([speeds((5.5,) * 50, (16.0,) * 50)], 15.0)
+    assert (norm.vmin, norm.vmax) == (5.0, 16.0)
+    assert ticks == pytest.approx([5.0, 10.0, 14.0, 15.0, 15.1, 15.5, 16.0])
+    assert np.asarray(norm([5.0, 15.0, 16.0])) == pytest.approx([0.0, 0.5, 1.0])
+
+
+def test_only_sumo_moves_vehicles_from_lane_to_lane_at_once() -> None:
+    t_s, width_m = 0.1 * np.arange(41), Scenario().road.lane_width_m
+    for y_m, gradual in (
+        (np.linspace(0.5, 1.5, 41) * width_m, True),
+        (np.where(t_s < 2.0, 0.5, 1.5) * width_m, False),
+    ):
+        tracks = make_tracks(
+            t_s, 1, s_m=[15.0 * t_s], y_m=[y_m], speed_mps=[15.0], accel_mps2=[0.0]
+        )
+        assert changes_gradually(tracks, Scenario()) is gradual
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ class Player {
     this.slider.value = this.t;
     const mean = present.reduce((sum, [, state]) => sum + state.v, 0) / (present.length || 1);
     const speed = present.length ? `, mean ${mean.toFixed(1)} m/s` : "";
-    this.output.textContent = `${this.t.toFixed(1)} s: ${present.length} vehicles${speed}`;
+    this.output.textContent = `${this.t.toFixed(1)} s: ${present.length} vehicle${present.length === 1 ? "" : "s"}${speed}`;
   }
 }
 

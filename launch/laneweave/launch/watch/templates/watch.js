@@ -91,7 +91,7 @@ class Watch {
     part("title").textContent = scene.title;
     part("cells-name").textContent = this.live || !scene.rolling ? "cells" : "held cells";
     part("sorted").parentElement.hidden = !scene.preferences;
-    part("loss-name").textContent = scene.losses ? "Message loss, whole run" : "Message loss";
+    part("loss-name").textContent = scene.losses ? "Loss, whole run" : "Message loss";
     part("paces").hidden = this.live;
     if (!this.live && this.place === null) {
       this.place = this.store.first;
