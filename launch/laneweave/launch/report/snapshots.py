@@ -141,7 +141,9 @@ def default_stretch_m(scenario: Scenario) -> tuple[float, float]:
         edges_m = [edge_m for one in road.closures for edge_m in (one.from_m, one.to_m)]
         inner_m = [edge_m for edge_m in edges_m if min(places_m) < edge_m < road.length_m]
         opens_m = [edge_m for edge_m in edges_m if 0.0 < edge_m < min(places_m)]
-        first_m = min(places_m) if scenario.entrance or not opens_m else max(opens_m)
+        # The way to an exit begins where its lane opens; what is before a ramp does not matter.
+        exit_first = min(places_m) in [one.at_m for one in scenario.exit]
+        first_m = max(opens_m) if exit_first and opens_m else min(places_m)
         start_m, end_m = first_m - _BEYOND_M, max([*places_m, *inner_m]) + _BEYOND_M
         return max(0.0, start_m, end_m - _MAX_STRETCH_M), min(road.length_m, end_m)
     start_m, length_m = max(0.0, road.sorting_start_m - 20.0), 320.0
