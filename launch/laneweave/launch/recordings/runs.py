@@ -140,10 +140,11 @@ def is_sweep(folder: Path) -> bool:
 
 
 def single_run(folder: Path) -> Run:
-    """Return the run in a folder.
+    """Return the run in a folder; a run of a sweep keeps its label.
 
     Raises:
-        BadInputError: the folder is not that of a finished run with trajectories.
+        BadInputError: the folder is not that of a finished run with trajectories, or the record of
+            its point in a sweep cannot be read.
     """
     if not (folder / TRAJECTORIES).is_file():
         raise BadInputError("DIR", str(folder), "the folder of a run, with trajectories.parquet")
@@ -155,7 +156,9 @@ def single_run(folder: Path) -> Run:
     summary = read_summary(folder)
     if summary is None:
         raise not_a_run(folder, "its summary.json is missing or incomplete")
-    return Run(folder, summary.method, summary.method, scenario, summary)
+    point = folder / POINT_FILE
+    label = _read_point(point).label if point.is_file() else summary.method
+    return Run(folder, label, summary.method, scenario, summary)
 
 
 def runs_of(folders: Sequence[Path]) -> Iterator[Run]:

@@ -15,7 +15,7 @@ from attrs import evolve
 from PIL import Image
 
 from laneweave.launch.drawing.road_scene import road_scene
-from laneweave.launch.recordings.runs import POINT_FILE, Comparison, runs_of
+from laneweave.launch.recordings.runs import POINT_FILE, Comparison, runs_of, single_run
 from laneweave.launch.report.page import Animation, Section, keep_units, render_page
 from laneweave.launch.report.report import TOO_SHORT
 from laneweave.launch.report.tables import Table, tables_of
@@ -132,6 +132,16 @@ def test_of_several_runs(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     texts = check_page(tmp_path / "both" / "report.html", len(FIGURES) + 1).texts
     # Same method, volume and seed: only their folders tell them apart.
     assert {"first", "second"} <= set(texts)
+
+
+def test_a_run_of_a_sweep_keeps_its_label(swept: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(swept / "formation-1000-1", folder)
+    data = json.loads((folder / POINT_FILE).read_text())
+    (folder / POINT_FILE).write_text(json.dumps(data | {"label": "rolling"}))
+    assert (single_run(folder).label, single_run(folder).method) == ("rolling", "formation")
+    (folder / POINT_FILE).unlink()
+    assert single_run(folder).label == "formation"
 
 
 def test_runs_that_failed_are_listed_and_not_averaged(swept: Path, tmp_path: Path) -> None:
