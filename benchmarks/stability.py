@@ -101,28 +101,37 @@ def draw(runs: Mapping[Case, Sequence[Response]], table: Sequence[dict[str, Any]
         vehicles = response.speed_mps.shape[1]
         for number in reversed(range(vehicles)):
             colour = str(0.25 + 0.6 * number / vehicles) if number else "#d55e00"
-            axes.plot(response.times_s, response.speed_mps[:, number], color=colour, linewidth=1.3)
-        axes.axvspan(0.0, BRAKING_S, color="#f3e3d6", zorder=0)
+            names = {0: "vehicle that brakes", vehicles // 2: "vehicles behind; lighter: farther"}
+            style: dict[str, Any] = {"color": colour, "linewidth": 1.3}
+            if number in names:
+                style["label"] = names[number]
+            axes.plot(response.times_s, response.speed_mps[:, number], **style)
+        axes.axvspan(0.0, BRAKING_S, color="#f3e3d6", zorder=0, label="while it brakes")
+        kind = "vehicles in a column" if shown.formation == "column" else "switching formation"
         axes.set_title(
-            f"{shown.formation}, {shown.drop_mps:g} m/s lost, "
-            f"{100 * shown.loss:g} % of messages lost, seed {shown.seed}"
+            f"{kind}: one brakes by {shown.drop_mps:g} m/s, {100 * shown.loss:g} % of messages lost"
         )
+        if shown is SHOWN[0]:
+            axes.legend(fontsize=8, frameon=False, loc="upper right")
         axes.set_xlabel("time since the disturbance began (s)")
         axes.set_ylabel("speed error (m/s)")
         axes.set_xlim(0.0, MEASURED_S)
     colours = dict(zip(DROPS_MPS["column"], COLOURS, strict=True))
     for entry in table:
         if entry["formation"] == "column":
+            # Points are beside each other, so that none hides another.
+            place = list(DROPS_MPS["column"]).index(entry["drop_mps"]) - 2
             last.plot(
+                np.arange(len(entry["speed_mps"])) + 0.12 * place * bool(entry["loss"]),
                 entry["speed_mps"],
                 color=colours[entry["drop_mps"]],
                 marker="o" if entry["loss"] else "",
                 linestyle="none" if entry["loss"] else "-",
                 markersize=4,
-                label="" if entry["loss"] else f"{entry['drop_mps']:g} m/s lost",
+                label="" if entry["loss"] else f"brakes by {entry['drop_mps']:g} m/s",
             )
-    last.set_title(f"column: largest speed error of {table[0]['runs']} runs")
-    last.set_xlabel("vehicles behind (points: 50 % of messages lost)")
+    last.set_title(f"vehicles in a column: largest speed error of {table[0]['runs']} runs")
+    last.set_xlabel("number of the vehicle behind (lines: no messages lost; points: 50 %)")
     last.set_ylabel("|speed error| (m/s)")
     last.set_ylim(0.0, 9.0)
     last.legend(fontsize=8, frameon=False, ncols=3, loc="upper right")

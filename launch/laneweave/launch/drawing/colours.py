@@ -90,6 +90,11 @@ def trip_lane(scenario: Scenario, trip: Mapping[str, Any]) -> int:
     return preferred
 
 
+def sorting_start(scenario: Scenario) -> str:
+    """Return the meaning of the position from which vehicles change lanes (`moves_from_m`)."""
+    return "lane sorting begins" if has_preferences(scenario) else "lane changes begin"
+
+
 def exit_in_words(name: str) -> str:
     """Return the name of an exit in a sentence; SUMO's names may be numbers."""
     return name if any(map(str.isalpha, name)) else f"exit {name}"
@@ -103,7 +108,9 @@ def vehicle_legend(scenario: Scenario, *, recorded: bool = False) -> tuple[tuple
     """
     lanes = scenario.road.lanes
     if recorded and not has_preferences(scenario):
-        arrived = (f"arrived in {_in_words(name)}" for name in lane_names(lanes))
+        names = [_in_words(name) for name in lane_names(lanes)]
+        names[0] += " (rightmost)" * ("right" not in names[0])
+        arrived = (f"arrived in {name}" for name in names)
         return tuple(zip(lane_colours(lanes), arrived, strict=True))[::-1]
     if not scenario.lane_shares:
         exits = tuple(

@@ -51,7 +51,10 @@ _HELD_FRAMES: Final = 8
 
 _WIDTH_IN, _LANE_IN, _ROAD_GAP_IN, _TIMES_IN = 11.0, 0.24, 0.24, 2.3
 _MARGIN_M = 10.0
-_CAPTION = "front to the right, left lane on top, lanes drawn wider than they are"
+_CAPTION = (
+    "front to the right, left lane on top, lanes drawn wider than they are; colours: vehicles with "
+    "the same targets"
+)
 _ROAD, _MARKING = "#e3e5e8", "#ffffff"
 
 
@@ -63,14 +66,14 @@ class Drive:
         road; s is the front bumper's position, 0 where the rear column is at time 0; y is the
         body centre's distance from the right road edge.
     slot_ticks: ticks per step.
-    overlaps: pairs of vehicles whose bodies overlapped.
+    overlaps: first tick at which the bodies of a pair of vehicles overlapped, for each such pair.
     min_gap_m: shortest gap between bodies in the same lane; infinite: there was no gap.
     """
 
     scenario: Scenario
     states: NDArray[np.float64]
     slot_ticks: int
-    overlaps: tuple[tuple[str, str], ...]
+    overlaps: dict[tuple[str, str], int]
     min_gap_m: float
 
     @property
@@ -110,15 +113,15 @@ def drive_plan(scenario: Scenario, names: Sequence[str], paths: Sequence[Sequenc
     slot_ticks = round(scenario.cycles_s[0] / scenario.runtime.tick_s)
     ticks = slot_ticks * (len(paths[0]) - 1)
     states = np.array([_drive_vehicle(scenario, path, slot_ticks, ticks) for path in paths])
-    overlaps: set[tuple[str, str]] = set()
+    overlaps: dict[tuple[str, str], int] = {}
     min_gap_m = np.inf
     size_m = scenario.vehicle.length_m, scenario.vehicle.width_m
-    for now in states.swapaxes(0, 1):
+    for tick, now in enumerate(states.swapaxes(0, 1)):
         poses = {name: pose_of(state) for name, state in zip(names, now.tolist(), strict=True)}
         bodies = Bodies(poses, *size_m)
-        overlaps.update(bodies.overlapping_pairs())
+        overlaps = dict.fromkeys(bodies.overlapping_pairs(), tick) | overlaps
         min_gap_m = min(min_gap_m, bodies.min_gaps().gap_m)
-    return Drive(scenario, states, slot_ticks, tuple(sorted(overlaps)), float(min_gap_m))
+    return Drive(scenario, states, slot_ticks, dict(sorted(overlaps.items())), float(min_gap_m))
 
 
 def _drive_vehicle(
@@ -187,20 +190,27 @@ def road_figure(picture: _Picture) -> Figure:
     """Return a figure of the road at successive instants and of positions over time."""
     drive, steps = picture.drive, picture.drive.steps
     count = min(steps, MAX_INSTANTS - 1) + 1
-    instants = [round(number * steps / max(1, count - 1)) for number in range(count)]
+    instants = {
+        round(number * steps / max(1, count - 1)) * drive.slot_ticks for number in range(count)
+    }
+    if count < MAX_INSTANTS:
+        instants |= set(list(drive.overlaps.values())[: MAX_INSTANTS - count])
+    count = len(instants)
     road_in = picture.lanes * _LANE_IN
     figure = new_figure(_WIDTH_IN, 0.9 + count * (road_in + _ROAD_GAP_IN) + 0.4 + _TIMES_IN)
     figure.suptitle(picture.title, fontsize=10, color=INK)
     heights_in = [count * (road_in + _ROAD_GAP_IN) + 0.4, _TIMES_IN]
     roads, times = figure.subfigures(2, 1, squeeze=False, height_ratios=heights_in)[:, 0]
     panels = list(roads.subplots(count, sharex=True, squeeze=False)[:, 0])
-    for axes, step in zip(panels, instants, strict=True):
+    for axes, tick in zip(panels, sorted(instants), strict=True):
         _draw_empty_road(axes, picture, label_axis=axes is panels[-1])
-        _draw_instant(axes, picture, step * drive.slot_ticks)
+        _draw_instant(axes, picture, tick)
     along, across = times.subplots(1, 2)
     moved_m = drive.scenario.formation.speed_mps * drive.time_s(1) * np.arange(drive.ticks + 1)
     _draw_over_time(along, picture, drive.states[:, :, 0] - moved_m, "s $-$ v$_F$ t (m)")
-    _draw_over_time(across, picture, drive.states[:, :, 3], "lateral position y (m)")
+    _draw_over_time(
+        across, picture, drive.states[:, :, 3], "lateral position y (m); dashed: lane borders"
+    )
     for lane in range(picture.lanes + 1):
         border_m = lane * drive.scenario.road.lane_width_m
         across.axhline(border_m, color=FAINT_INK, linewidth=0.5, dashes=(5, 5))
@@ -332,7 +342,10 @@ def _title(response: PlanResponse, drive: Drive) -> str:
         f"v$_F$ = {formation.speed_mps:g} m/s, d$_F$ = {formation.gap_m:g} m"
     )
     if drive.overlaps:
-        pairs = ", ".join(f"{_plain(one)} and {_plain(other)}" for one, other in drive.overlaps)
+        pairs = ", ".join(
+            f"{_plain(one)} and {_plain(other)} at {drive.time_s(tick):.1f} s"
+            for (one, other), tick in drive.overlaps.items()
+        )
         return f"{title}\nThe plan's conflict kinds allow that bodies overlap: {pairs}"
     if math.isfinite(drive.min_gap_m):
         return f"{title}; shortest gap between bodies {drive.min_gap_m:.1f} m"

@@ -11,6 +11,7 @@ from laneweave.launch.drawing.colours import (
     SPEED_SPAN_MPS,
     has_preferences,
     lane_colours,
+    sorting_start,
     vehicle_legend,
 )
 from laneweave.launch.web import text_of
@@ -28,7 +29,8 @@ def road_scene(scenario: Scenario, *, recorded: bool = False) -> dict[str, Any]:
             "length_m": road.length_m,
             "lanes": road.lanes,
             "lane_width_m": road.lane_width_m,
-            "sorting_start_m": road.sorting_start_m,
+            "sorting_start_m": scenario.moves_from_m,
+            "sorting_start": sorting_start(scenario),
             "ramps": [list(edge) for edge in ramp_edges(scenario)],
             "closed": [[part.lane, part.from_m, part.to_m] for part in closed],
             "stop_lines": [[part.lane, part.line_m] for part in closed if part.line_m is not None],

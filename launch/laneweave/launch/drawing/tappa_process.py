@@ -34,7 +34,7 @@ _SUBSCRIPTS: Final = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉
 _KEY: Final = (
     "circles: assignments A_k and their costs C_k; rectangles: their best path sets P_k and the "
     "costs C'_k of these, with a thick edge for the best one; in brackets: the target of each "
-    "vehicle"
+    "vehicle; white: no longer needed"
 )
 _SPACING: Final = 1.5
 """Line spacing that makes lines `_LINE_IN` high."""
@@ -80,7 +80,8 @@ def explanation_figure(explanation: Explanation) -> Figure:
     k, assignment = best
     heading = _formula(f"Constraint tree of A_{k}, {len(assignment.nodes)} nodes")
     write(axes, (_MARGIN_IN, top_in), heading, _NORMAL)
-    shown = f"{trees_shown(explanation)}; green: solution, yellow: still in T at the end"
+    colours = "grey: expanded, green: solution, yellow: still in the queue T at the end"
+    shown = f"{trees_shown(explanation)}; {colours}"
     write(axes, (_MARGIN_IN, top_in + 0.18), shown, _SMALL, color=FAINT_INK)
     _draw_tree(axes, assignment, layers, top_in + _HEADING_IN)
     count = f"{len(maps)} of {len(assignment.nodes)} nodes" if maps else ""

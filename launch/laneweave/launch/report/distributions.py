@@ -16,6 +16,7 @@ from attrs import field, frozen
 from laneweave.launch.recordings.trajectories import JUMP_MPS, Bools, Floats, Tracks
 from laneweave.launch.report.style import (
     REFERENCE,
+    SMALL_TEXT,
     explain_empty_axes,
     label_colours,
     label_dashes,
@@ -185,12 +186,11 @@ def _draw(
                     style = {"color": colours[label], "linestyle": dashes[label], "label": label}
                     style["linewidth"] = widths[label]
                     _draw_one(axes, counted[label, volume], quantity, style)
-            if not axes.lines:
-                explain_empty_axes(axes, "no trajectories")
+            _explain_missing(axes, counted, quantity, volume, labels)
             value = _set_value(quantity, scenario)
             axes.axvline(value, zorder=1, **REFERENCE)
             if quantity.exceedance:
-                axes.set_xlim(0.0, min(quantity.edges[-1], SHOWN_SHARE * value))
+                axes.set_xlim(0.0, min(1.05 * quantity.edges[-1], SHOWN_SHARE * value))
             axes.set_xlabel(f"{quantity.name} ({quantity.unit})")
             if volume == volumes[0]:
                 share = "time with more" if quantity.exceedance else "vehicles with less"
@@ -203,13 +203,40 @@ def _draw(
 
 def _draw_one(axes: Axes, counts: Counts, quantity: Quantity, style: dict[str, Any]) -> None:
     if quantity.exceedance:
-        shares = counts.exceedance(quantity)
-        axes.plot(quantity.edges[:-1][shares > 0.0], shares[shares > 0.0], **style)
         axes.set_yscale("log")
         axes.set_ylim(MIN_SHARE, 1.3)
     else:
-        axes.plot(quantity.edges[1:-1], counts.cumulative(quantity), **style)
         axes.set(ylim=(0.0, 1.03), xlim=(0.0, quantity.edges[-2]))
+    if not _has_values(counts, quantity):
+        axes.plot([], [], **style)  # only in the legend
+    elif quantity.exceedance:
+        shares = counts.exceedance(quantity)
+        axes.plot(quantity.edges[:-1][shares > 0.0], shares[shares > 0.0], **style)
+    else:
+        axes.plot(quantity.edges[1:-1], counts.cumulative(quantity), **style)
+
+
+def _has_values(counts: Counts, quantity: Quantity) -> bool:
+    """Return whether there is a curve; for an exceedance not if all values are in the first bin."""
+    first = 1 if quantity.exceedance else 0
+    return bool(counts.of[quantity.name][first:].any())
+
+
+def _explain_missing(
+    axes: Axes, counted: Counted, quantity: Quantity, volume: float, labels: Sequence[str]
+) -> None:
+    """Write into a panel which labels have no curve, and why."""
+    recorded = [label for label in labels if (label, volume) in counted]
+    missing = [one for one in recorded if not _has_values(counted[one, volume], quantity)]
+    why = "no values above 0" if quantity.exceedance else "no vehicle follows another"
+    if not recorded:
+        explain_empty_axes(axes, "no trajectories")
+    elif len(missing) == len(recorded):
+        explain_empty_axes(axes, why)
+    elif missing:
+        text = f"{why}:\n" + "\n".join(missing)
+        place: dict[str, Any] = {"xycoords": "axes fraction", "ha": "right", "va": "top"}
+        axes.annotate(text, (0.97, 0.97), **place, **SMALL_TEXT)
 
 
 def _set_value(quantity: Quantity, scenario: Scenario) -> float:

@@ -18,6 +18,7 @@ from laneweave.launch.recordings.runs import Comparison, Run
 from laneweave.launch.recordings.trajectories import Floats, read_tracks
 from laneweave.launch.report.style import (
     REFERENCE,
+    SEPARATOR,
     SMALL_TEXT,
     explain_empty_axes,
     label_colours,
@@ -96,6 +97,9 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
                         "va": "bottom",
                     }
                     lower.text(place, 0.03, "no vehicle", **style, **SMALL_TEXT)
+        for axes in panels.flat:
+            for number in range(1, len(volumes)):
+                axes.axvline(number - 0.5, **SEPARATOR)
         lower.set_xticks(range(len(volumes)), labels=[f"{volume:g}" for volume in volumes])
         lower.set_xlim(-0.6, len(volumes) - 0.4)
         lower.set_xlabel("traffic volume (veh/(lane·h))")
@@ -265,7 +269,8 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
             if volume == volumes[0]:
                 axes.set_ylabel(label, fontweight="bold")
             if run is None:
-                explain_empty_axes(axes, "no trajectories")
+                recorded = comparison.at(label, volume)
+                explain_empty_axes(axes, "no trajectories" if recorded else "not run")
                 continue
             one = maps[label, volume]
             mesh = axes.pcolormesh(
@@ -276,7 +281,7 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
                 norm=norm,
                 rasterized=True,
             )
-            start_m = run.scenario.road.sorting_start_m
+            start_m = run.scenario.moves_from_m
             axes.axhline(start_m, color=INK, linewidth=0.7, linestyle="--")
             _mark_closed_parts(axes, run)
         axes.set_xlim(0.0, max(one.edges_s[-1] for one in maps.values()))

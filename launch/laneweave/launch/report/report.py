@@ -12,7 +12,7 @@ from pathlib import Path
 from attrs import define, field
 
 from laneweave.launch.drawing.closed_parts import describe_closed_parts
-from laneweave.launch.drawing.colours import has_preferences
+from laneweave.launch.drawing.colours import has_preferences, sorting_start
 from laneweave.launch.drawing.figures import DPI, FigureFormat
 from laneweave.launch.recordings.runs import Comparison, Run, single_run
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks
@@ -29,10 +29,11 @@ REPORT_DPI = 300
 PAPER_STRETCH_M = (500.0, 800.0)
 """Stretch of road in the paper's snapshots (Section 5.2.3) [m]."""
 
-TOO_SHORT = (
-    "No vehicle counts for these results: the runs are too short. A vehicle counts if it entered "
-    f"after the warm-up of {WARM_UP_S:g} s, and before the last arrival, and has left."
+COUNTED = (
+    f"Counted are vehicles that entered after the first {WARM_UP_S:g} s and before the last "
+    "arrival, and have left."
 )
+TOO_SHORT = f"No vehicle was counted, because the runs are too short. {COUNTED}"
 SPEED_CLOSED_CAPTION = "Hatched, between dotted lines: positions at which a lane is closed."
 STEADY_CAPTION = (
     f"Samples from {WARM_UP_S:g} s to the end of the demand, or of the whole run if that time is "
@@ -56,9 +57,11 @@ def travel_caption(*, several: bool) -> str:
     """Return the caption of the travel times of several runs, or of one."""
     return _sentences(
         f"Travel times of the counted vehicles{' of all seeds' * several}, including the wait at "
-        "the entrance. Boxes: quartiles and median; whiskers: at most 1.5 interquartile ranges; "
+        f"the entrance. {COUNTED}",
+        "Boxes: quartiles and median; whiskers: at most 1.5 interquartile ranges; "
         "small dots: vehicles beyond the whiskers.",
-        "Large markers and lines: means. The axis is broken if only some methods jam."
+        "Large markers and lines: means. Boxes of the same volume are side by side. The axis is "
+        "broken if only some methods jam."
         if several
         else "Large marker: mean.",
         "Dashed, free flow: time at v_F from the start of the road to its end, without waiting; "
@@ -66,15 +69,22 @@ def travel_caption(*, several: bool) -> str:
     )
 
 
-def flow_caption(*, shares: bool) -> str:
-    """Return the caption of the throughput, with or without the shares in the preferred lane."""
+def flow_caption(*, shares: bool, seeds: bool) -> str:
+    """Return the caption of the throughput.
+
+    Args:
+        shares: whether the figure also has shares in the preferred lane.
+        seeds: whether there are several seeds.
+    """
     return _sentences(
         "Throughput: rate at which vehicles pass the end of the road, between the first and the "
         "last counted one. Over this short time arrivals can be denser than on average, and a jam "
         "can hold up the first vehicle, so that the throughput exceeds the demand.",
         "Left in the preferred lane: share of the counted vehicles." if shares else "",
-        "Small dots: runs; markers: means over the seeds; bars: standard deviations over the "
-        "seeds.",
+        "Methods at the same volume are displaced sideways.",
+        "Small dots: runs; markers and bars: means and standard deviations over the seeds."
+        if seeds
+        else "",
     )
 
 
@@ -84,8 +94,8 @@ def speed_caption(*, several: bool) -> str:
         "Mean speed in bins of 20 m and 5 s"
         + (", in the first run with trajectories of each method and volume." if several else "."),
         "White: v_F; red: slower; blue: faster; grey: no vehicle. Scale: square root of the "
-        "difference from v_F, on each side up to its 98th percentile, rounded up.",
-        "Dashed: start of lane sorting.",
+        "difference from v_F, on each side up to its 98th percentile, rounded up; it differs "
+        "between reports. Dashed: the position from which vehicles change lanes.",
     )
 
 
@@ -145,8 +155,8 @@ def report_run(
     road, title = run.scenario.road, f"laneweave run: {run.folder.resolve().name}"
     lead = _sentences(
         f"{_title(run)}.",
-        f"{road.lanes} lanes, {road.length_m:g} m; lane sorting begins at "
-        f"{road.sorting_start_m:g} m.",
+        f"{road.lanes} lanes, {road.length_m:g} m; {sorting_start(run.scenario)} at "
+        f"{run.scenario.moves_from_m:g} m.",
         describe_closed_parts(run.scenario),
         "" if run.scenario.lane_shares else "Vehicles have no preferred lanes.",
         f"Vehicles arrive for {run.scenario.demand.duration_s:g} s.",
@@ -240,7 +250,9 @@ def _add_results(report: _Report, comparison: Comparison, *, several: bool) -> N
             "Throughput and lanes" if shares else "Throughput",
             "flows.png",
             partial(figures.draw_flows, comparison),
-            flow_caption(shares=shares),
+            flow_caption(
+                shares=shares, seeds=len({run.scenario.seed for run in comparison.runs}) > 1
+            ),
             f"Throughput{' and share in the preferred lane' * shares} against traffic volume",
         )
 
@@ -262,8 +274,8 @@ def _snapshots(report: _Report, run: Run, tracks: Tracks) -> list[Picture]:
         if run.scenario.exit
         else "Colours and numbers on vehicles show the preferred lanes (0: rightmost);"
         if preferences
-        else "Colours show the lane in which a vehicle arrived;",
-        "faster vehicles are lighter.",
+        else "Colours show the lane in which a vehicle arrived (0: rightmost);",
+        "faster vehicles are lighter; a pale stripe is at the front.",
         "Hatched: closed; thick line: stop line before it." if run.scenario.road.closures else "",
     )
     coloured = f" coloured by {'preferred lane' if preferences else 'lane of arrival'}"
@@ -283,7 +295,7 @@ def _add_path_map(report: _Report, driven: DrivenMap, title: str) -> None:
         f"{title}. Cells (column, lane) of {driven.vehicles} at the ends of slots, as driven; "
         "columns are counted from the rearmost. "
         f"{driven.colours}; bold: moved in the preceding slot. Cost: the sum over the vehicles of "
-        "the slot in which they arrive.",
+        "the slot from whose end on they stay in their last cell.",
         f"Table of the cells of {driven.name} by vehicle and slot",
     )
 

@@ -15,11 +15,11 @@ from laneweave.launch.drawing.closed_parts import (
     ramp_edges,
 )
 from laneweave.launch.drawing.colours import (
-    NEUTRAL,
     SHADE_STRENGTH,
     SPEED_SPAN_MPS,
     exit_in_words,
     has_preferences,
+    sorting_start,
     text_colour,
     trip_lane,
     vehicle_colour,
@@ -120,7 +120,7 @@ def road_snapshots(
                     _draw_vehicle(axes, pose, trip_lane(scenario, trip), own, scale_pt_per_m)
         strips[-1].tick_params(axis="x", bottom=True, labelbottom=True)
         strips[-1].set_xlabel("position on the road (m)")
-        starts = stretch_m[0] < road.sorting_start_m < stretch_m[1]
+        starts = stretch_m[0] < scenario.moves_from_m < stretch_m[1]
         _draw_legend(figure, scenario, starts=starts, shaded=shaded)
 
 
@@ -146,7 +146,7 @@ def default_stretch_m(scenario: Scenario) -> tuple[float, float]:
         first_m = max(opens_m) if exit_first and opens_m else min(places_m)
         start_m, end_m = first_m - _BEYOND_M, max([*places_m, *inner_m]) + _BEYOND_M
         return max(0.0, start_m, end_m - _MAX_STRETCH_M), min(road.length_m, end_m)
-    start_m, length_m = max(0.0, road.sorting_start_m - 20.0), 320.0
+    start_m, length_m = max(0.0, scenario.moves_from_m - 20.0), 320.0
     if closed := closed_parts(scenario):
         first = min(closed, key=lambda part: part.from_m)
         short = first.to_m - first.from_m <= _MAX_CLOSED_M
@@ -201,8 +201,8 @@ def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -
             zorder=1,
         )
     _draw_closed_parts(axes, scenario)
-    if stretch_m[0] < road.sorting_start_m < stretch_m[1]:
-        place = ([road.sorting_start_m] * 2, [0.0, width_m])
+    if stretch_m[0] < scenario.moves_from_m < stretch_m[1]:
+        place = ([scenario.moves_from_m] * 2, [0.0, width_m])
         axes.plot(*place, color=INK, linewidth=1.0, linestyle=":", zorder=2)
     axes.set_yticks([])
     axes.tick_params(axis="x", bottom=False, labelbottom=False)
@@ -334,12 +334,12 @@ def _draw_legend(figure: Figure, scenario: Scenario, *, starts: bool, shaded: bo
     from matplotlib.patches import Patch  # noqa: PLC0415 - lazily
 
     speed_mps = scenario.formation.speed_mps
-    entries: list[tuple[Any, str]] = [*vehicle_legend(scenario, recorded=True)]
-    for over_mps, word in ((-SPEED_SPAN_MPS, "slower"), (SPEED_SPAN_MPS, "faster")):
-        entries.append((_shade(NEUTRAL, over_mps), f"{word} than {speed_mps:g} m/s"))
     handles: list[Patch | Line2D] = [
-        Patch(fc=colour, ec=INK, lw=0.5, label=label) for colour, label in entries
+        Patch(fc=colour, ec=INK, lw=0.5, label=label)
+        for colour, label in vehicle_legend(scenario, recorded=True)
     ]
+    shades = f"darker: slower than {speed_mps:g} m/s; lighter: faster"
+    handles.append(Line2D([], [], linewidth=0.0, label=shades))
     if scenario.road.closures:
         handles.append(Patch(label="closed", **_CLOSED))
     if any(part.line_m is not None for part in closed_parts(scenario)):
@@ -350,7 +350,7 @@ def _draw_legend(figure: Figure, scenario: Scenario, *, starts: bool, shaded: bo
     if starts:
         line: dict[str, Any] = {"marker": "$\u22ee$", "markersize": 9, "markeredgewidth": 0.0}
         handles.append(
-            Line2D([], [], color=INK, linewidth=0.0, label="lane sorting begins", **line)
+            Line2D([], [], color=INK, linewidth=0.0, label=sorting_start(scenario), **line)
         )
     if ramp_edges(scenario):
         handles.append(Line2D([], [], color=INK, linewidth=1.6, label="edge of a ramp"))

@@ -59,6 +59,8 @@ _STYLE: Final[Any] = {
 }
 REFERENCE: Final[dict[str, Any]] = {"color": "#8a9099", "linewidth": 1.0, "linestyle": "--"}
 """Style of lines for limits and nominal values."""
+SEPARATOR: Final[dict[str, Any]] = {"color": "#d8dbe0", "linewidth": 1.0, "zorder": 0}
+"""Style of lines between groups."""
 SMALL_TEXT: Final[dict[str, Any]] = {"fontsize": 7.5, "color": FAINT_INK}
 """Style of small text."""
 MAX_COLUMNS: Final = 6
@@ -106,7 +108,7 @@ def label_dashes(labels: Iterable[str]) -> dict[str, Any]:
 def label_widths(labels: Iterable[str]) -> dict[str, float]:
     """Return a line width for each label; later lines are thinner, so that none hides another."""
     places = {label: place for place, label in enumerate(dict.fromkeys(labels))}
-    step = min(1.1, 4.0 / max(1, len(places) - 1))
+    step = min(0.7, 2.6 / max(1, len(places) - 1))
     return {label: 1.3 + step * (len(places) - 1 - place) for label, place in places.items()}
 
 
@@ -136,7 +138,7 @@ def fitted_legend(figure: Figure, handles: Sequence[Any], **style: Any) -> None:
     """Draw a legend above all panels, in the smallest number of rows that fit."""
     for rows in range(max(1, math.ceil(len(handles) / MAX_ENTRIES)), len(handles) + 1):
         style |= {"loc": "outside upper center", "ncols": math.ceil(len(handles) / rows)}
-        legend = figure.legend(handles=handles, **style)
+        legend = figure.legend(handles=handles, **({"handlelength": 2.6} | style))
         if rows == len(handles) or legend.get_window_extent().width <= figure.bbox.width:
             return
         legend.remove()

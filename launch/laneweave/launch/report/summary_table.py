@@ -9,6 +9,7 @@ import statistics
 from collections import Counter
 from collections.abc import Iterator
 
+from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.scenario.fields import COMFORT_MPS2, ROLLING_SOLVER, Scenario
 from laneweave.protocol.summary import Planning, RunSummary, Safety
 
@@ -35,6 +36,8 @@ def _demand_rows(summary: RunSummary, scenario: Scenario | None) -> Iterator[Row
     yield "demand", f"{summary.volume_veh_per_lane_h:g} veh/(lane·h)"
     if scenario is not None:
         yield "arrivals during", f"{scenario.demand.duration_s:g} s"
+        if summary.method == FORMATION:
+            yield "operation", "rolling" if scenario.formation.rolling else "formations"
     yield "vehicles demanded", f"{summary.vehicles.demanded}"
     yield "seed", f"{summary.seed}"
 

@@ -25,7 +25,7 @@ _TRAFFIC: Final[tuple[_Column, ...]] = (
     ("in the preferred lane (%)", PREFERRED, "mean", 2),
     ("travel time mean (s)", "travel_time_s_mean", "mean", 2),
     ("counted", "travel_time_s_n", "sum", 0),
-    ("p95 (s)", "travel_time_s_p95", "mean", 2),
+    ("95th percentile (s)", "travel_time_s_p95", "mean", 2),
     ("throughput (veh/(lane·h))", "throughput_veh_per_lane_h", "mean", 0),
 )
 _SAFETY: Final[tuple[_Column, ...]] = (
@@ -36,12 +36,12 @@ _SAFETY: Final[tuple[_Column, ...]] = (
     ("real-time factor", "runtime_real_time_factor", "min", 1),
 )
 _PLANNING: Final[tuple[_Column, ...]] = (
-    ("largest formation", "planning_largest_formation", "max", 0),
+    ("most vehicles in a plan", "planning_largest_formation", "max", 0),
     ("plans", "planning_plans", "sum", 0),
     ("fallbacks", "planning_fallbacks", "sum", 0),
-    ("p50 (ms)", "planning_solve_ms_p50", "max", 1),
-    ("p95 (ms)", "planning_solve_ms_p95", "max", 1),
-    ("max (ms)", "planning_solve_ms_max", "max", 1),
+    ("median (ms)", "planning_solve_ms_p50", "max", 1),
+    ("95th percentile (ms)", "planning_solve_ms_p95", "max", 1),
+    ("maximum (ms)", "planning_solve_ms_max", "max", 1),
 )
 _BY_SOLVER: Final = "planning_by_solver_"
 _TECHNICAL: Final = (
@@ -92,11 +92,15 @@ def tables_of(comparison: Comparison) -> list[Table]:
             traffic,
             "Means over the seeds ± standard deviation; counted: vehicles of the travel times.",
         ),
-        _table(rows, _SAFETY, "Extremes or sums over the seeds."),
+        _table(
+            rows,
+            _SAFETY,
+            "Extremes or sums over the seeds; real-time factor above 1: faster than real time.",
+        ),
         _table(
             planned,
             (*by_solver, *_PLANNING),
-            "Planning: sums over the seeds; sizes and times are maxima.",
+            "Planning: sums over the seeds; numbers of vehicles and times of one plan are maxima.",
         ),
         failed_table(comparison),
     ]

@@ -273,7 +273,11 @@ const laneweaveRoad = (() => {
         pen.font = `${followed ? "600 " : ""}10px system-ui, sans-serif`;
         pen.textAlign = "center";
         pen.textBaseline = "bottom";
-        pen.fillText(body.name, this.x(centreS), this.y(centreY + 0.5 * width) - (followed ? 2 + RING_PX : 2));
+        const up = this.y(centreY + 0.5 * width) - (followed ? 2 + RING_PX : 2);
+        pen.strokeStyle = theme.asphalt; // keeps the name legible on lines
+        pen.lineWidth = 3;
+        pen.strokeText(body.name, this.x(centreS), up);
+        pen.fillText(body.name, this.x(centreS), up);
       }
     }
 

@@ -77,10 +77,11 @@ def test_limits_of_the_vehicle_are_kept(driven: Drive) -> None:
 
 def test_what_the_conflict_kinds_allow_is_shown(driven: Drive) -> None:
     """With node and edge conflicts alone, vehicles 2 and 3 pass through each other's corners."""
-    assert driven.overlaps == (("2", "3"),)
+    assert list(driven.overlaps) == [("2", "3")]
+    assert 0 < driven.overlaps["2", "3"] < driven.slot_ticks
     careful = attrs.evolve(REQUEST, conflicts=("geometric",))
     apart = drive_plan(SCENARIO, NAMES, plan(careful).paths)
-    assert apart.overlaps == ()
+    assert apart.overlaps == {}
     assert apart.min_gap_m > 0
 
 
@@ -95,19 +96,21 @@ def test_the_scenario_determines_speeds_and_distances() -> None:
 def test_a_panel_for_each_instant_shows_all_bodies_where_they_are(driven: Drive) -> None:
     figure = road_figure(_Picture.of(REQUEST, PLAN, SCENARIO))
     *roads, along, across = figure.axes
-    assert len(roads) == len(PLAN.paths[0])
-    for step, axes in enumerate(roads):
+    overlap = driven.overlaps["2", "3"]  # is shown, too
+    ticks = [0, overlap, *(step * driven.slot_ticks for step in (1, 2, 3))]
+    for tick, axes in zip(ticks, roads, strict=True):
         shapes = [patch for patch in axes.patches if type(patch) is Polygon]
         fronts = [float(shape.get_xy()[:, 0].max()) for shape in shapes]
-        expected = driven.states[:, step * driven.slot_ticks, 0]
+        expected = driven.states[:, tick, 0]
         assert fronts == pytest.approx(expected.tolist(), abs=0.5)
-    assert [axes.get_ylabel() for axes in roads] == ["0.0 s", "4.0 s", "8.0 s", "12.0 s"]
+    assert [axes.get_ylabel() for axes in roads] == [f"{0.1 * tick:.1f} s" for tick in ticks]
     assert len(along.lines) == 5
     relative_m = [np.asarray(line.get_ydata()) for line in along.lines]
     ends = [path[-1][0] * SCENARIO.formation.gap_m for path in PLAN.paths]
     assert [float(line[-1]) for line in relative_m] == pytest.approx(ends, abs=0.2)
     assert {text.get_text() for text in across.texts} >= {"3, 4", "5", "1, 2"}
-    assert "conflict kinds allow that bodies overlap: 2 and 3" in figure.get_suptitle()
+    title = f"conflict kinds allow that bodies overlap: 2 and 3 at {0.1 * overlap:.1f} s"
+    assert title in figure.get_suptitle()
 
 
 def test_long_plans_are_drawn_at_some_instants() -> None:

@@ -14,6 +14,7 @@ import pytest
 from attrs import evolve
 from numpy.typing import ArrayLike
 
+from laneweave.launch.drawing.figures import new_figure
 from laneweave.launch.recordings.formations import read_events
 from laneweave.launch.recordings.runs import Run, single_run
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks
@@ -25,6 +26,7 @@ from laneweave.launch.report.distributions import (
     SPACING,
     Counts,
     Quantity,
+    _explain_missing,
     count,
 )
 from laneweave.launch.report.figures import _break
@@ -107,6 +109,24 @@ def test_only_steady_traffic_is_counted_where_there_is_some() -> None:
     scenario = load_scenario(None, demand__duration_s=80.0)
     assert count(late, scenario).of[DECELERATION.name].sum() == 0
     assert count(late, load_scenario(None, demand__duration_s=65.0)).of["deceleration"].sum() == 101
+
+
+def test_panels_say_which_labels_have_no_curve() -> None:
+    figure = new_figure(4.0, 3.0)
+    still = count(tracks((0.0, 1.75, 10.0, 0.0)), SHORT)
+    braking = count(tracks((0.0, 1.75, 10.0, -1.0)), SHORT)
+    for counted, said in (
+        ({("a", 1.0): still}, "no values above 0"),
+        ({("a", 1.0): still, ("b", 1.0): braking}, "no values above 0:\na"),
+        ({("b", 1.0): braking}, None),
+        ({("a", 2.0): still}, "no trajectories"),
+    ):
+        axes = figure.add_subplot()
+        _explain_missing(axes, counted, DECELERATION, 1.0, ["a", "b"])
+        assert [text.get_text() for text in axes.texts] == [said] * (said is not None)
+    axes = figure.add_subplot()
+    _explain_missing(axes, {("a", 1.0): still}, SPACING, 1.0, ["a"])
+    assert axes.texts[0].get_text() == "no vehicle follows another"
 
 
 def test_counts_add_up() -> None:

@@ -237,14 +237,14 @@ def test_the_page_of_a_run_describes_closed_parts(tmp_path: Path) -> None:
 
 def test_the_page_of_several_runs_shows_results_over_methods(tmp_path: Path) -> None:
     runs = []
-    for label in ("first", "second"):
-        folder = make_run(tmp_path / label)
-        scenario = scenario_of(folder / "trips.parquet")
+    for label, seed in (("first", 1), ("second", 1), ("second", 2)):
+        folder = make_run(tmp_path / f"{label}-{seed}")
+        scenario = evolve(scenario_of(folder / "trips.parquet"), seed=seed)
         runs.append(Run(folder, label, "formation", scenario, make_summary()))
-    page = report_comparison(Comparison.of(runs), tmp_path / "out", "two runs")
+    page = report_comparison(Comparison.of(runs), tmp_path / "out", "three runs")
     text = page.read_text(encoding="utf-8")
     assert {"travel_times.png", "flows.png"} <= {path.name for path in page.parent.rglob("*.png")}
-    assert "means over the seeds" in text
+    assert "standard deviations over the seeds" in text
     assert "<h2>Throughput</h2>" in text  # everybody left in the preferred lane
     assert TOO_SHORT not in text
 

@@ -89,7 +89,7 @@ class Watch {
     this.painter = new laneweaveRoad.Painter(part("road"), scene, this.theme());
     document.title = `${scene.title} · laneweave`;
     part("title").textContent = scene.title;
-    part("cells-name").textContent = this.live || !scene.rolling ? "cells" : "held cells";
+    part("cells-name").textContent = this.live || !scene.rolling ? "cells" : "hold cells";
     part("sorted").parentElement.hidden = !scene.preferences;
     part("loss-name").textContent = scene.losses ? "Loss, whole run" : "Message loss";
     part("paces").hidden = this.live;
@@ -340,7 +340,7 @@ class Watch {
     if (losses) {
       const { published, dropped_by_faults: dropped } = losses;
       setText("loss", published ? `${((100 * dropped) / published).toFixed(2)} %` : "–");
-      setText("losses", published ? `${count(dropped)} of ${count(published)} dropped by faults` : "");
+      setText("losses", published ? `${count(dropped)} of ${count(published)} messages dropped by faults` : "");
       return;
     }
     setText("loss", loss ? `${((100 * loss[1]) / loss[0]).toFixed(2)} %` : "–");
@@ -441,7 +441,7 @@ class Watch {
       rest.push(entry({ kind: "odd" }, "without agent, or overdue"));
     }
     if (road.sorting_start_m > 0 && road.sorting_start_m < road.length_m) {
-      rest.push(entry({ kind: "sorting" }, "lane sorting begins"));
+      rest.push(entry({ kind: "sorting" }, road.sorting_start));
     }
     if (road.closed.length > 0) {
       rest.push(entry({ kind: "closed" }, "closed"), entry({ kind: "stop-line" }, "stop line"));
