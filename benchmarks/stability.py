@@ -107,9 +107,9 @@ def draw(runs: Mapping[Case, Sequence[Response]], table: Sequence[dict[str, Any]
                 style["label"] = names[number]
             axes.plot(response.times_s, response.speed_mps[:, number], **style)
         axes.axvspan(0.0, BRAKING_S, color="#f3e3d6", zorder=0, label="while it brakes")
-        kind = "vehicles in a column" if shown.formation == "column" else "switching formation"
+        kind = "column" if shown.formation == "column" else "switching"
         axes.set_title(
-            f"{kind}: one brakes by {shown.drop_mps:g} m/s, {100 * shown.loss:g} % of messages lost"
+            f"{kind}: one brakes by {shown.drop_mps:g} m/s, {100 * shown.loss:g} % message loss"
         )
         if shown is SHOWN[0]:
             axes.legend(fontsize=8, frameon=False, loc="upper right")
@@ -130,8 +130,8 @@ def draw(runs: Mapping[Case, Sequence[Response]], table: Sequence[dict[str, Any]
                 markersize=4,
                 label="" if entry["loss"] else f"brakes by {entry['drop_mps']:g} m/s",
             )
-    last.set_title(f"vehicles in a column: largest speed error of {table[0]['runs']} runs")
-    last.set_xlabel("number of the vehicle behind (lines: no messages lost; points: 50 %)")
+    last.set_title(f"column: largest speed error of {table[0]['runs']} runs")
+    last.set_xlabel("vehicle behind (lines: no message loss; points: 50 %)")
     last.set_ylabel("|speed error| (m/s)")
     last.set_ylim(0.0, 9.0)
     last.legend(fontsize=8, frameon=False, ncols=3, loc="upper right")

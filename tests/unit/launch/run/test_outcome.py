@@ -259,9 +259,9 @@ def test_the_table_says_which_solvers_planned(more: dict[str, Any], shown: dict[
 @pytest.mark.parametrize(
     ("low", "high", "said"),
     [
-        (-3.004, 3.0, ("-3.00 m/s2", "3.00 m/s2")),
-        (-3.01, 2.0, ("-3.01 m/s2, beyond comfort (3 m/s2)", "2.00 m/s2")),
-        (-1.0, 4.8, ("-1.00 m/s2", "4.80 m/s2, beyond comfort (3 m/s2)")),
+        (-3.004, 3.0, ("-3.00 m/s²", "3.00 m/s²")),
+        (-3.01, 2.0, ("-3.01 m/s², beyond comfort (3 m/s²)", "2.00 m/s²")),
+        (-1.0, 4.8, ("-1.00 m/s²", "4.80 m/s², beyond comfort (3 m/s²)")),
         (None, None, (None, None)),
     ],
 )
