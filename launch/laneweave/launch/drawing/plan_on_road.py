@@ -208,12 +208,11 @@ def road_figure(picture: _Picture) -> Figure:
     along, across = times.subplots(1, 2)
     moved_m = drive.scenario.formation.speed_mps * drive.time_s(1) * np.arange(drive.ticks + 1)
     _draw_over_time(along, picture, drive.states[:, :, 0] - moved_m, "s $-$ v$_F$ t (m)")
-    _draw_over_time(
-        across, picture, drive.states[:, :, 3], "lateral position y (m); dashed: lane borders"
-    )
+    _draw_over_time(across, picture, drive.states[:, :, 3], "lateral position y (m)")
     for lane in range(picture.lanes + 1):
         border_m = lane * drive.scenario.road.lane_width_m
         across.axhline(border_m, color=FAINT_INK, linewidth=0.5, dashes=(5, 5))
+    across.set_xlabel(f"{across.get_xlabel()}; dashed: lane borders")
     return figure
 
 
