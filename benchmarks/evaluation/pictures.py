@@ -108,9 +108,9 @@ _FIGURES: Final = (
         Picture(
             "evaluation-flows.png",
             "Throughput and share in the preferred lane against the demand",
-            "Throughput between the first and the last counted vehicle, and share in the preferred "
-            "lane. Small dots: runs; markers and bars: means and standard deviations over the "
-            "seeds.",
+            "Throughput between the first and the last counted vehicle, as a share of the demand, "
+            "and share in the preferred lane. Small dots: runs; markers and bars: means and "
+            "standard deviations over the seeds.",
         ),
         LABELS,
         VOLUMES,

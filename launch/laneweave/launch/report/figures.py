@@ -171,9 +171,9 @@ def _travel_times(runs: Iterable[Run]) -> Floats:
 
 
 def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
-    """Draw throughput and the share of vehicles in the preferred lane against the demand.
+    """Draw throughput as a share of the demand, and the share of vehicles in the preferred lane.
 
-    The share is left out if vehicles have no preferred lanes, or all left in theirs.
+    The latter is left out if vehicles have no preferred lanes, or all left in theirs.
     """
     volumes = np.array(comparison.volumes)
     range_veh_per_lane_h = float(np.ptp(volumes)) or 400.0
@@ -182,18 +182,16 @@ def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
     with picture(4.6 * panels, 3.7, out, dpi) as figure:
         shown = figure.subplots(1, panels, squeeze=False)[0]
         left = shown[0]
-        left.plot(span, span, zorder=0, **REFERENCE)
-        text = "dashed: throughput = demand"
-        left.annotate(text, (0.03, 0.96), xycoords="axes fraction", va="top", **SMALL_TEXT)
-        left.set_ylabel("throughput (veh/(lane·h))")
-        for axes, value in zip(shown, (_throughput, _preferred_percent), strict=False):
+        left.axhline(100.0, zorder=0, **REFERENCE)
+        left.set_ylabel("throughput (% of the demand)")
+        for axes, value in zip(shown, (_throughput_percent, _preferred_percent), strict=False):
             _draw_seeds(axes, comparison, value, 0.012 * range_veh_per_lane_h)
             axes.set_xlabel("traffic volume (veh/(lane·h))")
             axes.set_xlim(*span)
             axes.set_xticks(volumes if len(volumes) <= 8 else volumes[:: 1 + len(volumes) // 8])
         for axes in shown[1:]:
             axes.set_ylabel("left in the preferred lane (%)")
-            low = min(axes.get_ylim()[0], 95.0)
+            low = min(axes.get_ylim()[0], 99.0)
             axes.set_ylim(low, 100.0 + 0.04 * (100.0 - low))
         legend_above(figure)
 
@@ -204,8 +202,10 @@ def shares_differ(comparison: Comparison) -> bool:
     return any(percent is None or percent < 100.0 for percent in percents)
 
 
-def _throughput(run: Run) -> float | None:
-    return run.summary.throughput_veh_per_lane_h if run.summary else None
+def _throughput_percent(run: Run) -> float | None:
+    """Return the throughput as a share of the demand."""
+    flow = run.summary.throughput_veh_per_lane_h if run.summary else None
+    return None if flow is None else 100.0 * flow / run.volume_veh_per_lane_h
 
 
 def _preferred_percent(run: Run) -> float | None:

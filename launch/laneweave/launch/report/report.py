@@ -78,8 +78,9 @@ def flow_caption(*, shares: bool, seeds: bool) -> str:
     """
     return _sentences(
         "Throughput: rate at which vehicles pass the end of the road, between the first and the "
-        "last counted one. Over this short time arrivals can be denser than on average, and a jam "
-        "can hold up the first vehicle, so that the throughput exceeds the demand.",
+        "last counted one, as a share of the demand (dashed: 100 %). Over this short time "
+        "arrivals can be denser than on average, and a jam can hold up the first vehicle, so that "
+        "the throughput exceeds the demand.",
         "Left in the preferred lane: share of the counted vehicles." if shares else "",
         "Methods at the same volume are displaced sideways.",
         "Small dots: runs; markers and bars: means and standard deviations over the seeds."
