@@ -121,7 +121,8 @@ _FIGURES: Final = (
             "evaluation-speeds.png",
             "Heat maps of mean speed over time and position",
             "Mean speed over space and time, seed 1. White: v_F; red: slower; blue: faster; grey: "
-            "no vehicle. Dashed: start of lane sorting.",
+            "no vehicle; on each side a square root of the difference. Dashed: start of lane "
+            "sorting.",
         ),
         ("formations", "paper-6", "rule", "rule-net"),
         PAPER_VOLUMES[1:],
