@@ -236,6 +236,7 @@ def _explain_missing(
     elif missing:
         text = f"{why}:\n" + "\n".join(missing)
         place: dict[str, Any] = {"xycoords": "axes fraction", "ha": "right", "va": "top"}
+        place["bbox"] = {"fc": "white", "ec": "none", "pad": 1.0}  # keeps it legible on lines
         axes.annotate(text, (0.97, 0.97), **place, **SMALL_TEXT)
 
 

@@ -189,6 +189,8 @@ def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
             axes.set_xlabel("traffic volume (veh/(lane·h))")
             axes.set_xlim(*span)
             axes.set_xticks(volumes if len(volumes) <= 8 else volumes[:: 1 + len(volumes) // 8])
+        # Differences of a few vehicles must not look large.
+        left.set_ylim(min(left.get_ylim()[0], 95.0), max(left.get_ylim()[1], 105.0))
         for axes in shown[1:]:
             axes.set_ylabel("left in the preferred lane (%)")
             low = min(axes.get_ylim()[0], 99.0)
