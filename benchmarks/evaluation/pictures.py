@@ -98,7 +98,8 @@ _FIGURES: Final = (
         Picture(
             "evaluation-all.png",
             "Box plots of travel times at all volumes",
-            "Travel times up to 2400 veh/(lane h), of the methods that do not congest.",
+            "Travel times of four methods, each up to its highest volume. Volumes have places of "
+            "equal width.",
         ),
         ("formations", "paper-12", "rolling", "lc2013"),
         VOLUMES,
@@ -109,8 +110,8 @@ _FIGURES: Final = (
             "evaluation-flows.png",
             "Throughput and share in the preferred lane against the demand",
             "Throughput between the first and the last counted vehicle, as a share of the demand, "
-            "and share in the preferred lane. Small dots: runs; markers and bars: means and "
-            "standard deviations over the seeds.",
+            "and share in the preferred lane. Methods are side by side at each volume. Small "
+            "dots: runs; markers and bars: means and standard deviations over the seeds.",
         ),
         LABELS,
         VOLUMES,
@@ -120,9 +121,9 @@ _FIGURES: Final = (
         Picture(
             "evaluation-speeds.png",
             "Heat maps of mean speed over time and position",
-            "Mean speed over space and time, seed 1. White: v_F; red: slower; blue: faster; grey: "
-            "no vehicle; on each side a square root of the difference. Dashed: start of lane "
-            "sorting.",
+            "Mean speed in bins of 20 m and 5 s, seed 1. White: v_F; red: slower; blue: faster; "
+            "grey: no vehicle; on each side a square root of the difference. Dashed: start of "
+            "lane sorting.",
         ),
         ("formations", "paper-6", "rule", "rule-net"),
         PAPER_VOLUMES[1:],

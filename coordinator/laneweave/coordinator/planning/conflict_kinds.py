@@ -156,7 +156,10 @@ class ConflictModel:
         return not {"node", "geometric"} & set(self.kinds)
 
     def kind(self, a: Move, b: Move) -> str | None:
-        """Return the first kind of conflict between two moves made in the same step, or None."""
+        """Return the first kind of conflict between two moves made in the same step, or None.
+
+        The order of the moves does not matter.
+        """
         for kind in self.kinds:
             if kind == "geometric" and self.table is not None:
                 pair = _difference(a[0], b[0]), _difference(*a), _difference(*b)

@@ -172,7 +172,9 @@ def run(
         reject_unused_options(f"with --method {method}: {RECORDED_ONLY}", **live)
     from laneweave.launch.library.runs import perform_run
 
-    hint = None if tables else _watch_command(scenario)
+    shown = watch or watch_listen is not None
+    # Whoever has a page of the run needs no second one.
+    hint = None if tables or shown else _watch_command(scenario)
 
     def announce(endpoint: str) -> None:
         more = "" if hint is None else f" ({hint} --endpoint {endpoint})"
@@ -181,7 +183,6 @@ def run(
     def warn(line: str) -> None:
         typer.echo(line, err=True)
 
-    shown = watch or watch_listen is not None
     if shown and pace is None:
         pace = min(1.0, settings.runtime.max_pace)
     with _live_page(watch_listen, shown=shown) as page:

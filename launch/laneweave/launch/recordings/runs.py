@@ -11,7 +11,7 @@ from typing import Any
 import pyarrow.parquet as pq
 from attrs import evolve, frozen
 
-from laneweave.launch.run_methods import rank
+from laneweave.launch.run_methods import FORMATION, rank
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
@@ -52,6 +52,13 @@ class Run:
     def volume_veh_per_lane_h(self) -> float:
         """Demand per lane."""
         return self.scenario.demand.volume_veh_per_lane_h
+
+    @property
+    def title(self) -> str:
+        """Label, operation if it is the rolling one, volume and seed."""
+        rolling = self.method == FORMATION == self.label and self.scenario.formation.rolling
+        label = f"{self.label} (rolling operation)" if rolling else self.label
+        return f"{label}, {self.volume_veh_per_lane_h:g} veh/(lane·h), seed {self.scenario.seed}"
 
     @property
     def has_trajectories(self) -> bool:

@@ -193,7 +193,7 @@ def _draw(
                 axes.set_xlim(0.0, min(1.05 * quantity.edges[-1], SHOWN_SHARE * value))
             axes.set_xlabel(f"{quantity.name} ({quantity.unit})")
             if volume == volumes[0]:
-                share = "time with more" if quantity.exceedance else "vehicles with less"
+                share = "time with more" if quantity.exceedance else "samples with less"
                 axes.set_ylabel(f"share of {share}")
             if quantity is quantities[0] and not single:
                 axes.set_title(volume_title(volume))

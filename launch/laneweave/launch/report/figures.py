@@ -98,10 +98,7 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
                     }
                     lower.text(place, 0.03, "no vehicle", **style, **SMALL_TEXT)
         for axes in panels.flat:
-            for number in range(1, len(volumes)):
-                axes.axvline(number - 0.5, **SEPARATOR)
-        lower.set_xticks(range(len(volumes)), labels=[f"{volume:g}" for volume in volumes])
-        lower.set_xlim(-0.6, len(volumes) - 0.4)
+            label_volumes(axes, volumes)
         lower.set_xlabel("traffic volume (veh/(lane·h))")
         lower.set_ylabel("travel time (s)")
         legend_above(figure)
@@ -175,20 +172,18 @@ def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
 
     The latter is left out if vehicles have no preferred lanes, or all left in theirs.
     """
-    volumes = np.array(comparison.volumes)
-    range_veh_per_lane_h = float(np.ptp(volumes)) or 400.0
-    span = volumes[[0, -1]] + np.array([-0.06, 0.06]) * range_veh_per_lane_h
+    volumes = comparison.volumes
     panels = 2 if shares_differ(comparison) else 1
-    with picture(4.6 * panels, 3.7, out, dpi) as figure:
+    width_in = max(4.6, 1.4 + 0.07 * len(volumes) * (len(comparison.labels) + 1))
+    with picture(width_in * panels, 3.7, out, dpi) as figure:
         shown = figure.subplots(1, panels, squeeze=False)[0]
         left = shown[0]
-        left.axhline(100.0, zorder=0, **REFERENCE)
+        left.axhline(100.0, zorder=1, **(REFERENCE | {"color": INK}))
         left.set_ylabel("throughput (% of the demand)")
         for axes, value in zip(shown, (_throughput_percent, _preferred_percent), strict=False):
-            _draw_seeds(axes, comparison, value, 0.012 * range_veh_per_lane_h)
+            _draw_seeds(axes, comparison, value)
             axes.set_xlabel("traffic volume (veh/(lane·h))")
-            axes.set_xlim(*span)
-            axes.set_xticks(volumes if len(volumes) <= 8 else volumes[:: 1 + len(volumes) // 8])
+            label_volumes(axes, volumes)
         # Differences of a few vehicles must not look large.
         left.set_ylim(min(left.get_ylim()[0], 95.0), max(left.get_ylim()[1], 105.0))
         for axes in shown[1:]:
@@ -214,27 +209,33 @@ def _preferred_percent(run: Run) -> float | None:
     return run.preferred_percent
 
 
-def _draw_seeds(
-    axes: Axes, comparison: Comparison, value: Callable[[Run], float | None], apart: float
-) -> None:
+def label_volumes(axes: Axes, volumes: Sequence[float]) -> None:
+    """Give each volume a place of equal width on the horizontal axis, and name it."""
+    for number in range(1, len(volumes)):
+        axes.axvline(number - 0.5, **SEPARATOR)
+    axes.set_xticks(range(len(volumes)), labels=[f"{volume:g}" for volume in volumes])
+    axes.set_xlim(-0.6, len(volumes) - 0.4)
+
+
+def _draw_seeds(axes: Axes, comparison: Comparison, value: Callable[[Run], float | None]) -> None:
     """Draw each run as a dot, and means over seeds with standard deviations as a line.
 
-    The dots of labels are shifted sideways, because labels may have the same values.
+    Labels are side by side at each volume, because they may have the same values.
     """
     colours, labels, nothing = label_colours(comparison.labels), comparison.labels, True
     markers, widths = label_markers(labels), label_widths(labels)
-    for number, label in enumerate(labels):
-        shift = (number - 0.5 * (len(labels) - 1)) * apart
+    all_places = _places(len(labels), len(comparison.volumes))
+    for label, places in zip(labels, all_places, strict=True):
         means, spreads = [], []
-        for volume in comparison.volumes:
+        for volume, place in zip(comparison.volumes, places, strict=True):
             values = map(value, comparison.at(label, volume))
             found = [one for one in values if one is not None]
             nothing &= not found
             means.append(float(np.mean(found)) if found else np.nan)
             spreads.append(float(np.std(found, ddof=1)) if len(found) > 1 else 0.0)
-            place = [volume + shift] * len(found)
-            axes.plot(place, found, ".", color=colours[label], markersize=4, alpha=0.45)
-        places = np.array(comparison.volumes) + shift
+            axes.plot(
+                [place] * len(found), found, ".", color=colours[label], markersize=4, alpha=0.45
+            )
         style: dict[str, Any] = {"markersize": 5, "linewidth": widths[label], "capsize": 3}
         style["elinewidth"] = 1.5
         style["marker"] = markers[label]
@@ -290,7 +291,9 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
         axes.set_ylim(0.0, max(one.edges_m[-1] for one in maps.values()))
         figure.supxlabel("time (s)", fontsize=9)
         figure.supylabel("position on the road (m)", fontsize=9)
-        style: dict[str, Any] = {"aspect": 22 * len(labels), "fraction": 0.03, "extend": "both"}
+        style: dict[str, Any] = {"aspect": 22 * len(labels), "fraction": 0.03}
+        # No speed is below 0.
+        style["extend"] = "both" if (norm.vmin or 0.0) > 0.0 else "max"
         bar = figure.colorbar(mesh, ax=panels, pad=0.012, extendfrac=0.04, **style)
         bar.set_ticks(ticks, labels=[f"{one:.4g}" for one in ticks])
         bar.minorticks_off()

@@ -34,7 +34,9 @@ COUNTED = (
     "arrival, and have left."
 )
 TOO_SHORT = f"No vehicle was counted, because the runs are too short. {COUNTED}"
-SPEED_CLOSED_CAPTION = "Hatched, between dotted lines: positions at which a lane is closed."
+SPEED_CLOSED_CAPTION = (
+    "Hatched at the left edge, between dotted lines: positions at which a lane is closed."
+)
 STEADY_CAPTION = (
     f"Samples from {WARM_UP_S:g} s to the end of the demand, or of the whole run if that time is "
     "too short."
@@ -60,7 +62,7 @@ def travel_caption(*, several: bool) -> str:
         f"the entrance. {COUNTED}",
         "Boxes: quartiles and median; whiskers: at most 1.5 interquartile ranges; "
         "small dots: vehicles beyond the whiskers.",
-        "Large markers and lines: means. Boxes of the same volume are side by side. The axis is "
+        "Large markers and lines: means. Methods are side by side at each volume. The axis is "
         "broken if only some methods jam."
         if several
         else "Large marker: mean.",
@@ -82,7 +84,7 @@ def flow_caption(*, shares: bool, seeds: bool) -> str:
         "arrivals can be denser than on average, and a jam can hold up the first vehicle, so that "
         "the throughput exceeds the demand.",
         "Left in the preferred lane: share of the counted vehicles." if shares else "",
-        "Methods at the same volume are displaced sideways.",
+        "Methods are side by side at each volume.",
         "Small dots: runs; markers and bars: means and standard deviations over the seeds."
         if seeds
         else "",
@@ -155,7 +157,7 @@ def report_run(
     """
     road, title = run.scenario.road, f"laneweave run: {run.folder.resolve().name}"
     lead = _sentences(
-        f"{_title(run)}.",
+        f"{run.title}.",
         f"{road.lanes} lanes, {road.length_m:g} m; {sorting_start(run.scenario)} at "
         f"{run.scenario.moves_from_m:g} m.",
         describe_closed_parts(run.scenario),
@@ -211,7 +213,7 @@ def _sections(comparison: Comparison, report: _Report, formation: int | None) ->
     example = next((one for one in shown if not several or _has_formations(one[0])), None)
     driven = driven_map(*example, formation) if example else None
     if shown:
-        animations = [Animation(animation_data(run, tracks, _title(run))) for run, tracks in shown]
+        animations = [Animation(animation_data(run, tracks, run.title)) for run, tracks in shown]
         report.sections.append(Section("The moving road", animations=animations))
     report.sections.append(Section("Results", tables=tables_of(comparison)))
     summaries = [run.summary for run in comparison.runs if run.summary is not None]
@@ -231,7 +233,7 @@ def _sections(comparison: Comparison, report: _Report, formation: int | None) ->
         pictures = [one for run, tracks in shown for one in _snapshots(report, run, tracks)]
         report.sections.append(Section("Snapshots", pictures=pictures))
         if example and driven:
-            _add_path_map(report, driven, _title(example[0]))
+            _add_path_map(report, driven, example[0].title)
         _add_distributions(report, comparison, busiest[0])
     return report.sections
 
@@ -264,7 +266,7 @@ def _snapshots(report: _Report, run: Run, tracks: Tracks) -> list[Picture]:
     stretch_m = PAPER_STRETCH_M if fits and not run.scenario.road.closures else None
     preferences = has_preferences(run.scenario)
     caption = _sentences(
-        f"{_title(run)}. The four times, {run.scenario.cycles_s[0]:g} s apart, at which the most "
+        f"{run.title}. The four times, {run.scenario.cycles_s[0]:g} s apart, at which the most "
         "vehicles "
         + (
             "change lanes."
@@ -276,7 +278,8 @@ def _snapshots(report: _Report, run: Run, tracks: Tracks) -> list[Picture]:
         else "Colours and numbers on vehicles show the preferred lanes (0: rightmost);"
         if preferences
         else "Colours show the lane in which a vehicle arrived (0: rightmost);",
-        "faster vehicles are lighter; a pale stripe is at the front.",
+        "faster vehicles are lighter"
+        + ("." if preferences else "; a pale stripe is at the front."),
         "Hatched: closed; thick line: stop line before it." if run.scenario.road.closures else "",
     )
     coloured = f" coloured by {'preferred lane' if preferences else 'lane of arrival'}"
@@ -332,7 +335,3 @@ def _has_formations(run: Run) -> bool:
 def _sentences(*parts: str) -> str:
     """Join the sentences that are not empty."""
     return " ".join(part for part in parts if part)
-
-
-def _title(run: Run) -> str:
-    return f"{run.label}, {run.volume_veh_per_lane_h:g} veh/(lane·h), seed {run.scenario.seed}"

@@ -346,7 +346,7 @@ def _draw_legend(figure: Figure, scenario: Scenario, *, starts: bool, shaded: bo
         style: dict[str, Any] = {"marker": "|", "markersize": 9, "markeredgewidth": 1.6}
         handles.append(Line2D([], [], color=INK, linewidth=0.0, label="stop line", **style))
     if shaded:
-        handles.append(Patch(fc=_OWNED[1], label="columns of a formation"))
+        handles.append(Patch(fc=_OWNED[1], label="columns of a formation, in two shades"))
     if starts:
         line: dict[str, Any] = {"marker": "$\u22ee$", "markersize": 9, "markeredgewidth": 0.0}
         handles.append(

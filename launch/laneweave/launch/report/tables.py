@@ -95,12 +95,14 @@ def tables_of(comparison: Comparison) -> list[Table]:
         _table(
             rows,
             _SAFETY,
-            "Extremes or sums over the seeds; real-time factor above 1: faster than real time.",
+            "Extremes or sums over the seeds. Emergency brakes: how often vehicles braked with "
+            "more than 90 % of their limit; real-time factor above 1: faster than real time.",
         ),
         _table(
             planned,
             (*by_solver, *_PLANNING),
-            "Planning: sums over the seeds; numbers of vehicles and times of one plan are maxima.",
+            "Planning: sums over the seeds; numbers of vehicles and planning times of one plan are "
+            "maxima. Fallbacks: plans by another planner than the chosen one.",
         ),
         failed_table(comparison),
     ]

@@ -273,7 +273,13 @@ const laneweaveRoad = (() => {
         pen.font = `${followed ? "600 " : ""}10px system-ui, sans-serif`;
         pen.textAlign = "center";
         pen.textBaseline = "bottom";
-        const up = this.y(centreY + 0.5 * width) - (followed ? 2 + RING_PX : 2);
+        const above = this.y(centreY + 0.5 * width) - 2;
+        const up = followed ? -2 : above; // above the road, where it covers no vehicle
+        if (followed) {
+          pen.strokeStyle = theme.ink;
+          pen.lineWidth = 1;
+          line(pen, this.x(centreS), above - RING_PX, this.x(centreS), 0);
+        }
         pen.strokeStyle = theme.asphalt; // keeps the name legible on lines
         pen.lineWidth = 3;
         pen.strokeText(body.name, this.x(centreS), up);

@@ -171,14 +171,17 @@ class Lanes:
 
 
 class Rules:
-    """Lane changes and speeds by rules 1 to 3."""
+    """Lane changes and speeds by rules 1 to 3.
+
+    Attributes:
+        following: car following.
+        wanted: the lanes that vehicles want.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         """Read the parameters from the tables `rule`, `road`, `formation` and `vehicle`."""
         self.following = Following(scenario)
-        """Car following."""
         self.wanted = WantedLanes(scenario)
-        """The lanes that vehicles want."""
         rule, road = scenario.rule, scenario.road
         self._sorting_start_m = road.sorting_start_m
         self._sorting_m = road.s3_m
