@@ -44,6 +44,8 @@ GROUP_WIDTH = 0.8
 """Total width of the boxes at a volume; the distance between volumes is 1."""
 CLOSED_WIDTH = 0.025
 """Width of the marks of closed parts, as a share of the width of the axes."""
+WIDE_IN = 6.0
+"""Width from which panels of a figure are below each other."""
 BIN_M, BIN_S = 20.0, 5.0
 """Bin sizes for mean speeds."""
 LIMIT_PERCENT, MIN_LIMIT_MPS = 98.0, 0.5
@@ -175,8 +177,10 @@ def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
     volumes = comparison.volumes
     panels = 2 if shares_differ(comparison) else 1
     width_in = max(4.6, 1.4 + 0.07 * len(volumes) * (len(comparison.labels) + 1))
-    with picture(width_in * panels, 3.7, out, dpi) as figure:
-        shown = figure.subplots(1, panels, squeeze=False)[0]
+    # Wide panels are below each other.
+    rows = panels if width_in > WIDE_IN else 1
+    with picture(width_in * panels / rows, 0.7 + 3.0 * rows, out, dpi) as figure:
+        shown = list(figure.subplots(rows, panels // rows, squeeze=False).flat)
         left = shown[0]
         left.axhline(100.0, zorder=1, **(REFERENCE | {"color": INK}))
         left.set_ylabel("throughput (% of the demand)")
