@@ -171,6 +171,7 @@ const laneweaveRoad = (() => {
       pen.rect(0, -ABOVE_PX, this.width, this.roadPx + ABOVE_PX);
       pen.clip();
       for (const layer of layers) layer(this);
+      this.leader(bodies.find(({ name }) => name === this.followed));
       for (const body of bodies) {
         if (!this.shows(body.s - sizeOf(this.scene, body)[0], body.s)) continue;
         this.body(body);
@@ -273,18 +274,22 @@ const laneweaveRoad = (() => {
         pen.font = `${followed ? "600 " : ""}10px system-ui, sans-serif`;
         pen.textAlign = "center";
         pen.textBaseline = "bottom";
-        const above = this.y(centreY + 0.5 * width) - 2;
-        const up = followed ? -2 : above; // above the road, where it covers no vehicle
-        if (followed) {
-          pen.strokeStyle = theme.ink;
-          pen.lineWidth = 1;
-          line(pen, this.x(centreS), above - RING_PX, this.x(centreS), 0);
-        }
+        // Above the road, the name of the one that is followed covers no other vehicle.
+        const up = followed ? -2 : this.y(centreY + 0.5 * width) - 2;
         pen.strokeStyle = theme.asphalt; // keeps the name legible on lines
         pen.lineWidth = 3;
         pen.strokeText(body.name, this.x(centreS), up);
         pen.fillText(body.name, this.x(centreS), up);
       }
+    }
+
+    /** Draw a line from the body that is followed to its name above the road, under other bodies. */
+    leader(body) {
+      if (!body) return;
+      const x = this.x(body.s - 0.5 * sizeOf(this.scene, body)[0]);
+      this.pen.strokeStyle = this.theme.ink;
+      this.pen.lineWidth = 1;
+      line(this.pen, x, 0, x, this.y(body.y));
     }
 
     /** Draw a dark ring with a light edge around the body that is followed. */
