@@ -65,7 +65,7 @@ def test_a_run_leaves_all_its_files(finished_run: FinishedRun, name: str) -> Non
         assert {"t_s", "kind", "role"} <= event.keys()
         assert event.keys() <= {*COMMON_FIELDS, *FIELDS[event["kind"]]}
     assert len(plans(folder)) == found["planning"]["plans"]
-    for picture in ("travel_time", "speed", "road"):
+    for picture in ("speed", "road"):
         assert (folder / f"{picture}.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
