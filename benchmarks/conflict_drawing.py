@@ -61,7 +61,7 @@ class Severity(Enum):
 _MEANING: Final = {
     Severity.ON_TIME: "even if both are on time",
     Severity.LATE: f"if one is {LATENESS_S:g} s late",
-    Severity.LATER: "only if one is more than 0.5 s late",
+    Severity.LATER: f"only if one is more than {LATENESS_S:g} s late",
     Severity.FOOTPRINT: "never, though footprints meet",
     Severity.NEVER: "never",
 }

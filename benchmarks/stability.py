@@ -107,9 +107,9 @@ def draw(runs: Mapping[Case, Sequence[Response]], table: Sequence[dict[str, Any]
                 style["label"] = names[number]
             axes.plot(response.times_s, response.speed_mps[:, number], **style)
         axes.axvspan(0.0, BRAKING_S, color="#f3e3d6", zorder=0, label="while it brakes")
-        kind = "column" if shown.formation == "column" else "switching"
         axes.set_title(
-            f"{kind}: one brakes by {shown.drop_mps:g} m/s, {100 * shown.loss:g} % message loss"
+            f"{shown.formation}: one brakes by {shown.drop_mps:g} m/s, "
+            f"{100 * shown.loss:g} % message loss"
         )
         if shown is SHOWN[0]:
             axes.legend(fontsize=8, frameon=False, loc="upper right")
@@ -119,7 +119,7 @@ def draw(runs: Mapping[Case, Sequence[Response]], table: Sequence[dict[str, Any]
     colours = dict(zip(DROPS_MPS["column"], COLOURS, strict=True))
     for entry in table:
         if entry["formation"] == "column":
-            # Points are beside each other, so that none hides another.
+            # The points of a vehicle are displaced, so that none hides another.
             place = list(DROPS_MPS["column"]).index(entry["drop_mps"]) - 2
             last.plot(
                 np.arange(len(entry["speed_mps"])) + 0.12 * place * bool(entry["loss"]),

@@ -173,7 +173,7 @@ def run(
     from laneweave.launch.library.runs import perform_run
 
     shown = watch or watch_listen is not None
-    # Whoever has a page of the run needs no second one.
+    # A run with a live page needs no second one.
     hint = None if tables or shown else _watch_command(scenario)
 
     def announce(endpoint: str) -> None:

@@ -72,7 +72,7 @@ def text_colour(colour: str) -> str:
 
 
 def has_preferences(scenario: Scenario) -> bool:
-    """Return whether vehicles have preferred lanes or exits; colours then show these."""
+    """Return whether vehicles have preferred lanes or exits, which colours then show."""
     return bool(scenario.lane_shares or scenario.exit)
 
 

@@ -31,7 +31,7 @@ MAX_SAMPLES: Final = 600_000
 """Maximum number of samples (4 MB of text); longer runs are sampled more coarsely or truncated."""
 
 
-def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
+def animation_data(run: Run, tracks: Tracks) -> dict[str, Any]:
     """Return the data for the player as a JSON object."""
     scenario, road = run.scenario, run.scenario.road
     formations = closed_formations(run.folder, scenario)
@@ -43,7 +43,7 @@ def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
     }
     return {
         "format": FORMAT,
-        "title": title,
+        "title": run.title,
         "step_s": samples.step_s,
         "end_s": round(samples.end_s, 3),
         # When the first vehicle reaches the end of the road.

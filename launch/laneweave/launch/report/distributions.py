@@ -151,7 +151,7 @@ Counted = Mapping[tuple[str, float], Counts]
 MIN_SHARE = 1e-5
 """Lower limit of the exceedance scale."""
 SHOWN_SHARE = 1.3
-"""End of the axis of a quantity with a limit, as a multiple of the limit."""
+"""Upper limit of the axis, as a multiple of the limit of the quantity."""
 
 
 def draw_spacings(counted: Counted, scenario: Scenario, out: Path, dpi: int) -> None:
@@ -217,7 +217,7 @@ def _draw_one(axes: Axes, counts: Counts, quantity: Quantity, style: dict[str, A
 
 
 def _has_values(counts: Counts, quantity: Quantity) -> bool:
-    """Return whether there is a curve; for an exceedance not if all values are in the first bin."""
+    """Return whether a curve can be drawn; an exceedance needs values above the first bin."""
     first = 1 if quantity.exceedance else 0
     return bool(counts.of[quantity.name][first:].any())
 
@@ -225,7 +225,7 @@ def _has_values(counts: Counts, quantity: Quantity) -> bool:
 def _explain_missing(
     axes: Axes, counted: Counted, quantity: Quantity, volume: float, labels: Sequence[str]
 ) -> None:
-    """Write into a panel which labels have no curve, and why."""
+    """Write the labels without a curve into a panel, with the reason."""
     recorded = [label for label in labels if (label, volume) in counted]
     missing = [one for one in recorded if not _has_values(counted[one, volume], quantity)]
     why = "no values above 0" if quantity.exceedance else "no vehicle follows another"

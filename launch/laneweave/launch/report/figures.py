@@ -45,7 +45,7 @@ GROUP_WIDTH = 0.8
 CLOSED_WIDTH = 0.025
 """Width of the marks of closed parts, as a share of the width of the axes."""
 WIDE_IN = 6.0
-"""Width from which panels of a figure are below each other."""
+"""Width above which panels are drawn below each other, not side by side [in]."""
 BIN_M, BIN_S = 20.0, 5.0
 """Bin sizes for mean speeds."""
 LIMIT_PERCENT, MIN_LIMIT_MPS = 98.0, 0.5
@@ -100,7 +100,7 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
                     }
                     lower.text(place, 0.03, "no vehicle", **style, **SMALL_TEXT)
         for axes in panels.flat:
-            label_volumes(axes, volumes)
+            _label_volumes(axes, volumes)
         lower.set_xlabel("traffic volume (veh/(lane·h))")
         lower.set_ylabel("travel time (s)")
         legend_above(figure)
@@ -177,19 +177,18 @@ def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
     volumes = comparison.volumes
     panels = 2 if shares_differ(comparison) else 1
     width_in = max(4.6, 1.4 + 0.07 * len(volumes) * (len(comparison.labels) + 1))
-    # Wide panels are below each other.
     rows = panels if width_in > WIDE_IN else 1
     with picture(width_in * panels / rows, 0.7 + 3.0 * rows, out, dpi) as figure:
         shown = list(figure.subplots(rows, panels // rows, squeeze=False).flat)
-        left = shown[0]
-        left.axhline(100.0, zorder=1, **(REFERENCE | {"color": INK}))
-        left.set_ylabel("throughput (% of the demand)")
+        flow = shown[0]
+        flow.axhline(100.0, zorder=1, **(REFERENCE | {"color": INK}))
+        flow.set_ylabel("throughput (% of the demand)")
         for axes, value in zip(shown, (_throughput_percent, _preferred_percent), strict=False):
             _draw_seeds(axes, comparison, value)
             axes.set_xlabel("traffic volume (veh/(lane·h))")
-            label_volumes(axes, volumes)
+            _label_volumes(axes, volumes)
         # Differences of a few vehicles must not look large.
-        left.set_ylim(min(left.get_ylim()[0], 95.0), max(left.get_ylim()[1], 105.0))
+        flow.set_ylim(min(flow.get_ylim()[0], 95.0), max(flow.get_ylim()[1], 105.0))
         for axes in shown[1:]:
             axes.set_ylabel("left in the preferred lane (%)")
             low = min(axes.get_ylim()[0], 99.0)
@@ -213,7 +212,7 @@ def _preferred_percent(run: Run) -> float | None:
     return run.preferred_percent
 
 
-def label_volumes(axes: Axes, volumes: Sequence[float]) -> None:
+def _label_volumes(axes: Axes, volumes: Sequence[float]) -> None:
     """Give each volume a place of equal width on the horizontal axis, and name it."""
     for number in range(1, len(volumes)):
         axes.axvline(number - 0.5, **SEPARATOR)
@@ -296,7 +295,7 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
         figure.supxlabel("time (s)", fontsize=9)
         figure.supylabel("position on the road (m)", fontsize=9)
         style: dict[str, Any] = {"aspect": 22 * len(labels), "fraction": 0.03}
-        # No speed is below 0.
+        # A scale that begins at 0 has no values below it.
         style["extend"] = "both" if (norm.vmin or 0.0) > 0.0 else "max"
         bar = figure.colorbar(mesh, ax=panels, pad=0.012, extendfrac=0.04, **style)
         bar.set_ticks(ticks, labels=[f"{one:.4g}" for one in ticks])

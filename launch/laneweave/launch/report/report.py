@@ -213,7 +213,7 @@ def _sections(comparison: Comparison, report: _Report, formation: int | None) ->
     example = next((one for one in shown if not several or _has_formations(one[0])), None)
     driven = driven_map(*example, formation) if example else None
     if shown:
-        animations = [Animation(animation_data(run, tracks, run.title)) for run, tracks in shown]
+        animations = [Animation(animation_data(run, tracks)) for run, tracks in shown]
         report.sections.append(Section("The moving road", animations=animations))
     report.sections.append(Section("Results", tables=tables_of(comparison)))
     summaries = [run.summary for run in comparison.runs if run.summary is not None]
@@ -265,21 +265,24 @@ def _snapshots(report: _Report, run: Run, tracks: Tracks) -> list[Picture]:
     fits = not report.names and run.scenario.road.length_m >= PAPER_STRETCH_M[1]
     stretch_m = PAPER_STRETCH_M if fits and not run.scenario.road.closures else None
     preferences = has_preferences(run.scenario)
+    times = (
+        "at which the most vehicles change lanes."
+        if changes_gradually(tracks, run.scenario)
+        else "at which the most vehicles are on this stretch; "
+        "lane changes of this method are instantaneous."
+    )
+    if preferences:
+        exits = " and exits" * bool(run.scenario.exit)
+        colours = f"Colours and numbers on vehicles show the preferred lanes (0: rightmost){exits}"
+        colours += "; faster vehicles are lighter."
+    else:
+        colours = (
+            "Colours show the lane in which a vehicle arrived (0: rightmost); faster vehicles "
+        )
+        colours += "are lighter; a pale stripe is at the front."
     caption = _sentences(
-        f"{run.title}. The four times, {run.scenario.cycles_s[0]:g} s apart, at which the most "
-        "vehicles "
-        + (
-            "change lanes."
-            if changes_gradually(tracks, run.scenario)
-            else "are on this stretch; lane changes of this method are instantaneous."
-        ),
-        "Colours and numbers on vehicles show the preferred lanes (0: rightmost) and exits;"
-        if run.scenario.exit
-        else "Colours and numbers on vehicles show the preferred lanes (0: rightmost);"
-        if preferences
-        else "Colours show the lane in which a vehicle arrived (0: rightmost);",
-        "faster vehicles are lighter"
-        + ("." if preferences else "; a pale stripe is at the front."),
+        f"{run.title}. The four times, {run.scenario.cycles_s[0]:g} s apart, {times}",
+        colours,
         "Hatched: closed; thick line: stop line before it." if run.scenario.road.closures else "",
     )
     coloured = f" coloured by {'preferred lane' if preferences else 'lane of arrival'}"

@@ -59,8 +59,8 @@ _MAX_HEADING = 0.35
 """Maximum angle between a vehicle and the road in the picture [rad]."""
 _BETWEEN = 0.25
 """Distance from the lane centre, in lane widths, from which a vehicle is between two lanes."""
-_HEADROOM_M = 4.5
-"""Space above the road for formation numbers."""
+_ABOVE_M, _BELOW_M, _MARGIN_M = 4.0, 4.5, 0.5
+"""Space above the road for numbers of formations; below it with, and without, names of exits."""
 _MAX_STRETCH_M, _MAX_CLOSED_M, _BEYOND_M = 740.0, 120.0, 50.0
 """On roads with closed parts: maximum length of the stretch, maximum length of a closed part that
 is shown to its end, and length shown beyond its beginning or end."""
@@ -99,8 +99,8 @@ def road_snapshots(
     trips = read_trips(folder)
     formations = closed_formations(folder, scenario)
     beyond_m = 2.0 * scenario.longest_body_m
-    width_in, road_m = 9.6, road.lanes * road.lane_width_m + _HEADROOM_M
-    road_m += _below_m(scenario) - 0.5
+    width_in = 9.6
+    road_m = _below_m(scenario) + road.lanes * road.lane_width_m + _ABOVE_M
     length_m = stretch_m[1] - stretch_m[0]
     across = _ACROSS_SCALE if length_m <= _LONG_M else _LONG_ACROSS_SCALE
     strip_in = across * (width_in - 0.9) * road_m / length_m
@@ -125,7 +125,7 @@ def road_snapshots(
 
 
 def changes_gradually(tracks: Tracks, scenario: Scenario) -> bool:
-    """Return whether vehicles move across the road; SUMO's ones jump from lane to lane."""
+    """Return whether lane changes take time; SUMO's own lane changes are instantaneous."""
     return bool(np.any(_off_centre(tracks, scenario) > _BETWEEN))
 
 
@@ -180,8 +180,9 @@ def _pose(tracks: Tracks, number: int, t_s: float) -> tuple[float, float, float,
 
 
 def _below_m(scenario: Scenario) -> float:
-    """Return the space below the road, for the names of exits to the right."""
-    return 4.5 if any(min(one.lanes) < scenario.road.lanes / 2 for one in scenario.exit) else 0.5
+    """Return the space below the road [m], which contains the names of exits on the right."""
+    right = any(min(one.lanes) < scenario.road.lanes / 2 for one in scenario.exit)
+    return _BELOW_M if right else _MARGIN_M
 
 
 def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -> None:
@@ -189,7 +190,7 @@ def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -
     road = scenario.road
     width_m = road.lanes * road.lane_width_m
     axes.set_xlim(*stretch_m)
-    axes.set_ylim(-_below_m(scenario), width_m + _HEADROOM_M - 0.5)
+    axes.set_ylim(-_below_m(scenario), width_m + _ABOVE_M)
     axes.fill_between(stretch_m, 0.0, width_m, color=_ASPHALT, linewidth=0.0, zorder=0)
     for border in range(road.lanes + 1):
         edge = border in (0, road.lanes)
@@ -313,7 +314,7 @@ def _draw_vehicle(
         return
     first_m, last_m = axes.get_xlim()
     if not first_m < s_m - length_m or not s_m < last_m:
-        return  # half a number is worse than none
+        return  # the number would be cut off
     shown = text_colour("#" + "".join(f"{round(255 * part):02x}" for part in colour))
     style: dict[str, Any] = {"ha": "center", "va": "center_baseline", "clip_on": True, "zorder": 5}
     axes.text(

@@ -171,7 +171,7 @@ const laneweaveRoad = (() => {
       pen.rect(0, -ABOVE_PX, this.width, this.roadPx + ABOVE_PX);
       pen.clip();
       for (const layer of layers) layer(this);
-      this.leader(bodies.find(({ name }) => name === this.followed));
+      this.lineToName(bodies.find(({ name }) => name === this.followed));
       for (const body of bodies) {
         if (!this.shows(body.s - sizeOf(this.scene, body)[0], body.s)) continue;
         this.body(body);
@@ -284,7 +284,7 @@ const laneweaveRoad = (() => {
     }
 
     /** Draw a line from the body that is followed to its name above the road, under other bodies. */
-    leader(body) {
+    lineToName(body) {
       if (!body) return;
       const x = this.x(body.s - 0.5 * sizeOf(this.scene, body)[0]);
       this.pen.strokeStyle = this.theme.ink;

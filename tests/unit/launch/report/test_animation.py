@@ -41,7 +41,7 @@ def column(data: dict[str, Any], name: str) -> NDArray[np.float64]:
 
 
 def test_data_decode_to_the_trajectories(run: Run, tracks: Tracks) -> None:
-    data = json.loads(json.dumps(animation_data(run, tracks, "")))
+    data = json.loads(json.dumps(animation_data(run, tracks)))
     assert sorted(vehicle["name"] for vehicle in data["vehicles"]) == sorted(tracks.names)
     decoded = {name: column(data, name) for name in KINDS}
     offset = 0
@@ -67,7 +67,7 @@ def test_long_runs_are_sampled_more_coarsely_and_then_cut(
     samples = len(tracks.t_s) * run.scenario.runtime.tick_s
     for most, step_s in ((samples / 0.5 + 200, 0.5), (samples / 4, 1.0)):
         monkeypatch.setattr(animation, "MAX_SAMPLES", most)
-        data = animation_data(run, tracks, "")
+        data = animation_data(run, tracks)
         assert data["step_s"] == step_s
         assert len(column(data, "s_m")) <= most
     assert data["end_s"] < float(tracks.t_s.max())
@@ -75,7 +75,7 @@ def test_long_runs_are_sampled_more_coarsely_and_then_cut(
 
 
 def test_a_run_without_vehicles(run: Run) -> None:
-    data = animation_data(run, make_tracks(np.empty(0), 0), "")
+    data = animation_data(run, make_tracks(np.empty(0), 0))
     assert (data["vehicles"], data["columns"]["s_m"], data["end_s"]) == ([], "", 0.0)
 
 
@@ -92,7 +92,7 @@ def in_node(expression: str, data: dict[str, Any]) -> Any:  # noqa: ANN401 - any
 
 @needs_node
 def test_the_player_shows_the_recorded_positions(run: Run, tracks: Tracks) -> None:
-    data = animation_data(run, tracks, "")
+    data = animation_data(run, tracks)
     times_s = [0.0, 7.3, 21.05, 33.33, data["end_s"], data["end_s"] + 5.0]
     expression = (
         f"{json.dumps(times_s)}.map((t) => "
@@ -123,7 +123,7 @@ def test_the_player_shows_the_recorded_positions(run: Run, tracks: Tracks) -> No
 @needs_node
 @pytest.mark.parametrize("longer", [False, True], ids=["blocks", "lengths"])
 def test_the_player_follows_formations(run: Run, tracks: Tracks, *, longer: bool) -> None:
-    data = animation_data(run, tracks, "")
+    data = animation_data(run, tracks)
     lattice = run.scenario.lattice
     assert data["formations"][:2] == [[0, -3, 0], [1, -7, -4]]
     if longer:
@@ -136,7 +136,7 @@ def test_the_player_follows_formations(run: Run, tracks: Tracks, *, longer: bool
 
 @needs_node
 def test_the_player_offers_what_is_on_the_road(run: Run, tracks: Tracks) -> None:
-    data = animation_data(run, tracks, "")
+    data = animation_data(run, tracks)
     for t_s in (10.0, 30.0):
         names = in_node(f"laneweave.followable(run, {t_s}).map((one) => one.name)", data)
         present = {
@@ -154,7 +154,7 @@ def test_the_player_offers_what_is_on_the_road(run: Run, tracks: Tracks) -> None
 
 @needs_node
 def test_the_player_shows_the_whole_road_or_a_window_on_it(run: Run, tracks: Tracks) -> None:
-    data = animation_data(run, tracks, "")
+    data = animation_data(run, tracks)
     length_m = run.scenario.road.length_m
     expression = (
         "[laneweave.stretches(run, null, 5, 240),"
@@ -173,7 +173,7 @@ def test_the_player_shows_the_whole_road_or_a_window_on_it(run: Run, tracks: Tra
 
 @needs_node
 def test_the_player_shades_as_the_pictures_do(run: Run, tracks: Tracks) -> None:
-    data = animation_data(run, tracks, "")
+    data = animation_data(run, tracks)
     for over_mps in (-9.0, -2.5, 0.0, 1.0, 7.0):
         shade = data["shade"]
         call = (
@@ -186,7 +186,7 @@ def test_the_player_shades_as_the_pictures_do(run: Run, tracks: Tracks) -> None:
 
 @needs_node
 def test_narrow_pages_show_more_stretches(run: Run, tracks: Tracks) -> None:
-    data = animation_data(run, tracks, "")
+    data = animation_data(run, tracks)
     call = "[1200, 380, 60].map((width) => laneweaveRoad.wholeRoad(1000, width))"
     wide, narrow, tiny = in_node(call, data)
     assert [len(one) for one in (wide, narrow, tiny)] == [4, 8, 16]
@@ -196,7 +196,7 @@ def test_narrow_pages_show_more_stretches(run: Run, tracks: Tracks) -> None:
 
 @needs_node
 def test_text_is_legible_on_all_colours(run: Run, tracks: Tracks) -> None:
-    data = animation_data(run, tracks, "")
+    data = animation_data(run, tracks)
     for colour in (*lane_colours(3), *lane_colours(8)):
         red, green, blue = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
         shown = in_node(f"laneweaveRoad.textColour('rgb({red},{green},{blue})')", data)
