@@ -16,8 +16,8 @@ from laneweave.launch.report.corridor_comparison import compare
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
-from laneweave.sim_bridge.corridors import corridor_arrivals, sumo_config
-from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
+from laneweave.sim_bridge.corridors import corridor_arrivals, sumo_statistics
+from laneweave.sim_bridge.corridors.corridor_setup import WHOLE, read_corridor
 from laneweave.sim_bridge.corridors.sumo_statistics import read_statistics
 from support.interchange import CORRIDOR, TRUCKS, stream, vehicle, write_interchange
 
@@ -26,8 +26,8 @@ Events = list[dict[str, Any]]
 
 def scenario(folder: Path, vehicles: Sequence[str]) -> Scenario:
     config = write_interchange(folder, vehicles, types=TRUCKS)
-    found = read_corridor(config, CORRIDOR, folder)
-    return parse_scenario(corridor_tables(found, config, CORRIDOR))
+    found = read_corridor(config, CORRIDOR)
+    return parse_scenario(corridor_tables(found, config, WHOLE))
 
 
 def standing_vehicle(depart_s: int, at_m: int, stop: str) -> str:
@@ -156,7 +156,7 @@ def test_equal_runs_are_equal(tmp_path: Path) -> None:
 def test_a_queue_behind_the_exit_is_braked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sumo_config, "CONFLICT_S", 5.0)  # so that there are some
+    monkeypatch.setattr(sumo_statistics, "CONFLICT_S", 5.0)  # so that there are some
     standing = standing_vehicle(22, 25, 'duration="60"')
     leaving = [vehicle(f"e{n}", 4.0 * n, "exit") for n in range(6)]
     own = scenario(tmp_path, [standing, *leaving, vehicle("m", 24.0, "main")])

@@ -123,7 +123,7 @@ TRUCKS = '<vType id="truck" vClass="truck" length="7.1" accel="1.3" decel="4" si
 
 def interchange_scenario(folder: Path) -> Scenario:
     """Return the scenario of the corridor with a stream of vehicles of a minute."""
-    found = read_corridor(write_interchange(folder, stream(60), types=TRUCKS), CORRIDOR, folder)
+    found = read_corridor(write_interchange(folder, stream(60), types=TRUCKS), CORRIDOR)
     return parse_scenario(scenario_tables(found.corridor, found.demand))
 
 

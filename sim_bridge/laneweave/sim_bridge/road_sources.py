@@ -14,6 +14,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.corridors.corridor_arrivals import main_stream
 from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor, read_corridor
 from laneweave.sim_bridge.corridors.corridor_world import CorridorWorld
+from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
 from laneweave.sim_bridge.corridors.take_over import TakeOver
 from laneweave.sim_bridge.road.demand import Arrival, arrivals
 from laneweave.sim_bridge.road.outside_traffic import OutsideTraffic
@@ -53,7 +54,7 @@ def open_road(scenario: Scenario, results: Path) -> Iterator[RoadSource]:
                     world.show(scenario.runtime.tick_s)
                 yield RoadSource(world)
             return
-        setup = sumo_corridor(scenario, folder).setup(scenario)
+        setup = sumo_corridor(scenario).setup(scenario)
         with CorridorWorld(scenario, setup, folder, results) as world_of_sumo:
             if scenario.sumo.gui:
                 world_of_sumo.show(scenario.runtime.tick_s)
@@ -66,19 +67,20 @@ def demanded(scenario: Scenario) -> tuple[Arrival, ...]:
     """Return all vehicles that may arrive; those from SUMO with the times of their departures."""
     if not scenario.sumo.config:
         return arrivals(scenario)
-    with temporary_folder("sumo") as folder:
-        setup = sumo_corridor(scenario, folder).setup(scenario)
-    return tuple(one.arrival for one in setup.arrivals)
+    return tuple(one.arrival for one in sumo_corridor(scenario).setup(scenario).arrivals)
 
 
-def sumo_corridor(scenario: Scenario, folder: Path) -> SumoCorridor:
+def sumo_corridor(scenario: Scenario) -> SumoCorridor:
     """Return the corridor of a scenario, whose road must be that of the corridor.
 
     Raises:
         BadInputError: the simulation cannot be read, or has another road.
     """
     sumo = scenario.sumo
-    found = read_corridor(Path(sumo.config), sumo.corridor, folder, scenario.seed)
+    window = TimeWindow(
+        begin_s=sumo.begin_s, duration_s=scenario.demand.duration_s, scale=sumo.scale
+    )
+    found = read_corridor(Path(sumo.config), sumo.corridor, window, scenario.seed)
     corridor, road = found.corridor, scenario.road
     for field, value, expected in (
         ("road.lanes", road.lanes, corridor.lanes),

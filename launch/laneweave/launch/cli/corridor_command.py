@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,15 +12,27 @@ from rich.markup import escape
 from rich.table import Table
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.runtime.temporary_folders import temporary_folder
 
 if TYPE_CHECKING:
     from laneweave.sim_bridge.corridors.corridor import Corridor
     from laneweave.sim_bridge.corridors.corridor_search import Candidate
     from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor
-    from laneweave.sim_bridge.corridors.sumo_demand import CorridorDemand
+    from laneweave.sim_bridge.corridors.sumo_demand import CorridorDemand, TimeWindow
 
+MAX_BEGIN_S = 1e9
+MAX_SCALE = 1e3
 CORRIDOR_HELP = "The corridor's first and last edge."
+Begin = Annotated[
+    float | None,
+    typer.Option("--begin", help="SUMO's time of the first departure [s].", show_default=False),
+]
+End = Annotated[
+    float | None,
+    typer.Option("--end", help="SUMO's time of the last departure [s].", show_default=False),
+]
+Scale = Annotated[
+    float | None, typer.Option("--scale", help="Factor for SUMO's demand.", show_default=False)
+]
 
 
 def corridor(
@@ -31,45 +44,86 @@ def corridor(
     toml: Annotated[
         bool, typer.Option("--toml", help="Print the scenario file of the corridor.")
     ] = False,
+    begin: Begin = None,
+    end: End = None,
+    scale: Scale = None,
 ) -> None:
     """List what can be a corridor in a SUMO simulation, or describe one."""
     if toml and name is None:
         raise BadInputError("--corridor", "none", "FIRST_EDGE:LAST_EDGE with --toml")
     from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 
-    with temporary_folder("sumo") as folder:
-        if name is None:
-            _list(sumocfg, folder)
-            return
-        found = read_corridor(sumocfg, name, folder)
+    window = time_window(begin, end, scale)
+    if name is None:
+        _list(sumocfg, window)
+        return
+    found = read_corridor(sumocfg, name, window)
     if toml:
         import tomli_w
 
-        typer.echo(tomli_w.dumps(corridor_tables(found, sumocfg, name)), nl=False)
+        typer.echo(tomli_w.dumps(corridor_tables(found, sumocfg, window)), nl=False)
         return
-    _describe(found, name)
+    _describe(found)
 
 
-def corridor_tables(found: SumoCorridor, sumocfg: Path, name: str) -> dict[str, Any]:
-    """Return the tables of the scenario of a corridor."""
+def time_window(
+    begin_s: float | None, end_s: float | None, scale: float | None, duration_s: float | None = None
+) -> TimeWindow:
+    """Return the time window that options describe.
+
+    Raises:
+        BadInputError: it is empty, or a number is negative.
+    """
+    from laneweave.sim_bridge.corridors.sumo_demand import MAX_DEMAND_S, TimeWindow
+
+    if begin_s is not None and not 0.0 <= begin_s <= MAX_BEGIN_S:
+        raise BadInputError("--begin", begin_s, f"0 to {MAX_BEGIN_S:g}")
+    if end_s is not None and not end_s > (begin_s or 0.0):
+        raise BadInputError("--end", end_s, f"more than {begin_s or 0.0:g}, the begin")
+    if scale is not None and not 0.0 < scale <= MAX_SCALE:
+        raise BadInputError("--scale", scale, f"more than 0, at most {MAX_SCALE:g}")
+    return TimeWindow(
+        begin_s=begin_s,
+        duration_s=MAX_DEMAND_S if duration_s is None else duration_s,
+        end_s=math.inf if end_s is None else end_s,
+        scale=scale,
+    )
+
+
+def corridor_tables(found: SumoCorridor, sumocfg: Path, window: TimeWindow) -> dict[str, Any]:
+    """Return the tables of the scenario of a corridor.
+
+    Raises:
+        BadInputError: laneweave cannot drive it.
+    """
     from laneweave.sim_bridge.corridors.scenario_tables import checked_tables
 
-    tables = checked_tables(found.corridor, found.demand)
-    return tables | {"sumo": {"config": str(sumocfg.resolve()), "corridor": name}}
+    sumo: dict[str, Any] = {"config": str(sumocfg.resolve()), "corridor": found.corridor.name}
+    if window.begin_s is not None:
+        sumo["begin_s"] = window.begin_s
+    if window.scale is not None:
+        sumo["scale"] = window.scale
+    return checked_tables(found.corridor, found.demand) | {"sumo": sumo}
 
 
-def _list(sumocfg: Path, folder: Path) -> None:
-    from laneweave.sim_bridge.corridors.corridor_search import find_corridors
-    from laneweave.sim_bridge.corridors.sumo_config import read_config
-    from laneweave.sim_bridge.corridors.sumo_demand import read_demand
-    from laneweave.sim_bridge.corridors.sumo_network import read_network
+def _list(sumocfg: Path, window: TimeWindow) -> None:
+    from laneweave.sim_bridge.corridors.corridor_search import (
+        MIN_LANES,
+        MIN_LENGTH_M,
+        MIN_SPEED_MPS,
+        find_corridors,
+    )
+    from laneweave.sim_bridge.corridors.corridor_setup import read_simulation
 
-    config = read_config(sumocfg)
-    network = read_network(config.net_file)
-    found = find_corridors(network, read_demand(config, folder))
+    simulation = read_simulation(sumocfg, window)
+    found = find_corridors(simulation.network, simulation.demand)
     if not found:
         raise BadInputError(
-            "SUMOCFG", str(sumocfg), "a network with a chain of edges of 500 m with two lanes"
+            "SUMOCFG",
+            str(sumocfg),
+            f"a network with a chain of edges of at least {MIN_LENGTH_M:g} m, with at least "
+            f"{MIN_LANES} lanes for cars and a speed limit of at least {MIN_SPEED_MPS:g} m/s, "
+            "whose vehicles have priority; --corridor names shorter or slower ones",
         )
     table = Table(title=f"corridors of {escape(sumocfg.name)}")
     # Names are to be copied, however narrow the terminal is.
@@ -121,12 +175,12 @@ def _problem(corridor: Corridor, demand: CorridorDemand) -> str:
     return ""
 
 
-def _describe(found: SumoCorridor, name: str) -> None:
+def _describe(found: SumoCorridor) -> None:
     """Print what a corridor consists of."""
     corridor, demand = found.corridor, found.demand
-    console = Console()
+    console = Console(soft_wrap=True)
     table = Table(
-        title=f"corridor {escape(name)}: {corridor.lanes} lanes, {corridor.length_m:.0f} m"
+        title=f"corridor {escape(corridor.name)}: {corridor.lanes} lanes, {corridor.length_m:.0f} m"
     )
     for column in ("edge", "from m", "to m", "lanes"):
         table.add_column(column, justify="left" if column == "edge" else "right")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from laneweave.launch.cli.corridor_command import CORRIDOR_HELP
+from laneweave.launch.cli.corridor_command import CORRIDOR_HELP, Begin, End, Scale
 from laneweave.launch.cli.options import (
     Duration,
     NoProgress,
@@ -24,7 +24,6 @@ from laneweave.launch.cli.options import (
 from laneweave.launch.run_methods import FORMATION, LC2013, RULE, checked_method
 from laneweave.protocol.config.scenario_files import load_scenario, scenario_of
 from laneweave.protocol.errors import NO_VALUE, BadInputError
-from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario, check_pace
 
 if TYPE_CHECKING:
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
 
 
 RECORDED_ONLY = "it runs faster than real time; `laneweave watch DIR` shows its recording"
+SUMO_HAS_DEMAND = "none with a SUMO simulation, which has its own demand; --scale multiplies it"
 COMPARED_ROUTES = 4
 """Number of pairs of entrance and destination whose trips are printed."""
 
@@ -92,6 +92,9 @@ def run(
         str | None,
         typer.Option("--corridor", metavar="FIRST_EDGE:LAST_EDGE", help=CORRIDOR_HELP),
     ] = None,
+    begin: Begin = None,
+    end: End = None,
+    scale: Scale = None,
     compare: Annotated[
         bool,
         typer.Option("--compare", help="Also let SUMO drive alone, and compare (with --sumocfg)."),
@@ -126,13 +129,16 @@ def run(
     no_progress: NoProgress = False,
 ) -> None:
     """Run a scenario on this machine, and write the results to a folder."""
-    tables = corridor_scenario(scenario, sumocfg, corridor, seed)
+    window = {"begin_s": begin, "end_s": end, "scale": scale}
+    tables = corridor_scenario(scenario, sumocfg, corridor, seed, duration, **window)
     if tables:
-        reject_unused_options("with --sumocfg", volume=volume, operation=operation, solver=solver)
+        reject_unused_options("with --sumocfg", operation=operation, solver=solver)
+    else:
+        reject_unused_options("without --sumocfg", begin=begin, end=end, scale=scale)
     overrides = {
         "seed": seed,
         "demand__volume_veh_per_lane_h": volume,
-        "demand__duration_s": duration,
+        "demand__duration_s": None if tables else duration,
         "formation__operation": operation.value if operation is not None else None,
         "formation__solver": solver,
         "runtime__vehicles_per_process": vehicles_per_process,
@@ -141,8 +147,7 @@ def run(
         "sumo__gui": gui or None,
     }
     settings = scenario_of(tables, **overrides) if tables else load_scenario(scenario, **overrides)
-    if compare and not settings.sumo.config:
-        raise BadInputError("--compare", "given", "none without a SUMO simulation (--sumocfg)")
+    _check_sumo_options(settings, volume, compare=compare)
     check_pace(pace, "--pace")
     show = shows_progress(no_progress)
     checked_method(method, "--method")
@@ -206,6 +211,18 @@ def run(
     raise typer.Exit(outcome.exit_status)
 
 
+def _check_sumo_options(settings: Scenario, volume: float | None, *, compare: bool) -> None:
+    """Check options that need a SUMO simulation, or have no effect on one.
+
+    Raises:
+        BadInputError: an option would be ignored.
+    """
+    if volume is not None and settings.sumo.config:
+        raise BadInputError("--volume", volume, SUMO_HAS_DEMAND)
+    if compare and not settings.sumo.config:
+        raise BadInputError("--compare", "given", "none without a SUMO simulation (--sumocfg)")
+
+
 def _finish(outcome: Outcome) -> Path | None:
     """Print the outcome of a run and write its report; return the path of the page, if any."""
     from laneweave.launch.run.outcome import print_outcome
@@ -260,7 +277,12 @@ def _compare(settings: Scenario, folder: Path, *, show: bool) -> None:
 
 
 def corridor_scenario(
-    scenario: Path | None, sumocfg: Path | None, corridor: str | None, seed: int | None
+    scenario: Path | None,
+    sumocfg: Path | None,
+    corridor: str | None,
+    seed: int | None,
+    duration_s: float | None,
+    **window: float | None,
 ) -> dict[str, Any]:
     """Return the tables of the scenario of a corridor; none if it is not given by options.
 
@@ -275,9 +297,11 @@ def corridor_scenario(
     if scenario is not None:
         allowed = "none with --sumocfg: table sumo of the file names the simulation"
         raise BadInputError("SCENARIO.toml", str(scenario), allowed)
-    from laneweave.launch.cli.corridor_command import corridor_tables
+    from laneweave.launch.cli.corridor_command import corridor_tables, time_window
     from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 
-    with temporary_folder("sumo") as folder:
-        found = read_corridor(sumocfg, corridor, folder, Scenario().seed if seed is None else seed)
-    return corridor_tables(found, sumocfg, corridor)
+    departures = time_window(**window, duration_s=duration_s)
+    own_seed = Scenario().seed if seed is None else seed
+    return corridor_tables(
+        read_corridor(sumocfg, corridor, departures, own_seed), sumocfg, departures
+    )

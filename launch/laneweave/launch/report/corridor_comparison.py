@@ -55,7 +55,7 @@ def compare(
     alone = folder / ALONE_FOLDER
     alone.mkdir(exist_ok=True)
     with temporary_folder("sumo") as temporary:
-        setup = sumo_corridor(scenario, temporary).setup(scenario)
+        setup = sumo_corridor(scenario).setup(scenario)
         drive_alone(setup, scenario.seed, temporary, alone, progress)
     found = read_statistics(folder), read_statistics(alone)
     routes = _by_route(setup.arrivals, found)

@@ -139,5 +139,13 @@ class SumoSettings:
     """SUMO's configuration file; empty: the road of the scenario itself."""
     corridor: str = ""
     """Its first and its last edge: FIRST_EDGE:LAST_EDGE."""
+    begin_s: float | None = field(
+        default=None, validator=attrs.validators.optional(within(0.0, 1e9))
+    )
+    """SUMO's time at which the run begins; default: `begin` of the configuration."""
+    scale: float | None = field(
+        default=None, validator=attrs.validators.optional(within(0.0, 1e3, open_low=True))
+    )
+    """Factor for SUMO's demand; default: `scale` of the configuration."""
     gui: bool = False
     """Whether sumo-gui shows the run; with `config` or without."""

@@ -8,15 +8,18 @@ with its acceleration lane, and a lane whose links lead out of it an exit.
 
 from __future__ import annotations
 
+import re
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import cached_property
 from itertools import pairwise
 from statistics import median
 
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.fields import Closure
+from laneweave.protocol.road_layout import END_OF_ROAD
+from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Closure
 from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network
 
 MAX_LANES = 8
@@ -49,6 +52,8 @@ class CorridorEdge:
 class Ramp:
     """An on-ramp with an acceleration lane."""
 
+    name: str
+    """Name of its entrance in scenarios."""
     edge: str
     """Name of the last edge before the corridor."""
     to_edge: str
@@ -68,6 +73,8 @@ class Ramp:
 class WayOut:
     """An exit: lanes that lead out of the corridor."""
 
+    name: str
+    """Its name in scenarios."""
     edge: str
     """Name of the first edge behind the corridor."""
     from_edge: str
@@ -76,7 +83,7 @@ class WayOut:
     at_m: float
 
 
-@frozen
+@frozen(slots=False)
 class Corridor:
     """A road of lanes that are open from here to there, derived from consecutive edges."""
 
@@ -98,10 +105,19 @@ class Corridor:
         """Its first and its last edge, as in `--corridor`."""
         return f"{self.edges[0].name}:{self.edges[-1].name}"
 
-    @property
-    def edge_names(self) -> frozenset[str]:
-        """The names of its edges."""
-        return frozenset(edge.name for edge in self.edges)
+    @cached_property
+    def edge_numbers(self) -> Mapping[str, int]:
+        """The numbers of its edges, by name."""
+        return {edge.name: number for number, edge in enumerate(self.edges)}
+
+
+def unique_name(name: str, taken: Collection[str]) -> str:
+    """Return a name of SUMO's with characters that scenarios allow, unlike those that are taken."""
+    found = stem = re.sub(r"[^A-Za-z0-9_.-]", "_", name).lstrip("-._") or "edge"
+    number = 2
+    while found in taken:
+        found, number = f"{stem}-{number}", number + 1
+    return found
 
 
 def corridor_of(network: Network, first: str, last: str) -> Corridor:
@@ -221,6 +237,7 @@ class _Derivation:
             for edge, first, (from_m, to_m) in zip(way, first_lanes, places_m, strict=True)
         )
         self._unused: list[str] = []
+        self._taken = [MAIN_ENTRANCE, END_OF_ROAD]
 
     def corridor(self) -> Corridor:
         """Return the corridor."""
@@ -287,8 +304,14 @@ class _Derivation:
         at_m = max(
             MIN_AT_M, merge_m - min(length_m, MAX_RAMP_M), *(m + BEHIND_EXIT_M for m in before_m)
         )
-        to_edge = self._edges[part.first].name
-        return Ramp(feeding[0].origin.edge, to_edge, part.lane, at_m, merge_m, speed_mps, path)
+        edge, to_edge = feeding[0].origin.edge, self._edges[part.first].name
+        name = self._name(edge)
+        return Ramp(name, edge, to_edge, part.lane, at_m, merge_m, speed_mps, path)
+
+    def _name(self, edge: str) -> str:
+        """Return a name for an entrance or exit that no other one has."""
+        self._taken.append(unique_name(edge, self._taken))
+        return self._taken[-1]
 
     def _before(self, link: Link) -> tuple[float, float, tuple[Link, ...]]:
         """Return length, lowest speed limit and links of the way on which vehicles come to a link.
@@ -328,7 +351,7 @@ class _Derivation:
                         "without a lane of its own"
                     )
         for (edge, before, at_m), own in sorted(lanes.items(), key=lambda item: item[0][2]):
-            yield WayOut(edge, before, tuple(sorted(set(own))), at_m - HANDOVER_M)
+            yield WayOut(self._name(edge), edge, before, tuple(sorted(set(own))), at_m - HANDOVER_M)
 
     def _closures(
         self,

@@ -12,29 +12,37 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 
 from attrs import frozen
 
 from laneweave.protocol.config.participants import vehicle_name
-from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.corridors.corridor import Corridor
-from laneweave.sim_bridge.corridors.sumo_config import SumoConfig
+from laneweave.sim_bridge.corridors.sumo_config import NO_OPTIONS, SumoConfig
 from laneweave.sim_bridge.corridors.sumo_demand import (
+    AT_START,
+    LIMITS,
+    Attributes,
     CorridorDemand,
     Pass,
-    entrance_name,
+    SumoDemand,
+    SumoType,
     type_names,
 )
 from laneweave.sim_bridge.corridors.sumo_network import Network
+from laneweave.sim_bridge.corridors.sumo_statistics import output_options
 from laneweave.sim_bridge.road.demand import Arrival
 
 MAX_WAIT_S = 600.0
 """Time after the last departure for which vehicles on their way to a ramp are awaited."""
-
 FIRST_ENTRY_S = 1.0
 """Road time before which no vehicle enters, so that agents can be announced."""
+_FIRST_SIMULATION = ("device.rerouting.", "end", "scale", "begin", "step-length", "seed")
+"""Options that have determined the vehicles and their routes; they do not apply once more."""
 
 
 @frozen
@@ -44,6 +52,8 @@ class CorridorArrival:
     arrival: Arrival
     """At a ramp, its time is that of the departure from its first edge."""
     origin: Pass
+    on_ramp: bool = False
+    """Whether it departs on the ramp itself."""
 
     @property
     def departs_at_start(self) -> bool:
@@ -58,9 +68,9 @@ class CorridorSetup:
     config: SumoConfig
     network: Network
     corridor: Corridor
+    vehicles: SumoDemand
+    """All vehicles, inside the corridor and outside."""
     arrivals: tuple[CorridorArrival, ...]
-    duration_s: float
-    """Time within which vehicles depart."""
     left_out: frozenset[str] = frozenset()
     """Names in SUMO of vehicles with routes through the corridor that are not simulated."""
 
@@ -72,46 +82,118 @@ class CorridorSetup:
     @property
     def end_s(self) -> float:
         """SUMO's time until which vehicles are awaited."""
-        return self.config.begin_s + self.duration_s + MAX_WAIT_S
+        return self.vehicles.end_s + MAX_WAIT_S
 
-    def is_left_out(self, name: str, route: Sequence[str]) -> bool:
-        """Return whether a vehicle is in the corridor, but not one of its vehicles."""
-        # Those that were read are found by name: SUMO computes routes of trips only at departure.
-        return name in self.left_out or (
-            name not in self.by_name and not self.corridor.edge_names.isdisjoint(route)
+    def command(
+        self,
+        step_s: float,
+        seed: int,
+        folder: Path,
+        results: Path | None,
+        more: Mapping[str, str] = NO_OPTIONS,
+        *,
+        alone: bool = False,
+    ) -> Sequence[str]:
+        """Write the files of a simulation of these vehicles, and return SUMO's command line.
+
+        Args:
+            step_s: length of a step.
+            seed: seed, unless the configuration has one.
+            folder: folder for temporary files.
+            results: folder for SUMO's statistics; None: none are written.
+            more: further options, by name.
+            alone: whether SUMO also drives the vehicles that depart at the start of the corridor.
+        """
+        departures: dict[str, Attributes | None] = dict.fromkeys(self.left_out)
+        for name, one in self.by_name.items():
+            at_start = AT_START if one.on_ramp or one.departs_at_start else {}
+            if alone:
+                departures[name] = at_start
+            else:
+                depart_s = self.vehicles.begin_s + one.arrival.t_s
+                announced = {**at_start, "depart": f"{depart_s:.3f}"}
+                departures[name] = None if one.departs_at_start else announced
+        return self.config.command(
+            {
+                "begin": f"{self.vehicles.begin_s:.10g}",
+                "step-length": f"{step_s:g}",
+                "seed": self.config.options.get("seed", f"{seed % 2**31}"),
+                "collision.action": "warn",
+                **self.config.additional(folder, demand=False),
+                **self.vehicles.write(folder / "vehicles.rou.xml", departures),
+                **more,
+                **output_options(results, folder, self.corridor.edge_numbers),
+            },
+            without=_FIRST_SIMULATION,
         )
 
 
-def corridor_arrivals(scenario: Scenario, demand: CorridorDemand) -> tuple[CorridorArrival, ...]:
-    """Return the vehicles of a corridor in order of departure."""
-    names = type_names(demand.passes)
-    car = next(iter(names))
+def corridor_arrivals(
+    scenario: Scenario, corridor: Corridor, demand: CorridorDemand, begin_s: float
+) -> tuple[CorridorArrival, ...]:
+    """Return the vehicles of a corridor in order of departure.
+
+    Args:
+        scenario: the scenario of the corridor.
+        corridor: the corridor.
+        demand: its vehicles.
+        begin_s: SUMO's time at which the run begins.
+
+    Raises:
+        BadInputError: the scenario lacks an entrance, exit or type of vehicle.
+    """
+    types = _types_in(scenario, type_names(demand.passes))
     lanes = {entrance.name: entrance.lane for entrance in scenario.entrance}
+    on_ramp = {ramp.name: {link.origin.edge for link in ramp.path} for ramp in corridor.ramps}
     choose = _LaneChoice(scenario)
     found = []
     for number, one in enumerate(demand.passes, start=1):
-        t_s = one.vehicle.depart_s - demand.begin_s
-        destination = one.destination
-        if destination != END_OF_ROAD:
-            destination = entrance_name(destination)
+        t_s = one.vehicle.depart_s - begin_s
         if one.upstream:
             lane = scenario.road.first_lanes[0]  # which one it is depends on SUMO
         elif one.entrance == MAIN_ENTRANCE:
-            lane = choose.lane(t_s, destination)
+            lane = choose.lane(t_s, one.destination)
+        elif one.entrance in lanes:
+            lane = lanes[one.entrance]
         else:
-            lane = lanes[entrance_name(one.entrance)]
-        kind = one.vehicle.vehicle_type
+            allowed = f"an entrance {one.entrance}: {one.vehicle.name} of the simulation needs it"
+            raise BadInputError("entrance", [*lanes], allowed)
         arrival = Arrival(
             vehicle_name(number),
             lane,
             ANY_LANE,
             max(t_s, FIRST_ENTRY_S),
-            destination,
-            CAR if kind == car else names[kind],
+            one.destination,
+            types[one.vehicle.vehicle_type],
             one.vehicle.name,
         )
-        found.append(CorridorArrival(arrival, one))
+        departs_on_ramp = one.vehicle.route[0] in on_ramp.get(one.entrance, ())
+        found.append(CorridorArrival(arrival, one, departs_on_ramp))
     return tuple(found)
+
+
+def _types_in(scenario: Scenario, names: Mapping[SumoType, str]) -> Mapping[SumoType, str]:
+    """Return the scenario's type for each type of SUMO: the one with the same limits.
+
+    Which type is the most frequent one, and so has the name `car`, depends on the time window. A
+    type with other limits, which the user has changed, is found by its name.
+
+    Raises:
+        BadInputError: there is none.
+    """
+    limits = {
+        name: {field: getattr(own.vehicle, field) for field in LIMITS}
+        for name, own in scenario.types.items()
+    }
+    found = {}
+    for number, (kind, given) in enumerate(names.items()):
+        name, own = given if number else CAR, kind.limits
+        equal = [one for one in limits if limits[one] == own]
+        if not equal and name not in limits:
+            allowed = f"a type with the limits of {name} in the simulation: {own}"
+            raise BadInputError("vehicle_type", [*limits], allowed)
+        found[kind] = name if name in equal or not equal else equal[0]
+    return found
 
 
 class _LaneChoice:

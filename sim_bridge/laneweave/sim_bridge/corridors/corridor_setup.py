@@ -2,62 +2,110 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
-from attrs import evolve, frozen
+from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor, corridor_of
 from laneweave.sim_bridge.corridors.corridor_arrivals import CorridorSetup, corridor_arrivals
 from laneweave.sim_bridge.corridors.sumo_config import SumoConfig, read_config
-from laneweave.sim_bridge.corridors.sumo_demand import CorridorDemand, demand_on, read_demand
+from laneweave.sim_bridge.corridors.sumo_demand import (
+    CorridorDemand,
+    SumoDemand,
+    TimeWindow,
+    demand_on,
+    read_demand,
+)
 from laneweave.sim_bridge.corridors.sumo_network import Network, read_network
+
+WHOLE = TimeWindow()
+"""The default time window."""
+
+
+@frozen
+class SumoSimulation:
+    """A simulation of the user: its network, and its vehicles."""
+
+    config: SumoConfig
+    network: Network
+    demand: SumoDemand
 
 
 @frozen
 class SumoCorridor:
     """A corridor of a SUMO simulation, and the vehicles that drive through it."""
 
-    config: SumoConfig
-    network: Network
+    simulation: SumoSimulation
     corridor: Corridor
     demand: CorridorDemand
 
     def setup(self, scenario: Scenario) -> CorridorSetup:
-        """Return the setup of a run, with the vehicles that depart in its time."""
-        duration_s = min(self.demand.duration_s, scenario.demand.duration_s)
-        latest_s = self.demand.begin_s + duration_s
-        passes = tuple(one for one in self.demand.passes if one.vehicle.depart_s <= latest_s)
-        demand = evolve(self.demand, passes=passes)
-        later = {one.vehicle.name for one in self.demand.passes[len(passes) :]}
+        """Return the setup of a run.
+
+        Raises:
+            BadInputError: the scenario lacks an entrance, exit or type of vehicle.
+        """
+        simulation = self.simulation
         return CorridorSetup(
-            self.config,
-            self.network,
+            simulation.config,
+            simulation.network,
             self.corridor,
-            corridor_arrivals(scenario, demand),
-            duration_s,
-            self.demand.left_out | later,
+            simulation.demand,
+            corridor_arrivals(scenario, self.corridor, self.demand, simulation.demand.begin_s),
+            self.demand.left_out,
         )
 
 
-def read_corridor(file: Path, name: str, folder: Path, seed: int = 1) -> SumoCorridor:
+def read_simulation(file: Path, window: TimeWindow = WHOLE, seed: int = 1) -> SumoSimulation:
+    """Read the files of a simulation, and let SUMO draw its vehicles.
+
+    Args:
+        file: SUMO's configuration file.
+        window: when the vehicles depart.
+        seed: seed of SUMO, from which it draws flows and types.
+
+    Raises:
+        BadInputError: a file cannot be read, or no vehicle departs in the time window.
+        CommandFailedError: libsumo is missing, or SUMO rejects a file.
+    """
+    with temporary_folder("sumo") as folder:
+        config = read_config(file, folder)
+    changed = tuple(one.stat().st_mtime_ns for one in config.files)
+    return _simulation(config, window, seed, changed)
+
+
+@lru_cache(maxsize=2)
+def _simulation(
+    config: SumoConfig, window: TimeWindow, seed: int, _changed: tuple[int, ...]
+) -> SumoSimulation:
+    """Read a simulation; a command reads the same one several times."""
+    with temporary_folder("sumo") as folder:
+        network = read_network(config.net_file)
+        return SumoSimulation(config, network, read_demand(config, folder, window, seed))
+
+
+def read_corridor(file: Path, name: str, window: TimeWindow = WHOLE, seed: int = 1) -> SumoCorridor:
     """Read the files of a simulation, and derive a corridor.
 
     Args:
         file: SUMO's configuration file.
         name: the first and the last edge, FIRST_EDGE:LAST_EDGE.
-        folder: folder for temporary files.
+        window: when the vehicles depart.
         seed: seed of SUMO, from which it draws flows and types.
 
     Raises:
-        BadInputError: a file cannot be read, or the edges are not a corridor.
+        BadInputError: a file cannot be read, the edges are not a corridor, or no vehicle departs in
+            the time window.
+        CommandFailedError: libsumo is missing, or SUMO rejects a file.
     """
-    config = read_config(file)
-    network = read_network(config.net_file)
+    simulation = read_simulation(file, window, seed)
+    network = simulation.network
     corridor = corridor_of(network, *_edges_of(name, network))
-    demand = demand_on(corridor, read_demand(config, folder, seed))
-    return SumoCorridor(config, network, corridor, demand)
+    return SumoCorridor(simulation, corridor, demand_on(corridor, simulation.demand))
 
 
 def _edges_of(name: str, network: Network) -> tuple[str, str]:

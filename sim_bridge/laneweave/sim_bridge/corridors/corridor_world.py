@@ -1,10 +1,10 @@
 """A SUMO simulation of which laneweave drives a corridor, as the world of a bridge.
 
-SUMO loads and drives all vehicles outside. A vehicle that departs on the first edge of the corridor
-is taken out of SUMO when it is loaded, waits at the start of the road, and is added again when it
-enters. A vehicle from another edge is driven by SUMO until it comes to its ramp. Inside, SUMO
-displays all vehicles where their plants are, on the lanes of its network. At an exit, or at the end
-of the road, a vehicle is given back with its speed, and SUMO drives on along its route.
+SUMO drives all vehicles outside. A vehicle that departs on the first edge of the corridor waits at
+the start of the road, and is added to SUMO when it enters. A vehicle from another edge is driven by
+SUMO until it comes to its ramp. Inside, SUMO displays all vehicles where their plants are, on the
+lanes of its network. At an exit, or at the end of the road, a vehicle is given back with its speed,
+and SUMO drives on along its route.
 
 What SUMO drives near the corridor is seen by the sensors of vehicles inside (`others`).
 """
@@ -25,7 +25,6 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_
 from laneweave.sim_bridge.corridors.corridor import HANDOVER_M, OPTION, Corridor
 from laneweave.sim_bridge.corridors.corridor_arrivals import MAX_WAIT_S, CorridorSetup
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
-from laneweave.sim_bridge.corridors.sumo_config import sumo_command
 from laneweave.sim_bridge.corridors.sumo_network import Lane, Network
 from laneweave.sim_bridge.corridors.take_over import SEEN_BEYOND_M, Approaching
 from laneweave.sim_bridge.corridors.ways_in import ways_to_ramp, ways_to_start
@@ -39,12 +38,6 @@ _PLANTS = {
 """Options with which SUMO displays bodies as the bridge drives them."""
 _OWN_SPEED_MODE, _OWN_LANE_CHANGES = 31, 1621
 """SUMO's defaults: it drives."""
-STEPS_OUT = 2
-"""Steps after which SUMO's devices have forgotten a vehicle that was taken out.
-
-SUMO has driven a vehicle of a flow for a step already. If another one had its name at once, the
-device for conflicts would read the memory of the first.
-"""
 MAX_DISPLAY_ERROR_M = 0.1
 """Maximum distance between a body and where SUMO displays it."""
 
@@ -67,17 +60,8 @@ class CorridorWorld(SumoProcess):
             SumoUnavailableError: libsumo cannot be loaded.
             SumoFailedError: SUMO rejects a file.
         """
-        tick_s = scenario.runtime.tick_s
         super().__init__(
-            sumo_command(
-                setup.config,
-                tick_s,
-                scenario.seed,
-                folder,
-                results,
-                setup.corridor.edge_names,
-                _PLANTS,
-            )
+            setup.command(scenario.runtime.tick_s, scenario.seed, folder, results, _PLANTS)
         )
         self._types = scenario.types
         self._lane_m = scenario.road.lane_width_m
@@ -90,44 +74,35 @@ class CorridorWorld(SumoProcess):
         self._shown: dict[str, State] = {}
         self._returned: set[str] = set()
         """Names in SUMO of vehicles that have been given back and have not arrived."""
-        self._steps = 0
-        self._out: dict[str, int] = {}
-        """Step from which vehicles that were taken out of SUMO may be added again, by name."""
         self._taken: set[str] = set()
         """Names in SUMO of vehicles that have been taken over."""
         upstream = any(one.origin.upstream for one in setup.arrivals)
         to_start = ways_to_start(setup.network, setup.corridor) if upstream else {}
         self.start_lanes = tuple(to_start)
         """Lanes to whose beginning vehicles come from upstream."""
-        used = {(one.lane, round(one.at_m, 1)) for one in scenario.entrance}
+        entrances = {one.name for one in scenario.entrance}
         to_ramps = {
             ramp.lane: ways_to_ramp(setup.network, setup.corridor, ramp)
             for ramp in setup.corridor.ramps
-            if (ramp.lane, round(ramp.at_m, 1)) in used
+            if ramp.name in entrances
         }
         both = to_ramps.keys() & to_start.keys()
         if both:
             allowed = f"one whose lane {min(both)} is either open at the start or that of a ramp"
             raise BadInputError(OPTION, setup.corridor.name, allowed)
         self._ways_in = {**to_start, **to_ramps}
+        near = {name.rpartition("_")[0] for way in self._ways_in.values() for name in way}
+        self.departing = tuple(
+            one.arrival
+            for one in setup.arrivals
+            if not one.departs_at_start and one.origin.vehicle.route[0] in near
+        )
+        """Vehicles that depart near an entrance, in order of departure."""
         self._beyond = tuple(dict.fromkeys(_beyond(setup.network, setup.corridor)))
         self._approaching: dict[int, list[Approaching]] = {}
         """What SUMO has been asked since its last step, by lane."""
         self._others: list[OtherBody] | None = None
         """The same for bodies behind the exits; None: it has not been asked."""
-        self._take_out_loaded()
-
-    def _take_out_loaded(self) -> None:
-        """Take vehicles out of SUMO that wait at the start of the road, or are not served."""
-        for name in self.simulation.getLoadedIDList():
-            coming = self._coming.get(name)
-            waits = coming is not None and coming.departs_at_start
-            if (waits and name not in self._taken) or self._setup.is_left_out(
-                name, self.vehicle.getRoute(name)
-            ):
-                self.vehicle.remove(name)
-                if waits:
-                    self._out[name] = self._steps + STEPS_OUT
 
     # --- traffic that SUMO drives -------------------------------------------------------------
 
@@ -154,10 +129,6 @@ class CorridorWorld(SumoProcess):
                     arrival = evolve(coming.arrival, lane=lane)
                     yield Approaching(arrival, s_m, speed_mps, limits, way.upstream)
 
-    def is_out(self, vehicle: str) -> bool:
-        """Return whether a vehicle that departs at the start has been taken out of SUMO."""
-        return self._steps >= self._out.get(self._sumo_name[vehicle], math.inf)
-
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
         """Set the speed at which SUMO drives a vehicle, as far as it is safe; None: its own."""
         self.vehicle.setSpeed(self._sumo_name[vehicle], -1.0 if speed_mps is None else speed_mps)
@@ -176,10 +147,12 @@ class CorridorWorld(SumoProcess):
     def _find_others(self) -> Iterator[OtherBody]:
         api = self.vehicle
         for name, (lane, exit_m, from_m) in self._beyond:
+            inside = from_m < exit_m
             for vehicle in self.lane.getLastStepVehicleIDs(name):
+                if inside and vehicle in self._coming:
+                    continue  # it is driven here, or on its way to its entrance
                 rear_m = api.getLanePosition(vehicle) - api.getLength(vehicle)
-                seen = from_m + rear_m <= exit_m + SEEN_BEYOND_M
-                if seen and not self._is_driven(vehicle):
+                if from_m + rear_m <= exit_m + SEEN_BEYOND_M:
                     speed_mps, accel_mps2 = api.getSpeed(vehicle), api.getAcceleration(vehicle)
                     yield OtherBody(vehicle, lane, exit_m, from_m + rear_m, speed_mps, accel_mps2)
 
@@ -200,17 +173,19 @@ class CorridorWorld(SumoProcess):
         name = self._sumo_name[vehicle]
         coming, api = self._coming[name], self.vehicle
         if coming.departs_at_start:
-            del self._out[name]
+            origin = coming.origin.vehicle
             route = f"laneweave.{name}"
-            self.route.add(route, list(coming.origin.vehicle.route))
+            self.route.add(route, list(origin.route))
             api.add(
                 name,
                 route,
-                typeID=coming.origin.vehicle.type_name,
+                typeID=origin.type_name,
                 depart="now",
                 departPos="0",
                 departSpeed="0",
             )
+            if "speedFactor" in origin.attributes:
+                api.setSpeedFactor(name, float(origin.attributes["speedFactor"]))
         api.setSpeed(name, -1.0)
         api.setSpeedMode(name, 0)
         api.setLaneChangeMode(name, 0)
@@ -240,10 +215,8 @@ class CorridorWorld(SumoProcess):
         """
         super().step()
         api = self.vehicle
-        self._steps += 1
         self._approaching.clear()
         self._others = None
-        self._take_out_loaded()
         arrived = self.simulation.getArrivedIDList()
         self._returned.difference_update(arrived)
         for name in arrived:
@@ -270,16 +243,8 @@ class CorridorWorld(SumoProcess):
         return {vehicle: pose_of(state) for vehicle, state in self._shown.items()}
 
     def collisions(self) -> list[tuple[str, str]]:
-        """Return the sorted pairs that SUMO reports, with a vehicle of the corridor in each.
-
-        SUMO has driven the vehicles of flows for a step when they are taken out.
-        """
-        waiting = self._out.keys()
-        return [
-            pair
-            for pair in super().collisions()
-            if any(map(self._is_driven, pair)) and waiting.isdisjoint(pair)
-        ]
+        """Return the sorted pairs that SUMO reports, with a vehicle of the corridor in each."""
+        return [pair for pair in super().collisions() if any(map(self._is_driven, pair))]
 
     def remove(self, vehicle: str) -> None:
         """Give a vehicle back to SUMO, with its speed.
@@ -330,7 +295,7 @@ def _beyond(network: Network, corridor: Corridor) -> Iterator[tuple[str, tuple[i
             number = first[edge] + lane.index
             if number in lanes:
                 yield lane.name, (number, exit_m, exit_m - lane.length_m)
-                until_m, inside = exit_m + SEEN_BEYOND_M, corridor.edge_names
+                until_m, inside = exit_m + SEEN_BEYOND_M, corridor.edge_numbers
                 for name, from_m in _ahead(network, lane, exit_m, until_m, inside):
                     yield name, (number, exit_m, from_m)
 

@@ -27,7 +27,6 @@ from laneweave.sim_bridge.corridors.sumo_demand import (
     CorridorDemand,
     Pass,
     SumoType,
-    entrance_name,
     type_names,
 )
 
@@ -69,7 +68,7 @@ def _where(field: str, tables: Tables, corridor: Corridor) -> str:
     if kind == "exit":
         return f"exit to {corridor.ways_out[number].edge}"
     if kind == "entrance":
-        names = {entrance_name(ramp.edge): ramp.edge for ramp in corridor.ramps}
+        names = {ramp.name: ramp.edge for ramp in corridor.ramps}
         return f"on-ramp from {names[tables['entrance'][number]['name']]}"
     closure = tables["road"]["closures"][number]
     ends_m = closure.get("from_m", 0.0)
@@ -95,7 +94,7 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
     car, *others = names
     fastest_mps = min(corridor.speed_mps, *(one.max_speed_mps for one in names))
     per_hour = 3600.0 / demand.duration_s
-    ramps = [ramp for ramp in corridor.ramps if _from(demand, ramp.edge)]
+    ramps = [ramp for ramp in corridor.ramps if _from(demand, ramp.name)]
     tables: Tables = {
         "road": {
             "lanes": corridor.lanes,
@@ -104,22 +103,22 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
         },
         "entrance": [
             {
-                "name": entrance_name(ramp.edge),
+                "name": ramp.name,
                 "lane": ramp.lane,
                 "at_m": _m(ramp.at_m),
                 "merge_m": _m(ramp.merge_m),
-                "volume_veh_per_h": round(per_hour * len(_from(demand, ramp.edge)), 1),
-                "destinations": _destinations(_from(demand, ramp.edge)),
+                "volume_veh_per_h": round(per_hour * len(_from(demand, ramp.name)), 1),
+                "destinations": _destinations(_from(demand, ramp.name)),
                 "vehicle_types": [
                     {"type": names[one], "share": share}
-                    for one, share in _shares_of_types(_from(demand, ramp.edge)).items()
+                    for one, share in _shares_of_types(_from(demand, ramp.name)).items()
                     if one != car
                 ],
             }
             for ramp in ramps
         ],
         "exit": [
-            {"name": entrance_name(one.edge), "lanes": list(one.lanes), "at_m": _m(one.at_m)}
+            {"name": one.name, "lanes": list(one.lanes), "at_m": _m(one.at_m)}
             for one in corridor.ways_out
         ],
         "demand": {
@@ -127,9 +126,9 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
             "duration_s": float(math.ceil(demand.duration_s)),
             "destinations": _destinations(main),
         },
-        "vehicle": _limits(car) | {"max_speed_mps": round(fastest_mps, 2)},
+        "vehicle": {**car.limits, "max_speed_mps": round(fastest_mps, 2)},
         "vehicle_type": [
-            {"name": names[one], "share": _shares_of_types(main).get(one, 0.0), **_limits(one)}
+            {"name": names[one], "share": _shares_of_types(main).get(one, 0.0), **one.limits}
             for one in others
         ],
     }
@@ -179,24 +178,15 @@ def _closure(closure: Closure, corridor: Corridor, ramps: Sequence[Ramp]) -> dic
 def _destinations(passes: Sequence[Pass]) -> list[dict[str, Any]]:
     counts = Counter(one.destination for one in passes)
     return [
-        {"exit": entrance_name(edge), "share": round(count / len(passes), 4)}
-        for edge, count in sorted(counts.items())
-        if edge != END_OF_ROAD
+        {"exit": name, "share": round(count / len(passes), 4)}
+        for name, count in sorted(counts.items())
+        if name != END_OF_ROAD
     ]
 
 
 def _shares_of_types(passes: Sequence[Pass]) -> Mapping[SumoType, float]:
     counts = Counter(one.vehicle.vehicle_type for one in passes)
     return {kind: round(count / len(passes), 4) for kind, count in counts.items()}
-
-
-def _limits(kind: SumoType) -> dict[str, float]:
-    return {
-        "length_m": round(kind.length_m, 2),
-        "width_m": round(kind.width_m, 2),
-        "max_accel_mps2": round(kind.max_accel_mps2, 2),
-        "min_accel_mps2": round(kind.min_accel_mps2, 2),
-    }
 
 
 def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, Any]:

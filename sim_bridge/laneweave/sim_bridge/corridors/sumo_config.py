@@ -1,201 +1,204 @@
-"""Reads SUMO's configuration files (.sumocfg): which files a simulation consists of."""
+"""SUMO's configurations (.sumocfg), read by SUMO itself: the options of a simulation.
+
+SUMO writes the configuration with its own names of options, absolute paths and without defaults
+(`--save-configuration`). The simulations that laneweave starts add to these options. None writes
+the outputs that the configuration asks for.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import gzip
+import os
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from xml.etree import ElementTree as ET
 
 from attrs import field, frozen
 
-from laneweave.protocol.errors import NO_VALUE, BadInputError
-from laneweave.sim_bridge.corridors.sumo_statistics import (
-    COLLISIONS_FILE,
-    CONFLICT_S,
-    CONFLICTS_FILE,
-    STATISTICS_FILE,
-    TRIPS_FILE,
-)
+from laneweave.protocol.errors import NO_VALUE, BadInputError, Described
+from laneweave.sim_bridge.sumo.simulation import SumoFailedError, SumoProcess
 
-_SHORT_NAMES = {
-    "n": "net-file",
-    "net": "net-file",
-    "r": "route-files",
-    "a": "additional-files",
-    "additional": "additional-files",
-    "b": "begin",
-    "e": "end",
+_WITHOUT_EFFECT = frozenset({"output", "report", "traci_server", "gui_only"})
+"""Sections of options that do not determine how vehicles drive."""
+_OUTPUTS = (".output", "device.ssm.file", "device.toc.file")
+"""Ends of the names of options in other sections that name files to be written."""
+_REFUSED = {
+    "mesosim": "false: laneweave drives bodies on lanes, a mesoscopic simulation has neither",
+    "load-state": "none: the vehicles of a state have no departures",
+    "no-internal-links": "false: vehicles that laneweave drives need the lanes inside junctions",
 }
-_OPTIONS = frozenset({"processing", "routing", "random_number", "emissions"})
-"""Sections of options that determine how vehicles drive."""
-ALL_AT_ONCE = {"route-steps": "0"}
-"""Option with which SUMO loads all vehicles when it starts, so that it draws the same types."""
-CONFLICT_RANGE_M = 30.0
-"""Distance within which SUMO looks for vehicles that a vehicle may collide with."""
+_GZIP = b"\x1f\x8b"
 NO_OPTIONS: Mapping[str, str] = MappingProxyType({})
 _DEMAND = frozenset(
-    {"vType", "vTypeDistribution", "route", "routeDistribution", "flow", "vehicle", "trip"}
+    {
+        *("vType", "vTypeDistribution", "route", "routeDistribution", "flow", "vehicle", "trip"),
+        *("person", "personFlow", "container", "containerFlow", "interval"),
+        *("rerouter", "calibrator"),
+    }
 )
-"""Elements of additional files that describe vehicles."""
+"""Elements of additional files that create vehicles or change their routes."""
+_DRAWN = frozenset({"poly", "poi"})
+"""Elements that only a window shows."""
+_WRITTEN = ("file", "dest", "output")
+"""Attributes of elements of additional files that name files to be written."""
+_READ = frozenset({"variableSpeedSign", "rerouter"})
+"""Elements whose attribute `file` names a file to be read."""
 
 
 @frozen
 class SumoConfig:
-    """The files and times of a simulation."""
+    """A simulation as its configuration describes it."""
 
     file: Path
     net_file: Path
-    route_files: tuple[Path, ...] = ()
-    additional_files: tuple[Path, ...] = ()
-    begin_s: float = 0.0
-    end_s: float = math.inf
-    step_s: float = 1.0
-    """Length of a step."""
-    options: Mapping[str, str] = field(factory=dict)
-    """Options that determine how vehicles drive, by name."""
+    additional_files: tuple[Path, ...]
+    options: Mapping[str, str] = field(hash=False)
+    """All options that determine how vehicles drive, by SUMO's names; none with a default."""
 
-    def write_demand(self, folder: Path) -> tuple[Path, ...]:
-        """Return the files with the vehicles; those in additional files are copied to a folder.
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All files that it consists of, as far as they exist."""
+        named = [self.file, self.net_file, *self.additional_files]
+        named += _paths(self.options.get("route-files", ""))
+        return tuple(file for file in named if file.is_file())
+
+    def command(self, more: Mapping[str, str], without: Sequence[str] = ()) -> tuple[str, ...]:
+        """Return SUMO's command line.
+
+        Args:
+            more: more options, by name.
+            without: beginnings of the names of options that do not apply.
+        """
+        options = {
+            **{
+                name: value
+                for name, value in self.options.items()
+                if not name.startswith(tuple(without))
+            },
+            # Equal seeds give equal runs.
+            "random": "false",
+            "no-step-log": "true",
+            "no-warnings": "true",
+            "xml-validation": "never",
+            "duration-log.disable": "true",
+            **more,
+        }
+        return ("sumo", *(part for name, value in options.items() for part in (f"--{name}", value)))
+
+    def additional(self, folder: Path, *, demand: bool) -> Mapping[str, str]:
+        """Return the option with the additional files, copied to a folder without outputs.
+
+        Args:
+            folder: where they are written.
+            demand: whether elements that create vehicles, or change their routes, are kept.
 
         Raises:
             BadInputError: a file cannot be read.
         """
-        elements = [*self._demand_in_additional_files()]
-        if not elements:
-            return self.route_files
-        copied = folder / "additional.rou.xml"
-        copied.write_text("\n".join(["<routes>", *elements, "</routes>"]), encoding="utf-8")
-        return (copied, *self.route_files)
-
-    def _demand_in_additional_files(self) -> Iterator[str]:
-        """Yield the XML elements of the additional files that describe vehicles.
-
-        Others may describe outputs, which a simulation would write.
-
-        Raises:
-            BadInputError: a file cannot be read.
-        """
-        for file in self.additional_files:
-            for element in _parsed("additional-files", file):
-                if element.tag in _DEMAND:
-                    yield ET.tostring(element, encoding="unicode").strip()
+        without = _DRAWN if demand else _DRAWN | _DEMAND
+        copies = []
+        for number, file in enumerate(self.additional_files):
+            copy = folder / f"additional{number}{'' if demand else '-without-demand'}.xml"
+            root = ET.Element("additional")
+            root.extend(_elements(file, without))
+            ET.ElementTree(root).write(copy, encoding="utf-8", xml_declaration=True)
+            copies.append(str(copy))
+        return {"additional-files": ",".join(copies)} if copies else NO_OPTIONS
 
 
-def read_config(file: Path) -> SumoConfig:
-    """Read a configuration file; files that it names are relative to its folder.
+def read_config(file: Path, folder: Path) -> SumoConfig:
+    """Let SUMO read a configuration.
+
+    Args:
+        file: the configuration.
+        folder: folder for a temporary file.
 
     Raises:
-        BadInputError: it cannot be read, names no network, or a file that does not exist.
+        BadInputError: it cannot be read, names no network or a file that does not exist, or asks
+            for a simulation of another kind.
+        CommandFailedError: libsumo is missing.
     """
-    found: dict[str, str] = {}
+    _check_kind(file)
+    saved = folder / "saved.sumocfg"
+    command = ("sumo", "-c", str(file.resolve()), "--save-configuration", str(saved))
+    try:
+        SumoProcess(command).close()
+    except SumoFailedError as error:
+        raise BadInputError("SUMOCFG", str(file), "a configuration that SUMO can read") from error
     options: dict[str, str] = {}
-    for section in _parsed("SUMOCFG", file):
-        for element in (section, *section):
-            value = element.get("value", element.get("v"))
-            if value is not None:
-                found[_SHORT_NAMES.get(element.tag, element.tag)] = value.strip()
-                if section.tag in _OPTIONS:
-                    options[element.tag] = value.strip()
-    if not found.get("net-file"):
+    for section in ET.parse(saved).getroot():  # noqa: S314 (SUMO has written it)
+        if section.tag not in _WITHOUT_EFFECT:
+            options |= {
+                option.tag: os.path.expandvars(option.get("value", ""))
+                for option in section
+                if not option.tag.endswith(_OUTPUTS)
+            }
+    for name, allowed in _REFUSED.items():
+        if options.get(name, "false") != "false":
+            raise BadInputError(f"{name} of {file}", Described(options[name]), allowed)
+    if not options.get("net-file"):
         raise BadInputError("net-file", NO_VALUE, f"the network of {file}")
+    for name in ("net-file", "route-files", "additional-files"):
+        for named in _paths(options.get(name, "")):
+            if not named.is_file():
+                raise BadInputError(f"{name} of {file}", str(named), "a file that exists")
     return SumoConfig(
-        file,
-        _files(found, "net-file", file.parent)[0],
-        _files(found, "route-files", file.parent),
-        _files(found, "additional-files", file.parent),
-        _time_s(found, "begin", 0.0),
-        _time_s(found, "end", math.inf),
-        _time_s(found, "step-length", 1.0),
+        file.resolve(),
+        Path(options["net-file"]),
+        _paths(options.pop("additional-files", "")),
         options,
     )
 
 
-def _parsed(field: str, file: Path) -> ET.Element:
-    try:
-        return ET.parse(file).getroot()  # noqa: S314 - the user's own files, as SUMO reads them
-    except OSError as error:
-        raise BadInputError(field, str(file), f"a readable file ({error.strerror})") from error
-    except (ET.ParseError, ValueError) as error:
-        raise BadInputError(field, str(file), f"XML ({error})") from error
+def _check_kind(file: Path) -> None:
+    """Check that a file is a configuration.
 
-
-def _files(found: Mapping[str, str], name: str, folder: Path) -> tuple[Path, ...]:
-    files = [folder / part.strip() for part in found.get(name, "").split(",") if part.strip()]
-    for file in files:
-        if not file.is_file():
-            raise BadInputError(name, str(file), "a file that exists")
-    return tuple(files)
-
-
-def _time_s(found: Mapping[str, str], name: str, default: float) -> float:
-    """Return a time [s], given as seconds or [D:]H:M:S; -1 stands for none."""
-    text = found.get(name, "")
-    try:
-        parts = [float(part) for part in text.split(":")] if text else []
-    except ValueError:
-        raise BadInputError(name, text, "seconds, or H:M:S") from None
-    time_s = 0.0
-    for number, part in enumerate(parts):
-        time_s = time_s * (24.0 if number == 1 and len(parts) == 4 else 60.0) + part
-    return time_s if parts and time_s >= 0.0 else default
-
-
-def sumo_command(
-    config: SumoConfig,
-    step_s: float,
-    seed: int,
-    folder: Path,
-    results: Path | None,
-    conflict_edges: Iterable[str],
-    more: Mapping[str, str] = NO_OPTIONS,
-) -> Sequence[str]:
-    """Return SUMO's command line.
-
-    Args:
-        config: the user's simulation.
-        step_s: length of a step.
-        seed: seed, unless the configuration has one.
-        folder: folder for temporary files.
-        results: folder for SUMO's statistics; None: none are written.
-        conflict_edges: edges on which SUMO reports short times to collision.
-        more: further options, by name.
+    Raises:
+        BadInputError: it cannot be read, or is another file of SUMO.
     """
-    files = ",".join(map(str, config.write_demand(folder)))
-    own: dict[str, str] = {
-        **ALL_AT_ONCE,
-        **more,
-        "net-file": str(config.net_file),
-        "begin": str(config.begin_s),
-        "step-length": f"{step_s:g}",
-        "collision.action": "warn",
-        "no-step-log": "true",
-        "no-warnings": "true",
-        "xml-validation": "never",
-        "duration-log.disable": "true",
-    }
-    if files:
-        own["route-files"] = files
-    if results is not None:
-        # In a queue, the device keeps all pairs of vehicles, tick by tick: 20 GB in half an hour.
-        edges = folder / "conflicts.txt"
-        lines = [f"edge:{name}\n" for name in sorted(conflict_edges)]
-        edges.write_text("".join(lines), encoding="utf-8")
-        own["tripinfo-output"] = str(results / TRIPS_FILE)
-        own["statistic-output"] = str(results / STATISTICS_FILE)
-        own["collision-output"] = str(results / COLLISIONS_FILE)
-        own["device.emissions.probability"] = "1"
-        own |= {
-            "device.ssm.probability": "1",
-            "device.ssm.file": str(results / CONFLICTS_FILE),
-            "device.ssm.measures": "TTC",
-            "device.ssm.thresholds": f"{CONFLICT_S:g}",
-            "device.ssm.trajectories": "false",
-            "device.ssm.range": f"{CONFLICT_RANGE_M:g}",
-            "device.ssm.filter-edges.input-file": str(edges),
-        }
-    # Drawn vehicles must be those that have been read.
-    own["random"] = "false"
-    options = {"seed": str(seed % 2**31), **config.options, **own}
-    return ("sumo", *(part for name, value in options.items() for part in (f"--{name}", value)))
+    try:
+        with file.open("rb") as stream:
+            _, root = next(ET.iterparse(stream, events=("start",)))  # noqa: S314
+    except OSError as error:
+        raise BadInputError("SUMOCFG", str(file), f"a readable file ({error.strerror})") from error
+    except (ET.ParseError, StopIteration) as error:
+        raise BadInputError("SUMOCFG", str(file), f"XML ({error})") from error
+    kinds = {"net": "a network", "routes": "a file of routes", "additional": "an additional file"}
+    if root.tag in kinds:
+        allowed = f"a configuration (.sumocfg) that names it; the file is {kinds[root.tag]}"
+        raise BadInputError("SUMOCFG", str(file), allowed)
+
+
+def _paths(value: str) -> tuple[Path, ...]:
+    return tuple(Path(part.strip()) for part in value.split(",") if part.strip())
+
+
+def _elements(file: Path, without: Collection[str]) -> Iterator[ET.Element]:
+    """Yield the elements of an additional file, and of those that it includes.
+
+    Elements write no files, and files that they read have absolute paths.
+
+    Raises:
+        BadInputError: a file cannot be read.
+    """
+    try:
+        data = file.read_bytes()
+        root = ET.fromstring(gzip.decompress(data) if data.startswith(_GZIP) else data)  # noqa: S314
+    except OSError as error:
+        allowed = f"a readable file ({error.strerror or error})"
+        raise BadInputError("additional-files", str(file), allowed) from error
+    except (ET.ParseError, EOFError, ValueError) as error:
+        raise BadInputError("additional-files", str(file), f"XML ({error})") from error
+    for element in root:
+        if element.tag == "include":
+            yield from _elements(file.parent / element.get("href", ""), without)
+        elif element.tag not in without:
+            for own in element.iter():
+                for name in _WRITTEN:
+                    if name not in own.attrib:
+                        continue
+                    read = name == "file" and own.tag in _READ
+                    value = file.parent / own.attrib[name] if read else os.devnull
+                    own.set(name, str(value))
+            yield element

@@ -1,31 +1,58 @@
-"""The vehicles of a SUMO simulation, and those that drive through a corridor.
+"""The vehicles of a SUMO simulation, as SUMO itself draws them, and those of a corridor.
 
-SUMO itself loads the vehicles, with their routes and the limits of their types, and each is removed
-when it is loaded: this takes a fraction of a second, and flows, distributions and trips without
-routes mean what they mean to SUMO.
+SUMO drives the simulation once, with the user's own configuration, and reports each vehicle with
+its type, route, stops and departure (`--vehroute-output`). Whatever the configuration describes
+(flows, distributions, trips, districts, rerouters, a scale) becomes a list of vehicles, which
+laneweave and SUMO alone drive afterwards.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
-from attrs import frozen
+from attrs import field, frozen
 
+from laneweave.protocol.errors import BadInputError, Described
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE
-from laneweave.sim_bridge.corridors.corridor import Corridor
-from laneweave.sim_bridge.corridors.sumo_config import ALL_AT_ONCE, SumoConfig
+from laneweave.sim_bridge.corridors.corridor import Corridor, unique_name
+from laneweave.sim_bridge.corridors.sumo_config import SumoConfig
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
-STEP_S = 0.1
-"""Step with which vehicles are loaded; those of flows depart up to a step earlier."""
 MAX_DEMAND_S = 7200.0
-"""Maximum time for which vehicles are loaded."""
+"""Default length of the time window."""
+LATEST_S = 7.0 * 86400.0
+"""Time up to which the first departure is looked for."""
+AT_START = {"departLane": "best", "departPos": "base", "departSpeed": "max"}
+"""How vehicles depart at an entrance, whatever their files say: their trips are equally long."""
+LIMITS = ("length_m", "width_m", "max_accel_mps2", "min_accel_mps2")
+Attributes = Mapping[str, str]
+_NOT_KEPT = frozenset({"id", "type", "depart", "arrival", "fromTaz", "toTaz", "reroute"})
+"""Attributes of vehicles in SUMO's output that are written anew, or that routes have replaced."""
+_STOP_NOT_KEPT = frozenset(
+    {"triggered", "containerTriggered", "expected", "expectedContainers", "permitted"}
+    | {"started", "ended", "join", "split", "parkingBadges"}
+)
+"""Attributes of stops that depend on passengers or other vehicles, or say what has happened."""
+_DEFAULT_TYPE = "DEFAULT_VEHTYPE"
+
+
+@frozen(kw_only=True)
+class TimeWindow:
+    """When the vehicles of a run depart, and how many of them there are."""
+
+    begin_s: float | None = None
+    """None: as the configuration says."""
+    duration_s: float = MAX_DEMAND_S
+    end_s: float = math.inf
+    """Time at which it ends, if the duration does not end before."""
+    scale: float | None = None
+    """SUMO's factor for the demand; None: as the configuration says."""
 
 
 @frozen
@@ -39,6 +66,11 @@ class SumoType:
     """Hardest braking."""
     max_speed_mps: float
 
+    @property
+    def limits(self) -> Mapping[str, float]:
+        """The limits that a type of a scenario has, too, as it has them."""
+        return {name: round(getattr(self, name), 2) for name in LIMITS}
+
 
 @frozen
 class SumoVehicle:
@@ -46,23 +78,59 @@ class SumoVehicle:
 
     name: str
     depart_s: float
-    """When it is to depart."""
+    """When it is to depart; infinite: when passengers have come."""
     route: tuple[str, ...]
     """Edges, in order."""
     vehicle_type: SumoType
     vehicle_class: str
     type_name: str = ""
     """Name of its type in SUMO."""
+    attributes: Attributes = field(factory=dict, eq=False)
+    """Further attributes as SUMO has reported them."""
+    stops: tuple[Attributes, ...] = ()
+
+    def element(self, more: Attributes) -> ET.Element:
+        """Return the element of a file of routes, with more attributes."""
+        depart = f"{self.depart_s:.3f}"
+        own = {"id": self.name, "type": self.type_name, "depart": depart}
+        found = ET.Element("vehicle", {**self.attributes, **own, **more})
+        ET.SubElement(found, "route", {"edges": " ".join(self.route)})
+        for stop in self.stops:
+            ET.SubElement(found, "stop", dict(stop))
+        return found
 
 
 @frozen
 class SumoDemand:
-    """All vehicles of a simulation."""
+    """All vehicles of a simulation that depart in a time window."""
 
     vehicles: tuple[SumoVehicle, ...]
+    """In order of departure."""
     begin_s: float
     end_s: float
-    """Times between which they have been loaded."""
+    step_s: float = 1.0
+    """Length of a step of the configuration."""
+    types: str = field(default="", eq=False, repr=False)
+    """XML elements of the types."""
+    persons: int = 0
+    """Number of persons and containers, which nobody drives."""
+
+    def write(self, file: Path, departures: Mapping[str, Attributes | None]) -> Mapping[str, str]:
+        """Write a file of routes, and return the option that names it.
+
+        Args:
+            file: where it is written.
+            departures: attributes of vehicles that depart otherwise, by name; None: they do not
+                depart.
+        """
+        with file.open("w", encoding="utf-8") as stream:
+            stream.write(f"<routes>\n{self.types}")
+            for vehicle in self.vehicles:
+                more = departures.get(vehicle.name, {})
+                if more is not None and math.isfinite(vehicle.depart_s):
+                    stream.write(ET.tostring(vehicle.element(more), encoding="unicode") + "\n")
+            stream.write("</routes>\n")
+        return {"route-files": str(file)}
 
 
 @frozen
@@ -71,9 +139,9 @@ class Pass:
 
     vehicle: SumoVehicle
     entrance: str
-    """`MAIN_ENTRANCE`, or the last edge of a ramp."""
+    """`MAIN_ENTRANCE`, or the name of a ramp."""
     destination: str
-    """`END_OF_ROAD`, or the first edge of an exit."""
+    """`END_OF_ROAD`, or the name of an exit."""
     upstream: str = ""
     """Edge from which it comes to the start; empty: it departs on the first edge, or by a ramp."""
 
@@ -84,7 +152,6 @@ class CorridorDemand:
 
     passes: tuple[Pass, ...]
     """In order of departure."""
-    begin_s: float
     duration_s: float
     """Time within which they depart."""
     missing: Mapping[str, int]
@@ -93,59 +160,119 @@ class CorridorDemand:
     """Their names in SUMO."""
 
 
-def read_demand(config: SumoConfig, folder: Path, seed: int = 1) -> SumoDemand:
-    """Return the vehicles of a simulation, of its first two hours at most.
+def read_demand(config: SumoConfig, folder: Path, window: TimeWindow, seed: int = 1) -> SumoDemand:
+    """Let SUMO drive a simulation, and return its vehicles.
 
     Args:
-        config: files of the simulation.
-        folder: folder for a file with vehicles of additional files.
-        seed: SUMO's seed.
+        config: the simulation.
+        folder: folder for temporary files.
+        window: when the vehicles depart.
+        seed: SUMO's seed, unless the configuration has one.
 
     Raises:
+        BadInputError: no vehicle departs in the time window.
         CommandFailedError: libsumo is missing, or SUMO rejects a file.
     """
-    files = config.write_demand(folder)
-    end_s = min(config.end_s, config.begin_s + MAX_DEMAND_S)
-    command = ["sumo", "--net-file", str(config.net_file), "--begin", str(config.begin_s)]
-    if files:
-        command += ["--route-files", ",".join(map(str, files))]
-    command += ["--step-length", f"{STEP_S:g}", "--no-warnings", "true", "--no-step-log", "true"]
-    options = {"seed": str(seed % 2**31), **config.options}
-    options |= {"ignore-route-errors": "true", "xml-validation": "never", **ALL_AT_ONCE}
-    command += [part for name, value in options.items() for part in (f"--{name}", value)]
-    vehicles: list[SumoVehicle] = []
-    with SumoProcess(command) as sumo:
-        while True:
-            for name in sumo.simulation.getLoadedIDList():
-                vehicles.append(_vehicle(sumo, name))
-                sumo.vehicle.remove(name)
-            sumo.step()
-            loaded, now_s = sumo.simulation.getLoadedIDList(), sumo.simulation.getTime()
-            if now_s >= end_s or not (loaded or sumo.simulation.getMinExpectedNumber() > 0):
-                break
-    vehicles = [one for one in vehicles if one.depart_s < end_s]
-    vehicles.sort(key=lambda one: one.depart_s)
-    last_s = max((one.depart_s for one in vehicles), default=end_s)
-    return SumoDemand(tuple(vehicles), config.begin_s, min(end_s, math.ceil(last_s)))
-
-
-def _vehicle(sumo: SumoProcess, name: str) -> SumoVehicle:
-    api = sumo.vehicle
-    # Until they depart, loaded vehicles have a negative delay; those of flows come a step late.
-    return SumoVehicle(
-        name,
-        round(sumo.simulation.getTime() - api.getDepartDelay(name), 3),
-        _route(sumo, name),
-        SumoType(
-            length_m=api.getLength(name),
-            width_m=api.getWidth(name),
-            max_accel_mps2=api.getAccel(name),
-            min_accel_mps2=-max(api.getDecel(name), api.getEmergencyDecel(name)),
-            max_speed_mps=api.getMaxSpeed(name),
-        ),
-        api.getVehicleClass(name),
-        api.getTypeID(name),
+    routes, state = folder / "vehicles.xml", folder / "state.xml"
+    options = {
+        "seed": config.options.get("seed", f"{seed % 2**31}"),
+        **config.additional(folder, demand=True),
+        "vehroute-output": str(routes),
+        "vehroute-output.write-unfinished": "true",
+        "vehroute-output.intended-depart": "true",
+        "vehroute-output.last-route": "true",
+    }
+    if window.begin_s is not None:
+        options["begin"] = f"{window.begin_s:g}"
+    if window.scale is not None:
+        options["scale"] = f"{window.scale:g}"
+    with SumoProcess(config.command(options)) as sumo:
+        begin_s, until_s = sumo.simulation.getTime(), sumo.simulation.getEndTime()
+        until_s = until_s if until_s > begin_s else math.inf
+        end_s = min(begin_s + window.duration_s, window.end_s, until_s)
+        waiting = _drive(sumo, end_s, min(LATEST_S, until_s))
+        sumo.simulation.saveState(str(state))
+        types = {name: _type(sumo, name) for name in sumo.vehicletype.getIDList()}
+        found = [*_not_departed(sumo, waiting, types)]
+        step_s = sumo.simulation.getDeltaT()
+    found += _departed(routes, types, begin_s)
+    inside = sorted(
+        (one for one in found if one.depart_s < end_s or math.isinf(one.depart_s)),
+        key=lambda one: one.depart_s,
     )
+    departures_s = [one.depart_s for one in inside if math.isfinite(one.depart_s)]
+    if not departures_s:
+        first_s = min((one.depart_s for one in found), default=math.inf)
+        hint = f"the first one departs at {first_s:g} s: --begin {first_s:g}"
+        raise BadInputError(
+            f"demand of {config.file}",
+            Described(f"{begin_s:g} s to {end_s:g} s"),
+            "a time in which vehicles depart" + (f"; {hint}" if math.isfinite(first_s) else ""),
+        )
+    return SumoDemand(
+        tuple(inside),
+        begin_s,
+        min(end_s, math.floor(departures_s[-1]) + 1.0),
+        step_s,
+        _type_elements(state),
+        _count_persons(routes),
+    )
+
+
+def _drive(sumo: SumoProcess, end_s: float, latest_s: float) -> Mapping[str, float]:
+    """Drive until a time, or until the first vehicle departs if it does so later.
+
+    Returns:
+        Vehicles that have been loaded and have not departed, with the times at which they were to
+        depart.
+    """
+    waiting, departed = dict[str, float](), False
+    while sumo.simulation.getMinExpectedNumber() > 0:
+        now_s = sumo.simulation.getTime()
+        waiting |= {
+            name: now_s - sumo.vehicle.getDepartDelay(name)
+            for name in sumo.simulation.getLoadedIDList()
+        }
+        if now_s >= (end_s if departed or waiting else latest_s):
+            break
+        sumo.step()
+        for name in sumo.simulation.getDepartedIDList():
+            waiting.pop(name, None)
+            departed = True
+    return waiting
+
+
+def _type(sumo: SumoProcess, name: str) -> tuple[SumoType, str]:
+    """Return the limits of a type, and its class."""
+    api = sumo.vehicletype
+    limits = SumoType(
+        length_m=api.getLength(name),
+        width_m=api.getWidth(name),
+        max_accel_mps2=api.getAccel(name),
+        min_accel_mps2=-max(api.getDecel(name), api.getEmergencyDecel(name)),
+        max_speed_mps=api.getMaxSpeed(name),
+    )
+    return limits, api.getVehicleClass(name)
+
+
+def _not_departed(
+    sumo: SumoProcess, waiting: Mapping[str, float], types: Mapping[str, tuple[SumoType, str]]
+) -> Iterator[SumoVehicle]:
+    """Yield the vehicles that have been loaded and have not departed."""
+    present = {*sumo.vehicle.getLoadedIDList()}
+    for name, due_s in waiting.items():
+        if name not in present:
+            continue  # SUMO has given it up
+        # Those that wait for passengers are due at any time.
+        due_now_s = sumo.simulation.getTime() - sumo.vehicle.getDepartDelay(name)
+        type_name = sumo.vehicle.getTypeID(name)
+        yield SumoVehicle(
+            name,
+            round(due_s, 3) if abs(due_now_s - due_s) < 1e-3 else math.inf,
+            _route(sumo, name),
+            *types[type_name],
+            type_name,
+        )
 
 
 def _route(sumo: SumoProcess, name: str) -> tuple[str, ...]:
@@ -155,46 +282,96 @@ def _route(sumo: SumoProcess, name: str) -> tuple[str, ...]:
         return given
     found = list(given[:1])
     for before, after in pairwise(given):
-        way = sumo.simulation.findRoute(before, after, sumo.vehicle.getTypeID(name)).edges
-        if not way:
+        path = sumo.simulation.findRoute(before, after, sumo.vehicle.getTypeID(name)).edges
+        if not path:
             return given
-        found += way[1:]
+        found += path[1:]
     return tuple(found)
+
+
+def _departed(
+    file: Path, types: Mapping[str, tuple[SumoType, str]], begin_s: float
+) -> Iterator[SumoVehicle]:
+    """Yield the vehicles of SUMO's output."""
+    for _, element in ET.iterparse(file):  # noqa: S314 (SUMO has written it)
+        if element.tag != "vehicle":
+            continue
+        attributes = {
+            name: value for name, value in element.attrib.items() if name not in _NOT_KEPT
+        }
+        if float(attributes.get("departSpeed", "0")) > 0.0:
+            # What SUMO has reported is a speed, which may be too high beside other vehicles.
+            attributes["departSpeed"] = "max"
+        type_name = element.get("type", _DEFAULT_TYPE)
+        yield SumoVehicle(
+            element.get("id", ""),
+            _departure_s(element.get("depart", ""), begin_s),
+            tuple(_edges(element)),
+            *types[type_name],
+            type_name,
+            attributes,
+            tuple(map(_stop, element.iter("stop"))),
+        )
+        element.clear()
+
+
+def _departure_s(text: str, begin_s: float) -> float:
+    """Return a time of departure; infinite: it depends on passengers or other vehicles."""
+    if text == "begin":
+        return begin_s
+    try:
+        return float(text)
+    except ValueError:
+        return math.inf
+
+
+def _edges(vehicle: ET.Element) -> Sequence[str]:
+    *_, route = vehicle.iter("route")
+    return route.get("edges", "").split()
+
+
+def _stop(element: ET.Element) -> Attributes:
+    """Return the attributes of a stop that does not wait for passengers, as nobody drives them."""
+    stop = {name: value for name, value in element.attrib.items() if name not in _STOP_NOT_KEPT}
+    if not {"duration", "until"} & stop.keys():
+        started, ended = (float(element.get(name, "0")) for name in ("started", "ended"))
+        stop["duration"] = f"{max(ended - started, 0.0):g}"
+    return stop
+
+
+def _type_elements(state: Path) -> str:
+    """Return the XML elements of the types in a state that SUMO has saved."""
+    root = ET.parse(state).getroot()  # noqa: S314 (SUMO has written it)
+    found = root.findall("vType")
+    for kind in found:
+        for parameter in kind.findall("param"):
+            if parameter.get("key", "").startswith("has.rerouting"):
+                kind.remove(parameter)  # routes are those of the first simulation
+    return "".join(ET.tostring(kind, encoding="unicode") for kind in found)
+
+
+def _count_persons(routes: Path) -> int:
+    found = ET.iterparse(routes)  # noqa: S314 (SUMO has written it)
+    return sum(element.tag in {"person", "container"} for _, element in found)
 
 
 def demand_on(corridor: Corridor, demand: SumoDemand) -> CorridorDemand:
     """Return the vehicles whose routes lead through a corridor."""
     passes, missing, left_out = list[Pass](), Counter[str](), set[str]()
-    ways_in = {(ramp.edge, ramp.to_edge) for ramp in corridor.ramps}
-    ways_out = {(one.from_edge, one.edge) for one in corridor.ways_out}
-    numbers = {edge.name: number for number, edge in enumerate(corridor.edges)}
     for vehicle in demand.vehicles:
-        found = _pass_of(vehicle, numbers, ways_in, ways_out)
+        found = _pass_of(vehicle, corridor)
         if isinstance(found, Pass):
             passes.append(found)
         elif found:
             missing[found] += 1
             left_out.add(vehicle.name)
     duration_s = max(demand.end_s - demand.begin_s, 1.0)
-    names = frozenset(left_out)
-    return CorridorDemand(tuple(passes), demand.begin_s, duration_s, missing, names)
+    return CorridorDemand(tuple(passes), duration_s, missing, frozenset(left_out))
 
 
-def _pass_of(
-    vehicle: SumoVehicle,
-    numbers: Mapping[str, int],
-    ways_in: Collection[tuple[str, str]],
-    ways_out: Collection[tuple[str, str]],
-) -> Pass | str:
-    """Return a vehicle's way through the corridor, or why it is left out; empty: no contact.
-
-    Args:
-        vehicle: the vehicle.
-        numbers: number of each edge of the corridor.
-        ways_in: (edge before, edge of the corridor) of each ramp.
-        ways_out: (edge of the corridor, edge behind) of each exit.
-    """
-    route = vehicle.route
+def _pass_of(vehicle: SumoVehicle, corridor: Corridor) -> Pass | str:
+    """Return a vehicle's way through the corridor, or why it is left out; empty: no contact."""
+    route, numbers = vehicle.route, corridor.edge_numbers
     inside = [place for place, edge in enumerate(route) if edge in numbers]
     if not inside:
         return ""
@@ -203,19 +380,25 @@ def _pass_of(
         *range(numbers[route[first]], numbers[route[first]] + last - first + 1)
     ]:
         return "drive through it twice"
+    if math.isinf(vehicle.depart_s):
+        return "wait for passengers"
+    if vehicle.stops:
+        return "stop on their way"
     before = route[first - 1] if first else ""
     after = route[last + 1] if last + 1 < len(route) else ""
     entrance, destination, upstream = MAIN_ENTRANCE, END_OF_ROAD, ""
     if numbers[route[first]] == 0:
         upstream = before
-    elif (before, route[first]) in ways_in:
-        entrance = before
     else:
-        return f"enter from {before}" if before else f"start on {route[first]}"
+        ramps = {(one.edge, one.to_edge): one.name for one in corridor.ramps}
+        if (before, route[first]) not in ramps:
+            return f"enter from {before}" if before else f"start on {route[first]}"
+        entrance = ramps[before, route[first]]
     if numbers[route[last]] < len(numbers) - 1:
-        if (route[last], after) not in ways_out:
+        exits = {(one.from_edge, one.edge): one.name for one in corridor.ways_out}
+        if (route[last], after) not in exits:
             return f"leave to {after}" if after else f"end on {route[last]}"
-        destination = after
+        destination = exits[route[last], after]
     return Pass(vehicle, entrance, destination, upstream)
 
 
@@ -230,14 +413,5 @@ def type_names(passes: Sequence[Pass]) -> dict[SumoType, str]:
         classes = Counter(
             one.vehicle.vehicle_class for one in passes if one.vehicle.vehicle_type == kind
         )
-        name = stem = entrance_name(classes.most_common(1)[0][0])
-        number = 2
-        while name in names.values():
-            name, number = f"{stem}-{number}", number + 1
-        names[kind] = name
+        names[kind] = unique_name(classes.most_common(1)[0][0], names.values())
     return names
-
-
-def entrance_name(edge: str) -> str:
-    """Return the name of an edge as a name of an entrance or exit."""
-    return re.sub(r"[^A-Za-z0-9_.-]", "_", edge).lstrip("-._") or "edge"

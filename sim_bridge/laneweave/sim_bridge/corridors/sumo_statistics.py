@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -13,10 +13,38 @@ STATISTICS_FILE = "statistics.xml"
 COLLISIONS_FILE = "collisions.xml"
 CONFLICTS_FILE = "ssm.xml"
 """Output of SUMO's device for surrogate safety measures."""
-AGAIN = "laneweave."
-"""Beginning of the names of vehicles that SUMO has begun to drive, and begins again elsewhere."""
 CONFLICT_S = 1.5
 """Time to collision below which two vehicles are in conflict (Hayward 1972)."""
+CONFLICT_RANGE_M = 30.0
+"""Distance within which SUMO looks for vehicles that a vehicle may collide with."""
+
+
+def output_options(results: Path | None, folder: Path, edges: Iterable[str]) -> Mapping[str, str]:
+    """Return the options with which SUMO writes these statistics.
+
+    Args:
+        results: folder for the statistics; None: none are written.
+        folder: folder for temporary files.
+        edges: edges on which SUMO reports short times to collision.
+    """
+    if results is None:
+        return {}
+    # In a queue, the device keeps all pairs of vehicles, tick by tick: 20 GB in half an hour.
+    names = folder / "conflicts.txt"
+    names.write_text("".join(f"edge:{name}\n" for name in sorted(edges)), encoding="utf-8")
+    return {
+        "tripinfo-output": str(results / TRIPS_FILE),
+        "statistic-output": str(results / STATISTICS_FILE),
+        "collision-output": str(results / COLLISIONS_FILE),
+        "device.emissions.probability": "1",
+        "device.ssm.probability": "1",
+        "device.ssm.file": str(results / CONFLICTS_FILE),
+        "device.ssm.measures": "TTC",
+        "device.ssm.thresholds": f"{CONFLICT_S:g}",
+        "device.ssm.trajectories": "false",
+        "device.ssm.range": f"{CONFLICT_RANGE_M:g}",
+        "device.ssm.filter-edges.input-file": str(names),
+    }
 
 
 @frozen
@@ -27,6 +55,8 @@ class SumoTrip:
     duration_s: float
     """From its departure to its arrival."""
     arrival_s: float
+    arrival_edge: str = ""
+    """Edge on which it has arrived."""
     fuel_g: float | None = None
     """None: emissions were not computed."""
 
@@ -62,20 +92,18 @@ def read_statistics(folder: Path) -> SumoStatistics:
     Raises:
         OSError: a file cannot be read.
     """
-    trips, taken_out = dict[str, SumoTrip](), dict[str, SumoTrip]()
+    trips = dict[str, SumoTrip]()
     for _, element in ET.iterparse(folder / TRIPS_FILE):  # noqa: S314 (SUMO has written it)
         if element.tag == "tripinfo":
-            name, trip = element.get("id", "").removeprefix(AGAIN), _trip(element)
-            if element.get("vaporized"):
-                taken_out[name] = trip
-            elif trip.arrival_s >= 0.0:
-                trips[name] = trip
+            trip = _trip(element)
+            if trip.arrival_s >= 0.0:
+                trips[element.get("id", "")] = trip
             element.clear()
     found = ET.parse(folder / STATISTICS_FILE).getroot()  # noqa: S314 (SUMO has written it)
     safety, teleports = found.find("safety"), found.find("teleports")
     return SumoStatistics(
         trips,
-        collisions=_collisions(folder / COLLISIONS_FILE, taken_out),
+        collisions=_collisions(folder / COLLISIONS_FILE),
         teleports=_count(teleports, "total"),
         emergency_brakings=_count(safety, "emergencyBraking"),
         conflicts=tuple(
@@ -87,28 +115,9 @@ def read_statistics(folder: Path) -> SumoStatistics:
     )
 
 
-def _collisions(file: Path, taken_out: Mapping[str, SumoTrip]) -> int:
-    """Return the number of collisions of vehicles that were not being taken out.
-
-    Args:
-        file: SUMO's list of collisions.
-        taken_out: vehicles that were taken out, by name.
-    """
-
-    def is_out(name: str | None, at_s: float) -> bool:
-        trip = taken_out.get((name or "").removeprefix(AGAIN))
-        if trip is None:
-            return False
-        # It lasts for one step, at whose beginning SUMO notes collisions.
-        return trip.depart_s - trip.duration_s <= at_s <= trip.arrival_s
-
-    found = 0
-    for _, element in ET.iterparse(file):  # noqa: S314 (SUMO has written it)
-        if element.tag == "collision":
-            at_s, pair = float(element.get("time", "nan")), map(element.get, ("collider", "victim"))
-            found += not any(is_out(name, at_s) for name in pair)
-            element.clear()
-    return found
+def _collisions(file: Path) -> int:
+    found = ET.iterparse(file)  # noqa: S314 (SUMO has written it)
+    return sum(element.tag == "collision" for _, element in found)
 
 
 def _conflicts(file: Path) -> Iterator[Conflict]:
@@ -119,8 +128,8 @@ def _conflicts(file: Path) -> Iterator[Conflict]:
         least = element.find("minTTC")
         if least is not None and least.get("value", "NA") != "NA":
             yield Conflict(
-                element.get("ego", "").removeprefix(AGAIN),
-                element.get("foe", "").removeprefix(AGAIN),
+                element.get("ego", ""),
+                element.get("foe", ""),
                 float(least.get("value", "nan")),
                 float(least.get("time", "nan")),
             )
@@ -137,6 +146,7 @@ def _trip(element: ET.Element) -> SumoTrip:
         number("depart"),
         number("duration"),
         float(element.get("arrival", "-1")),
+        element.get("arrivalLane", "").rpartition("_")[0],
         fuel_g,
     )
 

@@ -10,6 +10,7 @@ laneweave takes over.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from typing import Protocol
 
@@ -67,14 +68,15 @@ class OutsideView(Protocol):
     def start_lanes(self) -> Sequence[int]:
         """Lanes to whose beginning vehicles come from upstream."""
 
+    @property
+    def departing(self) -> Sequence[Arrival]:
+        """Vehicles that depart near an entrance, in order of departure."""
+
     def approaching(self, lane: int) -> Sequence[Approaching]:
         """Return the vehicles that come to the entrance of a lane, the foremost first."""
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
         """Set the speed at which a vehicle is driven, if it can drive at it; None: its own."""
-
-    def is_out(self, vehicle: str) -> bool:
-        """Return whether a vehicle that departs at the start has been taken out of SUMO."""
 
     def others(self) -> Sequence[OtherBody]:
         """Return the bodies up to `SEEN_BEYOND_M` behind the exits."""
@@ -119,6 +121,10 @@ class TakeOver:
         """Cells in which vehicles are, or to which they move."""
         self._known: dict[Name, Arrival] = {}
         """Approaching vehicles, each with the time at which it was expected first."""
+        self._announce_s = scenario.runtime.announce_s
+        self._departing = deque(view.departing)
+        self._due: dict[Name, Arrival] = {}
+        """Announced vehicles that have not departed."""
 
     def demanded(self, t_s: float) -> Sequence[Arrival]:
         """Return the vehicles that have come near an entrance since the last call."""
@@ -131,12 +137,16 @@ class TakeOver:
                         one.speed_mps, self._lattice.speed_mps
                     )
                     self._known[name] = evolve(one.arrival, t_s=expected_s)
+                    self._due.pop(name, None)
                     new.append(self._known[name])
         return new
 
-    def announced(self) -> Sequence[Arrival]:
-        """Return the vehicles that approach."""
-        return [*self._known.values()]
+    def announced(self, t_s: float) -> Sequence[Arrival]:
+        """Return the vehicles that approach, or depart near an entrance within `announce_s`."""
+        while self._departing and self._departing[0].t_s <= t_s + self._announce_s:
+            first = self._departing.popleft()
+            self._due[Name(first.vehicle)] = first
+        return [*self._known.values(), *self._due.values()]
 
     @property
     def exhausted(self) -> bool:
@@ -147,10 +157,6 @@ class TakeOver:
     def start_lanes(self) -> Sequence[int]:
         """Lanes to whose beginning vehicles come from upstream."""
         return self._view.start_lanes
-
-    def has_come(self, vehicle: str) -> bool:
-        """Return whether a vehicle is waiting at the start."""
-        return self._view.is_out(vehicle)
 
     def has_room(self, destination: str, going: int, waiting: int) -> bool:
         """Return whether a vehicle that waits at the start may enter; see `ExitRoom`."""

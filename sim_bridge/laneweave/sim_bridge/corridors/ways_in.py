@@ -87,7 +87,7 @@ def _add(
         single: edges behind all junctions where ways join.
         parallel: whether the other lanes of an edge lead elsewhere.
     """
-    inside = corridor.edge_names
+    inside = corridor.edge_numbers
     limits: tuple[tuple[float, float], ...] = ()
     waiting = [(link, end_m, limits) for link in links]
     while waiting:

@@ -16,15 +16,12 @@ class OutsideTraffic(Protocol):
     def demanded(self, t_s: float) -> Sequence[Arrival]:
         """Return the vehicles that have become known since the last call."""
 
-    def announced(self) -> Sequence[Arrival]:
+    def announced(self, t_s: float) -> Sequence[Arrival]:
         """Return the vehicles that will enter soon, with the times at which they are expected."""
 
     @property
     def start_lanes(self) -> Sequence[int]:
         """Lanes to whose beginning vehicles come from upstream."""
-
-    def has_come(self, vehicle: str) -> bool:
-        """Return whether a vehicle is waiting at the start: the simulator has loaded it."""
 
     def has_room(self, destination: str, going: int, waiting: int) -> bool:
         """Return whether a vehicle that waits at the start may enter: its exit is not full.

@@ -144,9 +144,9 @@ class Roadside:
         """Arrivals so far, without those of `outside_traffic`."""
         self._others_demanded = 0
         self._held: list[Arrival] = []
-        """Vehicles that the simulator has not loaded yet, or whose exits have no room."""
+        """Vehicles whose exits have no room."""
         self._was_held = Counter[str]()
-        """Number of the latter by exit, at the last tick."""
+        """Their number by exit, at the last tick."""
         self._queued = 0
         self._entered = 0
         self._left = 0
@@ -210,9 +210,7 @@ class Roadside:
         waiting = Counter[str]()
         for arrival in held:
             to = arrival.destination
-            if not outside.has_come(arrival.vehicle):
-                self._held.append(arrival)
-            elif not waiting[to] and outside.has_room(to, going[to], self._was_held[to]):
+            if not waiting[to] and outside.has_room(to, going[to], self._was_held[to]):
                 going[to] += 1
                 self._meter.demand(arrival)
             else:
@@ -530,7 +528,7 @@ class Roadside:
             if room[arrival.lane] > 0:
                 room[arrival.lane] -= 1
                 coming.append(arrival)
-        coming += () if self._outside_traffic is None else self._outside_traffic.announced()
+        coming += () if self._outside_traffic is None else self._outside_traffic.announced(t_s)
         return tuple(
             Announcement(
                 vehicle=Name(arrival.vehicle),

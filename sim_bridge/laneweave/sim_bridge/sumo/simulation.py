@@ -60,7 +60,6 @@ class SumoProcess:
             reason = " ".join(str(error).split())
             raise SumoFailedError(f"SUMO cannot start ({reason}); its messages say why") from error
         SumoProcess._open = self
-        self._network = Path(command[command.index("--net-file") + 1])
         self._gui: SumoGui | None = None
 
     def show(self, tick_s: float) -> None:
@@ -72,12 +71,17 @@ class SumoProcess:
         Raises:
             CommandFailedError: sumo-gui is not installed, or cannot start.
         """
-        self._gui = SumoGui(self._network, tick_s)
+        self._gui = SumoGui(Path(self.simulation.getOption("net-file")), tick_s)
 
     @property
     def vehicle(self) -> Any:  # noqa: ANN401 - libsumo has no types
         """Interface to SUMO's vehicles in libsumo."""
         return self._sumo.vehicle
+
+    @property
+    def vehicletype(self) -> Any:  # noqa: ANN401 - libsumo has no types
+        """Interface to SUMO's types of vehicles in libsumo."""
+        return self._sumo.vehicletype
 
     @property
     def simulation(self) -> Any:  # noqa: ANN401 - libsumo has no types
@@ -107,8 +111,16 @@ class SumoProcess:
         )
 
     def step(self) -> None:
-        """Advance SUMO by one tick."""
-        self._sumo.simulationStep()
+        """Advance SUMO by one tick.
+
+        Raises:
+            SumoFailedError: SUMO ends, for example since it rejects what it reads while it runs.
+        """
+        try:
+            self._sumo.simulationStep()
+        except (self._sumo.TraCIException, self._sumo.FatalTraCIError) as error:
+            reason = " ".join(str(error).split())
+            raise SumoFailedError(f"SUMO has ended ({reason}); its messages say why") from error
         if self._gui is not None and not self._gui.show(self.vehicle, self.vehicle.getIDList()):
             self._gui = None
 

@@ -15,7 +15,7 @@ from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.run.outcome import Outcome, complete_summary, print_outcome
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
 from laneweave.protocol.summary import RunSummary, write_summary
-from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
+from laneweave.sim_bridge.corridors.corridor_setup import WHOLE, read_corridor
 from laneweave.sim_bridge.recording.trips import metadata_of, trips_table
 from support.closed_lanes import DROP
 from support.interchange import CORRIDOR, TRUCKS, stream, write_interchange
@@ -86,7 +86,7 @@ def test_vehicles_that_stay_outside_do_not_fail_a_complete_run(tmp_path: Path) -
     lost = judge(tmp_path, summary(entered=3, left=3))
     assert lost.problems == ("2 of 5 vehicles did not leave the road",)
     config = write_interchange(tmp_path, stream(9), types=TRUCKS)
-    tables = corridor_tables(read_corridor(config, CORRIDOR, tmp_path), config, CORRIDOR)
+    tables = corridor_tables(read_corridor(config, CORRIDOR), config, WHOLE)
     of_sumo = parse_scenario(tables)
     pq.write_table(trips_table([], 0.0, metadata_of(of_sumo)), tmp_path / "trips.parquet")
     outside = judge(tmp_path, summary(entered=3, left=3))

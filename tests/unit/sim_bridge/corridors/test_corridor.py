@@ -30,7 +30,7 @@ from support.interchange import (
 
 
 def network(folder: Path, state: str = "M") -> Network:
-    return read_network(read_config(write_interchange(folder, state=state)).net_file)
+    return read_network(read_config(write_interchange(folder, state=state), folder).net_file)
 
 
 def test_lanes_of_edges_are_joined_by_their_links(tmp_path: Path) -> None:
@@ -82,7 +82,7 @@ def test_a_part_of_the_edges_is_a_corridor_too(tmp_path: Path) -> None:
 def test_an_impossible_corridor_is_refused(tmp_path: Path, name: str, expected: str) -> None:
     config = write_interchange(tmp_path, stream(3), types=TRUCKS)
     with pytest.raises(BadInputError, match=expected):
-        read_corridor(config, name, tmp_path)
+        read_corridor(config, name)
 
 
 def test_names_of_edges_may_contain_colons(tmp_path: Path) -> None:
@@ -90,15 +90,15 @@ def test_names_of_edges_may_contain_colons(tmp_path: Path) -> None:
     for file in tmp_path.glob("small.*"):
         text = file.read_text(encoding="utf-8")
         file.write_text(re.sub(r"\bmain([15])\b", r"main:\1", text), encoding="utf-8")
-    found = read_corridor(config, "main:1:main:5", tmp_path)
+    found = read_corridor(config, "main:1:main:5")
     assert found.corridor.name == "main:1:main:5"
     with pytest.raises(BadInputError, match="two edges of the network"):
-        read_corridor(config, "main:1:main:6", tmp_path)
+        read_corridor(config, "main:1:main:6")
 
 
 def test_what_does_not_fit_is_named_as_in_the_network(tmp_path: Path) -> None:
     config = write_interchange(tmp_path, stream(60), types=TRUCKS)
-    found = read_corridor(config, CORRIDOR, tmp_path)
+    found = read_corridor(config, CORRIDOR)
     assert checked_tables(found.corridor, found.demand)
     (ramp,), opening = found.corridor.ramps, found.corridor.closures[0]
     late = evolve(found.corridor, ramps=(evolve(ramp, merge_m=ramp.merge_m + 200.0),))
@@ -123,7 +123,7 @@ def test_types_that_are_too_weak_are_named(
 ) -> None:
     types = f'<vType id="truck" vClass="truck" accel="{accel_mps2}" decel="4" sigma="0"/>'
     config = write_interchange(tmp_path, stream(60), types=types)
-    found = read_corridor(config, CORRIDOR, tmp_path)
+    found = read_corridor(config, CORRIDOR)
     if fits:
         assert scenario_tables(found.corridor, found.demand)
         return
@@ -138,8 +138,8 @@ def test_a_corridor_does_not_end_where_its_lanes_part(tmp_path: Path) -> None:
 
 def test_more_vehicles_than_the_road_carries_wait(tmp_path: Path) -> None:
     crowd = [vehicle(f"m{number}", 1.0, "main") for number in range(9)]
-    found = read_corridor(write_interchange(tmp_path, crowd), CORRIDOR, tmp_path)
-    assert found.demand.duration_s == 1.0
+    found = read_corridor(write_interchange(tmp_path, crowd), CORRIDOR)
+    assert found.demand.duration_s == 2.0
     scenario = parse_scenario(scenario_tables(found.corridor, found.demand))
     assert scenario.demand.volume_veh_per_lane_h < 3600.0
 
@@ -167,7 +167,7 @@ def test_the_longest_chain_with_priority_is_found(tmp_path: Path) -> None:
 
 
 def test_the_tables_are_a_valid_scenario(tmp_path: Path) -> None:
-    found = read_corridor(write_interchange(tmp_path, stream(90), types=TRUCKS), CORRIDOR, tmp_path)
+    found = read_corridor(write_interchange(tmp_path, stream(90), types=TRUCKS), CORRIDOR)
     scenario = parse_scenario(scenario_tables(found.corridor, found.demand))
     assert scenario.shared_exit_lanes == {0}
     assert scenario.formation.speed_mps == 25.0
@@ -181,6 +181,6 @@ def test_the_tables_are_a_valid_scenario(tmp_path: Path) -> None:
 
 def test_a_corridor_that_nobody_enters_at_its_start_is_refused(tmp_path: Path) -> None:
     config = write_interchange(tmp_path, [vehicle("r", 0.0, "ramp")])
-    found = read_corridor(config, CORRIDOR, tmp_path)
+    found = read_corridor(config, CORRIDOR)
     with pytest.raises(BadInputError, match="a corridor that vehicles enter on main1"):
         scenario_tables(found.corridor, found.demand)

@@ -16,7 +16,7 @@ from support.interchange import LANE_M, write_interchange
 
 @pytest.fixture
 def shape(tmp_path: Path) -> CorridorShape:
-    network = read_network(read_config(write_interchange(tmp_path)).net_file)
+    network = read_network(read_config(write_interchange(tmp_path), tmp_path).net_file)
     return CorridorShape(network, corridor_of(network, "main1", "main5"))
 
 

@@ -24,12 +24,10 @@ class View:
     advice: dict[str, float | None] = field(factory=dict)
     exhausted: bool = False
     start_lanes: tuple[int, ...] = ()
+    departing: tuple[Arrival, ...] = ()
 
     def approaching(self, lane: int) -> list[Approaching]:
         return [one for one in self.coming if one.arrival.lane == lane]
-
-    def is_out(self, _: str) -> bool:
-        return True
 
     def others(self) -> list[OtherBody]:
         return []

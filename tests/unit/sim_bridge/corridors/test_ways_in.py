@@ -12,9 +12,9 @@ from support.interchange import CORRIDOR, RAMP_SPEED_MPS, TRUCKS, stream, write_
 
 
 def test_the_way_in_with_its_limits(tmp_path: Path) -> None:
-    found = read_corridor(write_interchange(tmp_path, stream(10), types=TRUCKS), CORRIDOR, tmp_path)
+    found = read_corridor(write_interchange(tmp_path, stream(10), types=TRUCKS), CORRIDOR)
     (ramp,) = found.corridor.ramps
-    ways = ways_to_ramp(found.network, found.corridor, ramp)
+    ways = ways_to_ramp(found.simulation.network, found.corridor, ramp)
     lanes = {name: way for name, way in ways.items() if not name.startswith(":")}
     assert [*lanes] == ["on_0", "before_0"]
     assert lanes["on_0"].from_m == pytest.approx(ramp.merge_m - 300.0, abs=15.0)
@@ -31,8 +31,8 @@ def test_the_way_in_with_its_limits(tmp_path: Path) -> None:
 
 
 def test_the_ways_to_the_start_are_parallel(tmp_path: Path) -> None:
-    found = read_corridor(write_interchange(tmp_path, stream(10), types=TRUCKS), CORRIDOR, tmp_path)
-    lanes = ways_to_start(found.network, found.corridor)
+    found = read_corridor(write_interchange(tmp_path, stream(10), types=TRUCKS), CORRIDOR)
+    lanes = ways_to_start(found.simulation.network, found.corridor)
     assert [*lanes] == [1, 2, 3]
     for lane, ways in lanes.items():
         named = {name: way.from_m for name, way in ways.items() if not name.startswith(":")}

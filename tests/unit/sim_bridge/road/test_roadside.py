@@ -314,7 +314,6 @@ OFF_RAMP = {
 class Gate:
     """Outside traffic without vehicles, which may hold back those that wait at the start."""
 
-    come: bool = True
     room: bool = True
     exhausted: bool = False
     start_lanes: tuple[int, ...] = ()
@@ -322,11 +321,8 @@ class Gate:
     def demanded(self, _: float) -> list[Arrival]:
         return []
 
-    def announced(self) -> list[Arrival]:
+    def announced(self, _: float) -> list[Arrival]:
         return []
-
-    def has_come(self, vehicle: str) -> bool:
-        return self.come or vehicle != "v0001"
 
     def has_room(self, destination: str, going: int, waiting: int) -> bool:
         del going, waiting
@@ -358,17 +354,15 @@ def admitted(roadside: Roadside, scenario: Scenario, from_s: float, to_s: float)
     return found
 
 
-@pytest.mark.parametrize("gate", [Gate(come=False), Gate(room=False)], ids=["come", "room"])
-def test_a_vehicle_that_is_held_back_is_announced_and_enters_when_it_is_released(
-    gate: Gate,
-) -> None:
+def test_a_vehicle_that_is_held_back_is_announced_and_enters_when_it_is_released() -> None:
+    gate = Gate(room=False)
     roadside, scenario = held_roadside(gate, exits=1)
     before = admitted(roadside, scenario, 0.0, 60.0)
     # It does not keep those behind it back.
     assert [one.arrival.vehicle for one in before] == [f"v{n:04}" for n in range(2, 9)]
     assert [one.vehicle for one in roadside.census(60.0, ()).announced] == ["v0001"]
     assert not roadside.exhausted(60.0)
-    gate.come = gate.room = True
+    gate.room = True
     (late,) = admitted(roadside, scenario, 60.0, 65.0)
     assert late.arrival.vehicle == "v0001"
     # It does not enter in the past, where its body would be on the road already.
