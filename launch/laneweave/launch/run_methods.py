@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 FORMATION: Final = "formation"
 """Formation control by agents and coordinators."""
+SUMO_HAS_DEMAND: Final = "none with a SUMO simulation, which has its own demand; --scale changes it"
 RULE: Final = "rule"
 LC2013: Final = "lc2013"
 """Reference methods: the rules of the paper, and SUMO's own lane changing."""

@@ -23,6 +23,8 @@ IN_FILE = "in_file"
 """Metadata of a field: whether the file contains it; default True."""
 SUMMARY_FILE = "summary.json"
 SCHEMA = "laneweave.summary/1"
+HARD_BRAKE_MPS2 = 5.0
+"""Deceleration beyond which vehicles are counted as braking hard."""
 
 
 def about(meaning: str, unit: str = "") -> dict[str, str]:
@@ -51,6 +53,17 @@ class VehicleCounts:
     )
     left_off_lane: int | None = field(
         default=None, metadata=about("vehicles that left elsewhere or in another lane")
+    )
+    missed_exits: int | None = field(
+        default=None, metadata=about("vehicles that left by another exit than their destination")
+    )
+    stopped_at_lane_end: int | None = field(
+        default=None,
+        metadata=about("vehicles that left the lattice, to stop at the end of their lane"),
+    )
+    left_out: dict[str, int] | None = field(
+        default=None,
+        metadata=about("vehicles of a SUMO simulation that its corridor cannot serve, by reason"),
     )
     left_unattended: int | None = field(
         default=None, metadata=about("vehicles that left with a caretaker in charge")
@@ -111,6 +124,10 @@ class Safety:
     )
     emergency_brakes: int = field(
         metadata=about("episodes of braking with more than 90 % of the limit")
+    )
+    hard_brakes: int | None = field(
+        default=None,
+        metadata=about(f"vehicles that braked with more than {HARD_BRAKE_MPS2:g} m/s2"),
     )
     max_accel_mps2: float | None = field(metadata=about("maximum acceleration", "m/s2"))
     min_accel_mps2: float | None = field(

@@ -44,7 +44,7 @@ def run_bridge(
     with open_road(scenario, folder) as road, ExitStack() as closing:
         # A signal must not leave a record behind that is not closed.
         with interrupts_deferred():
-            record = RunRecord(folder, scenario, method, time.perf_counter)
+            record = RunRecord(folder, scenario, method, time.perf_counter, road.left_out)
             incarnations = Incarnations()
             core = BridgeCore(
                 scenario,

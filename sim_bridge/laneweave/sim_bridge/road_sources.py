@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from attrs import frozen
+from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
@@ -33,6 +33,8 @@ class RoadSource:
     stream: tuple[Arrival, ...] | None = None
     """The arrivals, by time; None: drawn from the scenario's seed."""
     outside_traffic: OutsideTraffic | None = None
+    left_out: Mapping[str, int] = field(factory=dict)
+    """Number of vehicles with routes through a corridor that it cannot serve, by reason."""
 
 
 @contextmanager
@@ -54,12 +56,14 @@ def open_road(scenario: Scenario, results: Path) -> Iterator[RoadSource]:
                     world.show(scenario.runtime.tick_s)
                 yield RoadSource(world)
             return
-        setup = sumo_corridor(scenario).setup(scenario)
+        found = sumo_corridor(scenario)
+        setup = found.setup(scenario)
         with CorridorWorld(scenario, setup, folder, results) as world_of_sumo:
             if scenario.sumo.gui:
                 world_of_sumo.show(scenario.runtime.tick_s)
             ramps = TakeOver(scenario, world_of_sumo)
-            yield RoadSource(world_of_sumo, tuple(main_stream(setup.arrivals)), ramps)
+            stream = tuple(main_stream(setup.arrivals))
+            yield RoadSource(world_of_sumo, stream, ramps, found.demand.missing)
             world_of_sumo.drive_on()
 
 
@@ -82,12 +86,12 @@ def sumo_corridor(scenario: Scenario) -> SumoCorridor:
     )
     found = read_corridor(Path(sumo.config), sumo.corridor, window, scenario.seed)
     corridor, road = found.corridor, scenario.road
-    for field, value, expected in (
+    for name, value, expected in (
         ("road.lanes", road.lanes, corridor.lanes),
         ("road.lane_width_m", road.lane_width_m, corridor.lane_width_m),
         ("road.s1_m + s2_m + s3_m", road.length_m, corridor.length_m),
     ):
         if abs(value - expected) > TOLERANCE_M:
             allowed = f"{expected:g}, as the corridor {sumo.corridor} has"
-            raise BadInputError(field, value, allowed)
+            raise BadInputError(name, value, allowed)
     return found

@@ -21,7 +21,7 @@ from laneweave.launch.cli.options import (
     reject_unused_options,
     shows_progress,
 )
-from laneweave.launch.run_methods import FORMATION, LC2013, RULE, checked_method
+from laneweave.launch.run_methods import FORMATION, LC2013, RULE, SUMO_HAS_DEMAND, checked_method
 from laneweave.protocol.config.scenario_files import load_scenario, scenario_of
 from laneweave.protocol.errors import NO_VALUE, BadInputError
 from laneweave.protocol.scenario.fields import Scenario, check_pace
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 
 RECORDED_ONLY = "it runs faster than real time; `laneweave watch DIR` shows its recording"
-SUMO_HAS_DEMAND = "none with a SUMO simulation, which has its own demand; --scale multiplies it"
 COMPARED_ROUTES = 4
 """Number of pairs of entrance and destination whose trips are printed."""
 
@@ -269,8 +268,10 @@ def _compare(settings: Scenario, folder: Path, *, show: bool) -> None:
         routes = compare(settings, folder, lambda share: bar.update(task, completed=share))
     for one in routes[:COMPARED_ROUTES]:
         own, alone = (
-            f"{count} of {one.vehicles}" + ("" if mean is None else f" in {mean:.1f} s")
-            for mean, count in zip(one.mean_s, one.arrived, strict=True)
+            f"{count} of {one.vehicles}"
+            + ("" if mean is None else f" in {mean:.1f} s")
+            + (f", {wrong} arrived elsewhere," if wrong else "")
+            for mean, count, wrong in zip(one.mean_s, one.arrived, one.elsewhere, strict=True)
         )
         typer.echo(f"{one.entrance} to {one.destination}: {own} with laneweave, {alone} with SUMO")
     typer.echo(f"comparison: {folder / PAGE_FILE}")

@@ -37,8 +37,13 @@ def sweep(
         ),
     ] = "formation",
     volumes: Annotated[
-        str, typer.Option("--volumes", metavar="LIST", help="Vehicles per lane per hour.")
-    ] = VOLUMES,
+        str | None,
+        typer.Option(
+            "--volumes",
+            metavar="LIST",
+            help=f"Vehicles per lane per hour. Default: {VOLUMES}; none on a corridor of SUMO.",
+        ),
+    ] = None,
     seeds: Seeds = "1:4",
     duration: Duration = None,
     jobs: Jobs = None,
@@ -65,7 +70,7 @@ def sweep(
     from laneweave.launch.run_methods import parse_methods
     from laneweave.launch.sweep.execution import run_locally
     from laneweave.launch.sweep.folder import SweepFolder
-    from laneweave.launch.sweep.points import parse_volumes, plan_points
+    from laneweave.launch.sweep.points import plan_points, sweep_volumes
     from laneweave.launch.sweep.sweep import Runner, print_results, run_sweep
     from laneweave.sim_bridge.recording.trips import WARM_UP_S
 
@@ -73,7 +78,7 @@ def sweep(
     points = plan_points(
         base,
         parse_methods(methods),
-        parse_volumes(volumes, base),
+        sweep_volumes(volumes, base, VOLUMES),
         parse_seeds(seeds),
         keep_trajectories,
     )

@@ -10,10 +10,12 @@ from attrs import frozen
 
 from laneweave.launch.report.page import Section, render_page
 from laneweave.launch.report.tables import Table
+from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.summary import HARD_BRAKE_MPS2, read_summary
 from laneweave.sim_bridge.corridors.corridor_arrivals import CorridorArrival
 from laneweave.sim_bridge.corridors.sumo_alone import drive_alone
 from laneweave.sim_bridge.corridors.sumo_statistics import (
@@ -37,7 +39,9 @@ class RouteTimes:
     destination: str
     vehicles: int
     arrived: tuple[int, ...]
-    """Number that has arrived, for each method."""
+    """Number that has arrived where the route ends, for each method."""
+    elsewhere: tuple[int, ...]
+    """Number that has arrived on another edge, for each method."""
     mean_s: tuple[float | None, ...]
     """Mean trip with the delay before departure [s], for each method."""
     fuel_g: tuple[float | None, ...]
@@ -59,7 +63,7 @@ def compare(
         drive_alone(setup, scenario.seed, temporary, alone, progress)
     found = read_statistics(folder), read_statistics(alone)
     routes = _by_route(setup.arrivals, found)
-    tables = [_times_table(routes), _events_table(found)]
+    tables = [_times_table(routes), _events_table(found), _shortfalls_table(folder, routes)]
     lead = f"Corridor {scenario.sumo.corridor} of {scenario.sumo.config}, seed {scenario.seed}."
     page = render_page("laneweave and SUMO alone", lead, [Section("Trips", tables)])
     write_atomically(folder / PAGE_FILE, page)
@@ -75,13 +79,21 @@ def _by_route(
         groups.setdefault((one.origin.entrance, one.origin.destination), []).append(one)
     routes = []
     for (entrance, destination), own in sorted(groups.items(), key=lambda item: -len(item[1])):
-        trips = [
+        ended = [
             [
-                (each.trips[one.origin.vehicle.name], one.origin.vehicle.depart_s)
+                (each.trips[one.origin.vehicle.name], one.origin.vehicle)
                 for one in own
                 if one.origin.vehicle.name in each.trips
             ]
             for each in found
+        ]
+        trips = [
+            [
+                (trip, vehicle.depart_s)
+                for trip, vehicle in each
+                if trip.arrival_edge == vehicle.route[-1]
+            ]
+            for each in ended
         ]
         routes.append(
             RouteTimes(
@@ -89,6 +101,7 @@ def _by_route(
                 destination,
                 len(own),
                 tuple(map(len, trips)),
+                tuple(len(all_) - len(right) for all_, right in zip(ended, trips, strict=True)),
                 # SUMO sees a vehicle of laneweave when it enters, with a delay of 0.
                 tuple(_mean([trip.arrival_s - s for trip, s in each]) for each in trips),
                 tuple(_mean([trip.fuel_g or 0.0 for trip, _ in each]) for each in trips),
@@ -104,14 +117,14 @@ def _mean(values: Sequence[float]) -> float | None:
 def _times_table(routes: Sequence[RouteTimes]) -> Table:
     """Return the table of trips by entrance and destination."""
     headings = ["from", "to", "vehicles"]
-    for what in ("arrived", "trip and delay [s]", "fuel [g]"):
+    for what in ("arrived", "arrived elsewhere", "trip and delay [s]", "fuel [g]"):
         headings += [f"{what}, {method}" for method in METHODS]
     rows = [
         [
             _ROUTES.get(one.entrance, one.entrance),
             _ROUTES.get(one.destination, one.destination),
             f"{one.vehicles}",
-            *(f"{count}" for count in one.arrived),
+            *(f"{count}" for count in (*one.arrived, *one.elsewhere)),
             *map(_shown, one.mean_s),
             *map(_shown, one.fuel_g),
         ]
@@ -119,9 +132,32 @@ def _times_table(routes: Sequence[RouteTimes]) -> Table:
     ]
     caption = (
         "Mean trip from departure to arrival, with the delay before departure, of the vehicles "
-        "that have arrived"
+        "that have arrived where their routes end"
     )
     return Table(headings, rows, caption, 2)
+
+
+def _shortfalls_table(folder: Path, routes: Sequence[RouteTimes]) -> Table:
+    """Return the table of vehicles that were not driven as they should, or not at all."""
+    summary = read_summary(folder)
+    if summary is None:
+        raise CommandFailedError(f"{folder} has no summary of a run")
+    vehicles, safety = summary.vehicles, summary.safety
+    rows = [
+        ["missed exits", f"{vehicles.missed_exits}", "-"],
+        ["arrived elsewhere", *(f"{sum(each)}" for each in zip(*_elsewhere(routes), strict=True))],
+        ["stopped at the end of a lane", f"{vehicles.stopped_at_lane_end}", "-"],
+        [f"braked with more than {HARD_BRAKE_MPS2:g} m/s2", f"{safety.hard_brakes}", "-"],
+    ]
+    rows += [
+        [f"left out: {reason}", f"{count}", f"{count}"]
+        for reason, count in sorted((vehicles.left_out or {}).items())
+    ]
+    return Table(["vehicles that", *METHODS], rows, "Shortfalls in the corridor")
+
+
+def _elsewhere(routes: Sequence[RouteTimes]) -> Sequence[Sequence[int]]:
+    return [one.elsewhere for one in routes] or [(0, 0)]
 
 
 def _shown(value: float | None) -> str:

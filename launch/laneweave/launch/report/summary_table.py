@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.scenario.fields import COMFORT_MPS2, ROLLING_SOLVER, Scenario
-from laneweave.protocol.summary import Planning, RunSummary, Safety
+from laneweave.protocol.summary import HARD_BRAKE_MPS2, Planning, RunSummary, Safety
 
 Row = tuple[str, str]
 """Name of a figure, and its value with unit."""
@@ -50,6 +50,12 @@ def _traffic_rows(summary: RunSummary, *, preferences: bool) -> Iterator[Row]:
     outside = vehicles.demanded - vehicles.entered
     if outside and summary.ending == "complete":
         yield "never entered: did not come to the corridor, or exit full", f"{outside}"
+    for reason, count in sorted((vehicles.left_out or {}).items()):
+        yield f"left out: vehicles that {reason}", f"{count}"
+    if vehicles.missed_exits:
+        yield "missed exits: vehicles that left elsewhere", f"{vehicles.missed_exits}"
+    if vehicles.stopped_at_lane_end:
+        yield "stopped at the end of a lane", f"{vehicles.stopped_at_lane_end} vehicles"
     yield "most vehicles at one time", f"{vehicles.peak}"
     if preferences and summary.preferred_percent is not None:
         share = f"{summary.preferred_percent:.2f} % of {vehicles.left} vehicles"
@@ -73,6 +79,8 @@ def _safety_rows(safety: Safety) -> Iterator[Row]:
         ("lowest acceleration", safety.min_accel_mps2, _accel_unit(safety.min_accel_mps2)),
         ("highest acceleration", safety.max_accel_mps2, _accel_unit(safety.max_accel_mps2)),
     )
+    if safety.hard_brakes:
+        yield f"braked with more than {HARD_BRAKE_MPS2:g} m/s²", f"{safety.hard_brakes} vehicles"
     yield "emergency brakes", f"{safety.emergency_brakes:,}"
 
 

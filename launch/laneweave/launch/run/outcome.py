@@ -16,7 +16,7 @@ from laneweave.coordinator.planning.plug_ins.registry import PLANNERS
 from laneweave.launch.faults.failover import Failover
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.report.summary_table import summary_rows
-from laneweave.launch.run_methods import REFERENCE_METHODS
+from laneweave.launch.run_methods import FORMATION, REFERENCE_METHODS
 from laneweave.protocol.summary import RunSummary, read_summary, write_summary
 
 
@@ -145,6 +145,8 @@ def _violations(summary: RunSummary, *, interrupted: bool, of_sumo: bool) -> lis
     if vehicles.left < expected:
         missing = expected - vehicles.left
         found.append(f"{missing} of {vehicles.demanded} vehicles did not leave the road")
+    if vehicles.missed_exits and summary.faults is None and summary.method == FORMATION:
+        found.append(f"{vehicles.missed_exits} of {vehicles.left} vehicles missed their exits")
     return found
 
 

@@ -156,7 +156,7 @@ class SimulatedRun:
             open_road(scenario, self.folder) as road,
             RunProgress(scenario, show=self.show_progress) as progress,
         ):
-            record = RunRecord(self.folder, scenario, FORMATION, time.perf_counter)
+            record = RunRecord(self.folder, scenario, FORMATION, time.perf_counter, road.left_out)
             bridge = BridgeCore(
                 scenario,
                 road.world,

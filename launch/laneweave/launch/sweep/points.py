@@ -11,6 +11,7 @@ from laneweave.coordinator.planning.plug_ins.registry import checked_solver
 from laneweave.launch.run_methods import (
     FORMATION,
     REFERENCE_METHODS,
+    SUMO_HAS_DEMAND,
     KeepTrajectories,
     labelled,
     reference_method,
@@ -47,13 +48,20 @@ def volume_text(volume_veh_per_lane_h: float) -> str:
     return f"{volume_veh_per_lane_h:.10g}"
 
 
-def parse_volumes(text: str, base: Scenario) -> tuple[float, ...]:
+def sweep_volumes(text: str | None, base: Scenario, default: str = "") -> tuple[float, ...]:
     """Return the volumes of a comma-separated list, in vehicles/(lane h).
+
+    A corridor of a SUMO simulation has the demand of that simulation, and so one volume.
 
     Raises:
         BadInputError: a volume is not a number, impossible in this scenario, or repeated.
     """
+    if base.sumo.config:
+        if text is not None:
+            raise BadInputError("--volumes", text, SUMO_HAS_DEMAND)
+        return (base.demand.volume_veh_per_lane_h,)
     volumes: list[float] = []
+    text = default if text is None else text
     for entry in text.split(","):
         try:
             volume = float(entry)
@@ -113,6 +121,8 @@ def _check_plug_ins(scenario: Scenario, method: str) -> None:
     Raises:
         BadInputError: it does not.
     """
+    if scenario.sumo.config and method != FORMATION:
+        raise BadInputError("--methods", method, f"{FORMATION}, with a SUMO simulation")
     if method == FORMATION:
         checked_solver(scenario.formation.solver, "formation.solver")
     elif not REFERENCE_METHODS.is_built_in(method):

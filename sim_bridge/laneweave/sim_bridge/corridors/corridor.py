@@ -105,6 +105,17 @@ class Corridor:
         """Its first and its last edge, as in `--corridor`."""
         return f"{self.edges[0].name}:{self.edges[-1].name}"
 
+    def lane_name(self, lane: int, at_m: float) -> str:
+        """Return SUMO's name of the lane at a position, or before it."""
+        edges = [
+            edge
+            for edge in self.edges
+            if edge.from_m < at_m + HANDOVER_M
+            and edge.first_lane <= lane < edge.first_lane + edge.lanes
+        ]
+        edge = edges[-1] if edges else self.edges[0]
+        return f"{edge.name}_{lane - edge.first_lane}"
+
     @cached_property
     def edge_numbers(self) -> Mapping[str, int]:
         """The numbers of its edges, by name."""
@@ -114,6 +125,7 @@ class Corridor:
 def unique_name(name: str, taken: Collection[str]) -> str:
     """Return a name of SUMO's with characters that scenarios allow, unlike those that are taken."""
     found = stem = re.sub(r"[^A-Za-z0-9_.-]", "_", name).lstrip("-._") or "edge"
+    found = stem = stem.replace("lane-", "lane_", 1)  # exits at the end of the road have such names
     number = 2
     while found in taken:
         found, number = f"{stem}-{number}", number + 1
@@ -251,6 +263,12 @@ class _Derivation:
             for number, part in enumerate(parts)
             if (ramp := self._ramp(part, ends_m[:number])) is not None
         )
+        for edge, count in Counter(ramp.edge for ramp in ramps).items():
+            if count > 1:
+                allowed = (
+                    f"on-ramps of one lane, but {count} lanes of {edge} lead into the corridor"
+                )
+                raise BadInputError(OPTION, self._name_of_corridor, allowed)
         used = [lane for edge in self._way for lane in edge.car_lanes]
         ways_out = tuple(self._ways_out(parts))
         return Corridor(
@@ -264,6 +282,10 @@ class _Derivation:
             ways_out=ways_out,
             unused=tuple(self._unused),
         )
+
+    @property
+    def _name_of_corridor(self) -> str:
+        return f"{self._way[0].name}:{self._way[-1].name}"
 
     def _lane(self, number: int, lane: int) -> Lane:
         """Return the lane of an edge that is part of a corridor lane."""

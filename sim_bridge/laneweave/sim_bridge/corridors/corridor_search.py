@@ -70,9 +70,12 @@ def _chains(network: Network) -> Iterator[list[Edge]]:
         ):
             before[after] = name
     starts = [name for name in edges if name not in before]
-    for name in starts:
-        chain, seen = [edges[name]], {name}
-        after = following[name]
+    seen = set[str]()
+    for name in (*starts, *edges):  # a ring has no start: it begins with any of its edges
+        if name in seen:
+            continue
+        chain, after = [edges[name]], following[name]
+        seen.add(name)
         while after and before[after] == chain[-1].name and after not in seen:
             chain.append(edges[after])
             seen.add(after)

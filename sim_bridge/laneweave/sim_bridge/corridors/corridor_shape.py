@@ -1,6 +1,7 @@
 """The shape of a corridor in the world: from positions on its road to SUMO's coordinates.
 
-A position on the road is a distance s along the corridor and a distance y from its right edge. Each
+A position on the road is a distance s along the corridor and a distance y from its right edge, or
+from its left edge where vehicles drive on the left: the road is then mirrored. Each
 corridor lane has a centre line, made of the shapes of the lanes of its edges and of the lanes
 inside the junctions between them. A body is placed beside the centre line of the lane that it is
 in, as far as its centre is from the middle of the lane.
@@ -73,6 +74,8 @@ class CorridorShape:
 
     def __init__(self, network: Network, corridor: Corridor) -> None:
         """Join the shapes of the lanes of a corridor."""
+        self.side = -1.0 if network.left_hand else 1.0
+        """-1: the road is mirrored, since vehicles drive on the left."""
         self._lane_m = corridor.lane_width_m
         pieces: list[list[Piece]] = [[] for _ in range(corridor.lanes)]
         for lane, piece in (*_main(network, corridor), *_ramps(corridor)):
@@ -104,7 +107,7 @@ class CorridorShape:
             others = [one for one in (lane + 1, lane - 1) if 0 <= one < len(self._pieces)]
             lane = next((one for one in others if self._exists(one, s_m)), lane)
         piece = self.piece_at(lane, s_m)
-        return piece.at(s_m, y_m - (lane + 0.5) * self._lane_m), piece
+        return piece.at(s_m, self.side * (y_m - (lane + 0.5) * self._lane_m)), piece
 
     def _exists(self, lane: int, s_m: float) -> bool:
         return any(one.begins_m <= s_m <= one.to_m for one in self._pieces[lane])

@@ -275,7 +275,7 @@ class CorridorWorld(SumoProcess):
         """Pass the middle of the front bumper and the angle to SUMO."""
         _, _, heading, _ = pose_of(state)
         (x, y, direction), piece = self._shape.at(state[0], state[3])
-        degrees = 90.0 - math.degrees(direction + heading)
+        degrees = 90.0 - math.degrees(direction + self._shape.side * heading)
         name = self._sumo_name[vehicle]
         self.vehicle.moveToXY(name, piece.edge, piece.index, x, y, degrees, 2)
 

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from laneweave.protocol.config.cross_checks import MIN_SIDE_GAP_M
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
@@ -55,7 +56,7 @@ def checked_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
         if not where:
             raise
         field = f"{OPTION} {corridor.name}, {where} ({error.field} of its scenario)"
-        raise BadInputError(field, error.value, error.allowed) from error
+        raise BadInputError(field, error.value, _enough(error)) from error
     return tables
 
 
@@ -66,14 +67,47 @@ def _where(field: str, tables: Tables, corridor: Corridor) -> str:
         return ""
     kind, number = found[1], int(found[2])
     if kind == "exit":
-        return f"exit to {corridor.ways_out[number].edge}"
+        out = corridor.ways_out[number]
+        opens_m = max(
+            (
+                one.to_m
+                for one in corridor.closures
+                if one.lane in out.lanes and one.to_m < out.at_m
+            ),
+            default=0.0,
+        )
+        lanes = " and ".join(corridor.lane_name(lane, out.at_m) for lane in out.lanes)
+        return f"exit to {out.edge} from lane {lanes}, open for {out.at_m - opens_m:.0f} m"
     if kind == "entrance":
-        names = {ramp.name: ramp.edge for ramp in corridor.ramps}
-        return f"on-ramp from {names[tables['entrance'][number]['name']]}"
+        names = {ramp.name: ramp for ramp in corridor.ramps}
+        ramp = names[tables["entrance"][number]["name"]]
+        ends_m = min(
+            (
+                one.from_m
+                for one in corridor.closures
+                if one.lane == ramp.lane and one.from_m > ramp.merge_m
+            ),
+            default=corridor.length_m,
+        )
+        lane = corridor.lane_name(ramp.lane, ramp.merge_m)
+        used_m, open_m = ramp.merge_m - ramp.at_m, ends_m - ramp.merge_m
+        return f"on-ramp from {ramp.edge} of {used_m:.0f} m into lane {lane} of {open_m:.0f} m"
     closure = tables["road"]["closures"][number]
     ends_m = closure.get("from_m", 0.0)
-    edges = [edge.name for edge in corridor.edges if edge.from_m <= ends_m <= edge.to_m]
-    return f"end of lane {closure['lane']} on edge {edges[0]}" if edges else ""
+    return f"end of lane {corridor.lane_name(closure['lane'], ends_m)}"
+
+
+def _enough(error: BadInputError) -> str:
+    """Return what is allowed, with the length that is missing."""
+    found = re.match(r"at least ([\d.]+)", error.allowed)
+    if found is None or not isinstance(error.value, float):
+        if error.field.endswith("].lane"):
+            return (
+                "a ramp in line with no lane that is open at the start of the corridor: begin the "
+                "corridor on a later edge"
+            )
+        return error.allowed
+    return f"{error.allowed}; {float(found[1]) - error.value:.0f} m longer are enough"
 
 
 def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
@@ -132,6 +166,7 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
             for one in others
         ],
     }
+    _check_widths(corridor, names)
     tables["formation"] = _motion(
         tables, corridor, math.floor(2.0 * SPEED_SHARE * fastest_mps) / 2.0
     )
@@ -149,6 +184,22 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
     tables["road"] |= {"s1_m": settled_m, "s2_m": 0.0, "s3_m": _m(corridor.length_m - settled_m)}
     filled = {name: table for name, table in tables.items() if table}
     return {"schema": "laneweave.scenario/1", **filled}
+
+
+def _check_widths(corridor: Corridor, names: Mapping[SumoType, str]) -> None:
+    """Check that vehicles fit between those in the lanes beside theirs.
+
+    Raises:
+        BadInputError: a type is too wide for the narrowest lane.
+    """
+    widest = max(names, key=lambda kind: kind.width_m)
+    most_m = corridor.lane_width_m - MIN_SIDE_GAP_M
+    if widest.width_m > most_m:
+        raise BadInputError(
+            f"{OPTION} {corridor.name}, width of vehicles of class {names[widest]}",
+            widest.width_m,
+            f"at most {most_m:g} m, {MIN_SIDE_GAP_M:g} m less than its narrowest lane is wide",
+        )
 
 
 def _from(demand: CorridorDemand, entrance: str) -> list[Pass]:

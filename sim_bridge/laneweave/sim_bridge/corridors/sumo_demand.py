@@ -226,20 +226,25 @@ def _drive(sumo: SumoProcess, end_s: float, latest_s: float) -> Mapping[str, flo
         Vehicles that have been loaded and have not departed, with the times at which they were to
         depart.
     """
-    waiting, departed = dict[str, float](), False
+    waiting, departed = _due_s(sumo), False
     while sumo.simulation.getMinExpectedNumber() > 0:
-        now_s = sumo.simulation.getTime()
-        waiting |= {
-            name: now_s - sumo.vehicle.getDepartDelay(name)
-            for name in sumo.simulation.getLoadedIDList()
-        }
-        if now_s >= (end_s if departed or waiting else latest_s):
+        if sumo.simulation.getTime() >= (end_s if departed or waiting else latest_s):
             break
         sumo.step()
+        waiting |= _due_s(sumo)
         for name in sumo.simulation.getDepartedIDList():
             waiting.pop(name, None)
             departed = True
     return waiting
+
+
+def _due_s(sumo: SumoProcess) -> dict[str, float]:
+    """Return when the vehicles that have been loaded in the last step are to depart."""
+    now_s = sumo.simulation.getTime()
+    return {
+        name: now_s - sumo.vehicle.getDepartDelay(name)
+        for name in sumo.simulation.getLoadedIDList()
+    }
 
 
 def _type(sumo: SumoProcess, name: str) -> tuple[SumoType, str]:
@@ -260,15 +265,15 @@ def _not_departed(
 ) -> Iterator[SumoVehicle]:
     """Yield the vehicles that have been loaded and have not departed."""
     present = {*sumo.vehicle.getLoadedIDList()}
+    now_s, pending = sumo.simulation.getTime(), {*sumo.simulation.getPendingVehicles()}
     for name, due_s in waiting.items():
         if name not in present:
             continue  # SUMO has given it up
-        # Those that wait for passengers are due at any time.
-        due_now_s = sumo.simulation.getTime() - sumo.vehicle.getDepartDelay(name)
         type_name = sumo.vehicle.getTypeID(name)
         yield SumoVehicle(
             name,
-            round(due_s, 3) if abs(due_now_s - due_s) < 1e-3 else math.inf,
+            # Those that wait for passengers are due, but SUMO does not try to insert them.
+            round(due_s, 3) if name in pending or due_s >= now_s else math.inf,
             _route(sumo, name),
             *types[type_name],
             type_name,

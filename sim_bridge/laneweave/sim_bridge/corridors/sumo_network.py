@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
 import math
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 from attrs import define, field, frozen
 
@@ -28,7 +30,7 @@ class Lane:
     name: str
     edge: str
     index: int
-    """Number in its edge, from the right."""
+    """Number in its edge, from the side on which vehicles drive."""
     length_m: float
     width_m: float
     speed_mps: float
@@ -87,6 +89,8 @@ class Network:
     edges: Mapping[str, Edge]
     links: tuple[Link, ...] = field(factory=tuple)
     """Links that cars may use."""
+    left_hand: bool = False
+    """Whether vehicles drive on the left: lanes are numbered from the left."""
 
     @cached_property
     def _from(self) -> Mapping[str, tuple[Link, ...]]:
@@ -119,7 +123,7 @@ def read_network(file: Path) -> Network:
     """Read a network file.
 
     Raises:
-        BadInputError: it cannot be read, or is not a network on whose right side vehicles drive.
+        BadInputError: it cannot be read.
     """
     from sumolib import net as sumo_net  # noqa: PLC0415 (slow to import)
 
@@ -127,13 +131,21 @@ def read_network(file: Path) -> Network:
         found = sumo_net.readNet(str(file), withInternal=True, lxml=False)
         edges = {edge.getID(): _edge(edge) for edge in found.getEdges(withInternal=False)}
         links = tuple(_links(found, edges))
+        left_hand = _is_left_hand(file)
     except OSError as error:
         raise BadInputError("net-file", str(file), f"a readable file ({error})") from error
     except Exception as error:  # sumolib raises whatever its parsers raise
         raise BadInputError("net-file", str(file), f"a network of SUMO ({error!r})") from error
     if not edges:
         raise BadInputError("net-file", str(file), "a network of SUMO with at least one edge")
-    return Network({name: edge for name, edge in edges.items() if edge.lanes}, links)
+    return Network({name: edge for name, edge in edges.items() if edge.lanes}, links, left_hand)
+
+
+def _is_left_hand(file: Path) -> bool:
+    """Return whether vehicles drive on the left; sumolib does not read it."""
+    with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as stream:
+        _, root = next(ET.iterparse(stream, events=("start",)))  # noqa: S314 (sumolib reads it, too)
+    return bool(root.get("lefthand") == "true")
 
 
 def _edge(edge: Any) -> Edge:  # noqa: ANN401 - sumolib has no types

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from enum import Enum
 from pathlib import Path
+from types import MappingProxyType
 from typing import Protocol
 
 import pyarrow as pa
@@ -46,6 +47,7 @@ from laneweave.protocol.wire.events import (
     FORMATION_CLOSED,
     LEADER,
     LEFT,
+    LEFT_LATTICE,
     LEFT_OFF_LANE,
     OVERLAP,
     RUN_ENDED,
@@ -59,6 +61,8 @@ from laneweave.sim_bridge.recording.ticks import Ticks
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import Trip, Trips, metadata_of, throughput, travel_time
 from laneweave.sim_bridge.road.demand import Arrival
+
+NOBODY: Mapping[str, int] = MappingProxyType({})
 
 
 class RecordedVehicle(Protocol):
@@ -119,9 +123,22 @@ class RunRecord:
     """Collector of a run's measurements, and writer of its files."""
 
     def __init__(
-        self, folder: Path, scenario: Scenario, method: str, stopwatch: Callable[[], float]
+        self,
+        folder: Path,
+        scenario: Scenario,
+        method: str,
+        stopwatch: Callable[[], float],
+        left_out: Mapping[str, int] = NOBODY,
     ) -> None:
-        """Open the files of a run in its folder; create the folder if necessary."""
+        """Open the files of a run in its folder; create the folder if necessary.
+
+        Args:
+            folder: the run's folder.
+            scenario: the scenario.
+            method: value of `laneweave run --method`.
+            stopwatch: returns the wall time [s].
+            left_out: number of vehicles that the run leaves out, by reason.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._scenario = scenario
@@ -145,6 +162,10 @@ class RunRecord:
         self._caretaker_takeovers = 0
         self._agent_takeovers = 0
         self._left_unattended = 0
+        self._left_out = left_out
+        self._missed_exits = 0
+        self._stopped = set[Name]()
+        """Vehicles that have left the lattice at the end of a lane."""
         self._exits = Exits(scenario.sections, scenario.road.length_m)
         self._closed = False
         self.missed_ticks = 0
@@ -209,6 +230,7 @@ class RunRecord:
         trip.exit = section.exit if section.to_m < self._scenario.road.length_m else END_OF_ROAD
         at_destination = section.serves(arrival.preferred_lane, arrival.destination)
         trip.at_destination = at_destination
+        self._missed_exits += trip.exit != arrival.destination
         self._rung_ticks.update(vehicle.rung_ticks)
         self._left_unattended += not attended
         where = {"vehicle": vehicle.name, "lane": lane, "exit": trip.exit}
@@ -225,6 +247,8 @@ class RunRecord:
 
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Record that a vehicle has left the lattice at a dead end, or comes back; see `events`."""
+        if kind == LEFT_LATTICE:
+            self._stopped.add(vehicle)
         self.event(t_s, kind, vehicle=vehicle, lane=lane)
 
     def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
@@ -332,6 +356,9 @@ class RunRecord:
                 at_destination=on_preferred_lane,
                 peak=self._trajectories.peak,
                 left_off_lane=left - on_preferred_lane,
+                missed_exits=self._missed_exits,
+                stopped_at_lane_end=len(self._stopped),
+                left_out=dict(self._left_out) or None,
                 left_unattended=self._left_unattended,
             ),
             travel_time_s=travel_time(trips),

@@ -12,7 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from laneweave.protocol.lattice import Lattice
-from laneweave.protocol.summary import Safety
+from laneweave.protocol.summary import HARD_BRAKE_MPS2, Safety
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.columns import TRAJECTORIES, Metadata
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
@@ -98,6 +98,7 @@ class Trajectories:
         self._collisions: set[tuple[str, str]] = set()
         self._min_gap_m = self._min_headway_s = math.inf
         self._emergency_brakes = 0
+        self._hard_brakes = set[str]()
         self._min_accel_mps2, self._max_accel_mps2 = math.inf, -math.inf
         self._max_jerk_mps3 = -math.inf
 
@@ -115,6 +116,8 @@ class Trajectories:
                     own_mps2 = EMERGENCY_SHARE * self._min_accel_of(vehicle)
                 if accel < own_mps2 and (last is None or last >= own_mps2):
                     self._emergency_brakes += 1
+            if accel < -HARD_BRAKE_MPS2:
+                self._hard_brakes.add(vehicle)
         self._last_s, self._last_accels = t_s, accels
         self._min_accel_mps2 = min(self._min_accel_mps2, *accels.values(), math.inf)
         self._max_accel_mps2 = max(self._max_accel_mps2, *accels.values(), -math.inf)
@@ -145,6 +148,7 @@ class Trajectories:
             min_gap_m=finite(self._min_gap_m),
             min_headway_s=finite(self._min_headway_s),
             emergency_brakes=self._emergency_brakes,
+            hard_brakes=len(self._hard_brakes),
             max_accel_mps2=finite(self._max_accel_mps2),
             min_accel_mps2=finite(self._min_accel_mps2),
             max_jerk_mps3=finite(self._max_jerk_mps3),

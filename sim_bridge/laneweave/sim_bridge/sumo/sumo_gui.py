@@ -7,6 +7,7 @@ traffic of its own, and shows the vehicles of the first, tick by tick, over TraC
 from __future__ import annotations
 
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 from laneweave.protocol.errors import CommandFailedError
 
 MISSING = "sumo-gui is not installed: pip install 'laneweave[gui]'"
+NO_DISPLAY = "sumo-gui needs a screen, and DISPLAY is not set: run without --gui, or with xvfb-run"
 _ROUTE, _LABEL = "laneweave", "laneweave-gui"
 _EXACT = 2
 """moveToXY puts a vehicle exactly at a position, whatever its route."""
@@ -33,6 +35,8 @@ class SumoGui:
         Raises:
             CommandFailedError: sumo-gui is not installed, or cannot start.
         """
+        if program == "sumo-gui" and sys.platform == "linux" and not os.environ.get("DISPLAY"):
+            raise CommandFailedError(NO_DISPLAY)
         package, traci = importlib.util.find_spec("sumo"), load_traci()
         if package is None or package.origin is None or traci is None:
             raise CommandFailedError(MISSING)

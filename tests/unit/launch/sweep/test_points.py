@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from laneweave.launch.run_methods import METHODS, KeepTrajectories, parse_methods, rank
-from laneweave.launch.sweep.points import parse_volumes, plan_points
+from laneweave.launch.sweep.points import plan_points, sweep_volumes
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
@@ -97,12 +97,12 @@ def test_bad_methods(text: str) -> None:
 @pytest.mark.parametrize("text", ["", "a", "1000,", "0", "-5", "5000", "nan", "inf", "1e3,1000"])
 def test_bad_volumes(text: str) -> None:
     with pytest.raises(BadInputError, match="--volumes: got "):
-        parse_volumes(text, Scenario())
+        sweep_volumes(text, Scenario())
 
 
 def test_volumes_and_labels_that_do_not_fit_the_scenario() -> None:
     with pytest.raises(BadInputError, match="--volumes: got '1600'"):
-        parse_volumes("1000,1600", load_scenario(None, demand__min_headway_s=3.0))
+        sweep_volumes("1000,1600", load_scenario(None, demand__min_headway_s=3.0))
     base = load_scenario(None, road__s3_m=160.0)
     with pytest.raises(BadInputError, match=r"road.s3_m \(paper-12\): got 160.0"):
         plan_points(base, ["paper-12"], [1000.0], range(1), KeepTrajectories.none)
