@@ -190,11 +190,12 @@ def read_demand(config: SumoConfig, folder: Path, window: TimeWindow, seed: int 
         begin_s, until_s = sumo.simulation.getTime(), sumo.simulation.getEndTime()
         until_s = until_s if until_s > begin_s else math.inf
         end_s = min(begin_s + window.duration_s, window.end_s, until_s)
-        waiting = _drive(sumo, end_s, min(LATEST_S, until_s))
+        # One step more: a vehicle departs in the first step after its time.
+        step_s = sumo.simulation.getDeltaT()
+        waiting = _drive(sumo, end_s + step_s, min(LATEST_S, until_s))
         sumo.simulation.saveState(str(state))
         types = {name: _type(sumo, name) for name in sumo.vehicletype.getIDList()}
         found = [*_not_departed(sumo, waiting, types)]
-        step_s = sumo.simulation.getDeltaT()
     found += _departed(routes, types, begin_s)
     inside = sorted(
         (one for one in found if one.depart_s < end_s or math.isinf(one.depart_s)),
@@ -265,7 +266,8 @@ def _not_departed(
 ) -> Iterator[SumoVehicle]:
     """Yield the vehicles that have been loaded and have not departed."""
     present = {*sumo.vehicle.getLoadedIDList()}
-    now_s, pending = sumo.simulation.getTime(), {*sumo.simulation.getPendingVehicles()}
+    step_s, now_s = sumo.simulation.getDeltaT(), sumo.simulation.getTime()
+    pending = {*sumo.simulation.getPendingVehicles()}
     for name, due_s in waiting.items():
         if name not in present:
             continue  # SUMO has given it up
@@ -273,7 +275,7 @@ def _not_departed(
         yield SumoVehicle(
             name,
             # Those that wait for passengers are due, but SUMO does not try to insert them.
-            round(due_s, 3) if name in pending or due_s >= now_s else math.inf,
+            round(due_s, 3) if name in pending or due_s > now_s - step_s else math.inf,
             _route(sumo, name),
             *types[type_name],
             type_name,

@@ -1,0 +1,281 @@
+"""Corridors drawn at random, written with netconvert, and an oracle for runs on them.
+
+A drawn network is a main road of two to four lanes with an on-ramp, exits, both or neither, in any
+order, with any lengths; the corridor may begin and end on any of its main edges. Vehicles depart on
+the first edge, upstream of it or on the ramp, anywhere on their edges. The oracle uses only what
+the run has recorded and what SUMO reports, no code of the bridge.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from itertools import combinations, pairwise
+from pathlib import Path
+from random import Random
+
+import pyarrow.parquet as pq
+import sumo
+from attrs import define, field, frozen
+
+NETCONVERT = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
+DEMAND_S = 60
+CAR, TRUCK = (4.5, 1.8), (7.1, 2.4)
+"""(length, width) [m] of the drawn types."""
+TOLERANCE_M = 0.05
+"""By how much bodies may overlap in the oracle, which ignores their headings."""
+
+
+@frozen
+class DrawnCorridor:
+    """A simulation, and the corridor in it."""
+
+    config: Path
+    name: str
+    """FIRST_EDGE:LAST_EDGE."""
+    text: str
+    """What it is, in a few words."""
+
+
+@define
+class _Main:
+    """The main road while it is drawn."""
+
+    rng: Random
+    lanes: int
+    speed_mps: float
+    nodes: list[str] = field(factory=list)
+    edges: list[str] = field(factory=list)
+    connections: list[str] = field(factory=list)
+    main: list[str] = field(factory=list)
+    """Names of the main edges."""
+    exits: list[tuple[str, int]] = field(factory=list)
+    """Names of the exits' edges, and the numbers of the main edges before."""
+    ramps: list[tuple[str, int]] = field(factory=list)
+    """Names of the ramps' first edges, and the numbers of the main edges behind."""
+    x_m: float = 0.0
+
+    def node(self, x_m: float, y_m: float = 0.0) -> str:
+        name = f"n{len(self.nodes)}"
+        self.nodes.append(f'<node id="{name}" x="{x_m:.2f}" y="{y_m:.2f}" type="priority"/>')
+        return name
+
+    def edge(self, name: str, begin: str, end: str, lanes: int, speed_mps: float = 0.0) -> str:
+        self.edges.append(
+            f'<edge id="{name}" from="{begin}" to="{end}" numLanes="{lanes}" priority="9" '
+            f'speed="{speed_mps or self.speed_mps:.2f}"/>'
+        )
+        return name
+
+    def connect(self, before: str, after: str, pairs: Sequence[tuple[int, int]]) -> None:
+        self.connections += [
+            f'<connection from="{before}" to="{after}" fromLane="{a}" toLane="{b}"/>'
+            for a, b in pairs
+        ]
+
+    def extend(self, length_m: float, *, extra: bool = False) -> str:
+        """Add a main edge; `extra`: with a lane 0 beside the others."""
+        begin = self.node(self.x_m) if not self.nodes else f"n{self.last}"
+        self.x_m += length_m
+        end = self.node(self.x_m)
+        self.last = int(end[1:])
+        name = self.edge(f"e{len(self.main)}", begin, end, self.lanes + extra)
+        self.main.append(name)
+        return name
+
+    last: int = 0
+
+
+def draw_corridor(seed: int, folder: Path) -> DrawnCorridor:
+    """Write the files of a drawn simulation."""
+    rng = Random(seed)
+    main = _Main(rng, rng.choice((2, 2, 3, 3, 4)), rng.choice((16.67, 22.22, 27.78)))
+    kind = rng.choice(
+        ("plain", "ramp", "ramp", "exit", "exit", "ramp-exit", "exit-ramp", "weaving", "exits")
+    )
+    _draw_road(main, kind)
+    first, last = _draw_ends(main)
+    left_hand = rng.random() < 0.1
+    _netconvert(main, folder, left_hand=left_hand)
+    vehicles = sorted(_draw_vehicles(main, first, last))
+    types = (
+        f'<vType id="car" length="{CAR[0]}" width="{CAR[1]}" accel="2.6" decel="4.5"/>'
+        f'<vType id="truck" vClass="truck" length="{TRUCK[0]}" width="{TRUCK[1]}" accel="1.3"'
+        ' decel="4" maxSpeed="36"/>'
+    )
+    routes = "\n".join(["<routes>", types, *(text for _, text in vehicles), "</routes>"])
+    (folder / "drawn.rou.xml").write_text(routes, encoding="utf-8")
+    config = folder / "drawn.sumocfg"
+    step_s = rng.choice((0.2, 0.5, 1.0))
+    config.write_text(
+        '<configuration><input><net-file value="drawn.net.xml"/>'
+        '<route-files value="drawn.rou.xml"/></input>'
+        f'<time><begin value="0"/><end value="{DEMAND_S}"/><step-length value="{step_s}"/></time>'
+        "</configuration>",
+        encoding="utf-8",
+    )
+    name = f"{main.main[first]}:{main.main[last]}"
+    text = f"{kind}, {main.lanes} lanes, {main.speed_mps} m/s, {name}, {len(vehicles)} vehicles"
+    return DrawnCorridor(config, name, text + (", left-hand" if left_hand else ""))
+
+
+def _draw_road(main: _Main, kind: str) -> None:
+    """Draw the edges: a feature needs lanes that are long enough for the speed."""
+    rng = main.rng
+    per_mps = main.speed_mps / 27.78
+    for _ in range(rng.choice((0, 0, 1, 2))):
+        main.extend(rng.uniform(120.0, 400.0))
+    main.extend(rng.uniform(350.0, 700.0))
+    for part in kind.replace("exits", "exit-exit").split("-"):
+        if part == "plain":
+            continue
+        if part in ("ramp", "weaving"):
+            _draw_ramp(main)
+        extra = main.extend(per_mps * rng.uniform(260.0, 480.0), extra=True)
+        main.connect(main.main[-2], extra, [(n, n + 1) for n in range(main.lanes)])
+        if part in ("ramp", "weaving"):
+            main.connect(main.ramps[-1][0].replace("far", "on"), extra, [(0, 0)])
+        if part in ("exit", "weaving"):
+            out = f"off{len(main.exits)}"
+            end = main.node(main.x_m + 250.0, -60.0)
+            main.edge(out, f"n{main.last}", end, 1, main.speed_mps * rng.choice((0.8, 1.0)))
+            main.exits.append((out, len(main.main) - 1))
+            main.connect(extra, out, [(0, 0)])
+        after = main.extend(rng.uniform(320.0, 600.0))
+        main.connect(extra, after, [(n + 1, n) for n in range(main.lanes)])
+    for _ in range(rng.choice((0, 0, 1))):
+        main.extend(rng.uniform(60.0, 300.0))
+    for before, after in pairwise(main.main):
+        if not any(f'from="{before}" to="{after}"' in one for one in main.connections):
+            main.connect(before, after, [(n, n) for n in range(main.lanes)])
+
+
+def _draw_ramp(main: _Main) -> None:
+    """Draw an on-ramp of one or two edges to the present end of the main road."""
+    rng, number = main.rng, len(main.ramps)
+    length_m, speed_mps = rng.uniform(150.0, 330.0), main.speed_mps * rng.choice((0.8, 1.0))
+    middle = main.node(main.x_m - length_m, -0.3 * length_m)
+    main.edge(f"on{number}", middle, f"n{main.last}", 1, speed_mps)
+    name = f"on{number}"
+    if rng.random() < 0.5:
+        far = main.node(main.x_m - length_m - rng.uniform(60.0, 250.0), -0.6 * length_m)
+        name = main.edge(f"far{number}", far, middle, 1, speed_mps)
+    main.ramps.append((name, len(main.main)))
+
+
+def _draw_ends(main: _Main) -> tuple[int, int]:
+    """Return the numbers of the first and the last main edge of a corridor."""
+    rng = main.rng
+    special = {number for _, number in (*main.exits, *main.ramps)}
+    firsts = [n for n in range(len(main.main)) if n < min(special, default=len(main.main))]
+    first = rng.choice((0, firsts[-1], rng.choice(firsts)))
+    lasts = [n for n in range(first, len(main.main)) if n > max(special, default=-1)]
+    return first, rng.choice((lasts[0], lasts[-1], rng.choice(lasts)))
+
+
+def _draw_vehicles(main: _Main, first: int, last: int) -> Iterator[tuple[float, str]]:
+    """Yield (departure, XML element)."""
+    rng = main.rng
+    trucks = rng.choice((0.0, 0.1, 0.25))
+    to_exit = rng.uniform(0.05, 0.25)
+    for lane in range(main.lanes):
+        t_s = rng.uniform(0.0, 5.0)
+        mean_s = 3600.0 / rng.uniform(300.0, 1300.0)
+        while t_s < DEMAND_S:
+            begin = rng.choice((0, 0, first))
+            route = main.main[begin:]
+            if main.exits and rng.random() < to_exit:
+                out, number = rng.choice(main.exits)
+                route = [*main.main[begin : number + 1], out]
+            kind = "truck" if rng.random() < trucks else "car"
+            at = rng.choice(("base", "base", "random", "last"))
+            yield t_s, _vehicle(f"m{lane}#{t_s:.1f}", kind, t_s, route, at)
+            t_s += 1.0 + rng.expovariate(1.0 / max(mean_s - 1.0, 0.5))
+    for name, number in main.ramps:
+        t_s, mean_s = rng.uniform(0.0, 9.0), 3600.0 / rng.uniform(100.0, 450.0)
+        while t_s < DEMAND_S:
+            edges = [name, *([name.replace("far", "on")] if name.startswith("far") else [])]
+            if rng.random() < 0.2:
+                edges = edges[-1:]
+            later = [one for one in main.exits if one[1] >= number]
+            route = [*edges, *main.main[number:]]
+            if later and rng.random() < 0.2:
+                out, until = rng.choice(later)
+                route = [*edges, *main.main[number : until + 1], out]
+            kind = "truck" if rng.random() < 0.5 * trucks else "car"
+            at = rng.choice(("base", "base", "random", "last"))
+            yield t_s, _vehicle(f"{name}.{t_s:.1f}", kind, t_s, route, at)
+            t_s += 2.0 + rng.expovariate(1.0 / mean_s)
+
+
+def _vehicle(name: str, kind: str, depart_s: float, route: Sequence[str], at: str) -> str:
+    return (
+        f'<vehicle id="{name}" type="{kind}" depart="{depart_s:.2f}" departPos="{at}"'
+        f' departLane="best" departSpeed="max"><route edges="{" ".join(route)}"/></vehicle>'
+    )
+
+
+def _netconvert(main: _Main, folder: Path, *, left_hand: bool) -> None:
+    files = {"nod": main.nodes, "edg": main.edges, "con": main.connections}
+    roots = {"nod": "nodes", "edg": "edges", "con": "connections"}
+    for suffix, elements in files.items():
+        text = "\n".join([f"<{roots[suffix]}>", *elements, f"</{roots[suffix]}>"])
+        (folder / f"drawn.{suffix}.xml").write_text(text, encoding="utf-8")
+    command = [str(NETCONVERT), "-n", "drawn.nod.xml", "-e", "drawn.edg.xml"]
+    command += ["-x", "drawn.con.xml", "-o", "drawn.net.xml", "--no-turnarounds", "true"]
+    command += ["--lefthand", "true"] if left_hand else []
+    subprocess.run(command, cwd=folder, check=True, capture_output=True, timeout=60)  # noqa: S603
+
+
+def problems(drawn: DrawnCorridor, run: Path) -> list[str]:
+    """Return what is wrong in a recorded run on a drawn corridor; empty: nothing."""
+    return [*_overlaps(run), *_without_agents(run), *_wrong_ends(drawn, run)]
+
+
+def _overlaps(run: Path) -> Iterator[str]:
+    """Yield the pairs of bodies whose rectangles overlap at a tick."""
+    trips = pq.read_table(run / "trips.parquet").to_pylist()
+    sizes = {one["vehicle"]: TRUCK if one["vehicle_type"] == "truck" else CAR for one in trips}
+    rows = pq.read_table(run / "trajectories.parquet", columns=["t_s", "vehicle", "s_m", "y_m"])
+    ticks: dict[float, list[tuple[float, float, str]]] = defaultdict(list)
+    for row in rows.to_pylist():
+        ticks[row["t_s"]].append((row["s_m"], row["y_m"], row["vehicle"]))
+    found = set[tuple[str, str]]()
+    for bodies in ticks.values():
+        bodies.sort()
+        for (s_m, y_m, one), (ahead_m, beside_m, other) in combinations(bodies, 2):
+            if ahead_m - sizes[other][0] >= s_m - TOLERANCE_M:
+                continue
+            half_m = 0.5 * (sizes[one][1] + sizes[other][1])
+            if abs(y_m - beside_m) < half_m - TOLERANCE_M:
+                found.add((one, other))
+    for pair in sorted(found):
+        yield f"bodies overlap: {pair}"
+
+
+def _without_agents(run: Path) -> Iterator[str]:
+    wrong = {"agent-missing", "agent-silent", "caretaker-took-over"}
+    for line in (run / "events.jsonl").read_text(encoding="utf-8").splitlines():
+        event = json.loads(line)
+        if event["kind"] in wrong:
+            yield f"{event['kind']}: {event.get('vehicle')} at {event['t_s']:.1f} s"
+
+
+def _wrong_ends(drawn: DrawnCorridor, run: Path) -> Iterator[str]:
+    """Yield the vehicles that SUMO does not report at the ends of their routes."""
+    routes = {
+        one.attrib["id"]: one.find("route").attrib["edges"].split()  # type: ignore[union-attr]
+        for one in ET.parse(drawn.config.with_name("drawn.rou.xml")).iter("vehicle")  # noqa: S314
+    }
+    ends = {
+        one.attrib["id"]: one.attrib["arrivalLane"].rpartition("_")[0]
+        for one in ET.parse(run / "tripinfo.xml").iter("tripinfo")  # noqa: S314
+    }
+    first, last = drawn.name.split(":")
+    for name, route in routes.items():
+        crosses = first in route or last in route
+        if crosses and ends.get(name) != route[-1]:
+            yield f"{name} has arrived on {ends.get(name) or 'no edge'}, not on {route[-1]}"
