@@ -22,6 +22,8 @@ ClosedPart = tuple[int, float, float]
 """(lane, from, to) [m] of a closed part of a lane."""
 LanePosition = tuple[int, float]
 """(lane, position [m])."""
+LaneChange = tuple[int, int]
+"""(from, to) of neighbouring lanes."""
 _NO_EXITS: Mapping[LanePosition, str] = MappingProxyType({})
 _NO_RAMPS: Mapping[LanePosition, float] = MappingProxyType({})
 

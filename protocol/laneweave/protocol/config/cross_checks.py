@@ -18,7 +18,10 @@ from laneweave.protocol.scenario.fields import (
     MAX_HORIZON_TICKS,
     Entrance,
     Inflow,
+    LaneRule,
     Scenario,
+    SolidLine,
+    TypeShare,
     formation_columns,
 )
 from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
@@ -32,6 +35,8 @@ MIN_SIDE_GAP_M = 0.5
 """Minimum lateral gap between bodies side by side; covers rotation and tracking errors."""
 MAX_SECURED_VEHICLES = 5000
 """Maximum number of vehicles for which a router holds access rules."""
+ROUNDED_SHARE = 1e-3
+"""Share of a type that may be due to the rounding of others: it needs no lane."""
 
 _RELATIONS = {"at least": ge, "at most": le, "more than": gt, "less than": lt}
 _Comparison = tuple[str, str, float, str]
@@ -279,6 +284,82 @@ def _check_closures(scenario: Scenario) -> None:
             list(shares),
             f"shares of lanes that reach the end of the road, {reaching}, and 0 for the others",
         )
+
+
+def _check_lane_rules(scenario: Scenario) -> None:
+    """Check restrictions and solid lines: the rolling operation, lanes, positions, types."""
+    road, formation = scenario.road, scenario.formation
+    rules: dict[str, LaneRule] = {
+        f"road.restrictions[{number}]": one for number, one in enumerate(road.restrictions)
+    }
+    rules |= {f"road.solid_lines[{number}]": one for number, one in enumerate(road.solid_lines)}
+    if not rules:
+        return
+    allowed = '"rolling" with road.restrictions or road.solid_lines'
+    _require(formation.rolling, "formation.operation", formation.operation, allowed)
+    for name, one in rules.items():
+        allowed = f"a lane from 0 to {road.lanes - 1}"
+        _require(one.lane < road.lanes, f"{name}.lane", one.lane, allowed)
+        allowed = f"less than the length of the road, {road.length_m:g}"
+        _require(one.from_m < road.length_m, f"{name}.from_m", one.from_m, allowed)
+        allowed = f"more than from_m, {one.from_m:g}"
+        _require(one.to_m > one.from_m, f"{name}.to_m", one.to_m, allowed)
+        allowed = f"names of types, each once: {', '.join(scenario.types)}"
+        given = one.vehicle_types
+        ok = set(given) <= scenario.types.keys() and len(set(given)) == len(given)
+        _require(ok, f"{name}.vehicle_types", list(given), allowed)
+        if isinstance(one, SolidLine):
+            allowed = f"the side of lane {one.lane} on which there is another lane"
+            _require(0 <= one.changes[0][1] < road.lanes, f"{name}.to", one.to, allowed)
+        else:
+            allowed = "at least one type; road.closures close a lane to all"
+            _require(bool(given), f"{name}.vehicle_types", list(given), allowed)
+    _check_permitted_lanes(scenario)
+
+
+def _check_permitted_lanes(scenario: Scenario) -> None:
+    """Check that each type has a lane to enter by, and one to leave by if its demand is drawn."""
+    if not scenario.road.restrictions:
+        return
+    demand, drawn = scenario.demand, not scenario.sumo.config
+    shares = [TypeShare(one.name, one.share) for one in scenario.vehicle_type]
+    entrances = [(MAIN_ENTRANCE, scenario.road.first_lanes, shares, demand.destinations)]
+    entrances += [
+        (one.name, (one.lane,), list(one.vehicle_types) or shares, one.destinations)
+        for one in scenario.entrance
+    ]
+    for entrance, lanes, types, destinations in entrances:
+        cars = TypeShare(CAR, max(0.0, 1.0 - sum(one.share for one in types)))
+        wanted = [one.exit for one in destinations if one.share > 0.0]
+        if sum(one.share for one in destinations) < 1.0:
+            wanted.append(END_OF_ROAD)
+        for name in [one.type for one in (*types, cars) if one.share > ROUNDED_SHARE]:
+            enters = any(
+                not scenario.is_restricted(lane, scenario.entry_m[lane], name) for lane in lanes
+            )
+            allowed = f"types other than {name}, which has no lane left at entrance {entrance}"
+            _require_lane(enters, scenario, name, lanes, allowed)
+            for destination in wanted if drawn else ():
+                ends = [one for one in scenario.sections if one.serves(ANY_LANE, destination)]
+                leaves = not ends or any(scenario.may_leave_by(one, name) for one in ends)
+                allowed = (
+                    f"types other than {name}, which has no lane left to leave by {destination}"
+                )
+                _require_lane(leaves, scenario, name, [one.lane for one in ends], allowed)
+
+
+def _require_lane(
+    ok: bool, scenario: Scenario, vehicle_type: str, lanes: Collection[int], allowed: str
+) -> None:
+    """Require a lane for a type; the error names the first restriction of these lanes."""
+    if not ok:
+        number, one = next(
+            (number, one)
+            for number, one in enumerate(scenario.road.restrictions)
+            if one.lane in lanes and one.applies_to(vehicle_type)
+        )
+        field = f"road.restrictions[{number}].vehicle_types"
+        raise BadInputError(field, list(one.vehicle_types), allowed)
 
 
 def _check_entrances(scenario: Scenario) -> None:
@@ -732,6 +813,7 @@ def _check_security(scenario: Scenario) -> None:
 _CHECKS = (
     (
         _check_types,
+        _check_lane_rules,
         _check_lanes,
         _check_motion,
         _check_closures,

@@ -20,7 +20,14 @@ from attrs.validators import optional
 from laneweave.protocol.errors import BadInputError, unknown_name
 from laneweave.protocol.field_validators import NAME_PATTERN, key_part, one_of, within
 from laneweave.protocol.lattice import Cell, Lattice, displacements
-from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, open_sections
+from laneweave.protocol.road_layout import (
+    ANY_LANE,
+    END_OF_ROAD,
+    LaneChange,
+    LaneSection,
+    open_sections,
+    sections_for,
+)
 from laneweave.protocol.scenario.deployment_fields import (
     Network,
     Observation,
@@ -141,6 +148,58 @@ class Closure:
 
 
 @frozen
+class Restriction:
+    """A part of a lane in which vehicles of some types may not drive."""
+
+    lane: int = field(validator=within(0, 7))
+    vehicle_types: tuple[str, ...]
+    from_m: float = field(default=0.0, validator=within(0.0, LONGEST_ROAD_M))
+    """Where it begins; by default, at the start of the road."""
+    to_m: float = field(
+        default=LONGEST_ROAD_M, validator=within(0.0, LONGEST_ROAD_M, open_low=True)
+    )
+    """Where it ends; by default, at the end of the road."""
+
+    def applies_to(self, vehicle_type: str) -> bool:
+        """Return whether vehicles of a type may not drive there."""
+        return vehicle_type in self.vehicle_types
+
+    @property
+    def changes(self) -> tuple[LaneChange, ...]:
+        """The lane changes that it forbids: those into the lane."""
+        return (self.lane - 1, self.lane), (self.lane + 1, self.lane)
+
+
+@frozen
+class SolidLine:
+    """A line beside a part of a lane that vehicles may not cross from this lane."""
+
+    lane: int = field(validator=within(0, 7))
+    to: str = field(validator=one_of("left", "right"))
+    """The side of the lane on which the line is."""
+    from_m: float = field(default=0.0, validator=within(0.0, LONGEST_ROAD_M))
+    """Where it begins; by default, at the start of the road."""
+    to_m: float = field(
+        default=LONGEST_ROAD_M, validator=within(0.0, LONGEST_ROAD_M, open_low=True)
+    )
+    """Where it ends; by default, at the end of the road."""
+    vehicle_types: tuple[str, ...] = ()
+    """Types that may not cross it; empty: all types."""
+
+    def applies_to(self, vehicle_type: str) -> bool:
+        """Return whether vehicles of a type may not cross the line."""
+        return not self.vehicle_types or vehicle_type in self.vehicle_types
+
+    @property
+    def changes(self) -> tuple[LaneChange, ...]:
+        """The lane change that it forbids."""
+        return ((self.lane, self.lane + (1 if self.to == "left" else -1)),)
+
+
+LaneRule = Restriction | SolidLine
+
+
+@frozen
 class Road:
     """The road: segments S1 (entry), S2 (driving), S3 (lane sorting); paper, Section 5.2.1."""
 
@@ -151,6 +210,10 @@ class Road:
     s3_m: float = field(default=600.0, validator=within(0.0, 20_000.0, open_low=True))
     closures: tuple[Closure, ...] = ()
     """Parts of lanes in which no vehicle may drive."""
+    restrictions: tuple[Restriction, ...] = ()
+    """Parts of lanes in which vehicles of some types may not drive."""
+    solid_lines: tuple[SolidLine, ...] = ()
+    """Lines that vehicles may not cross."""
 
     @property
     def length_m(self) -> float:
@@ -647,6 +710,43 @@ class Scenario:
             {(one.lane, one.at_m): one.merge_m for one in self.entrance},
         )
 
+    def is_restricted(self, lane: int, s_m: float, vehicle_type: str) -> bool:
+        """Return whether vehicles of a type may not drive in a lane at a position."""
+        return any(
+            one.lane == lane and one.from_m <= s_m < one.to_m and one.applies_to(vehicle_type)
+            for one in self.road.restrictions
+        )
+
+    def may_leave_by(self, section: LaneSection, vehicle_type: str) -> bool:
+        """Return whether vehicles of a type may drive at the end of a section."""
+        return not any(
+            one.lane == section.lane
+            and one.from_m < section.to_m <= one.to_m
+            and one.applies_to(vehicle_type)
+            for one in self.road.restrictions
+        )
+
+    def goal_sections(
+        self, preferred_lane: int, destination: str, vehicle_type: str
+    ) -> frozenset[int]:
+        """Return the numbers of the sections that serve a vehicle (`LaneSection.serves`).
+
+        Where its type may not drive at their ends, those of other lanes to its destination; if
+        there are none either, the type is ignored.
+        """
+        wanted = sections_for(self.sections, preferred_lane, destination)
+        if not self.road.restrictions:
+            return wanted
+        for numbers in (wanted, sections_for(self.sections, ANY_LANE, destination)):
+            permitted = frozenset(
+                number
+                for number in numbers
+                if self.may_leave_by(self.sections[number], vehicle_type)
+            )
+            if permitted:
+                return permitted
+        return wanted
+
     @property
     def step_m(self) -> float:
         """Distance that a vehicle needs for one move, with the length of the longest body."""
@@ -853,7 +953,10 @@ class Scenario:
 
     @cached_property
     def inflows(self) -> Mapping[int, Inflow]:
-        """The vehicles that enter in each lane, by lane; lanes in which none enter are left out."""
+        """The vehicles that enter in each lane, by lane; lanes in which none enter are left out.
+
+        A type that may not drive in some lanes at the start of the road enters in the others.
+        """
         demand, first, types = self.demand, self.road.first_lanes, self._type_shares
         arriving = _normalised(demand.arrival_shares or (1.0,) * self.road.lanes, first)
         volumes = {
@@ -864,16 +967,55 @@ class Scenario:
             for lane, volume in volumes.items()
             if volume > 0.0
         }
+        if self.road.restrictions and found:
+            found = self._permitted(found)
         every = range(self.road.lanes)
         for one in self.entrance:
             preferring = _normalised(one.lane_shares, every) if one.lane_shares else ()
-            found[one.lane] = Inflow(
+            own = Inflow(
                 one.volume_veh_per_h,
                 one.destinations,
                 preferring or self.lane_shares,
                 one.vehicle_types or types,
             )
+            found |= self._permitted({one.lane: own}) if self.road.restrictions else {one.lane: own}
         return MappingProxyType(dict(sorted(found.items())))
+
+    def _permitted(self, inflows: Mapping[int, Inflow]) -> dict[int, Inflow]:
+        """Return the inflows of an entrance after each type has left lanes in which it may not be.
+
+        A type enters in its other lanes, in proportion to the volumes of these. Types
+        without a lane do not enter, and there are more vehicles of the others.
+        """
+        shares = {one.type: one.share for one in next(iter(inflows.values())).types}
+        shares[CAR] = max(0.0, 1.0 - sum(shares.values()))
+        lanes_of = {
+            name: [
+                lane for lane in inflows if not self.is_restricted(lane, self.entry_m[lane], name)
+            ]
+            for name in shares
+        }
+        entering = sum(share for name, share in shares.items() if lanes_of[name])
+        total = sum(one.volume_veh_per_h for one in inflows.values())
+        found = {}
+        for lane, inflow in inflows.items():
+            volumes = {
+                name: total
+                * (share / entering)
+                * inflow.volume_veh_per_h
+                / sum(inflows[other].volume_veh_per_h for other in lanes_of[name])
+                for name, share in shares.items()
+                if share > 0.0 and lane in lanes_of[name]
+            }
+            volume = sum(volumes.values())
+            if volume > 0.0:
+                types = tuple(
+                    TypeShare(name, min(own / volume, 1.0))
+                    for name, own in volumes.items()
+                    if name != CAR
+                )
+                found[lane] = attrs.evolve(inflow, volume_veh_per_h=volume, types=types)
+        return found
 
     @property
     def _type_shares(self) -> tuple[TypeShare, ...]:

@@ -76,31 +76,56 @@ def _arrivals_in(
         default_rng(SeedSequence(scenario.seed, spawn_key=(purpose, lane)))
         for purpose in (_HEADWAYS, _PREFERENCES, _TYPES)
     )
-    choices = list(_destinations(inflow, scenario))
-    # Drop the last bound: rounded to less than 1, it would exclude some draws in [0, 1).
-    bounds = np.array([*accumulate(share for share, _, _ in choices)][:-1])
-    type_bounds = np.array([*accumulate(one.share for one in inflow.types)])
     names = [*(one.type for one in inflow.types), CAR]
+    choices = {name: list(_destinations(inflow, scenario, name)) for name in names}
+    # Drop the last bound: rounded to less than 1, it would exclude some draws in [0, 1).
+    bounds = {
+        name: np.array([*accumulate(share for share, _, _ in own)][:-1])
+        for name, own in choices.items()
+    }
+    type_bounds = np.array([*accumulate(one.share for one in inflow.types)])
+    if type_bounds.size and type_bounds[-1] > 1.0 - 1e-9:
+        type_bounds[-1] = 1.0  # no cars
     result: list[tuple[float, int, int, str, str]] = []
     t_s = 0.0
     while True:
         t_s += demand.min_headway_s + mean_excess_s * headways.standard_exponential()
         if t_s > demand.duration_s:
             return result
-        number = int(np.searchsorted(bounds, preferences.random(), side="right"))
-        _, preferred, destination = choices[number]
         kind = names[int(np.searchsorted(type_bounds, types.random(), side="right"))]
+        number = int(np.searchsorted(bounds[kind], preferences.random(), side="right"))
+        _, preferred, destination = choices[kind][number]
         result.append((float(t_s), lane, preferred, destination, kind))
 
 
-def _destinations(inflow: Inflow, scenario: Scenario) -> Iterator[tuple[float, int, str]]:
-    """Yield (share, preferred lane, destination) of the vehicles that enter in a lane."""
+def _destinations(
+    inflow: Inflow, scenario: Scenario, vehicle_type: str
+) -> Iterator[tuple[float, int, str]]:
+    """Yield (share, preferred lane, destination) of a type of vehicle that enters in a lane."""
     exits = inflow.destinations
     to_end = 1.0 - sum(one.share for one in exits)
-    if inflow.lane_shares:
-        for preferred, share in enumerate(inflow.lane_shares):
+    shares = _lane_shares(inflow, scenario, vehicle_type)
+    if shares:
+        for preferred, share in enumerate(shares):
             yield to_end * share, preferred, END_OF_ROAD
     else:
         yield to_end, ANY_LANE, END_OF_ROAD
     for one in exits:
         yield one.share, scenario.exit_lane(one.exit), one.exit
+
+
+def _lane_shares(inflow: Inflow, scenario: Scenario, vehicle_type: str) -> Sequence[float]:
+    """Return the share of vehicles of a type that prefer each lane; empty: no preferences.
+
+    None prefer a lane in which they may not drive at the end of the road.
+    """
+    ends = [
+        section.lane
+        for section in scenario.sections
+        if section.serves(ANY_LANE) and scenario.may_leave_by(section, vehicle_type)
+    ]
+    permitted = [share if lane in ends else 0.0 for lane, share in enumerate(inflow.lane_shares)]
+    total = sum(permitted)
+    if permitted == [*inflow.lane_shares]:
+        return inflow.lane_shares
+    return [share / total for share in permitted] if total > 0.0 else ()

@@ -14,7 +14,7 @@ from types import MappingProxyType
 from attrs import evolve
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import END_OF_ROAD, LaneSection, sections_for
+from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.runtime.node import Effect, Send
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
@@ -102,7 +102,7 @@ class Roadside:
             interlaced=formation.interlaced,
             entry_m=scenario.entry_m,
             column_bound=[name for name, one in scenario.types.items() if not one.changes_columns],
-            goals_of=partial(_goals, scenario.sections),
+            goals_of=partial(_goals, scenario),
             shared_lanes=self._shared_lanes,
             is_free=self._is_free,
         )
@@ -540,8 +540,11 @@ class Roadside:
         )
 
 
-def _goals(sections: Sequence[LaneSection], arrival: Arrival) -> Goals:
+def _goals(scenario: Scenario, arrival: Arrival) -> Goals:
     """Return where a vehicle may leave the road."""
-    numbers = sections_for(sections, arrival.preferred_lane, arrival.destination)
-    lanes = {sections[number].lane for number in numbers}
-    return Goals(tuple(sorted(lanes)), max(sections[number].to_m for number in numbers))
+    numbers = scenario.goal_sections(
+        arrival.preferred_lane, arrival.destination, arrival.vehicle_type
+    )
+    sections = [scenario.sections[number] for number in numbers]
+    lanes = {section.lane for section in sections}
+    return Goals(tuple(sorted(lanes)), max(section.to_m for section in sections))

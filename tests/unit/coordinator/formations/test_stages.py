@@ -31,11 +31,11 @@ from laneweave.protocol.vehicle.lane_ends import drive_out
 
 ROOM_M = drive_out(Scenario(road=Road(closures=(Closure(0, 800.0),)))).room_m
 """Distance between a line and the end of its lane."""
-LENGTHS = {"s1_m": 50.0, "s2_m": 100.0, "s3_m": 850.0}
+LENGTHS = Road(s1_m=50.0, s2_m=100.0, s3_m=850.0)
 
 
 def road(*closures: Closure, lanes: int = 3) -> Scenario:
-    return Scenario(road=Road(lanes, closures=closures, **LENGTHS))
+    return Scenario(road=evolve(LENGTHS, lanes=lanes, closures=closures))
 
 
 STRAIGHT = road()

@@ -161,3 +161,29 @@ def test_an_entrance_has_shares_of_its_own() -> None:
             assert count / len(ramp) == pytest.approx(share, abs=0.03)
         count = sum(one.vehicle_type == "truck" for one in ramp)
         assert count / len(ramp) == pytest.approx(trucks, abs=0.03)
+
+
+def test_no_vehicle_arrives_in_or_prefers_a_lane_in_which_its_type_may_not_drive() -> None:
+    found = parse_scenario(
+        {
+            "formation": {"operation": "rolling"},
+            "demand": {"duration_s": 3000.0},
+            "vehicle_type": [{"name": "truck", "share": 0.2}],
+            "road": {
+                "restrictions": [
+                    {"lane": 2, "vehicle_types": ["truck"], "to_m": 500.0},
+                    {"lane": 1, "vehicle_types": ["truck"], "from_m": 500.0},
+                    {"lane": 0, "vehicle_types": ["car"], "to_m": 500.0},
+                ]
+            },
+        }
+    )
+    stream = arrivals(found)
+    trucks = [one for one in stream if one.vehicle_type == "truck"]
+    cars = [one for one in stream if one.vehicle_type == "car"]
+    assert {one.lane for one in trucks} == {0, 1}
+    assert {one.preferred_lane for one in trucks} == {0, 2}
+    assert {one.lane for one in cars} == {1, 2}
+    assert {one.preferred_lane for one in cars} == {0, 1, 2}
+    assert len(trucks) / len(stream) == pytest.approx(0.2, abs=0.02)
+    assert len(stream) == pytest.approx(2500, rel=0.05)
