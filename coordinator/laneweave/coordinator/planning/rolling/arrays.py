@@ -12,9 +12,11 @@ from functools import lru_cache
 from typing import NamedTuple, cast
 
 import numpy as np
+from attrs import evolve
 from numpy.typing import NDArray
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel, conflict_offsets
+from laneweave.coordinator.planning.rolling.lane_rules import LaneRules, Zones, lane_rules, zones
 from laneweave.coordinator.planning.rolling.paths_kernel import (
     ENTERING,
     FIXED,
@@ -29,6 +31,8 @@ from laneweave.coordinator.planning.rolling.problem import (
 )
 from laneweave.protocol.lattice import Cell, Mode, displacements
 
+_MAX_RESTRICTED_COST = 1000.0
+"""Maximum cost of a path for driving where it may not, far below that of a forbidden move."""
 _SAVED = MAX_EJECTED + 32
 """Maximum number of paths saved during a chain or a reordering."""
 
@@ -57,9 +61,13 @@ class Table(NamedTuple):
     """Column and lane of each displacement; (displacements, 2)."""
     moving_columns: Ints
     """First and last column in which moves may start in each slot; (slots, 2)."""
-    section: NDArray[np.int16]
-    """Section in which each cell is at the beginning of each slot, or beyond whose end; -1: none;
-    (slots + 1, lanes, columns)."""
+    forbidden: Singles
+    """`UNREACHED` for each move that the types of a group may not make, otherwise 0;
+    (groups - 1, slots, displacements, lanes, columns). Group 0 may make all moves."""
+    zone: NDArray[np.int16]
+    """Zone in which each cell is at the beginning of each slot; (slots + 1, lanes, columns). A zone
+    is a section, with what is beyond its end, or a part of one that some groups should leave; -1:
+    no section, if there are no such parts."""
     left: Bools
     """Whether each cell is beyond the end of its section; same shape."""
     first_left: Ints
@@ -67,7 +75,7 @@ class Table(NamedTuple):
     road_end: Ints
     """First column from which all cells are beyond the ends of their sections; (slots + 1)."""
     mixed: Bools
-    """Whether the cells of each lane are in different sections; (lanes)."""
+    """Whether the cells of each lane are in different zones; (lanes)."""
 
 
 class Paths(NamedTuple):
@@ -81,7 +89,11 @@ class Paths(NamedTuple):
     slots: Ints
     """Number of slots in the path up to the end of its last section."""
     target: Bools
-    """Whether each section is a target, and False for no section; (vehicles, sections + 1)."""
+    """Whether each zone is in a target, and False for no section; (vehicles, zones)."""
+    zone_cost: Singles
+    """Cost of each slot that begins in a zone; same shape."""
+    group: Ints
+    """Index of the group of types to which the vehicle belongs."""
     held: Bools
     waits: Ints
     """Number of slots in which the vehicle stays first."""
@@ -93,6 +105,8 @@ class Paths(NamedTuple):
     """Lower bound on the cost of paths that end at a target."""
     can_arrive: Bools
     """Whether there are enough slots to reach a target, ignoring other vehicles."""
+    urgent_cost: Floats
+    """Cost from which ejection chains make room for a vehicle that can arrive."""
     penalty: Ints
     """Cost to other vehicles of a conflict with this one."""
     cost: Floats
@@ -105,7 +119,7 @@ class Costs(NamedTuple):
 
     of_move: Singles
     """Cost of each displacement."""
-    off_lane: np.float32
+    restricted: np.float32
 
 
 class Saved(NamedTuple):
@@ -172,18 +186,23 @@ def window(
     # Add slots for vehicles that fall back.
     slots += int(np.ceil(reach * road.pitch_m / road.advance_m))
     at_m = now_m + np.arange(slots + 1)[:, None] * road.advance_m
-    table = _table(road, at_m, low, blocked)
+    rules = lane_rules(road, vehicles, at_m)
+    table, own_zones = _table(road, at_m, low, blocked, rules)
+    # A path must remain cheaper than one with a forbidden move.
+    costs = evolve(costs, restricted=min(costs.restricted, _MAX_RESTRICTED_COST / slots))
     return Window(
         low,
         table,
-        _paths(road, costs, table, low, vehicles),
+        _paths(road, costs, table, low, vehicles, rules, own_zones),
         _costs(costs, table.steps),
         _scratch(len(vehicles), slots, reach, road.lanes),
     )
 
 
-def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) -> Table:
-    """Return an empty table; `at_m`: positions of columns at the beginning of slots."""
+def _table(
+    road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell], rules: LaneRules
+) -> tuple[Table, Zones]:
+    """Return an empty table and its zones; `at_m`: positions of columns when slots begin."""
     slots, columns = at_m.shape[0] - 1, at_m.shape[1]
     offsets, first = _offsets(road.mode, road.model)
     is_blocked = np.zeros((road.lanes, columns), dtype=np.bool_)
@@ -193,6 +212,8 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
     steps = displacements(road.mode)
     load = np.zeros((slots, len(steps), road.lanes, columns), dtype=np.float32)
     section, left, open_ = _sections(road, at_m)
+    found = zones(section, rules.restricted, len(road.sections))
+    zone = found.of_cell
     may_move = _may_move(road, open_, is_blocked)
     load[:, 1:][~may_move] = FIXED * ENTERING
     may_leave: Bools = np.asarray(may_move.any(axis=(1, 2)))
@@ -200,7 +221,7 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
         [may_leave.argmax(axis=1), columns - 1 - may_leave[:, ::-1].argmax(axis=1)]
     )
     moving_columns[:, ~may_leave.any(axis=1)] = [[columns], [-1]]
-    return Table(
+    table = Table(
         load,
         np.full((slots, road.lanes, columns), -1, dtype=np.int32),
         np.zeros((slots, road.lanes, columns), dtype=np.int8),
@@ -208,18 +229,21 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
         first,
         np.array(steps, dtype=np.int64),
         np.ascontiguousarray(moving_columns.T),
-        section,
+        rules.forbidden,
+        zone,
         left,
         np.where(left.any(axis=2), left.argmax(axis=2), columns),
         columns - np.logical_and.reduce(left, axis=1)[:, ::-1].cumprod(axis=1).sum(axis=1),
-        (section != section[:1, :, :1]).any(axis=(0, 2)),
+        (zone != zone[:1, :, :1]).any(axis=(0, 2)),
     )
+    return table, found
 
 
 def _sections(road: StreamRoad, at_m: Floats) -> tuple[NDArray[np.int16], Bools, Bools]:
-    """Return `Table.section` and `Table.left`, and the cells that are open throughout each slot.
+    """Return sections, `Table.left`, and the cells that are open throughout each slot.
 
-    A cell is open if the whole body is, from the beginning of a move to its end a slot later.
+    The section of a cell is the one in which it is when a slot begins, or beyond whose end; -1:
+    none. A cell is open if the whole body is, from the beginning of a move to its end a slot later.
     """
     slots, columns = at_m.shape[0] - 1, at_m.shape[1]
     section = np.full((slots + 1, road.lanes, columns), -1, dtype=np.int16)
@@ -267,7 +291,13 @@ def _may_move(road: StreamRoad, is_open: Bools, is_blocked: Bools) -> Bools:
 
 
 def _paths(
-    road: StreamRoad, costs: StreamCosts, table: Table, low: int, vehicles: Sequence[StreamVehicle]
+    road: StreamRoad,
+    costs: StreamCosts,
+    table: Table,
+    low: int,
+    vehicles: Sequence[StreamVehicle],
+    rules: LaneRules,
+    own_zones: Zones,
 ) -> Paths:
     slots, count = len(table.load), len(vehicles)
     column, lane = np.zeros((2, count, slots + 1), dtype=np.int64)
@@ -291,18 +321,27 @@ def _paths(
     waits = np.where(away > 0, may_move.argmax(axis=0), 0)
     min_cost = away * (costs.move + costs.off_lane) + waits * costs.off_lane
     min_cost += chances * min(0.0, costs.forward)
+    # In row-major order, for which the kernels are compiled.
+    in_target = np.take(target, own_zones.section, axis=1)
+    zone_cost = np.where(in_target, 0.0, costs.off_lane)
+    with_rules = rules.group > 0
+    zone_cost[with_rules] += costs.restricted * own_zones.restricted[rules.group[with_rules] - 1]
+    missing_cost = costs.missing * (1.0 + 1.0 / (1.0 + chances))
     return Paths(
         column,
         lane,
         np.zeros((count, slots), dtype=np.int8),
         np.zeros(count, dtype=np.int64),
-        target,
+        in_target,
+        zone_cost.astype(np.float32, order="C"),
+        rules.group,
         held,
         stays,
         np.array([[one.drives(*step) for step in steps] for one in vehicles], dtype=np.bool_),
-        costs.missing * (1.0 + 1.0 / (1.0 + chances)),
+        missing_cost,
         min_cost,
         ~held & (chances >= away),
+        missing_cost.copy(),
         np.where(held, FIXED, PENALTY),
         np.zeros(count),
         np.zeros(count, dtype=np.bool_),
@@ -313,7 +352,7 @@ def _costs(costs: StreamCosts, steps: Ints) -> Costs:
     of_move = np.where((steps != 0).any(axis=1), costs.move, 0.0)
     of_move += np.where(steps[:, 0] < 0, costs.backward, 0.0)
     of_move += np.where(steps[:, 0] > 0, costs.forward, 0.0)
-    return Costs(of_move.astype(np.float32), np.float32(costs.off_lane))
+    return Costs(of_move.astype(np.float32), np.float32(costs.restricted))
 
 
 def _scratch(count: int, slots: int, reach: int, lanes: int) -> Scratch:

@@ -22,7 +22,7 @@ MAX_EJECTED = 100
 _IMPASSABLE = 5e3
 """Cost at which paths are rejected, and factor of forbidden conflicts. Conflict-free paths cost at
 most a hundredth of this; a conflict with a `FIXED` vehicle costs more than this."""
-_UNREACHED = 1e9
+UNREACHED = 1e9
 NO_PATH = 1e9
 """Cost of a vehicle without a path."""
 
@@ -56,6 +56,13 @@ def _relax(here, there, load, base, scale):
 
 
 @njit(cache=True, nogil=True)
+def _relax_permitted(here, there, load, forbidden, base, scale):
+    """Relax one displacement, as `_relax`, for a group of types that may not make all moves."""
+    for i in range(len(here)):
+        there[i] = min(there[i], here[i] + base + scale * load[i] + forbidden[i])
+
+
+@njit(cache=True, nogil=True)
 def find_path(table, paths, costs, v, softness, upper_bound, scratch):
     """Set the cheapest path of a vehicle that is not in the table; return the path's own cost.
 
@@ -64,13 +71,14 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
     `FIXED` vehicles are avoided. If there is no such path, returns `NO_PATH` and sets nothing.
     """
     load, steps, of_move, value = table.load, table.steps, costs.of_move, scratch.value
-    section, left, row = table.section, table.left, scratch.row
+    zone, left, row = table.zone, table.left, scratch.row
+    group = paths.group[v]
     scratch.searches[0] += 1
     slots, fan, lanes, _ = load.shape
     scale = np.float32(softness / (PENALTY * ENTERING) if softness > 0.0 else _IMPASSABLE)
     # Offsets in `value` are columns minus this.
     shift = paths.column[v, 0] - (value.shape[2] // 2)
-    value[:] = _UNREACHED
+    value[:] = UNREACHED
     low = high = value.shape[2] // 2
     value[0, paths.lane[v, 0], low] = 0.0
     best, best_s, best_offset, best_lane = min(upper_bound, _IMPASSABLE), -1, 0, 0
@@ -81,11 +89,11 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
                     continue
                 total = value[s, lane, offset]
                 if total < best:
-                    if not paths.target[v, section[s, lane, offset + shift]]:
+                    if not paths.target[v, zone[s, lane, offset + shift]]:
                         total += paths.missing_cost[v]
                     if total < best:
                         best, best_s, best_offset, best_lane = total, s, offset, lane
-                value[s, lane, offset] = _UNREACHED
+                value[s, lane, offset] = UNREACHED
         high = min(high, table.road_end[s] - 1 - shift)
         if s == slots or high < low:
             break
@@ -94,28 +102,38 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
         )
         for lane in range(lanes):
             here = value[s, lane, low : high + 1]
-            off = np.float32(0.0)
+            stay_cost = np.float32(0.0)
             if table.mixed[lane]:
                 for i in range(len(here)):
-                    row[i] = here[i]
-                    if not paths.target[v, section[s, lane, low + shift + i]]:
-                        row[i] += costs.off_lane
+                    row[i] = here[i] + paths.zone_cost[v, zone[s, lane, low + shift + i]]
                 here = row[: high + 1 - low]
-            elif not paths.target[v, section[s, lane, low + shift]]:
-                off = costs.off_lane
+            else:
+                stay_cost = paths.zone_cost[v, zone[s, lane, low + shift]]
             for d in range(fan if moves and s >= paths.waits[v] else 1):
                 to_lane, to = lane + steps[d, 1], low + steps[d, 0]
                 if 0 <= to_lane < lanes and paths.drives[v, d]:
-                    base = off + of_move[d] + (scratch.delay[s] if d > 0 else np.float32(0.0))
+                    base = stay_cost + of_move[d] + (scratch.delay[s] if d > 0 else np.float32(0.0))
                     there = value[s + 1, to_lane, to : to + high + 1 - low]
                     loads = load[s, d, lane, low + shift : high + shift + 1]
-                    _relax(here, there, loads, base, scale)
+                    if group > 0:
+                        forbidden = table.forbidden[group - 1, s, d, lane]
+                        forbidden = forbidden[low + shift : high + shift + 1]
+                        _relax_permitted(here, there, loads, forbidden, base, scale)
+                    else:
+                        _relax(here, there, loads, base, scale)
         if moves:
             low, high = max(1, low - 1), min(value.shape[2] - 2, high + 1)
     if best_s < 0:
         return NO_PATH
     _trace(table, paths, costs, v, scale, best_s, best_lane, best_offset, scratch)
     return own_cost(table, paths, costs, v)
+
+
+@njit(cache=True, nogil=True)
+def is_forbidden(table, paths, v, s, d, lane, column):
+    """Return whether the type of a vehicle may not make a move."""
+    group = paths.group[v]
+    return group > 0 and table.forbidden[group - 1, s, d, lane, column] > 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -134,14 +152,15 @@ def _trace(table, paths, costs, v, scale, slots, lane, offset, scratch):
                 continue
             if not paths.drives[v, d]:
                 continue
+            if is_forbidden(table, paths, v, s, d, from_lane, before + shift):
+                continue
             if table.left[s, from_lane, before + shift]:
                 continue
             total = value[s, from_lane, before] + costs.of_move[d]
             if d > 0:
                 total += scratch.delay[s]
             total += scale * load[s, d, from_lane, before + shift]
-            if not paths.target[v, table.section[s, from_lane, before + shift]]:
-                total += costs.off_lane
+            total += paths.zone_cost[v, table.zone[s, from_lane, before + shift]]
             if total < best:
                 best, move = total, d
         paths.move[v, s] = move
@@ -154,9 +173,8 @@ def own_cost(table, paths, costs, v):
     total, slots = 0.0, paths.slots[v]
     for s in range(slots):
         total += costs.of_move[paths.move[v, s]]
-        if not paths.target[v, table.section[s, paths.lane[v, s], paths.column[v, s]]]:
-            total += costs.off_lane
-    if not paths.target[v, table.section[slots, paths.lane[v, slots], paths.column[v, slots]]]:
+        total += paths.zone_cost[v, table.zone[s, paths.lane[v, s], paths.column[v, s]]]
+    if not paths.target[v, table.zone[slots, paths.lane[v, slots], paths.column[v, slots]]]:
         total += paths.missing_cost[v]
     return total
 
@@ -183,6 +201,8 @@ def follow(table, paths, costs, v, cells):
         if move < 0 or not paths.drives[v, move] or table.load[s, move, lane, column] > 0.0:
             return False
         if move > 0 and s < paths.waits[v]:
+            return False
+        if is_forbidden(table, paths, v, s, move, lane, column):
             return False
         paths.move[v, s] = move
         paths.column[v, s + 1], paths.lane[v, s + 1] = cells[s + 1, 0], cells[s + 1, 1]

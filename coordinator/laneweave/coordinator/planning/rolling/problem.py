@@ -11,7 +11,9 @@ from attrs import Attribute, Factory, evolve, field, frozen
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.protocol.lattice import WAIT, Cell, Mode
-from laneweave.protocol.road_layout import LaneSection, open_sections
+from laneweave.protocol.road_layout import LaneChange, LaneSection, open_sections
+from laneweave.protocol.scenario.fields import LaneRule, Restriction, SolidLine
+from laneweave.protocol.wire.messages import CAR
 
 ROUNDING_M = 1e-6
 """Tolerance for comparing positions."""
@@ -59,6 +61,31 @@ class StreamRoad:
     early_m: float | None = None
     """Moves begin at any time of a slot, as soon as the body, without its first `early_m`, is where
     both lanes are open; None: at its beginning."""
+    restrictions: tuple[Restriction, ...] = ()
+    """Where vehicles of some types may not drive."""
+    solid_lines: tuple[SolidLine, ...] = ()
+    """Lines that vehicles may not cross."""
+
+    def rules_of(self, vehicle_type: str) -> list[LaneRule]:
+        """Return the restrictions and solid lines that apply to a type of vehicle."""
+        rules: list[LaneRule] = [*self.restrictions, *self.solid_lines]
+        return [one for one in rules if one.applies_to(vehicle_type)]
+
+    def forbidden_changes(self, vehicle_type: str) -> Iterator[tuple[LaneChange, float, float]]:
+        """Yield the lane changes that a type may not make, and from where to where [m].
+
+        No part of the body may be there at any time of the move.
+        """
+        for one in self.rules_of(vehicle_type):
+            for change in one.changes:
+                yield change, one.from_m, one.to_m
+
+    def forbids(self, vehicle_type: str, change: LaneChange, rear_m: float, front_m: float) -> bool:
+        """Return whether a type may not change lanes between two positions."""
+        return any(
+            own == change and rear_m < to_m - ROUNDING_M and front_m > from_m + ROUNDING_M
+            for own, from_m, to_m in self.forbidden_changes(vehicle_type)
+        )
 
     def start_m(self, front_m: float, lanes: Iterable[int]) -> float:
         """Return where a move begins that is planned for a slot.
@@ -176,6 +203,9 @@ class StreamCosts:
     """Extra cost of a move that gains a column; a negative cost rewards gaining columns."""
     missing: float = 60.0
     """Cost of ending elsewhere than at a target; up to twice as much near the end."""
+    restricted: float = 20.0
+    """Cost of each slot in which the vehicle drives where it may not; less on long roads, since the
+    costs of a path must remain below those of forbidden moves."""
 
 
 def _as_set(targets: int | Iterable[int]) -> frozenset[int]:
@@ -196,6 +226,7 @@ class StreamVehicle:
     """Moves (columns, lanes) that the vehicle can drive; None: all of the mode."""
     waits: int = 0
     """Number of slots for which it stays in its cell first, since it settles there."""
+    vehicle_type: str = CAR
 
     def drives(self, columns: int, lanes: int) -> bool:
         """Return whether the vehicle can drive a move."""

@@ -60,7 +60,7 @@ def problems_of_path(
     here = path[0]
     for s, there in enumerate(path[1:], start=slot):
         if there != here:
-            yield from _problems_of_move(road, s, name, here, there, blocked)
+            yield from _problems_of_move(road, s, vehicle, here, there, blocked)
             if not vehicle.drives(there[0] - here[0], there[1] - here[1]):
                 yield f"{name} cannot drive from {here} to {there} in slot {s}"
             if vehicle.held:
@@ -78,8 +78,14 @@ def problems_of_path(
 
 
 def _problems_of_move(
-    road: StreamRoad, slot: int, name: str, here: Cell, there: Cell, blocked: frozenset[Cell]
+    road: StreamRoad,
+    slot: int,
+    vehicle: StreamVehicle,
+    here: Cell,
+    there: Cell,
+    blocked: frozenset[Cell],
 ) -> Iterator[str]:
+    name = vehicle.vehicle
     columns, lanes = abs(there[0] - here[0]), abs(there[1] - here[1])
     lanes_of = {here[1], there[1]} & {*range(road.lanes)}
     if (columns + lanes if road.mode == 1 else max(columns, lanes)) != 1:
@@ -102,6 +108,12 @@ def _problems_of_move(
         # A section must be open for the whole body and the whole slot.
         if not road.is_open(lane, rear_m, front_m):
             yield f"{name} moves between {rear_m} m and {front_m} m, where lane {lane} is closed"
+    change = here[1], there[1]
+    if road.forbids(vehicle.vehicle_type, change, rear_m, front_m):
+        yield (
+            f"{name} changes from lane {change[0]} to {change[1]} between {rear_m} m and "
+            f"{front_m} m, where a {vehicle.vehicle_type} may not"
+        )
 
 
 def _conflicts(road: StreamRoad, plan: StreamPlan) -> Iterator[str]:

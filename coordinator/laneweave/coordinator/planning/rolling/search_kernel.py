@@ -52,6 +52,9 @@ def set_paths(table, paths, costs, kept, first, rng, scratch):
             stay(table, paths, costs, v)
             put(table, paths, v, 1)
     for v in range(count):
+        if paths.group[v] > 0 and not paths.held[v]:
+            _set_bounds(table, paths, costs, v, scratch)
+    for v in range(count):
         if not paths.held[v] and follow(table, paths, costs, v, kept[first[v] : first[v + 1]]):
             put(table, paths, v, 1)
     # Foremost vehicles first: they have the least time left.
@@ -68,6 +71,19 @@ def set_paths(table, paths, costs, kept, first, rng, scratch):
                 break
         if not paths.placed[v]:
             _hold(table, paths, costs, v, scratch)
+
+
+@njit(cache=True, nogil=True)
+def _set_bounds(table, paths, costs, v, scratch):
+    """Set the bounds on the cost of a vehicle to whose type rules apply; only held ones are placed.
+
+    The table then tells whether it can arrive, or must drive where it may not. Others make room for
+    it if it drives there although it could do without, or misses a lane that it could reach.
+    """
+    cost = find_path(table, paths, costs, v, 0.0, NO_PATH, scratch)
+    paths.min_cost[v] = cost
+    paths.can_arrive[v] = cost < NO_PATH
+    paths.urgent_cost[v] = cost + costs.restricted - _ROUNDING
 
 
 @njit(cache=True, nogil=True)
@@ -227,11 +243,14 @@ def _reorder(table, paths, costs, seed, size, slack, rng, scratch):
 
 @njit(cache=True, nogil=True)
 def _list_costly(paths, off_lane, costly):
-    """List the vehicles that miss a reachable lane, and those that exceed their minimum cost."""
+    """List the vehicles for which others must make room, and others above their minimum cost.
+
+    The first miss a lane that they could reach, or drive where they may not without need.
+    """
     missing_count = costly_count = 0
     for v in range(len(paths.cost)):
         if paths.can_arrive[v]:
-            if paths.cost[v] >= paths.missing_cost[v]:
+            if paths.cost[v] >= paths.urgent_cost[v]:
                 off_lane[missing_count] = v
                 missing_count += 1
             elif paths.cost[v] > paths.min_cost[v] + _ROUNDING:
