@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from laneweave.coordinator.planning.rolling.problem import StreamRoad, StreamVehicle
 from laneweave.coordinator.planning.rolling.requested_moves import is_possible
 from laneweave.protocol.lattice import Cell, displacements, footprint
-from laneweave.protocol.road_layout import sections_for
 from laneweave.protocol.scenario.fields import READY_LATE_S, Scenario
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -54,7 +53,7 @@ class Observer:
     """Number of columns that are observed ahead, and behind."""
     moves: tuple[Cell, ...] = field(init=False)
     """Displacement of each action; action 0 is to hold."""
-    _targets: dict[tuple[int, str], frozenset[int]] = field(factory=dict)
+    _targets: dict[tuple[int, str, str], frozenset[int]] = field(factory=dict)
     """Sections by whose ends vehicles may leave, by preferred lane and destination."""
 
     def __attrs_post_init__(self) -> None:
@@ -128,12 +127,20 @@ class Observer:
         waits = math.ceil((vehicle.ready_s - READY_LATE_S) / slot_s - slot - 1e-9)
         moves = self.scenario.moves_of(vehicle.arrival.vehicle_type)
         targets = self._targets_of(vehicle)
-        return StreamVehicle(name, vehicle.cell, targets, moves=moves, waits=max(0, waits))
+        return StreamVehicle(
+            name,
+            vehicle.cell,
+            targets,
+            moves=moves,
+            waits=max(0, waits),
+            vehicle_type=vehicle.arrival.vehicle_type,
+        )
 
     def _targets_of(self, vehicle: RoadVehicle) -> frozenset[int]:
-        wanted = vehicle.arrival.preferred_lane, vehicle.arrival.destination
+        own = vehicle.arrival
+        wanted = own.preferred_lane, own.destination, own.vehicle_type
         if wanted not in self._targets:
-            self._targets[wanted] = sections_for(self.scenario.sections, *wanted)
+            self._targets[wanted] = self.scenario.goal_sections(*wanted)
         return self._targets[wanted]
 
     def _to_target(self, vehicle: RoadVehicle) -> float:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 
+from attrs import evolve
+
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.kernels import ROLLING
 from laneweave.coordinator.planning.rolling.problem import (
@@ -14,7 +16,7 @@ from laneweave.coordinator.planning.rolling.problem import (
 )
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
 from laneweave.protocol.lattice import Cell, Mode
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.fields import READY_LATE_S, Scenario
 from laneweave.protocol.vehicle.lane_ends import early_start_m, sections_to_lines
 
 REWARD = -0.5
@@ -68,6 +70,8 @@ def stream_road(scenario: Scenario) -> StreamRoad:
     """Return a scenario's road as input for the rolling planner."""
     formation, road = scenario.formation, scenario.road
     mode: Mode = 1 if formation.mode == 1 else 2
+    # A vehicle that settles may begin a move late, and ahead of its cell.
+    ahead_m = formation.speed_mps * READY_LATE_S + scenario.room_ahead_m
     return StreamRoad(
         lanes=road.lanes,
         pitch_m=formation.gap_m,
@@ -79,4 +83,10 @@ def stream_road(scenario: Scenario) -> StreamRoad:
         model=ConflictModel(formation.conflict_kinds),
         sections=sections_to_lines(scenario),
         early_m=None if formation.change_columns else early_start_m(scenario),
+        restrictions=tuple(
+            evolve(one, from_m=max(0.0, one.from_m - ahead_m)) for one in road.restrictions
+        ),
+        solid_lines=tuple(
+            evolve(one, from_m=max(0.0, one.from_m - ahead_m)) for one in road.solid_lines
+        ),
     )

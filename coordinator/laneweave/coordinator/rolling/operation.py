@@ -23,7 +23,7 @@ from laneweave.coordinator.rolling.observed import ObservedRoad, Snapshot
 from laneweave.coordinator.rolling.ownership import certain_cells, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
-from laneweave.protocol.road_layout import ANY_LANE, sections_for
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import READY_LATE_S, SNAPSHOT_S, Scenario
 from laneweave.protocol.state_machine import RuleBook
@@ -203,7 +203,9 @@ class RollingOperation:
             targets = self._targets(entry, s_m)
             moves = self._scenario.moves_of(entry.vehicle_type)
             if state is None:
-                unknown = StreamVehicle(entry.vehicle, entry.cell, targets, held=True)
+                unknown = StreamVehicle(
+                    entry.vehicle, entry.cell, targets, True, vehicle_type=entry.vehicle_type
+                )
                 vehicles.setdefault(entry.cell, unknown)
                 continue
             # With an open gate the move may begin at any time. With a closed gate it never begins
@@ -223,8 +225,9 @@ class RollingOperation:
             waits = max(0, math.ceil(ready_s / self._slot_s - slot - 1e-9))
             if entry.vehicle in gated:
                 waits = max(waits, 1)
-            known = StreamVehicle(entry.vehicle, state.hold_cell, targets, held, moves, waits)
-            vehicles.setdefault(state.hold_cell, known)
+            cell, own = state.hold_cell, entry.vehicle_type
+            known = StreamVehicle(entry.vehicle, cell, targets, held, moves, waits, own)
+            vehicles.setdefault(cell, known)
         columns = [column for column, _ in vehicles] or [0]
         window = range(min(columns) - MARGIN_COLUMNS, max(columns) + MARGIN_COLUMNS + 1)
         blocked = frozenset(
@@ -268,10 +271,10 @@ class RollingOperation:
 
         A vehicle that has passed its exit drives to the end of the road.
         """
-        sections = self._sections
-        wanted = sections_for(sections, entry.preferred_lane, entry.destination)
-        ahead = frozenset(number for number in wanted if sections[number].to_m > s_m)
-        return ahead or sections_for(sections, ANY_LANE)
+        goals, own = self._scenario.goal_sections, entry.vehicle_type
+        wanted = goals(entry.preferred_lane, entry.destination, own)
+        ahead = frozenset(number for number in wanted if self._sections[number].to_m > s_m)
+        return ahead or goals(ANY_LANE, END_OF_ROAD, own)
 
     def _is_displaced(self, state: VehicleState) -> bool:
         """Return whether a body is farther from its cell than any move of one cell takes it.

@@ -26,7 +26,7 @@ from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Compute, Computed
-from laneweave.protocol.scenario.fields import READY_LATE_S, SNAPSHOT_S
+from laneweave.protocol.scenario.fields import READY_LATE_S, SNAPSHOT_S, Scenario
 from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
@@ -99,11 +99,12 @@ class Bench:
     seq: Iterable[int] = field(factory=lambda: count(1))
     jobs: Iterable[int] = field(factory=lambda: count(100))
     asked_above: list[Ballot | None] = field(factory=list)
+    scenario: Scenario = ROLLING
     control: RollingOperation = field(init=False)
 
     def __attrs_post_init__(self) -> None:
         """Make the operation, with this object's planner."""
-        self.control = RollingOperation(ROLLING, self.new_ballot, self.new_job, self.plan)
+        self.control = RollingOperation(self.scenario, self.new_ballot, self.new_job, self.plan)
 
     def new_ballot(self, above: Ballot | None) -> Ballot:
         self.asked_above.append(above)
@@ -278,6 +279,29 @@ def test_the_planner_gets_all_vehicles_and_owned_cells() -> None:
     assert call.before is None
     desk.think(LOOK_S + SLOT_S)
     assert desk.calls[1].before == StreamPlan(SLOT + 1, {}, ())
+
+
+def test_the_planner_gets_types_and_goals_that_suit_them() -> None:
+    scenario = parse_scenario(
+        {
+            "formation": {"operation": "rolling"},
+            "vehicle_type": [{"name": "truck", "share": 0.1}],
+            "road": {"restrictions": [{"lane": 1, "vehicle_types": ["truck"], "from_m": 500.0}]},
+        }
+    )
+    desk = Bench(scenario=scenario)
+    own = census(A, B)
+    trucks = evolve(
+        own, on_road=(evolve(own.on_road[0], vehicle_type=Name("truck")), own.on_road[1])
+    )
+    desk.control.on_census(trucks)
+    assert desk.order(BEGUN_S - 2.0) is None
+    desk.hear(shown(A), shown(B))
+    vehicles = desk.call().vehicles
+    assert (vehicles[A].vehicle_type, vehicles[B].vehicle_type) == ("truck", "car")
+    # They want lane 1, in which trucks may not drive at the end.
+    assert vehicles[A].targets == frozenset({0, 2})
+    assert vehicles[B].targets == frozenset({1})
 
 
 def test_later_states_do_not_count() -> None:
