@@ -13,7 +13,7 @@ from pathlib import Path
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod
+from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod, check_no_lane_rules
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle, Traffic
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.sumo.road_edges import lane_end_m
@@ -141,6 +141,7 @@ def check_lc2013(scenario: Scenario) -> None:
                 f"lc2013.{name}", value, f"at most {limit:g}, the limit vehicle.{whose}"
             )
     _check_closures(scenario)
+    check_no_lane_rules(scenario, "lc2013")
 
 
 def _check_closures(scenario: Scenario) -> None:

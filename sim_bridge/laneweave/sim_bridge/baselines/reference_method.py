@@ -6,8 +6,22 @@ from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager
 from pathlib import Path
 
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.reference_road import Traffic
+
+
+def check_no_lane_rules(scenario: Scenario, method: str) -> None:
+    """Check that a scenario has no rules that the built-in methods do not know.
+
+    Raises:
+        BadInputError: it has restrictions or solid lines.
+    """
+    road = scenario.road
+    for name, rules in (("restrictions", road.restrictions), ("solid_lines", road.solid_lines)):
+        if rules:
+            lanes = [one.lane for one in rules]
+            raise BadInputError(f"road.{name}", lanes, f"none with --method {method}")
 
 
 class ReferenceMethod(ABC):

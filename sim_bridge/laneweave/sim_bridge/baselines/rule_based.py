@@ -13,7 +13,7 @@ from pathlib import Path
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod
+from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod, check_no_lane_rules
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle, Traffic
 from laneweave.sim_bridge.baselines.rules import Lanes, Rules, priority, safe_change_m
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
@@ -184,6 +184,7 @@ def check_rule(scenario: Scenario) -> None:
         raise BadInputError(
             "vehicle_type", names, "none with --method rule, which drives cars only"
         )
+    check_no_lane_rules(scenario, "rule")
     rule, road, speed_mps = scenario.rule, scenario.road, scenario.formation.speed_mps
     # Speed decreases in proportion to the remaining distance, once per tick.
     braking_m = speed_mps**2 / -scenario.vehicle.min_accel_mps2

@@ -12,7 +12,14 @@ from laneweave.launch.run_methods import LC2013, METHODS
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import ANY_LANE, Exits
-from laneweave.protocol.scenario.fields import Demand, Scenario, VehicleType
+from laneweave.protocol.scenario.fields import (
+    Demand,
+    Restriction,
+    Road,
+    Scenario,
+    SolidLine,
+    VehicleType,
+)
 from laneweave.sim_bridge.baselines.lc2013 import Lc2013Traffic, check_lc2013
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
 from laneweave.sim_bridge.baselines.rule_based import check_rule
@@ -182,3 +189,16 @@ def test_trucks_drive_among_cars_within_their_limits(tmp_path: Path) -> None:
     assert {one.arrival.vehicle_type for one in left} == {"car", "truck"}
     with pytest.raises(BadInputError, match=r"vehicle_type: got ..truck..; allowed: none with"):
         check_rule(scenario)
+
+
+@pytest.mark.parametrize(
+    ("road", "field"),
+    [
+        (Road(restrictions=(Restriction(2, ("car",)),)), "restrictions"),
+        (Road(solid_lines=(SolidLine(1, "left"),)), "solid_lines"),
+    ],
+)
+def test_rules_of_lanes_are_refused(road: Road, field: str) -> None:
+    for check, method in ((check_lc2013, "lc2013"), (check_rule, "rule")):
+        with pytest.raises(BadInputError, match=rf"road\.{field}: .*none with --method {method}"):
+            check(Scenario(road=road))
