@@ -103,6 +103,8 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
             "tuple[str, ...]": "list of texts",
             "bool": "`true`, `false`",
             "tuple[Closure, ...]": "list of tables",
+            "tuple[Restriction, ...]": "list of tables",
+            "tuple[SolidLine, ...]": "list of tables",
             "tuple[DestinationShare, ...]": "list of tables",
             "tuple[Entrance, ...]": "list of tables",
             "tuple[Exit, ...]": "list of tables",

@@ -56,10 +56,15 @@ def _relax(here, there, load, base, scale):
 
 
 @njit(cache=True, nogil=True)
-def _relax_permitted(here, there, load, forbidden, base, scale):
-    """Relax one displacement, as `_relax`, for a group of types that may not make all moves."""
+def _relax_permitted(here, there, load, forbidden, place, base, scale):
+    """Relax one displacement, as `_relax`, for a group of types that may not make all moves.
+
+    `place`: index in `forbidden` of the first column.
+    """
+    group, s, d, lane, first = place
+    extra = forbidden[group, s, d, lane, first : first + len(here)]
     for i in range(len(here)):
-        there[i] = min(there[i], here[i] + base + scale * load[i] + forbidden[i])
+        there[i] = min(there[i], here[i] + base + scale * load[i] + extra[i])
 
 
 @njit(cache=True, nogil=True)
@@ -72,7 +77,7 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
     """
     load, steps, of_move, value = table.load, table.steps, costs.of_move, scratch.value
     zone, left, row = table.zone, table.left, scratch.row
-    group = paths.group[v]
+    forbidden, group = table.forbidden, paths.group[v]
     scratch.searches[0] += 1
     slots, fan, lanes, _ = load.shape
     scale = np.float32(softness / (PENALTY * ENTERING) if softness > 0.0 else _IMPASSABLE)
@@ -115,12 +120,11 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
                     base = stay_cost + of_move[d] + (scratch.delay[s] if d > 0 else np.float32(0.0))
                     there = value[s + 1, to_lane, to : to + high + 1 - low]
                     loads = load[s, d, lane, low + shift : high + shift + 1]
-                    if group > 0:
-                        forbidden = table.forbidden[group - 1, s, d, lane]
-                        forbidden = forbidden[low + shift : high + shift + 1]
-                        _relax_permitted(here, there, loads, forbidden, base, scale)
-                    else:
+                    if group == 0:
                         _relax(here, there, loads, base, scale)
+                    else:
+                        place = group - 1, s, d, lane, low + shift
+                        _relax_permitted(here, there, loads, forbidden, place, base, scale)
         if moves:
             low, high = max(1, low - 1), min(value.shape[2] - 2, high + 1)
     if best_s < 0:
@@ -130,16 +134,10 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
 
 
 @njit(cache=True, nogil=True)
-def is_forbidden(table, paths, v, s, d, lane, column):
-    """Return whether the type of a vehicle may not make a move."""
-    group = paths.group[v]
-    return group > 0 and table.forbidden[group - 1, s, d, lane, column] > 0.0
-
-
-@njit(cache=True, nogil=True)
 def _trace(table, paths, costs, v, scale, slots, lane, offset, scratch):
     """Set the path found by `find_path`, from its end to its beginning."""
     load, steps, value = table.load, table.steps, scratch.value
+    forbidden, group = table.forbidden, paths.group[v]
     fan, lanes = load.shape[1:3]
     shift = paths.column[v, 0] - (value.shape[2] // 2)
     paths.slots[v] = slots
@@ -152,7 +150,7 @@ def _trace(table, paths, costs, v, scale, slots, lane, offset, scratch):
                 continue
             if not paths.drives[v, d]:
                 continue
-            if is_forbidden(table, paths, v, s, d, from_lane, before + shift):
+            if group > 0 and forbidden[group - 1, s, d, from_lane, before + shift] > 0.0:
                 continue
             if table.left[s, from_lane, before + shift]:
                 continue
@@ -188,7 +186,7 @@ def follow(table, paths, costs, v, cells):
     slots, fan = table.load.shape[:2]
     if len(cells) == 0 or cells[0, 0] != paths.column[v, 0] or cells[0, 1] != paths.lane[v, 0]:
         return False
-    s = 0
+    s, group = 0, paths.group[v]
     while s < slots and not table.left[s, paths.lane[v, s], paths.column[v, s]]:
         if s + 1 >= len(cells):
             return False
@@ -202,7 +200,7 @@ def follow(table, paths, costs, v, cells):
             return False
         if move > 0 and s < paths.waits[v]:
             return False
-        if is_forbidden(table, paths, v, s, move, lane, column):
+        if group > 0 and table.forbidden[group - 1, s, move, lane, column] > 0.0:
             return False
         paths.move[v, s] = move
         paths.column[v, s + 1], paths.lane[v, s + 1] = cells[s + 1, 0], cells[s + 1, 1]
