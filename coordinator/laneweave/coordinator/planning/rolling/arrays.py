@@ -16,12 +16,12 @@ from attrs import evolve
 from numpy.typing import NDArray
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel, conflict_offsets
-from laneweave.coordinator.planning.rolling.lane_rules import LaneRules, Zones, lane_rules, zones
 from laneweave.coordinator.planning.rolling.paths_kernel import (
     ENTERING,
     FIXED,
     MAX_EJECTED,
     PENALTY,
+    UNREACHED,
 )
 from laneweave.coordinator.planning.rolling.problem import (
     ROUNDING_M,
@@ -167,6 +167,34 @@ class Window(NamedTuple):
     scratch: Scratch
 
 
+class _LaneRules(NamedTuple):
+    """Where vehicles may not drive or change lanes because of their type.
+
+    Types to which restrictions or solid lines apply form *groups*. Lane changes that are forbidden
+    are never planned. Driving on in a lane that is restricted ahead is not forbidden, since a
+    vehicle that has no room beside it must drive on; it only has a high cost.
+    """
+
+    group: Ints
+    """Group of each vehicle; 0: no rules apply to it."""
+    forbidden: Singles
+    """`Table.forbidden`."""
+    restricted: Bools
+    """Whether a vehicle that stays in a lane drives where it may not, in the slot that begins in a
+    cell; (groups - 1, slots + 1, lanes, columns)."""
+
+
+class _Zones(NamedTuple):
+    """Sections, divided where restrictions of groups begin and end."""
+
+    of_cell: NDArray[np.int16]
+    """`Table.zone`."""
+    section: Ints
+    """Section of each zone; -1: none."""
+    restricted: Bools
+    """Whether each zone is restricted for each group; (groups - 1, zones)."""
+
+
 def window(
     road: StreamRoad,
     costs: StreamCosts,
@@ -186,7 +214,7 @@ def window(
     # Add slots for vehicles that fall back.
     slots += int(np.ceil(reach * road.pitch_m / road.advance_m))
     at_m = now_m + np.arange(slots + 1)[:, None] * road.advance_m
-    rules = lane_rules(road, vehicles, at_m)
+    rules = _lane_rules(road, vehicles, at_m)
     table, own_zones = _table(road, at_m, low, blocked, rules)
     # A path must remain cheaper than one with a forbidden move.
     costs = evolve(costs, restricted=min(costs.restricted, _MAX_RESTRICTED_COST / slots))
@@ -200,8 +228,8 @@ def window(
 
 
 def _table(
-    road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell], rules: LaneRules
-) -> tuple[Table, Zones]:
+    road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell], rules: _LaneRules
+) -> tuple[Table, _Zones]:
     """Return an empty table and its zones; `at_m`: positions of columns when slots begin."""
     slots, columns = at_m.shape[0] - 1, at_m.shape[1]
     offsets, first = _offsets(road.mode, road.model)
@@ -212,7 +240,7 @@ def _table(
     steps = displacements(road.mode)
     load = np.zeros((slots, len(steps), road.lanes, columns), dtype=np.float32)
     section, left, open_ = _sections(road, at_m)
-    found = zones(section, rules.restricted, len(road.sections))
+    found = _zones(section, rules.restricted, len(road.sections))
     zone = found.of_cell
     may_move = _may_move(road, open_, is_blocked)
     load[:, 1:][~may_move] = FIXED * ENTERING
@@ -237,6 +265,78 @@ def _table(
         (zone != zone[:1, :, :1]).any(axis=(0, 2)),
     )
     return table, found
+
+
+def _lane_rules(road: StreamRoad, vehicles: Sequence[StreamVehicle], at_m: Floats) -> _LaneRules:
+    """Return the rules for vehicles; `at_m`: positions of columns at the beginning of slots."""
+    types = [one.vehicle_type for one in vehicles]
+    names = [name for name in sorted(set(types)) if road.rules_of(name)]
+    numbers = {name: number for number, name in enumerate(names, start=1)}
+    slots, columns = at_m.shape[0] - 1, at_m.shape[1]
+    steps = displacements(road.mode)
+    shape = (len(names), slots, len(steps), road.lanes, columns)
+    rules = _LaneRules(
+        np.array([numbers.get(name, 0) for name in types], dtype=np.int64),
+        np.zeros(shape, dtype=np.float32),
+        np.zeros((len(names), slots + 1, road.lanes, columns), dtype=np.bool_),
+    )
+    if not names:
+        return rules
+    starts_m = [_starts_m(road, at_m[:-1], lane) for lane in range(road.lanes)]
+    for name, forbidden, restricted in zip(names, rules.forbidden, rules.restricted, strict=True):
+        for (lane, to_lane), from_m, to_m in road.forbidden_changes(name):
+            if not 0 <= min(lane, to_lane) <= max(lane, to_lane) < road.lanes:
+                continue
+            start_m = np.maximum(starts_m[lane], starts_m[to_lane])
+            for d, (column, side) in enumerate(steps):
+                if side == to_lane - lane:
+                    rear_m = start_m - road.body_m + min(0, column) * road.pitch_m
+                    front_m = start_m + road.advance_m + max(0, column) * road.pitch_m
+                    is_there = (rear_m < to_m - ROUNDING_M) & (front_m > from_m + ROUNDING_M)
+                    forbidden[:, d, lane][is_there] = UNREACHED
+        for one in road.restrictions:
+            if one.applies_to(name):
+                restricted[:, one.lane] |= (at_m - road.body_m < one.to_m - ROUNDING_M) & (
+                    at_m + road.advance_m > one.from_m + ROUNDING_M
+                )
+    return rules
+
+
+def _starts_m(road: StreamRoad, front_m: Floats, lane: int) -> Floats:
+    """Return `StreamRoad.start_m` for many positions of the front, and one lane."""
+    starts_m = front_m.copy()
+    if road.early_m is None:
+        return starts_m
+    for from_m, to_m, number in road.lane_sections[lane]:
+        begins_m = road.first_m(from_m, number)
+        later = (front_m < road.line_m(number, to_m)) & (front_m < begins_m)
+        later &= begins_m <= front_m + road.advance_m
+        starts_m[later] = np.maximum(starts_m[later], begins_m)
+    return starts_m
+
+
+def _zones(section: NDArray[np.int16], restricted: Bools, sections: int) -> _Zones:
+    """Divide sections where restrictions begin and end.
+
+    Args:
+        section: section of each cell at the beginning of each slot; -1: none.
+        restricted: `_LaneRules.restricted`.
+        sections: number of sections.
+    """
+    groups = len(restricted)
+    if not groups:
+        numbers = np.array([*range(sections), -1], dtype=np.int64)
+        return _Zones(section, numbers, np.zeros((0, sections + 1), dtype=np.bool_))
+    code = section.astype(np.int64) + 1
+    for own in restricted:
+        code = 2 * code + own
+    codes, of_cell = np.unique(code, return_inverse=True)
+    bits = [(codes >> (groups - 1 - group)) & 1 for group in range(groups)]
+    return _Zones(
+        of_cell.reshape(section.shape).astype(np.int16),
+        (codes >> groups) - 1,
+        np.array(bits, dtype=np.bool_),
+    )
 
 
 def _sections(road: StreamRoad, at_m: Floats) -> tuple[NDArray[np.int16], Bools, Bools]:
@@ -296,8 +396,8 @@ def _paths(
     table: Table,
     low: int,
     vehicles: Sequence[StreamVehicle],
-    rules: LaneRules,
-    own_zones: Zones,
+    rules: _LaneRules,
+    own_zones: _Zones,
 ) -> Paths:
     slots, count = len(table.load), len(vehicles)
     column, lane = np.zeros((2, count, slots + 1), dtype=np.int64)
