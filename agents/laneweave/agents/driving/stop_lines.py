@@ -46,7 +46,12 @@ class StopLines:
             s_m: measured position of the front bumper.
         """
         lines = [
-            (end, np.abs(states[:, 3] - self._lattice.cell_y_m(end.lane)) < self._touch_m)
+            (
+                end,
+                (np.abs(states[:, 3] - self._lattice.cell_y_m(end.lane)) < self._touch_m)
+                # The reference may lead into the lane where it is open again.
+                & (states[:, 0] < end.reopens_m),
+            )
             for end in self._ahead(s_m)
         ]
         latest = gaps.latest

@@ -164,6 +164,9 @@ class LaneEnds:
             since_s: road time at which the cell is in the section; None: `t_s`.
             body_m: a position in the section, instead of that of the cell.
         """
+        if body_m is None:
+            # A move may begin before its lane opens: what ended before does not concern it.
+            body_m = self.in_section_m(cell, t_s if since_s is None else since_s)
         return self._has_passed_line(self.ahead, cell, t_s, since_s, body_m)
 
     def ends_changes(

@@ -287,10 +287,15 @@ class MotionController:
         """
         s_m, speed_mps, goal = measured[0], measured[1], self.hold_cell[1]
         first, last = self.lattice.lanes_touched(measured[3], self._scenario.vehicle.width_m)
-        lanes = {*range(first, last + 1)}
-        if not self._must_stay_in_lane(tick):
-            lanes.add(goal)
-        ends = [end for lane in lanes if (end := self._lane_ends.ahead(lane, s_m)) is not None]
+        in_lane_m = dict.fromkeys(range(first, last + 1), s_m)
+        if goal not in in_lane_m and not self._must_stay_in_lane(tick):
+            # The lane may open ahead, behind the end of another section.
+            in_lane_m[goal] = self._lane_ends.in_section_m(self.hold_cell, tick * self.tick_s)
+        ends = [
+            end
+            for lane, at_m in in_lane_m.items()
+            if (end := self._lane_ends.ahead(lane, at_m)) is not None
+        ]
         if all(end.lane == goal for end in ends):
             self._past_line = False
         elif speed_mps < STANDING_MPS and self._body_lane == goal:

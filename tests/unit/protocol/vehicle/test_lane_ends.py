@@ -9,6 +9,7 @@ from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from laneweave.agents.driving.reference import Reference
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE, LaneSection, open_sections, sections_for
@@ -18,6 +19,7 @@ from laneweave.protocol.vehicle.lane_ends import (
     LaneEnds,
     dead_ends,
     drive_out,
+    early_start_m,
     lane_beside,
     sections_to_lines,
 )
@@ -26,8 +28,11 @@ from laneweave.sim_bridge.bodies.motion_controller import Rung
 from support.closed_lanes import BLOCKED, DROP
 from support.convoy import ROLLING
 from support.road_vehicles import controller_in
+from support.states import command
 
 INF = math.inf
+KEEPING = evolve(BLOCKED, formation=evolve(BLOCKED.formation, change_columns=False))
+"""Vehicles keep their columns, and may begin moves a little before a lane opens."""
 
 
 def with_closures(*closures: Closure) -> Scenario:
@@ -98,6 +103,16 @@ def test_cells_pass_the_line_with_the_lattice() -> None:
     assert ends.has_passed((-10, 1), opens_s - 0.01)
     assert ends.has_passed((-10, 1), opens_s + 0.01, passing_s)  # it was before the closed part
     assert not ends.has_passed((-10, 1), opens_s + 0.01)
+
+
+def test_a_cell_is_in_a_lane_that_opens_again_as_soon_as_moves_into_it_may_begin() -> None:
+    ends, lattice = LaneEnds(KEEPING), KEEPING.lattice
+    begins_m = 700.0 + KEEPING.longest_body_m - early_start_m(KEEPING)
+    assert begins_m < 700.0
+    begins_s = lattice.passing_time_s(-10, begins_m)
+    assert ends.has_passed((-10, 1), begins_s - 0.01)
+    assert not ends.has_passed((-10, 1), begins_s + 0.01)
+    assert ends.has_begun(1, begins_m + 0.01)
 
 
 @pytest.mark.parametrize(
@@ -224,6 +239,30 @@ def test_the_line_counts_for_a_lane_that_the_vehicle_is_about_to_enter() -> None
     (line,) = controller._lines_ahead(state, 493)
     assert (line.lane, line.speed_mps) == (0, 0.0)
     assert line.gap_m == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize("error_m", [-0.3, 0.0, 0.3])
+def test_no_line_counts_in_a_lane_that_opens_again_for_a_move_behind_its_end(
+    error_m: float,
+) -> None:
+    """The move may begin before the lane opens, and the body may be measured behind its cell."""
+    lattice, tick_s = KEEPING.lattice, KEEPING.runtime.tick_s
+    begins_m = 700.0 + KEEPING.longest_body_m - early_start_m(KEEPING)
+    begin_tick = math.ceil(lattice.passing_time_s(-10, begins_m) / tick_s)
+    state = cell_state(lattice, (-10, 0), begin_tick * tick_s)
+    controller = controller_in((-10, 0), KEEPING, state=state, attendant=7)
+    controller.assign_cell((-10, 1))
+    ticks = KEEPING.move_ticks(KEEPING.cycles_s[0])
+    reference = Reference.move(KEEPING, (-10, 0), (-10, 1), begin_tick, ticks)
+    window = reference.window(begin_tick)
+    move = command(begin_tick, *window.jerks.tolist(), hold_cell=(-10, 1), incarnation=7)
+    assert controller.accept_command(evolve(move, motion_origin=(-10, 0)))
+    for tick in range(begin_tick, begin_tick + len(window.jerks)):
+        s, *rest = controller.plant.state
+        controller.perceive((s + error_m, *rest), controller.neighbours)
+        assert controller._lines_ahead(controller.measured, tick) == []
+        controller.step(tick)
+        assert controller.rung is Rung.EXECUTE
 
 
 def test_a_body_that_must_stay_in_its_lane_does_not_stop_at_the_line_of_another() -> None:
