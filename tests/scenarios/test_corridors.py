@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import pytest
 
@@ -19,13 +20,22 @@ from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.sim_bridge.corridors import corridor_arrivals, sumo_statistics
 from laneweave.sim_bridge.corridors.corridor_setup import WHOLE, read_corridor
 from laneweave.sim_bridge.corridors.sumo_statistics import read_statistics
-from support.interchange import CORRIDOR, TRUCKS, stream, vehicle, write_interchange
+from support.interchange import (
+    CORRIDOR,
+    EXIT_FIRST,
+    RAMP_FIRST,
+    TRUCKS,
+    Network,
+    stream,
+    vehicle,
+    write_interchange,
+)
 
 Events = list[dict[str, Any]]
 
 
-def scenario(folder: Path, vehicles: Sequence[str]) -> Scenario:
-    config = write_interchange(folder, vehicles, types=TRUCKS)
+def scenario(folder: Path, vehicles: Sequence[str], network: Network = EXIT_FIRST) -> Scenario:
+    config = write_interchange(folder, vehicles, types=TRUCKS, network=network)
     found = read_corridor(config, CORRIDOR)
     return parse_scenario(corridor_tables(found, config, WHOLE))
 
@@ -49,6 +59,11 @@ def read_rows(folder: Path) -> dict[tuple[str, int], tuple[float, float]]:
     columns = read_trajectories(folder, ["vehicle", "t_s", "s_m", "speed_mps"]).to_pydict()
     keys = zip(columns["vehicle"], (round(t_s / 0.1) for t_s in columns["t_s"]), strict=True)
     return dict(zip(keys, zip(columns["s_m"], columns["speed_mps"], strict=True), strict=True))
+
+
+def hardest_braking_mps2(folder: Path) -> float:
+    accels = read_trajectories(folder, ["accel_mps2"]).to_pydict()["accel_mps2"]
+    return -min(map(float, accels))
 
 
 def drive(own: Scenario, folder: Path) -> tuple[dict[str, Any], Events]:
@@ -142,6 +157,31 @@ def test_vehicles_come_from_upstream(tmp_path: Path) -> None:
     assert {event["kind"] for event in events}.isdisjoint({"missed-exit", "left-lattice"})
     trips = read_trips(tmp_path / "run").values()
     assert {trip["entrance"] for trip in trips} == {MAIN_ENTRANCE, "on"}
+
+
+def test_an_exit_follows_a_ramp_in_the_same_lane(tmp_path: Path) -> None:
+    """Moves into the lane of the exit begin at different times of their slots, some early."""
+    vehicles = []
+    for second in range(0, 60, 2):
+        kind = "truck" if second % 14 == 6 else "car"
+        route = "late exit" if second % 6 == 4 else "main"
+        vehicles.append(vehicle(f"{route[-4:]}{second}", second, route, kind))
+        if second % 8 == 0:
+            vehicles.append(vehicle(f"ramp{second}", second, "early ramp"))
+    own = scenario(tmp_path, vehicles, RAMP_FIRST)
+    folder = tmp_path / "run"
+    summary, events = drive(own, folder)
+    assert summary["vehicles"]["left"] == summary["vehicles"]["at_destination"] == len(vehicles)
+    assert summary["safety"]["overlaps"] == summary["safety"]["sumo_collisions"] == 0
+    assert summary["tracking"]["emergency_ticks"] == 0
+    assert {event["kind"] for event in events}.isdisjoint({"missed-exit", "left-lattice"})
+    assert hardest_braking_mps2(folder) <= 4.0
+    # What SUMO says, too.
+    trips = ET.parse(folder / "tripinfo.xml").getroot()  # noqa: S314 (written by SUMO)
+    for trip in trips.iter("tripinfo"):
+        if not trip.get("vaporized"):
+            edge = "off" if trip.attrib["id"].startswith("exit") else "main5"
+            assert trip.attrib["arrivalLane"].startswith(f"{edge}_")
 
 
 def test_equal_runs_are_equal(tmp_path: Path) -> None:

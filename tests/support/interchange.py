@@ -1,8 +1,15 @@
-"""A small motorway interchange as a SUMO simulation: an exit, and behind it an on-ramp.
+"""Small motorway interchanges as SUMO simulations.
+
+An exit, and behind it an on-ramp (`EXIT_FIRST`):
 
     start (400 m, 3 lanes) -> main1 (700 m, 3) -> main2 (250 m, 4: lane 0 leads to the exit)
     -> main3 (160 m, 3) -> main4 (250 m, 4: lane 0 comes from the ramp, and ends)
     -> main5 (600 m, 3)
+
+An on-ramp, and behind it an exit in the same lane (`RAMP_FIRST`):
+
+    main1 (400 m, 2 lanes) -> main2 (300 m, 3: lane 0 comes from the ramp, and ends)
+    -> main3 (300 m, 2) -> main4 (262 m, 3: lane 0 leads to the exit) -> main5 (200 m, 2)
 
 The main road is straight, to the east; the exit and the ramp are beside it. The files are written
 without netconvert, like those of `sim_bridge.sumo.network`.
@@ -43,7 +50,15 @@ def _centres(first: int, count: int, shift_m: float = 0.0) -> tuple[float, ...]:
     return tuple((lane + 0.5) * LANE_M + shift_m for lane in range(first, first + count))
 
 
-EDGES = (
+@frozen
+class Network:
+    """Edges, and links between their lanes: (edge, lane, next edge, its lane)."""
+
+    edges: tuple[_Edge, ...]
+    links: tuple[tuple[str, int, str, int], ...]
+
+
+_EDGES = (
     _Edge("start", "Z", "A", -400.0, 0.0, _centres(1, 3)),
     _Edge("main1", "A", "B", 0.0, 700.0, _centres(1, 3)),
     _Edge("main2", "B", "C", 700.0, 950.0, _centres(0, 4)),
@@ -54,7 +69,7 @@ EDGES = (
     _Edge("before", "H", "I", 510.0, 810.0, _centres(0, 1, -40.0), RAMP_SPEED_MPS),
     _Edge("on", "I", "D", 810.0, 1110.0, _centres(0, 1, -40.0), RAMP_SPEED_MPS),
 )
-LINKS = (
+_LINKS = (
     *(("start", lane, "main1", lane) for lane in range(3)),
     *(("main1", lane, "main2", lane + 1) for lane in range(3)),
     *(("main2", lane + 1, "main3", lane) for lane in range(3)),
@@ -64,10 +79,37 @@ LINKS = (
     *(("main4", lane + 1, "main5", lane) for lane in range(3)),
     ("before", 0, "on", 0),
 )
+EXIT_FIRST = Network(_EDGES, _LINKS)
+RAMP_FIRST = Network(
+    (
+        _Edge("main1", "A", "B", 0.0, 400.0, _centres(1, 2)),
+        _Edge("main2", "B", "C", 400.0, 700.0, _centres(0, 3)),
+        _Edge("main3", "C", "D", 700.0, 1000.0, _centres(1, 2)),
+        _Edge("main4", "D", "E", 1000.0, 1262.0, _centres(0, 3)),
+        _Edge("main5", "E", "F", 1262.0, 1462.0, _centres(1, 2)),
+        _Edge("off", "E", "G", 1262.0, 1562.0, _centres(0, 1, -20.0), RAMP_SPEED_MPS),
+        _Edge("before", "H", "I", -200.0, 100.0, _centres(0, 1, -40.0), RAMP_SPEED_MPS),
+        _Edge("on", "I", "B", 100.0, 400.0, _centres(0, 1, -40.0), RAMP_SPEED_MPS),
+    ),
+    (
+        *(("main1", lane, "main2", lane + 1) for lane in range(2)),
+        *(("main2", lane + 1, "main3", lane) for lane in range(2)),
+        *(("main3", lane, "main4", lane + 1) for lane in range(2)),
+        *(("main4", lane + 1, "main5", lane) for lane in range(2)),
+        ("main4", 0, "off", 0),
+        ("on", 0, "main2", 0),
+        ("before", 0, "on", 0),
+    ),
+)
 
 
 def write_interchange(
-    folder: Path, vehicles: Sequence[str] = (), *, types: str = "", state: str = "M"
+    folder: Path,
+    vehicles: Sequence[str] = (),
+    *,
+    types: str = "",
+    state: str = "M",
+    network: Network = EXIT_FIRST,
 ) -> Path:
     """Write the files of the simulation, and return its configuration.
 
@@ -76,8 +118,9 @@ def write_interchange(
         vehicles: XML elements of vehicles, in order of departure.
         types: XML elements of types; the type `car` always exists.
         state: right of way of the link from main4 to main5.
+        network: the road.
     """
-    (folder / "small.net.xml").write_text("\n".join(_network(state)), encoding="utf-8")
+    (folder / "small.net.xml").write_text("\n".join(_network(network, state)), encoding="utf-8")
     routes = ["<routes>", '<vType id="car" sigma="0"/>', types, *vehicles, "</routes>"]
     (folder / "small.rou.xml").write_text("\n".join(routes), encoding="utf-8")
     config = folder / "small.sumocfg"
@@ -91,16 +134,22 @@ def write_interchange(
     return config
 
 
+ROUTES = {
+    "main": "main1 main2 main3 main4 main5",
+    "exit": "main1 main2 off",
+    "ramp": "before on main4 main5",
+    "inside": "main3 main4 main5",
+    "upstream": "start main1 main2 main3 main4 main5",
+    "upstream exit": "start main1 main2 off",
+    "late exit": "main1 main2 main3 main4 off",
+    "early ramp": "before on main2 main3 main4 main5",
+}
+"""Edges of routes; the last two are those of `RAMP_FIRST`."""
+
+
 def vehicle(name: str, depart_s: float, route: str, kind: str = "car") -> str:
-    """Return the XML element of a vehicle; `route` is the name of one of these."""
-    edges = {
-        "main": "main1 main2 main3 main4 main5",
-        "exit": "main1 main2 off",
-        "ramp": "before on main4 main5",
-        "inside": "main3 main4 main5",
-        "upstream": "start main1 main2 main3 main4 main5",
-        "upstream exit": "start main1 main2 off",
-    }[route]
+    """Return the XML element of a vehicle; `route` is one of `ROUTES`."""
+    edges = ROUTES[route]
     return (
         f'<vehicle id="{name}" type="{kind}" depart="{depart_s:g}" departSpeed="max">'
         f'<route edges="{edges}"/></vehicle>'
@@ -127,12 +176,13 @@ def interchange_scenario(folder: Path) -> Scenario:
     return parse_scenario(scenario_tables(found.corridor, found.demand))
 
 
-def _network(state: str) -> Iterator[str]:
+def _network(network: Network, state: str) -> Iterator[str]:
+    edges, links = network.edges, network.links
     yield '<net version="1.20">'
-    bounds = "-400,-60,1960,20"
+    bounds = f"{min(edge.from_m for edge in edges)},-60,{max(edge.to_m for edge in edges)},20"
     yield f'<location netOffset="0,0" convBoundary="{bounds}" origBoundary="{bounds}"'
     yield ' projParameter="!"/>'
-    for edge in EDGES:
+    for edge in edges:
         yield f'<edge id="{edge.name}" from="{edge.origin}" to="{edge.destination}" priority="1">'
         for index, y_m in enumerate(edge.lanes):
             yield (
@@ -141,14 +191,14 @@ def _network(state: str) -> Iterator[str]:
                 f' shape="{edge.from_m},{y_m} {edge.to_m},{y_m}"/>'
             )
         yield "</edge>"
-    nodes = {edge.origin: edge.from_m for edge in EDGES}
-    nodes |= {edge.destination: edge.to_m for edge in EDGES}
+    nodes = {edge.origin: edge.from_m for edge in edges}
+    nodes |= {edge.destination: edge.to_m for edge in edges}
     for node, x_m in nodes.items():
-        coming = [edge for edge in EDGES if edge.destination == node]
+        coming = [edge for edge in edges if edge.destination == node]
         names = " ".join(
             f"{edge.name}_{lane}" for edge in coming for lane in range(len(edge.lanes))
         )
-        count = sum(before in {edge.name for edge in coming} for before, *_ in LINKS)
+        count = sum(before in {edge.name for edge in coming} for before, *_ in links)
         yield (
             f'<junction id="{node}" type="{"priority" if count else "dead_end"}" x="{x_m}" y="20"'
             f' incLanes="{names}" intLanes="" shape="{x_m},-60 {x_m},20">'
@@ -157,7 +207,7 @@ def _network(state: str) -> Iterator[str]:
             none = "0" * count
             yield f'<request index="{number}" response="{none}" foes="{none}" cont="0"/>'
         yield "</junction>"
-    for before, from_lane, after, to_lane in LINKS:
+    for before, from_lane, after, to_lane in links:
         right = state if after == "main5" else "M"
         yield (
             f'<connection from="{before}" to="{after}" fromLane="{from_lane}" toLane="{to_lane}"'

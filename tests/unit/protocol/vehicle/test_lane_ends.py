@@ -258,8 +258,8 @@ def test_no_line_counts_in_a_lane_that_opens_again_for_a_move_behind_its_end(
     move = command(begin_tick, *window.jerks.tolist(), hold_cell=(-10, 1), incarnation=7)
     assert controller.accept_command(evolve(move, motion_origin=(-10, 0)))
     for tick in range(begin_tick, begin_tick + len(window.jerks)):
-        s, *rest = controller.plant.state
-        controller.perceive((s + error_m, *rest), controller.neighbours)
+        s, v, a, y, v_y, a_y = controller.plant.state
+        controller.perceive((s + error_m, v, a, y, v_y, a_y), controller.neighbours)
         assert controller._lines_ahead(controller.measured, tick) == []
         controller.step(tick)
         assert controller.rung is Rung.EXECUTE
