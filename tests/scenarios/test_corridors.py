@@ -24,6 +24,7 @@ from support.interchange import (
     CORRIDOR,
     EXIT_FIRST,
     RAMP_FIRST,
+    RAMP_SPEED_MPS,
     TRUCKS,
     Network,
     stream,
@@ -223,6 +224,20 @@ def test_a_queue_behind_the_exit_is_braked_for(
     assert checked > 0
 
 
+def test_a_truck_does_not_brake_hard_behind_one_that_has_left(tmp_path: Path) -> None:
+    """The limit behind the exit is lower than v_F, and SUMO slows down for it."""
+    seconds = [first + second for first in range(0, 20, 5) for second in (0, 1)]
+    leaving = [vehicle(f"t{second}", second, "exit", "truck") for second in seconds]
+    own = scenario(tmp_path, leaving)
+    assert own.formation.speed_mps > RAMP_SPEED_MPS
+    summary, _ = drive(own, tmp_path / "run")
+    assert summary["vehicles"]["left"] == summary["vehicles"]["at_destination"] == 8
+    assert summary["safety"]["overlaps"] == summary["safety"]["sumo_collisions"] == 0
+    assert summary["tracking"]["emergency_ticks"] == 0
+    assert hardest_braking_mps2(tmp_path / "run") <= 4.0
+    assert read_statistics(tmp_path / "run").collisions == 0
+
+
 def test_vehicles_wait_at_the_start_while_their_exit_is_full(tmp_path: Path) -> None:
     """In the corridor they would stop beside the exit, and so would all vehicles behind them."""
     until_s = 100
@@ -262,6 +277,7 @@ def test_a_run_ends_although_an_exit_remains_full(
     assert summary["vehicles"]["left"] == summary["vehicles"]["entered"]
     assert summary["safety"]["overlaps"] == 0
     assert {event["kind"] for event in events}.isdisjoint({"missed-exit", "left-lattice"})
+    assert read_statistics(tmp_path / "run").collisions == 0
 
 
 def test_flows_on_the_first_edge(tmp_path: Path) -> None:

@@ -38,6 +38,12 @@ _PLANTS = {
 """Options with which SUMO displays bodies as the bridge drives them."""
 _OWN_SPEED_MODE, _OWN_LANE_CHANGES = 31, 1621
 """SUMO's defaults: it drives."""
+_SLOWING_MODE = 0b1011011
+"""The same with a given speed: above the limits of lanes, and braking as hard as is necessary."""
+SLOWS_MPS2, SLOWS_S = 0.5, 5.0
+"""Deceleration of a vehicle that is given back before a lower limit, and for how long at most. SUMO
+would brake it as hard as its type allows, and a truck one column behind, which is still inside,
+would brake in an emergency."""
 MAX_DISPLAY_ERROR_M = 0.1
 """Maximum distance between a body and where SUMO displays it."""
 
@@ -74,6 +80,8 @@ class CorridorWorld(SumoProcess):
         self._shown: dict[str, State] = {}
         self._returned: set[str] = set()
         """Names in SUMO of vehicles that have been given back and have not arrived."""
+        self._slowing: dict[str, tuple[float, float, float]] = {}
+        """When vehicles were given back, their speed then, and the lower limit ahead, by name."""
         self._taken: set[str] = set()
         """Names in SUMO of vehicles that have been taken over."""
         upstream = any(one.origin.upstream for one in setup.arrivals)
@@ -213,13 +221,11 @@ class CorridorWorld(SumoProcess):
         Raises:
             RuntimeError: SUMO does not display a vehicle where it is (internal error).
         """
-        super().step()
+        self._advance()
         api = self.vehicle
         self._approaching.clear()
         self._others = None
-        arrived = self.simulation.getArrivedIDList()
-        self._returned.difference_update(arrived)
-        for name in arrived:
+        for name in self.simulation.getArrivedIDList():
             if name not in self._taken and self._is_ramp_vehicle(name):
                 del self._coming[name]
         on_road = set(api.getIDList())
@@ -252,7 +258,8 @@ class CorridorWorld(SumoProcess):
         Raises:
             ValueError: the vehicle is not on the road.
         """
-        if self._states.pop(vehicle, None) is None:
+        state = self._states.pop(vehicle, None)
+        if state is None:
             raise ValueError(f"{vehicle} is not on the road")
         self._shown.pop(vehicle, None)
         name, api = self._sumo_name[vehicle], self.vehicle
@@ -261,6 +268,35 @@ class CorridorWorld(SumoProcess):
         del self._coming[name]
         self._returned.add(name)
         self._others = None
+        limit_mps = self._next_limit_mps(name)
+        if state[1] > limit_mps:
+            self._slowing[name] = self.simulation.getTime(), state[1], limit_mps
+            api.setSpeedMode(name, _SLOWING_MODE)
+
+    def _next_limit_mps(self, name: str) -> float:
+        """Return how fast a vehicle may drive on the next edge of its route."""
+        api = self.vehicle
+        following = api.getRoute(name)[api.getRouteIndex(name) + 1 :][:1]
+        edges = self._setup.network.edges
+        limits = (lane.speed_mps for edge in following for lane in edges[edge].car_lanes)
+        return min(limits, default=math.inf) * float(api.getSpeedFactor(name))
+
+    def _advance(self) -> None:
+        """Advance SUMO; vehicles that have been given back before a lower limit slow down."""
+        api, now_s = self.vehicle, self.simulation.getTime()
+        for name, (since_s, speed_mps, limit_mps) in [*self._slowing.items()]:
+            slower_mps = speed_mps - SLOWS_MPS2 * (now_s - since_s)
+            if now_s < since_s + SLOWS_S and slower_mps > limit_mps:
+                api.setSpeed(name, slower_mps)
+            else:
+                api.setSpeed(name, -1.0)
+                api.setSpeedMode(name, _OWN_SPEED_MODE)
+                del self._slowing[name]
+        super().step()
+        arrived = self.simulation.getArrivedIDList()
+        self._returned.difference_update(arrived)
+        for name in arrived:
+            self._slowing.pop(name, None)
 
     def drive_on(self) -> None:
         """Let SUMO drive on until the vehicles that it got back have arrived (statistics)."""
@@ -268,8 +304,7 @@ class CorridorWorld(SumoProcess):
             return  # the run has been interrupted, or vehicles stand inside
         end_s = self.simulation.getTime() + MAX_WAIT_S
         while self._returned and self.simulation.getTime() < end_s:
-            super().step()
-            self._returned.difference_update(self.simulation.getArrivedIDList())
+            self._advance()
 
     def _move(self, vehicle: str, state: State) -> None:
         """Pass the middle of the front bumper and the angle to SUMO."""
