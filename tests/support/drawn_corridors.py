@@ -18,7 +18,7 @@ from pathlib import Path
 from random import Random
 
 import pyarrow.parquet as pq
-import sumo
+import sumo  # type: ignore[import-untyped]
 from attrs import define, field, frozen
 
 NETCONVERT = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
@@ -100,7 +100,7 @@ def draw_corridor(seed: int, folder: Path) -> DrawnCorridor:
     first, last = _draw_ends(main)
     left_hand = rng.random() < 0.1
     _netconvert(main, folder, left_hand=left_hand)
-    vehicles = sorted(_draw_vehicles(main, first, last))
+    vehicles = sorted(_draw_vehicles(main, first))
     types = (
         f'<vType id="car" length="{CAR[0]}" width="{CAR[1]}" accel="2.6" decel="4.5"/>'
         f'<vType id="truck" vClass="truck" length="{TRUCK[0]}" width="{TRUCK[1]}" accel="1.3"'
@@ -176,7 +176,7 @@ def _draw_ends(main: _Main) -> tuple[int, int]:
     return first, rng.choice((lasts[0], lasts[-1], rng.choice(lasts)))
 
 
-def _draw_vehicles(main: _Main, first: int, last: int) -> Iterator[tuple[float, str]]:
+def _draw_vehicles(main: _Main, first: int) -> Iterator[tuple[float, str]]:
     """Yield (departure, XML element)."""
     rng = main.rng
     trucks = rng.choice((0.0, 0.1, 0.25))
@@ -227,7 +227,7 @@ def _netconvert(main: _Main, folder: Path, *, left_hand: bool) -> None:
     command = [str(NETCONVERT), "-n", "drawn.nod.xml", "-e", "drawn.edg.xml"]
     command += ["-x", "drawn.con.xml", "-o", "drawn.net.xml", "--no-turnarounds", "true"]
     command += ["--lefthand", "true"] if left_hand else []
-    subprocess.run(command, cwd=folder, check=True, capture_output=True, timeout=60)  # noqa: S603
+    subprocess.run(command, cwd=folder, check=True, capture_output=True, timeout=60)
 
 
 def problems(drawn: DrawnCorridor, run: Path) -> list[str]:

@@ -15,7 +15,7 @@ from functools import cached_property
 from itertools import pairwise
 from statistics import median
 
-from attrs import frozen
+from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
@@ -97,6 +97,8 @@ class Corridor:
     closures: tuple[Closure, ...]
     ramps: tuple[Ramp, ...] = ()
     ways_out: tuple[WayOut, ...] = ()
+    parts: tuple[tuple[int, float, float, Lane], ...] = field(default=(), repr=False)
+    """(lane, from, to [m], SUMO's lane) of the lanes that it consists of."""
     unused: tuple[str, ...] = ()
     """Ways into the corridor and out of it that vehicles cannot use, in words."""
 
@@ -280,6 +282,7 @@ class _Derivation:
             closures=tuple(self._closures(parts, lanes, ramps, ways_out)),
             ramps=ramps,
             ways_out=ways_out,
+            parts=tuple(self._lane_parts()),
             unused=tuple(self._unused),
         )
 
@@ -290,6 +293,13 @@ class _Derivation:
     def _lane(self, number: int, lane: int) -> Lane:
         """Return the lane of an edge that is part of a corridor lane."""
         return self._way[number].lanes[lane - self._edges[number].first_lane]
+
+    def _lane_parts(self) -> Iterator[tuple[int, float, float, Lane]]:
+        """Yield the lanes of all edges, each with the junction behind it."""
+        ends_m = [*(edge.from_m for edge in self._edges[1:]), self._edges[-1].to_m]
+        for edge, end_m, way in zip(self._edges, ends_m, self._way, strict=True):
+            for lane in way.car_lanes:
+                yield edge.first_lane + lane.index, edge.from_m, end_m, lane
 
     def _parts(self) -> Iterator[_OpenPart]:
         """Yield the open parts of all corridor lanes."""

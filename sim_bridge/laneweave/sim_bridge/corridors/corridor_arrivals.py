@@ -11,7 +11,7 @@ when SUMO has driven them there.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 from attrs import frozen
@@ -152,7 +152,7 @@ def corridor_arrivals(
         if one.upstream:
             lane = scenario.road.first_lanes[0]  # which one it is depends on SUMO
         elif one.entrance == MAIN_ENTRANCE:
-            lane = choose.lane(t_s, one.destination)
+            lane = choose.lane(t_s, one.destination, types[one.vehicle.vehicle_type])
         elif one.entrance in lanes:
             lane = lanes[one.entrance]
         else:
@@ -203,19 +203,17 @@ class _LaneChoice:
         self._spacing_s = scenario.formation.entry_spacing_s
         self._free_s: dict[int, float] = dict.fromkeys(scenario.road.first_lanes, 0.0)
         """When the next vehicle can enter, by lane."""
-        self._nearest: Mapping[str, int] = {
-            each.name: min(
-                scenario.road.first_lanes,
-                key=lambda lane: min(abs(lane - own) for own in each.lanes),
-            )
-            for each in scenario.exit
-        }
+        self._scenario = scenario
+        self._exit_lanes = {each.name: each.lanes for each in scenario.exit}
 
-    def lane(self, t_s: float, destination: str) -> int:
-        """Return the lane of the next vehicle."""
-        lanes: Sequence[int] = [*self._free_s]
-        if destination in self._nearest:
-            lanes = [self._nearest[destination]]
+    def lane(self, t_s: float, destination: str, vehicle_type: str) -> int:
+        """Return the lane of the next vehicle, in which its type may drive."""
+        is_closed = partial(self._scenario.is_restricted, s_m=0.0, vehicle_type=vehicle_type)
+        lanes: Sequence[int] = [lane for lane in self._free_s if not is_closed(lane)]
+        lanes = lanes or [*self._free_s]
+        if destination in self._exit_lanes:
+            nearest = self._exit_lanes[destination]
+            lanes = [min(lanes, key=lambda lane: min(abs(lane - own) for own in nearest))]
         chosen = min(lanes, key=lambda lane: (max(self._free_s[lane], t_s), -lane))
         self._free_s[chosen] = max(self._free_s[chosen], t_s) + self._spacing_s
         return chosen

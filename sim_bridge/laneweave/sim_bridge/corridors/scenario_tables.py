@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from laneweave.protocol.config.cross_checks import MIN_SIDE_GAP_M
@@ -23,6 +23,7 @@ from laneweave.protocol.scenario.fields import (
 from laneweave.protocol.structuring import structure
 from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
 from laneweave.protocol.vehicle.lane_ends import drive_out, own_drive_out
+from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor, Ramp
 from laneweave.sim_bridge.corridors.sumo_demand import (
     CorridorDemand,
@@ -126,6 +127,7 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
         raise BadInputError(OPTION, corridor.name, f"a corridor that vehicles enter on {edge}")
     names = type_names(demand.passes)
     car, *others = names
+    own_names = {**names, car: CAR}
     fastest_mps = min(corridor.speed_mps, *(one.max_speed_mps for one in names))
     per_hour = 3600.0 / demand.duration_s
     ramps = [ramp for ramp in corridor.ramps if _from(demand, ramp.name)]
@@ -134,6 +136,8 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
             "lanes": corridor.lanes,
             "lane_width_m": corridor.lane_width_m,
             "closures": [_closure(one, corridor, ramps) for one in corridor.closures],
+            "restrictions": [*_restrictions(corridor, own_names)],
+            "solid_lines": [*_solid_lines(corridor, own_names)],
         },
         "entrance": [
             {
@@ -182,6 +186,7 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
     if settled_m >= corridor.length_m:
         raise BadInputError(OPTION, corridor.name, f"a corridor longer than {settled_m:g} m")
     tables["road"] |= {"s1_m": settled_m, "s2_m": 0.0, "s3_m": _m(corridor.length_m - settled_m)}
+    tables["road"] = {name: value for name, value in tables["road"].items() if value != []}
     filled = {name: table for name, table in tables.items() if table}
     return {"schema": "laneweave.scenario/1", **filled}
 
@@ -224,6 +229,32 @@ def _closure(closure: Closure, corridor: Corridor, ramps: Sequence[Ramp]) -> dic
     table: dict[str, Any] = {"lane": closure.lane}
     table |= {"from_m": _m(closure.from_m)} if closure.from_m > 0.0 else {}
     return table | ({"to_m": _m(to_m)} if to_m < corridor.length_m else {})
+
+
+def _restrictions(corridor: Corridor, names: Mapping[SumoType, str]) -> Iterator[dict[str, Any]]:
+    """Yield the tables of the parts of lanes in which some types may not drive."""
+    for number, from_m, to_m, lane in corridor.parts:
+        banned = [name for kind, name in names.items() if not lane.allows(kind.vehicle_class)]
+        if banned:
+            yield _part(number, from_m, to_m) | {"vehicle_types": banned}
+
+
+def _solid_lines(corridor: Corridor, names: Mapping[SumoType, str]) -> Iterator[dict[str, Any]]:
+    """Yield the tables of the lines that some types may not cross."""
+    for number, from_m, to_m, lane in corridor.parts:
+        for side, beside in (("left", number + 1), ("right", number - 1)):
+            kept = [
+                name
+                for kind, name in names.items()
+                if not lane.allows_change(kind.vehicle_class, side)
+            ]
+            if kept and 0 <= beside < corridor.lanes:
+                types = {} if len(kept) == len(names) else {"vehicle_types": kept}
+                yield _part(number, from_m, to_m) | {"to": side, **types}
+
+
+def _part(lane: int, from_m: float, to_m: float) -> dict[str, Any]:
+    return {"lane": lane, "from_m": _m(max(from_m, 0.0)), "to_m": _m(to_m)}
 
 
 def _destinations(passes: Sequence[Pass]) -> list[dict[str, Any]]:

@@ -57,7 +57,7 @@ class TimeWindow:
 
 @frozen
 class SumoType:
-    """Limits of a type of vehicle."""
+    """Limits of a type of vehicle, and its class."""
 
     length_m: float
     width_m: float
@@ -65,6 +65,8 @@ class SumoType:
     min_accel_mps2: float
     """Hardest braking."""
     max_speed_mps: float
+    vehicle_class: str = "passenger"
+    """SUMO's class, on which lanes depend in which it may drive."""
 
     @property
     def limits(self) -> Mapping[str, float]:
@@ -82,7 +84,6 @@ class SumoVehicle:
     route: tuple[str, ...]
     """Edges, in order."""
     vehicle_type: SumoType
-    vehicle_class: str
     type_name: str = ""
     """Name of its type in SUMO."""
     attributes: Attributes = field(factory=dict, eq=False)
@@ -248,21 +249,21 @@ def _due_s(sumo: SumoProcess) -> dict[str, float]:
     }
 
 
-def _type(sumo: SumoProcess, name: str) -> tuple[SumoType, str]:
+def _type(sumo: SumoProcess, name: str) -> SumoType:
     """Return the limits of a type, and its class."""
     api = sumo.vehicletype
-    limits = SumoType(
+    return SumoType(
         length_m=api.getLength(name),
         width_m=api.getWidth(name),
         max_accel_mps2=api.getAccel(name),
         min_accel_mps2=-max(api.getDecel(name), api.getEmergencyDecel(name)),
         max_speed_mps=api.getMaxSpeed(name),
+        vehicle_class=api.getVehicleClass(name),
     )
-    return limits, api.getVehicleClass(name)
 
 
 def _not_departed(
-    sumo: SumoProcess, waiting: Mapping[str, float], types: Mapping[str, tuple[SumoType, str]]
+    sumo: SumoProcess, waiting: Mapping[str, float], types: Mapping[str, SumoType]
 ) -> Iterator[SumoVehicle]:
     """Yield the vehicles that have been loaded and have not departed."""
     present = {*sumo.vehicle.getLoadedIDList()}
@@ -277,7 +278,7 @@ def _not_departed(
             # Those that wait for passengers are due, but SUMO does not try to insert them.
             round(due_s, 3) if name in pending or due_s > now_s - step_s else math.inf,
             _route(sumo, name),
-            *types[type_name],
+            types[type_name],
             type_name,
         )
 
@@ -296,9 +297,7 @@ def _route(sumo: SumoProcess, name: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _departed(
-    file: Path, types: Mapping[str, tuple[SumoType, str]], begin_s: float
-) -> Iterator[SumoVehicle]:
+def _departed(file: Path, types: Mapping[str, SumoType], begin_s: float) -> Iterator[SumoVehicle]:
     """Yield the vehicles of SUMO's output."""
     for _, element in ET.iterparse(file):  # noqa: S314 (SUMO has written it)
         if element.tag != "vehicle":
@@ -314,7 +313,7 @@ def _departed(
             element.get("id", ""),
             _departure_s(element.get("depart", ""), begin_s),
             tuple(_edges(element)),
-            *types[type_name],
+            types[type_name],
             type_name,
             attributes,
             tuple(map(_stop, element.iter("stop"))),
@@ -412,13 +411,10 @@ def _pass_of(vehicle: SumoVehicle, corridor: Corridor) -> Pass | str:
 def type_names(passes: Sequence[Pass]) -> dict[SumoType, str]:
     """Return the types with their names, the most frequent first; that is the car.
 
-    Types with equal limits are one. Their names are those of SUMO's classes of vehicles.
+    Types with equal limits and classes are one. Their names are those of SUMO's classes.
     """
     counts = Counter(one.vehicle.vehicle_type for one in passes)
     names: dict[SumoType, str] = {}
     for kind, _ in counts.most_common():
-        classes = Counter(
-            one.vehicle.vehicle_class for one in passes if one.vehicle.vehicle_type == kind
-        )
-        names[kind] = unique_name(classes.most_common(1)[0][0], names.values())
+        names[kind] = unique_name(kind.vehicle_class, names.values())
     return names

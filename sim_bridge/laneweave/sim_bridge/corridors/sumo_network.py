@@ -16,11 +16,14 @@ from laneweave.protocol.errors import BadInputError
 
 CARS = "passenger"
 """Class of vehicles that must be allowed in a lane of a corridor."""
+IGNORING = "ignoring"
+"""Class of vehicles that may drive anywhere."""
 _HAS_PRIORITY = "M"
 """State of a link whose vehicles give way to nobody."""
 _DEFAULT_LANE_M = 3.2
 """SUMO's width of lanes."""
 Point = tuple[float, float]
+_Changes = Mapping[str, frozenset[str]]
 
 
 @frozen
@@ -38,6 +41,19 @@ class Lane:
     allows_cars: bool
     shape: tuple[Point, ...] = ()
     """Centre line in the network's coordinates [m]."""
+    classes: frozenset[str] = frozenset()
+    """Classes of vehicles that may drive in it."""
+    changing: Mapping[str, frozenset[str]] = field(factory=dict, eq=False)
+    """Classes that may change lanes to a side; absent: all."""
+
+    def allows(self, vehicle_class: str) -> bool:
+        """Return whether vehicles of a class may drive in it."""
+        return vehicle_class in self.classes or vehicle_class == IGNORING
+
+    def allows_change(self, vehicle_class: str, side: str) -> bool:
+        """Return whether vehicles of a class may change lanes to a side, `left` or `right`."""
+        classes = self.changing.get(side)
+        return classes is None or vehicle_class in classes or vehicle_class == IGNORING
 
 
 @frozen
@@ -129,9 +145,9 @@ def read_network(file: Path) -> Network:
 
     try:
         found = sumo_net.readNet(str(file), withInternal=True, lxml=False)
-        edges = {edge.getID(): _edge(edge) for edge in found.getEdges(withInternal=False)}
+        left_hand, changing = _side_and_changes(file)
+        edges = {edge.getID(): _edge(edge, changing) for edge in found.getEdges(withInternal=False)}
         links = tuple(_links(found, edges))
-        left_hand = _is_left_hand(file)
     except OSError as error:
         raise BadInputError("net-file", str(file), f"a readable file ({error})") from error
     except Exception as error:  # sumolib raises whatever its parsers raise
@@ -141,14 +157,28 @@ def read_network(file: Path) -> Network:
     return Network({name: edge for name, edge in edges.items() if edge.lanes}, links, left_hand)
 
 
-def _is_left_hand(file: Path) -> bool:
-    """Return whether vehicles drive on the left; sumolib does not read it."""
+def _side_and_changes(file: Path) -> tuple[bool, Mapping[str, _Changes]]:
+    """Return whether vehicles drive on the left, and which may change lanes, by lane.
+
+    sumolib reads neither.
+    """
+    left_hand, changing = False, dict[str, _Changes]()
     with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as stream:
-        _, root = next(ET.iterparse(stream, events=("start",)))  # noqa: S314 (sumolib reads it, too)
-    return bool(root.get("lefthand") == "true")
+        for _, element in ET.iterparse(stream, events=("start",)):  # noqa: S314 (as sumolib does)
+            if element.tag == "net":
+                left_hand = element.get("lefthand") == "true"
+            if element.tag == "lane":
+                own = {
+                    side: frozenset(element.attrib[f"change{side.title()}"].split())
+                    for side in ("left", "right")
+                    if element.get(f"change{side.title()}", "all") != "all"
+                }
+                changing |= {element.get("id", ""): own} if own else {}
+            element.clear()
+    return left_hand, changing
 
 
-def _edge(edge: Any) -> Edge:  # noqa: ANN401 - sumolib has no types
+def _edge(edge: Any, changing: Mapping[str, _Changes]) -> Edge:  # noqa: ANN401 - sumolib has no types
     return Edge(
         edge.getID(),
         tuple(
@@ -161,6 +191,8 @@ def _edge(edge: Any) -> Edge:  # noqa: ANN401 - sumolib has no types
                 speed_mps=lane.getSpeed(),
                 allows_cars=lane.allows(CARS),
                 shape=tuple((point[0], point[1]) for point in lane.getShape()),
+                classes=frozenset(lane.getPermissions()),
+                changing=changing.get(lane.getID(), {}),
             )
             for lane in edge.getLanes()
         ),
