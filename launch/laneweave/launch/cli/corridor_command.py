@@ -177,6 +177,8 @@ def _problem(corridor: Corridor, demand: CorridorDemand) -> str:
 
 def _describe(found: SumoCorridor) -> None:
     """Print what a corridor consists of."""
+    from laneweave.sim_bridge.corridors.scenario_tables import speed_remark
+
     corridor, demand = found.corridor, found.demand
     console = Console(soft_wrap=True)
     table = Table(
@@ -200,6 +202,11 @@ def _describe(found: SumoCorridor) -> None:
         console.print(f"laneweave cannot drive it: {escape(problem)}")
     for remark in corridor.unused:
         console.print(f"not used: {escape(remark)}")
+    remark = speed_remark(corridor, demand)
+    if remark:
+        console.print(escape(remark))
     console.print(f"{len(demand.passes)} vehicles in {demand.duration_s:.0f} s drive through it")
     for reason, count in sorted(demand.missing.items()):
         console.print(f"left out: {count} vehicles that {escape(reason)}")
+    if found.simulation.demand.persons:
+        console.print(f"left out: {found.simulation.demand.persons} persons and containers")

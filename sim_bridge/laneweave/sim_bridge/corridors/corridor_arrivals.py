@@ -26,7 +26,6 @@ from laneweave.sim_bridge.corridors.sumo_config import NO_OPTIONS, SumoConfig
 from laneweave.sim_bridge.corridors.sumo_demand import (
     AT_START,
     LIMITS,
-    Attributes,
     CorridorDemand,
     Pass,
     SumoDemand,
@@ -35,6 +34,7 @@ from laneweave.sim_bridge.corridors.sumo_demand import (
 )
 from laneweave.sim_bridge.corridors.sumo_network import Network
 from laneweave.sim_bridge.corridors.sumo_statistics import output_options
+from laneweave.sim_bridge.corridors.ways_in import ways_to_ramp, ways_to_start
 from laneweave.sim_bridge.road.demand import Arrival
 
 MAX_WAIT_S = 600.0
@@ -54,6 +54,8 @@ class CorridorArrival:
     origin: Pass
     on_ramp: bool = False
     """Whether it departs on the ramp itself."""
+    near: bool = False
+    """Whether it departs near its entrance, on an edge on which vehicles are advised."""
 
     @property
     def departs_at_start(self) -> bool:
@@ -92,7 +94,7 @@ class CorridorSetup:
         results: Path | None,
         more: Mapping[str, str] = NO_OPTIONS,
         *,
-        alone: bool = False,
+        speed_mps: float | None = None,
     ) -> Sequence[str]:
         """Write the files of a simulation of these vehicles, and return SUMO's command line.
 
@@ -102,17 +104,25 @@ class CorridorSetup:
             folder: folder for temporary files.
             results: folder for SUMO's statistics; None: none are written.
             more: further options, by name.
-            alone: whether SUMO also drives the vehicles that depart at the start of the corridor.
+            speed_mps: v_F, at which vehicles are taken over; None: SUMO drives all of them.
         """
-        departures: dict[str, Attributes | None] = dict.fromkeys(self.left_out)
+        departures: dict[str, dict[str, str] | None] = dict.fromkeys(self.left_out)
         for name, one in self.by_name.items():
-            at_start = AT_START if one.on_ramp or one.departs_at_start else {}
-            if alone:
+            at_start = {**AT_START} if one.on_ramp or one.departs_at_start else {}
+            if speed_mps is None:
                 departures[name] = at_start
+            elif one.departs_at_start:
+                departures[name] = None
             else:
                 depart_s = self.vehicles.begin_s + one.arrival.t_s
-                announced = {**at_start, "depart": f"{depart_s:.3f}"}
-                departures[name] = None if one.departs_at_start else announced
+                at_start["depart"] = f"{depart_s:.3f}"
+                departures[name] = at_start
+                if one.near:
+                    # There is no room before the entrance to brake from a higher speed.
+                    lanes = self.network.edges[one.origin.vehicle.route[0]].car_lanes
+                    factor = speed_mps / max(lane.speed_mps for lane in lanes)
+                    factor = min(factor, one.origin.vehicle.speed_factor)
+                    at_start["speedFactor"] = f"{factor:.4f}"
         return self.config.command(
             {
                 "begin": f"{self.vehicles.begin_s:.10g}",
@@ -129,12 +139,17 @@ class CorridorSetup:
 
 
 def corridor_arrivals(
-    scenario: Scenario, corridor: Corridor, demand: CorridorDemand, begin_s: float
+    scenario: Scenario,
+    network: Network,
+    corridor: Corridor,
+    demand: CorridorDemand,
+    begin_s: float,
 ) -> tuple[CorridorArrival, ...]:
     """Return the vehicles of a corridor in order of departure.
 
     Args:
         scenario: the scenario of the corridor.
+        network: the network.
         corridor: the corridor.
         demand: its vehicles.
         begin_s: SUMO's time at which the run begins.
@@ -145,6 +160,9 @@ def corridor_arrivals(
     types = _types_in(scenario, type_names(demand.passes))
     lanes = {entrance.name: entrance.lane for entrance in scenario.entrance}
     on_ramp = {ramp.name: {link.origin.edge for link in ramp.path} for ramp in corridor.ramps}
+    ways = [*ways_to_start(network, corridor).values()]
+    ways += [ways_to_ramp(network, corridor, ramp) for ramp in corridor.ramps]
+    near = {lane.rpartition("_")[0] for way in ways for lane in way} - corridor.edge_numbers.keys()
     choose = _LaneChoice(scenario)
     found = []
     for number, one in enumerate(demand.passes, start=1):
@@ -167,8 +185,9 @@ def corridor_arrivals(
             types[one.vehicle.vehicle_type],
             one.vehicle.name,
         )
-        departs_on_ramp = one.vehicle.route[0] in on_ramp.get(one.entrance, ())
-        found.append(CorridorArrival(arrival, one, departs_on_ramp))
+        first = one.vehicle.route[0]
+        departs_on_ramp = first in on_ramp.get(one.entrance, ())
+        found.append(CorridorArrival(arrival, one, departs_on_ramp, near=first in near))
     return tuple(found)
 
 

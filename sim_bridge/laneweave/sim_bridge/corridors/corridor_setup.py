@@ -55,7 +55,13 @@ class SumoCorridor:
             simulation.network,
             self.corridor,
             simulation.demand,
-            corridor_arrivals(scenario, self.corridor, self.demand, simulation.demand.begin_s),
+            corridor_arrivals(
+                scenario,
+                simulation.network,
+                self.corridor,
+                self.demand,
+                simulation.demand.begin_s,
+            ),
             self.demand.left_out,
         )
 

@@ -67,7 +67,14 @@ class CorridorWorld(SumoProcess):
             SumoFailedError: SUMO rejects a file.
         """
         super().__init__(
-            setup.command(scenario.runtime.tick_s, scenario.seed, folder, results, _PLANTS)
+            setup.command(
+                scenario.runtime.tick_s,
+                scenario.seed,
+                folder,
+                results,
+                _PLANTS,
+                speed_mps=scenario.formation.speed_mps,
+            )
         )
         self._types = scenario.types
         self._lane_m = scenario.road.lane_width_m
@@ -99,11 +106,8 @@ class CorridorWorld(SumoProcess):
             allowed = f"one whose lane {min(both)} is either open at the start or that of a ramp"
             raise BadInputError(OPTION, setup.corridor.name, allowed)
         self._ways_in = {**to_start, **to_ramps}
-        near = {name.rpartition("_")[0] for way in self._ways_in.values() for name in way}
         self.departing = tuple(
-            one.arrival
-            for one in setup.arrivals
-            if not one.departs_at_start and one.origin.vehicle.route[0] in near
+            one.arrival for one in setup.arrivals if one.near and not one.departs_at_start
         )
         """Vehicles that depart near an entrance, in order of departure."""
         self._beyond = tuple(dict.fromkeys(_beyond(setup.network, setup.corridor)))
@@ -192,8 +196,6 @@ class CorridorWorld(SumoProcess):
                 departPos="0",
                 departSpeed="0",
             )
-            if "speedFactor" in origin.attributes:
-                api.setSpeedFactor(name, float(origin.attributes["speedFactor"]))
         api.setSpeed(name, -1.0)
         api.setSpeedMode(name, 0)
         api.setLaneChangeMode(name, 0)
@@ -265,6 +267,7 @@ class CorridorWorld(SumoProcess):
         name, api = self._sumo_name[vehicle], self.vehicle
         api.setSpeedMode(name, _OWN_SPEED_MODE)
         api.setLaneChangeMode(name, _OWN_LANE_CHANGES)
+        api.setSpeedFactor(name, self._coming[name].origin.vehicle.speed_factor)
         del self._coming[name]
         self._returned.add(name)
         self._others = None

@@ -191,6 +191,19 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
     return {"schema": "laneweave.scenario/1", **filled}
 
 
+def speed_remark(corridor: Corridor, demand: CorridorDemand) -> str:
+    """Return which type of vehicle makes v_F lower than the lanes allow; empty: none."""
+    counts = Counter(one.vehicle.vehicle_type for one in demand.passes)
+    slowest = min(counts, key=lambda kind: kind.max_speed_mps, default=None)
+    if slowest is None or slowest.max_speed_mps >= corridor.speed_mps:
+        return ""
+    return (
+        f"v_F is 90 % of {slowest.max_speed_mps:.1f} m/s, the maximum speed of class "
+        f"{slowest.vehicle_class} ({counts[slowest]} of {len(demand.passes)} vehicles); the lanes "
+        f"allow {corridor.speed_mps:.1f} m/s"
+    )
+
+
 def _check_widths(corridor: Corridor, names: Mapping[SumoType, str]) -> None:
     """Check that vehicles fit between those in the lanes beside theirs.
 

@@ -35,7 +35,7 @@ def drive_alone(
         SumoFailedError: SUMO rejects a file.
     """
     begin_s, end_s = setup.vehicles.begin_s, setup.end_s
-    command = setup.command(setup.vehicles.step_s, seed, folder, results, alone=True)
+    command = setup.command(setup.vehicles.step_s, seed, folder, results)
     awaited = {*setup.by_name}
     with SumoProcess(command) as sumo:
         while awaited and (now_s := sumo.simulation.getTime()) < end_s:

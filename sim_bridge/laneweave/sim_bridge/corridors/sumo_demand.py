@@ -90,6 +90,11 @@ class SumoVehicle:
     """Further attributes as SUMO has reported them."""
     stops: tuple[Attributes, ...] = ()
 
+    @property
+    def speed_factor(self) -> float:
+        """Its speed where there is no other vehicle, as a multiple of the limit."""
+        return float(self.attributes.get("speedFactor", "1"))
+
     def element(self, more: Attributes) -> ET.Element:
         """Return the element of a file of routes, with more attributes."""
         depart = f"{self.depart_s:.3f}"
@@ -116,7 +121,9 @@ class SumoDemand:
     persons: int = 0
     """Number of persons and containers, which nobody drives."""
 
-    def write(self, file: Path, departures: Mapping[str, Attributes | None]) -> Mapping[str, str]:
+    def write(
+        self, file: Path, departures: Mapping[str, dict[str, str] | None]
+    ) -> Mapping[str, str]:
         """Write a file of routes, and return the option that names it.
 
         Args:

@@ -17,7 +17,7 @@ from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 from laneweave.sim_bridge.corridors.scenario_tables import checked_tables, scenario_tables
 from laneweave.sim_bridge.corridors.sumo_config import read_config
 from laneweave.sim_bridge.corridors.sumo_demand import SumoDemand
-from laneweave.sim_bridge.corridors.sumo_network import Network, read_network
+from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network, read_network
 from support.interchange import (
     CORRIDOR,
     LONGEST_CORRIDOR,
@@ -102,11 +102,15 @@ def test_what_does_not_fit_is_named_as_in_the_network(tmp_path: Path) -> None:
     assert checked_tables(found.corridor, found.demand)
     (ramp,), opening = found.corridor.ramps, found.corridor.closures[0]
     late = evolve(found.corridor, ramps=(evolve(ramp, merge_m=ramp.merge_m + 200.0),))
-    with pytest.raises(BadInputError, match=r"on-ramp from on of 345 m into lane main4_0 of 50 m \(entrance"):
+    with pytest.raises(
+        BadInputError, match=r"on-ramp from on of 345 m into lane main4_0 of 50 m \(entrance"
+    ):
         checked_tables(late, found.demand)
     others = found.corridor.closures[1:]
     early = evolve(found.corridor, closures=(evolve(opening, to_m=900.0), *others))
-    with pytest.raises(BadInputError, match=r"exit to off from lane main2_0, open for 46 m \(exit.*longer are"):
+    with pytest.raises(
+        BadInputError, match=r"exit to off from lane main2_0, open for 46 m \(exit.*longer are"
+    ):
         checked_tables(early, found.demand)
     closures = tuple(
         evolve(one, from_m=ramp.merge_m + 60.0) if one.from_m > ramp.merge_m else one
@@ -164,6 +168,61 @@ def test_the_longest_chain_with_priority_is_found(tmp_path: Path) -> None:
     assert found.volume_veh_per_h == 0.0
     parts = {one.name for one in find_corridors(network(tmp_path, state="m"), nobody)}
     assert parts == {"start:main4", "main5:main5"}
+
+
+def ring(count: int) -> Network:
+    """Return a ring of edges with two lanes."""
+    edges = {
+        f"e{n}": Edge(
+            f"e{n}",
+            tuple(
+                Lane(f"e{n}_{lane}", f"e{n}", lane, 300.0, 3.2, 20.0, allows_cars=True)
+                for lane in range(2)
+            ),
+        )
+        for n in range(count)
+    }
+    links = (
+        Link(edges[f"e{n}"].lanes[lane], edges[f"e{(n + 1) % count}"].lanes[lane])
+        for n in range(count)
+        for lane in range(2)
+    )
+    return Network(edges, tuple(links))
+
+
+def test_a_ring_is_found() -> None:
+    nobody = SumoDemand((), 0.0, 1.0)
+    (found,) = find_corridors(ring(4), nobody)
+    assert found.name == "e0:e3"
+    assert found.corridor is not None
+    assert found.corridor.length_m == 1200.0 - HANDOVER_M
+
+
+def test_a_ramp_with_two_lanes_is_refused_in_words_of_the_network(tmp_path: Path) -> None:
+    whole = network(tmp_path)
+    on, main4 = whole.edges["on"], whole.edges["main4"]
+    second = evolve(on.lanes[0], name="on_1", index=1)
+    edges = {**whole.edges, "on": evolve(on, lanes=(*on.lanes, second))}
+    links = [link for link in whole.links if link.target.name != "main4_1"]
+    links.append(Link(second, main4.lanes[1]))
+    with pytest.raises(BadInputError, match="on-ramps of one lane, but 2 lanes of on lead"):
+        corridor_of(Network(edges, tuple(links)), "main1", "main5")
+
+
+def test_a_ramp_in_line_with_a_lane_that_is_open_at_the_start_is_refused(tmp_path: Path) -> None:
+    config = write_interchange(tmp_path, stream(60), types=TRUCKS)
+    found = read_corridor(config, CORRIDOR)
+    closures = found.corridor.closures[1:]
+    with pytest.raises(BadInputError, match="begin the corridor on a later edge"):
+        checked_tables(evolve(found.corridor, closures=closures), found.demand)
+
+
+def test_vehicles_that_are_too_wide_are_named(tmp_path: Path) -> None:
+    types = '<vType id="truck" vClass="truck" width="2.9" sigma="0"/>'
+    found = read_corridor(write_interchange(tmp_path, stream(60), types=types), CORRIDOR)
+    expected = r"width of vehicles of class truck: got 2\.9; allowed: at most 2\.7 m"
+    with pytest.raises(BadInputError, match=expected):
+        scenario_tables(found.corridor, found.demand)
 
 
 def test_the_tables_are_a_valid_scenario(tmp_path: Path) -> None:

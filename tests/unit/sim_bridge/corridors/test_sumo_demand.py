@@ -11,10 +11,10 @@ import pytest
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
-from laneweave.protocol.scenario.fields import MAIN_ENTRANCE
+from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.sim_bridge.corridors.corridor_arrivals import (
     FIRST_ENTRY_S,
-    corridor_arrivals,
+    CorridorArrival,
     main_stream,
 )
 from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor, read_corridor
@@ -31,6 +31,10 @@ from support.interchange import CORRIDOR, TRUCKS, stream, vehicle, write_interch
 
 def corridor(folder: Path, *vehicles: str) -> SumoCorridor:
     return read_corridor(write_interchange(folder, vehicles, types=TRUCKS), CORRIDOR)
+
+
+def arrivals_of(found: SumoCorridor, scenario: Scenario) -> tuple[CorridorArrival, ...]:
+    return found.setup(scenario).arrivals
 
 
 def written(folder: Path) -> set[str]:
@@ -63,7 +67,7 @@ def test_vehicles_that_start_inside_are_left_out_and_listed(tmp_path: Path) -> N
     assert [one.vehicle.name for one in found.demand.passes] == ["a"]
     assert found.demand.missing == {"start on main3": 1}
     setup = found.setup(parse_scenario(scenario_tables(found.corridor, found.demand)))
-    setup.command(0.1, 1, tmp_path, None, alone=True)
+    setup.command(0.1, 1, tmp_path, None)
     assert written(tmp_path) == {"a"}
 
 
@@ -100,7 +104,7 @@ def test_flows_are_vehicles_as_sumo_makes_them(tmp_path: Path) -> None:
 def test_arrivals_have_names_of_laneweave_and_lanes_that_suit_them(tmp_path: Path) -> None:
     found = corridor(tmp_path, *stream(60))
     scenario = parse_scenario(scenario_tables(found.corridor, found.demand))
-    arrivals = corridor_arrivals(scenario, found.corridor, found.demand, 0.0)
+    arrivals = arrivals_of(found, scenario)
     assert [one.arrival.vehicle for one in arrivals[:2]] == ["v0001", "v0002"]
     assert {one.arrival.lane for one in arrivals if one.origin.entrance == "on"} == {0}
     # The lane next to the exit for those that leave, and all lanes for the others.
@@ -117,9 +121,7 @@ def test_arrivals_have_names_of_laneweave_and_lanes_that_suit_them(tmp_path: Pat
 def test_vehicles_that_depart_together_arrive_in_different_lanes(tmp_path: Path) -> None:
     found = corridor(tmp_path, *(vehicle(f"m{n}", 10.0, "main") for n in range(4)))
     scenario = parse_scenario(scenario_tables(found.corridor, found.demand))
-    lanes = [
-        one.arrival.lane for one in corridor_arrivals(scenario, found.corridor, found.demand, 0.0)
-    ]
+    lanes = [one.arrival.lane for one in arrivals_of(found, scenario)]
     assert lanes == [3, 2, 1, 3]
 
 
@@ -225,9 +227,9 @@ def test_vehicles_with_stops_are_left_out_of_the_corridor_only(tmp_path: Path) -
     found = corridor(tmp_path, bus, elsewhere, vehicle("a", 0.0, "main"))
     assert found.demand.missing == {"stop on their way": 1}
     setup = found.setup(parse_scenario(scenario_tables(found.corridor, found.demand)))
-    setup.command(0.1, 1, tmp_path, None, alone=True)
-    assert written(tmp_path) == {"waits", "a"}
     setup.command(0.1, 1, tmp_path, None)
+    assert written(tmp_path) == {"waits", "a"}
+    setup.command(0.1, 1, tmp_path, None, speed_mps=25.0)
     assert written(tmp_path) == {"waits"}
 
 
