@@ -134,8 +134,17 @@ def unique_name(name: str, taken: Collection[str]) -> str:
     return found
 
 
-def corridor_of(network: Network, first: str, last: str) -> Corridor:
+def corridor_of(
+    network: Network, first: str, last: str, departing: Collection[str] = ()
+) -> Corridor:
     """Return the corridor from one edge to another.
+
+    Args:
+        network: the network.
+        first: name of its first edge.
+        last: name of its last edge.
+        departing: edges on which vehicles depart. A ramp begins with the last one of them, since
+            vehicles must not depart between vehicles that have been taken over.
 
     Raises:
         BadInputError: an edge does not exist, no way leads from the first to the last, or vehicles
@@ -151,7 +160,7 @@ def corridor_of(network: Network, first: str, last: str) -> Corridor:
     _check_end(network, way[-1])
     for before, after in pairwise(way):
         _check_right_of_way(network, before, after)
-    return _Derivation(network, way).corridor()
+    return _Derivation(network, way, departing).corridor()
 
 
 def _check_end(network: Network, last: Edge) -> None:
@@ -229,8 +238,9 @@ class _OpenPart:
 class _Derivation:
     """The derivation of one corridor."""
 
-    def __init__(self, network: Network, way: tuple[Edge, ...]) -> None:
+    def __init__(self, network: Network, way: tuple[Edge, ...], departing: Collection[str]) -> None:
         self._network = network
+        self._departing = departing
         self._way = way
         self._names = {edge.name for edge in way}
         self._links = [through_links(network, *pair) for pair in pairwise(way)]
@@ -348,7 +358,8 @@ class _Derivation:
     def _before(self, link: Link) -> tuple[float, float, tuple[Link, ...]]:
         """Return length, lowest speed limit and links of the way on which vehicles come to a link.
 
-        It begins where others join, where vehicles have to give way, or where it has more lanes.
+        It begins where others join, where vehicles depart or have to give way, or where it has
+        more lanes.
         """
         length_m, speed_mps, path = 0.0, link.origin.speed_mps, list[Link]()
         seen = set[str]()
@@ -359,7 +370,8 @@ class _Derivation:
             length_m += lane.length_m + link.length_m
             speed_mps = min(speed_mps, lane.speed_mps)
             before = self._network.links_to(lane)
-            if len(before) != 1 or len(self._network.edges[lane.edge].car_lanes) > 1:
+            lanes = self._network.edges[lane.edge].car_lanes
+            if len(before) != 1 or len(lanes) > 1 or lane.edge in self._departing:
                 break
             link = before[0]
         return length_m, speed_mps, tuple(path)

@@ -52,7 +52,7 @@ def find_corridors(network: Network, demand: SumoDemand) -> list[Candidate]:
 def _candidate(network: Network, demand: SumoDemand, chain: list[Edge]) -> Candidate:
     name = f"{chain[0].name}:{chain[-1].name}"
     try:
-        corridor = corridor_of(network, chain[0].name, chain[-1].name)
+        corridor = corridor_of(network, chain[0].name, chain[-1].name, demand.departing)
     except BadInputError as error:
         return Candidate(name, None, None, str(error))
     return Candidate(name, corridor, demand_on(corridor, demand))

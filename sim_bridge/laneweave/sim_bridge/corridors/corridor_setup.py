@@ -110,7 +110,8 @@ def read_corridor(file: Path, name: str, window: TimeWindow = WHOLE, seed: int =
     """
     simulation = read_simulation(file, window, seed)
     network = simulation.network
-    corridor = corridor_of(network, *_edges_of(name, network))
+    first, last = _edges_of(name, network)
+    corridor = corridor_of(network, first, last, simulation.demand.departing)
     return SumoCorridor(simulation, corridor, demand_on(corridor, simulation.demand))
 
 

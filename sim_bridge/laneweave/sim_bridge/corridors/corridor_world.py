@@ -271,10 +271,33 @@ class CorridorWorld(SumoProcess):
         del self._coming[name]
         self._returned.add(name)
         self._others = None
+        self._correct_route(name)
         limit_mps = self._next_limit_mps(name)
         if state[1] > limit_mps:
             self._slowing[name] = self.simulation.getTime(), state[1], limit_mps
             api.setSpeedMode(name, _SLOWING_MODE)
+
+    def _correct_route(self, name: str) -> None:
+        """Give a vehicle that leaves elsewhere than its route does a route from there.
+
+        SUMO would stop it, or put it in front of others on the next edge of its route.
+        """
+        api, network = self.vehicle, self._setup.network
+        edge, _, index = api.getLaneID(name).rpartition("_")
+        if edge not in network.edges:
+            return
+        route = self._sumo_route(name)
+        lane = network.edges[edge].lanes[int(index)]
+        ahead = [link.target.edge for link in network.links_from(lane)]
+        following = route[route.index(edge) + 1 :] if edge in route else ()
+        if not ahead or not following or following[0] in ahead:
+            return
+        find, kind = self.simulation.findRoute, api.getTypeID(name)
+        ways = (find(one, route[-1], kind).edges for one in ahead)
+        api.setRoute(name, [edge, *next(filter(None, ways), ahead[:1])])
+
+    def _sumo_route(self, name: str) -> tuple[str, ...]:
+        return self._setup.by_name[name].origin.vehicle.route
 
     def _next_limit_mps(self, name: str) -> float:
         """Return how fast a vehicle may drive on the next edge of its route."""

@@ -36,6 +36,9 @@ SPEED_SHARE = 0.9
 """v_F as a share of the speed limit: vehicles that move to a cell ahead are faster."""
 SPARE_PITCH_M = 2.0
 """Part of the column pitch that leaves room for moves to a cell ahead."""
+HEADWAY_S = 1.0
+"""Least column pitch as a time, the paper's 15 m at 15 m/s: a vehicle that has fallen behind its cell
+catches up without coming so close to the one ahead that it has to brake."""
 MAX_SETTLE_S = 8.0
 """Time in which vehicles settle in their cells, if ramps are long enough."""
 _WIDE_M = 100.0
@@ -115,8 +118,8 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
     """Return the tables of a scenario file, not checked against each other.
 
     Vehicles arrive at random with the mean volumes of the simulation. No vehicle exceeds the lowest
-    speed limit of edges and types, and v_F is 90 % of it. The column pitch is the least that suits
-    all types, and T_F is long enough for moves between lanes.
+    speed limit of edges and types, and v_F is 90 % of it. The column pitch is the least of at least
+    `HEADWAY_S` that suits all types, and T_F is long enough for moves between lanes.
 
     Raises:
         BadInputError: no vehicle enters at the start of the corridor, or it is too short.
@@ -294,7 +297,8 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
     }
     kinds = {name: tables[name] for name in ("road", "vehicle", "vehicle_type")}
     wide = structure({"formation": formation | {"gap_m": _WIDE_M}, **kinds}, Scenario)
-    pitch_m = math.ceil(max(min_pitch_m(own) for own in wide.types.values()) + SPARE_PITCH_M)
+    least_m = max(min_pitch_m(own) for own in wide.types.values()) + SPARE_PITCH_M
+    pitch_m = math.ceil(max(least_m, HEADWAY_S * speed_mps))
     ramps_m = (one["merge_m"] - one["at_m"] for one in tables["entrance"])
     settle_s = min([MAX_SETTLE_S, *(length_m / speed_mps for length_m in ramps_m)])
     formation |= {"gap_m": float(pitch_m), "settle_s": math.floor(10.0 * settle_s) / 10.0}
