@@ -37,8 +37,8 @@ SPEED_SHARE = 0.9
 SPARE_PITCH_M = 2.0
 """Part of the column pitch that leaves room for moves to a cell ahead."""
 HEADWAY_S = 1.0
-"""Least column pitch as a time, the paper's 15 m at 15 m/s: a vehicle that has fallen behind its cell
-catches up without coming so close to the one ahead that it has to brake."""
+"""Least column pitch as a time, as the paper's 15 m at 15 m/s. A vehicle that has fallen behind its
+cell can then catch up without coming so close to the one ahead that it has to brake."""
 MAX_SETTLE_S = 8.0
 """Time in which vehicles settle in their cells, if ramps are long enough."""
 _WIDE_M = 100.0

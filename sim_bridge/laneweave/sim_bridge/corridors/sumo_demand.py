@@ -121,6 +121,11 @@ class SumoDemand:
     persons: int = 0
     """Number of persons and containers, which nobody drives."""
 
+    @property
+    def departing(self) -> frozenset[str]:
+        """The edges on which vehicles depart."""
+        return frozenset(vehicle.route[0] for vehicle in self.vehicles if vehicle.route)
+
     def write(
         self, file: Path, departures: Mapping[str, dict[str, str] | None]
     ) -> Mapping[str, str]:
