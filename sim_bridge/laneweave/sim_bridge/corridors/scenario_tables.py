@@ -57,9 +57,8 @@ def checked_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
         parse_scenario(tables)
     except BadInputError as error:
         where = _where(error.field, tables, corridor)
-        if not where:
-            raise
-        field = f"{OPTION} {corridor.name}, {where} ({error.field} of its scenario)"
+        field = f"{OPTION} {corridor.name}, {where}{error.field} of its scenario"
+        field += ")" if where else ""
         raise BadInputError(field, error.value, _enough(error)) from error
     return tables
 
@@ -68,7 +67,7 @@ def _where(field: str, tables: Tables, corridor: Corridor) -> str:
     """Return what a field of a scenario means in the network; empty: nothing special."""
     found = re.match(r"(?:road\.)?(entrance|exit|closures)\[(\d+)\]", field)
     if found is None:
-        return ""
+        return f"{corridor.length_m:.0f} m long (" if field.startswith("road.s") else ""
     kind, number = found[1], int(found[2])
     if kind == "exit":
         out = corridor.ways_out[number]
@@ -81,7 +80,7 @@ def _where(field: str, tables: Tables, corridor: Corridor) -> str:
             default=0.0,
         )
         lanes = " and ".join(corridor.lane_name(lane, out.at_m) for lane in out.lanes)
-        return f"exit to {out.edge} from lane {lanes}, open for {out.at_m - opens_m:.0f} m"
+        return f"exit to {out.edge} from lane {lanes}, open for {out.at_m - opens_m:.0f} m ("
     if kind == "entrance":
         names = {ramp.name: ramp for ramp in corridor.ramps}
         ramp = names[tables["entrance"][number]["name"]]
@@ -95,10 +94,10 @@ def _where(field: str, tables: Tables, corridor: Corridor) -> str:
         )
         lane = corridor.lane_name(ramp.lane, ramp.merge_m)
         used_m, open_m = ramp.merge_m - ramp.at_m, ends_m - ramp.merge_m
-        return f"on-ramp from {ramp.edge} of {used_m:.0f} m into lane {lane} of {open_m:.0f} m"
+        return f"on-ramp from {ramp.edge} of {used_m:.0f} m into lane {lane} of {open_m:.0f} m ("
     closure = tables["road"]["closures"][number]
     ends_m = closure.get("from_m", 0.0)
-    return f"end of lane {corridor.lane_name(closure['lane'], ends_m)}"
+    return f"end of lane {corridor.lane_name(closure['lane'], ends_m)} ("
 
 
 def _enough(error: BadInputError) -> str:
