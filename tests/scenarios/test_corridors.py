@@ -13,12 +13,13 @@ import pytest
 
 from laneweave.launch.cli.corridor_command import corridor_tables
 from laneweave.launch.recordings.trajectories import read_trajectories, read_trips
-from laneweave.launch.report.corridor_comparison import compare
+from laneweave.launch.report.corridor_comparison import ALONE_FOLDER, compare
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.sim_bridge.corridors import corridor_arrivals, sumo_statistics
 from laneweave.sim_bridge.corridors.corridor_setup import WHOLE, read_corridor
+from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
 from laneweave.sim_bridge.corridors.sumo_statistics import read_statistics
 from support.interchange import (
     CORRIDOR,
@@ -136,6 +137,41 @@ def test_sumo_drives_the_same_vehicles_alone(
     page = (folder / "comparison.html").read_text(encoding="utf-8")
     assert "start of the corridor" in page
     assert "SUMO alone" in page
+
+
+def test_both_runs_have_the_same_vehicles(tmp_path: Path) -> None:
+    """Also where SUMO draws them: flows by probability, districts, trips, stops, a scale."""
+    routes = [
+        (
+            '<flow id="p" type="car" begin="0" end="15" probability="0.3" departLane="free">'
+            '<route edges="main1 main2 main3 main4 main5"/></flow>'
+        ),
+        '<flow id="t" type="car" begin="2" end="12" number="3" fromTaz="A" toTaz="B"/>',
+        (
+            '<vehicle id="bus" type="car" depart="3"><route edges="main1 main2 main3 main4 main5"/>'
+            '<stop lane="main2_1" endPos="100" duration="5"/></vehicle>'
+        ),
+        '<trip id="u" type="car" depart="4" from="before" to="main5"/>',
+    ]
+    config = write_interchange(tmp_path, routes, types=TRUCKS)
+    districts = '<taz id="A" edges="start"/><taz id="B" edges="off"/>'
+    (tmp_path / "taz.xml").write_text(f"<additional>{districts}</additional>", encoding="utf-8")
+    text = config.read_text(encoding="utf-8")
+    config.write_text(
+        text.replace("</input>", '<additional-files value="taz.xml"/></input>'), encoding="utf-8"
+    )
+    window = TimeWindow(duration_s=15.0, scale=2.0)
+    own = parse_scenario(corridor_tables(read_corridor(config, CORRIDOR, window), config, window))
+    summary, _ = drive(own, tmp_path / "run")
+    assert summary["vehicles"]["left_out"] == {"stop on their way": 2}
+    compare(own, tmp_path / "run")
+    ours = read_statistics(tmp_path / "run").trips
+    alone = read_statistics(tmp_path / "run" / ALONE_FOLDER).trips
+    assert ours.keys() == alone.keys()
+    assert {name.split(".")[0] for name in ours} == {"p", "t", "u"}
+    assert {name: trip.arrival_edge for name, trip in ours.items()} == {
+        name: trip.arrival_edge for name, trip in alone.items()
+    }
 
 
 def test_vehicles_come_from_upstream(tmp_path: Path) -> None:

@@ -39,6 +39,8 @@ _STOP_NOT_KEPT = frozenset(
     | {"started", "ended", "join", "split", "parkingBadges"}
 )
 """Attributes of stops that depend on passengers or other vehicles, or say what has happened."""
+_PARKING = 1
+"""Flag of stops beside the road."""
 _DEFAULT_TYPE = "DEFAULT_VEHTYPE"
 
 
@@ -209,7 +211,8 @@ def read_demand(config: SumoConfig, folder: Path, window: TimeWindow, seed: int 
         sumo.simulation.saveState(str(state))
         types = {name: _type(sumo, name) for name in sumo.vehicletype.getIDList()}
         found = [*_not_departed(sumo, waiting, types)]
-    found += _departed(routes, types, begin_s)
+        ahead = {name: stops for name in sumo.vehicle.getIDList() if (stops := _stops(sumo, name))}
+    found += _departed(routes, types, begin_s, ahead)
     inside = sorted(
         (one for one in found if one.depart_s < end_s or math.isinf(one.depart_s)),
         key=lambda one: one.depart_s,
@@ -292,7 +295,22 @@ def _not_departed(
             _route(sumo, name),
             types[type_name],
             type_name,
+            stops=_stops(sumo, name),
         )
+
+
+def _stops(sumo: SumoProcess, name: str) -> tuple[Attributes, ...]:
+    """Return the stops that a vehicle has not reached; SUMO's output does not contain them."""
+    return tuple(
+        {
+            "lane": one.lane,
+            "startPos": f"{one.startPos:.2f}",
+            "endPos": f"{one.endPos:.2f}",
+            "duration": f"{max(one.duration, 0.0):g}",
+            "parking": f"{bool(one.stopFlags & _PARKING)}".lower(),
+        }
+        for one in sumo.vehicle.getStops(name)
+    )
 
 
 def _route(sumo: SumoProcess, name: str) -> tuple[str, ...]:
@@ -309,8 +327,13 @@ def _route(sumo: SumoProcess, name: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _departed(file: Path, types: Mapping[str, SumoType], begin_s: float) -> Iterator[SumoVehicle]:
-    """Yield the vehicles of SUMO's output."""
+def _departed(
+    file: Path,
+    types: Mapping[str, SumoType],
+    begin_s: float,
+    ahead: Mapping[str, tuple[Attributes, ...]],
+) -> Iterator[SumoVehicle]:
+    """Yield the vehicles of SUMO's output; `ahead`: stops that they have not reached."""
     for _, element in ET.iterparse(file):  # noqa: S314 (SUMO has written it)
         if element.tag != "vehicle":
             continue
@@ -328,7 +351,7 @@ def _departed(file: Path, types: Mapping[str, SumoType], begin_s: float) -> Iter
             types[type_name],
             type_name,
             attributes,
-            tuple(map(_stop, element.iter("stop"))),
+            (*map(_stop, element.iter("stop")), *ahead.get(element.get("id", ""), ())),
         )
         element.clear()
 
