@@ -34,6 +34,9 @@ from laneweave.sim_bridge.corridors.sumo_demand import (
 
 SPEED_SHARE = 0.9
 """v_F as a share of the speed limit: vehicles that move to a cell ahead are faster."""
+MAX_SPEED_MPS = 60.0
+"""Highest speed of vehicles."""
+MIN_SETTLE_S = 1.0
 SPARE_PITCH_M = 2.0
 """Part of the column pitch that leaves room for moves to a cell ahead."""
 HEADWAY_S = 1.0
@@ -54,6 +57,7 @@ def checked_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
     """
     tables = scenario_tables(corridor, demand)
     try:
+        _cap_volume(tables)
         parse_scenario(tables)
     except BadInputError as error:
         where = _where(error.field, tables, corridor)
@@ -61,6 +65,16 @@ def checked_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
         field += ")" if where else ""
         raise BadInputError(field, error.value, _enough(error)) from error
     return tables
+
+
+def _cap_volume(tables: Tables) -> None:
+    """Lower the volume to what the road carries: vehicles that cannot enter wait."""
+    try:
+        parse_scenario(tables)
+    except BadInputError as error:
+        most = re.match(r"at most ([\d.]+)", error.allowed)
+        if error.field == "demand.volume_veh_per_lane_h" and most:
+            tables["demand"]["volume_veh_per_lane_h"] = math.floor(float(most[1]))
 
 
 def _where(field: str, tables: Tables, corridor: Corridor) -> str:
@@ -130,7 +144,7 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
     names = type_names(demand.passes)
     car, *others = names
     own_names = {**names, car: CAR}
-    fastest_mps = min(corridor.speed_mps, *(one.max_speed_mps for one in names))
+    fastest_mps = min(MAX_SPEED_MPS, corridor.speed_mps, *(one.max_speed_mps for one in names))
     per_hour = 3600.0 / demand.duration_s
     ramps = [ramp for ramp in corridor.ramps if _from(demand, ramp.name)]
     tables: Tables = {
@@ -298,8 +312,16 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
     wide = structure({"formation": formation | {"gap_m": _WIDE_M}, **kinds}, Scenario)
     least_m = max(min_pitch_m(own) for own in wide.types.values()) + SPARE_PITCH_M
     pitch_m = math.ceil(max(least_m, HEADWAY_S * speed_mps))
-    ramps_m = (one["merge_m"] - one["at_m"] for one in tables["entrance"])
-    settle_s = min([MAX_SETTLE_S, *(length_m / speed_mps for length_m in ramps_m)])
+    ramps_m = {one["name"]: one["merge_m"] - one["at_m"] for one in tables["entrance"]}
+    settle_s = min([MAX_SETTLE_S, *(length_m / speed_mps for length_m in ramps_m.values())])
+    if settle_s < MIN_SETTLE_S:
+        name = min(ramps_m, key=ramps_m.__getitem__)
+        edge = next(ramp.edge for ramp in corridor.ramps if ramp.name == name)
+        raise BadInputError(
+            f"{OPTION} {corridor.name}, length of the on-ramp from {edge}",
+            round(max(ramps_m[name], 0.0), 1),
+            f"at least {MIN_SETTLE_S * speed_mps:g} m, for {speed_mps:g} m/s",
+        )
     formation |= {"gap_m": float(pitch_m), "settle_s": math.floor(10.0 * settle_s) / 10.0}
     found = structure({"formation": formation, **kinds}, Scenario)
     for own in found.types.values():

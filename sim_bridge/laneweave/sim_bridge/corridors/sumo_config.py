@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import gzip
 import os
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from urllib.parse import unquote
 from xml.etree import ElementTree as ET
 
 from attrs import field, frozen
@@ -130,7 +132,8 @@ def read_config(file: Path, folder: Path) -> SumoConfig:
     for section in ET.parse(saved).getroot():  # noqa: S314 (SUMO has written it)
         if section.tag not in _WITHOUT_EFFECT:
             options |= {
-                option.tag: os.path.expandvars(option.get("value", ""))
+                # SUMO writes blanks and other special characters as in URLs.
+                option.tag: os.path.expandvars(unquote(option.get("value", "")))
                 for option in section
                 if not option.tag.endswith(_OUTPUTS)
             }
@@ -140,9 +143,11 @@ def read_config(file: Path, folder: Path) -> SumoConfig:
     if not options.get("net-file"):
         raise BadInputError("net-file", NO_VALUE, f"the network of {file}")
     for name in ("net-file", "route-files", "additional-files"):
-        for named in _paths(options.get(name, "")):
-            if not named.is_file():
-                raise BadInputError(f"{name} of {file}", str(named), "a file that exists")
+        named = _paths(options.get(name, ""))
+        for missing in (one for one in named if not one.is_file()):
+            raise BadInputError(f"{name} of {file}", str(missing), "a file that exists")
+        if named:
+            options[name] = ",".join(map(str, named))
     return SumoConfig(
         file.resolve(),
         Path(options["net-file"]),
@@ -171,7 +176,9 @@ def _check_kind(file: Path) -> None:
 
 
 def _paths(value: str) -> tuple[Path, ...]:
-    return tuple(Path(part.strip()) for part in value.split(",") if part.strip())
+    """Return the files of a list; blanks behind its commas are not part of their names."""
+    found = (Path(part.strip()) for part in value.split(",") if part.strip())
+    return tuple(one if one.is_file() else Path(re.sub("/ +", "/", str(one))) for one in found)
 
 
 def _elements(file: Path, without: Collection[str]) -> Iterator[ET.Element]:

@@ -36,9 +36,19 @@ def write_config(folder: Path, text: str, vehicles: Sequence[str] = (FLOW,)) -> 
         (f"<input>{FILES}<weight-files value='weights.xml'/></input>", 20),
         ('<n v="${LANEWEAVE_TEST_FOLDER}/small.net.xml"/><r v="small.rou.xml"/>', 20),
         (f"{FILES}<output><human-readable-time value='true'/></output>", 20),
+        (f"{FILES}<additional-files value='more.xml, other file.xml'/>", 20),
         (f"{FILES}<route-steps value='10'/><random value='true'/>", 20),
     ],
-    ids=["synonyms", "scale", "times", "weights", "environment", "human-readable", "random"],
+    ids=[
+        "synonyms",
+        "scale",
+        "times",
+        "weights",
+        "environment",
+        "human-readable",
+        "blanks",
+        "random",
+    ],
 )
 def test_options_mean_what_they_mean_to_sumo(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, count: int
@@ -46,6 +56,8 @@ def test_options_mean_what_they_mean_to_sumo(
     monkeypatch.setenv("LANEWEAVE_TEST_FOLDER", str(tmp_path))
     weights = '<meandata><interval begin="0" end="9"><edge id="main1" traveltime="9"/></interval>'
     (tmp_path / "weights.xml").write_text(f"{weights}</meandata>", encoding="utf-8")
+    for name in ("more.xml", "other file.xml"):
+        (tmp_path / name).write_text("<additional/>", encoding="utf-8")
     found = read_simulation(write_config(tmp_path, text))
     assert len(found.demand.vehicles) == count
 
