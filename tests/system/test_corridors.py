@@ -70,7 +70,7 @@ def test_corridors_are_listed_described_and_written(lab: Lab, config: Path) -> N
         ),
         (("--sumocfg", "CONFIG", "--corridor", "main1:off:x"), "--corridor: got 'main1:off:x'"),
         (("--sumocfg", "CONFIG", "--corridor", "main5:main1"), "0 edges can be reached"),
-        (("--sumocfg", "CONFIG", "--corridor", CORRIDOR, "--volume", "9"), "--volume: got '9.0'"),
+        (("--sumocfg", "CONFIG", "--corridor", CORRIDOR, "--volume", "9"), "--volume: got 9.0"),
         (
             ("--sumocfg", "CONFIG", "--corridor", CORRIDOR, "--method", "rule"),
             "--method: got 'rule'",
