@@ -236,7 +236,7 @@ def test_a_queue_behind_the_exit_is_braked_for(
     monkeypatch.setattr(sumo_statistics, "CONFLICT_S", 5.0)  # so that there are some
     standing = standing_vehicle(22, 25, 'duration="60"')
     leaving = [vehicle(f"e{n}", 4.0 * n, "exit") for n in range(6)]
-    own = scenario(tmp_path, [standing, *leaving, vehicle("m", 24.0, "main")])
+    own = scenario(tmp_path, [*leaving, standing, vehicle("m", 24.0, "main")])
     summary, _ = drive(own, tmp_path / "run")
     assert summary["safety"]["overlaps"] == summary["safety"]["sumo_collisions"] == 0
     assert summary["vehicles"]["left"] == summary["vehicles"]["at_destination"] == 7

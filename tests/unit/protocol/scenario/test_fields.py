@@ -155,6 +155,8 @@ def test_every_wrong_type_of_every_field_is_refused_by_name(field: str, default:
         wrongs = (1, True, None, [], "x", 1.5, {"a": 1}, {"a": []}, {"a": "x"}, {"a": [1]})
     elif field in (
         "formation.cycle_s",
+        "sumo.begin_s",
+        "sumo.scale",
         "formation.planning_deadline_s",
         "lc2013.accel_mps2",
         "lc2013.decel_mps2",

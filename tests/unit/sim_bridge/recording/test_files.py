@@ -249,6 +249,7 @@ def test_safety_is_the_worst_of_the_run(trajectories: Trajectories) -> None:
         min_gap_m=None,
         min_headway_s=None,
         emergency_brakes=0,
+        hard_brakes=0,
         max_accel_mps2=None,
         min_accel_mps2=None,
         max_jerk_mps3=None,
