@@ -125,10 +125,10 @@ class Corridor:
 
 
 def unique_name(name: str, taken: Collection[str]) -> str:
-    """Return a name of SUMO's with characters that scenarios allow, unlike those that are taken."""
-    found = stem = re.sub(r"[^A-Za-z0-9_.-]", "_", name).lstrip("-._") or "edge"
-    found = stem = stem.replace("lane-", "lane_", 1)  # exits at the end of the road have such names
-    number = 2
+    """Return a name in the characters that scenarios allow, different from all that are taken."""
+    stem = re.sub(r"[^A-Za-z0-9_.-]", "_", name).lstrip("-._") or "edge"
+    stem = stem.replace("lane-", "lane_", 1)  # exits at the end of the road have such names
+    found, number = stem, 2
     while found in taken:
         found, number = f"{stem}-{number}", number + 1
     return found
@@ -280,7 +280,8 @@ class _Derivation:
                 allowed = (
                     f"on-ramps of one lane, but {count} lanes of {edge} lead into the corridor"
                 )
-                raise BadInputError(OPTION, self._name_of_corridor, allowed)
+                name = f"{self._way[0].name}:{self._way[-1].name}"
+                raise BadInputError(OPTION, name, allowed)
         used = [lane for edge in self._way for lane in edge.car_lanes]
         ways_out = tuple(self._ways_out(parts))
         return Corridor(
@@ -295,10 +296,6 @@ class _Derivation:
             parts=tuple(self._lane_parts()),
             unused=tuple(self._unused),
         )
-
-    @property
-    def _name_of_corridor(self) -> str:
-        return f"{self._way[0].name}:{self._way[-1].name}"
 
     def _lane(self, number: int, lane: int) -> Lane:
         """Return the lane of an edge that is part of a corridor lane."""

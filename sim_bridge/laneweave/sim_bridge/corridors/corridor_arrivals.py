@@ -41,7 +41,7 @@ MAX_WAIT_S = 600.0
 """Time after the last departure for which vehicles on their way to a ramp are awaited."""
 FIRST_ENTRY_S = 1.0
 """Road time before which no vehicle enters, so that agents can be announced."""
-_FIRST_SIMULATION = ("device.rerouting.", "end", "scale", "begin", "step-length", "seed")
+_FIRST_SIMULATION = ("device.rerouting.", "end", "scale", "begin", "step-length")
 """Options that have determined the vehicles and their routes; they do not apply once more."""
 
 
@@ -124,10 +124,10 @@ class CorridorSetup:
                     factor = min(factor, one.origin.vehicle.speed_factor)
                     at_start["speedFactor"] = f"{factor:.4f}"
         return self.config.command(
+            seed,
             {
                 "begin": f"{self.vehicles.begin_s:.10g}",
                 "step-length": f"{step_s:g}",
-                "seed": self.config.options.get("seed", f"{seed % 2**31}"),
                 "collision.action": "warn",
                 **self.config.additional(folder, demand=False),
                 **self.vehicles.write(folder / "vehicles.rou.xml", departures),

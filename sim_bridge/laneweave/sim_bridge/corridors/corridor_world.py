@@ -286,7 +286,7 @@ class CorridorWorld(SumoProcess):
         edge, _, index = api.getLaneID(name).rpartition("_")
         if edge not in network.edges:
             return
-        route = self._sumo_route(name)
+        route = self._setup.by_name[name].origin.vehicle.route
         lane = network.edges[edge].lanes[int(index)]
         ahead = [link.target.edge for link in network.links_from(lane)]
         following = route[route.index(edge) + 1 :] if edge in route else ()
@@ -295,9 +295,6 @@ class CorridorWorld(SumoProcess):
         find, kind = self.simulation.findRoute, api.getTypeID(name)
         ways = (find(one, route[-1], kind).edges for one in ahead)
         api.setRoute(name, [edge, *next(filter(None, ways), ahead[:1])])
-
-    def _sumo_route(self, name: str) -> tuple[str, ...]:
-        return self._setup.by_name[name].origin.vehicle.route
 
     def _next_limit_mps(self, name: str) -> float:
         """Return how fast a vehicle may drive on the next edge of its route."""

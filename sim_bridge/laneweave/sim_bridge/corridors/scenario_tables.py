@@ -40,8 +40,8 @@ MIN_SETTLE_S = 1.0
 SPARE_PITCH_M = 2.0
 """Part of the column pitch that leaves room for moves to a cell ahead."""
 HEADWAY_S = 1.0
-"""Least column pitch as a time, as the paper's 15 m at 15 m/s. A vehicle that has fallen behind its
-cell can then catch up without coming so close to the one ahead that it has to brake."""
+"""Minimum column pitch as a time, as the paper's 15 m at 15 m/s. A vehicle that has fallen behind
+its cell can then catch up without coming so close to the one ahead that it has to brake."""
 MAX_SETTLE_S = 8.0
 """Time in which vehicles settle in their cells, if ramps are long enough."""
 _WIDE_M = 100.0
@@ -56,32 +56,34 @@ def checked_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
         BadInputError: it cannot; the error names the ramp, exit or edge.
     """
     tables = scenario_tables(corridor, demand)
-    try:
-        _cap_volume(tables)
-        parse_scenario(tables)
-    except BadInputError as error:
-        where = _where(error.field, tables, corridor)
-        field = f"{OPTION} {corridor.name}, {where}{error.field} of its scenario"
-        field += ")" if where else ""
+    error = _problem(tables)
+    if error is not None and error.field == "demand.volume_veh_per_lane_h":
+        # Vehicles that cannot enter wait; the volume is only that of a drawn demand.
+        most = re.match(r"at most ([\d.]+)", error.allowed)
+        if most:
+            tables["demand"]["volume_veh_per_lane_h"] = math.floor(float(most[1]))
+            error = _problem(tables)
+    if error is not None:
+        field, where = f"{error.field} of its scenario", _where(error.field, tables, corridor)
+        field = f"{OPTION} {corridor.name}, " + (f"{where} ({field})" if where else field)
         raise BadInputError(field, error.value, _enough(error)) from error
     return tables
 
 
-def _cap_volume(tables: Tables) -> None:
-    """Lower the volume to what the road carries: vehicles that cannot enter wait."""
+def _problem(tables: Tables) -> BadInputError | None:
+    """Return why the tables are no valid scenario; None: they are."""
     try:
         parse_scenario(tables)
     except BadInputError as error:
-        most = re.match(r"at most ([\d.]+)", error.allowed)
-        if error.field == "demand.volume_veh_per_lane_h" and most:
-            tables["demand"]["volume_veh_per_lane_h"] = math.floor(float(most[1]))
+        return error
+    return None
 
 
 def _where(field: str, tables: Tables, corridor: Corridor) -> str:
     """Return what a field of a scenario means in the network; empty: nothing special."""
     found = re.match(r"(?:road\.)?(entrance|exit|closures)\[(\d+)\]", field)
     if found is None:
-        return f"{corridor.length_m:.0f} m long (" if field.startswith("road.s") else ""
+        return f"{corridor.length_m:.0f} m long" if field.startswith("road.s") else ""
     kind, number = found[1], int(found[2])
     if kind == "exit":
         out = corridor.ways_out[number]
@@ -94,7 +96,7 @@ def _where(field: str, tables: Tables, corridor: Corridor) -> str:
             default=0.0,
         )
         lanes = " and ".join(corridor.lane_name(lane, out.at_m) for lane in out.lanes)
-        return f"exit to {out.edge} from lane {lanes}, open for {out.at_m - opens_m:.0f} m ("
+        return f"exit to {out.edge} from lane {lanes}, open for {out.at_m - opens_m:.0f} m"
     if kind == "entrance":
         names = {ramp.name: ramp for ramp in corridor.ramps}
         ramp = names[tables["entrance"][number]["name"]]
@@ -108,10 +110,10 @@ def _where(field: str, tables: Tables, corridor: Corridor) -> str:
         )
         lane = corridor.lane_name(ramp.lane, ramp.merge_m)
         used_m, open_m = ramp.merge_m - ramp.at_m, ends_m - ramp.merge_m
-        return f"on-ramp from {ramp.edge} of {used_m:.0f} m into lane {lane} of {open_m:.0f} m ("
+        return f"on-ramp from {ramp.edge} of {used_m:.0f} m into lane {lane} of {open_m:.0f} m"
     closure = tables["road"]["closures"][number]
     ends_m = closure.get("from_m", 0.0)
-    return f"end of lane {corridor.lane_name(closure['lane'], ends_m)} ("
+    return f"end of lane {corridor.lane_name(closure['lane'], ends_m)}"
 
 
 def _enough(error: BadInputError) -> str:
@@ -131,8 +133,8 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
     """Return the tables of a scenario file, not checked against each other.
 
     Vehicles arrive at random with the mean volumes of the simulation. No vehicle exceeds the lowest
-    speed limit of edges and types, and v_F is 90 % of it. The column pitch is the least of at least
-    `HEADWAY_S` that suits all types, and T_F is long enough for moves between lanes.
+    speed limit of edges and types, and v_F is 90 % of it. The column pitch is the minimum that
+    suits all types, but at least `HEADWAY_S` long, and T_F is long enough for moves between lanes.
 
     Raises:
         BadInputError: no vehicle enters at the start of the corridor, or it is too short.

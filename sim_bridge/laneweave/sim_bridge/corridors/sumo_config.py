@@ -65,14 +65,18 @@ class SumoConfig:
         named += _paths(self.options.get("route-files", ""))
         return tuple(file for file in named if file.is_file())
 
-    def command(self, more: Mapping[str, str], without: Sequence[str] = ()) -> tuple[str, ...]:
+    def command(
+        self, seed: int, more: Mapping[str, str], without: Sequence[str] = ()
+    ) -> tuple[str, ...]:
         """Return SUMO's command line.
 
         Args:
+            seed: SUMO's seed, unless the configuration has one.
             more: more options, by name.
             without: beginnings of the names of options that do not apply.
         """
         options = {
+            "seed": f"{seed % 2**31}",
             **{
                 name: value
                 for name, value in self.options.items()

@@ -121,7 +121,7 @@ class SumoDemand:
     types: str = field(default="", eq=False, repr=False)
     """XML elements of the types."""
     persons: int = 0
-    """Number of persons and containers, which nobody drives."""
+    """Number of persons and containers, which are in no run."""
 
     @property
     def departing(self) -> frozenset[str]:
@@ -190,7 +190,6 @@ def read_demand(config: SumoConfig, folder: Path, window: TimeWindow, seed: int 
     """
     routes, state = folder / "vehicles.xml", folder / "state.xml"
     options = {
-        "seed": config.options.get("seed", f"{seed % 2**31}"),
         **config.additional(folder, demand=True),
         "vehroute-output": str(routes),
         "vehroute-output.write-unfinished": "true",
@@ -201,7 +200,7 @@ def read_demand(config: SumoConfig, folder: Path, window: TimeWindow, seed: int 
         options["begin"] = f"{window.begin_s:g}"
     if window.scale is not None:
         options["scale"] = f"{window.scale:g}"
-    with SumoProcess(config.command(options)) as sumo:
+    with SumoProcess(config.command(seed, options)) as sumo:
         begin_s, until_s = sumo.simulation.getTime(), sumo.simulation.getEndTime()
         until_s = until_s if until_s > begin_s else math.inf
         end_s = min(begin_s + window.duration_s, window.end_s, until_s)
@@ -212,7 +211,8 @@ def read_demand(config: SumoConfig, folder: Path, window: TimeWindow, seed: int 
         types = {name: _type(sumo, name) for name in sumo.vehicletype.getIDList()}
         found = [*_not_departed(sumo, waiting, types)]
         ahead = {name: stops for name in sumo.vehicle.getIDList() if (stops := _stops(sumo, name))}
-    found += _departed(routes, types, begin_s, ahead)
+    departed, persons = _departed(routes, types, begin_s, ahead)
+    found += departed
     inside = sorted(
         (one for one in found if one.depart_s < end_s or math.isinf(one.depart_s)),
         key=lambda one: one.depart_s,
@@ -232,7 +232,7 @@ def read_demand(config: SumoConfig, folder: Path, window: TimeWindow, seed: int 
         min(end_s, math.floor(departures_s[-1]) + 1.0),
         step_s,
         _type_elements(state),
-        _count_persons(routes),
+        persons,
     )
 
 
@@ -332,28 +332,44 @@ def _departed(
     types: Mapping[str, SumoType],
     begin_s: float,
     ahead: Mapping[str, tuple[Attributes, ...]],
-) -> Iterator[SumoVehicle]:
-    """Yield the vehicles of SUMO's output; `ahead`: stops that they have not reached."""
+) -> tuple[list[SumoVehicle], int]:
+    """Return the vehicles of SUMO's output, and the number of persons and containers.
+
+    Args:
+        file: the output.
+        types: the types, by name.
+        begin_s: when the simulation has begun.
+        ahead: stops that vehicles have not reached.
+    """
+    vehicles, persons = list[SumoVehicle](), 0
     for _, element in ET.iterparse(file):  # noqa: S314 (SUMO has written it)
-        if element.tag != "vehicle":
-            continue
-        attributes = {
-            name: value for name, value in element.attrib.items() if name not in _NOT_KEPT
-        }
-        if float(attributes.get("departSpeed", "0")) > 0.0:
-            # What SUMO has reported is a speed, which may be too high beside other vehicles.
-            attributes["departSpeed"] = "max"
-        type_name = element.get("type", _DEFAULT_TYPE)
-        yield SumoVehicle(
-            element.get("id", ""),
-            _departure_s(element.get("depart", ""), begin_s),
-            tuple(_edges(element)),
-            types[type_name],
-            type_name,
-            attributes,
-            (*map(_stop, element.iter("stop")), *ahead.get(element.get("id", ""), ())),
-        )
-        element.clear()
+        persons += element.tag in {"person", "container"}
+        if element.tag == "vehicle":
+            vehicles.append(_reported(element, types, begin_s, ahead))
+            element.clear()
+    return vehicles, persons
+
+
+def _reported(
+    element: ET.Element,
+    types: Mapping[str, SumoType],
+    begin_s: float,
+    ahead: Mapping[str, tuple[Attributes, ...]],
+) -> SumoVehicle:
+    attributes = {name: value for name, value in element.attrib.items() if name not in _NOT_KEPT}
+    if float(attributes.get("departSpeed", "0")) > 0.0:
+        # What SUMO has reported is a speed, which may be too high beside other vehicles.
+        attributes["departSpeed"] = "max"
+    name, type_name = element.get("id", ""), element.get("type", _DEFAULT_TYPE)
+    return SumoVehicle(
+        name,
+        _departure_s(element.get("depart", ""), begin_s),
+        tuple(_edges(element)),
+        types[type_name],
+        type_name,
+        attributes,
+        (*map(_stop, element.iter("stop")), *ahead.get(name, ())),
+    )
 
 
 def _departure_s(text: str, begin_s: float) -> float:
@@ -372,7 +388,7 @@ def _edges(vehicle: ET.Element) -> Sequence[str]:
 
 
 def _stop(element: ET.Element) -> Attributes:
-    """Return the attributes of a stop that does not wait for passengers, as nobody drives them."""
+    """Return the attributes of a stop without those that make it wait for passengers."""
     stop = {name: value for name, value in element.attrib.items() if name not in _STOP_NOT_KEPT}
     if not {"duration", "until"} & stop.keys():
         started, ended = (float(element.get(name, "0")) for name in ("started", "ended"))
@@ -389,11 +405,6 @@ def _type_elements(state: Path) -> str:
             if parameter.get("key", "").startswith("has.rerouting"):
                 kind.remove(parameter)  # routes are those of the first simulation
     return "".join(ET.tostring(kind, encoding="unicode") for kind in found)
-
-
-def _count_persons(routes: Path) -> int:
-    found = ET.iterparse(routes)  # noqa: S314 (SUMO has written it)
-    return sum(element.tag in {"person", "container"} for _, element in found)
 
 
 def demand_on(corridor: Corridor, demand: SumoDemand) -> CorridorDemand:

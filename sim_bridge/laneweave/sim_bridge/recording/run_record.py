@@ -62,7 +62,7 @@ from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import Trip, Trips, metadata_of, throughput, travel_time
 from laneweave.sim_bridge.road.demand import Arrival
 
-NOBODY: Mapping[str, int] = MappingProxyType({})
+NONE_LEFT_OUT: Mapping[str, int] = MappingProxyType({})
 
 
 class RecordedVehicle(Protocol):
@@ -128,7 +128,7 @@ class RunRecord:
         scenario: Scenario,
         method: str,
         stopwatch: Callable[[], float],
-        left_out: Mapping[str, int] = NOBODY,
+        left_out: Mapping[str, int] = NONE_LEFT_OUT,
     ) -> None:
         """Open the files of a run in its folder; create the folder if necessary.
 

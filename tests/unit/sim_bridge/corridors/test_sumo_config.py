@@ -165,6 +165,6 @@ def test_options_of_the_configuration_stay(tmp_path: Path) -> None:
     found = read_config(write_config(tmp_path, text), tmp_path)
     assert found.options["time-to-teleport"] == "60"
     assert "verbose" not in found.options
-    command = found.command({"seed": found.options["seed"]}, without=("time-to",))
+    command = found.command(1, {}, without=("time-to",))
     assert "--time-to-teleport" not in command
     assert command[command.index("--seed") + 1] == "7"
