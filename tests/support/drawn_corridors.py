@@ -1,32 +1,27 @@
-"""Corridors drawn at random, written with netconvert, and an oracle for runs on them.
+"""Corridors drawn at random, written with netconvert.
 
 A drawn network is a main road of two to four lanes with an on-ramp, exits, both or neither, in any
 order, with any lengths; the corridor may begin and end on any of its main edges. Vehicles depart on
-the first edge, upstream of it or on the ramp, anywhere on their edges. The oracle uses only what
-the run has recorded and what SUMO reports, no code of the bridge.
+the first edge, upstream of it or on the ramp, anywhere on their edges.
 """
 
 from __future__ import annotations
 
-import json
 import subprocess
-import xml.etree.ElementTree as ET
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from itertools import combinations, pairwise
+from itertools import pairwise
 from pathlib import Path
 from random import Random
 
-import pyarrow.parquet as pq
 import sumo  # type: ignore[import-untyped]
 from attrs import define, field, frozen
+
+from support import corridor_oracle
 
 NETCONVERT = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
 DEMAND_S = 60
 CAR, TRUCK = (4.5, 1.8), (7.1, 2.4)
 """(length, width) [m] of the drawn types."""
-TOLERANCE_M = 0.05
-"""By how much bodies may overlap in the oracle, which ignores their headings."""
 
 
 @frozen
@@ -232,50 +227,5 @@ def _netconvert(main: _Main, folder: Path, *, left_hand: bool) -> None:
 
 def problems(drawn: DrawnCorridor, run: Path) -> list[str]:
     """Return what is wrong in a recorded run on a drawn corridor; empty: nothing."""
-    return [*_overlaps(run), *_without_agents(run), *_wrong_ends(drawn, run)]
-
-
-def _overlaps(run: Path) -> Iterator[str]:
-    """Yield the pairs of bodies whose rectangles overlap at a tick."""
-    trips = pq.read_table(run / "trips.parquet").to_pylist()
-    sizes = {one["vehicle"]: TRUCK if one["vehicle_type"] == "truck" else CAR for one in trips}
-    rows = pq.read_table(run / "trajectories.parquet", columns=["t_s", "vehicle", "s_m", "y_m"])
-    ticks: dict[float, list[tuple[float, float, str]]] = defaultdict(list)
-    for row in rows.to_pylist():
-        ticks[row["t_s"]].append((row["s_m"], row["y_m"], row["vehicle"]))
-    found = set[tuple[str, str]]()
-    for bodies in ticks.values():
-        bodies.sort()
-        for (s_m, y_m, one), (ahead_m, beside_m, other) in combinations(bodies, 2):
-            if ahead_m - sizes[other][0] >= s_m - TOLERANCE_M:
-                continue
-            half_m = 0.5 * (sizes[one][1] + sizes[other][1])
-            if abs(y_m - beside_m) < half_m - TOLERANCE_M:
-                found.add((one, other))
-    for pair in sorted(found):
-        yield f"bodies overlap: {pair}"
-
-
-def _without_agents(run: Path) -> Iterator[str]:
-    wrong = {"agent-missing", "agent-silent", "caretaker-took-over"}
-    for line in (run / "events.jsonl").read_text(encoding="utf-8").splitlines():
-        event = json.loads(line)
-        if event["kind"] in wrong:
-            yield f"{event['kind']}: {event.get('vehicle')} at {event['t_s']:.1f} s"
-
-
-def _wrong_ends(drawn: DrawnCorridor, run: Path) -> Iterator[str]:
-    """Yield the vehicles that SUMO does not report at the ends of their routes."""
-    routes = {
-        one.attrib["id"]: one.find("route").attrib["edges"].split()  # type: ignore[union-attr]
-        for one in ET.parse(drawn.config.with_name("drawn.rou.xml")).iter("vehicle")  # noqa: S314
-    }
-    ends = {
-        one.attrib["id"]: one.attrib["arrivalLane"].rpartition("_")[0]
-        for one in ET.parse(run / "tripinfo.xml").iter("tripinfo")  # noqa: S314
-    }
-    first, last = drawn.name.split(":")
-    for name, route in routes.items():
-        crosses = first in route or last in route
-        if crosses and ends.get(name) != route[-1]:
-            yield f"{name} has arrived on {ends.get(name) or 'no edge'}, not on {route[-1]}"
+    routes = drawn.config.with_name("drawn.rou.xml")
+    return corridor_oracle.problems(run, drawn.name, routes, {"car": CAR, "truck": TRUCK})

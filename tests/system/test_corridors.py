@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from support.commands import run
+from support.drawn_corridors import draw_corridor, problems
 from support.harness import Lab, check_safe_and_complete, summary, trips
 from support.interchange import CORRIDOR, LONGEST_CORRIDOR, TRUCKS, stream, write_interchange
 
@@ -40,6 +41,19 @@ def test_real_processes_drive_the_same_trips_as_a_simulated_run(lab: Lab, config
     for name, trip in ours.items():
         assert trip["entered_s"] == pytest.approx(theirs[name]["entered_s"], abs=0.11)
         assert trip["left_s"] == pytest.approx(theirs[name]["left_s"], abs=0.3)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", range(20))
+def test_real_processes_drive_drawn_corridors(lab: Lab, tmp_path: Path, seed: int) -> None:
+    drawn, folder = draw_corridor(seed, tmp_path), lab.folder / "run"
+    options = "--sumocfg", drawn.config, "--corridor", drawn.name
+    ended = lab.run("run", *options, "--vehicles-per-process", "10", "--out", folder)
+    if ended.status == 2:
+        pytest.skip(f"refused: {ended.complaints}")
+    assert (ended.status, ended.complaints) == (0, []), (ended, drawn.text)
+    check_safe_and_complete(folder)
+    assert problems(drawn, folder) == [], drawn.text
 
 
 def test_corridors_are_listed_described_and_written(lab: Lab, config: Path) -> None:
