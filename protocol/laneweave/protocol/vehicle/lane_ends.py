@@ -164,9 +164,6 @@ class LaneEnds:
             since_s: road time at which the cell is in the section; None: `t_s`.
             body_m: a position in the section, instead of that of the cell.
         """
-        if body_m is None:
-            # A move may begin before its lane opens: what ended before does not concern it.
-            body_m = self.in_section_m(cell, t_s if since_s is None else since_s)
         return self._has_passed_line(self.ahead, cell, t_s, since_s, body_m)
 
     def ends_changes(
@@ -187,11 +184,11 @@ class LaneEnds:
         body_m: float | None,
     ) -> bool:
         """Return whether a cell has passed the line of the end that is found for its section."""
-        (column, lane), cell_s_m = cell, self._lattice.cell_s_m
         if body_m is None:
-            body_m = cell_s_m(column, t_s if since_s is None else since_s)
-        end = find(lane, body_m)
-        return end is not None and cell_s_m(column, t_s) > end.line_m
+            # A move may begin before its lane opens: what ended before does not concern it.
+            body_m = self.in_section_m(cell, t_s if since_s is None else since_s)
+        end = find(cell[1], body_m)
+        return end is not None and self._lattice.cell_s_m(cell[0], t_s) > end.line_m
 
     def too_late_to_move(self, origin: Cell, target: Cell, t_s: float) -> bool:
         """Return whether a body in one lane can no longer begin to enter another, for an exit."""

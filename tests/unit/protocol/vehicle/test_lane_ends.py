@@ -13,7 +13,7 @@ from laneweave.agents.driving.reference import Reference
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE, LaneSection, open_sections, sections_for
-from laneweave.protocol.scenario.fields import Closure, Scenario
+from laneweave.protocol.scenario.fields import Closure, Exit, Scenario
 from laneweave.protocol.vehicle.lane_ends import (
     LaneEnd,
     LaneEnds,
@@ -113,6 +113,19 @@ def test_a_cell_is_in_a_lane_that_opens_again_as_soon_as_moves_into_it_may_begin
     assert ends.has_passed((-10, 1), begins_s - 0.01)
     assert not ends.has_passed((-10, 1), begins_s + 0.01)
     assert ends.has_begun(1, begins_m + 0.01)
+
+
+def test_the_exit_before_does_not_end_moves_that_begin_before_the_lane_opens_again() -> None:
+    exits = (Exit("first", (0,), 400.0), Exit("second", (0,), 900.0))
+    closed = (Closure(0, 400.0, 700.0), Closure(0, 900.0))
+    road = evolve(KEEPING.road, closures=closed)
+    scenario = evolve(KEEPING, road=road, exit=exits)
+    ends, lattice = LaneEnds(scenario), scenario.lattice
+    begins_m = 700.0 + scenario.longest_body_m - early_start_m(scenario)
+    assert begins_m < 700.0
+    begins_s = lattice.passing_time_s(-10, begins_m)
+    assert ends.too_late_to_move((-10, 1), (-10, 0), begins_s - 0.01)
+    assert not ends.too_late_to_move((-10, 1), (-10, 0), begins_s + 0.01)
 
 
 @pytest.mark.parametrize(

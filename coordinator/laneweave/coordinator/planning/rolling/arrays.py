@@ -253,7 +253,7 @@ def _table(
         load,
         np.full((slots, road.lanes, columns), -1, dtype=np.int32),
         np.zeros((slots, road.lanes, columns), dtype=np.int8),
-        offsets,
+        offsets.copy(),  # the search changes a factor
         first,
         np.array(steps, dtype=np.int64),
         np.ascontiguousarray(moving_columns.T),

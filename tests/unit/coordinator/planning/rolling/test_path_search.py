@@ -185,6 +185,20 @@ def test_others_make_room_for_a_vehicle_that_does_not_change_columns() -> None:
     assert StreamPlanner(ROAD).plan(0, vehicles).missed == ("truck", "b")
 
 
+@pytest.mark.parametrize("gaps", [(), (3,), (1, 2, 4)])
+def test_others_leave_a_lane_in_which_they_could_stay(gaps: tuple[int, ...]) -> None:
+    """Beside the end of a lane, one who moves to the third lane costs less than one who misses."""
+    road = lanes(LaneSection(0, to_m=800.0, exit="off"), *through(1, 2))
+    vehicles = [
+        StreamVehicle(f"{lane}-{column}", (column, lane), {1, 2}, moves=LATERAL)
+        for column in (25, *(25 + gap for gap in gaps))
+        for lane in (0, 1)
+    ]
+    plan = StreamPlanner(road).plan(0, vehicles)
+    assert problems_of_plan(road, plan, vehicles) == []
+    assert plan.missed == ()
+
+
 def test_a_path_blocked_by_a_held_vehicle_is_replaced() -> None:
     planner = StreamPlanner(ROAD)
     vehicles = [StreamVehicle("a", (30, 0), 2), StreamVehicle("b", (31, 1), 1)]
