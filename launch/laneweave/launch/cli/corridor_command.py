@@ -63,7 +63,7 @@ def corridor(
 
         typer.echo(tomli_w.dumps(corridor_tables(found, sumocfg, window)), nl=False)
         return
-    _describe(found)
+    _describe(found, sumocfg)
 
 
 def time_window(
@@ -98,12 +98,16 @@ def corridor_tables(found: SumoCorridor, sumocfg: Path, window: TimeWindow) -> d
     """
     from laneweave.sim_bridge.corridors.scenario_tables import checked_tables
 
-    sumo: dict[str, Any] = {"config": str(sumocfg.resolve()), "corridor": found.corridor.name}
+    sumo = _sumo_table(sumocfg, found.corridor)
     if window.begin_s is not None:
         sumo["begin_s"] = window.begin_s
     if window.scale is not None:
         sumo["scale"] = window.scale
-    return checked_tables(found.corridor, found.demand) | {"sumo": sumo}
+    return checked_tables(found.corridor, found.demand, sumo)
+
+
+def _sumo_table(sumocfg: Path, corridor: Corridor) -> dict[str, Any]:
+    return {"config": str(sumocfg.resolve()), "corridor": corridor.name}
 
 
 def _list(sumocfg: Path, window: TimeWindow) -> None:
@@ -135,7 +139,7 @@ def _list(sumocfg: Path, window: TimeWindow) -> None:
     console = Console()
     console.print(table)
     for one in found:
-        remark = _remark(one)
+        remark = _remark(one, sumocfg)
         if remark:
             console.print(f"{escape(one.name)}: {escape(remark)}", soft_wrap=True)
 
@@ -155,27 +159,27 @@ def _numbers(one: Candidate) -> tuple[str, ...]:
     )
 
 
-def _remark(one: Candidate) -> str:
+def _remark(one: Candidate, sumocfg: Path) -> str:
     """Return why laneweave cannot drive a corridor, or what it does not use."""
     corridor, demand = one.corridor, one.demand
     if corridor is None or demand is None:
         return one.problem
     unused = f"{len(corridor.unused)} ways not used" if corridor.unused else ""
-    return _problem(corridor, demand) or unused
+    return _problem(corridor, demand, sumocfg) or unused
 
 
-def _problem(corridor: Corridor, demand: CorridorDemand) -> str:
+def _problem(corridor: Corridor, demand: CorridorDemand, sumocfg: Path) -> str:
     """Return why laneweave cannot drive a corridor; empty: it can."""
     from laneweave.sim_bridge.corridors.scenario_tables import checked_tables
 
     try:
-        checked_tables(corridor, demand)
+        checked_tables(corridor, demand, _sumo_table(sumocfg, corridor))
     except BadInputError as error:
         return str(error)
     return ""
 
 
-def _describe(found: SumoCorridor) -> None:
+def _describe(found: SumoCorridor, sumocfg: Path) -> None:
     """Print what a corridor consists of."""
     from laneweave.sim_bridge.corridors.scenario_tables import speed_remark
 
@@ -197,7 +201,7 @@ def _describe(found: SumoCorridor) -> None:
     for exit_ in corridor.ways_out:
         lanes = ", ".join(map(str, exit_.lanes))
         console.print(f"exit to {escape(exit_.edge)} from lane {lanes} at {exit_.at_m:.0f} m")
-    problem = _problem(corridor, demand)
+    problem = _problem(corridor, demand, sumocfg)
     if problem:
         console.print(f"laneweave cannot drive it: {escape(problem)}")
     for remark in corridor.unused:

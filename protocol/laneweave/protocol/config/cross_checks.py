@@ -129,6 +129,13 @@ def _check_lanes(scenario: Scenario) -> None:
     width_m = scenario.widest_body_m + MIN_SIDE_GAP_M
     what = f"the largest width_m and {MIN_SIDE_GAP_M:g} between bodies side by side"
     _compare(scenario, [("road.lane_width_m", "at least", width_m, what)])
+    if scenario.draws_vehicles:
+        _check_volumes(scenario)
+
+
+def _check_volumes(scenario: Scenario) -> None:
+    """Check that vehicles can enter each lane as often as its volume says."""
+    road, demand = scenario.road, scenario.demand
     ramps = {
         one.lane: (f"entrance[{number}].volume_veh_per_h", one.volume_veh_per_h)
         for number, one in enumerate(scenario.entrance)
@@ -321,7 +328,7 @@ def _check_permitted_lanes(scenario: Scenario) -> None:
     """Check that each type has a lane to enter by, and one to leave by if its demand is drawn."""
     if not scenario.road.restrictions:
         return
-    demand, drawn = scenario.demand, not scenario.sumo.config
+    demand = scenario.demand
     shares = [TypeShare(one.name, one.share) for one in scenario.vehicle_type]
     entrances = [(MAIN_ENTRANCE, scenario.road.first_lanes, shares, demand.destinations)]
     entrances += [
@@ -339,7 +346,7 @@ def _check_permitted_lanes(scenario: Scenario) -> None:
             )
             allowed = f"types other than {name}, which has no lane left at entrance {entrance}"
             _require_lane(enters, scenario, name, lanes, allowed)
-            for destination in wanted if drawn else ():
+            for destination in wanted if scenario.draws_vehicles else ():
                 ends = [one for one in scenario.sections if one.serves(ANY_LANE, destination)]
                 leaves = not ends or any(scenario.may_leave_by(one, name) for one in ends)
                 allowed = (
@@ -451,8 +458,8 @@ def _check_exits(scenario: Scenario) -> None:
 def _check_capacity(scenario: Scenario) -> None:
     """Check that the lanes that are open can carry the demand everywhere."""
     road, bound = scenario.road, scenario.formation.bound_veh_per_lane_h
-    if not road.closures:
-        return  # the bound of the entrance holds everywhere
+    if not road.closures or not scenario.draws_vehicles:
+        return  # the bound of the entrance holds everywhere, or vehicles wait until they can enter
     exits_m = {one.name: one.at_m for one in scenario.exit}
     parts = [
         (scenario.entry_m[lane], inflow.volume_veh_per_h * share, exits_m.get(name, math.inf))

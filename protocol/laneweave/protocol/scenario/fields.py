@@ -1130,9 +1130,14 @@ class Scenario:
         return min(start_m, max(self.road.s1_m, formation.speed_mps * (formation.settle_s + 4.0)))
 
     @property
+    def draws_vehicles(self) -> bool:
+        """Whether vehicles are drawn at random, and not those of a SUMO simulation."""
+        return not self.sumo.config
+
+    @property
     def lane_shares(self) -> tuple[float, ...]:
         """Share of vehicles that prefer each lane; the sum is one. Empty: no preferences."""
-        if self.road.closures and not self.demand.lane_shares:
+        if (self.road.closures or not self.draws_vehicles) and not self.demand.lane_shares:
             return ()
         lanes = range(self.road.lanes)
         return _normalised(self.demand.lane_shares or (1.0,) * len(lanes), lanes)

@@ -36,6 +36,7 @@ SPEED_SHARE = 0.9
 """v_F as a share of the speed limit: vehicles that move to a cell ahead are faster."""
 MAX_SPEED_MPS = 60.0
 """Highest speed of vehicles."""
+MAX_VOLUME_VEH_PER_H = 3600.0
 MIN_SETTLE_S = 1.0
 SPARE_PITCH_M = 2.0
 """Part of the column pitch that leaves room for moves to a cell ahead."""
@@ -49,34 +50,25 @@ _WIDE_M = 100.0
 Tables = dict[str, Any]
 
 
-def checked_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
+def checked_tables(corridor: Corridor, demand: CorridorDemand, sumo: Tables) -> Tables:
     """Return the tables of a scenario file, which laneweave can drive.
+
+    Args:
+        corridor: the corridor.
+        demand: its vehicles.
+        sumo: the table `sumo`.
 
     Raises:
         BadInputError: it cannot; the error names the ramp, exit or edge.
     """
-    tables = scenario_tables(corridor, demand)
-    error = _problem(tables)
-    if error is not None and error.field == "demand.volume_veh_per_lane_h":
-        # Vehicles that cannot enter wait; the volume is only that of a drawn demand.
-        most = re.match(r"at most ([\d.]+)", error.allowed)
-        if most:
-            tables["demand"]["volume_veh_per_lane_h"] = math.floor(float(most[1]))
-            error = _problem(tables)
-    if error is not None:
+    tables = scenario_tables(corridor, demand) | {"sumo": sumo}
+    try:
+        parse_scenario(tables)
+    except BadInputError as error:
         field, where = f"{error.field} of its scenario", _where(error.field, tables, corridor)
         field = f"{OPTION} {corridor.name}, " + (f"{where} ({field})" if where else field)
         raise BadInputError(field, error.value, _enough(error)) from error
     return tables
-
-
-def _problem(tables: Tables) -> BadInputError | None:
-    """Return why the tables are no valid scenario; None: they are."""
-    try:
-        parse_scenario(tables)
-    except BadInputError as error:
-        return error
-    return None
 
 
 def _where(field: str, tables: Tables, corridor: Corridor) -> str:
@@ -163,7 +155,7 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
                 "lane": ramp.lane,
                 "at_m": _m(ramp.at_m),
                 "merge_m": _m(ramp.merge_m),
-                "volume_veh_per_h": round(per_hour * len(_from(demand, ramp.name)), 1),
+                "volume_veh_per_h": _volume(per_hour * len(_from(demand, ramp.name))),
                 "destinations": _destinations(_from(demand, ramp.name)),
                 "vehicle_types": [
                     {"type": names[one], "share": share}
@@ -178,7 +170,7 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
             for one in corridor.ways_out
         ],
         "demand": {
-            "volume_veh_per_lane_h": round(per_hour * len(main) / _first_lanes(corridor), 1),
+            "volume_veh_per_lane_h": _volume(per_hour * len(main) / _first_lanes(corridor)),
             "duration_s": float(math.ceil(demand.duration_s)),
             "destinations": _destinations(main),
         },
@@ -193,13 +185,6 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
         tables, corridor, math.floor(2.0 * SPEED_SHARE * fastest_mps) / 2.0
     )
     formation = tables["formation"]
-    # Vehicles that cannot enter wait; the volume is only that of a drawn demand.
-    most = 0.9 * min(3600.0 * formation["speed_mps"] / formation["gap_m"], 3600.0)
-    for table, key in (
-        (tables["demand"], "volume_veh_per_lane_h"),
-        *((one, "volume_veh_per_h") for one in tables["entrance"]),
-    ):
-        table[key] = min(table[key], math.floor(most))
     settled_m = _m(formation["speed_mps"] * formation["settle_s"])
     if settled_m >= corridor.length_m:
         raise BadInputError(OPTION, corridor.name, f"a corridor longer than {settled_m:g} m")
@@ -240,6 +225,11 @@ def _check_widths(corridor: Corridor, names: Mapping[SumoType, str]) -> None:
 
 def _from(demand: CorridorDemand, entrance: str) -> list[Pass]:
     return [one for one in demand.passes if one.entrance == entrance]
+
+
+def _volume(veh_per_h: float) -> float:
+    """Return a volume as scenarios allow it; it is that of a drawn demand only."""
+    return min(round(veh_per_h, 1), MAX_VOLUME_VEH_PER_H)
 
 
 def _m(position_m: float) -> float:

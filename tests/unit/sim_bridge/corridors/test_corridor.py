@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from attrs import evolve
@@ -11,12 +12,12 @@ from attrs import evolve
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Closure
-from laneweave.sim_bridge.corridors.corridor import HANDOVER_M, MIN_AT_M, corridor_of
+from laneweave.sim_bridge.corridors.corridor import HANDOVER_M, MIN_AT_M, Corridor, corridor_of
 from laneweave.sim_bridge.corridors.corridor_search import find_corridors
 from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 from laneweave.sim_bridge.corridors.scenario_tables import checked_tables, scenario_tables
 from laneweave.sim_bridge.corridors.sumo_config import read_config
-from laneweave.sim_bridge.corridors.sumo_demand import SumoDemand
+from laneweave.sim_bridge.corridors.sumo_demand import CorridorDemand, SumoDemand
 from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network, read_network
 from support.interchange import (
     CORRIDOR,
@@ -27,6 +28,10 @@ from support.interchange import (
     vehicle,
     write_interchange,
 )
+
+
+def checked(corridor: Corridor, demand: CorridorDemand) -> dict[str, Any]:
+    return checked_tables(corridor, demand, {"config": "small.sumocfg", "corridor": corridor.name})
 
 
 def network(folder: Path, state: str = "M") -> Network:
@@ -99,26 +104,26 @@ def test_names_of_edges_may_contain_colons(tmp_path: Path) -> None:
 def test_what_does_not_fit_is_named_as_in_the_network(tmp_path: Path) -> None:
     config = write_interchange(tmp_path, stream(60), types=TRUCKS)
     found = read_corridor(config, CORRIDOR)
-    assert checked_tables(found.corridor, found.demand)
+    assert checked(found.corridor, found.demand)
     (ramp,), opening = found.corridor.ramps, found.corridor.closures[0]
     late = evolve(found.corridor, ramps=(evolve(ramp, merge_m=ramp.merge_m + 200.0),))
     with pytest.raises(
         BadInputError, match=r"on-ramp from on of 345 m into lane main4_0 of 50 m \(entrance"
     ):
-        checked_tables(late, found.demand)
+        checked(late, found.demand)
     others = found.corridor.closures[1:]
     early = evolve(found.corridor, closures=(evolve(opening, to_m=900.0), *others))
     with pytest.raises(
         BadInputError, match=r"exit to off from lane main2_0, open for 46 m \(exit.*longer are"
     ):
-        checked_tables(early, found.demand)
+        checked(early, found.demand)
     closures = tuple(
         evolve(one, from_m=ramp.merge_m + 60.0) if one.from_m > ramp.merge_m else one
         for one in found.corridor.closures
     )
     short = evolve(found.corridor, closures=closures)
     with pytest.raises(BadInputError, match=r"end of lane main4_0|on-ramp from on.*main4_0"):
-        checked_tables(short, found.demand)
+        checked(short, found.demand)
 
 
 @pytest.mark.parametrize(("accel_mps2", "fits"), [(0.8, True), (0.2, False)])
@@ -144,8 +149,15 @@ def test_more_vehicles_than_the_road_carries_wait(tmp_path: Path) -> None:
     crowd = [vehicle(f"m{number}", 1.0, "main") for number in range(9)]
     found = read_corridor(write_interchange(tmp_path, crowd), CORRIDOR)
     assert found.demand.duration_s == 2.0
-    scenario = parse_scenario(scenario_tables(found.corridor, found.demand))
-    assert scenario.demand.volume_veh_per_lane_h < 3600.0
+    scenario = parse_scenario(checked(found.corridor, found.demand))
+    assert scenario.demand.volume_veh_per_lane_h == 3600.0
+
+
+def test_vehicles_of_a_corridor_prefer_no_lane(tmp_path: Path) -> None:
+    """A plain road would otherwise have to be long enough for random preferences."""
+    vehicles = [vehicle(f"m{number}", 3.0 * number, "main") for number in range(3)]
+    found = read_corridor(write_interchange(tmp_path, vehicles), "main1:main1")
+    assert parse_scenario(checked(found.corridor, found.demand)).lane_shares == ()
 
 
 def test_vehicles_of_a_corridor_do_not_give_way(tmp_path: Path) -> None:
@@ -214,7 +226,7 @@ def test_a_ramp_in_line_with_a_lane_that_is_open_at_the_start_is_refused(tmp_pat
     found = read_corridor(config, CORRIDOR)
     closures = found.corridor.closures[1:]
     with pytest.raises(BadInputError, match="begin the corridor on a later edge"):
-        checked_tables(evolve(found.corridor, closures=closures), found.demand)
+        checked(evolve(found.corridor, closures=closures), found.demand)
 
 
 def test_vehicles_that_are_too_wide_are_named(tmp_path: Path) -> None:
