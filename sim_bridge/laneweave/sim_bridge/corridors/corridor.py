@@ -8,6 +8,7 @@ with its acceleration lane, and a lane whose links lead out of it an exit.
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -31,7 +32,10 @@ though in the world they never meet."""
 MIN_AT_M = 1.0
 """Position of ramps that begin before the corridor: their lanes are closed at its start."""
 HANDOVER_M = 4.0
-"""Distance before the end of an edge at which vehicles are given back to SUMO."""
+"""Distance before the end of an edge at which vehicles are given back to SUMO, if they need not
+give way behind it."""
+HANDOVER_DECEL_MPS2 = 3.0
+"""Deceleration for which SUMO has room where vehicles give way, or come to a traffic light."""
 OPTION = "--corridor"
 
 
@@ -287,7 +291,14 @@ class _Derivation:
         return Corridor(
             edges=self._edges,
             lanes=lanes,
-            length_m=self._edges[-1].to_m - HANDOVER_M,
+            length_m=self._given_back_m(
+                len(self._way) - 1,
+                [
+                    link
+                    for lane in self._way[-1].car_lanes
+                    for link in self._network.links_from(lane)
+                ],
+            ),
             lane_width_m=min(lane.width_m for lane in used),
             speed_mps=min(lane.speed_mps for lane in used),
             closures=tuple(self._closures(parts, lanes, ramps, ways_out)),
@@ -295,6 +306,39 @@ class _Derivation:
             ways_out=ways_out,
             parts=tuple(self._lane_parts()),
             unused=tuple(self._unused),
+        )
+
+    def _given_back_m(self, number: int, links: Sequence[Link]) -> float:
+        """Return where vehicles are given back on an edge, before links that lead out of it.
+
+        Raises:
+            BadInputError: the edge is too short for SUMO to brake there.
+        """
+        edge = self._edges[number]
+        fastest_mps = min(lane.speed_mps for one in self._way for lane in one.car_lanes)
+        brakes_m = fastest_mps**2 / (2.0 * HANDOVER_DECEL_MPS2)
+        nearest_m = min((self._gives_way_m(link, brakes_m) for link in links), default=math.inf)
+        handover_m = max(HANDOVER_M, brakes_m - nearest_m)
+        if handover_m > edge.to_m - edge.from_m:
+            allowed = (
+                f"at least {handover_m:.0f} m, since vehicles have to give way behind it and brake "
+                "there: end the corridor before"
+            )
+            raise BadInputError(
+                f"{OPTION}, length of {edge.name}", round(edge.to_m - edge.from_m, 1), allowed
+            )
+        return edge.to_m - handover_m
+
+    def _gives_way_m(self, link: Link, until_m: float) -> float:
+        """Return how far behind a link vehicles give way next; infinite: not up to a distance."""
+        if not link.has_priority:
+            return 0.0
+        length_m = link.length_m + link.target.length_m
+        if length_m >= until_m:
+            return math.inf
+        following = self._network.links_from(link.target)
+        return length_m + min(
+            (self._gives_way_m(one, until_m - length_m) for one in following), default=math.inf
         )
 
     def _lane(self, number: int, lane: int) -> Lane:
@@ -375,7 +419,7 @@ class _Derivation:
 
     def _ways_out(self, parts: Sequence[_OpenPart]) -> Iterator[WayOut]:
         """Yield the exits; note ways out of lanes that go on."""
-        lanes: dict[tuple[str, str, float], list[int]] = {}
+        found: dict[tuple[str, int], list[tuple[int, Link]]] = {}
         for part in parts:
             for number in range(part.first, min(part.last + 1, len(self._way) - 1)):
                 at_m = self._edges[number].to_m
@@ -383,16 +427,17 @@ class _Derivation:
                     if link.target.edge in self._names:
                         continue
                     if number == part.last:
-                        lanes.setdefault(
-                            (link.target.edge, self._edges[number].name, at_m), []
-                        ).append(part.lane)
+                        found.setdefault((link.target.edge, number), []).append((part.lane, link))
                         break
                     self._unused.append(
                         f"the way to {link.target.edge} leaves lane {part.lane} at {at_m:.0f} m "
                         "without a lane of its own"
                     )
-        for (edge, before, at_m), own in sorted(lanes.items(), key=lambda item: item[0][2]):
-            yield WayOut(self._name(edge), edge, before, tuple(sorted(set(own))), at_m - HANDOVER_M)
+        for (edge, number), own in sorted(found.items(), key=lambda item: item[0][1]):
+            before = self._edges[number]
+            at_m = self._given_back_m(number, [link for _, link in own])
+            own_lanes = tuple(sorted({lane for lane, _ in own}))
+            yield WayOut(self._name(edge), edge, before.name, own_lanes, at_m)
 
     def _closures(
         self,
@@ -403,7 +448,10 @@ class _Derivation:
     ) -> Iterator[Closure]:
         """Yield the closed parts of all lanes."""
         end_m = self._edges[-1].to_m
-        exits_m = {(lane, one.at_m + HANDOVER_M) for one in ways_out for lane in one.lanes}
+        ends_m = {edge.name: edge.to_m for edge in self._edges}
+        exits_m = {
+            (lane, ends_m[one.from_edge]): one.at_m for one in ways_out for lane in one.lanes
+        }
         at_m = {(ramp.lane, ramp.merge_m): ramp.at_m for ramp in ramps}
         for lane in range(lanes):
             closed_m = 0.0
@@ -414,7 +462,6 @@ class _Derivation:
                     if opens_m > closed_m:
                         yield Closure(lane, closed_m, opens_m)
                     closed_m = self._edges[part.last].to_m
-                    if (lane, closed_m) in exits_m:
-                        closed_m -= HANDOVER_M
+                    closed_m = exits_m.get((lane, closed_m), closed_m)
             if closed_m < end_m:
                 yield Closure(lane, closed_m)

@@ -22,7 +22,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
-from laneweave.sim_bridge.corridors.corridor import HANDOVER_M, OPTION, Corridor
+from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor
 from laneweave.sim_bridge.corridors.corridor_arrivals import MAX_WAIT_S, CorridorSetup
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
 from laneweave.sim_bridge.corridors.sumo_network import Lane, Network
@@ -344,18 +344,19 @@ def _beyond(network: Network, corridor: Corridor) -> Iterator[tuple[str, tuple[i
     Positions are distances [m] from the start of the road, along the lane of the corridor.
     """
     last = corridor.edges[-1]
-    ends = [(one.from_edge, one.lanes, one.at_m + HANDOVER_M) for one in corridor.ways_out]
+    ends = [(one.from_edge, one.lanes, one.at_m) for one in corridor.ways_out]
     every = tuple(range(last.first_lane, last.first_lane + last.lanes))
-    ends.append((last.name, every, last.to_m))
-    first = {edge.name: edge.first_lane for edge in corridor.edges}
-    for edge, lanes, exit_m in ends:
-        for lane in network.edges[edge].car_lanes:
-            number = first[edge] + lane.index
+    ends.append((last.name, every, corridor.length_m))
+    edges = {edge.name: edge for edge in corridor.edges}
+    for name, lanes, exit_m in ends:
+        end_m, first = edges[name].to_m, edges[name].first_lane
+        for lane in network.edges[name].car_lanes:
+            number = first + lane.index
             if number in lanes:
-                yield lane.name, (number, exit_m, exit_m - lane.length_m)
+                yield lane.name, (number, exit_m, end_m - lane.length_m)
                 until_m, inside = exit_m + SEEN_BEYOND_M, corridor.edge_numbers
-                for name, from_m in _ahead(network, lane, exit_m, until_m, inside):
-                    yield name, (number, exit_m, from_m)
+                for ahead, from_m in _ahead(network, lane, end_m, until_m, inside):
+                    yield ahead, (number, exit_m, from_m)
 
 
 def _ahead(

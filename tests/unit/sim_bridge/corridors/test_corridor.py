@@ -12,7 +12,13 @@ from attrs import evolve
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Closure
-from laneweave.sim_bridge.corridors.corridor import HANDOVER_M, MIN_AT_M, Corridor, corridor_of
+from laneweave.sim_bridge.corridors.corridor import (
+    HANDOVER_DECEL_MPS2,
+    HANDOVER_M,
+    MIN_AT_M,
+    Corridor,
+    corridor_of,
+)
 from laneweave.sim_bridge.corridors.corridor_search import find_corridors
 from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
 from laneweave.sim_bridge.corridors.scenario_tables import checked_tables, scenario_tables
@@ -22,6 +28,7 @@ from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Networ
 from support.interchange import (
     CORRIDOR,
     LONGEST_CORRIDOR,
+    MAIN_SPEED_MPS,
     RAMP_SPEED_MPS,
     TRUCKS,
     stream,
@@ -143,6 +150,34 @@ def test_types_that_are_too_weak_are_named(
 def test_a_corridor_does_not_end_where_its_lanes_part(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="lane 0 to off; lane 1 to main3"):
         corridor_of(network(tmp_path), "main1", "main2")
+
+
+def test_sumo_has_room_to_brake_where_vehicles_give_way_behind_the_corridor(tmp_path: Path) -> None:
+    whole = network(tmp_path)
+    brakes_m = MAIN_SPEED_MPS**2 / (2.0 * HANDOVER_DECEL_MPS2)
+
+    def with_crossing(length_m: float) -> Network:
+        """The exit gives way; behind main5, after `length_m`, is a traffic light."""
+        links = [evolve(one, state="m") if one.target.edge == "off" else one for one in whole.links]
+        behind, last = (
+            Edge(name, (Lane(f"{name}_0", name, 0, length_m, 3.2, 20.0, allows_cars=True),))
+            for name in ("behind", "last")
+        )
+        links += [Link(lane, behind.lanes[0]) for lane in whole.edges["main5"].lanes]
+        links.append(Link(behind.lanes[0], last.lanes[0], traffic_light="L"))
+        return Network({**whole.edges, "behind": behind, "last": last}, tuple(links))
+
+    corridor = corridor_of(with_crossing(50.0), "main1", "main5")
+    assert corridor.length_m == pytest.approx(1960.0 - brakes_m + 50.0)
+    (exit_,) = corridor.ways_out
+    assert exit_.at_m == pytest.approx(950.0 - brakes_m)
+    assert any((one.lane, one.from_m) == (0, exit_.at_m) for one in corridor.closures)
+    far = corridor_of(with_crossing(200.0), "main1", "main5")
+    assert far.length_m == 1960.0 - HANDOVER_M
+    with pytest.raises(
+        BadInputError, match=r"length of behind: got 50\.0; allowed: at least 67 m"
+    ):
+        corridor_of(with_crossing(50.0), "main1", "behind")
 
 
 def test_more_vehicles_than_the_road_carries_wait(tmp_path: Path) -> None:
