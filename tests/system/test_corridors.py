@@ -57,6 +57,9 @@ def test_real_processes_drive_drawn_corridors(lab: Lab, tmp_path: Path, seed: in
 
 
 def test_corridors_are_listed_described_and_written(lab: Lab, config: Path) -> None:
+    verbose = '<report><verbose value="true"/></report></configuration>'
+    text = config.read_text(encoding="utf-8")
+    config.write_text(text.replace("</configuration>", verbose), encoding="utf-8")
     listed = lab.run_forked("corridor", config)
     assert listed.status == 0, listed
     assert LONGEST_CORRIDOR in listed.out
@@ -101,6 +104,28 @@ def test_what_does_not_fit_is_one_line(
     assert (ended.status, ended.out) == (2, "")
     assert expected in line
     assert not (lab.folder / "run").exists()
+
+
+def test_a_window_without_a_screen_is_refused_in_one_line(
+    lab: Lab, config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    options = "--sumocfg", config, "--corridor", CORRIDOR, "--gui", "--transport", "simulated"
+    ended = lab.run_forked("run", *options, "--out", lab.folder / "run")
+    (line,) = ended.complaints
+    assert ended.status == 1
+    assert "sumo-gui needs a screen" in line
+    assert not (lab.folder / "run").exists()
+
+
+def test_the_volume_of_a_corridor_is_that_of_its_simulation(lab: Lab, config: Path) -> None:
+    written = lab.run_forked("corridor", config, "--corridor", CORRIDOR, "--toml").out
+    file = lab.path("corridor.toml", written)
+    ended = lab.run_forked("sweep", file, "--volumes", "900", "--out", lab.folder / "sweep")
+    (line,) = ended.complaints
+    assert ended.status == 2
+    assert "--volumes: got '900'" in line
+    assert not (lab.folder / "sweep").exists()
 
 
 def test_a_road_that_is_not_that_of_the_corridor_is_refused(lab: Lab, config: Path) -> None:

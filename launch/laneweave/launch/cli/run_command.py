@@ -211,11 +211,16 @@ def run(
 
 
 def _check_sumo_options(settings: Scenario, volume: float | None, *, compare: bool) -> None:
-    """Check options that need a SUMO simulation, or have no effect on one.
+    """Check options that need a SUMO simulation or its window, or have no effect on one.
 
     Raises:
         BadInputError: an option would be ignored.
+        CommandFailedError: there is no screen for the window.
     """
+    if settings.sumo.gui:
+        from laneweave.sim_bridge.sumo.sumo_gui import check_screen
+
+        check_screen()
     if volume is not None and settings.sumo.config:
         raise BadInputError("--volume", volume, SUMO_HAS_DEMAND)
     if compare and not settings.sumo.config:

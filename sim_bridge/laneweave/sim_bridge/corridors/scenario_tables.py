@@ -104,8 +104,10 @@ def _where(field: str, tables: Tables, corridor: Corridor) -> str:
         used_m, open_m = ramp.merge_m - ramp.at_m, ends_m - ramp.merge_m
         return f"on-ramp from {ramp.edge} of {used_m:.0f} m into lane {lane} of {open_m:.0f} m"
     closure = tables["road"]["closures"][number]
-    ends_m = closure.get("from_m", 0.0)
-    return f"end of lane {corridor.lane_name(closure['lane'], ends_m)}"
+    if field.endswith("to_m"):
+        at_m = closure["to_m"]
+        return f"lane {corridor.lane_name(closure['lane'], at_m)}, which begins at {at_m:.0f} m"
+    return f"end of lane {corridor.lane_name(closure['lane'], closure.get('from_m', 0.0))}"
 
 
 def _enough(error: BadInputError) -> str:
@@ -185,6 +187,7 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
         tables, corridor, math.floor(2.0 * SPEED_SHARE * fastest_mps) / 2.0
     )
     formation = tables["formation"]
+    _close_openings_at_the_end(tables, corridor.length_m, max(one.length_m for one in names))
     settled_m = _m(formation["speed_mps"] * formation["settle_s"])
     if settled_m >= corridor.length_m:
         raise BadInputError(OPTION, corridor.name, f"a corridor longer than {settled_m:g} m")
@@ -225,6 +228,15 @@ def _check_widths(corridor: Corridor, names: Mapping[SumoType, str]) -> None:
 
 def _from(demand: CorridorDemand, entrance: str) -> list[Pass]:
     return [one for one in demand.passes if one.entrance == entrance]
+
+
+def _close_openings_at_the_end(tables: Tables, length_m: float, body_m: float) -> None:
+    """Let lanes that open so late that nobody could change into them be closed to the end."""
+    formation = tables["formation"]
+    latest_m = length_m - body_m - formation["speed_mps"] * formation["cycle_s"]
+    for closure in tables["road"]["closures"]:
+        if closure.get("to_m", 0.0) > latest_m:
+            del closure["to_m"]
 
 
 def _volume(veh_per_h: float) -> float:

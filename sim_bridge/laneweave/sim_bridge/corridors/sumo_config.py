@@ -127,7 +127,8 @@ def read_config(file: Path, folder: Path) -> SumoConfig:
     """
     _check_kind(file)
     saved = folder / "saved.sumocfg"
-    command = ("sumo", "-c", str(file.resolve()), "--save-configuration", str(saved))
+    command = ["sumo", "-c", str(file.resolve()), "--save-configuration", str(saved)]
+    command += ["--verbose", "false"]  # it would write into the output of laneweave's command
     try:
         SumoProcess(command).close()
     except SumoFailedError as error:

@@ -21,6 +21,16 @@ _EXACT = 2
 """moveToXY puts a vehicle exactly at a position, whatever its route."""
 
 
+def check_screen() -> None:
+    """Check that there is a screen for a window.
+
+    Raises:
+        CommandFailedError: there is none.
+    """
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        raise CommandFailedError(NO_DISPLAY)
+
+
 class SumoGui:
     """A window of sumo-gui, to be closed."""
 
@@ -35,8 +45,8 @@ class SumoGui:
         Raises:
             CommandFailedError: sumo-gui is not installed, or cannot start.
         """
-        if program == "sumo-gui" and sys.platform == "linux" and not os.environ.get("DISPLAY"):
-            raise CommandFailedError(NO_DISPLAY)
+        if program == "sumo-gui":
+            check_screen()
         package, traci = importlib.util.find_spec("sumo"), load_traci()
         if package is None or package.origin is None or traci is None:
             raise CommandFailedError(MISSING)

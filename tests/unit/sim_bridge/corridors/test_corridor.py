@@ -174,10 +174,16 @@ def test_sumo_has_room_to_brake_where_vehicles_give_way_behind_the_corridor(tmp_
     assert any((one.lane, one.from_m) == (0, exit_.at_m) for one in corridor.closures)
     far = corridor_of(with_crossing(200.0), "main1", "main5")
     assert far.length_m == 1960.0 - HANDOVER_M
-    with pytest.raises(
-        BadInputError, match=r"length of behind: got 50\.0; allowed: at least 67 m"
-    ):
+    with pytest.raises(BadInputError, match=r"length of behind: got 50\.0; allowed: at least 67 m"):
         corridor_of(with_crossing(50.0), "main1", "behind")
+
+
+def test_a_lane_that_begins_just_before_the_end_is_not_used(tmp_path: Path) -> None:
+    found = read_corridor(write_interchange(tmp_path, stream(60), types=TRUCKS), CORRIDOR)
+    beyond = Closure(0, found.corridor.closures[-1].from_m, found.corridor.length_m - 50.0)
+    late = evolve(found.corridor, closures=(*found.corridor.closures[:-1], beyond))
+    closures = checked(late, found.demand)["road"]["closures"]
+    assert closures[-1] == {"lane": 0, "from_m": beyond.from_m}
 
 
 def test_more_vehicles_than_the_road_carries_wait(tmp_path: Path) -> None:
