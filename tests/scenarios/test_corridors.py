@@ -139,6 +139,19 @@ def test_sumo_drives_the_same_vehicles_alone(
     assert "SUMO alone" in page
 
 
+def test_a_vehicle_that_never_comes_to_the_corridor_is_counted(tmp_path: Path) -> None:
+    stands = (
+        '<vehicle id="stands" type="car" depart="0" departPos="200"><route edges="before"/>'
+        '<stop lane="before_0" endPos="220" duration="2000"/></vehicle>'
+    )
+    vehicles = [stands, vehicle("m", 1.0, "main"), vehicle("r", 5.0, "ramp")]
+    summary, _ = drive(scenario(tmp_path, vehicles), tmp_path / "run")
+    assert summary["vehicles"]["demanded"] == 2
+    assert summary["vehicles"]["entered"] == summary["vehicles"]["left"] == 1
+    (waits,) = [one for one in read_trips(tmp_path / "run").values() if one["left_s"] is None]
+    assert (waits["sumo_id"], waits["entrance"]) == ("r", "on")
+
+
 def test_both_runs_have_the_same_vehicles(tmp_path: Path) -> None:
     """Also where SUMO draws them: flows by probability, districts, trips, stops, a scale."""
     routes = [

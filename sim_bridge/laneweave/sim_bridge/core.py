@@ -449,6 +449,8 @@ class BridgeCore:
     def _finish(self, ending: Ending) -> None:
         if self.phase is not TickPhase.ENDED:
             self.phase = TickPhase.ENDED
+            for arrival in self._roadside.never_came if ending is Ending.COMPLETE else ():
+                self._record.on_demanded(arrival)
             for vehicle in self.vehicles.values():
                 self._record.on_still_on_road(vehicle)
             self._record.close(self.t_s, ending)

@@ -28,6 +28,7 @@ from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
 from laneweave.sim_bridge.corridors.sumo_network import Lane, Network
 from laneweave.sim_bridge.corridors.take_over import SEEN_BEYOND_M, Approaching
 from laneweave.sim_bridge.corridors.ways_in import ways_to_ramp, ways_to_start
+from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 _PLANTS = {
@@ -87,6 +88,8 @@ class CorridorWorld(SumoProcess):
         self._shown: dict[str, State] = {}
         self._returned: set[str] = set()
         """Names in SUMO of vehicles that have been given back and have not arrived."""
+        self._elsewhere: list[Arrival] = []
+        """Vehicles that have arrived without coming to their entrances."""
         self._slowing: dict[str, tuple[float, float, float]] = {}
         """When vehicles were given back, their speed then, and the lower limit ahead, by name."""
         self._taken: set[str] = set()
@@ -149,6 +152,12 @@ class CorridorWorld(SumoProcess):
     def exhausted(self) -> bool:
         """Whether no vehicles come to an entrance any more, or they have not come for long."""
         return not self._coming or self.simulation.getTime() >= self._setup.end_s
+
+    @property
+    def outside(self) -> Sequence[Arrival]:
+        """The vehicles that come from elsewhere and have not been taken over."""
+        coming = (one for name, one in self._coming.items() if name not in self._taken)
+        return [*self._elsewhere, *(one.arrival for one in coming if not one.departs_at_start)]
 
     def others(self) -> Sequence[OtherBody]:
         """Return SUMO's own vehicles behind the exits and the end of the road."""
@@ -229,7 +238,7 @@ class CorridorWorld(SumoProcess):
         self._others = None
         for name in self.simulation.getArrivedIDList():
             if name not in self._taken and self._is_ramp_vehicle(name):
-                del self._coming[name]
+                self._elsewhere.append(self._coming.pop(name).arrival)
         on_road = set(api.getIDList())
         for vehicle, state in self._states.items():
             name = self._sumo_name[vehicle]

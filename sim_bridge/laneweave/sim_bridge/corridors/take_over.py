@@ -85,6 +85,10 @@ class OutsideView(Protocol):
     def exhausted(self) -> bool:
         """Whether no vehicles come to an entrance any more."""
 
+    @property
+    def outside(self) -> Sequence[Arrival]:
+        """The vehicles that have not been taken over."""
+
 
 class TakeOver:
     """Takes vehicles over from SUMO; see `OutsideTraffic`."""
@@ -152,6 +156,11 @@ class TakeOver:
     def exhausted(self) -> bool:
         """Whether no more vehicles will come."""
         return self._view.exhausted
+
+    @property
+    def never_came(self) -> Sequence[Arrival]:
+        """The vehicles that were to come, and have not come near an entrance."""
+        return [one for one in self._view.outside if Name(one.vehicle) not in self._known]
 
     @property
     def start_lanes(self) -> Sequence[int]:

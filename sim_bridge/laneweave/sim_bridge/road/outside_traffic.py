@@ -47,3 +47,7 @@ class OutsideTraffic(Protocol):
     @property
     def exhausted(self) -> bool:
         """Whether no more vehicles will come."""
+
+    @property
+    def never_came(self) -> Sequence[Arrival]:
+        """The vehicles that were to come, and have not come near an entrance."""

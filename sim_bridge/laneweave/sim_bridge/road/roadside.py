@@ -471,6 +471,11 @@ class Roadside:
         outside = self._outside_traffic
         return outside is not None and outside.exhausted and t_s >= self._moved_s + STANDING_S
 
+    @property
+    def never_came(self) -> Sequence[Arrival]:
+        """The vehicles that were to come from outside, and have not come near an entrance."""
+        return () if self._outside_traffic is None else self._outside_traffic.never_came
+
     def exhausted(self, t_s: float) -> bool:
         """Return whether no vehicle waits or will arrive."""
         return (

@@ -25,6 +25,7 @@ class View:
     exhausted: bool = False
     start_lanes: tuple[int, ...] = ()
     departing: tuple[Arrival, ...] = ()
+    outside: tuple[Arrival, ...] = ()
 
     def approaching(self, lane: int) -> list[Approaching]:
         return [one for one in self.coming if one.arrival.lane == lane]
