@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from laneweave.sim_bridge.corridors.corridor import Corridor
     from laneweave.sim_bridge.corridors.corridor_search import Candidate
     from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor
-    from laneweave.sim_bridge.corridors.sumo_demand import CorridorDemand, TimeWindow
+    from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
 
 MAX_BEGIN_S = 1e9
 MAX_SCALE = 1e3
@@ -164,24 +164,18 @@ def _remark(one: Candidate, sumocfg: Path) -> str:
     corridor, demand = one.corridor, one.demand
     if corridor is None or demand is None:
         return one.problem
-    unused = f"{len(corridor.unused)} ways not used" if corridor.unused else ""
-    return _problem(corridor, demand, sumocfg) or unused
-
-
-def _problem(corridor: Corridor, demand: CorridorDemand, sumocfg: Path) -> str:
-    """Return why laneweave cannot drive a corridor; empty: it can."""
     from laneweave.sim_bridge.corridors.scenario_tables import checked_tables
 
     try:
         checked_tables(corridor, demand, _sumo_table(sumocfg, corridor))
     except BadInputError as error:
         return str(error)
-    return ""
+    return f"{len(corridor.unused)} ways not used" if corridor.unused else ""
 
 
 def _describe(found: SumoCorridor, sumocfg: Path) -> None:
     """Print what a corridor consists of."""
-    from laneweave.sim_bridge.corridors.scenario_tables import speed_remark
+    from laneweave.sim_bridge.corridors.scenario_tables import checked_tables, remarks
 
     corridor, demand = found.corridor, found.demand
     console = Console(soft_wrap=True)
@@ -201,14 +195,13 @@ def _describe(found: SumoCorridor, sumocfg: Path) -> None:
     for exit_ in corridor.ways_out:
         lanes = ", ".join(map(str, exit_.lanes))
         console.print(f"exit to {escape(exit_.edge)} from lane {lanes} at {exit_.at_m:.0f} m")
-    problem = _problem(corridor, demand, sumocfg)
-    if problem:
-        console.print(f"laneweave cannot drive it: {escape(problem)}")
-    for remark in corridor.unused:
-        console.print(f"not used: {escape(remark)}")
-    remark = speed_remark(corridor, demand)
-    if remark:
-        console.print(escape(remark))
+    try:
+        tables = checked_tables(corridor, demand, _sumo_table(sumocfg, corridor))
+        lines = remarks(corridor, demand, tables)
+    except BadInputError as error:
+        lines = [f"laneweave cannot drive it: {error}"]
+    for line in (*lines, *(f"not used: {remark}" for remark in corridor.unused)):
+        console.print(escape(line))
     console.print(f"{len(demand.passes)} vehicles in {demand.duration_s:.0f} s drive through it")
     for reason, count in sorted(demand.missing.items()):
         console.print(f"left out: {count} vehicles that {escape(reason)}")

@@ -305,12 +305,12 @@ def corridor_scenario(
         raise BadInputError("SCENARIO.toml", str(scenario), allowed)
     from laneweave.launch.cli.corridor_command import corridor_tables, time_window
     from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
-    from laneweave.sim_bridge.corridors.scenario_tables import speed_remark
+    from laneweave.sim_bridge.corridors.scenario_tables import remarks
 
     departures = time_window(**window, duration_s=duration_s)
     own_seed = Scenario().seed if seed is None else seed
     found = read_corridor(sumocfg, corridor, departures, own_seed)
-    remark = speed_remark(found.corridor, found.demand)
-    if remark:
+    tables = corridor_tables(found, sumocfg, departures)
+    for remark in remarks(found.corridor, found.demand, tables):
         typer.echo(remark, err=True)
-    return corridor_tables(found, sumocfg, departures)
+    return tables

@@ -197,7 +197,30 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
     return {"schema": "laneweave.scenario/1", **filled}
 
 
-def speed_remark(corridor: Corridor, demand: CorridorDemand) -> str:
+def remarks(corridor: Corridor, demand: CorridorDemand, tables: Tables) -> list[str]:
+    """Return what makes trips longer than the lanes require, in words.
+
+    Args:
+        corridor: the corridor.
+        demand: its vehicles.
+        tables: the tables of its scenario file.
+    """
+    found = (_speed_remark(corridor, demand), _volume_remark(tables))
+    return [one for one in found if one]
+
+
+def _volume_remark(tables: Tables) -> str:
+    """Return that more vehicles are to enter than the lanes carry; empty: they do not."""
+    try:
+        parse_scenario({name: table for name, table in tables.items() if name != "sumo"})
+    except BadInputError as error:
+        if "volume" in error.field:
+            allowed = f"without waiting {error.allowed}"
+            return f"vehicles wait at the entrances: {error.field} is {error.value:g}, {allowed}"
+    return ""
+
+
+def _speed_remark(corridor: Corridor, demand: CorridorDemand) -> str:
     """Return which type of vehicle makes v_F lower than the lanes allow; empty: none."""
     counts = Counter(one.vehicle.vehicle_type for one in demand.passes)
     slowest = min(counts, key=lambda kind: kind.max_speed_mps, default=None)

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from attrs import evolve
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor, read_corridor
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
-from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables, speed_remark
+from laneweave.sim_bridge.corridors.scenario_tables import remarks, scenario_tables
 from support.interchange import CORRIDOR, LANE_M, TRUCKS, stream, vehicle, write_interchange
 
 KINDS = ("car", "truck")
@@ -26,6 +27,11 @@ def corridor_with(
     assert old in text
     file.write_text(text.replace(old, new), encoding="utf-8")
     return read_corridor(config, CORRIDOR)
+
+
+def remarks_on(found: SumoCorridor) -> list[str]:
+    tables = scenario_tables(found.corridor, found.demand)
+    return remarks(found.corridor, found.demand, tables)
 
 
 def test_trucks_keep_out_of_lanes_that_ban_them(tmp_path: Path) -> None:
@@ -96,8 +102,13 @@ def test_traffic_on_the_left_is_mirrored(tmp_path: Path) -> None:
 def test_a_slow_type_that_lowers_the_speed_of_all_is_named(tmp_path: Path) -> None:
     types = '<vType id="truck" vClass="moped" maxSpeed="12.5" sigma="0"/>'
     found = corridor_with(tmp_path, "<net", "<net", types=types)
-    assert "12.5 m/s, the maximum speed of class moped (9 of 70" in speed_remark(
-        found.corridor, found.demand
-    )
-    fast = corridor_with(tmp_path, "<net", "<net")
-    assert not speed_remark(fast.corridor, fast.demand)
+    (remark,) = remarks_on(found)
+    assert "12.5 m/s, the maximum speed of class moped (9 of 70" in remark
+    assert not remarks_on(corridor_with(tmp_path, "<net", "<net"))
+
+
+def test_it_is_said_that_vehicles_wait_where_lanes_carry_fewer(tmp_path: Path) -> None:
+    found = corridor_with(tmp_path, "<net", "<net")
+    most = evolve(found.demand, duration_s=20.0)
+    (remark,) = remarks(found.corridor, most, scenario_tables(found.corridor, most))
+    assert "vehicles wait at the entrances: demand.volume_veh_per_lane_h is 3600, with" in remark
