@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from laneweave.sim_bridge.corridors.corridor_arrivals import CorridorSetup
+from laneweave.sim_bridge.corridors.corridor_arrivals import MAX_WAIT_S, CorridorSetup
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 
@@ -34,7 +34,8 @@ def drive_alone(
         SumoUnavailableError: libsumo cannot be loaded.
         SumoFailedError: SUMO rejects a file.
     """
-    begin_s, end_s = setup.vehicles.begin_s, setup.end_s
+    # SUMO also drives on after a run of laneweave, as long (`CorridorWorld.drive_on`).
+    begin_s, end_s = setup.vehicles.begin_s, setup.end_s + MAX_WAIT_S
     command = setup.command(setup.vehicles.step_s, seed, folder, results)
     awaited = {*setup.by_name}
     with SumoProcess(command) as sumo:
