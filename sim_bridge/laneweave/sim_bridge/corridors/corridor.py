@@ -34,8 +34,13 @@ MIN_AT_M = 1.0
 HANDOVER_M = 4.0
 """Distance before the end of an edge at which vehicles are given back to SUMO, if they need not
 give way behind it."""
-HANDOVER_DECEL_MPS2 = 3.0
-"""Deceleration for which SUMO has room where vehicles give way, or come to a traffic light."""
+SPEED_SHARE = 0.9
+"""v_F as a share of the speed limit: vehicles that move to a cell ahead are faster."""
+MAX_SPEED_MPS = 60.0
+"""Highest speed of vehicles."""
+REACTION_S, DECEL_MPS2 = 1.0, 4.0
+"""SUMO's defaults, deceleration of trucks: vehicles that are given back stop in this way where they
+give way, or come to a traffic light."""
 OPTION = "--corridor"
 
 
@@ -136,6 +141,11 @@ def unique_name(name: str, taken: Collection[str]) -> str:
     while found in taken:
         found, number = f"{stem}-{number}", number + 1
     return found
+
+
+def braking_m(speed_mps: float) -> float:
+    """Return the distance in which SUMO's vehicles stop."""
+    return speed_mps * REACTION_S + speed_mps**2 / (2.0 * DECEL_MPS2)
 
 
 def corridor_of(
@@ -315,8 +325,8 @@ class _Derivation:
             BadInputError: the edge is too short for SUMO to brake there.
         """
         edge = self._edges[number]
-        fastest_mps = min(lane.speed_mps for one in self._way for lane in one.car_lanes)
-        brakes_m = fastest_mps**2 / (2.0 * HANDOVER_DECEL_MPS2)
+        limit_mps = min(lane.speed_mps for one in self._way for lane in one.car_lanes)
+        brakes_m = braking_m(SPEED_SHARE * min(limit_mps, MAX_SPEED_MPS))
         nearest_m = min((self._gives_way_m(link, brakes_m) for link in links), default=math.inf)
         handover_m = max(HANDOVER_M, brakes_m - nearest_m)
         if handover_m > edge.to_m - edge.from_m:

@@ -24,7 +24,13 @@ from laneweave.protocol.structuring import structure
 from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
 from laneweave.protocol.vehicle.lane_ends import drive_out, own_drive_out
 from laneweave.protocol.wire.messages import CAR
-from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor, Ramp
+from laneweave.sim_bridge.corridors.corridor import (
+    MAX_SPEED_MPS,
+    OPTION,
+    SPEED_SHARE,
+    Corridor,
+    Ramp,
+)
 from laneweave.sim_bridge.corridors.sumo_demand import (
     CorridorDemand,
     Pass,
@@ -32,10 +38,6 @@ from laneweave.sim_bridge.corridors.sumo_demand import (
     type_names,
 )
 
-SPEED_SHARE = 0.9
-"""v_F as a share of the speed limit: vehicles that move to a cell ahead are faster."""
-MAX_SPEED_MPS = 60.0
-"""Highest speed of vehicles."""
 MAX_VOLUME_VEH_PER_H = 3600.0
 MIN_SETTLE_S = 1.0
 SPARE_PITCH_M = 2.0

@@ -13,10 +13,11 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Closure
 from laneweave.sim_bridge.corridors.corridor import (
-    HANDOVER_DECEL_MPS2,
     HANDOVER_M,
     MIN_AT_M,
+    SPEED_SHARE,
     Corridor,
+    braking_m,
     corridor_of,
 )
 from laneweave.sim_bridge.corridors.corridor_search import find_corridors
@@ -154,7 +155,8 @@ def test_a_corridor_does_not_end_where_its_lanes_part(tmp_path: Path) -> None:
 
 def test_sumo_has_room_to_brake_where_vehicles_give_way_behind_the_corridor(tmp_path: Path) -> None:
     whole = network(tmp_path)
-    brakes_m = MAIN_SPEED_MPS**2 / (2.0 * HANDOVER_DECEL_MPS2)
+    brakes_m = braking_m(SPEED_SHARE * MAIN_SPEED_MPS)
+    assert brakes_m == pytest.approx(103.1, abs=0.1)
 
     def with_crossing(length_m: float) -> Network:
         """The exit gives way; behind main5, after `length_m`, is a traffic light."""
@@ -174,7 +176,7 @@ def test_sumo_has_room_to_brake_where_vehicles_give_way_behind_the_corridor(tmp_
     assert any((one.lane, one.from_m) == (0, exit_.at_m) for one in corridor.closures)
     far = corridor_of(with_crossing(200.0), "main1", "main5")
     assert far.length_m == 1960.0 - HANDOVER_M
-    with pytest.raises(BadInputError, match=r"length of behind: got 50\.0; allowed: at least 67 m"):
+    with pytest.raises(BadInputError, match=r"length of behind: got 50\.0; allowed: at least 58 m"):
         corridor_of(with_crossing(50.0), "main1", "behind")
 
 
