@@ -45,6 +45,9 @@ SLOWS_MPS2, SLOWS_S = 0.5, 5.0
 """Deceleration of a vehicle that is given back before a lower limit, and for how long at most. SUMO
 would brake it as hard as its type allows, and a truck one column behind, which is still inside,
 would brake in an emergency."""
+SLOWING_TAU_S = 0.5
+"""Headway that SUMO keeps meanwhile: vehicles of the lattice are closer than most of its drivers,
+and it would brake them to get farther apart."""
 MAX_DISPLAY_ERROR_M = 0.1
 """Maximum distance between a body and where SUMO displays it."""
 
@@ -90,8 +93,9 @@ class CorridorWorld(SumoProcess):
         """Names in SUMO of vehicles that have been given back and have not arrived."""
         self._elsewhere: list[Arrival] = []
         """Vehicles that have arrived without coming to their entrances."""
-        self._slowing: dict[str, tuple[float, float, float]] = {}
-        """When vehicles were given back, their speed then, and the lower limit ahead, by name."""
+        self._slowing: dict[str, tuple[float, float, float, float]] = {}
+        """When vehicles were given back, their speed then, the lower limit ahead, and the headway
+        of their own, by name."""
         self._taken: set[str] = set()
         """Names in SUMO of vehicles that have been taken over."""
         upstream = any(one.origin.upstream for one in setup.arrivals)
@@ -283,8 +287,10 @@ class CorridorWorld(SumoProcess):
         self._correct_route(name)
         limit_mps = self._next_limit_mps(name)
         if state[1] > limit_mps:
-            self._slowing[name] = self.simulation.getTime(), state[1], limit_mps
+            tau_s = api.getTau(name)
+            self._slowing[name] = self.simulation.getTime(), state[1], limit_mps, tau_s
             api.setSpeedMode(name, _SLOWING_MODE)
+            api.setTau(name, min(tau_s, SLOWING_TAU_S))
 
     def _correct_route(self, name: str) -> None:
         """Give a vehicle that leaves elsewhere than its route does a route from there.
@@ -316,13 +322,14 @@ class CorridorWorld(SumoProcess):
     def _advance(self) -> None:
         """Advance SUMO; vehicles that have been given back before a lower limit slow down."""
         api, now_s = self.vehicle, self.simulation.getTime()
-        for name, (since_s, speed_mps, limit_mps) in [*self._slowing.items()]:
+        for name, (since_s, speed_mps, limit_mps, tau_s) in [*self._slowing.items()]:
             slower_mps = speed_mps - SLOWS_MPS2 * (now_s - since_s)
             if now_s < since_s + SLOWS_S and slower_mps > limit_mps:
                 api.setSpeed(name, slower_mps)
             else:
                 api.setSpeed(name, -1.0)
                 api.setSpeedMode(name, _OWN_SPEED_MODE)
+                api.setTau(name, tau_s)
                 del self._slowing[name]
         super().step()
         arrived = self.simulation.getArrivedIDList()
