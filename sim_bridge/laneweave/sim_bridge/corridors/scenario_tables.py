@@ -346,6 +346,9 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
     if settle_s < MIN_SETTLE_S:
         name = min(ramps_m, key=ramps_m.__getitem__)
         edge = next(ramp.edge for ramp in corridor.ramps if ramp.name == name)
+        if not next(ramp.path for ramp in corridor.ramps if ramp.name == name):
+            allowed = "on-ramps whose vehicles have priority where their acceleration lanes begin"
+            raise BadInputError(f"{OPTION} {corridor.name}, on-ramp", edge, allowed)
         raise BadInputError(
             f"{OPTION} {corridor.name}, length of the on-ramp from {edge}",
             round(max(ramps_m[name], 0.0), 1),

@@ -119,6 +119,9 @@ def test_what_does_not_fit_is_named_as_in_the_network(tmp_path: Path) -> None:
         BadInputError, match=r"on-ramp from on of 345 m into lane main4_0 of 50 m \(entrance"
     ):
         checked(late, found.demand)
+    gives_way = evolve(found.corridor, ramps=(evolve(ramp, path=(), at_m=ramp.merge_m),))
+    with pytest.raises(BadInputError, match="on-ramp: got 'on'; allowed: on-ramps whose vehicles"):
+        checked(gives_way, found.demand)
     others = found.corridor.closures[1:]
     early = evolve(found.corridor, closures=(evolve(opening, to_m=900.0), *others))
     with pytest.raises(
