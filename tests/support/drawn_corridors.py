@@ -179,7 +179,7 @@ def _draw_vehicles(main: _Main, first: int) -> Iterator[tuple[float, str]]:
     for lane in range(main.lanes):
         t_s = rng.uniform(0.0, 5.0)
         mean_s = 3600.0 / rng.uniform(300.0, 1300.0)
-        while t_s < DEMAND_S:
+        while round(t_s, 2) < DEMAND_S:
             begin = rng.choice((0, 0, first))
             route = main.main[begin:]
             if main.exits and rng.random() < to_exit:
@@ -191,7 +191,7 @@ def _draw_vehicles(main: _Main, first: int) -> Iterator[tuple[float, str]]:
             t_s += 1.0 + rng.expovariate(1.0 / max(mean_s - 1.0, 0.5))
     for name, number in main.ramps:
         t_s, mean_s = rng.uniform(0.0, 9.0), 3600.0 / rng.uniform(100.0, 450.0)
-        while t_s < DEMAND_S:
+        while round(t_s, 2) < DEMAND_S:
             edges = [name, *([name.replace("far", "on")] if name.startswith("far") else [])]
             if rng.random() < 0.2:
                 edges = edges[-1:]

@@ -317,6 +317,7 @@ class Gate:
     room: bool = True
     exhausted: bool = False
     start_lanes: tuple[int, ...] = ()
+    never_came: tuple[Arrival, ...] = ()
 
     def demanded(self, _: float) -> list[Arrival]:
         return []
