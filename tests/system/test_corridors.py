@@ -13,8 +13,18 @@ import pytest
 
 from support.commands import run
 from support.drawn_corridors import draw_corridor, problems
-from support.harness import Lab, check_safe_and_complete, summary, trips
+from support.harness import Ended, Lab, check_safe_and_complete, summary, trips
 from support.interchange import CORRIDOR, LONGEST_CORRIDOR, TRUCKS, stream, write_interchange
+
+
+def refused(lab: Lab, *words: object, expected: str, status: int = 2) -> Ended:
+    """Run a command that is refused in one line, and check that it leaves no folder."""
+    ended = lab.run_forked(*words, "--out", lab.folder / "out")
+    (line,) = ended.complaints
+    assert ended.status == status
+    assert expected in line
+    assert not (lab.folder / "out").exists()
+    return ended
 
 
 @pytest.fixture
@@ -99,11 +109,7 @@ def test_what_does_not_fit_is_one_line(
     lab: Lab, config: Path, options: tuple[str, ...], expected: str
 ) -> None:
     words = [config if word == "CONFIG" else word for word in options]
-    ended = lab.run_forked("run", *words, "--out", lab.folder / "run")
-    (line,) = ended.complaints
-    assert (ended.status, ended.out) == (2, "")
-    assert expected in line
-    assert not (lab.folder / "run").exists()
+    assert refused(lab, "run", *words, expected=expected).out == ""
 
 
 def test_a_window_without_a_screen_is_refused_in_one_line(
@@ -111,30 +117,20 @@ def test_a_window_without_a_screen_is_refused_in_one_line(
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     options = "--sumocfg", config, "--corridor", CORRIDOR, "--gui", "--transport", "simulated"
-    ended = lab.run_forked("run", *options, "--out", lab.folder / "run")
-    (line,) = ended.complaints
-    assert ended.status == 1
-    assert "sumo-gui needs a screen" in line
-    assert not (lab.folder / "run").exists()
+    refused(lab, "run", *options, expected="sumo-gui needs a screen", status=1)
 
 
 def test_the_volume_of_a_corridor_is_that_of_its_simulation(lab: Lab, config: Path) -> None:
     written = lab.run_forked("corridor", config, "--corridor", CORRIDOR, "--toml").out
     file = lab.path("corridor.toml", written)
-    ended = lab.run_forked("sweep", file, "--volumes", "900", "--out", lab.folder / "sweep")
-    (line,) = ended.complaints
-    assert ended.status == 2
-    assert "--volumes: got '900'" in line
-    assert not (lab.folder / "sweep").exists()
+    refused(lab, "sweep", file, "--volumes", "900", expected="--volumes: got '900'")
 
 
 def test_a_road_that_is_not_that_of_the_corridor_is_refused(lab: Lab, config: Path) -> None:
     written = lab.run_forked("corridor", config, "--corridor", CORRIDOR, "--toml").out
     wrong = lab.path("wrong.toml", written.replace("lane_width_m = 3.2", "lane_width_m = 3.3"))
-    ended = lab.run_forked("run", wrong, "--transport", "simulated", "--out", lab.folder / "run")
-    (line,) = ended.complaints
-    assert ended.status == 2
-    assert "road.lane_width_m: got 3.3; allowed: 3.2, as the corridor main1:main5 has" in line
+    expected = "road.lane_width_m: got 3.3; allowed: 3.2, as the corridor main1:main5 has"
+    refused(lab, "run", wrong, "--transport", "simulated", expected=expected)
 
 
 def test_a_network_from_opendrive(lab: Lab, config: Path) -> None:

@@ -87,7 +87,7 @@ class BadInputError(ValueError):
             shown = _SHORT.repr(self.value)
         except ValueError:  # an integer with thousands of digits
             shown = f"a huge {type(self.value).__name__}"
-        field, value, allowed = one_line(self.field, 240), one_line(shown, 80), self.allowed
+        field, value, allowed = one_line(self.field, 180), one_line(shown, 80), self.allowed
         line = f"{field}: got {value}; allowed: {one_line(allowed)}"
         suggestion = self.suggestion
         if suggestion:

@@ -34,7 +34,7 @@ def test_an_error_is_one_short_readable_line(value: object) -> None:
         line = str(BadInputError(field, value, "what is allowed"))
         assert len(line.splitlines()) == 1
         assert line.isprintable()
-        assert len(line) < 400
+        assert len(line) < 300
         assert line.endswith("; allowed: what is allowed")
 
 
