@@ -1,4 +1,4 @@
-"""An oracle for runs on corridors: what the run has recorded and SUMO reports, no bridge code."""
+"""An oracle for runs on corridors: it reads recordings and SUMO's output, and no bridge code."""
 
 from __future__ import annotations
 

@@ -84,6 +84,18 @@ def scenario_problems(scenario: Scenario) -> Iterator[BadInputError]:
             yield error
 
 
+def check_volumes(scenario: Scenario) -> None:
+    """Check that the lanes carry the volumes, whether vehicles are drawn or those of SUMO.
+
+    Vehicles of SUMO that cannot enter wait, so that `check_scenario` allows any volume of them.
+
+    Raises:
+        BadInputError: a volume is too high.
+    """
+    _check_lane_volumes(scenario)
+    _check_capacity(scenario)
+
+
 def effect_problems(data: Mapping[str, Any], scenario: Scenario) -> Iterator[BadInputError]:
     """Yield an error for each value in a file that has no effect in the resulting scenario."""
     formation, given = scenario.formation, data.get("formation", {})
@@ -130,10 +142,10 @@ def _check_lanes(scenario: Scenario) -> None:
     what = f"the largest width_m and {MIN_SIDE_GAP_M:g} between bodies side by side"
     _compare(scenario, [("road.lane_width_m", "at least", width_m, what)])
     if scenario.draws_vehicles:
-        _check_volumes(scenario)
+        _check_lane_volumes(scenario)
 
 
-def _check_volumes(scenario: Scenario) -> None:
+def _check_lane_volumes(scenario: Scenario) -> None:
     """Check that vehicles can enter each lane as often as its volume says."""
     road, demand = scenario.road, scenario.demand
     ramps = {
@@ -455,11 +467,16 @@ def _check_exits(scenario: Scenario) -> None:
             )
 
 
+def _check_drawn_capacity(scenario: Scenario) -> None:
+    if scenario.draws_vehicles:
+        _check_capacity(scenario)
+
+
 def _check_capacity(scenario: Scenario) -> None:
     """Check that the lanes that are open can carry the demand everywhere."""
     road, bound = scenario.road, scenario.formation.bound_veh_per_lane_h
-    if not road.closures or not scenario.draws_vehicles:
-        return  # the bound of the entrance holds everywhere, or vehicles wait until they can enter
+    if not road.closures:
+        return  # the bound of the entrance holds everywhere
     exits_m = {one.name: one.at_m for one in scenario.exit}
     parts = [
         (scenario.entry_m[lane], inflow.volume_veh_per_h * share, exits_m.get(name, math.inf))
@@ -827,7 +844,7 @@ _CHECKS = (
         _check_entrances,
         _check_dead_ends,
         _check_exits,
-        _check_capacity,
+        _check_drawn_capacity,
         _check_destinations,
         _check_structures,
         _check_timing,

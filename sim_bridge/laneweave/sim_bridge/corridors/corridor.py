@@ -39,8 +39,8 @@ SPEED_SHARE = 0.9
 MAX_SPEED_MPS = 60.0
 """Highest speed of vehicles."""
 REACTION_S, DECEL_MPS2 = 1.0, 4.0
-"""SUMO's defaults, deceleration of trucks: vehicles that are given back stop in this way where they
-give way, or come to a traffic light."""
+"""Reaction time of SUMO's default drivers, and deceleration of its default trucks, with which
+vehicles that are given back stop before crossings and traffic lights."""
 OPTION = "--corridor"
 
 
@@ -257,6 +257,7 @@ class _Derivation:
         self._departing = departing
         self._way = way
         self._names = {edge.name for edge in way}
+        self._limit_mps = min(lane.speed_mps for edge in way for lane in edge.car_lanes)
         self._links = [through_links(network, *pair) for pair in pairwise(way)]
         first_lanes, at_m = [0], 0.0
         places_m = []
@@ -296,7 +297,6 @@ class _Derivation:
                 )
                 name = f"{self._way[0].name}:{self._way[-1].name}"
                 raise BadInputError(OPTION, name, allowed)
-        used = [lane for edge in self._way for lane in edge.car_lanes]
         ways_out = tuple(self._ways_out(parts))
         return Corridor(
             edges=self._edges,
@@ -309,8 +309,8 @@ class _Derivation:
                     for link in self._network.links_from(lane)
                 ],
             ),
-            lane_width_m=min(lane.width_m for lane in used),
-            speed_mps=min(lane.speed_mps for lane in used),
+            lane_width_m=min(lane.width_m for edge in self._way for lane in edge.car_lanes),
+            speed_mps=self._limit_mps,
             closures=tuple(self._closures(parts, lanes, ramps, ways_out)),
             ramps=ramps,
             ways_out=ways_out,
@@ -325,8 +325,7 @@ class _Derivation:
             BadInputError: the edge is too short for SUMO to brake there.
         """
         edge = self._edges[number]
-        limit_mps = min(lane.speed_mps for one in self._way for lane in one.car_lanes)
-        brakes_m = braking_m(SPEED_SHARE * min(limit_mps, MAX_SPEED_MPS))
+        brakes_m = braking_m(SPEED_SHARE * min(self._limit_mps, MAX_SPEED_MPS))
         nearest_m = min((self._gives_way_m(link, brakes_m) for link in links), default=math.inf)
         handover_m = max(HANDOVER_M, brakes_m - nearest_m)
         if handover_m > edge.to_m - edge.from_m:
@@ -458,10 +457,7 @@ class _Derivation:
     ) -> Iterator[Closure]:
         """Yield the closed parts of all lanes."""
         end_m = self._edges[-1].to_m
-        ends_m = {edge.name: edge.to_m for edge in self._edges}
-        exits_m = {
-            (lane, ends_m[one.from_edge]): one.at_m for one in ways_out for lane in one.lanes
-        }
+        exits_m = {(lane, one.from_edge): one.at_m for one in ways_out for lane in one.lanes}
         at_m = {(ramp.lane, ramp.merge_m): ramp.at_m for ramp in ramps}
         for lane in range(lanes):
             closed_m = 0.0
@@ -471,7 +467,7 @@ class _Derivation:
                     opens_m = at_m.get((lane, begins_m), begins_m)
                     if opens_m > closed_m:
                         yield Closure(lane, closed_m, opens_m)
-                    closed_m = self._edges[part.last].to_m
-                    closed_m = exits_m.get((lane, closed_m), closed_m)
+                    last = self._edges[part.last]
+                    closed_m = exits_m.get((lane, last.name), last.to_m)
             if closed_m < end_m:
                 yield Closure(lane, closed_m)

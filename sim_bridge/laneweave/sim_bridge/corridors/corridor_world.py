@@ -15,7 +15,7 @@ import math
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
-from attrs import evolve
+from attrs import evolve, frozen
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
@@ -46,10 +46,24 @@ SLOWS_MPS2, SLOWS_S = 0.5, 5.0
 would brake it as hard as its type allows, and a truck one column behind, which is still inside,
 would brake in an emergency."""
 SLOWING_TAU_S = 0.5
-"""Headway that SUMO keeps meanwhile: vehicles of the lattice are closer than most of its drivers,
-and it would brake them to get farther apart."""
+"""Headway that SUMO keeps meanwhile. That of the lattice may be shorter than SUMO's default, 1 s,
+and SUMO would brake to lengthen it."""
 MAX_DISPLAY_ERROR_M = 0.1
 """Maximum distance between a body and where SUMO displays it."""
+
+
+@frozen
+class _Slowing:
+    """A vehicle that has been given back before a lower speed limit."""
+
+    since_s: float
+    """SUMO's time at which it was given back."""
+    speed_mps: float
+    """Its speed then."""
+    limit_mps: float
+    """The limit ahead."""
+    tau_s: float
+    """The headway of its type in SUMO."""
 
 
 class CorridorWorld(SumoProcess):
@@ -93,9 +107,8 @@ class CorridorWorld(SumoProcess):
         """Names in SUMO of vehicles that have been given back and have not arrived."""
         self._elsewhere: list[Arrival] = []
         """Vehicles that have arrived without coming to their entrances."""
-        self._slowing: dict[str, tuple[float, float, float, float]] = {}
-        """When vehicles were given back, their speed then, the lower limit ahead, and the headway
-        of their own, by name."""
+        self._slowing: dict[str, _Slowing] = {}
+        """Vehicles that slow down since a lower limit is ahead, by name."""
         self._taken: set[str] = set()
         """Names in SUMO of vehicles that have been taken over."""
         upstream = any(one.origin.upstream for one in setup.arrivals)
@@ -288,7 +301,8 @@ class CorridorWorld(SumoProcess):
         limit_mps = self._next_limit_mps(name)
         if state[1] > limit_mps:
             tau_s = api.getTau(name)
-            self._slowing[name] = self.simulation.getTime(), state[1], limit_mps, tau_s
+            now_s = self.simulation.getTime()
+            self._slowing[name] = _Slowing(now_s, state[1], limit_mps, tau_s)
             api.setSpeedMode(name, _SLOWING_MODE)
             api.setTau(name, min(tau_s, SLOWING_TAU_S))
 
@@ -322,14 +336,14 @@ class CorridorWorld(SumoProcess):
     def _advance(self) -> None:
         """Advance SUMO; vehicles that have been given back before a lower limit slow down."""
         api, now_s = self.vehicle, self.simulation.getTime()
-        for name, (since_s, speed_mps, limit_mps, tau_s) in [*self._slowing.items()]:
-            slower_mps = speed_mps - SLOWS_MPS2 * (now_s - since_s)
-            if now_s < since_s + SLOWS_S and slower_mps > limit_mps:
+        for name, one in [*self._slowing.items()]:
+            slower_mps = one.speed_mps - SLOWS_MPS2 * (now_s - one.since_s)
+            if now_s < one.since_s + SLOWS_S and slower_mps > one.limit_mps:
                 api.setSpeed(name, slower_mps)
             else:
                 api.setSpeed(name, -1.0)
                 api.setSpeedMode(name, _OWN_SPEED_MODE)
-                api.setTau(name, tau_s)
+                api.setTau(name, one.tau_s)
                 del self._slowing[name]
         super().step()
         arrived = self.simulation.getArrivedIDList()

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from laneweave.protocol.config.cross_checks import MIN_SIDE_GAP_M
+from laneweave.protocol.config.cross_checks import MIN_SIDE_GAP_M, check_volumes
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
@@ -212,13 +212,12 @@ def remarks(corridor: Corridor, demand: CorridorDemand, tables: Tables) -> list[
 
 
 def _volume_remark(tables: Tables) -> str:
-    """Return that more vehicles are to enter than the lanes carry; empty: they do not."""
+    """Return which volume exceeds what the lanes carry; empty: none."""
     try:
-        parse_scenario({name: table for name, table in tables.items() if name != "sumo"})
+        check_volumes(structure(tables, Scenario))
     except BadInputError as error:
-        if "volume" in error.field:
-            allowed = f"without waiting {error.allowed}"
-            return f"vehicles wait at the entrances: {error.field} is {error.value:g}, {allowed}"
+        allowed = f"without waiting {error.allowed}"
+        return f"vehicles wait at the entrances: {error.field} is {error.value:g}, {allowed}"
     return ""
 
 
@@ -256,7 +255,7 @@ def _from(demand: CorridorDemand, entrance: str) -> list[Pass]:
 
 
 def _close_openings_at_the_end(tables: Tables, length_m: float, body_m: float) -> None:
-    """Let lanes that open so late that nobody could change into them be closed to the end."""
+    """Close lanes to the end that open so late that no vehicle can change into them."""
     formation = tables["formation"]
     latest_m = length_m - body_m - formation["speed_mps"] * formation["cycle_s"]
     for closure in tables["road"]["closures"]:
@@ -345,12 +344,12 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
     settle_s = min([MAX_SETTLE_S, *(length_m / speed_mps for length_m in ramps_m.values())])
     if settle_s < MIN_SETTLE_S:
         name = min(ramps_m, key=ramps_m.__getitem__)
-        edge = next(ramp.edge for ramp in corridor.ramps if ramp.name == name)
-        if not next(ramp.path for ramp in corridor.ramps if ramp.name == name):
+        ramp = next(one for one in corridor.ramps if one.name == name)
+        if not ramp.path:
             allowed = "on-ramps whose vehicles have priority where their acceleration lanes begin"
-            raise BadInputError(f"{OPTION} {corridor.name}, on-ramp", edge, allowed)
+            raise BadInputError(f"{OPTION} {corridor.name}, on-ramp", ramp.edge, allowed)
         raise BadInputError(
-            f"{OPTION} {corridor.name}, length of the on-ramp from {edge}",
+            f"{OPTION} {corridor.name}, length of the on-ramp from {ramp.edge}",
             round(max(ramps_m[name], 0.0), 1),
             f"at least {MIN_SETTLE_S * speed_mps:g} m, for {speed_mps:g} m/s",
         )

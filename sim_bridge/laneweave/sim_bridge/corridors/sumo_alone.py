@@ -34,7 +34,7 @@ def drive_alone(
         SumoUnavailableError: libsumo cannot be loaded.
         SumoFailedError: SUMO rejects a file.
     """
-    # SUMO also drives on after a run of laneweave, as long (`CorridorWorld.drive_on`).
+    # After a run of laneweave, SUMO drives on for up to this time (`CorridorWorld.drive_on`).
     begin_s, end_s = setup.vehicles.begin_s, setup.end_s + MAX_WAIT_S
     command = setup.command(setup.vehicles.step_s, seed, folder, results)
     awaited = {*setup.by_name}

@@ -36,10 +36,10 @@ _MAX_REORDERED = 13
 _IDLE_ROUNDS = 200
 """Maximum number of rounds spent only on cheaper paths, when no reachable lane is missed."""
 _IDLE_SOFTNESS = 3.0
-_OTHER_STAYING_AFTER = 100
-"""Number of rounds after which it is or is not penalized to stay in the place of another vehicle.
-If it is, paths lead through others to free cells behind them: in dense traffic such chains are
-short, but one who passes only pushes another out of a place that both could have had."""
+_STAYING_CHANGES_EVERY = 100
+"""Number of rounds after which the penalty for staying in another vehicle's place is switched off
+or on again. With it, paths lead on through others to free cells beyond them, which keeps chains
+short in dense traffic. Without it, the other vehicle moves to the free cell."""
 _ROUNDING = 1e-4
 
 
@@ -265,7 +265,7 @@ def _list_costly(paths, off_lane, costly):
 
 @njit(cache=True, nogil=True)
 def _change_staying(table, paths):
-    """Penalize it to stay where another vehicle stays, or no longer."""
+    """Switch the penalty for staying in another vehicle's place off, or on again."""
     for v in range(len(paths.cost)):
         put(table, paths, v, -1)
     for k in range(table.first[0], table.first[1]):
@@ -295,7 +295,7 @@ def improve(table, paths, costs, rounds, max_paths, rng, scratch):
             slack = max(slack, _FIRST_SLACK * (1.0 - done / _COOLED_AFTER))
         else:
             idle += 1
-        if missing_count > 0 and turn % _OTHER_STAYING_AFTER == _OTHER_STAYING_AFTER - 1:
+        if missing_count > 0 and (turn + 1) % _STAYING_CHANGES_EVERY == 0:
             _change_staying(table, paths)
         if missing_count > 0 and turn % _REORDER_EVERY > 0:
             v = off_lane[random_below(rng, missing_count)]

@@ -187,7 +187,7 @@ def test_others_make_room_for_a_vehicle_that_does_not_change_columns() -> None:
 
 @pytest.mark.parametrize("gaps", [(), (3,), (1, 2, 4)])
 def test_others_leave_a_lane_in_which_they_could_stay(gaps: tuple[int, ...]) -> None:
-    """Beside the end of a lane, one who moves to the third lane costs less than one who misses."""
+    """A move to the third lane costs less than a vehicle beside it that cannot leave its lane."""
     road = lanes(LaneSection(0, to_m=800.0, exit="off"), *through(1, 2))
     vehicles = [
         StreamVehicle(f"{lane}-{column}", (column, lane), {1, 2}, moves=LATERAL)
