@@ -17,7 +17,7 @@ from laneweave.launch.report.corridor_comparison import ALONE_FOLDER, compare
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
-from laneweave.sim_bridge.corridors import corridor_arrivals, sumo_statistics
+from laneweave.sim_bridge.corridors import corridor_setup, sumo_statistics
 from laneweave.sim_bridge.corridors.corridor_setup import WHOLE, read_corridor
 from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
 from laneweave.sim_bridge.corridors.sumo_statistics import read_statistics
@@ -315,7 +315,7 @@ def test_vehicles_wait_at_the_start_while_their_exit_is_full(tmp_path: Path) -> 
 def test_a_run_ends_although_an_exit_remains_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(corridor_arrivals, "MAX_WAIT_S", 60.0)
+    monkeypatch.setattr(corridor_setup, "MAX_WAIT_S", 60.0)
     blocked = standing_vehicle(0, 40, 'duration="100000"')
     leaving = [vehicle(f"e{n}", 3.0 * n, "exit") for n in range(9)]
     own = scenario(tmp_path, [blocked, *leaving, vehicle("m", 24.0, "main")])

@@ -11,7 +11,6 @@ from attrs import field, frozen
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.corridors.corridor_arrivals import main_stream
 from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor, read_corridor
 from laneweave.sim_bridge.corridors.corridor_world import CorridorWorld
 from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
@@ -58,11 +57,11 @@ def open_road(scenario: Scenario, results: Path) -> Iterator[RoadSource]:
             return
         found = sumo_corridor(scenario)
         setup = found.setup(scenario)
-        with CorridorWorld(scenario, setup, folder, results) as world_of_sumo:
+        with CorridorWorld(setup, folder, results) as world_of_sumo:
             if scenario.sumo.gui:
                 world_of_sumo.show(scenario.runtime.tick_s)
             ramps = TakeOver(scenario, world_of_sumo)
-            stream = tuple(main_stream(setup.arrivals))
+            stream = tuple(one.arrival for one in setup.arrivals if one.departs_at_start)
             yield RoadSource(world_of_sumo, stream, ramps, found.demand.missing)
             world_of_sumo.drive_on()
 

@@ -60,7 +60,7 @@ def compare(
     alone.mkdir(exist_ok=True)
     with temporary_folder("sumo") as temporary:
         setup = sumo_corridor(scenario).setup(scenario)
-        drive_alone(setup, scenario.seed, temporary, alone, progress)
+        drive_alone(setup, temporary, alone, progress)
     found = read_statistics(folder), read_statistics(alone)
     routes = _by_route(setup.arrivals, found)
     tables = [_times_table(routes), _events_table(found), _shortfalls_table(folder, routes)]

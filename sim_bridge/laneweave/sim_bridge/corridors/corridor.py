@@ -127,6 +127,16 @@ class Corridor:
         edge = edges[-1] if edges else self.edges[0]
         return f"{edge.name}_{lane - edge.first_lane}"
 
+    def opens_m(self, lanes: Collection[int], before_m: float) -> float:
+        """Return where the last of some lanes opens before a position; -inf: at the start."""
+        opens_m = [one.to_m for one in self.closures if one.lane in lanes and one.to_m < before_m]
+        return max(opens_m, default=-math.inf)
+
+    def ends_m(self, lane: int, behind_m: float) -> float:
+        """Return where a lane ends behind a position; infinite: it does not end."""
+        ends_m = [one.from_m for one in self.closures if one.lane == lane]
+        return min((end_m for end_m in ends_m if end_m > behind_m), default=math.inf)
+
     @cached_property
     def edge_numbers(self) -> Mapping[str, int]:
         """The numbers of its edges, by name."""

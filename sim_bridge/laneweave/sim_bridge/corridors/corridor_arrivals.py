@@ -10,9 +10,8 @@ when SUMO has driven them there.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property, partial
-from pathlib import Path
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 
 from attrs import frozen
 
@@ -22,27 +21,17 @@ from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.corridors.corridor import Corridor
-from laneweave.sim_bridge.corridors.sumo_config import NO_OPTIONS, SumoConfig
 from laneweave.sim_bridge.corridors.sumo_demand import (
-    AT_START,
     LIMITS,
     CorridorDemand,
     Pass,
-    SumoDemand,
     SumoType,
     type_names,
 )
-from laneweave.sim_bridge.corridors.sumo_network import Network
-from laneweave.sim_bridge.corridors.sumo_statistics import output_options
-from laneweave.sim_bridge.corridors.ways_in import ways_to_ramp, ways_to_start
 from laneweave.sim_bridge.road.demand import Arrival
 
-MAX_WAIT_S = 600.0
-"""Time after the last departure for which vehicles on their way to a ramp are awaited."""
 FIRST_ENTRY_S = 1.0
 """Road time before which no vehicle enters, so that agents can be announced."""
-_FIRST_SIMULATION = ("device.rerouting.", "end", "scale", "begin", "step-length")
-"""Options that have determined the vehicles and their routes; they do not apply once more."""
 
 
 @frozen
@@ -63,95 +52,20 @@ class CorridorArrival:
         return self.origin.entrance == MAIN_ENTRANCE and not self.origin.upstream
 
 
-@frozen(slots=False)
-class CorridorSetup:
-    """Everything that the simulation of a corridor consists of."""
-
-    config: SumoConfig
-    network: Network
-    corridor: Corridor
-    vehicles: SumoDemand
-    """All vehicles, inside the corridor and outside."""
-    arrivals: tuple[CorridorArrival, ...]
-    left_out: frozenset[str] = frozenset()
-    """Names in SUMO of vehicles with routes through the corridor that are not simulated."""
-
-    @cached_property
-    def by_name(self) -> Mapping[str, CorridorArrival]:
-        """Its vehicles by their names in SUMO."""
-        return {one.origin.vehicle.name: one for one in self.arrivals}
-
-    @property
-    def end_s(self) -> float:
-        """SUMO's time until which vehicles are awaited."""
-        return self.vehicles.end_s + MAX_WAIT_S
-
-    def command(
-        self,
-        step_s: float,
-        seed: int,
-        folder: Path,
-        results: Path | None,
-        more: Mapping[str, str] = NO_OPTIONS,
-        *,
-        speed_mps: float | None = None,
-    ) -> Sequence[str]:
-        """Write the files of a simulation of these vehicles, and return SUMO's command line.
-
-        Args:
-            step_s: length of a step.
-            seed: seed, unless the configuration has one.
-            folder: folder for temporary files.
-            results: folder for SUMO's statistics; None: none are written.
-            more: further options, by name.
-            speed_mps: v_F, at which vehicles are taken over; None: SUMO drives all of them.
-        """
-        departures: dict[str, dict[str, str] | None] = dict.fromkeys(self.left_out)
-        for name, one in self.by_name.items():
-            at_start = {**AT_START} if one.on_ramp or one.departs_at_start else {}
-            if speed_mps is None:
-                departures[name] = at_start
-            elif one.departs_at_start:
-                departures[name] = None
-            else:
-                depart_s = self.vehicles.begin_s + one.arrival.t_s
-                at_start["depart"] = f"{depart_s:.3f}"
-                departures[name] = at_start
-                if one.near:
-                    # There is no room before the entrance to brake from a higher speed.
-                    lanes = self.network.edges[one.origin.vehicle.route[0]].car_lanes
-                    factor = speed_mps / max(lane.speed_mps for lane in lanes)
-                    factor = min(factor, one.origin.vehicle.speed_factor)
-                    at_start["speedFactor"] = f"{factor:.4f}"
-        return self.config.command(
-            seed,
-            {
-                "begin": f"{self.vehicles.begin_s:.10g}",
-                "step-length": f"{step_s:g}",
-                "collision.action": "warn",
-                **self.config.additional(folder, demand=False),
-                **self.vehicles.write(folder / "vehicles.rou.xml", departures),
-                **more,
-                **output_options(results, folder, self.corridor.edge_numbers),
-            },
-            without=_FIRST_SIMULATION,
-        )
-
-
 def corridor_arrivals(
     scenario: Scenario,
-    network: Network,
     corridor: Corridor,
     demand: CorridorDemand,
+    near: Collection[str],
     begin_s: float,
 ) -> tuple[CorridorArrival, ...]:
     """Return the vehicles of a corridor in order of departure.
 
     Args:
         scenario: the scenario of the corridor.
-        network: the network.
         corridor: the corridor.
         demand: its vehicles.
+        near: edges on which vehicles are advised before they are taken over.
         begin_s: SUMO's time at which the run begins.
 
     Raises:
@@ -160,9 +74,6 @@ def corridor_arrivals(
     types = _types_in(scenario, type_names(demand.passes))
     lanes = {entrance.name: entrance.lane for entrance in scenario.entrance}
     on_ramp = {ramp.name: {link.origin.edge for link in ramp.path} for ramp in corridor.ramps}
-    ways = [*ways_to_start(network, corridor).values()]
-    ways += [ways_to_ramp(network, corridor, ramp) for ramp in corridor.ramps]
-    near = {lane.rpartition("_")[0] for way in ways for lane in way} - corridor.edge_numbers.keys()
     choose = _LaneChoice(scenario)
     found = []
     for number, one in enumerate(demand.passes, start=1):
@@ -236,10 +147,3 @@ class _LaneChoice:
         chosen = min(lanes, key=lambda lane: (max(self._free_s[lane], t_s), -lane))
         self._free_s[chosen] = max(self._free_s[chosen], t_s) + self._spacing_s
         return chosen
-
-
-def main_stream(found: Sequence[CorridorArrival]) -> Iterator[Arrival]:
-    """Yield the arrivals at the start of the road, by time."""
-    for one in found:
-        if one.departs_at_start:
-            yield one.arrival

@@ -18,16 +18,14 @@ from pathlib import Path
 from attrs import evolve, frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
 from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor
-from laneweave.sim_bridge.corridors.corridor_arrivals import MAX_WAIT_S, CorridorSetup
+from laneweave.sim_bridge.corridors.corridor_setup import MAX_WAIT_S, CorridorSetup
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
 from laneweave.sim_bridge.corridors.sumo_network import Lane, Network
 from laneweave.sim_bridge.corridors.take_over import SEEN_BEYOND_M, Approaching
-from laneweave.sim_bridge.corridors.ways_in import ways_to_ramp, ways_to_start
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
@@ -69,14 +67,11 @@ class _Slowing:
 class CorridorWorld(SumoProcess):
     """The corridor's vehicles in SUMO. Close it, or use it as a context manager."""
 
-    def __init__(
-        self, scenario: Scenario, setup: CorridorSetup, folder: Path, results: Path | None = None
-    ) -> None:
+    def __init__(self, setup: CorridorSetup, folder: Path, results: Path | None = None) -> None:
         """Start SUMO.
 
         Args:
-            scenario: road, vehicles and tick.
-            setup: network, demand, corridor.
+            setup: corridor and scenario.
             folder: folder for temporary files.
             results: folder for SUMO's own statistics; None: none are written.
 
@@ -84,23 +79,16 @@ class CorridorWorld(SumoProcess):
             SumoUnavailableError: libsumo cannot be loaded.
             SumoFailedError: SUMO rejects a file.
         """
-        super().__init__(
-            setup.command(
-                scenario.runtime.tick_s,
-                scenario.seed,
-                folder,
-                results,
-                _PLANTS,
-                speed_mps=scenario.formation.speed_mps,
-            )
-        )
+        super().__init__(setup.command(folder, results, _PLANTS))
+        scenario, found = setup.scenario, setup.found
+        network, corridor = found.simulation.network, found.corridor
         self._types = scenario.types
         self._lane_m = scenario.road.lane_width_m
         self._length_m = scenario.road.length_m
-        self._shape = CorridorShape(setup.network, setup.corridor)
+        self._shape = CorridorShape(network, corridor)
         self._sumo_name = {one.arrival.vehicle: one.origin.vehicle.name for one in setup.arrivals}
         self._coming = dict(setup.by_name)
-        self._setup = setup
+        self._setup, self._network = setup, network
         self._states: dict[str, State] = {}
         self._shown: dict[str, State] = {}
         self._returned: set[str] = set()
@@ -112,25 +100,25 @@ class CorridorWorld(SumoProcess):
         self._taken: set[str] = set()
         """Names in SUMO of vehicles that have been taken over."""
         upstream = any(one.origin.upstream for one in setup.arrivals)
-        to_start = ways_to_start(setup.network, setup.corridor) if upstream else {}
+        to_start = found.ways_to_start if upstream else {}
         self.start_lanes = tuple(to_start)
         """Lanes to whose beginning vehicles come from upstream."""
         entrances = {one.name for one in scenario.entrance}
         to_ramps = {
-            ramp.lane: ways_to_ramp(setup.network, setup.corridor, ramp)
-            for ramp in setup.corridor.ramps
+            ramp.lane: found.ways_to_ramps[ramp.name]
+            for ramp in corridor.ramps
             if ramp.name in entrances
         }
         both = to_ramps.keys() & to_start.keys()
         if both:
             allowed = f"one whose lane {min(both)} is either open at the start or that of a ramp"
-            raise BadInputError(OPTION, setup.corridor.name, allowed)
+            raise BadInputError(OPTION, corridor.name, allowed)
         self._ways_in = {**to_start, **to_ramps}
         self.departing = tuple(
             one.arrival for one in setup.arrivals if one.near and not one.departs_at_start
         )
         """Vehicles that depart near an entrance, in order of departure."""
-        self._beyond = tuple(dict.fromkeys(_beyond(setup.network, setup.corridor)))
+        self._beyond = tuple(dict.fromkeys(_beyond(network, corridor)))
         self._approaching: dict[int, list[Approaching]] = {}
         """What SUMO has been asked since its last step, by lane."""
         self._others: list[OtherBody] | None = None
@@ -311,7 +299,7 @@ class CorridorWorld(SumoProcess):
 
         SUMO would stop it, or put it in front of others on the next edge of its route.
         """
-        api, network = self.vehicle, self._setup.network
+        api, network = self.vehicle, self._network
         edge, _, index = api.getLaneID(name).rpartition("_")
         if edge not in network.edges:
             return
@@ -329,7 +317,7 @@ class CorridorWorld(SumoProcess):
         """Return how fast a vehicle may drive on the next edge of its route."""
         api = self.vehicle
         following = api.getRoute(name)[api.getRouteIndex(name) + 1 :][:1]
-        edges = self._setup.network.edges
+        edges = self._network.edges
         limits = (lane.speed_mps for edge in following for lane in edges[edge].car_lanes)
         return min(limits, default=math.inf) * float(api.getSpeedFactor(name))
 

@@ -81,27 +81,13 @@ def _where(field: str, tables: Tables, corridor: Corridor) -> str:
     kind, number = found[1], int(found[2])
     if kind == "exit":
         out = corridor.ways_out[number]
-        opens_m = max(
-            (
-                one.to_m
-                for one in corridor.closures
-                if one.lane in out.lanes and one.to_m < out.at_m
-            ),
-            default=0.0,
-        )
+        open_m = out.at_m - max(corridor.opens_m(out.lanes, out.at_m), 0.0)
         lanes = " and ".join(corridor.lane_name(lane, out.at_m) for lane in out.lanes)
-        return f"exit to {out.edge} from lane {lanes}, open for {out.at_m - opens_m:.0f} m"
+        return f"exit to {out.edge} from lane {lanes}, open for {open_m:.0f} m"
     if kind == "entrance":
         names = {ramp.name: ramp for ramp in corridor.ramps}
         ramp = names[tables["entrance"][number]["name"]]
-        ends_m = min(
-            (
-                one.from_m
-                for one in corridor.closures
-                if one.lane == ramp.lane and one.from_m > ramp.merge_m
-            ),
-            default=corridor.length_m,
-        )
+        ends_m = min(corridor.ends_m(ramp.lane, ramp.merge_m), corridor.length_m)
         lane = corridor.lane_name(ramp.lane, ramp.merge_m)
         used_m, open_m = ramp.merge_m - ramp.at_m, ends_m - ramp.merge_m
         return f"on-ramp from {ramp.edge} of {used_m:.0f} m into lane {lane} of {open_m:.0f} m"
@@ -383,21 +369,13 @@ def _cycle_s(scenario: Scenario, corridor: Corridor) -> float:
     )
     shortest_s = CYCLE_STEP_S * math.ceil((move_s + SLACK_S) / CYCLE_STEP_S)
     needed_m = drive_out(scenario).room_m + scenario.longest_body_m
-    opens_m = {
-        one.at_m: max(
-            (each.to_m for each in corridor.closures if each.lane == lane and each.to_m < one.at_m),
-            default=-math.inf,
-        )
-        for one in corridor.ways_out
-        for lane in one.lanes
-    }
-    rooms_m = [at_m - opened_m - needed_m for at_m, opened_m in opens_m.items()]
+    rooms_m = [
+        one.at_m - corridor.opens_m(one.lanes, one.at_m) - needed_m for one in corridor.ways_out
+    ]
     # At a ramp, a slot shall begin where a move into the next lane is possible.
     rooms_m += [
-        0.5 * (closure.from_m - ramp.merge_m - needed_m)
+        0.5 * (corridor.ends_m(ramp.lane, ramp.merge_m) - ramp.merge_m - needed_m)
         for ramp in corridor.ramps
-        for closure in corridor.closures
-        if closure.lane == ramp.lane and closure.from_m > ramp.merge_m
     ]
     longest_s = min(rooms_m, default=math.inf) / scenario.formation.speed_mps
     steps = math.floor(min(longest_s, SHORTEST_CYCLE_S) / CYCLE_STEP_S + 1e-9)

@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from laneweave.sim_bridge.corridors.corridor_arrivals import MAX_WAIT_S, CorridorSetup
+from laneweave.sim_bridge.corridors.corridor_setup import MAX_WAIT_S, CorridorSetup
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 
 def drive_alone(
     setup: CorridorSetup,
-    seed: int,
     folder: Path,
     results: Path,
     progress: Callable[[float], None] = lambda _: None,
@@ -24,8 +23,7 @@ def drive_alone(
     """Run a simulation in which SUMO drives all vehicles, and write its statistics.
 
     Args:
-        setup: network, demand, corridor.
-        seed: SUMO's seed.
+        setup: corridor and scenario.
         folder: folder for temporary files.
         results: folder for SUMO's statistics.
         progress: called with the share of the simulated time that has passed.
@@ -35,10 +33,9 @@ def drive_alone(
         SumoFailedError: SUMO rejects a file.
     """
     # After a run of laneweave, SUMO drives on for up to this time (`CorridorWorld.drive_on`).
-    begin_s, end_s = setup.vehicles.begin_s, setup.end_s + MAX_WAIT_S
-    command = setup.command(setup.vehicles.step_s, seed, folder, results)
+    begin_s, end_s = setup.found.simulation.demand.begin_s, setup.end_s + MAX_WAIT_S
     awaited = {*setup.by_name}
-    with SumoProcess(command) as sumo:
+    with SumoProcess(setup.command_alone(folder, results)) as sumo:
         while awaited and (now_s := sumo.simulation.getTime()) < end_s:
             sumo.step()
             awaited.difference_update(sumo.simulation.getArrivedIDList())

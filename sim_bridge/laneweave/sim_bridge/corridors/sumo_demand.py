@@ -128,9 +128,7 @@ class SumoDemand:
         """The edges on which vehicles depart."""
         return frozenset(vehicle.route[0] for vehicle in self.vehicles if vehicle.route)
 
-    def write(
-        self, file: Path, departures: Mapping[str, dict[str, str] | None]
-    ) -> Mapping[str, str]:
+    def write(self, file: Path, departures: Mapping[str, Attributes | None]) -> Mapping[str, str]:
         """Write a file of routes, and return the option that names it.
 
         Args:

@@ -15,7 +15,6 @@ from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.sim_bridge.corridors.corridor_arrivals import (
     FIRST_ENTRY_S,
     CorridorArrival,
-    main_stream,
 )
 from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor, read_corridor
 from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
@@ -67,7 +66,7 @@ def test_vehicles_that_start_inside_are_left_out_and_listed(tmp_path: Path) -> N
     assert [one.vehicle.name for one in found.demand.passes] == ["a"]
     assert found.demand.missing == {"start on main3": 1}
     setup = found.setup(parse_scenario(scenario_tables(found.corridor, found.demand)))
-    setup.command(0.1, 1, tmp_path, None)
+    setup.command_alone(tmp_path, tmp_path)
     assert written(tmp_path) == {"a"}
 
 
@@ -108,7 +107,7 @@ def test_arrivals_have_names_of_laneweave_and_lanes_that_suit_them(tmp_path: Pat
     assert [one.arrival.vehicle for one in arrivals[:2]] == ["v0001", "v0002"]
     assert {one.arrival.lane for one in arrivals if one.origin.entrance == "on"} == {0}
     # The lane next to the exit for those that leave, and all lanes for the others.
-    main = [*main_stream(arrivals)]
+    main = [one.arrival for one in arrivals if one.departs_at_start]
     assert {one.lane for one in main if one.destination == "off"} == {1}
     assert {one.lane for one in main if one.destination == END_OF_ROAD} == {2, 3}
     assert {one.vehicle_type for one in main} == {"car", "truck"}
@@ -227,9 +226,9 @@ def test_vehicles_with_stops_are_left_out_of_the_corridor_only(tmp_path: Path) -
     found = corridor(tmp_path, bus, elsewhere, vehicle("a", 0.0, "main"))
     assert found.demand.missing == {"stop on their way": 1}
     setup = found.setup(parse_scenario(scenario_tables(found.corridor, found.demand)))
-    setup.command(0.1, 1, tmp_path, None)
+    setup.command_alone(tmp_path, tmp_path)
     assert written(tmp_path) == {"waits", "a"}
-    setup.command(0.1, 1, tmp_path, None, speed_mps=25.0)
+    setup.command(tmp_path, None, {})
     assert written(tmp_path) == {"waits"}
 
 
