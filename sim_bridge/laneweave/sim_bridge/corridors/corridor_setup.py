@@ -21,9 +21,9 @@ from laneweave.sim_bridge.corridors.sumo_demand import (
     SumoDemand,
     TimeWindow,
     demand_on,
-    read_demand,
+    read_network_and_demand,
 )
-from laneweave.sim_bridge.corridors.sumo_network import Network, read_network
+from laneweave.sim_bridge.corridors.sumo_network import Network
 from laneweave.sim_bridge.corridors.sumo_statistics import output_options
 from laneweave.sim_bridge.corridors.ways_in import WayIn, ways_to_ramp, ways_to_start
 
@@ -188,8 +188,7 @@ def _simulation(
 ) -> SumoSimulation:
     """Read a simulation; a command reads the same one several times."""
     with temporary_folder("sumo") as folder:
-        network = read_network(config.net_file)
-        return SumoSimulation(config, network, read_demand(config, folder, window, seed))
+        return SumoSimulation(config, *read_network_and_demand(config, folder, window, seed))
 
 
 def read_corridor(file: Path, name: str, window: TimeWindow = WHOLE, seed: int = 1) -> SumoCorridor:

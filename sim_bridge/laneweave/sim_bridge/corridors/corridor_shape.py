@@ -150,8 +150,8 @@ def _of_lane(lane: Lane, from_m: float, to_m: float) -> Piece:
 
 
 def _of_link(link: Link, from_m: float, to_m: float) -> Piece:
-    ends = (link.origin.shape[-1], link.target.shape[0])
-    return _piece(from_m, to_m, (ends[0], *link.shape, ends[1]))
+    across = [point for lane in link.across for point in lane.shape]
+    return _piece(from_m, to_m, (link.origin.shape[-1], *across, link.target.shape[0]))
 
 
 def _piece(

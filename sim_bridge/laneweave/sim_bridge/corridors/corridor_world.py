@@ -393,8 +393,8 @@ def _ahead(
         if link.target.edge in inside:
             continue
         from_m = end_m
-        for name, length_m in link.across:
-            yield name, from_m
-            from_m += length_m
+        for across in link.across:
+            yield across.name, from_m
+            from_m += across.length_m
         yield link.target.name, from_m
         yield from _ahead(network, link.target, from_m + link.target.length_m, until_m, inside)

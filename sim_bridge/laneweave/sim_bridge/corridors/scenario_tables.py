@@ -123,8 +123,10 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
     """
     main = _from(demand, MAIN_ENTRANCE)
     if not main:
-        edge = corridor.edges[0].name
-        raise BadInputError(OPTION, corridor.name, f"a corridor that vehicles enter on {edge}")
+        allowed = f"a corridor that vehicles enter on {corridor.edges[0].name}"
+        left_out = " and ".join(f"{count} {reason}" for reason, count in demand.missing.items())
+        allowed += f"; of those left out, {left_out}" if left_out else ""
+        raise BadInputError(OPTION, corridor.name, allowed)
     names = type_names(demand.passes)
     car, *others = names
     own_names = {**names, car: CAR}

@@ -22,6 +22,7 @@ from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE
 from laneweave.sim_bridge.corridors.corridor import Corridor, unique_name
 from laneweave.sim_bridge.corridors.sumo_config import SumoConfig
+from laneweave.sim_bridge.corridors.sumo_network import Network, read_network
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 MAX_DEMAND_S = 7200.0
@@ -173,8 +174,10 @@ class CorridorDemand:
     """Their names in SUMO."""
 
 
-def read_demand(config: SumoConfig, folder: Path, window: TimeWindow, seed: int = 1) -> SumoDemand:
-    """Let SUMO drive a simulation, and return its vehicles.
+def read_network_and_demand(
+    config: SumoConfig, folder: Path, window: TimeWindow, seed: int = 1
+) -> tuple[Network, SumoDemand]:
+    """Let SUMO drive a simulation, and return its network and its vehicles.
 
     Args:
         config: the simulation.
@@ -199,6 +202,7 @@ def read_demand(config: SumoConfig, folder: Path, window: TimeWindow, seed: int 
     if window.scale is not None:
         options["scale"] = f"{window.scale:g}"
     with SumoProcess(config.command(seed, options)) as sumo:
+        network = read_network(sumo)
         begin_s, until_s = sumo.simulation.getTime(), sumo.simulation.getEndTime()
         until_s = until_s if until_s > begin_s else math.inf
         end_s = min(begin_s + window.duration_s, window.end_s, until_s)
@@ -224,7 +228,7 @@ def read_demand(config: SumoConfig, folder: Path, window: TimeWindow, seed: int 
             Described(f"{begin_s:g} s to {end_s:g} s"),
             "a time in which vehicles depart" + (f"; {hint}" if math.isfinite(first_s) else ""),
         )
-    return SumoDemand(
+    return network, SumoDemand(
         tuple(inside),
         begin_s,
         min(end_s, math.floor(departures_s[-1]) + 1.0),

@@ -1,18 +1,17 @@
-"""Reads SUMO's networks; the only module that imports sumolib."""
+"""The network of a SUMO simulation, as SUMO has read it."""
 
 from __future__ import annotations
 
 import gzip
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree as ET
 
 from attrs import define, field, frozen
 
-from laneweave.protocol.errors import BadInputError
+from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 CARS = "passenger"
 """Class of vehicles that must be allowed in a lane of a corridor."""
@@ -20,15 +19,14 @@ IGNORING = "ignoring"
 """Class of vehicles that may drive anywhere."""
 _HAS_PRIORITY = "M"
 """State of a link whose vehicles give way to nobody."""
-_DEFAULT_LANE_M = 3.2
-"""SUMO's width of lanes."""
+_SIDES = {"left": 1, "right": -1}
+"""SUMO's numbers for the sides to which vehicles change lanes."""
 Point = tuple[float, float]
-_Changes = Mapping[str, frozenset[str]]
 
 
 @frozen
 class Lane:
-    """A lane of an edge."""
+    """A lane of an edge, or inside a junction."""
 
     name: str
     edge: str
@@ -38,17 +36,21 @@ class Lane:
     width_m: float
     speed_mps: float
     """Speed limit."""
-    allows_cars: bool
     shape: tuple[Point, ...] = ()
     """Centre line in the network's coordinates [m]."""
-    classes: frozenset[str] = frozenset()
-    """Classes of vehicles that may drive in it."""
+    banned: frozenset[str] = frozenset()
+    """Classes of vehicles that may not drive in it."""
     changing: Mapping[str, frozenset[str]] = field(factory=dict, eq=False)
     """Classes that may change lanes to a side; absent: all."""
 
+    @property
+    def allows_cars(self) -> bool:
+        """Whether cars may drive in it."""
+        return self.allows(CARS)
+
     def allows(self, vehicle_class: str) -> bool:
         """Return whether vehicles of a class may drive in it."""
-        return vehicle_class in self.classes or vehicle_class == IGNORING
+        return vehicle_class not in self.banned
 
     def allows_change(self, vehicle_class: str, side: str) -> bool:
         """Return whether vehicles of a class may change lanes to a side, `left` or `right`."""
@@ -80,17 +82,21 @@ class Link:
 
     origin: Lane
     target: Lane
-    length_m: float = 0.0
-    """Length of the way across the junction."""
+    across: tuple[Lane, ...] = ()
+    """The lanes inside the junction, in order."""
     state: str = _HAS_PRIORITY
     """SUMO's letter for the right of way."""
     traffic_light: str = ""
-    shape: tuple[Point, ...] = ()
-    """Centre line of the way across the junction in the network's coordinates [m]."""
-    across: tuple[tuple[str, float], ...] = ()
-    """Name and length [m] of the lanes inside the junction, in order."""
-    speed_mps: float = math.inf
-    """Lowest speed limit inside the junction."""
+
+    @property
+    def length_m(self) -> float:
+        """Length of the way across the junction."""
+        return sum(lane.length_m for lane in self.across)
+
+    @property
+    def speed_mps(self) -> float:
+        """Lowest speed limit inside the junction."""
+        return min((lane.speed_mps for lane in self.across), default=math.inf)
 
     @property
     def has_priority(self) -> bool:
@@ -100,7 +106,7 @@ class Link:
 
 @define(slots=False)
 class Network:
-    """Edges and their links, without the lanes inside junctions."""
+    """Edges and their links."""
 
     edges: Mapping[str, Edge]
     links: tuple[Link, ...] = field(factory=tuple)
@@ -135,100 +141,64 @@ class Network:
         return tuple(self.edges[name] for name in names)
 
 
-def read_network(file: Path) -> Network:
-    """Read a network file.
-
-    Raises:
-        BadInputError: it cannot be read.
-    """
-    from sumolib import net as sumo_net  # noqa: PLC0415 (slow to import)
-
-    try:
-        found = sumo_net.readNet(str(file), withInternal=True, lxml=False)
-        left_hand, changing = _side_and_changes(file)
-        edges = {edge.getID(): _edge(edge, changing) for edge in found.getEdges(withInternal=False)}
-        links = tuple(_links(found, edges))
-    except OSError as error:
-        raise BadInputError("net-file", str(file), f"a readable file ({error})") from error
-    except Exception as error:  # sumolib raises whatever its parsers raise
-        raise BadInputError("net-file", str(file), f"a network of SUMO ({error!r})") from error
-    if not edges:
-        raise BadInputError("net-file", str(file), "a network of SUMO with at least one edge")
-    return Network({name: edge for name, edge in edges.items() if edge.lanes}, links, left_hand)
-
-
-def _side_and_changes(file: Path) -> tuple[bool, Mapping[str, _Changes]]:
-    """Return whether vehicles drive on the left, and which may change lanes, by lane.
-
-    sumolib reads neither.
-    """
-    left_hand, changing = False, dict[str, _Changes]()
+def read_network(sumo: SumoProcess) -> Network:
+    """Return the network of a simulation."""
+    edges = {
+        name: Edge(
+            name, tuple(_lane(sumo, f"{name}_{n}") for n in range(sumo.edge.getLaneNumber(name)))
+        )
+        for name in sumo.edge.getIDList()
+        if not name.startswith(":")  # inside a junction
+    }
+    # libsumo does not say it.
+    file = Path(sumo.simulation.getOption("net-file"))
     with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as stream:
-        for _, element in ET.iterparse(stream, events=("start",)):  # noqa: S314 (as sumolib does)
-            if element.tag == "net":
-                left_hand = element.get("lefthand") == "true"
-            if element.tag == "lane":
-                own = {
-                    side: frozenset(element.attrib[f"change{side.title()}"].split())
-                    for side in ("left", "right")
-                    if element.get(f"change{side.title()}", "all") != "all"
-                }
-                changing |= {element.get("id", ""): own} if own else {}
-            element.clear()
-    return left_hand, changing
+        _, root = next(ET.iterparse(stream, events=("start",)))  # noqa: S314 (SUMO has read it)
+    return Network(edges, tuple(_links(sumo, edges)), root.get("lefthand") == "true")
 
 
-def _edge(edge: Any, changing: Mapping[str, _Changes]) -> Edge:  # noqa: ANN401 - sumolib has no types
-    return Edge(
-        edge.getID(),
-        tuple(
-            Lane(
-                name=lane.getID(),
-                edge=edge.getID(),
-                index=lane.getIndex(),
-                length_m=lane.getLength(),
-                width_m=lane.getWidth() if lane.getWidth() > 0.0 else _DEFAULT_LANE_M,
-                speed_mps=lane.getSpeed(),
-                allows_cars=lane.allows(CARS),
-                shape=tuple((point[0], point[1]) for point in lane.getShape()),
-                classes=frozenset(lane.getPermissions()),
-                changing=changing.get(lane.getID(), {}),
-            )
-            for lane in edge.getLanes()
-        ),
+def _lane(sumo: SumoProcess, name: str) -> Lane:
+    edge, _, index = name.rpartition("_")
+    api = sumo.lane
+    return Lane(
+        name,
+        edge,
+        int(index),
+        api.getLength(name),
+        api.getWidth(name),
+        api.getMaxSpeed(name),
+        tuple(api.getShape(name)),
+        frozenset(api.getDisallowed(name)),
+        {
+            side: frozenset(api.getChangePermissions(name, number))
+            for side, number in _SIDES.items()
+        },
     )
 
 
-def _links(network: Any, edges: Mapping[str, Edge]) -> Iterable[Link]:  # noqa: ANN401
+def _links(sumo: SumoProcess, edges: Mapping[str, Edge]) -> Iterator[Link]:
     """Yield the links of all edges that cars may use."""
-    for name, edge in edges.items():
-        for lane, found in zip(edge.lanes, network.getEdge(name).getLanes(), strict=True):
-            for connection in found.getOutgoing():
-                to = connection.getToLane()
-                after = edges.get(to.getEdge().getID())  # None: a crossing for pedestrians
-                if after and lane.allows_cars and after.lanes[to.getIndex()].allows_cars:
-                    across = _lanes_across(network, connection.getViaLaneID())
-                    yield Link(
-                        lane,
-                        after.lanes[to.getIndex()],
-                        length_m=sum(one.getLength() for one in across),
-                        state=connection.getState(),
-                        traffic_light=connection.getTLSID(),
-                        shape=tuple(
-                            (point[0], point[1]) for one in across for point in one.getShape()
-                        ),
-                        across=tuple((one.getID(), one.getLength()) for one in across),
-                        speed_mps=min((one.getSpeed() for one in across), default=math.inf),
-                    )
+    lights = {
+        (origin, target): light
+        for light in sumo.trafficlight.getIDList()
+        for links in sumo.trafficlight.getControlledLinks(light)
+        for origin, target, _ in links
+    }
+    for edge in edges.values():
+        for origin in edge.car_lanes:
+            for to, _, _, _, via, state, _, _ in sumo.lane.getLinks(origin.name):
+                name, _, index = to.rpartition("_")
+                if name in edges and edges[name].lanes[int(index)].allows_cars:
+                    across = tuple(_across(sumo, via))
+                    light = lights.get((origin.name, to), "")
+                    yield Link(origin, edges[name].lanes[int(index)], across, state, light)
 
 
-def _lanes_across(network: Any, via: str) -> list[Any]:  # noqa: ANN401
-    """Return the lanes inside a junction, from the first one on."""
-    lanes: list[Any] = []
-    while via and len(lanes) < 8:  # at most two or three in practice; a loop is a broken file
-        lanes.append(network.getLane(via))
-        via = next((after.getViaLaneID() for after in lanes[-1].getOutgoing()), "")
-    return lanes
+def _across(sumo: SumoProcess, via: str) -> Iterator[Lane]:
+    """Yield the lanes inside a junction, from the first one on."""
+    while via:
+        yield _lane(sumo, via)
+        via = next((after[4] for after in sumo.lane.getLinks(via)), "")
 
 
 def _grouped(pairs: Iterable[tuple[str, Link]]) -> Mapping[str, tuple[Link, ...]]:

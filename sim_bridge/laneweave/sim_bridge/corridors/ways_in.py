@@ -94,10 +94,10 @@ def _add(
         link, to_m, limits = waiting.pop(0)
         edge = network.edges[link.origin.edge]
         upstream = edge.name not in single
-        for name, length_m in reversed(link.across):
+        for lane in reversed(link.across):
             limits = ((to_m, link.speed_mps), *limits)
-            to_m -= length_m
-            found[name] = WayIn(to_m, limits, upstream)
+            to_m -= lane.length_m
+            found[lane.name] = WayIn(to_m, limits, upstream)
         from_m, limits = to_m - edge.length_m, ((to_m, link.origin.speed_mps), *limits)
         if edge.name in inside or link.origin.name in found:
             continue

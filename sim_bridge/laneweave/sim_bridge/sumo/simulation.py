@@ -60,6 +60,14 @@ class SumoProcess:
             reason = " ".join(str(error).split())
             raise SumoFailedError(f"SUMO cannot start ({reason}); its messages say why") from error
         SumoProcess._open = self
+        # libsumo's interfaces, which have no types.
+        self.simulation: Any = self._sumo.simulation
+        self.vehicle: Any = self._sumo.vehicle
+        self.vehicletype: Any = self._sumo.vehicletype
+        self.route: Any = self._sumo.route
+        self.edge: Any = self._sumo.edge
+        self.lane: Any = self._sumo.lane
+        self.trafficlight: Any = self._sumo.trafficlight
         self._gui: SumoGui | None = None
 
     def show(self, tick_s: float) -> None:
@@ -72,31 +80,6 @@ class SumoProcess:
             CommandFailedError: sumo-gui is not installed, or cannot start.
         """
         self._gui = SumoGui(Path(self.simulation.getOption("net-file")), tick_s)
-
-    @property
-    def vehicle(self) -> Any:  # noqa: ANN401 - libsumo has no types
-        """Interface to SUMO's vehicles in libsumo."""
-        return self._sumo.vehicle
-
-    @property
-    def vehicletype(self) -> Any:  # noqa: ANN401 - libsumo has no types
-        """Interface to SUMO's types of vehicles in libsumo."""
-        return self._sumo.vehicletype
-
-    @property
-    def simulation(self) -> Any:  # noqa: ANN401 - libsumo has no types
-        """Interface to SUMO's simulation in libsumo."""
-        return self._sumo.simulation
-
-    @property
-    def lane(self) -> Any:  # noqa: ANN401 - libsumo has no types
-        """Interface to SUMO's lanes in libsumo."""
-        return self._sumo.lane
-
-    @property
-    def route(self) -> Any:  # noqa: ANN401 - libsumo has no types
-        """Interface to SUMO's routes in libsumo."""
-        return self._sumo.route
 
     def collisions(self) -> list[tuple[str, str]]:
         """Return the sorted pairs that SUMO reports as colliding in the last step.

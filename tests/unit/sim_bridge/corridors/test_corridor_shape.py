@@ -9,14 +9,15 @@ import pytest
 
 from laneweave.sim_bridge.corridors.corridor import corridor_of
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape, _piece
-from laneweave.sim_bridge.corridors.sumo_config import read_config
 from laneweave.sim_bridge.corridors.sumo_network import read_network
+from laneweave.sim_bridge.sumo.simulation import SumoProcess
 from support.interchange import LANE_M, write_interchange
 
 
 @pytest.fixture
 def shape(tmp_path: Path) -> CorridorShape:
-    network = read_network(read_config(write_interchange(tmp_path), tmp_path).net_file)
+    with SumoProcess(("sumo", "-c", str(write_interchange(tmp_path)))) as sumo:
+        network = read_network(sumo)
     return CorridorShape(network, corridor_of(network, "main1", "main5"))
 
 
