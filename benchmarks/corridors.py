@@ -18,8 +18,8 @@ from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
+from laneweave.sim_bridge.corridors.corridor_reading import read_corridor, read_simulation
 from laneweave.sim_bridge.corridors.corridor_search import find_corridors
-from laneweave.sim_bridge.corridors.corridor_setup import read_corridor, read_simulation
 from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
 
 

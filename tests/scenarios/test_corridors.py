@@ -18,7 +18,7 @@ from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.sim_bridge.corridors import corridor_setup, sumo_statistics
-from laneweave.sim_bridge.corridors.corridor_setup import WHOLE, read_corridor
+from laneweave.sim_bridge.corridors.corridor_reading import WHOLE, read_corridor
 from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
 from laneweave.sim_bridge.corridors.sumo_statistics import read_statistics
 from support.interchange import (

@@ -10,7 +10,7 @@ from laneweave.launch.cli.corridor_command import corridor_tables
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.sim_bridge.corridors.corridor_setup import WHOLE, read_corridor
+from laneweave.sim_bridge.corridors.corridor_reading import WHOLE, read_corridor
 from support.drawn_corridors import draw_corridor, problems
 
 IN_EACH_TEST_RUN = 6

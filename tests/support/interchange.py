@@ -24,7 +24,7 @@ from attrs import frozen
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
+from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
 from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
 
 LANE_M = 3.2

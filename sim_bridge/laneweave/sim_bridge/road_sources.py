@@ -11,7 +11,8 @@ from attrs import field, frozen
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor, read_corridor
+from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
+from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor
 from laneweave.sim_bridge.corridors.corridor_world import CorridorWorld
 from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
 from laneweave.sim_bridge.corridors.take_over import TakeOver

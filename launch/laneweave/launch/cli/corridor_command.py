@@ -51,7 +51,7 @@ def corridor(
     """List what can be a corridor in a SUMO simulation, or describe one."""
     if toml and name is None:
         raise BadInputError("--corridor", "none", "FIRST_EDGE:LAST_EDGE with --toml")
-    from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
+    from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
 
     window = time_window(begin, end, scale)
     if name is None:
@@ -111,13 +111,13 @@ def _sumo_table(sumocfg: Path, corridor: Corridor) -> dict[str, Any]:
 
 
 def _list(sumocfg: Path, window: TimeWindow) -> None:
+    from laneweave.sim_bridge.corridors.corridor_reading import read_simulation
     from laneweave.sim_bridge.corridors.corridor_search import (
         MIN_LANES,
         MIN_LENGTH_M,
         MIN_SPEED_MPS,
         find_corridors,
     )
-    from laneweave.sim_bridge.corridors.corridor_setup import read_simulation
 
     simulation = read_simulation(sumocfg, window)
     found = find_corridors(simulation.network, simulation.demand)

@@ -304,7 +304,7 @@ def corridor_scenario(
         allowed = "none with --sumocfg: table sumo of the file names the simulation"
         raise BadInputError("SCENARIO.toml", str(scenario), allowed)
     from laneweave.launch.cli.corridor_command import corridor_tables, time_window
-    from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
+    from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
     from laneweave.sim_bridge.corridors.scenario_tables import remarks
 
     departures = time_window(**window, duration_s=duration_s)

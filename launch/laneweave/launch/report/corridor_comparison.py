@@ -16,7 +16,7 @@ from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.protocol.summary import HARD_BRAKE_MPS2, read_summary
-from laneweave.sim_bridge.corridors.corridor_arrivals import CorridorArrival
+from laneweave.sim_bridge.corridors.corridor_setup import CorridorArrival
 from laneweave.sim_bridge.corridors.sumo_alone import drive_alone
 from laneweave.sim_bridge.corridors.sumo_statistics import (
     CONFLICT_S,

@@ -1,38 +1,67 @@
-"""A corridor with everything that a run on it needs, read from the files of a SUMO simulation."""
+"""A corridor of a SUMO simulation with all that a run on it needs, and its vehicles as arrivals.
+
+Vehicles get the names of all vehicles of laneweave, v0001 and so on in order of departure, since
+names in SUMO may contain characters that keys of messages must not. Those that depart on the
+first edge arrive at the start of the road, in a lane that suits their destination: with an exit,
+the lane next to it, and otherwise the one in which they can enter first. Vehicles that come from
+other edges arrive at the start or at a ramp; when, and in which lane of the start, is known only
+when SUMO has driven them there.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property, partial
 from pathlib import Path
 
 from attrs import frozen
 
+from laneweave.protocol.config.participants import vehicle_name
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.runtime.temporary_folders import temporary_folder
-from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor, corridor_of
-from laneweave.sim_bridge.corridors.corridor_arrivals import CorridorArrival, corridor_arrivals
-from laneweave.sim_bridge.corridors.sumo_config import NO_OPTIONS, SumoConfig, read_config
+from laneweave.protocol.road_layout import ANY_LANE
+from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.wire.messages import CAR
+from laneweave.sim_bridge.corridors.corridor import Corridor
+from laneweave.sim_bridge.corridors.sumo_config import NO_OPTIONS, SumoConfig
 from laneweave.sim_bridge.corridors.sumo_demand import (
     AT_START,
+    LIMITS,
     Attributes,
     CorridorDemand,
+    Pass,
     SumoDemand,
-    TimeWindow,
-    demand_on,
-    read_network_and_demand,
+    SumoType,
+    type_names,
 )
 from laneweave.sim_bridge.corridors.sumo_network import Network
 from laneweave.sim_bridge.corridors.sumo_statistics import output_options
 from laneweave.sim_bridge.corridors.ways_in import WayIn, ways_to_ramp, ways_to_start
+from laneweave.sim_bridge.road.demand import Arrival
 
-WHOLE = TimeWindow()
-"""The default time window."""
+FIRST_ENTRY_S = 1.0
+"""Road time before which no vehicle enters, so that agents can be announced."""
 MAX_WAIT_S = 600.0
 """Time after the last departure for which vehicles on their way to a ramp are awaited."""
 _FIRST_SIMULATION = ("device.rerouting.", "end", "scale", "begin", "step-length")
 """Options that have determined the vehicles and their routes; they do not apply once more."""
+
+
+@frozen
+class CorridorArrival:
+    """A vehicle of SUMO that drives through a corridor."""
+
+    arrival: Arrival
+    """At a ramp, its time is that of the departure from its first edge."""
+    origin: Pass
+    on_ramp: bool = False
+    """Whether it departs on the ramp itself."""
+    near: bool = False
+    """Whether it departs near its entrance, on an edge on which vehicles are advised."""
+
+    @property
+    def departs_at_start(self) -> bool:
+        """Whether it departs on the first edge of the corridor; others come from outside."""
+        return self.origin.entrance == MAIN_ENTRANCE and not self.origin.upstream
 
 
 @frozen
@@ -69,18 +98,7 @@ class SumoCorridor:
         Raises:
             BadInputError: the scenario lacks an entrance, exit or type of vehicle.
         """
-        lanes = {
-            name
-            for ways in (*self.ways_to_start.values(), *self.ways_to_ramps.values())
-            for name in ways
-        }
-        near = {name.rpartition("_")[0] for name in lanes} - self.corridor.edge_numbers.keys()
-        begin_s = self.simulation.demand.begin_s
-        return CorridorSetup(
-            self,
-            scenario,
-            corridor_arrivals(scenario, self.corridor, self.demand, near, begin_s),
-        )
+        return CorridorSetup(self, scenario, _arrivals(self, scenario))
 
 
 @frozen(slots=False)
@@ -164,68 +182,88 @@ class CorridorSetup:
         )
 
 
-def read_simulation(file: Path, window: TimeWindow = WHOLE, seed: int = 1) -> SumoSimulation:
-    """Read the files of a simulation, and let SUMO draw its vehicles.
-
-    Args:
-        file: SUMO's configuration file.
-        window: when the vehicles depart.
-        seed: seed of SUMO, from which it draws flows and types.
+def _arrivals(found: SumoCorridor, scenario: Scenario) -> tuple[CorridorArrival, ...]:
+    """Return the vehicles of a corridor in order of departure.
 
     Raises:
-        BadInputError: a file cannot be read, or no vehicle departs in the time window.
-        CommandFailedError: libsumo is missing, or SUMO rejects a file.
+        BadInputError: the scenario lacks an entrance, exit or type of vehicle.
     """
-    with temporary_folder("sumo") as folder:
-        config = read_config(file, folder)
-    changed = tuple(one.stat().st_mtime_ns for one in config.files)
-    return _simulation(config, window, seed, changed)
+    types = _types_in(scenario, type_names(found.demand.passes))
+    lanes = {entrance.name: entrance.lane for entrance in scenario.entrance}
+    corridor, begin_s = found.corridor, found.simulation.demand.begin_s
+    on_ramp = {ramp.name: {link.origin.edge for link in ramp.path} for ramp in corridor.ramps}
+    ways = (*found.ways_to_start.values(), *found.ways_to_ramps.values())
+    near = {lane.rpartition("_")[0] for way in ways for lane in way} - corridor.edge_numbers.keys()
+    choose = _LaneChoice(scenario)
+    arrivals = []
+    for number, one in enumerate(found.demand.passes, start=1):
+        t_s = one.vehicle.depart_s - begin_s
+        if one.upstream:
+            lane = scenario.road.first_lanes[0]  # which one it is depends on SUMO
+        elif one.entrance == MAIN_ENTRANCE:
+            lane = choose.lane(t_s, one.destination, types[one.vehicle.vehicle_type])
+        elif one.entrance in lanes:
+            lane = lanes[one.entrance]
+        else:
+            allowed = f"an entrance {one.entrance}: {one.vehicle.name} of the simulation needs it"
+            raise BadInputError("entrance", [*lanes], allowed)
+        arrival = Arrival(
+            vehicle_name(number),
+            lane,
+            ANY_LANE,
+            max(t_s, FIRST_ENTRY_S),
+            one.destination,
+            types[one.vehicle.vehicle_type],
+            one.vehicle.name,
+        )
+        first = one.vehicle.route[0]
+        departs_on_ramp = first in on_ramp.get(one.entrance, ())
+        arrivals.append(CorridorArrival(arrival, one, departs_on_ramp, near=first in near))
+    return tuple(arrivals)
 
 
-@lru_cache(maxsize=2)
-def _simulation(
-    config: SumoConfig, window: TimeWindow, seed: int, _changed: tuple[int, ...]
-) -> SumoSimulation:
-    """Read a simulation; a command reads the same one several times."""
-    with temporary_folder("sumo") as folder:
-        return SumoSimulation(config, *read_network_and_demand(config, folder, window, seed))
+def _types_in(scenario: Scenario, names: Mapping[SumoType, str]) -> Mapping[SumoType, str]:
+    """Return the scenario's type for each type of SUMO: the one with the same limits.
 
-
-def read_corridor(file: Path, name: str, window: TimeWindow = WHOLE, seed: int = 1) -> SumoCorridor:
-    """Read the files of a simulation, and derive a corridor; see `read_simulation`.
-
-    Args:
-        file: SUMO's configuration file.
-        name: the first and the last edge, FIRST_EDGE:LAST_EDGE.
-        window: when the vehicles depart.
-        seed: seed of SUMO, from which it draws flows and types.
+    Which type is the most frequent one, and so has the name `car`, depends on the time window. A
+    type with other limits, which the user has changed, is found by its name.
 
     Raises:
-        BadInputError: a file cannot be read, the edges are not a corridor, or no vehicle departs in
-            the time window.
-        CommandFailedError: libsumo is missing, or SUMO rejects a file.
+        BadInputError: there is none.
     """
-    simulation = read_simulation(file, window, seed)
-    network = simulation.network
-    first, last = _edges_of(name, network)
-    corridor = corridor_of(network, first, last, simulation.demand.departing)
-    return SumoCorridor(simulation, corridor, demand_on(corridor, simulation.demand))
+    limits = {
+        name: {field: getattr(own.vehicle, field) for field in LIMITS}
+        for name, own in scenario.types.items()
+    }
+    found = {}
+    for number, (kind, given) in enumerate(names.items()):
+        name, own = given if number else CAR, kind.limits
+        equal = [one for one in limits if limits[one] == own]
+        if not equal and name not in limits:
+            allowed = f"a type with the limits of {name} in the simulation: {own}"
+            raise BadInputError("vehicle_type", [*limits], allowed)
+        found[kind] = name if name in equal or not equal else equal[0]
+    return found
 
 
-def _edges_of(name: str, network: Network) -> tuple[str, str]:
-    """Return the first and the last edge that a name of a corridor consists of.
+class _LaneChoice:
+    """Chooses lanes at the start of the road."""
 
-    Names of edges may contain colons.
+    def __init__(self, scenario: Scenario) -> None:
+        self._spacing_s = scenario.formation.entry_spacing_s
+        self._free_s: dict[int, float] = dict.fromkeys(scenario.road.first_lanes, 0.0)
+        """When the next vehicle can enter, by lane."""
+        self._scenario = scenario
+        self._exit_lanes = {each.name: each.lanes for each in scenario.exit}
 
-    Raises:
-        BadInputError: it does not consist of two names.
-    """
-    colons = [place for place, letter in enumerate(name) if letter == ":"]
-    pairs = [(name[:place], name[place + 1 :]) for place in colons]
-    pairs = [pair for pair in pairs if all(pair)]
-    for pair in pairs:
-        if all(edge in network.edges for edge in pair):
-            return pair
-    if len(pairs) != 1:
-        raise BadInputError(OPTION, name, "FIRST_EDGE:LAST_EDGE, two edges of the network")
-    return pairs[0]
+    def lane(self, t_s: float, destination: str, vehicle_type: str) -> int:
+        """Return the lane of the next vehicle, in which its type may drive."""
+        is_closed = partial(self._scenario.is_restricted, s_m=0.0, vehicle_type=vehicle_type)
+        lanes: Sequence[int] = [lane for lane in self._free_s if not is_closed(lane)]
+        lanes = lanes or [*self._free_s]
+        if destination in self._exit_lanes:
+            nearest = self._exit_lanes[destination]
+            lanes = [min(lanes, key=lambda lane: min(abs(lane - own) for own in nearest))]
+        chosen = min(lanes, key=lambda lane: (max(self._free_s[lane], t_s), -lane))
+        self._free_s[chosen] = max(self._free_s[chosen], t_s) + self._spacing_s
+        return chosen

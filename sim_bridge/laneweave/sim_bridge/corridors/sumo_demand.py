@@ -22,7 +22,6 @@ from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE
 from laneweave.sim_bridge.corridors.corridor import Corridor, unique_name
 from laneweave.sim_bridge.corridors.sumo_config import SumoConfig
-from laneweave.sim_bridge.corridors.sumo_network import Network, read_network
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 MAX_DEMAND_S = 7200.0
@@ -40,6 +39,8 @@ _STOP_NOT_KEPT = frozenset(
     | {"started", "ended", "join", "split", "parkingBadges"}
 )
 """Attributes of stops that depend on passengers or other vehicles, or say what has happened."""
+_ROUTES_FILE = "vehicles.xml"
+"""SUMO's report of the vehicles."""
 _PARKING = 1
 """Flag of stops beside the road."""
 _DEFAULT_TYPE = "DEFAULT_VEHTYPE"
@@ -174,10 +175,10 @@ class CorridorDemand:
     """Their names in SUMO."""
 
 
-def read_network_and_demand(
+def first_simulation(
     config: SumoConfig, folder: Path, window: TimeWindow, seed: int = 1
-) -> tuple[Network, SumoDemand]:
-    """Let SUMO drive a simulation, and return its network and its vehicles.
+) -> SumoProcess:
+    """Start the simulation in which SUMO draws the vehicles.
 
     Args:
         config: the simulation.
@@ -186,13 +187,11 @@ def read_network_and_demand(
         seed: SUMO's seed, unless the configuration has one.
 
     Raises:
-        BadInputError: no vehicle departs in the time window.
         CommandFailedError: libsumo is missing, or SUMO rejects a file.
     """
-    routes, state = folder / "vehicles.xml", folder / "state.xml"
     options = {
         **config.additional(folder, demand=True),
-        "vehroute-output": str(routes),
+        "vehroute-output": str(folder / _ROUTES_FILE),
         "vehroute-output.write-unfinished": "true",
         "vehroute-output.intended-depart": "true",
         "vehroute-output.last-route": "true",
@@ -201,19 +200,37 @@ def read_network_and_demand(
         options["begin"] = f"{window.begin_s:g}"
     if window.scale is not None:
         options["scale"] = f"{window.scale:g}"
-    with SumoProcess(config.command(seed, options)) as sumo:
-        network = read_network(sumo)
-        begin_s, until_s = sumo.simulation.getTime(), sumo.simulation.getEndTime()
-        until_s = until_s if until_s > begin_s else math.inf
-        end_s = min(begin_s + window.duration_s, window.end_s, until_s)
-        # One step more: a vehicle departs in the first step after its time.
-        step_s = sumo.simulation.getDeltaT()
-        waiting = _drive(sumo, end_s + step_s, min(LATEST_S, until_s))
-        sumo.simulation.saveState(str(state))
-        types = {name: _type(sumo, name) for name in sumo.vehicletype.getIDList()}
-        found = [*_not_departed(sumo, waiting, types)]
-        ahead = {name: stops for name in sumo.vehicle.getIDList() if (stops := _stops(sumo, name))}
-    departed, persons = _departed(routes, types, begin_s, ahead)
+    return SumoProcess(config.command(seed, options))
+
+
+def read_demand(
+    sumo: SumoProcess, config: SumoConfig, folder: Path, window: TimeWindow
+) -> SumoDemand:
+    """Let SUMO drive a simulation, close it, and return its vehicles.
+
+    Args:
+        sumo: the simulation, which `first_simulation` has started.
+        config: its configuration.
+        folder: folder for temporary files.
+        window: when the vehicles depart.
+
+    Raises:
+        BadInputError: no vehicle departs in the time window.
+        CommandFailedError: SUMO rejects a file.
+    """
+    state = folder / "state.xml"
+    begin_s, until_s = sumo.simulation.getTime(), sumo.simulation.getEndTime()
+    until_s = until_s if until_s > begin_s else math.inf
+    end_s = min(begin_s + window.duration_s, window.end_s, until_s)
+    # One step more: a vehicle departs in the first step after its time.
+    step_s = sumo.simulation.getDeltaT()
+    waiting = _drive(sumo, end_s + step_s, min(LATEST_S, until_s))
+    sumo.simulation.saveState(str(state))
+    types = {name: _type(sumo, name) for name in sumo.vehicletype.getIDList()}
+    found = [*_not_departed(sumo, waiting, types)]
+    ahead = {name: stops for name in sumo.vehicle.getIDList() if (stops := _stops(sumo, name))}
+    sumo.close()  # SUMO completes its output
+    departed, persons = _departed(folder / _ROUTES_FILE, types, begin_s, ahead)
     found += departed
     inside = sorted(
         (one for one in found if one.depart_s < end_s or math.isinf(one.depart_s)),
@@ -228,7 +245,7 @@ def read_network_and_demand(
             Described(f"{begin_s:g} s to {end_s:g} s"),
             "a time in which vehicles depart" + (f"; {hint}" if math.isfinite(first_s) else ""),
         )
-    return network, SumoDemand(
+    return SumoDemand(
         tuple(inside),
         begin_s,
         min(end_s, math.floor(departures_s[-1]) + 1.0),

@@ -1,17 +1,12 @@
-"""The network of a SUMO simulation, as SUMO has read it."""
+"""The network of a SUMO simulation: edges, their lanes, and the links between these."""
 
 from __future__ import annotations
 
-import gzip
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property
-from pathlib import Path
-from xml.etree import ElementTree as ET
 
 from attrs import define, field, frozen
-
-from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 CARS = "passenger"
 """Class of vehicles that must be allowed in a lane of a corridor."""
@@ -19,8 +14,6 @@ IGNORING = "ignoring"
 """Class of vehicles that may drive anywhere."""
 _HAS_PRIORITY = "M"
 """State of a link whose vehicles give way to nobody."""
-_SIDES = {"left": 1, "right": -1}
-"""SUMO's numbers for the sides to which vehicles change lanes."""
 Point = tuple[float, float]
 
 
@@ -139,66 +132,6 @@ class Network:
         """Return the edges to which an edge has links."""
         names = {link.target.edge: None for lane in edge.lanes for link in self.links_from(lane)}
         return tuple(self.edges[name] for name in names)
-
-
-def read_network(sumo: SumoProcess) -> Network:
-    """Return the network of a simulation."""
-    edges = {
-        name: Edge(
-            name, tuple(_lane(sumo, f"{name}_{n}") for n in range(sumo.edge.getLaneNumber(name)))
-        )
-        for name in sumo.edge.getIDList()
-        if not name.startswith(":")  # inside a junction
-    }
-    # libsumo does not say it.
-    file = Path(sumo.simulation.getOption("net-file"))
-    with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as stream:
-        _, root = next(ET.iterparse(stream, events=("start",)))  # noqa: S314 (SUMO has read it)
-    return Network(edges, tuple(_links(sumo, edges)), root.get("lefthand") == "true")
-
-
-def _lane(sumo: SumoProcess, name: str) -> Lane:
-    edge, _, index = name.rpartition("_")
-    api = sumo.lane
-    return Lane(
-        name,
-        edge,
-        int(index),
-        api.getLength(name),
-        api.getWidth(name),
-        api.getMaxSpeed(name),
-        tuple(api.getShape(name)),
-        frozenset(api.getDisallowed(name)),
-        {
-            side: frozenset(api.getChangePermissions(name, number))
-            for side, number in _SIDES.items()
-        },
-    )
-
-
-def _links(sumo: SumoProcess, edges: Mapping[str, Edge]) -> Iterator[Link]:
-    """Yield the links of all edges that cars may use."""
-    lights = {
-        (origin, target): light
-        for light in sumo.trafficlight.getIDList()
-        for links in sumo.trafficlight.getControlledLinks(light)
-        for origin, target, _ in links
-    }
-    for edge in edges.values():
-        for origin in edge.car_lanes:
-            for to, _, _, _, via, state, _, _ in sumo.lane.getLinks(origin.name):
-                name, _, index = to.rpartition("_")
-                if name in edges and edges[name].lanes[int(index)].allows_cars:
-                    across = tuple(_across(sumo, via))
-                    light = lights.get((origin.name, to), "")
-                    yield Link(origin, edges[name].lanes[int(index)], across, state, light)
-
-
-def _across(sumo: SumoProcess, via: str) -> Iterator[Lane]:
-    """Yield the lanes inside a junction, from the first one on."""
-    while via:
-        yield _lane(sumo, via)
-        via = next((after[4] for after in sumo.lane.getLinks(via)), "")
 
 
 def _grouped(pairs: Iterable[tuple[str, Link]]) -> Mapping[str, tuple[Link, ...]]:

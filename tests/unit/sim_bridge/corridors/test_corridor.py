@@ -20,11 +20,12 @@ from laneweave.sim_bridge.corridors.corridor import (
     braking_m,
     corridor_of,
 )
+from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
 from laneweave.sim_bridge.corridors.corridor_search import find_corridors
-from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
+from laneweave.sim_bridge.corridors.network_reading import read_network
 from laneweave.sim_bridge.corridors.scenario_tables import checked_tables, scenario_tables
 from laneweave.sim_bridge.corridors.sumo_demand import CorridorDemand, SumoDemand
-from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network, read_network
+from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 from support.interchange import (
     CORRIDOR,

@@ -9,7 +9,7 @@ import pytest
 
 from laneweave.sim_bridge.corridors.corridor import corridor_of
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape, _piece
-from laneweave.sim_bridge.corridors.sumo_network import read_network
+from laneweave.sim_bridge.corridors.network_reading import read_network
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 from support.interchange import LANE_M, write_interchange
 

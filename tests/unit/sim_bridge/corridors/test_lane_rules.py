@@ -9,7 +9,8 @@ import pytest
 from attrs import evolve
 
 from laneweave.protocol.config.scenario_files import parse_scenario
-from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor, read_corridor
+from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
+from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
 from laneweave.sim_bridge.corridors.scenario_tables import remarks, scenario_tables
 from support.interchange import CORRIDOR, LANE_M, TRUCKS, stream, vehicle, write_interchange

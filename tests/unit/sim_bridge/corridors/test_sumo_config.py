@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.sim_bridge.corridors.corridor_setup import read_simulation
+from laneweave.sim_bridge.corridors.corridor_reading import read_simulation
 from laneweave.sim_bridge.corridors.sumo_config import read_config
 from support.interchange import vehicle, write_interchange
 

@@ -12,11 +12,12 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
-from laneweave.sim_bridge.corridors.corridor_arrivals import (
+from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
+from laneweave.sim_bridge.corridors.corridor_setup import (
     FIRST_ENTRY_S,
     CorridorArrival,
+    SumoCorridor,
 )
-from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor, read_corridor
 from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
 from laneweave.sim_bridge.corridors.sumo_demand import (
     SumoDemand,

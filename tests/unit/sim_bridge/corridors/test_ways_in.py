@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from laneweave.sim_bridge.corridors.corridor_setup import read_corridor
+from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
 from laneweave.sim_bridge.corridors.ways_in import ways_to_ramp, ways_to_start
 from support.interchange import CORRIDOR, RAMP_SPEED_MPS, TRUCKS, stream, write_interchange
 
