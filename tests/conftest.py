@@ -21,9 +21,14 @@ settings.load_profile("any-load")  # no test depends on the machine's load
 
 
 def pytest_configure() -> None:
-    """Restore SIGINT: a shell's background jobs ignore it, and child processes inherit that."""
+    """Let child processes receive SIGINT and SIGHUP, which background jobs and nohup ignore.
+
+    Child processes inherit that a signal is ignored, but no handlers.
+    """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda *_: None)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
