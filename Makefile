@@ -16,7 +16,7 @@ export OPENBLAS_NUM_THREADS := 1
 # Keep compiled modules: every process of a run would otherwise compile the project again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-unit test-full containers evaluation evaluation-faults docs site check format clean install help
+.PHONY: demo test test-more test-unit test-full containers evaluation evaluation-faults docs site check format clean install help
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 19
@@ -47,10 +47,13 @@ format: $(STAMP) ## format the code
 	$(BIN)/ruff check --fix .
 
 test-unit: $(STAMP) ## run the fast tests: no processes, under a minute
-	$(PYTEST) -m 'not full and not slow' tests/unit
+	$(PYTEST) -m 'not full and not more and not slow' tests/unit
 
-test: $(STAMP) ## run the tests that CI runs
-	$(PYTEST) -m 'not full'
+test: $(STAMP) ## run the tests that prove that everything works
+	$(PYTEST) -m 'not full and not more'
+
+test-more: $(STAMP) ## run what CI runs beyond them
+	$(PYTEST) -m 'more and not full'
 
 test-full: $(STAMP) ## run all tests, including the long ones
 	$(PYTEST)

@@ -273,6 +273,7 @@ def test_exchange_without_a_bay_is_infeasible() -> None:
     assert _assert_oracles_agree(request) is None
 
 
+@pytest.mark.more
 def test_start_of_the_horizon_does_not_matter() -> None:
     for seed in (3, 27, 51):
         request = random_request(seed)

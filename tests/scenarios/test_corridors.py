@@ -139,6 +139,7 @@ def test_sumo_drives_the_same_vehicles_alone(
     assert "SUMO alone" in page
 
 
+@pytest.mark.more
 def test_a_vehicle_that_never_comes_to_the_corridor_is_counted(tmp_path: Path) -> None:
     stands = (
         '<vehicle id="stands" type="car" depart="0" departPos="200"><route edges="before"/>'
@@ -187,6 +188,7 @@ def test_both_runs_have_the_same_vehicles(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.more
 def test_vehicles_come_from_upstream(tmp_path: Path) -> None:
     """SUMO determines their lanes; some arrive at the same time in different lanes."""
     vehicles = []
@@ -209,6 +211,7 @@ def test_vehicles_come_from_upstream(tmp_path: Path) -> None:
     assert {trip["entrance"] for trip in trips} == {MAIN_ENTRANCE, "on"}
 
 
+@pytest.mark.more
 def test_an_exit_follows_a_ramp_in_the_same_lane(tmp_path: Path) -> None:
     """Moves into the lane of the exit begin at different times of their slots, some early."""
     vehicles = []
@@ -234,6 +237,7 @@ def test_an_exit_follows_a_ramp_in_the_same_lane(tmp_path: Path) -> None:
             assert trip.attrib["arrivalLane"].startswith(f"{edge}_")
 
 
+@pytest.mark.more
 def test_equal_runs_are_equal(tmp_path: Path) -> None:
     own = scenario(tmp_path, stream(8))
     folders = [tmp_path / name for name in ("one", "two")]
@@ -287,6 +291,7 @@ def test_a_truck_does_not_brake_hard_behind_one_that_has_left(tmp_path: Path) ->
     assert read_statistics(tmp_path / "run").collisions == 0
 
 
+@pytest.mark.more
 def test_vehicles_wait_at_the_start_while_their_exit_is_full(tmp_path: Path) -> None:
     """In the corridor they would stop beside the exit, and so would all vehicles behind them."""
     until_s = 100
@@ -312,6 +317,7 @@ def test_vehicles_wait_at_the_start_while_their_exit_is_full(tmp_path: Path) -> 
             assert trip["left_s"] - trip["entered_s"] == pytest.approx(free_s, abs=1.5)
 
 
+@pytest.mark.more
 def test_a_run_ends_although_an_exit_remains_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -329,6 +335,7 @@ def test_a_run_ends_although_an_exit_remains_full(
     assert read_statistics(tmp_path / "run").collisions == 0
 
 
+@pytest.mark.more
 def test_flows_on_the_first_edge(tmp_path: Path) -> None:
     """SUMO drives their vehicles for a step, before they are taken out and wait."""
     flow = '<flow id="{0}" type="car" begin="0" end="40" period="{1}" departSpeed="max">'

@@ -13,14 +13,15 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.sim_bridge.corridors.corridor_reading import WHOLE, read_corridor
 from support.drawn_corridors import draw_corridor, problems
 
-IN_EACH_TEST_RUN = 6
+IN_CI = 6
 
 
 @pytest.mark.parametrize(
     "seed",
     [
-        pytest.param(seed, marks=() if seed < IN_EACH_TEST_RUN else pytest.mark.full)
-        for seed in range(500)
+        0,
+        *(pytest.param(seed, marks=pytest.mark.more) for seed in range(1, IN_CI)),
+        *(pytest.param(seed, marks=pytest.mark.full) for seed in range(IN_CI, 500)),
     ],
 )
 def test_all_get_where_their_routes_lead(tmp_path: Path, seed: int) -> None:

@@ -27,6 +27,8 @@ DEMAND_S = 60.0
 HARDEST_MPS2 = -4.0
 RAMP_VEH_PER_H = 360.0
 TRUCK_SHARE, EXIT_SHARE = 0.25, 0.15
+IN_CI = (3700, 1)
+"""Volume and seed."""
 NETWORKS = {
     "exit-first": (EXIT_FIRST, {"main": "main", "exit": "exit", "ramp": "ramp"}),
     "ramp-first": (RAMP_FIRST, {"main": "main", "exit": "late exit", "ramp": "early ramp"}),
@@ -49,7 +51,9 @@ def traffic(volume_veh_per_h: float, seed: int) -> Iterator[tuple[float, str, st
 @pytest.mark.parametrize(
     ("volume", "seed"),
     [
-        pytest.param(volume, seed, marks=() if (volume, seed) == (3700, 1) else pytest.mark.full)
+        pytest.param(
+            volume, seed, marks=pytest.mark.more if (volume, seed) == IN_CI else pytest.mark.full
+        )
         for volume in (1800, 3700)
         for seed in range(1, 11)
     ],

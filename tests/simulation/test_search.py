@@ -24,6 +24,11 @@ from laneweave.launch.fault_search.story import Story
 
 BATCH = 20
 SEEDS = 20
+LONG = {"roads", "entry-roads", "lane-ends", "dense", "clocks", "rolling", "rolling-dense"} | {
+    "entry-rolling",
+    "harmful-rolling",
+}
+"""Profiles whose runs take seconds."""
 DIGESTS = range(1000, 1006)
 _PRINT_DIGESTS = """
 import json, sys
@@ -70,7 +75,14 @@ def test_no_rule_is_broken_and_all_vehicles_arrive_long(
     assert search(profile, range(first, first + 100)).motions > motions
 
 
-@pytest.mark.parametrize("profile", [name for name in PROFILES if name != "mixed"])
+@pytest.mark.parametrize(
+    "profile",
+    [
+        pytest.param(name, marks=pytest.mark.more if name in LONG else ())
+        for name in PROFILES
+        if name != "mixed"
+    ],
+)
 def test_profile(profile: str) -> None:
     search(profile, range({"rolling-dense": 2}.get(profile, 4)))
 
@@ -82,6 +94,7 @@ def test_profile_long(profile: str) -> None:
     search(profile, range(1000, 1200))
 
 
+@pytest.mark.more
 def test_formations_are_joined() -> None:
     assert search("joint", range(110, 122)).joint_plans > 0
 
@@ -114,6 +127,7 @@ def test_without_faults_the_last_plan_is_not_late(seed: int) -> None:
     assert outcome.totals.dropped == 0
 
 
+@pytest.mark.more
 def test_equal_seeds_give_equal_runs_under_any_hash_seed() -> None:
     digests = [outcome.digest for outcome in outcomes("mixed", DIGESTS, digest=True)]
     assert len(set(digests)) == len(DIGESTS)

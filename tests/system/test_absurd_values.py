@@ -182,6 +182,7 @@ def leader_changes(folder: Path) -> int:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_single_absurd_messages_stop_nothing(lab: Lab, road: Path) -> None:
     with running(lab, road, "--pace", PACE) as (forger, folder):
         for row in ROWS.values():

@@ -87,6 +87,7 @@ def test_a_signal_ends_a_run(
 @pytest.mark.parametrize("tries", [3, pytest.param(20, marks=pytest.mark.full)])
 @pytest.mark.parametrize("options", [OVER_ZENOH, SIMULATED], ids=["zenoh", "simulated"])
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
+@pytest.mark.more
 def test_a_signal_to_the_group_ends_a_run_in_good_order_at_any_moment(
     lab: Lab, road: Path, number: signal.Signals, options: tuple[str, ...], tries: int
 ) -> None:
@@ -167,6 +168,7 @@ def start_in_terminal(lab: Lab, *arguments: object) -> tuple[int, subprocess.Pop
     return ours, process
 
 
+@pytest.mark.more
 def test_what_killed_runs_left_is_removed_at_the_next_start(lab: Lab, road: Path) -> None:
     own = lab.sockets / "laneweave-results"
     own.mkdir()
@@ -263,6 +265,7 @@ def test_a_run_ends_when_the_fork_server_is_killed(lab: Lab, road: Path) -> None
         pytest.param("router", signal.SIGUSR1, marks=pytest.mark.full),
     ],
 )
+@pytest.mark.more
 def test_a_run_ends_with_its_bridge_and_its_router(
     lab: Lab, road: Path, role: str, number: signal.Signals
 ) -> None:
@@ -280,6 +283,7 @@ def test_a_run_ends_with_its_bridge_and_its_router(
         check_files(lab.folder / "out")
 
 
+@pytest.mark.more
 def test_vehicles_arrive_though_an_agent_is_killed(lab: Lab) -> None:
     road = lab.path("short.toml", SHORT_ROAD)
     process = start_and_wait(lab, road, "--duration", "14", "--coordinators", "1")

@@ -133,6 +133,7 @@ def test_a_road_that_is_not_that_of_the_corridor_is_refused(lab: Lab, config: Pa
     refused(lab, "run", wrong, "--transport", "simulated", expected=expected)
 
 
+@pytest.mark.more
 def test_a_network_from_opendrive(lab: Lab, config: Path) -> None:
     """Names of edges are new after the interchange was written as OpenDRIVE and read again."""
     network, drive = (config.with_name(name) for name in ("small.net.xml", "small.xodr"))

@@ -80,6 +80,7 @@ def test_plan_from_python() -> None:
     assert "red takes target " in printed
 
 
+@pytest.mark.more
 def test_a_planner_of_a_user_plans(
     installed: dict[str, str], scenario: Path, tmp_path: Path
 ) -> None:
@@ -99,6 +100,7 @@ def test_a_planner_of_a_user_plans(
     assert summary.safety.overlaps == 0
 
 
+@pytest.mark.more
 def test_a_planner_of_a_user_plans_in_coordinators(
     installed: dict[str, str], scenario: Path, tmp_path: Path
 ) -> None:
@@ -109,6 +111,7 @@ def test_a_planner_of_a_user_plans_in_coordinators(
     assert summary.planning.by_solver["prioritized"] > 0
 
 
+@pytest.mark.more
 def test_methods_of_a_user_are_swept_and_reported(
     installed: dict[str, str], scenario: Path, tmp_path: Path
 ) -> None:

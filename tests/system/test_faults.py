@@ -74,6 +74,7 @@ def test_half_of_all_messages_are_lost(lab: Lab) -> None:
     assert found["faults"]["injected"] == []
 
 
+@pytest.mark.more
 def test_nothing_arrives_from_the_start(lab: Lab) -> None:
     road = lab.path("blackout.toml", BLACKOUT_ROAD)
     faults = lab.path("faults.toml", "[[messages]]\nloss = 1.0\n")
@@ -116,6 +117,7 @@ def test_a_leader_that_is_killed_is_replaced(
     assert [line for line in log_lines(folder) if line["level"] == "error"] == []
 
 
+@pytest.mark.more
 def test_agents_are_killed_and_all_but_one_started_again(lab: Lab, short: Path) -> None:
     """An agent that stays dead is no failure of the run."""
     faults = lab.path(
@@ -136,6 +138,7 @@ def test_agents_are_killed_and_all_but_one_started_again(lab: Lab, short: Path) 
     assert "v0003" in {event["vehicle"] for event in events(folder, "caretaker-took-over")}
 
 
+@pytest.mark.more
 def test_a_leader_that_is_paused_is_replaced_and_comes_back(
     finished_run: FinishedRun, lab: Lab, road: Path
 ) -> None:
@@ -162,6 +165,7 @@ def test_a_leader_that_is_paused_is_replaced_and_comes_back(
     assert final_lanes(lab.folder / "out") == final_lanes(finished_run("simulated"))
 
 
+@pytest.mark.more
 def test_the_router_is_killed_and_two_groups_are_cut_from_each_other(lab: Lab, short: Path) -> None:
     faults = lab.path(
         "faults.toml",
@@ -179,6 +183,7 @@ def test_the_router_is_killed_and_two_groups_are_cut_from_each_other(lab: Lab, s
     assert found["messages"]["dropped_by_faults"] > 0
 
 
+@pytest.mark.more
 def test_each_group_is_cut_off_for_some_time(lab: Lab, short: Path) -> None:
     windows = {"coordinators": (8, 12), "vehicles": (14, 15), "bridge": (18, 19)}
     faults = lab.path(
@@ -243,6 +248,7 @@ def _is_stopped(process: psutil.Process) -> bool:
         return False
 
 
+@pytest.mark.more
 def test_links_lose_packets(lab: Lab, short: Path) -> None:
     faults = lab.path("faults.toml", "[[link]]\nloss = 0.02\nfrom_s = 5\nuntil_s = 15\n")
     folder = lab.folder / "out"

@@ -56,6 +56,7 @@ def test_a_plan_compiles_nothing(lab: Lab) -> None:
     assert not compiled(cache)
 
 
+@pytest.mark.more
 def test_coordinators_answer_while_one_of_them_compiles(lab: Lab) -> None:
     cache = {"NUMBA_CACHE_DIR": str(lab.folder / "cache")}
     config = deployment(lab, free_tcp())
@@ -97,6 +98,7 @@ def test_coordinators_answer_while_one_of_them_compiles(lab: Lab) -> None:
     lab.check_nothing_left()
 
 
+@pytest.mark.more
 def test_a_run_of_formations_does_not_wait_for_a_solver(lab: Lab, road: Path) -> None:
     cache = lab.folder / "cache"
 

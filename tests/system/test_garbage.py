@@ -213,6 +213,7 @@ def test_nonsense_changes_nothing(
     assert any(event.get("name") == GHOST for event in events(folder, "plan-made"))
 
 
+@pytest.mark.more
 def test_forged_messages_crash_no_process(
     lab: Lab, road: Path, talk: Callable[[Callable[[ZenohTransport], None]], None]
 ) -> None:

@@ -57,6 +57,7 @@ def finish(hosts: Hosts) -> Path:
     return folder
 
 
+@pytest.mark.more
 def test_a_link_is_cut_and_the_router_killed(make_hosts: MakeHosts) -> None:
     hosts = make_hosts()
     hosts.start_all()
@@ -77,6 +78,7 @@ def test_a_link_is_cut_and_the_router_killed(make_hosts: MakeHosts) -> None:
     assert sum(lanes[name] == wanted[name] for name in lanes) >= 0.8 * len(lanes)
 
 
+@pytest.mark.more
 def test_links_lose_packets(make_hosts: MakeHosts) -> None:
     hosts = make_hosts(pace=3.0, link="quic?mixed_rel=1")
     try:

@@ -31,6 +31,7 @@ between_s = [8.0, 20.0]
 
 
 @pytest.mark.parametrize("operation", ["rolling", "formations"])
+@pytest.mark.more
 def test_vehicles_without_agents_stop_wait_and_get_on(lab: Lab, operation: str) -> None:
     road = lab.path("road.toml", ROAD.replace("OPERATION", operation))
     faults = lab.path("faults.toml", KILLS)

@@ -180,6 +180,7 @@ def delays(lab: Lab) -> tuple[object, ...]:
     return ("run", short, *DEMAND, "--faults", faults, *out)
 
 
+@pytest.mark.more
 def test_a_run_over_links_with_delays(lab: Lab, delays: tuple[object, ...]) -> None:
     ended = lab.run(*delays)
     if "link[0]: " in ended.err:
@@ -195,6 +196,7 @@ def test_a_run_over_links_with_delays(lab: Lab, delays: tuple[object, ...]) -> N
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.more
 def test_relays_end_with_their_run(
     lab: Lab, delays: tuple[object, ...], number: signal.Signals
 ) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from laneweave.protocol.config.scenario_files import load_scenario
 from support.harness import Lab, check_safe_and_complete, summary, trips
 
@@ -79,6 +81,7 @@ gap_m = 20.0
 """
 
 
+@pytest.mark.more
 def test_cars_vans_and_trucks_sort_in_formations(lab: Lab) -> None:
     """Vans drive all moves; trucks change lanes only, and others make room."""
     folder = lab.folder / "run"

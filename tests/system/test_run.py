@@ -27,7 +27,9 @@ from support.harness import (
 from system.conftest import FinishedRun
 
 
-@pytest.mark.parametrize("name", ["zenoh", "packed", "simulated"])
+@pytest.mark.parametrize(
+    "name", ["zenoh", pytest.param("packed", marks=pytest.mark.more), "simulated"]
+)
 def test_a_run_keeps_its_promises(finished_run: FinishedRun, name: str) -> None:
     folder = finished_run(name)
 

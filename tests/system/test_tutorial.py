@@ -94,6 +94,7 @@ def test_the_tutorial(lab: Lab, clone: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("clone")
+@pytest.mark.more
 def test_the_guide_for_python(lab: Lab) -> None:
     run, read, plan = follow(lab, "PYTHON.md")
 

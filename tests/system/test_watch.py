@@ -121,6 +121,7 @@ def shown_since(page: Page, before: dict[str, int], count: str) -> bool:
 
 
 @needs_chromium
+@pytest.mark.more
 def test_90_vehicles_are_shown(lab: Lab, page: Page) -> None:
     endpoint = free_tcp()
     config = deployment(lab, endpoint)
@@ -341,6 +342,7 @@ def moved_m(before: dict[str, float], after: dict[str, float]) -> float:
     return max((after[name] - before[name] for name in before.keys() & after.keys()), default=0.0)
 
 
+@pytest.mark.more
 def test_an_interrupted_run_says_so_on_its_page(lab: Lab, road: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         refused = lab.run("run", road, "--watch-listen", f"127.0.0.1:{taken.getsockname()[1]}")
@@ -364,6 +366,7 @@ def test_an_interrupted_run_says_so_on_its_page(lab: Lab, road: Path) -> None:
     lab.check_nothing_left()
 
 
+@pytest.mark.more
 def test_a_watcher_waits_for_the_router_of_a_run_and_sees_its_end(lab: Lab) -> None:
     config = lab.path("short.toml", SHORT)
     watch = lab.start("watch", "--config", config, "--wait", "60", "--listen", "127.0.0.1:0")
@@ -388,6 +391,7 @@ def test_a_watcher_waits_for_the_router_of_a_run_and_sees_its_end(lab: Lab) -> N
     lab.check_nothing_left()
 
 
+@pytest.mark.more
 def test_two_runs_do_not_share_an_endpoint(lab: Lab) -> None:
     config = lab.path("short.toml", SHORT)
     options = ("--vehicles-per-process", "8", "--duration", "600")

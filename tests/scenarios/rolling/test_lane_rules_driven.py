@@ -8,6 +8,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from laneweave.launch.recordings.trajectories import read_trajectories, read_trips
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
@@ -50,6 +52,7 @@ def by_vehicle(rows: list[Row]) -> Iterator[tuple[str, list[Row]]]:
         yield name, [row for row in rows if row[0] == name]
 
 
+@pytest.mark.more
 def test_no_truck_is_ever_in_the_lane_that_is_closed_to_trucks(tmp_path: Path) -> None:
     own = scenario(restrictions=[{"lane": LEFT, "vehicle_types": ["truck"]}])
     rows, trucks = drive(own, tmp_path)
@@ -64,6 +67,7 @@ def test_no_truck_is_ever_in_the_lane_that_is_closed_to_trucks(tmp_path: Path) -
     assert changing - trucks
 
 
+@pytest.mark.more
 def test_rules_for_parts_of_the_road_are_kept_there(tmp_path: Path) -> None:
     line_m, ban_m = (300.0, 500.0), (450.0, 600.0)
     own = scenario(

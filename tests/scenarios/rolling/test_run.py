@@ -77,6 +77,7 @@ def test_on_a_bad_network_vehicles_are_late_at_worst(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("conditions", [Conditions(), BAD], ids=["good", "bad"])
+@pytest.mark.more
 def test_messages_in_kind_make_the_same_run(
     tmp_path: Path, conditions: Conditions, monkeypatch: pytest.MonkeyPatch
 ) -> None:

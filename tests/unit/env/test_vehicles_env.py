@@ -108,6 +108,7 @@ def test_possible_agents_are_the_demanded_vehicles() -> None:
     assert {*env.record.trips} == {*env.possible_agents}
 
 
+@pytest.mark.more
 def test_varied_demands_are_within_the_possible_agents() -> None:
     env = parallel_env(SHORT, vary_demand=True)
     entered = []
@@ -118,6 +119,7 @@ def test_varied_demands_are_within_the_possible_agents() -> None:
     assert entered[0] != entered[1] != entered[2]
 
 
+@pytest.mark.more
 def test_same_seed_gives_the_same_episode_also_beside_another_one() -> None:
     one, other = parallel_env(SHORT), parallel_env(SHORT)
     first = play(one, any_move, 5)
@@ -149,7 +151,9 @@ def test_episodes_without_seeds_differ_but_repeat_after_the_same_first_seed() ->
     "tables",
     [
         SHORT,
-        SHORT | {"formation": {"mode": 2, "conflicts": ["geometric"]}},
+        pytest.param(
+            SHORT | {"formation": {"mode": 2, "conflicts": ["geometric"]}}, marks=pytest.mark.more
+        ),
         SHORT | {"road": ROAD | {"closures": [{"lane": 0, "from_m": 550.0, "to_m": 750.0}]}},
     ],
     ids=["straight", "oblique moves", "lane drop"],
@@ -336,6 +340,7 @@ def test_bad_input() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_example() -> None:
     command = [sys.executable, str(ROOT / "examples" / "pettingzoo_env.py")]
     scenario = str(ROOT / "scenarios" / "demo.toml")

@@ -57,6 +57,7 @@ print(*(name for name in sys.modules if name.split(".")[0] in ("attrs", "numpy",
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_a_wheel_is_typed_for_users(tmp_path: Path) -> None:
     """Build and install the wheel, and check a user's program elsewhere."""
     pip, site = (sys.executable, "-m", "pip"), tmp_path / "site"

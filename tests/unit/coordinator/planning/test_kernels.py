@@ -120,6 +120,7 @@ def test_kernels_are_compiled_once(workshop: Workshop) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_a_changed_callee_is_compiled_again(workshop: Workshop) -> None:
     """Numba alone would call the code of the old one, since the caller's file is the same."""
     assert workshop.result(LOAD) == [1, 20]
@@ -132,6 +133,7 @@ def test_a_changed_callee_is_compiled_again(workshop: Workshop) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_an_incomplete_cache_is_not_used(workshop: Workshop) -> None:
     workshop.result(LOAD)
     for path in workshop.folder.rglob("fake_outer.*.nb?"):
@@ -142,6 +144,7 @@ def test_an_incomplete_cache_is_not_used(workshop: Workshop) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_a_process_that_found_kernels_missing_loads_them_when_they_are_compiled(
     workshop: Workshop,
 ) -> None:
@@ -167,6 +170,7 @@ print(json.dumps([first, fake.known_missing, fake.load_if_compiled(), len(calls)
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_one_of_several_processes_compiles(workshop: Workshop) -> None:
     processes = [workshop.start(LOAD) for _ in range(3)]
 
@@ -176,6 +180,7 @@ def test_one_of_several_processes_compiles(workshop: Workshop) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_a_killed_compilation_leaves_no_lock(workshop: Workshop) -> None:
     program = """
 with fake.compilation_lock():

@@ -196,6 +196,7 @@ def driven() -> Profile:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lateness_s", [0.0, 0.2, 0.5])
+@pytest.mark.more
 def test_formations_keep_the_clearance_when_agents_drive_them(lateness_s: float) -> None:
     """Eight vehicles in mode 2 follow a timetable with delays."""
     least_m = []

@@ -781,6 +781,7 @@ def test_answers_are_forgotten_when_they_are_long(
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_large_requests_leave_little_behind() -> None:
     grid = {
         "columns": 100,

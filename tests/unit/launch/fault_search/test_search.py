@@ -47,6 +47,7 @@ def test_bad_jobs(jobs: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_several_processes_have_the_results_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search_module, "BATCH", 2)
     seeds = range(4)  # two batches

@@ -127,6 +127,7 @@ def test_only_one_run_at_a_time_is_in_this_process(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_a_script_without_a_guard_runs_once_and_in_any_thread(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(

@@ -123,6 +123,7 @@ def test_of_a_run_without_formations(laneweave: Here, swept: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_of_several_runs(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     folders = [tmp_path / "first", tmp_path / "second"]
     for folder in folders:

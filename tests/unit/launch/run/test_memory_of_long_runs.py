@@ -17,6 +17,7 @@ ROLLING = {"operation": "rolling"}
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_nothing_grows_with_the_vehicles_that_have_passed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -14,6 +14,7 @@ distributed = pytest.importorskip(
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_a_cluster_has_the_same_results(tmp_path: Path) -> None:
     scenario = short_road(tmp_path)
     lists = ("--volumes", "1600", "--seeds", "3:5")

@@ -67,6 +67,7 @@ def test_the_files_of_a_sweep(whole: Path) -> None:
     }
 
 
+@pytest.mark.more
 def test_an_interrupted_sweep_is_continued(whole: Path, scenario: Path, tmp_path: Path) -> None:
     out = tmp_path / "sweep"
     process = subprocess.Popen(
@@ -121,6 +122,7 @@ def test_a_run_whose_process_dies_is_a_failed_row_and_tried_again(
     assert [row["status"] for row in results(out)] == ["done"]
 
 
+@pytest.mark.more
 def test_a_run_that_breaks_a_promise_is_a_failed_row_with_its_numbers(tmp_path: Path) -> None:
     scenario = short_road(tmp_path)
     scenario.write_text(scenario.read_text() + "\n[runtime]\nmax_road_s = 8.0\n")

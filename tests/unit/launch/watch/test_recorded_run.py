@@ -28,6 +28,7 @@ def frames(recording: Recording) -> list[dict[str, Any]]:
     return [json.loads(text) for text in recording.frames(0, recording.last)]
 
 
+@pytest.mark.more
 def test_vehicles_are_at_their_recorded_positions(recorded: Path) -> None:
     recording, tracks = Recording(recorded), read_tracks(recorded)
     shown = frames(recording)

@@ -102,6 +102,7 @@ def test_all_vehicles_leave_on_their_preferred_lanes_without_touching(
 @pytest.mark.slow
 @pytest.mark.parametrize("gap", ["front-to-front", "net"])
 @pytest.mark.parametrize("lane_change_s", [0.0, 4.0])
+@pytest.mark.more
 def test_a_jam_clears_up(gap: str, lane_change_s: float) -> None:
     scenario = parse_scenario(
         {

@@ -120,6 +120,7 @@ def test_the_census_tells_where_they_stand() -> None:
 
 
 @pytest.mark.parametrize("blind", [False, True], ids=["", "planted bug"])
+@pytest.mark.more
 def test_a_queue_that_reaches_the_entrance_keeps_vehicles_from_entering(
     monkeypatch: pytest.MonkeyPatch, *, blind: bool
 ) -> None:

@@ -99,6 +99,7 @@ def test_vehicles_in_the_lane_of_an_exit_leave_there_whatever_their_destination(
     assert not road.events
 
 
+@pytest.mark.more
 def test_a_queue_on_a_ramp_keeps_vehicles_from_entering_until_there_is_room_to_merge() -> None:
     full = ramp_road(demand={"volume_veh_per_lane_h": 1800.0, "duration_s": 120.0})
     full = evolve(full, entrance=(evolve(full.entrance[0], volume_veh_per_h=1200.0),))
