@@ -153,6 +153,7 @@ def test_a_vehicle_that_never_comes_to_the_corridor_is_counted(tmp_path: Path) -
     assert (waits["sumo_id"], waits["entrance"]) == ("r", "on")
 
 
+@pytest.mark.more
 def test_both_runs_have_the_same_vehicles(tmp_path: Path) -> None:
     """Also where SUMO draws them: flows by probability, districts, trips, stops, a scale."""
     routes = [
@@ -247,6 +248,7 @@ def test_equal_runs_are_equal(tmp_path: Path) -> None:
     assert one == two
 
 
+@pytest.mark.more
 def test_a_queue_behind_the_exit_is_braked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

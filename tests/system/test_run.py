@@ -82,6 +82,7 @@ def test_a_run_prints_a_table_and_nothing_else(finished_run: FinishedRun) -> Non
     assert Ended(0, out, err).complaints == []
 
 
+@pytest.mark.more
 def test_the_number_of_processes_is_as_asked(finished_run: FinishedRun) -> None:
     single, packed = summary(finished_run("zenoh")), summary(finished_run("packed"))
 

@@ -76,6 +76,7 @@ def test_counts_are_those_of_the_tables() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_a_picture_is_written(tmp_path: Path) -> None:
     out = tmp_path / "images" / "conflicts.png"
     draw_conflicts(out, dpi=40)
