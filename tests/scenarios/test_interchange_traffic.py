@@ -28,7 +28,7 @@ HARDEST_MPS2 = -4.0
 RAMP_VEH_PER_H = 360.0
 TRUCK_SHARE, EXIT_SHARE = 0.25, 0.15
 IN_CI = (3700, 1)
-"""Volume and seed."""
+"""Volume [veh/h] and seed of the runs that CI makes."""
 NETWORKS = {
     "exit-first": (EXIT_FIRST, {"main": "main", "exit": "exit", "ramp": "ramp"}),
     "ramp-first": (RAMP_FIRST, {"main": "main", "exit": "late exit", "ramp": "early ramp"}),

@@ -24,11 +24,11 @@ from laneweave.launch.fault_search.story import Story
 
 BATCH = 20
 SEEDS = 20
-LONG = {"roads", "entry-roads", "lane-ends", "dense", "clocks", "rolling", "rolling-dense"} | {
-    "entry-rolling",
-    "harmful-rolling",
+LONG = {
+    *("roads", "entry-roads", "lane-ends", "dense", "clocks"),
+    *("rolling", "rolling-dense", "entry-rolling", "harmful-rolling"),
 }
-"""Profiles whose runs take seconds."""
+"""Profiles whose search takes more than ten seconds."""
 DIGESTS = range(1000, 1006)
 _PRINT_DIGESTS = """
 import json, sys

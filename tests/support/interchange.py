@@ -24,8 +24,11 @@ from attrs import frozen
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.sim_bridge.corridors import sumo_network
 from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
+from laneweave.sim_bridge.corridors.network_reading import read_network
 from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
+from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 LANE_M = 3.2
 CORRIDOR = "main1:main5"
@@ -168,6 +171,12 @@ def stream(duration_s: int) -> list[str]:
 
 
 TRUCKS = '<vType id="truck" vClass="truck" length="7.1" accel="1.3" decel="4" sigma="0"/>'
+
+
+def interchange_network(folder: Path, state: str = "M") -> sumo_network.Network:
+    """Return the network of the corridor's simulation; `state`: right of way of its main road."""
+    with SumoProcess(("sumo", "-c", str(write_interchange(folder, state=state)))) as sumo:
+        return read_network(sumo)
 
 
 def interchange_scenario(folder: Path) -> Scenario:

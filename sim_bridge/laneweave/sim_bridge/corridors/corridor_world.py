@@ -82,9 +82,7 @@ class CorridorWorld(SumoProcess):
         super().__init__(setup.command(folder, results, _PLANTS))
         scenario, found = setup.scenario, setup.found
         network, corridor = found.simulation.network, found.corridor
-        self._types = scenario.types
         self._lane_m = scenario.road.lane_width_m
-        self._length_m = scenario.road.length_m
         self._shape = CorridorShape(network, corridor)
         self._sumo_name = {one.arrival.vehicle: one.origin.vehicle.name for one in setup.arrivals}
         self._coming = dict(setup.by_name)

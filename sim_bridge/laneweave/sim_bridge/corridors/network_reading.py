@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-import gzip
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from xml.etree import ElementTree as ET
 
+from laneweave.protocol.errors import BadInputError
+from laneweave.sim_bridge.corridors.sumo_config import first_element
 from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
+_MOST_ACROSS = 8
+"""Most lanes one after another inside a junction; a loop of them is a broken file."""
 _SIDES = {"left": 1, "right": -1}
 """SUMO's numbers for the sides to which vehicles change lanes."""
 
 
 def read_network(sumo: SumoProcess) -> Network:
-    """Return the network of a simulation."""
+    """Return the network of a simulation.
+
+    Raises:
+        BadInputError: it has no edges.
+    """
     edges = {
         name: Edge(
             name, tuple(_lane(sumo, f"{name}_{n}") for n in range(sumo.edge.getLaneNumber(name)))
@@ -23,11 +29,12 @@ def read_network(sumo: SumoProcess) -> Network:
         for name in sumo.edge.getIDList()
         if not name.startswith(":")  # inside a junction
     }
-    # libsumo does not say it.
     file = Path(sumo.simulation.getOption("net-file"))
-    with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as stream:
-        _, root = next(ET.iterparse(stream, events=("start",)))  # noqa: S314 (SUMO has read it)
-    return Network(edges, tuple(_links(sumo, edges)), root.get("lefthand") == "true")
+    if not edges:
+        raise BadInputError("net-file", str(file), "a network of SUMO with at least one edge")
+    # libsumo does not tell on which side vehicles drive.
+    left_hand = first_element("net-file", file).get("lefthand") == "true"
+    return Network(edges, tuple(_links(sumo, edges)), left_hand)
 
 
 def _lane(sumo: SumoProcess, name: str) -> Lane:
@@ -69,6 +76,8 @@ def _links(sumo: SumoProcess, edges: Mapping[str, Edge]) -> Iterator[Link]:
 
 def _across(sumo: SumoProcess, via: str) -> Iterator[Lane]:
     """Yield the lanes inside a junction, from the first one on."""
-    while via:
+    for _ in range(_MOST_ACROSS):
+        if not via:
+            break
         yield _lane(sumo, via)
         via = next((after[4] for after in sumo.lane.getLinks(via)), "")

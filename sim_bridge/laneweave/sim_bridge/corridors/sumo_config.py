@@ -153,9 +153,12 @@ def read_config(file: Path, folder: Path) -> SumoConfig:
             raise BadInputError(f"{name} of {file}", str(missing), "a file that exists")
         if named:
             options[name] = ",".join(map(str, named))
+    net_file = Path(options["net-file"])
+    if first_element("net-file", net_file).tag != "net":
+        raise BadInputError("net-file", str(net_file), "a network of SUMO")
     return SumoConfig(
         file.resolve(),
-        Path(options["net-file"]),
+        net_file,
         _paths(options.pop("additional-files", "")),
         options,
     )
@@ -167,17 +170,32 @@ def _check_kind(file: Path) -> None:
     Raises:
         BadInputError: it cannot be read, or is another file of SUMO.
     """
-    try:
-        with file.open("rb") as stream:
-            _, root = next(ET.iterparse(stream, events=("start",)))  # noqa: S314
-    except OSError as error:
-        raise BadInputError("SUMOCFG", str(file), f"a readable file ({error.strerror})") from error
-    except (ET.ParseError, StopIteration) as error:
-        raise BadInputError("SUMOCFG", str(file), f"XML ({error})") from error
+    kind = first_element("SUMOCFG", file).tag
     kinds = {"net": "a network", "routes": "a file of routes", "additional": "an additional file"}
-    if root.tag in kinds:
-        allowed = f"a configuration (.sumocfg) that names it; the file is {kinds[root.tag]}"
+    if kind in kinds:
+        allowed = f"a configuration (.sumocfg) that names it; the file is {kinds[kind]}"
         raise BadInputError("SUMOCFG", str(file), allowed)
+
+
+def first_element(field: str, file: Path) -> ET.Element:
+    """Return the outermost element of an XML file with its attributes, not its content.
+
+    Args:
+        field: what the file is, for errors.
+        file: the file, compressed if its name ends with `.gz`.
+
+    Raises:
+        BadInputError: it cannot be read, or is no XML.
+    """
+    try:
+        with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as stream:
+            found: ET.Element = next(ET.iterparse(stream, events=("start",)))[1]  # noqa: S314
+    except (ET.ParseError, StopIteration, EOFError, gzip.BadGzipFile) as error:
+        raise BadInputError(field, str(file), f"XML ({error})") from error
+    except OSError as error:
+        allowed = f"a readable file ({error.strerror or error})"
+        raise BadInputError(field, str(file), allowed) from error
+    return found
 
 
 def _paths(value: str) -> tuple[Path, ...]:

@@ -9,15 +9,12 @@ import pytest
 
 from laneweave.sim_bridge.corridors.corridor import corridor_of
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape, _piece
-from laneweave.sim_bridge.corridors.network_reading import read_network
-from laneweave.sim_bridge.sumo.simulation import SumoProcess
-from support.interchange import LANE_M, write_interchange
+from support.interchange import LANE_M, interchange_network
 
 
 @pytest.fixture
 def shape(tmp_path: Path) -> CorridorShape:
-    with SumoProcess(("sumo", "-c", str(write_interchange(tmp_path)))) as sumo:
-        network = read_network(sumo)
+    network = interchange_network(tmp_path)
     return CorridorShape(network, corridor_of(network, "main1", "main5"))
 
 
