@@ -304,7 +304,7 @@ class Road:
         }
         start_s = start_time_s(cells.values(), self.tick * scenario.runtime.tick_s, scenario)
         task = SortingTask((block,), cells, goal_lanes, (), scenario, LONGEST_DEADLINE_S)
-        moves = sort_lanes(task, scenario.formation.max_nodes, plan).moves
+        moves = sort_lanes(task, scenario.formation.max_nodes, plan, time.monotonic).moves
         every = [move for each in moves.values() for move in each]
         slot_s = scenario.cycles_s[0]
         if max(step for step, _, _ in every) >= steps_left(

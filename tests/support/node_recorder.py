@@ -122,7 +122,7 @@ def chatter(
                 sent += 1
                 return [
                     beat(sent, name),
-                    *([node.Compute(sent, lambda: 1)] if sent % 10 == 0 else []),
+                    *([node.Compute(sent, lambda _: 1)] if sent % 10 == 0 else []),
                 ]
             return ()
 

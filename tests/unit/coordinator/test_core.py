@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 from attrs import evolve
 from hypothesis import given, settings
@@ -12,6 +14,7 @@ from laneweave.coordinator.formations import planning_orders as formation_planne
 from laneweave.coordinator.formations.planning_orders import START_MARGIN_S
 from laneweave.coordinator.formations.roster import start_time_s
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
+from laneweave.coordinator.planning.budget import Clock
 from laneweave.coordinator.planning.response import PlanFunction
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.runtime.node import (
@@ -276,7 +279,7 @@ def test_a_result_for_an_older_ballot_is_dropped_while_the_newer_one_is_planned(
     desk = Desk()
     cells: Cells = {A: (0, 0), B: (-1, 1)}
     (old,) = jobs(desk.collect_promises(cells, {A: 1, B: 0}))
-    before = old.work()
+    before = old.work(time.monotonic)
     assert isinstance(before, Sorting)
     desk.tell(census(cells, {A: 2, B: 0}, t_s=T_S + 1.0))
     assert jobs(desk.promise(cells)) == []
@@ -468,9 +471,9 @@ def test_planning_may_last_until_the_first_move(
 ) -> None:
     asked = list[float]()
 
-    def record(task: SortingTask, max_nodes: int, plan: PlanFunction) -> Sorting:
+    def record(task: SortingTask, max_nodes: int, plan: PlanFunction, clock: Clock) -> Sorting:
         asked.append(task.deadline_s)
-        return sort_lanes(task, max_nodes, plan)
+        return sort_lanes(task, max_nodes, plan, clock)
 
     monkeypatch.setattr(formation_planner, "sort_lanes", record)
     formation = evolve(PAPER.formation, planning_deadline_s=given_s)

@@ -29,6 +29,7 @@ from laneweave.coordinator.formations.roster import (
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
 from laneweave.coordinator.formations.stages import Stage, stages
 from laneweave.coordinator.operation import LogEntry
+from laneweave.coordinator.planning.budget import Clock
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.response import PlanFunction
 from laneweave.protocol.lattice import Cell
@@ -113,7 +114,7 @@ class FormationPlanner:
         self._groups = groups
         self._leaders = leaders
         self._new_job = new_job
-        self._waiting: dict[int, tuple[Ballot, Callable[[], Sorting]]] = {}
+        self._waiting: dict[int, tuple[Ballot, Callable[[Clock], Sorting]]] = {}
         """Waiting requests, oldest first: ballot and computation of each formation."""
         self._under_way: tuple[int, int, Ballot] | None = None
         """Id, formation and ballot of the current computation."""

@@ -12,7 +12,6 @@ structures, in which every vehicle may take any place.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from itertools import islice, product
@@ -262,7 +261,7 @@ def sort_lanes(
     task: SortingTask,
     max_nodes: int,
     plan: PlanFunction,
-    clock: Clock = time.monotonic,
+    clock: Clock,
 ) -> Sorting:
     """Plan lane sorting; if it is infeasible, exempt one member from reaching its lane.
 
@@ -270,12 +269,12 @@ def sort_lanes(
         task: the sorting task.
         max_nodes: maximum number of search nodes per attempt.
         plan: answers a request.
-        clock: returns the time for the deadline [s].
+        clock: returns the time for the deadline [s]; the plan reads it, too.
     """
     if not task.movers:
         return _sorting(task, None)
     memory_mb = task.scenario.service.worker_memory_mb
-    make_plan = partial(plan, max_nodes=max_nodes, max_memory_mb=memory_mb)
+    make_plan = partial(plan, max_nodes=max_nodes, max_memory_mb=memory_mb, clock=clock)
     if task.structure is not None:
         return _form(task, task.structure, make_plan)
     ends_s = clock() + task.deadline_s

@@ -72,14 +72,14 @@ def plan(
             request at all, or a plug-in without a valid plan, is always replaced by others.
         compiled_only: without the compiled kernels of branching, TAPPA answers instead; False: they
             are compiled when they are needed, so that the plan does not depend on them.
-        clock: returns the time [s].
+        clock: returns the time for the deadline [s].
 
     Raises:
         BadInputError: there is no such solver, or it cannot be loaded.
         CacheError: the kernels cannot be compiled, see `kernels`.
         RuntimeError: the plan is invalid because of an error in the planner.
     """
-    started = clock()
+    started, began_s = clock(), time.monotonic()
     original, request = request, request.resolved()
     requested = checked_solver(solver or request.solver or DEFAULT_SOLVER)
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
@@ -90,9 +90,10 @@ def plan(
         order = tuple(name for name in order if name != BRANCHING.name) or ("tappa",)
     results: list[_Result] = []
     for name in order:
-        began = clock()
+        before = clock(), time.monotonic()
         available = _load(name, compiled_only=compiled_only)
-        started += clock() - began  # loading code is not part of planning
+        started += clock() - before[0]  # loading code is not part of planning
+        began_s += time.monotonic() - before[1]
         if not available:
             continue
         is_limited = name == "tappa" and order[-1] != name
@@ -110,7 +111,8 @@ def plan(
         results.append(_solve(name, problem, request, weights, budget, limits))
         if results[-1].found.finished or not (results[-1].found.aborted or is_limited):
             break
-    response = _response(request, problem, requested, results, started, clock)
+    rest = Budget(deadline=started + request.deadline_s, clock=clock)
+    response = _response(request, problem, requested, results, rest, began_s)
     if original.structure is not None:
         response = attrs.evolve(response, targets=request.targets)
     problems = problems_of_response(original, response)
@@ -172,8 +174,8 @@ def _response(
     problem: Problem,
     requested: str,
     results: Sequence[_Result],
-    started: float,
-    clock: Clock,
+    budget: Budget,
+    began_s: float,
 ) -> PlanResponse:
     """Combine the results of the solvers: the cheapest path set and the highest lower bound."""
     searches = [result.found for result in results]
@@ -181,7 +183,6 @@ def _response(
     best = min(found, key=lambda solution: solution.cost, default=None)
     is_own = PLANNERS.is_built_in(results[-1].solver)  # paths of a plug-in stay as they are
     if best is not None and is_own and not any(search.has_fewest_moves for search in searches):
-        budget = Budget(deadline=started + request.deadline_s, clock=clock)
         best = without_needless_moves(problem, best, budget)
     cells = [] if best is None else problem.cells_of(best)
     path_map = RelativePathMap.padded(request.ids[: len(cells)], cells)
@@ -196,7 +197,7 @@ def _response(
         steps=None if best is None else path_map.steps,
         assignment=() if best is None else best.assignment,
         paths=path_map.rows,
-        solve_ms=round(1e3 * (clock() - started), 3),
+        solve_ms=round(1e3 * (time.monotonic() - began_s), 3),
         assignments_tried=sum(search.tried for search in searches),
         nodes_expanded=sum(result.nodes for result in results),
         solver=last,

@@ -178,7 +178,7 @@ class RollingOperation:
         job = self._new_job()
         self._ordered = (job, slot + 1)
         plan = partial(self._planner, slot + 1, vehicles, self._last_plan, blocked, ends_m)
-        yield Compute(job, plan)
+        yield Compute(job, lambda _: plan())
 
     def _observed_at(
         self, snapshot_s: float, slot: int

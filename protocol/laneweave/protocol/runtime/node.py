@@ -194,10 +194,14 @@ class Decline:
 
 @frozen
 class Compute:
-    """Run `work` in another thread, after earlier jobs; `Computed` carries the result."""
+    """Run `work` in another thread, after earlier jobs; `Computed` carries the result.
+
+    `work` is called with the clock for its deadlines, which stands still in simulated time: there,
+    results do not depend on the speed of the machine.
+    """
 
     job: int
-    work: Callable[[], Any]
+    work: Callable[[Clock], Any]
 
 
 @frozen
@@ -473,10 +477,10 @@ def known_key(keys: Keys, key: str) -> tuple[Topic, Mapping[str, str]]:
     return known
 
 
-def run_job(job: Compute) -> Computed:
-    """Run a computation and return its result or error."""
+def run_job(job: Compute, clock: Clock = time.monotonic) -> Computed:
+    """Run a computation that reads `clock`, and return its result or error."""
     try:
-        return Computed(job.job, job.work())
+        return Computed(job.job, job.work(clock))
     except StoppedError:
         return Computed(job.job, None, STOPPED)
     except Exception as error:
@@ -492,7 +496,7 @@ def run_delegated(job: Delegate, now_s: Clock, clock: Clock = time.monotonic) ->
     left_s = job.deadline_s - now_s()
     if left_s <= 0:
         return Computed(job.job, None, TOO_LATE)
-    return run_job(Compute(job.job, partial(job.work, left_s, clock)))
+    return run_job(Compute(job.job, partial(job.work, left_s)), clock)
 
 
 def error_text(error: Exception) -> str:

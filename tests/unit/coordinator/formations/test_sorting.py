@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import pytest
@@ -41,7 +42,7 @@ def task(
 
 
 def sort(order: SortingTask) -> Sorting:
-    return sort_lanes(order, NODES, plan)
+    return sort_lanes(order, NODES, plan, time.monotonic)
 
 
 def ends(order: SortingTask, sorting: Sorting) -> dict[Name, Cell]:
@@ -195,7 +196,7 @@ def test_a_search_that_ran_out_of_nodes_says_nothing_of_room() -> None:
     """With a neighbour's block as well it would only take longer."""
     cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
     order = task(cells, {A: 2, B: 2, C: 1, D: 0, E: 0, F: 1})
-    sorting = sort_lanes(order, 1, plan)
+    sorting = sort_lanes(order, 1, plan, time.monotonic)
     assert sorting.response is not None
     assert sorting.response.status == "timeout"
     assert (sorting.solved, sorting.short_of_room) == (False, False)
@@ -225,7 +226,7 @@ def test_a_structure_that_cannot_be_reached_is_planned_once() -> None:
     held: dict[Name, Cell] = {C: (0, 1), D: (-1, 0), E: (-2, 0), F: (-3, 1)}
     order = task({A: (0, 0), B: (-3, 0)} | held, dict.fromkeys([A, B, *held], 0), *held)
     lane_2 = DrivingStructure(from_m=200.0, structure="parallel", lanes=(2,))
-    sorting = sort_lanes(evolve(order, structure=lane_2), NODES, count)
+    sorting = sort_lanes(evolve(order, structure=lane_2), NODES, count, time.monotonic)
     assert (sorting.solved, len(asked)) == (False, 1)
 
 
@@ -237,7 +238,7 @@ def test_all_placements_share_one_deadline() -> None:
     def slow_plan(request: PlanRequest, **limits: Any) -> PlanResponse:  # noqa: ANN401
         asked.append(request.deadline_s)
         now_s[0] += 2.0
-        return plan(request, **limits)
+        return plan(request, **limits | {"clock": time.monotonic})
 
     cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
     order = task(cells, {A: 2, B: 2, C: 1, D: 0, E: 0, F: 1}, numbers=(0, 1))
@@ -404,13 +405,13 @@ def test_a_plan_with_long_ways_is_made_again_with_near_targets() -> None:
     )
     asked: list[PlanRequest] = []
 
-    def slow(request: PlanRequest, *, max_nodes: int, max_memory_mb: int) -> PlanResponse:
+    def slow(request: PlanRequest, **limits: Any) -> PlanResponse:  # noqa: ANN401
         asked.append(request)
-        response = plan(request, max_nodes=max_nodes, max_memory_mb=max_memory_mb)
+        response = plan(request, **limits)
         return evolve(response, steps=9) if len(asked) == 1 else response
 
     in_time = evolve(order, steps=3)
-    found = sort_lanes(in_time, NODES, slow)
+    found = sort_lanes(in_time, NODES, slow, time.monotonic)
     assert len(asked) == 2
     assert all(len(vehicle.eligible or ()) == 1 for vehicle in asked[1].vehicles)
     assert found.response is not None

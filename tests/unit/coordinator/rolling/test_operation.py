@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterable, Mapping
 from itertools import count
 from typing import Any
@@ -144,7 +145,7 @@ class Bench:
         return self.finish(compute, t_s)
 
     def finish(self, compute: Compute, t_s: float) -> list[LogEntry]:
-        computed = Computed(compute.job, compute.work())
+        computed = Computed(compute.job, compute.work(time.monotonic))
         return list(self.control.finish(computed, t_s, 50.0))
 
     def call(self, t_s: float = LOOK_S) -> Call:
@@ -210,7 +211,7 @@ def test_a_new_leader_listens_first() -> None:
     assert desk.order(BEGUN_S + 3.0, now_s=10.0 + LISTEN_S - 0.01) is None
     compute = desk.order(BEGUN_S + 1.0, now_s=10.0 + LISTEN_S)
     assert compute is not None
-    compute.work()
+    compute.work(time.monotonic)
     assert not desk.calls[0].vehicles[A].held
 
 
@@ -227,7 +228,7 @@ def test_a_leader_that_is_elected_again_listens_again() -> None:
     desk.hear(evolve(shown(A), hold_cell=(1, 0), t_s=later_s + 0.2))
     compute = desk.order(later_s + LISTEN_S)
     assert compute is not None
-    compute.work()
+    compute.work(time.monotonic)
     assert desk.calls[-1].vehicles == {
         A: StreamVehicle(A, (1, 0), 1, held=False),
         B: StreamVehicle(B, HOMES[B], 1, held=True),  # where it was when it was heard last
@@ -250,7 +251,7 @@ def test_results_of_others_and_failures_change_nothing() -> None:
     desk = bench(A)
     compute = desk.order()
     assert compute is not None
-    stranger = Computed(compute.job + 1, compute.work())
+    stranger = Computed(compute.job + 1, compute.work(time.monotonic))
     assert list(desk.control.finish(stranger, BEGUN_S, 0.0)) == []
     failed = Computed(compute.job, None, "out of memory")
     (note,) = desk.control.finish(failed, BEGUN_S, 0.0)
@@ -658,7 +659,7 @@ def test_a_new_road_starts_without_memory() -> None:
     assert desk.order(0.0, now_s=100.0) is None  # it listens first
     compute = desk.order(SNAPSHOT_S + 0.1, now_s=101.0)
     assert compute is not None
-    compute.work()
+    compute.work(time.monotonic)
     call = desk.calls[-1]
     assert (call.slot, call.before) == (1, None)
     assert call.vehicles == {A: StreamVehicle(A, HOMES[A], 1, held=True)}  # not heard
@@ -686,7 +687,7 @@ def test_the_real_planner_accepts_its_input() -> None:
     for name in (A, B):
         assert control.on_state(shown(name), 0.0) is None
     (compute,) = control.order(LOOK_S, 9.0)
-    plan = compute.work()
+    plan = compute.work(time.monotonic)
     assert isinstance(plan, StreamPlan)
     assert set(plan.paths) == {A, B, C}
     for vehicle, way in plan.paths.items():
@@ -708,7 +709,7 @@ def test_a_wrong_plan_is_not_issued() -> None:
     assert compute is not None
     one = rf"the plan of slot {SLOT + 1} is invalid: [^;]* on the road$"
     with pytest.raises(ValueError, match=one):
-        compute.work()
+        compute.work(time.monotonic)
     (note,) = bench.control.finish(Computed(compute.job, None, "wrong"), LOOK_S, 0.0)
     assert note == LogEntry("planning-failed", {"slot": SLOT + 1, "error": "wrong"})
     assert bench.control.transfers == []

@@ -215,7 +215,7 @@ def test_a_message_on_a_topic_without_messages_is_counted(bench: Bench, key: str
 
 
 def test_effects_reach_the_transport(bench: Bench) -> None:
-    work = Compute(1, lambda: 2)
+    work = Compute(1, lambda _: 2)
     calls = bench.carry_out(
         Listen(topics.STATE, {"formation": 3}),
         Listen(topics.CENSUS),
@@ -288,8 +288,8 @@ def test_end_closes_the_transport_and_nothing_is_handled_any_more(bench: Bench) 
 
 
 def test_a_computation_brings_its_result_or_its_failure() -> None:
-    def fail() -> None:
+    def fail(_: object) -> None:
         raise RuntimeError("no luck")
 
-    assert run_job(Compute(3, lambda: [1])) == Computed(3, [1])
+    assert run_job(Compute(3, lambda _: [1])) == Computed(3, [1])
     assert run_job(Compute(4, fail)) == Computed(4, None, "RuntimeError: no luck")

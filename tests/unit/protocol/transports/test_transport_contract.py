@@ -493,9 +493,10 @@ def test_a_killed_process_loses_its_token(bed: Bed) -> None:
     b.transport.watch(TOKENS)
     bed.join_process("v")
     bed.until(lambda: b.tokens() == ["+v"])
+    before = b.got.count(LinkDown())  # on a busy machine a connection may be made twice
     bed.kill("v")
     bed.until(lambda: b.tokens() == ["+v", "-v"])
-    assert LinkDown() not in b.got
+    assert b.got.count(LinkDown()) == before
 
 
 # --- queries ----------------------------------------------------------------------------------
@@ -761,7 +762,7 @@ class Errand:
                 self.wakeup_s = None
                 message = Heartbeat(Name("c"), 1, 1, leading=False, formations=0)
                 yield node.Send(HEARTBEAT, message, {"coordinator": "errand"})
-                yield node.Compute(1, lambda: "done")
+                yield node.Compute(1, lambda _: "done")
             case node.Computed(1, "done"):
                 self.wakeup_s = None
             case node.QueryArrived(token):

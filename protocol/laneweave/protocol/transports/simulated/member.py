@@ -200,7 +200,7 @@ class Member:
         if conditions.compute_failure and draw() < conditions.compute_failure:
             simulation.at(end_s, self.handle, Computed(job.job, None, INJECTED_FAILURE))
         elif isinstance(job, Delegate):
-            simulation.at(end_s, self.handle, run_delegated(job, self._local_s))
+            simulation.at(end_s, self.handle, run_delegated(job, self._local_s, self._local_s))
         else:
             simulation.at(end_s, self._run, job)
 
@@ -208,7 +208,7 @@ class Member:
         """Run a computation at its end, since a thread may read what has changed meanwhile."""
         if self.closed:
             return
-        computed = run_job(job)
+        computed = run_job(job, self._local_s)
         if computed.error:
             self._simulation.failed_jobs.append((self._simulation.now_s, self.name, computed.error))
         self.handle(computed)

@@ -8,6 +8,7 @@ import pytest
 
 from laneweave.protocol.runtime.node import (
     Arrived,
+    Clock,
     Compute,
     Computed,
     Delegate,
@@ -216,18 +217,31 @@ def computing(conditions: Conditions, *jobs: Compute | Delegate) -> Recorder:
 
 
 def test_a_computation_takes_its_time() -> None:
-    def fail() -> None:
+    def fail(_: object) -> None:
         raise ValueError("no")
 
-    core = computing(Conditions(compute_s=0.25), Compute(1, lambda: 41 + 1), Compute(2, fail))
+    core = computing(Conditions(compute_s=0.25), Compute(1, lambda _: 41 + 1), Compute(2, fail))
     assert core.of(Computed) == [Computed(1, 42), Computed(2, None, "ValueError: no")]
     assert core.times(Computed) == [0.25, 0.25]
+
+
+def test_no_time_passes_while_a_computation_runs() -> None:
+    """Deadlines do not depend on the speed of the machine: equal seeds give equal runs."""
+
+    def read(clock: Clock) -> list[float]:
+        return [clock(), clock()]
+
+    here = Compute(1, read)
+    delegated = Delegate(2, lambda _, clock: read(clock), 1000.0)
+    core = computing(Conditions(compute_s=0.25), here, delegated)
+    results = [event.result for event in core.of(Computed) if isinstance(event, Computed)]
+    assert sorted(results) == [[0.0, 0.0], [0.25, 0.25]]
 
 
 def test_a_computation_sees_what_has_changed_since_it_was_ordered() -> None:
     """As in a thread: a job that reads what its core changes is not pure."""
     state = [1]
-    core = Recorder(at_start(Compute(1, lambda: sum(state))))
+    core = Recorder(at_start(Compute(1, lambda _: sum(state))))
     network = SimulatedNetwork(3, Conditions(compute_s=0.25))
     network.add("a", core, REALM)
     network.at(0.1, state.append, 10)
@@ -237,7 +251,7 @@ def test_a_computation_sees_what_has_changed_since_it_was_ordered() -> None:
 
 
 def test_failed_computations_are_reported_unless_injected() -> None:
-    def fail() -> None:
+    def fail(_: object) -> None:
         raise ValueError("no")
 
     for share, failed in ((0.0, [(0.25, "a", "ValueError: no")]), (1.0, [])):
@@ -249,7 +263,7 @@ def test_failed_computations_are_reported_unless_injected() -> None:
 
 def test_computations_take_their_own_time_each_and_end_in_order() -> None:
     conditions = Conditions(compute_s=0.25, compute_jitter_s=2.0)
-    core = computing(conditions, *(Compute(number, lambda: 7) for number in range(40)))
+    core = computing(conditions, *(Compute(number, lambda _: 7) for number in range(40)))
     assert core.of(Computed) == [Computed(number, 7) for number in range(40)]
     times = core.times(Computed)
     assert times == sorted(times)
@@ -263,7 +277,7 @@ def test_computations_take_their_own_time_each_and_end_in_order() -> None:
 def test_delegated_computations_hold_up_no_others() -> None:
     conditions = Conditions(compute_s=0.0, compute_jitter_s=1.0)
     jobs = [
-        Delegate(number, lambda *_: 7, 1000.0) if number % 2 else Compute(number, lambda: 7)
+        Delegate(number, lambda *_: 7, 1000.0) if number % 2 else Compute(number, lambda _: 7)
         for number in range(40)
     ]
     numbers = [event.job for event in computing(conditions, *jobs).of(Computed)]  # type: ignore[union-attr]
@@ -277,7 +291,7 @@ def test_computations_fail_at_the_given_rate_without_being_done(share: float) ->
     done: list[int] = []
 
     def job(number: int) -> Compute:
-        return Compute(number, lambda: done.append(number))
+        return Compute(number, lambda _: done.append(number))
 
     core = computing(Conditions(compute_failure=share), *(job(number) for number in range(1000)))
     failed = [event.job for event in core.of(Computed) if event.error]  # type: ignore[union-attr]

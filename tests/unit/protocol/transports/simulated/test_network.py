@@ -379,7 +379,7 @@ def test_a_node_started_again_under_its_name_gets_nothing_of_the_old_one() -> No
     watcher = listener()
 
     def order(event: node.Event, _: float) -> Iterable[node.Effect]:
-        start = at_start(token("v"), node.Listen(HEARTBEAT), node.Compute(1, lambda: "old"))
+        start = at_start(token("v"), node.Listen(HEARTBEAT), node.Compute(1, lambda _: "old"))
         return start(event, 0.0)
 
     old = Recorder(order)
@@ -433,7 +433,7 @@ def test_a_node_may_end_at_any_moment(moment: type) -> None:
     if "v" in network:
         network.pause("v")
         send(network, "a", 1)
-        perform(network, "v", node.Compute(1, lambda: 1))
+        perform(network, "v", node.Compute(1, lambda _: 1))
         network.run(0.2)
         network.resume("v")
         network.run(0.3)
