@@ -15,7 +15,8 @@ from typing import Any
 
 import attrs
 
-from laneweave.protocol.field_validators import HOST_PORT_RULE, NAME_RULE
+from laneweave.protocol.field_validators import HOST_PORT_RULE
+from laneweave.protocol.names import NAME_RULE
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS, Scenario
 
 MISSING = "?"

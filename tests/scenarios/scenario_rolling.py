@@ -22,7 +22,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 
-from attrs import define, evolve, field
+from attrs import define, field
+from msgspec.structs import replace
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.rolling.transfer import CellTransfer
@@ -74,7 +75,7 @@ class StreamLeader:
     def hear(self, state: VehicleState, now_s: float) -> Lines:
         transfer = self.transfer
         if self.claims and transfer is not None and state.vehicle in transfer.moves:
-            state = evolve(state, owned=tuple(sorted({*state.owned, *self.claims})))
+            state = replace(state, owned=tuple(sorted({*state.owned, *self.claims})))
         self.states[state.vehicle] = state
         if transfer is None:
             return

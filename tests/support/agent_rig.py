@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from itertools import count
 
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import Driver, TrackingDriver
@@ -69,7 +69,7 @@ class Rig:
     def sense(self, *, left: bool = False, off_lattice: bool = False) -> Sense:
         self.controller.perceive(self.state, Neighbours(self.ahead, ()))
         sensed = self.vehicle.sense(self.tick, caretaker=False, left=left)
-        self._sensed = evolve(sensed, off_lattice=off_lattice)
+        self._sensed = replace(sensed, off_lattice=off_lattice)
         return self._sensed
 
     def hand(self, topic: Topic, message: object) -> list[Effect]:
@@ -106,7 +106,7 @@ class Rig:
         (command,) = sent(effects, Command)
         self.controller.store_requests(command)
         joined, accepted = self.controller.joined, self.controller.accepted
-        return self.hand(SENSE, evolve(self._sensed, joined=joined, accepted=accepted))
+        return self.hand(SENSE, replace(self._sensed, joined=joined, accepted=accepted))
 
     def coast(self, ticks: int) -> None:
         """Drive by the last command, and by the hold law when it runs out."""

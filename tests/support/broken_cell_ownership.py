@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.coordinator.rolling import ownership, transfer
 from laneweave.coordinator.rolling.ownership import States
@@ -83,7 +83,7 @@ def show_owned_cells_at_once(patch: Patch) -> None:
     state = PlanExecution.state
 
     def mutant(self: PlanExecution, sense: Sense, *, attended: bool) -> VehicleState:
-        return state(self, evolve(sense, promised=self.promised), attended=attended)
+        return state(self, replace(sense, promised=self.promised), attended=attended)
 
     patch.setattr(PlanExecution, "state", mutant)
 
@@ -114,7 +114,7 @@ def forget_motion(patch: Patch) -> None:
     def mutant(
         state: VehicleState, states: States, gone: Collection[Name]
     ) -> frozenset[Cell] | None:
-        return owned_cells(evolve(state, moving=False), states, gone)
+        return owned_cells(replace(state, moving=False), states, gone)
 
     patch.setattr(transfer, "owned_cells", mutant)
 
@@ -132,7 +132,7 @@ def keep_what_is_given(patch: Patch) -> None:
         after = {
             name: tuple(sorted({*cells, *plan.before[name]})) for name, cells in plan.after.items()
         }
-        return evolve(plan, after=after)
+        return replace(plan, after=after)
 
     patch.setattr(CellTransfer, "_plan", mutant)
     skip_ownership_checks(patch)

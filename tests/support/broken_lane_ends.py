@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
@@ -46,7 +46,7 @@ def agent_remembers(patch: pytest.MonkeyPatch) -> None:
     act = AgentCore._act
 
     def forgetful(self: AgentCore, sense: Sense, *, in_charge: bool, drove: bool) -> list[object]:
-        blind = evolve(sense, off_lattice=False)
+        blind = replace(sense, off_lattice=False)
         self._sense = blind
         return act(self, blind, in_charge=in_charge, drove=drove)  # type: ignore[return-value]
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
@@ -247,7 +248,7 @@ def promised_something(_: FormationLeader, state: VehicleState) -> bool:
 
 def count_entry_cell(me: FormationLeader, state: VehicleState) -> None:
     cells = {member.vehicle: member.cell for member in me.formation.members}
-    me.promises[state.vehicle] = evolve(state, hold_cell=cells[state.vehicle])
+    me.promises[state.vehicle] = replace(state, hold_cell=cells[state.vehicle])
 
 
 def time_is_up_unless_issuing(me: FormationLeader, _: object) -> bool:
@@ -296,7 +297,7 @@ def close_at_once(patch: pytest.MonkeyPatch) -> None:
     ) -> dict[int, Formation]:
         blocks = sorted({scenario.lattice.block_of(entry.cell[0]) for entry in census.on_road})
         closed = tuple(ClosedFormation(block, block, 0.0) for block in blocks)
-        early = evolve(census, formations=closed, closed_to=FAR_BEHIND)
+        early = replace(census, formations=closed, closed_to=FAR_BEHIND)
         return closed_formations(early, t_s, scenario, groups)
 
     patch.setattr(operation, "closed_formations", mutant)
@@ -324,7 +325,7 @@ def play_any_command(patch: pytest.MonkeyPatch) -> None:
 
     def mutant(self: MotionController, command: Command) -> bool:
         return accept_command(
-            self, evolve(command, incarnation=max(command.incarnation, self.attendant))
+            self, replace(command, incarnation=max(command.incarnation, self.attendant))
         )
 
     patch.setattr(MotionController, "accept_command", mutant)

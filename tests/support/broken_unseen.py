@@ -7,6 +7,7 @@ from itertools import count
 
 import pytest
 from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
@@ -167,7 +168,7 @@ def compare_foremost_block(patch: Patch) -> None:
         begun = [groups.of(block) for block in blocks if groups.of(block)[0] <= census.closed_to]
         last = max((numbers[-1] for numbers in begun), default=census.closed_to)
         closed_to = max(census.closed_to, last)
-        return closed_formations(evolve(census, closed_to=closed_to), t_s, scenario, groups)
+        return closed_formations(replace(census, closed_to=closed_to), t_s, scenario, groups)
 
     patch.setattr(formations, "closed_formations", mutant)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.state_machine import RuleBook
@@ -94,7 +94,7 @@ def state(
         owned = BEFORE.get(name, ((9, 2),))
     cell = make_plan().start_cells.get(name, owned[0] if owned else (9, 2))
     shown = vehicle().state(sense(), attended=True)
-    return evolve(
+    return replace(
         shown, vehicle=name, hold_cell=cell, promised=promised, transfer=transfer, owned=owned,
         accepted=accepted, ready=accepted, t_s=t_s,
         s_m=ROLLING.lattice.cell_s_m(cell[0], t_s),

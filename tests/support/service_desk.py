@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from typing import Any
 
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.formations.leader import FormationLeader
@@ -100,7 +100,7 @@ class Desk:
         effects: list[Effect] = []
         for name, cell in cells.items():
             shown = state(name, cell, self.ballot, t_s=1.0, joined=joined)
-            effects += self.tell(evolve(shown, attended=name not in unattended))
+            effects += self.tell(replace(shown, attended=name not in unattended))
         return effects
 
 

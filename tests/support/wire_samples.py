@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-import attrs
+from msgspec import Struct
 
 from laneweave.protocol.wire.codec import KINDS
 from laneweave.protocol.wire.messages import Ballot, Name
@@ -16,14 +16,19 @@ Leaf = Callable[[Any], Any]
 """From the annotation of a simple field (a number, a name, ...) to its value."""
 
 
-def hints_of(kinds: Mapping[str, type]) -> dict[type, dict[str, Any]]:
+def is_struct(hint: object) -> bool:
+    """Tell whether an annotation is a message or a class that is part of one."""
+    return isinstance(hint, type) and issubclass(hint, Struct)
+
+
+def hints_of(kinds: Mapping[str, type[Struct]]) -> dict[type, dict[str, Any]]:
     """Return the annotations of the fields of all kinds, and of the classes nested in them."""
     found: dict[type, dict[str, Any]] = {}
 
     def add(hint: Any) -> None:  # noqa: ANN401
-        if attrs.has(hint) and hint not in found:
+        if is_struct(hint) and hint not in found:
             found[hint] = get_type_hints(hint)
-        for part in found[hint].values() if attrs.has(hint) else get_args(hint):
+        for part in found[hint].values() if is_struct(hint) else get_args(hint):
             add(part)
 
     for kind in kinds.values():
@@ -37,7 +42,7 @@ HINTS = hints_of(KINDS)
 def filled(hint: Any, leaf: Leaf) -> Any:  # noqa: ANN401
     """Return a value of an annotation; optional parts are present, collections have one entry."""
     parts = get_args(hint)
-    if attrs.has(hint):
+    if is_struct(hint):
         return hint(**{name: filled(part, leaf) for name, part in HINTS[hint].items()})
     if hint is Ballot:
         return Ballot(leaf(int), leaf(Name), leaf(int), leaf(int))

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import msgpack
 import pytest
-from attrs import fields_dict, frozen
+from attrs import frozen
+from msgspec.structs import fields
 
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.runtime.transport import Delivery
@@ -19,6 +20,7 @@ from laneweave.protocol.scenario.fields import SNAPSHOT_S
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.codec import VERSION
+from laneweave.protocol.wire.field_types import Message
 from laneweave.protocol.wire.messages import Heartbeat, RoadClock
 from laneweave.protocol.wire.topics import CLOCK, HEARTBEAT, Keys, Quality
 from support.deployments import REALM, free_port, start_router, stop
@@ -340,7 +342,7 @@ def test_a_flood_changes_the_leader_at_most_once(lab: Lab, road: Path) -> None:
     def ignore(_: Delivery) -> None:
         pass
 
-    floods = [
+    floods: list[tuple[type[Message], str]] = [
         (RoadClock, KEYS.key(CLOCK)),
         (Heartbeat, KEYS.key(HEARTBEAT, coordinator="c1")),
         (Heartbeat, KEYS.key(HEARTBEAT, coordinator="zz")),
@@ -351,7 +353,7 @@ def test_a_flood_changes_the_leader_at_most_once(lab: Lab, road: Path) -> None:
         transport = ZenohTransport(forger.access, ignore)
         junk = []
         for kind, key in floods:
-            body = dict.fromkeys(fields_dict(kind), 2 * HUGE)
+            body = [2 * HUGE] * len(fields(kind))
             junk.append((key, msgpack.packb([VERSION, kind.__name__, body])))
         began_s, sent = time.monotonic(), 0
         while sent < FLOOD:

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.agents.driving.driver import Driver, SolverStats, TrackingDriver
 from laneweave.protocol.errors import BadInputError
@@ -345,7 +345,7 @@ class AgentCore:
         """Ask the controller to store changes now rather than with the next tick's COMMAND."""
         command = self._command
         assert command is not None  # noqa: S101 (in charge: it has sent one)
-        self._command = evolve(
+        self._command = replace(
             command,
             joined=execution.wanted_joined,
             accepted=execution.wanted_accepted,

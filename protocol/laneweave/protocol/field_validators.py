@@ -12,9 +12,8 @@ from typing import Any
 import attrs
 
 from laneweave.protocol.errors import BadInputError, unknown_name
+from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
 
-NAME_PATTERN = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-NAME_RULE = "letters, digits, `_`, `-`, `.`; at least 1, at most 64"
 HOST_PORT_RULE = "HOST:PORT with a port from 1 to 65535, or nothing"
 LINK_OPTIONS = ("?rel=0", "?mixed_rel=1", "?rel=1;mixed_rel=1")
 """Zenoh's options for links over datagrams: all messages unreliable; unreliable and reliable

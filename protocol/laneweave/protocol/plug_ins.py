@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError, one_line, unknown_name
-from laneweave.protocol.field_validators import NAME_PATTERN
+from laneweave.protocol.names import NAME_PATTERN
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

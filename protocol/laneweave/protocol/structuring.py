@@ -16,6 +16,7 @@ from itertools import cycle
 from typing import Any, TypeVar, get_args, get_origin
 
 import attrs
+import msgspec
 from cattrs import Converter
 from cattrs.errors import (
     AttributeValidationNote,
@@ -96,7 +97,24 @@ def strict_converter(*, detailed: bool) -> Converter:
         lambda kind: _dict_hook(kind, converter),
     )
     converter.register_structure_hook_factory(attrs.has, lambda kind: _class_hook(kind, converter))
+    converter.register_structure_hook_func(_is_struct, _struct)
+    converter.register_unstructure_hook_func(_is_struct, msgspec.structs.asdict)
     return converter
+
+
+def _is_struct(kind: object) -> bool:
+    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
+
+
+def _struct(value: object, kind: type[msgspec.Struct]) -> msgspec.Struct:
+    """Return a part of a message, which files describe by the names of its fields."""
+    names = kind.__struct_fields__
+    if not isinstance(value, dict) or value.keys() != set(names):
+        raise BadInputError("", value, f"a table of {', '.join(names)}")
+    try:
+        return msgspec.convert([value[name] for name in names], kind)
+    except msgspec.ValidationError as error:
+        raise BadInputError("", value, str(error)) from error
 
 
 def _origin(kind: Any) -> object:  # noqa: ANN401 (any annotation)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
@@ -192,7 +192,7 @@ class Fleet:
     def census(self, **changes: Any) -> list[Effect]:  # noqa: ANN401 (fields)
         self.now_s += 1.0
         entries = (CensusEntry(ME, HOME, 0, 0.0),)
-        made = evolve(Census(self.now_s, entries, (), bridge=BRIDGE), **changes)
+        made = replace(Census(self.now_s, entries, (), bridge=BRIDGE), **changes)
         return self.host.handle(Arrived(CENSUS, {}, made), self.now_s)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.launch.fault_search.road.stand_ins import LightDriver
@@ -93,7 +93,7 @@ class Seat:
         """Show it within the tick what the controller has noted, for the one in charge."""
         if attendant is None:
             attendant = self.last.attendant
-        noted = evolve(self.last, accepted=accepted, joined=joined, attendant=attendant)
+        noted = replace(self.last, accepted=accepted, joined=joined, attendant=attendant)
         return self.rig.hand(SENSE, noted)
 
     def take_charge(self, joined: tuple[int, ...] = (0,)) -> None:
@@ -263,7 +263,7 @@ def taken() -> Seat:
     seat.take_charge()
     seat.prepare()
     (command,) = sent(seat.repeat(), Command)
-    assert sent(seat.plan(), Command) == [evolve(command, accepted=BALLOT)]  # the same motion
+    assert sent(seat.plan(), Command) == [replace(command, accepted=BALLOT)]  # the same motion
     return seat
 
 

@@ -6,6 +6,7 @@ from itertools import count
 
 import attrs
 import pytest
+from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import TrackingDriver
@@ -41,10 +42,10 @@ def test_starts_with_its_own_topics_and_the_token_last() -> None:
 
 def test_the_state_contains_measurements_and_the_block_of_entry() -> None:
     rig = Rig()
-    sense = attrs.evolve(rig.sense(), formation=5, joined=(5, 6))
+    sense = replace(rig.sense(), formation=5, joined=(5, 6))
     rig.hand(topics.SENSE, sense)
     rig.coast(1)
-    sense = attrs.evolve(rig.sense(), formation=5, joined=(5, 6), attendant=1)
+    sense = replace(rig.sense(), formation=5, joined=(5, 6), attendant=1)
     command, state = (each for each in rig.hand(topics.SENSE, sense) if isinstance(each, node.Send))
     assert (command.topic, command.parameters) == (topics.COMMAND, {"vehicle": ME})
     assert (state.topic, state.parameters) == (topics.STATE, {"formation": 5, "vehicle": ME})
@@ -82,7 +83,7 @@ def test_answers_each_tick_once_and_repeats_are_the_same_bytes() -> None:
     assert (command.tick, command.hold_cell, command.motion_end_tick) == (2, HOME, 0)
     assert (command.incarnation, command.joined) == (1, (0,))
     for _ in range(3):
-        assert rig.hand(topics.SENSE, attrs.evolve(sense, setpoint=(9.0, 9.0))) == [
+        assert rig.hand(topics.SENSE, replace(sense, setpoint=(9.0, 9.0))) == [
             node.Send(topics.COMMAND, command, {"vehicle": ME})
         ]
 
@@ -92,7 +93,7 @@ def test_older_ticks_and_other_vehicles_are_ignored() -> None:
     old = rig.sense()
     rig.run(2)
     assert rig.hand(topics.SENSE, old) == []
-    assert rig.hand(topics.SENSE, attrs.evolve(rig.sense(), vehicle=OTHER)) == []
+    assert rig.hand(topics.SENSE, replace(rig.sense(), vehicle=OTHER)) == []
     assert rig.run().t_s == pytest.approx((rig.tick - 1) * TICK_S)
 
 
@@ -101,18 +102,18 @@ def test_an_agent_starts_anew_on_the_road_of_a_newer_bridge() -> None:
     rig.accept((0, HOME, (-1, 2)))
     rig.run(20)
     late = rig.tick + 50
-    old = attrs.evolve(rig.sense(), tick=late, t_s=late * TICK_S)
+    old = replace(rig.sense(), tick=late, t_s=late * TICK_S)
     first = Rig().sense()  # of the next road: tick 0, and no process is in charge yet
-    (claim,) = sent(rig.hand(topics.SENSE, attrs.evolve(first, bridge=7)), Command)
+    (claim,) = sent(rig.hand(topics.SENSE, replace(first, bridge=7)), Command)
     assert (claim.tick, claim.incarnation, claim.hold_cell) == (0, 2, HOME)
     assert not rig.agent.in_charge
     # A message of the earlier bridge may still be on its way, and its tick is higher.
     assert rig.hand(topics.SENSE, old) == []
-    granted = attrs.evolve(first, bridge=7, tick=1, t_s=TICK_S, attendant=2)
+    granted = replace(first, bridge=7, tick=1, t_s=TICK_S, attendant=2)
     rig.hand(topics.SENSE, granted)
     state = rig.shown[-1]
     assert (state.incarnation, state.promised, state.accepted) == (2, None, False)
-    assert rig.hand(topics.SENSE, attrs.evolve(old, left=True)) == []
+    assert rig.hand(topics.SENSE, replace(old, left=True)) == []
     assert not rig.agent.ended
 
 
@@ -122,7 +123,7 @@ def test_a_lost_note_is_requested_again_with_each_tick() -> None:
     plan = make_plan({ME: HOME}, {ME: ((0, HOME, (-1, 2)),)})
     (asked,) = sent(rig.hand(topics.PLAN, plan), Command)  # it is lost
     assert rig.played is not None
-    assert asked == attrs.evolve(rig.played, accepted=BALLOT)  # the same motion
+    assert asked == replace(rig.played, accepted=BALLOT)  # the same motion
     for _ in range(3):
         effects = rig.hand(topics.SENSE, rig.sense())
         (command,) = sent(effects, Command)
@@ -295,7 +296,7 @@ def test_an_agent_drives_its_type_and_takes_no_plan_that_the_type_cannot_drive()
         return TrackingDriver(own)
 
     agent = AgentCore(ME, count(1).__next__, scenario, make_driver)
-    sense = attrs.evolve(Rig().sense(), vehicle_type=Name("truck"))
+    sense = replace(Rig().sense(), vehicle_type=Name("truck"))
     agent.handle(node.Arrived(topics.SENSE, {"vehicle": ME}, sense), 0.0)
     assert [own.vehicle.length_m for own in made] == [5.0, 12.0]
     assert agent.execution is not None
@@ -305,11 +306,11 @@ def test_an_agent_drives_its_type_and_takes_no_plan_that_the_type_cannot_drive()
         plan = make_plan({ME: HOME}, {ME: ((0, HOME, target),)})
         assert drives_its_moves(agent.execution, plan) == taken
     # A type is that of the first SENSE, and a type of the scenario.
-    other = attrs.evolve(sense, tick=1, t_s=TICK_S, vehicle_type=Name("car"))
+    other = replace(sense, tick=1, t_s=TICK_S, vehicle_type=Name("car"))
     agent.handle(node.Arrived(topics.SENSE, {"vehicle": ME}, other), 0.1)
     assert len(made) == 2
     agent = AgentCore(ME, count(1).__next__, scenario, make_driver)
-    unknown = attrs.evolve(sense, vehicle_type=Name("tank"))
+    unknown = replace(sense, vehicle_type=Name("tank"))
     (refused,) = agent.handle(node.Arrived(topics.SENSE, {"vehicle": ME}, unknown), 0.0)
     assert isinstance(refused, node.Refuse)
     assert "vehicle_type: got 'tank'; allowed: one of the scenario's types: car, truck" in str(

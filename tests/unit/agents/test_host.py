@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import NO_BRIDGE_S, AgentHost, AgentMetrics
@@ -109,7 +110,7 @@ def test_states_go_to_the_members_of_their_formation(formation: int) -> None:
         feel(host, name, cell)
     *_, last = sent(accept(host, {A: FRONT, B: SIDE}), VehicleState)
     assert (last.vehicle, last.ready) == (B, True)
-    show(host, evolve(last, formation=formation))
+    show(host, replace(last, formation=formation))
     (state,) = sent(feel(host, A, FRONT, 2), VehicleState)
     assert state.go is (formation == 0)  # A has heard B
     (state,) = sent(feel(host, B, SIDE, 2), VehicleState)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.protocol.runtime.node import (
     Arrived,
@@ -42,7 +42,7 @@ CELLS = {A: (0, 0), B: (-1, 0)}
 
 def clock(t_s: float, **changes: Any) -> RoadClock:  # noqa: ANN401 (fields)
     made = RoadClock(round(10 * t_s), t_s, 1, 1, 1, 0, ended=False, bridge=7)
-    return evolve(made, **changes)
+    return replace(made, **changes)
 
 
 class Road(Desk):
@@ -68,7 +68,7 @@ class Road(Desk):
         self.send(CENSUS, self.census())
 
     def census(self, **changes: Any) -> Census:  # noqa: ANN401 (fields)
-        return evolve(census(CELLS, t_s=self.t_s), **({"bridge": 7} | changes))
+        return replace(census(CELLS, t_s=self.t_s), **({"bridge": 7} | changes))
 
     def drive(self, seconds: float) -> None:
         """Let time pass, with clock and census in each tick."""
@@ -109,7 +109,7 @@ def beat(term: int = 1, incarnation: int = 1, name: str = "c2") -> Heartbeat:
         (HEARTBEAT, lambda _: beat(incarnation=HUGE)),
         (STATE, lambda _: state(A, promised=HIGH)),
         (STATE, lambda _: state(A, t_s=1e12)),
-        (STATE, lambda _: evolve(state(A), incarnation=2**62)),
+        (STATE, lambda _: replace(state(A), incarnation=2**62)),
     ],
 )  # fmt: skip
 def test_impossible_numbers_change_nothing(topic: Topic, make: Callable[[Road], object]) -> None:
@@ -142,7 +142,7 @@ def test_tokens_with_impossible_incarnations_change_nothing(
         lambda road: (CLOCK, clock(road.t_s, bridge=DAY_NS)),
         lambda road: (CLOCK, clock(road.t_s + 9.0)),
         lambda road: (CENSUS, road.census(bridge=DAY_NS, on_road=())),
-        lambda road: (CENSUS, evolve(census({}, t_s=road.t_s + 9.0), bridge=7)),
+        lambda road: (CENSUS, replace(census({}, t_s=road.t_s + 9.0), bridge=7)),
     ],
     ids=["clock bridge", "clock time", "census bridge", "census time"],
 )
@@ -172,7 +172,7 @@ def test_a_state_that_its_vehicle_does_not_show_is_forgotten(changes: dict[str, 
     road = Road()
     for vehicle, cell in CELLS.items():
         road.send(STATE, state(vehicle, cell, t_s=road.t_s))
-    road.send(STATE, evolve(state(A, CELLS[A], t_s=road.t_s), **changes))
+    road.send(STATE, replace(state(A, CELLS[A], t_s=road.t_s), **changes))
     for _ in range(round(FORGET_S / 0.1) + 2):
         road.drive(0.1)
         for vehicle, cell in CELLS.items():

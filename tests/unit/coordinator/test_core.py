@@ -8,6 +8,7 @@ import pytest
 from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.formations import planning_orders as formation_planner
@@ -118,7 +119,7 @@ def test_tokens_of_no_newer_bridge_change_nothing(other: str) -> None:
 
 def of_bridge(bridge: int, cells: Cells, t_s: float) -> tuple[Census, RoadClock]:
     clock = RoadClock(round(10 * t_s), t_s, 1, 1, 1, 0, ended=False, bridge=bridge)
-    return evolve(census(cells, t_s=t_s), bridge=bridge), clock
+    return replace(census(cells, t_s=t_s), bridge=bridge), clock
 
 
 def road(desk: Desk) -> tuple[list[Name], float]:
@@ -148,8 +149,8 @@ def test_states_of_vehicles_that_the_census_does_not_list_are_ignored() -> None:
     theirs = Ballot(4, Name("c9"), 3, 2)
     for stranger in (
         state(C, (0, 0), theirs, joined=(0, 1)),
-        evolve(state(A, (0, 0), theirs, joined=(0, 1)), formation=1),
-        evolve(state(B, (-5, 0), theirs, joined=(0, 1)), formation=0),
+        replace(state(A, (0, 0), theirs, joined=(0, 1)), formation=1),
+        replace(state(B, (-5, 0), theirs, joined=(0, 1)), formation=0),
     ):
         desk.tell(stranger)
     assert set(desk.leaders) == {0, 1}  # not joined
@@ -180,7 +181,7 @@ def test_leads_and_steps_down() -> None:
     assert set(desk.leaders) == {0}
     better = Heartbeat(Name("c1"), 1, 1, leading=False, formations=0)
     assert logged(desk.tell(better)) == []  # it waits until the newcomer leads
-    effects = desk.tell(evolve(better, leading=True))
+    effects = desk.tell(replace(better, leading=True))
     assert Unlisten(STATE) in effects
     assert logged(effects) == ["leader-stepped-down"]
     assert desk.leaders == {}
@@ -396,7 +397,7 @@ def test_cells_that_cannot_be_planned_from_do_not_stop_the_coordinator(cell: Cel
     desk = leading({A: (0, 0), B: (-1, 1)})
     desk.tell(state(A))
     desk.tell(state(B))
-    desk.tell(evolve(state(A, promised=desk.ballot, t_s=1.0), hold_cell=cell))
+    desk.tell(replace(state(A, promised=desk.ballot, t_s=1.0), hold_cell=cell))
     (job,) = jobs(desk.tell(state(B, (-1, 1), desk.ballot, t_s=1.0)))
     assert logged(desk.give(run_job(job))) == ["planning-failed"]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.protocol.runtime.node import (
     Arrived,
@@ -371,7 +371,7 @@ def test_a_caretaker_that_has_ended_publishes_nothing(cared_for: Desk) -> None:
 def test_the_next_caretaker_remembers_the_joined_formations_only(cared_for: Desk) -> None:
     prepare, _ = ballot_for(cared_for)
     both = (prepare.formations[0], prepare.formations[0] + 1)
-    cared_for.give(Arrived(PREPARE, OF_B, evolve(prepare, formations=both)))
+    cared_for.give(Arrived(PREPARE, OF_B, replace(prepare, formations=both)))
     first = cared_for.core.vehicles[B].controller.attendant
     cared_for.up(B)
     next_tick(cared_for, A)

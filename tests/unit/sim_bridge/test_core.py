@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.protocol.runtime.node import (
     Announce,
@@ -255,7 +255,7 @@ def test_the_first_answer_of_a_known_vehicle_counts(desk: Desk) -> None:
     known = desk.known(A)
     desk.answer(A, jerks=jerks((9.0, 0.0)))
     assert desk.known(A) == known
-    ghost = evolve(desk.command(A), vehicle=Name("ghost"))
+    ghost = replace(desk.command(A), vehicle=Name("ghost"))
     assert desk.give(Arrived(topics.COMMAND, {"vehicle": "ghost"}, ghost)) == []
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.coordinator.formations.roster import on_tick, start_time_s
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
@@ -78,7 +78,7 @@ def paced(
         if len(slots_s) > 1:
             t0_s = _start_s(plan, slot_s, not_before_s, scenario, from_m)
         max_steps = max(0, int((end_s - t0_s) / slot_s))
-        best = with_pauses(evolve(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, max_steps)
+        best = with_pauses(replace(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, max_steps)
         if t0_s + steps_of(best) * slot_s <= end_s - reserve_s:
             return best
     return best
@@ -140,7 +140,7 @@ def with_pauses(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: i
 
 def _paused(plan: Plan, pause: int) -> Plan:
     """Return a plan whose moves from step `pause` on begin one slot later."""
-    return evolve(
+    return replace(
         plan,
         moves={
             vehicle: tuple(

@@ -35,8 +35,8 @@ from laneweave.protocol.errors import (
     raise_all,
     unknown_name,
 )
-from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.lattice import Cell, Mode, displacements
+from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS, DEFAULT_CONFLICTS
 from laneweave.protocol.structuring import as_lists, structure, without
 

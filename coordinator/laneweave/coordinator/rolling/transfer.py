@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from attrs import define, evolve, field
+from attrs import define, field
+from msgspec.structs import replace
 
 from laneweave.coordinator.ballots.ballot_round import (
     FAILED,
@@ -96,7 +97,7 @@ class CellTransfer(BallotRound):
         moves: dict[Name, tuple[PlannedMove, ...]] = dict.fromkeys(self.roster, ())
         moves |= {name: ((0, *move),) for name, move in self.moves.items()}
         formations = tuple(sorted({promise.formation for promise in self.promises.values()}))
-        return evolve(
+        return replace(
             self.make_plan(formations, moves, self.t0_s, self.slot_s),
             before={name: tuple(sorted(before[name])) for name in self.roster},
             after={name: tuple(sorted(after[name])) for name in self.roster},

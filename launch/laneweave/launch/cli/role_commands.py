@@ -83,7 +83,7 @@ def coordinator(
     """Run a coordinator, which also answers plan requests."""
     from laneweave.coordinator.planning.plug_ins.registry import checked_solver
     from laneweave.coordinator.process import run_coordinator
-    from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
+    from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
 
     if not NAME_PATTERN.fullmatch(name):
         raise BadInputError("--name", name, NAME_RULE)

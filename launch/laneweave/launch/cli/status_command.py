@@ -30,7 +30,7 @@ from laneweave.launch.observe.status import (
     status_of,
 )
 from laneweave.protocol.errors import BadInputError, CommandFailedError
-from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
+from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.scenario.deployment_fields import parse_shard
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of

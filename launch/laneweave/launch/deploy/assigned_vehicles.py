@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
+from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.scenario.deployment_fields import FleetMembers, Security, Shard, parse_shard
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import Party

@@ -23,7 +23,7 @@ from laneweave.protocol.config.source_files import (
     unique_keys,
 )
 from laneweave.protocol.errors import BadInputError, combined, raise_all
-from laneweave.protocol.field_validators import NAME_PATTERN
+from laneweave.protocol.names import NAME_PATTERN
 from laneweave.protocol.scenario.deployment_fields import Service
 
 

@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
 from typing import Any, Protocol
 
-import attrs
 import structlog
 from attrs import field, frozen
+from msgspec.structs import replace
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.quick_frozen import quick_frozen
@@ -393,7 +393,7 @@ class Node:
         message, topic = effect.message, effect.topic
         self.published += 1
         if isinstance(message, Report):
-            message = attrs.evolve(
+            message = replace(
                 message,
                 process=self._label,
                 published=self.published,

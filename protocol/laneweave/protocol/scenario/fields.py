@@ -18,8 +18,9 @@ from attrs import field, frozen
 from attrs.validators import optional
 
 from laneweave.protocol.errors import BadInputError, unknown_name
-from laneweave.protocol.field_validators import NAME_PATTERN, key_part, one_of, within
+from laneweave.protocol.field_validators import key_part, one_of, within
 from laneweave.protocol.lattice import Cell, Lattice, displacements
+from laneweave.protocol.names import NAME_PATTERN
 from laneweave.protocol.road_layout import (
     ANY_LANE,
     END_OF_ROAD,

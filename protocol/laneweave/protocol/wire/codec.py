@@ -1,71 +1,145 @@
-"""MessagePack codec of the messages: [version, kind, fields].
+"""MessagePack codec of the messages: [version, kind, [field, ...]].
 
-Decoding checks size, version, kind, field names, types, finiteness and ranges. Invalid bytes raise
-only `BadInputError`.
+Decoding checks size, version, kind, number of fields, types, finiteness and ranges. Invalid bytes
+raise only `BadInputError`, which names the field.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+import re
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 import msgpack
+from msgspec import Raw, Struct, ValidationError, convert
+from msgspec.msgpack import Decoder, Encoder
+from msgspec.structs import fields
 
-from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
-from laneweave.protocol.structuring import problems_of, strict_converter
-from laneweave.protocol.wire.messages import Ballot, Name
+from laneweave.protocol.errors import NO_VALUE, BadInputError
+from laneweave.protocol.names import NAME_RULE
+from laneweave.protocol.wire.field_types import Message
+from laneweave.protocol.wire.messages import LogEvent
 from laneweave.protocol.wire.topics import TOPICS
 
-VERSION = 1
+VERSION = 2
 MAX_BYTES = 1 << 20
-KINDS: dict[str, type] = {
+KINDS: dict[str, type[Message]] = {
     topic.kind.__name__: topic.kind for topic in TOPICS if topic.kind is not None
 }
-_MIN_INT, _MAX_INT = -(2**63), 2**63 - 1
-_MIN_FLOAT, _MAX_FLOAT = -1e12, 1e12
-"""Range of floats: wider than any position, speed or time, and safe in calculations."""
+_ENCODER = Encoder()
+_ENVELOPE = Decoder(tuple[int, str, Raw])
+_DECODERS: dict[str, Decoder[Any]] = {name: Decoder(kind) for name, kind in KINDS.items()}
 _MAX_DEPTH = 8
+_MIN_INT, _MAX_INT = -(2**63), 2**63 - 1
+_PLACE = re.compile(r"Expected (?P<allowed>.*?)(?:, got .*?)?(?: - at (?P<path>.*))?", re.DOTALL)
+_LENGTH = re.compile(r"`array` of at least length \d+, got (\d+)")
+_IN_WORDS = {
+    "`int`": "a 64-bit integer",
+    "`float`": "a number",
+    "`bool`": "true or false",
+    "`str`": f"a name of {NAME_RULE}",
+    "`bytes`": "bytes",
+    "`array`": "a list",
+    "`object`": "a map",
+    "`null`": "nothing",
+}
 
 
-def _name(value: object, _: type) -> str:
-    if type(value) is not str or not NAME_PATTERN.fullmatch(value):
-        raise BadInputError("", value, "a name of " + NAME_RULE)
-    return value
+def encode(message: object) -> bytes:
+    """Return the bytes of a message."""
+    return _ENCODER.encode((VERSION, type(message).__name__, message))
 
 
-def _integer(value: object, _: type) -> int:
-    if type(value) is not int or not _MIN_INT <= value <= _MAX_INT:
-        raise BadInputError("", value, "a 64-bit integer")
-    return value
+def decode(payload: bytes, expected: type | None = None) -> object:
+    """Return the message in `payload`.
+
+    Args:
+        payload: arbitrary bytes.
+        expected: required message class; None: any.
+
+    Raises:
+        BadInputError: the payload is not one valid message of the expected class.
+    """
+    if len(payload) > MAX_BYTES:
+        raise BadInputError("message", f"{len(payload)} bytes", f"at most {MAX_BYTES} bytes")
+    try:
+        version, name, body = _ENVELOPE.decode(payload)
+        kind = KINDS[name]
+        if version == VERSION and (expected is None or kind is expected):
+            message = _DECODERS[name].decode(body)
+            if kind is not LogEvent or _is_plain(message.data, _MAX_DEPTH):
+                return message
+        problem = ""
+    except Exception as error:  # noqa: BLE001 (the slow path names the field)
+        problem = str(error) if isinstance(error, ValidationError) else ""
+    raise _refusal(payload, expected, problem)
 
 
-def _measure(value: object, _: type) -> float:
-    if type(value) is float:
-        if _MIN_FLOAT <= value <= _MAX_FLOAT:
-            return value
-    elif type(value) is int and _MIN_FLOAT <= value <= _MAX_FLOAT:
-        return float(value)
-    raise BadInputError("", value, f"a number in [{_MIN_FLOAT:g}, {_MAX_FLOAT:g}]")
-
-
-def _ballot(value: object, _: type) -> Ballot:
-    if not isinstance(value, (list, tuple)) or len(value) != 4:
-        raise BadInputError("", value, "a ballot [term, coordinator, incarnation, seq]")
-    term, coordinator, incarnation, seq = value
-    return Ballot(
-        _integer(term, int),
-        Name(_name(coordinator, str)),
-        _integer(incarnation, int),
-        _integer(seq, int),
-    )
-
-
-def _plain_data(value: object, _: type) -> dict[str, Any]:
-    if not isinstance(value, dict) or not _is_plain(value, _MAX_DEPTH):
+def _refusal(payload: bytes, expected: type | None, problem: str) -> BadInputError:
+    """Return the error of a payload that is not a message; `problem`: the decoder's message."""
+    try:
+        envelope = msgpack.unpackb(payload, strict_map_key=False)
+    except Exception:  # noqa: BLE001 (any error means the same)
+        return BadInputError("message", bytes(payload[:16]), "MessagePack")
+    if not isinstance(envelope, list) or len(envelope) != 3:
+        return BadInputError("message", type(envelope).__name__, "[version, kind, fields]")
+    version, name, body = envelope
+    if type(version) is not int or version != VERSION:
+        return BadInputError("version", version, str(VERSION))
+    kind = KINDS.get(name) if isinstance(name, str) else None
+    if kind is None or (expected is not None and kind is not expected):
+        allowed = expected.__name__ if expected is not None else ", ".join(KINDS)
+        return BadInputError("kind", name, allowed)
+    if not problem and kind is LogEvent and isinstance(body, list):
         allowed = "a map of JSON values: text keys, finite 64-bit numbers, not too deep"
-        raise BadInputError("", value, allowed)
-    return value
+        return BadInputError("LogEvent.data", body[-1], allowed)
+    match = _PLACE.fullmatch(problem)
+    if match is None:
+        return BadInputError("message", bytes(payload[:16]), "MessagePack of a message")
+    field, value, hint = _part(kind, body, match["path"] or "")
+    lacking = _LENGTH.match(problem.removeprefix("Expected "))
+    if lacking is not None and isinstance(hint, type) and issubclass(hint, Struct):
+        missing = fields(hint)[int(lacking[1])].name
+        return BadInputError(f"{field}.{missing}", NO_VALUE, "a value; this field is required")
+    allowed = match["allowed"]
+    for type_name, words in _IN_WORDS.items():
+        allowed = allowed.replace(type_name, words)
+    return BadInputError(field, value, allowed.split(" matching regex")[0].replace(" | ", " or "))
+
+
+def _part(kind: type, body: object, path: str) -> tuple[str, Any, Any]:
+    """Return the name, value and type of the part of a message to which a decoder's path leads."""
+    field, value, hint = kind.__name__, body, kind
+    for step in re.findall(r"\[(\d+|\.\.\.)\]", path):
+        hint = next((one for one in _options(hint) if one is not NoneType), hint)
+        parts = get_args(hint)
+        if step == "...":
+            assert isinstance(value, dict)  # noqa: S101 (the decoder has found a map)
+            key = next(key for key, item in value.items() if not _is_valid(item, parts[1]))
+            field, value, hint = f"{field}[{key}]", value[key], parts[1]
+            continue
+        index = int(step)
+        assert isinstance(value, list)  # noqa: S101 (the decoder has found an array)
+        if parts:
+            hint, field = parts[0 if parts[-1] is Ellipsis else index], f"{field}[{index}]"
+        else:
+            name, hint = list(get_type_hints(hint, include_extras=True).items())[index]
+            field = f"{field}.{name}"
+        value = value[index]
+    return field, value, hint
+
+
+def _options(hint: Any) -> tuple[Any, ...]:  # noqa: ANN401 (annotations have no type)
+    return get_args(hint) if get_origin(hint) is UnionType else (hint,)
+
+
+def _is_valid(value: object, hint: Any) -> bool:  # noqa: ANN401 (annotations have no type)
+    try:
+        convert(value, hint)
+    except ValidationError:
+        return False
+    return True
 
 
 def _is_plain(value: object, depth: int) -> bool:
@@ -83,77 +157,3 @@ def _is_plain(value: object, depth: int) -> bool:
                 type(key) is str and _is_plain(item, depth - 1) for key, item in value.items()
             )
     return False
-
-
-def _make_converter(*, detailed: bool) -> Any:  # noqa: ANN401 (cattrs converters are generic)
-    converter = strict_converter(detailed=detailed)
-    converter.register_structure_hook(int, _integer)
-    converter.register_structure_hook(float, _measure)
-    converter.register_structure_hook(Name, _name)
-    converter.register_structure_hook(Ballot, _ballot)
-    converter.register_structure_hook_func(lambda kind: kind == dict[str, Any], _plain_data)
-    return converter
-
-
-_FAST = _make_converter(detailed=False)
-_DETAILED = _make_converter(detailed=True)
-
-
-def warm_up() -> None:
-    """Generate the conversion code of all message classes in advance."""
-    for kind in KINDS.values():
-        _FAST.get_structure_hook(kind)
-        _FAST.get_unstructure_hook(kind)
-
-
-def encode(message: object) -> bytes:
-    """Return the bytes of a message."""
-    body = _FAST.unstructure(message)
-    packed = msgpack.packb((VERSION, type(message).__name__, body))
-    assert isinstance(packed, bytes)  # noqa: S101 (narrows msgpack's untyped result)
-    return packed
-
-
-def decode(payload: bytes, expected: type | None = None) -> object:
-    """Return the message in `payload`.
-
-    Args:
-        payload: arbitrary bytes.
-        expected: required message class; None: any.
-
-    Raises:
-        BadInputError: the payload is not one valid message of the expected class.
-    """
-    kind, body = _open_envelope(payload, expected)
-    try:
-        return _FAST.structure(body, kind)
-    except Exception:  # noqa: BLE001 (the slow converter reports the field)
-        return _explain(body, kind)
-
-
-def _open_envelope(payload: bytes, expected: type | None) -> tuple[type, dict[str, Any]]:
-    if len(payload) > MAX_BYTES:
-        raise BadInputError("message", f"{len(payload)} bytes", f"at most {MAX_BYTES} bytes")
-    try:
-        envelope = msgpack.unpackb(payload, strict_map_key=False)
-    except Exception as error:
-        raise BadInputError("message", bytes(payload[:16]), "MessagePack") from error
-    if not isinstance(envelope, list) or len(envelope) != 3:
-        raise BadInputError("message", type(envelope).__name__, "[version, kind, fields]")
-    version, name, body = envelope
-    if type(version) is not int or version != VERSION:
-        raise BadInputError("version", version, str(VERSION))
-    kind = KINDS.get(name) if isinstance(name, str) else None
-    if kind is None or (expected is not None and kind is not expected):
-        allowed = expected.__name__ if expected is not None else ", ".join(KINDS)
-        raise BadInputError("kind", name, allowed)
-    if not isinstance(body, dict):
-        raise BadInputError(kind.__name__, body, "a map of fields")
-    return kind, body
-
-
-def _explain(body: dict[str, Any], kind: type) -> object:
-    try:
-        return _DETAILED.structure(body, kind)
-    except Exception as error:
-        raise problems_of(error)[0].within(kind.__name__) from error

@@ -20,7 +20,7 @@ from pathlib import Path
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.field_validators import NAME_PATTERN
+from laneweave.protocol.names import NAME_PATTERN
 from laneweave.protocol.wire.topics import Party
 
 MAX_COMMON_NAME = 64

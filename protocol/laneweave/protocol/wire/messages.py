@@ -1,7 +1,8 @@
 """All messages: senders, receivers, rates, units, and the effect of loss, delay and duplication.
 
-Messages are frozen attrs classes, the frequent ones for type checkers only. `codec` encodes them as
-MessagePack and checks field types when decoding, so a core never receives a malformed message.
+Messages are frozen msgspec structs, which travel as arrays of their fields in the order given here.
+`codec` encodes them as MessagePack and checks field types and ranges when decoding, so a core never
+receives a malformed message. New fields come last and have a default.
 `t_s` is road time [s], the clock that moves the lattice; it advances in ticks. A cell is (column,
 lane) in the lattice frame. The sections of docs/PROTOCOL.md on messages are generated from the
 docstrings of this module.
@@ -9,17 +10,15 @@ docstrings of this module.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, NamedTuple, NewType
+from typing import Any, Final, NamedTuple
 
-from attrs import field, frozen
-from cattrs import override
+from msgspec import field
 
-from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
-from laneweave.protocol.quick_frozen import quick_frozen
+from laneweave.protocol.lattice import Lattice
+from laneweave.protocol.names import Name as Name  # noqa: PLC0414 (exported)
 from laneweave.protocol.road_layout import END_OF_ROAD
+from laneweave.protocol.wire.field_types import Cell, Int64, Message, PlannedMove, Real
 
-Name = NewType("Name", str)
-"""Name of a vehicle, coordinator or role: letters, digits, `_`, `-`, `.`; at most 64."""
 CAR: Final = "car"
 """Name of the type of vehicle that the scenario's table `vehicle` describes."""
 
@@ -31,18 +30,17 @@ class Ballot(NamedTuple):
     a ballot: a restarted coordinator has a new incarnation.
     """
 
-    term: int
+    term: Int64
     """Term of the leader; each election raises it above every term that other candidates have
     shown. At most `bounds.max_term`."""
     coordinator: Name
-    incarnation: int
+    incarnation: Int64
     """Incarnation of the coordinator process [ns]."""
-    seq: int
+    seq: Int64
     """Sequence number of the ballot in its process."""
 
 
-@frozen
-class Heartbeat:
+class Heartbeat(Message, frozen=True):
     """Coordinator to coordinators, bridge and observers, every `network.heartbeat_s` (wall clock).
 
     Also sent at once when a coordinator begins or stops leading. Missing for `network.election_s`:
@@ -54,18 +52,17 @@ class Heartbeat:
 
     coordinator: Name
     """Sender."""
-    incarnation: int
+    incarnation: Int64
     """Incarnation of the sender [ns]."""
-    term: int
+    term: Int64
     """Highest term that the sender has seen; its own term while it leads."""
     leading: bool
     """Whether the sender leads."""
-    formations: int
+    formations: Int64
     """Number of plans in force, for observers."""
 
 
-@frozen
-class PendingTransfer:
+class PendingTransfer(Message, frozen=True):
     """Transfer of cells by one plan of the rolling operation, as stored by one vehicle.
 
     Part of other messages. The vehicle owns the cells `before` until it knows that the start gate
@@ -97,8 +94,7 @@ class PendingTransfer:
         return not self.open and not self.withdrawn
 
 
-@frozen
-class Prepare:
+class Prepare(Message, frozen=True):
     """Leader to each vehicle of the roster that has not promised, every `network.resend_s`.
 
     Missing: sent again. Duplicated, late, or with a lower ballot than the promised one: no effect,
@@ -107,15 +103,14 @@ class Prepare:
     """
 
     ballot: Ballot
-    formations: tuple[int, ...]
+    formations: tuple[Int64, ...]
     """Blocks that the plan may use, ascending: the blocks of one formation or several joined."""
     roster: tuple[Name, ...]
     """All vehicles on the road that entered in these blocks; in the rolling operation, the vehicles
     that move and the owners of the cells that they need."""
 
 
-@frozen
-class Plan:
+class Plan(Message, frozen=True):
     """Leader to each vehicle of the roster that has not accepted, every `network.resend_s`.
 
     Each ballot has one plan. Missing: sent again; no vehicle moves until all have accepted (start
@@ -126,30 +121,29 @@ class Plan:
     """
 
     ballot: Ballot
-    formations: tuple[int, ...]
+    formations: tuple[Int64, ...]
     """Blocks of the ballot, which contain the territory."""
     roster: tuple[Name, ...]
     """Vehicles of the ballot."""
-    incarnations: dict[Name, int]
+    incarnations: dict[Name, Int64]
     """Incarnation of the process in charge of each vehicle when it promised [ns]."""
     start_cells: dict[Name, Cell]
     """Hold cell of each vehicle, from its promise."""
     moves: dict[Name, tuple[PlannedMove, ...]]
     """Moves (step, from, to) of each vehicle, in ascending order of steps."""
-    t0_s: float
+    t0_s: Real
     """Road time at which step 0 may begin [s]."""
-    slot_s: float
+    slot_s: Real
     """T_F [s]: step n may begin at t0 + n T_F. A move takes 0.2 s less, or `formation.move_s`."""
     territory: tuple[Cell, ...]
     """All start cells and the footprints of all moves."""
-    before: dict[Name, tuple[Cell, ...]] = field(factory=dict)
+    before: dict[Name, tuple[Cell, ...]] = field(default_factory=dict)
     """Rolling operation: cells that each vehicle owns when the plan is made."""
-    after: dict[Name, tuple[Cell, ...]] = field(factory=dict)
+    after: dict[Name, tuple[Cell, ...]] = field(default_factory=dict)
     """Rolling operation: cells that each vehicle owns once the start gate is open."""
 
 
-@quick_frozen
-class VehicleState:
+class VehicleState(Message, frozen=True):
     """Vehicle to its formation and the coordinators, every tick and at once on every change.
 
     The state serves as promise, acceptance and progress report. Missing: vehicles that wait for it
@@ -160,11 +154,11 @@ class VehicleState:
 
     vehicle: Name
     """Vehicle that the state describes; a caretaker sends the state while there is no agent."""
-    incarnation: int
+    incarnation: Int64
     """Incarnation of the process in charge of the vehicle [ns]."""
-    formation: int
+    formation: Int64
     """Number of the block in which the vehicle entered."""
-    joined: tuple[int, ...]
+    joined: tuple[Int64, ...]
     """Blocks that the vehicle's plans must cover, ascending, as stored by its motion controller."""
     promised: Ballot | None
     """Highest ballot that the process in charge has promised."""
@@ -172,7 +166,7 @@ class VehicleState:
     """Whether the plan of that ballot is accepted, and the motion controller has stored this."""
     ready: bool
     """Whether the plan is accepted and the vehicle holds or makes a move of this plan."""
-    completed: int
+    completed: Int64
     """k: number of completed moves of the accepted plan."""
     hold_cell: Cell
     """Cell in which the vehicle holds, or the target of its motion."""
@@ -186,23 +180,22 @@ class VehicleState:
     """Whether the next move has been due for 1.5 slots, or for a slot plus 2 s if that is less."""
     attended: bool
     """Whether an agent drives the vehicle; otherwise a caretaker does, and the vehicle holds."""
-    s_m: float
+    s_m: Real
     """Position of the front bumper along the road [m], from the start of the road."""
-    y_m: float
+    y_m: Real
     """Position of the body centre across the road [m], from the right edge."""
-    speed_mps: float
+    speed_mps: Real
     """Speed along the road [m/s]."""
-    t_s: float
+    t_s: Real
     """Road time of the tick [s]."""
-    owned: Annotated[tuple[Cell, ...], override(rename="estate")] = ()
+    owned: tuple[Cell, ...] = ()
     """Rolling operation: cells that the vehicle owns; empty until its motion controller has stored
-    the promise. Key on the wire: `estate`."""
-    transfer: Annotated[PendingTransfer | None, override(rename="deed")] = None
-    """Rolling operation: newest transfer of its cells. Key on the wire: `deed`."""
+    the promise."""
+    transfer: PendingTransfer | None = None
+    """Rolling operation: newest transfer of its cells."""
 
 
-@quick_frozen
-class Motion:
+class Motion(Message, frozen=True):
     """Vehicle to others in its own and both adjacent stretches of columns: its current motion.
 
     Sent when the motion begins and every 10 ticks while it lasts; a vehicle that holds sends
@@ -215,35 +208,33 @@ class Motion:
 
     vehicle: Name
     """Sender."""
-    incarnation: int
+    incarnation: Int64
     """Incarnation of the sending process [ns]."""
-    stretch: int
+    stretch: Int64
     """Index of the stretch of columns in which the motion began."""
     origin: Cell
     target: Cell
-    begin_tick: int
+    begin_tick: Int64
     """Tick at which the motion began."""
-    ticks: int
+    ticks: Int64
     """Duration [ticks]."""
-    tick: int
+    tick: Int64
     """Tick at which the message was sent."""
 
 
-@quick_frozen
-class Neighbour:
+class Neighbour(Message, frozen=True):
     """Nearest vehicle ahead or behind in a lane, as measured by sensors; part of `Sense`."""
 
-    lane: int
-    gap_m: float
+    lane: Int64
+    gap_m: Real
     """Net bumper-to-bumper distance along the road [m]; negative: side by side."""
-    speed_mps: float
+    speed_mps: Real
     """Speed along the road [m/s]."""
-    accel_mps2: float = 0.0
+    accel_mps2: Real = 0.0
     """Acceleration along the road [m/s2]."""
 
 
-@quick_frozen
-class Sense:
+class Sense(Message, frozen=True):
     """Bridge to one vehicle at each tick: measurements and the state of its motion controller.
 
     Missing: sent again every `runtime.tick_resend_s` until `runtime.tick_deadline_s`, or at shorter
@@ -256,46 +247,46 @@ class Sense:
 
     vehicle: Name
     """Receiver."""
-    tick: int
-    t_s: float
+    tick: Int64
+    t_s: Real
     """Road time of the tick [s]."""
-    state: tuple[float, float, float, float, float, float]
+    state: tuple[Real, Real, Real, Real, Real, Real]
     """Measured (s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2]); s is the front bumper
     along the road, y the body centre from the right edge."""
     hold_cell: Cell
     """Cell in which the motion controller will hold unless it receives a new command."""
-    motion_end_tick: int
+    motion_end_tick: Int64
     """Tick at which the current motion ends; at most `tick` if the vehicle holds."""
     motion_origin: Cell
     """Cell in which the current motion began; `hold_cell` if the vehicle holds."""
-    preferred_lane: int
+    preferred_lane: Int64
     ahead: tuple[Neighbour, ...]
     """Neighbours ahead: at most one per lane that the body touches or is next to."""
     behind: tuple[Neighbour, ...] = ()
     """Neighbours behind: at most one per lane that the body touches or is next to."""
-    setpoint: tuple[float, float] = (0.0, 0.0)
+    setpoint: tuple[Real, Real] = (0.0, 0.0)
     """Accelerations last commanded to the actuators, along and across the road [m/s2]."""
-    formation: int = 0
+    formation: Int64 = 0
     """Number of the block in which the vehicle entered."""
-    attendant: int = 0
+    attendant: Int64 = 0
     """Incarnation of the process in charge of the vehicle [ns]; 0: none yet."""
-    motion_ticks: int = 0
+    motion_ticks: Int64 = 0
     """Duration of the current move [ticks]; 0: the vehicle settles in its cell, or holds."""
     caretaker: bool = False
     """Whether the caretaker is in charge because the agent is absent or does not answer in time."""
-    joined: tuple[int, ...] = ()
+    joined: tuple[Int64, ...] = ()
     """Blocks that the controller has stored as joined."""
     accepted: Ballot | None = None
     """Ballot of the newest plan that the process in charge has accepted, as stored."""
     left: bool = False
     """Whether the vehicle has left the road; its agent then sends its report and stops."""
-    owned: Annotated[tuple[Cell, ...], override(rename="estate")] = ()
-    """Rolling operation: cells that the vehicle owns. Key on the wire: `estate`."""
+    owned: tuple[Cell, ...] = ()
+    """Rolling operation: cells that the vehicle owns."""
     promised: Ballot | None = None
     """Rolling operation: highest ballot that any process in charge has promised, as stored."""
-    transfer: Annotated[PendingTransfer | None, override(rename="deed")] = None
-    """Rolling operation: newest transfer of cells. Key on the wire: `deed`."""
-    bridge: int = 0
+    transfer: PendingTransfer | None = None
+    """Rolling operation: newest transfer of cells."""
+    bridge: Int64 = 0
     """Incarnation of the bridge [ns]; a new value means a new road; 0: not given."""
     off_lattice: bool = False
     """Whether the vehicle has no cell: it has stopped before the end of its lane, or drives back
@@ -304,8 +295,7 @@ class Sense:
     """Type of the vehicle, which determines its limits."""
 
 
-@quick_frozen
-class Command:
+class Command(Message, frozen=True):
     """Agent to the motion controller of its vehicle (in the bridge), in answer to each `Sense`.
 
     A command contains the complete remaining trajectory. Missing: the controller executes its
@@ -320,51 +310,48 @@ class Command:
 
     vehicle: Name
     """Sender."""
-    incarnation: int
+    incarnation: Int64
     """Incarnation of the sending process [ns]."""
-    tick: int
+    tick: Int64
     """Tick of the SENSE that it answers."""
     hold_cell: Cell
     """Cell in which the controller holds after the last jerk."""
-    motion_end_tick: int
+    motion_end_tick: Int64
     """Tick at which the current motion ends; 0 if the vehicle holds."""
     motion_origin: Cell
     """Cell in which the motion began."""
     jerks: bytes
     """Little-endian float32 pairs (along, across) [m/s3], one per tick, from `tick` on."""
-    motion_ticks: int = 0
+    motion_ticks: Int64 = 0
     """Duration of the current move [ticks]; 0: the vehicle settles in its cell, or holds."""
-    joined: tuple[int, ...] = ()
+    joined: tuple[Int64, ...] = ()
     """Blocks that the controller adds to the joined ones."""
     accepted: Ballot | None = None
     """Ballot of the accepted plan, to be stored."""
     promised: Ballot | None = None
     """Rolling operation: promised ballot, to be stored."""
-    transfer: Annotated[PendingTransfer | None, override(rename="deed")] = None
-    """Rolling operation: transfer of the newest plan, to be stored or opened. Key on the wire:
-    `deed`."""
+    transfer: PendingTransfer | None = None
+    """Rolling operation: transfer of the newest plan, to be stored or opened."""
 
 
-@frozen
-class OffLattice:
+class OffLattice(Message, frozen=True):
     """Body of a vehicle that has no cell; part of `CensusEntry`."""
 
-    lane: int
+    lane: Int64
     """Lane in which it is; usually one that ends, which it has not left in time."""
-    rear_m: float
+    rear_m: Real
     """Position of its rear bumper [m]."""
 
 
-@frozen
-class CensusEntry:
+class CensusEntry(Message, frozen=True):
     """Vehicle on the road, as recorded at its entry; part of `Census`."""
 
     vehicle: Name
     cell: Cell
     """Cell in which it entered the lattice last; its column determines the block."""
-    preferred_lane: int
+    preferred_lane: Int64
     """Lane in which it wants to leave the road; -1: any lane that reaches its destination."""
-    entered_s: float
+    entered_s: Real
     """Road time of its entry [s]."""
     off_lattice: OffLattice | None = None
     """None: the vehicle has cells, and takes part in plans."""
@@ -372,23 +359,22 @@ class CensusEntry:
     """Name of the exit by which it wants to leave the road; `end`: the end of the road."""
     vehicle_type: Name = Name(CAR)
     """Type of the vehicle, which determines the moves that it can drive."""
-    ready_s: float = 0.0
+    ready_s: Real = 0.0
     """Road time from which it is in this cell, or almost: it is ready for no plan before [s]."""
 
 
-@frozen
-class ClosedFormation:
+class ClosedFormation(Message, frozen=True):
     """Formation that accepts no more vehicles, and its blocks; part of `Census`."""
 
-    first_block: int
+    first_block: Int64
     """Number of its foremost block, which is also the number of the formation."""
-    last_block: int
+    last_block: Int64
     """Number of its rearmost block."""
-    closed_s: float
+    closed_s: Real
     """Road time at which it was closed [s]."""
 
     @property
-    def blocks(self) -> tuple[int, ...]:
+    def blocks(self) -> tuple[Int64, ...]:
         """Block numbers, ascending."""
         return tuple(range(self.first_block, self.last_block + 1))
 
@@ -399,20 +385,18 @@ class ClosedFormation:
         )
 
 
-@frozen
-class Announcement:
+class Announcement(Message, frozen=True):
     """Vehicle that will arrive soon; part of `Census`."""
 
     vehicle: Name
-    lane: int
+    lane: Int64
     """Lane in which it arrives."""
-    preferred_lane: int
-    arrival_s: float
+    preferred_lane: Int64
+    arrival_s: Real
     """Road time at which it would pass its entrance without other vehicles [s]."""
 
 
-@frozen
-class Census:
+class Census(Message, frozen=True):
     """Bridge to coordinators, fleets and observers, on every change and every 10 ticks.
 
     The census changes when a vehicle enters or leaves, a formation closes, or an announcement is
@@ -427,7 +411,7 @@ class Census:
     the census and the clock; more than 10 s ahead of it: refused.
     """
 
-    t_s: float
+    t_s: Real
     """Road time [s]."""
     on_road: tuple[CensusEntry, ...]
     """All vehicles on the road."""
@@ -436,9 +420,9 @@ class Census:
     formations: tuple[ClosedFormation, ...] = ()
     """Closed formations with a vehicle on the road, foremost first. Listed formations never change,
     and no block belongs to two of them. Empty in the rolling operation."""
-    closed_to: int = -1
+    closed_to: Int64 = -1
     """All blocks up to this number are closed: their vehicles are listed or have left."""
-    bridge: int = 0
+    bridge: Int64 = 0
     """Incarnation of the bridge [ns]; a new value means a new road; 0: not given."""
 
     @property
@@ -447,8 +431,7 @@ class Census:
         return tuple(entry for entry in self.on_road if entry.off_lattice is None)
 
 
-@frozen
-class RoadClock:
+class RoadClock(Message, frozen=True):
     """Bridge to coordinators and observers, each tick: road time and progress.
 
     Missing: the coordinator's road time stops until the next clock or census, so the coordinator
@@ -457,25 +440,24 @@ class RoadClock:
     road time from `Sense`.
     """
 
-    tick: int
-    t_s: float
+    tick: Int64
+    t_s: Real
     """Road time of the tick [s]."""
-    demanded: int
+    demanded: Int64
     """Number of vehicles that have arrived so far."""
-    entered: int
+    entered: Int64
     """Number of vehicles that have entered so far."""
-    on_road: int
+    on_road: Int64
     """Number of vehicles on the road."""
-    left: int
+    left: Int64
     """Number of vehicles that have left so far."""
     ended: bool
     """Whether the run is over."""
-    bridge: int = 0
+    bridge: Int64 = 0
     """Incarnation of the bridge [ns]; a new value means a new road; 0: not given."""
 
 
-@frozen
-class Report:
+class Report(Message, frozen=True):
     """Any role to the recorder: the sender's counters.
 
     Sent by agents when their vehicle has left or they are stopped, by the bridge when its run ends,
@@ -489,22 +471,21 @@ class Report:
     name: Name
     process: Name = Name("unknown")
     """Process of the sender, set by the node; several vehicles may share one."""
-    published: int = 0
+    published: Int64 = 0
     """Number of messages published by the process, including this one; set by the node."""
-    rejected: int = 0
+    rejected: Int64 = 0
     """Number of malformed messages received by the process; set by the node."""
-    solves: int = 0
+    solves: Int64 = 0
     """Number of ticks at which a reference was tracked."""
-    unusable: int = 0
+    unusable: Int64 = 0
     """Number of solves without a usable solution."""
-    osqp_solves: int = 0
+    osqp_solves: Int64 = 0
     """Number of solves with OSQP; in the rest the unconstrained optimum met all constraints."""
     solve_ms: bytes = b""
     """CPU time of each solve [ms], little-endian float32."""
 
 
-@frozen
-class LogEvent:
+class LogEvent(Message, frozen=True):
     """Any role to the recorder, for each event: a line in `events.jsonl`.
 
     Currently only coordinators send events; the bridge writes its own directly. Missing, or
@@ -513,9 +494,9 @@ class LogEvent:
 
     role: Name
     name: Name
-    t_s: float
+    t_s: Real
     """Road time [s]."""
     kind: Name
     """One of the names in `wire.events`."""
-    data: dict[str, Any] = field(factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)
     """Details, as JSON values."""

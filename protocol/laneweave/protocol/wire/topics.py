@@ -17,8 +17,9 @@ from types import MappingProxyType
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
+from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.wire import messages
+from laneweave.protocol.wire.field_types import Message
 
 PREFIX = "laneweave"
 
@@ -80,7 +81,7 @@ class Topic:
     name: str
     pattern: str
     """Key without prefix or realm, with {parameters}."""
-    kind: type | None
+    kind: type[Message] | None
     """Message class; None for tokens and the planning service."""
     sender: str
     """A `Party`, or `ANY_SENDER`. Keys with the name of a process are reserved for that process."""

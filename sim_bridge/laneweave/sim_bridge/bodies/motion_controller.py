@@ -29,7 +29,8 @@ from array import array
 from collections.abc import Iterable, Sequence
 from enum import Enum, IntEnum
 
-from attrs import define, evolve, field
+from attrs import define, field
+from msgspec.structs import replace
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Lattice
@@ -614,7 +615,7 @@ class MotionController:
 
 def _with_cells(transfer: PendingTransfer, cells: Iterable[Cell]) -> PendingTransfer:
     """Return a transfer with additional cells that the vehicle keeps."""
-    return evolve(
+    return replace(
         transfer,
         before=tuple(sorted({*transfer.before, *cells})),
         after=tuple(sorted({*transfer.after, *cells})),

@@ -7,6 +7,7 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from laneweave.agents.driving.driver import Drive, SolverStats, TrackingDriver
@@ -165,9 +166,7 @@ def test_a_motion_that_is_over_or_of_an_impossible_duration_is_taken_over_as_a_h
     end_tick: int, ticks: int
 ) -> None:
     made, felt = TrackingDriver(SCENARIO), sense(25, MOVE[2])
-    made.take_over(
-        attrs.evolve(felt, motion_end_tick=end_tick, motion_origin=HOME, motion_ticks=ticks)
-    )
+    made.take_over(replace(felt, motion_end_tick=end_tick, motion_origin=HOME, motion_ticks=ticks))
     assert made.at_rest(felt)
     drive = made.drive(felt, moving=False)
     assert (drive.motion_origin, drive.motion_ticks) == (MOVE[2], 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import attrs
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from laneweave.agents.core import AgentCore
@@ -277,7 +278,7 @@ def test_a_motion_that_has_ended_or_was_not_repeated_does_not_count() -> None:
 def test_a_motion_that_comes_when_it_has_ended_does_not_count() -> None:
     """Also within the tick in which others were forgotten already."""
     tick = BEGIN + MOVE_TICKS
-    third = attrs.evolve(motion(name=Name("third")), begin_tick=tick, tick=tick)
+    third = replace(motion(name=Name("third")), begin_tick=tick, tick=tick)
     around, seen = hearing(third), neighbour(path(tick), 1, tick)
     assert not beyond_sensing(around, tick, seen)
     around.on_motion(motion(tick=tick - 1))
@@ -302,10 +303,10 @@ def test_the_newest_incarnation_and_then_the_newest_motion_counts() -> None:
     assert not beyond_sensing(hearing(motion(), newer), 20, seen)
     assert not beyond_sensing(hearing(newer, motion()), 20, seen)
     assert beyond_sensing(hearing(motion(elsewhere), motion(incarnation=2)), 20, seen)
-    later = attrs.evolve(motion(elsewhere), begin_tick=BEGIN + 5)
+    later = replace(motion(elsewhere), begin_tick=BEGIN + 5)
     assert not beyond_sensing(hearing(motion(), later), 20, seen)
     assert not beyond_sensing(hearing(later, motion()), 20, seen)
-    older = attrs.evolve(motion(elsewhere), begin_tick=BEGIN - 5)
+    older = replace(motion(elsewhere), begin_tick=BEGIN - 5)
     assert beyond_sensing(hearing(motion(), older), 20, seen)
 
 
@@ -333,12 +334,12 @@ def test_a_motion_counts_while_its_body_touches_a_lane_that_counts() -> None:
         motion(((1, 1), (3, 1))),
         motion(((1, 1), (0, 2))),  # oblique, which mode 1 does not know
         motion(((2**63 - 1, 2**63 - 1), (-(2**63), 0))),
-        attrs.evolve(motion(), ticks=MOVE_TICKS - 1),  # no slot of this scenario lasts so long
-        attrs.evolve(motion(), ticks=0),
-        attrs.evolve(motion(), ticks=2**63 - 1),
-        attrs.evolve(motion(), ticks=-(2**63)),
-        attrs.evolve(motion(), begin_tick=2**63 - 1, tick=-(2**63)),
-        attrs.evolve(motion(), begin_tick=-(2**63), tick=2**63 - 1),
+        replace(motion(), ticks=MOVE_TICKS - 1),  # no slot of this scenario lasts so long
+        replace(motion(), ticks=0),
+        replace(motion(), ticks=2**63 - 1),
+        replace(motion(), ticks=-(2**63)),
+        replace(motion(), begin_tick=2**63 - 1, tick=-(2**63)),
+        replace(motion(), begin_tick=-(2**63), tick=2**63 - 1),
     ],
 )
 def test_implausible_motions_are_ignored(nonsense: Motion) -> None:

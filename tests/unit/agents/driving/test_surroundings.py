@@ -6,7 +6,7 @@ import random
 
 import numpy as np
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.agents.driving.surroundings import SENSED_S, SLOW_S, SLOW_SHARE, Surroundings
 from laneweave.agents.driving.tracking_problem import NO_GAPS, Gaps
@@ -140,14 +140,14 @@ def test_of_two_the_nearer_one_counts_at_each_moment() -> None:
     """While it changes lanes: the one behind is faster and passes the other's place."""
     felt = sense((Neighbour(1, 10.0, 5.0), Neighbour(2, 6.0, V_F)))
     each = [
-        off(gaps_of(evolve(felt, ahead=(one,)), 2, all_of_them=True).latest) for one in felt.ahead
+        off(gaps_of(replace(felt, ahead=(one,)), 2, all_of_them=True).latest) for one in felt.ahead
     ]
     both = off(gaps_of(felt, 2, all_of_them=True).latest)
     assert (both == np.minimum(*each)).all()
     assert both[0] == each[1][0] != both[10] == each[0][10]
-    felt = evolve(felt, ahead=(), behind=(Neighbour(1, 10.0, 22.0), Neighbour(2, 6.0, V_F)))
+    felt = replace(felt, ahead=(), behind=(Neighbour(1, 10.0, 22.0), Neighbour(2, 6.0, V_F)))
     each = [
-        off(gaps_of(evolve(felt, behind=(one,)), 2, all_of_them=True).earliest)
+        off(gaps_of(replace(felt, behind=(one,)), 2, all_of_them=True).earliest)
         for one in felt.behind
     ]
     both = off(gaps_of(felt, 2, all_of_them=True).earliest)

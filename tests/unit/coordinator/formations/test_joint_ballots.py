@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.formations.operation import JUST_CLOSED_S
@@ -228,7 +229,7 @@ def test_groups_that_overlap_become_one() -> None:
     desk = leading(cells)
     assert sorted(desk.leaders) == [0, 1, 2]
     desk.tell(state(A, cells[A], joined=(0, 1)))
-    desk.tell(evolve(state(C, cells[C]), formation=2, joined=(1, 2)))
+    desk.tell(replace(state(C, cells[C]), formation=2, joined=(1, 2)))
     assert {number: each.formation.numbers for number, each in desk.leaders.items()} == {
         0: (0, 1, 2)
     }
@@ -335,7 +336,7 @@ def test_when_no_vehicle_can_be_moved_the_plan_has_no_moves() -> None:
     assert logged(effects) == ["lane-out-of-reach"]
     for name, cell in cells.items():
         shown = state(name, cell, desk.ballot, accepted=True, t_s=2.0)
-        desk.tell(evolve(shown, attended=False, done=True))
+        desk.tell(replace(shown, attended=False, done=True))
     desk.watch(3.0)
     assert desk.leaders[0].phase is BallotPhase.IN_FORCE  # and it is not planned again
 

@@ -6,6 +6,7 @@ import pytest
 from attrs import evolve
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from laneweave.coordinator.formations.roster import (
     Formation,
@@ -107,7 +108,7 @@ def test_a_formation_has_all_of_its_blocks_and_is_planned_only_as_a_whole() -> N
         0: formation_of((0, 1, 2, 3), entries_of(a=(0, 0), b=(-2, 2)), 3.0),
         4: formation_of((4, 5, 6), entries_of(c=(-4, 2), d=(-6, 1)), 9.0),
     }
-    assert list(closed_formations(evolve(seen, closed_to=5), NOW_S, GROWING, Groups())) == [0]
+    assert list(closed_formations(replace(seen, closed_to=5), NOW_S, GROWING, Groups())) == [0]
 
 
 def test_joined_formations_have_the_blocks_of_all_and_the_latest_closing() -> None:
@@ -117,7 +118,7 @@ def test_joined_formations_have_the_blocks_of_all_and_the_latest_closing() -> No
     assert closed_formations(seen, NOW_S, GROWING, joined(3, 4)) == {
         0: formation_of(tuple(range(7)), entries_of(a=(0, 0), c=(-4, 2)), 9.0, joined=2)
     }
-    assert closed_formations(evolve(seen, closed_to=5), NOW_S, GROWING, joined(3, 4)) == {}
+    assert closed_formations(replace(seen, closed_to=5), NOW_S, GROWING, joined(3, 4)) == {}
 
 
 def test_what_the_census_has_told_of_a_formation_is_remembered() -> None:
@@ -189,6 +190,6 @@ def test_groups_are_forgotten_when_all_their_vehicles_have_left() -> None:
     assert groups.of(0) == (0,)
     assert groups.of(2) == (2, 3)  # a vehicle of block 3 is on the road
     assert groups.of(4) == (4, 5, 6)  # vehicles may still enter block 6
-    groups.forget_departed(evolve(seen, closed_to=6), LATTICE.block_of)
+    groups.forget_departed(replace(seen, closed_to=6), LATTICE.block_of)
     assert groups.of(4) == (4,)
     assert groups.of(2) == (2, 3)

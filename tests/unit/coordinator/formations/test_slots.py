@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.coordinator.formations import pacing
 from laneweave.coordinator.formations.pacing import MIN_RESERVE_S, RESERVE_S, steps_of, with_pauses
@@ -39,9 +39,9 @@ def left_s(plan: Plan) -> float:
 @pytest.mark.parametrize("steps", range(12))
 def test_slots_are_the_longest_that_leave_a_reserve(steps: int, late_s: float) -> None:
     plan = climbing(steps)
-    plan = evolve(plan, t0_s=plan.t0_s + late_s)
+    plan = replace(plan, t0_s=plan.t0_s + late_s)
     chosen = paced(plan)
-    assert chosen == evolve(plan, slot_s=chosen.slot_s)
+    assert chosen == replace(plan, slot_s=chosen.slot_s)
     leisurely, hasty = (
         max(
             (s for s in SCENARIO.slots_s if steps * s <= left_s(plan) - reserve_s),
@@ -63,7 +63,7 @@ def test_more_steps_have_shorter_slots() -> None:
 
 def test_a_plan_begins_before_its_rear_is_in_s3_unless_a_lane_change_does() -> None:
     along: tuple[PlannedMove, ...] = ((0, (-3, 0), (-2, 0)), (1, (-2, 0), (-2, 1)))
-    plan = evolve(
+    plan = replace(
         climbing(0),
         start_cells={A: (-3, 0)},
         moves={A: along},
@@ -100,8 +100,8 @@ def test_neighbours_with_slots_of_other_lengths_are_kept_apart(
     slot_s: float, their_slot_s: float, late_s: float, pauses: int
 ) -> None:
     """Their move lasts as long as their slot but for the slack."""
-    mine = evolve(climbing(1), moves={A: ((0, (-5, 1), (-4, 1)),)}, slot_s=slot_s)
-    theirs = evolve(mine, moves={A: ((0, (-2, 1), (-3, 1)),)}, slot_s=their_slot_s)
-    late = evolve(mine, t0_s=mine.t0_s + late_s)
+    mine = replace(climbing(1), moves={A: ((0, (-5, 1), (-4, 1)),)}, slot_s=slot_s)
+    theirs = replace(mine, moves={A: ((0, (-2, 1), (-3, 1)),)}, slot_s=their_slot_s)
+    late = replace(mine, t0_s=mine.t0_s + late_s)
     paused = with_pauses(late, [theirs], SCENARIO.formation.slack_s, 9)
     assert (steps_of(paused) - 1 > 0) is bool(pauses)

@@ -9,7 +9,8 @@ from itertools import count
 from typing import Any
 
 import pytest
-from attrs import define, evolve, field
+from attrs import define, field
+from msgspec.structs import replace
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry
@@ -66,7 +67,7 @@ def shown(
 ) -> State:
     plain = state(name, promised, transfer, owned=OWNED[name], t_s=BEGUN_S + 0.4)
     values: dict[str, Any] = {"hold_cell": HOMES[name], "done": True} | changes
-    return evolve(plain, **values)
+    return replace(plain, **values)
 
 
 def census(*names: Name) -> Census:
@@ -128,7 +129,7 @@ class Bench:
 
     def hear(self, *states: State) -> list[LogEntry]:
         """Hear the states of vehicles that are in their cells."""
-        placed = [evolve(each, s_m=place_m(each)) for each in states]
+        placed = [replace(each, s_m=place_m(each)) for each in states]
         return [entry for each in placed for entry in self.control.on_state(each, 0.0) or ()]
 
     def order(self, t_s: float = LOOK_S, now_s: float | None = None) -> Compute | None:
@@ -204,10 +205,10 @@ def test_nothing_is_planned_without_a_road() -> None:
 def test_a_new_leader_listens_first() -> None:
     """However fast or slow the road is; then it looks at once, and at the newest."""
     desk = Bench()
-    desk.control.on_census(evolve(census(), t_s=BEGUN_S + 0.9))
+    desk.control.on_census(replace(census(), t_s=BEGUN_S + 0.9))
     assert desk.order(LOOK_S, now_s=10.0) is None
-    desk.control.on_census(evolve(census(A), t_s=BEGUN_S + 0.9))
-    desk.hear(evolve(shown(A), t_s=BEGUN_S + 1.0))
+    desk.control.on_census(replace(census(A), t_s=BEGUN_S + 0.9))
+    desk.hear(replace(shown(A), t_s=BEGUN_S + 1.0))
     assert desk.order(BEGUN_S + 3.0, now_s=10.0 + LISTEN_S - 0.01) is None
     compute = desk.order(BEGUN_S + 1.0, now_s=10.0 + LISTEN_S)
     assert compute is not None
@@ -225,7 +226,7 @@ def test_a_leader_that_is_elected_again_listens_again() -> None:
     assert desk.order(later_s + LISTEN_S) is None  # it needs a census, too
     desk.control.on_census(census(A, B))
     assert desk.order(later_s) is None
-    desk.hear(evolve(shown(A), hold_cell=(1, 0), t_s=later_s + 0.2))
+    desk.hear(replace(shown(A), hold_cell=(1, 0), t_s=later_s + 0.2))
     compute = desk.order(later_s + LISTEN_S)
     assert compute is not None
     compute.work(time.monotonic)
@@ -292,8 +293,8 @@ def test_the_planner_gets_types_and_goals_that_suit_them() -> None:
     )
     desk = Bench(scenario=scenario)
     own = census(A, B)
-    trucks = evolve(
-        own, on_road=(evolve(own.on_road[0], vehicle_type=Name("truck")), own.on_road[1])
+    trucks = replace(
+        own, on_road=(replace(own.on_road[0], vehicle_type=Name("truck")), own.on_road[1])
     )
     desk.control.on_census(trucks)
     assert desk.order(BEGUN_S - 2.0) is None
@@ -309,9 +310,9 @@ def test_later_states_do_not_count() -> None:
     """Whether it has arrived by then depends on how fast messages are."""
     desk = bench(A, B)
     desk.control.on_census(census(A, B, C))
-    desk.hear(evolve(shown(A, OLD), hold_cell=(1, 0), t_s=LOOK_S))
-    desk.hear(evolve(shown(C), t_s=LOOK_S))
-    desk.control.on_census(evolve(census(B, D), t_s=LOOK_S))
+    desk.hear(replace(shown(A, OLD), hold_cell=(1, 0), t_s=LOOK_S))
+    desk.hear(replace(shown(C), t_s=LOOK_S))
+    desk.control.on_census(replace(census(B, D), t_s=LOOK_S))
     call = desk.call()
     assert call.vehicles == {
         name: StreamVehicle(name, HOMES[name], 1, held=name is C) for name in (A, B, C)
@@ -328,8 +329,8 @@ def test_a_body_that_is_more_than_a_move_from_its_cell_is_held(
 ) -> None:
     """It is not ready for plans, and others plan around its cell."""
     desk = bench(A)
-    state = evolve(shown(A), t_s=BEGUN_S + SNAPSHOT_S)
-    desk.control.on_state(evolve(state, s_m=place_m(state) + ahead_m), 0.0)
+    state = replace(shown(A), t_s=BEGUN_S + SNAPSHOT_S)
+    desk.control.on_state(replace(state, s_m=place_m(state) + ahead_m), 0.0)
     desk.think()
     assert desk.calls[0].vehicles[A].held == held
 
@@ -344,9 +345,9 @@ def test_a_vehicle_that_settles_is_planned_from_when_it_is_ready(
     desk = bench(A)
     entry = CensusEntry(A, HOMES[A], 1, 0.0, ready_s=ready_s)
     desk.control.on_census(Census(BEGUN_S + 0.1, (entry,), ()))
-    state = evolve(shown(A), t_s=BEGUN_S + SNAPSHOT_S)
+    state = replace(shown(A), t_s=BEGUN_S + SNAPSHOT_S)
     far_m = 40.0 if waits else 0.0
-    desk.control.on_state(evolve(state, s_m=place_m(state) + far_m), 0.0)
+    desk.control.on_state(replace(state, s_m=place_m(state) + far_m), 0.0)
     desk.think()
     asked = desk.calls[0].vehicles[A]
     assert (asked.waits, asked.held) == (waits, False)
@@ -365,7 +366,7 @@ def test_members_of_a_ballot_whose_gate_is_closed_take_part_in_no_other() -> Non
         t_s = BEGUN_S + slots * SLOT_S
         pending = PendingTransfer(transfer.ballot, OWNED[A], OWNED[A], (A,))
         first = shown(A, transfer.ballot, pending, accepted=True, go=go, done=False)
-        desk.hear(*(evolve(one, t_s=t_s + 0.4) for one in (first, shown(B))))
+        desk.hear(*(replace(one, t_s=t_s + 0.4) for one in (first, shown(B))))
         return desk.call(t_s + SNAPSHOT_S + 0.1)
 
     call = next_call(1, go=False)
@@ -381,7 +382,7 @@ def test_vehicles_without_cells_are_not_planned_and_end_the_sections_they_are_in
     entries = census(A, B).on_road
     body = OffLattice(lane=1, rear_m=700.0)
     desk.control.on_census(
-        evolve(census(A), on_road=(entries[0], evolve(entries[1], off_lattice=body)))
+        replace(census(A), on_road=(entries[0], replace(entries[1], off_lattice=body)))
     )
     desk.think()
     assert set(desk.calls[0].vehicles) == {A}
@@ -390,11 +391,11 @@ def test_vehicles_without_cells_are_not_planned_and_end_the_sections_they_are_in
 
 def test_states_may_arrive_in_any_order() -> None:
     desk = bench(A)
-    desk.hear(evolve(shown(A), hold_cell=(2, 0), t_s=LOOK_S))
+    desk.hear(replace(shown(A), hold_cell=(2, 0), t_s=LOOK_S))
     moving = shown(A, OLD, moving=True, accepted=True, t_s=BEGUN_S + SNAPSHOT_S)
-    desk.hear(evolve(moving, hold_cell=(1, 0)))
-    desk.hear(evolve(shown(A), hold_cell=(0, 0), t_s=BEGUN_S + SNAPSHOT_S - 0.1))
-    desk.hear(evolve(shown(A, OLD), hold_cell=(2, 0), t_s=LOOK_S))  # twice in a tick
+    desk.hear(replace(moving, hold_cell=(1, 0)))
+    desk.hear(replace(shown(A), hold_cell=(0, 0), t_s=BEGUN_S + SNAPSHOT_S - 0.1))
+    desk.hear(replace(shown(A, OLD), hold_cell=(2, 0), t_s=LOOK_S))  # twice in a tick
     desk.think()
     assert desk.calls[0].vehicles == {A: StreamVehicle(A, (1, 0), 1, held=False)}
 
@@ -404,11 +405,11 @@ def test_an_unheard_vehicle_does_not_keep_others_from_being_planned() -> None:
     for names in ((A, B), (B, A)):
         desk = bench(*names)
         desk.control.on_census(census(*names, C))
-        desk.hear(evolve(shown(A), hold_cell=HOMES[C], t_s=BEGUN_S + SNAPSHOT_S))
+        desk.hear(replace(shown(A), hold_cell=HOMES[C], t_s=BEGUN_S + SNAPSHOT_S))
         desk.think()
         assert set(desk.calls[0].vehicles) == {A, B}
     desk = bench(A, B)
-    desk.hear(evolve(shown(A), hold_cell=HOMES[B], t_s=BEGUN_S + SNAPSHOT_S))
+    desk.hear(replace(shown(A), hold_cell=HOMES[B], t_s=BEGUN_S + SNAPSHOT_S))
     desk.think()
     assert len(desk.calls[0].vehicles) == 1
 
@@ -417,8 +418,8 @@ def test_a_vehicle_that_has_moved_since_is_left_out() -> None:
     desk = bench(A, B, ways={A: ((0, 0), (0, 1)), B: ((2, 1), (2, 2))})
     compute = desk.order()
     assert compute is not None
-    desk.hear(evolve(shown(A, OLD, moving=True), hold_cell=(1, 0), t_s=LOOK_S))
-    desk.hear(evolve(shown(B), owned=(*OWNED[B], (2, 2)), t_s=LOOK_S))
+    desk.hear(replace(shown(A, OLD, moving=True), hold_cell=(1, 0), t_s=LOOK_S))
+    desk.hear(replace(shown(B), owned=(*OWNED[B], (2, 2)), t_s=LOOK_S))
     desk.finish(compute, LOOK_S)
     assert [set(transfer.moves) for transfer in desk.control.transfers] == [{B}]
 
@@ -483,7 +484,7 @@ def test_which_vehicles_are_held_and_which_cells_are_blocked(
     observed: State, held: bool, blocked: set[Cell], usable: set[Cell]
 ) -> None:
     desk = bench(A, B)
-    desk.hear(evolve(observed, t_s=BEGUN_S + 0.5))
+    desk.hear(replace(observed, t_s=BEGUN_S + 0.5))
     call = desk.call()
     assert [vehicle.held for vehicle in call.vehicles.values()] == [held, False]
     assert blocked <= call.blocked
@@ -519,10 +520,10 @@ def test_an_unheard_vehicle_stays_where_it_entered_and_owns_nothing() -> None:
 @pytest.mark.parametrize(
     ("older", "newer"),
     [
-        (shown(A), evolve(shown(A), t_s=BEGUN_S + 1.0)),
-        (evolve(shown(A), t_s=BEGUN_S + 1.0), evolve(shown(A), incarnation=8)),
+        (shown(A), replace(shown(A), t_s=BEGUN_S + 1.0)),
+        (replace(shown(A), t_s=BEGUN_S + 1.0), replace(shown(A), incarnation=8)),
         (shown(A), shown(A, OLD)),
-        (evolve(shown(A, OLD), owned=()), shown(A, OLD)),
+        (replace(shown(A, OLD), owned=()), shown(A, OLD)),
         (shown(A, OLD), shown(A, OLD, accepted=True)),
         (shown(A, OLD), shown(A, OLD, PendingTransfer(OLD))),
         (shown(A, OLD, PendingTransfer(OLD)), shown(A, OLD, PendingTransfer(OLD, open=True))),
@@ -534,12 +535,12 @@ def test_the_newest_state_counts_in_whichever_order_they_come(older: State, newe
         desk = Bench()
         desk.control.on_census(census(A))
         desk.hear(*states)
-        assert desk.control.observed.states[A] == evolve(newer, s_m=place_m(newer))
+        assert desk.control.observed.states[A] == replace(newer, s_m=place_m(newer))
 
 
 def test_ballots_are_above_all_that_was_promised() -> None:
     desk = bench(A, B)
-    desk.hear(evolve(shown(B, OLD), t_s=BEGUN_S + 0.5))
+    desk.hear(replace(shown(B, OLD), t_s=BEGUN_S + 0.5))
     desk.ways = {A: ((0, 0), (1, 0))}
     desk.think()
     assert desk.asked_above == [OLD]
@@ -599,7 +600,7 @@ def run_ballot(desk: Bench) -> Plan:
     sent = dict(desk.control.outgoing(50.0))
     assert {type(message) for message in sent.values()} == {Prepare}
     ballot = desk.control.transfers[0].ballot
-    desk.hear(*(evolve(shown(name, ballot), t_s=BEGUN_S + 1.0) for name in sent))
+    desk.hear(*(replace(shown(name, ballot), t_s=BEGUN_S + 1.0) for name in sent))
     plan = dict(desk.control.outgoing(50.0))[A]
     assert isinstance(plan, Plan)
     return plan
@@ -613,7 +614,7 @@ def test_from_the_plan_to_a_ballot_in_force() -> None:
     assert plan.moves == {A: ((0, (0, 0), (0, 1)),), B: ()}
     assert desk.control.in_force == 0
     accepted = [
-        evolve(shown(name, plan.ballot, accepted=True), t_s=BEGUN_S + 1.0) for name in (A, B)
+        replace(shown(name, plan.ballot, accepted=True), t_s=BEGUN_S + 1.0) for name in (A, B)
     ]
     assert desk.hear(accepted[0]) == []
     assert desk.hear(accepted[1]) == [
@@ -626,9 +627,9 @@ def test_from_the_plan_to_a_ballot_in_force() -> None:
 def test_a_ballot_that_fails_is_noted() -> None:
     desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
     desk.think()
-    (note,) = desk.hear(evolve(shown(B, Ballot(9, Name("c2"), 1, 1)), t_s=BEGUN_S + 1.0))
+    (note,) = desk.hear(replace(shown(B, Ballot(9, Name("c2"), 1, 1)), t_s=BEGUN_S + 1.0))
     assert (note.kind, note.data) == ("handover-given-up", {"roster": [A, B], "why": "outbid"})
-    assert desk.hear(evolve(shown(A), t_s=BEGUN_S + 1.0)) == []
+    assert desk.hear(replace(shown(A), t_s=BEGUN_S + 1.0)) == []
 
 
 # --- the census -------------------------------------------------------------------------------
@@ -655,7 +656,7 @@ def test_a_new_road_starts_without_memory() -> None:
         [],
     )
     assert desk.order(LOOK_S + SLOT_S) is None
-    desk.control.on_census(evolve(census(A), t_s=0.0))
+    desk.control.on_census(replace(census(A), t_s=0.0))
     assert desk.order(0.0, now_s=100.0) is None  # it listens first
     compute = desk.order(SNAPSHOT_S + 0.1, now_s=101.0)
     assert compute is not None
@@ -667,8 +668,8 @@ def test_a_new_road_starts_without_memory() -> None:
 
 def test_vehicles_that_have_left_are_forgotten() -> None:
     desk = bench(A, B, C)
-    desk.hear(*(evolve(shown(name), t_s=BEGUN_S + 0.5) for name in (A, B, C)))
-    desk.control.on_census(evolve(census(B), t_s=BEGUN_S + 0.5))
+    desk.hear(*(replace(shown(name), t_s=BEGUN_S + 0.5) for name in (A, B, C)))
+    desk.control.on_census(replace(census(B), t_s=BEGUN_S + 0.5))
     desk.think()
     kept = desk.control.observed
     assert set(kept.states) == {B}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.coordinator.rolling.ownership import certain_cells, owned_cells, partners
 from laneweave.protocol.wire.messages import Ballot, Name, PendingTransfer, VehicleState
@@ -66,7 +66,7 @@ def test_when_all_have_promised_more_with_closed_gates_the_old_cells_are_owned()
     assert owned_cells(CLOSED, others) == certain_cells(CLOSED, others) == OWNED_BEFORE
     assert partners(CLOSED, others) == frozenset()
     assert owned_cells(state(A, MID, TRANSFER), others) is None  # A may open its own gate
-    assert owned_cells(evolve(CLOSED, owned=()), others) is None
+    assert owned_cells(replace(CLOSED, owned=()), others) is None
 
 
 @pytest.mark.parametrize("newer", [None, state(C, HIGH, PendingTransfer(BETWEEN, open=True))])
@@ -82,21 +82,21 @@ def test_cells_owned_either_way_are_certain(
     assert owned_cells(CLOSED, {B: state(B, HIGH), **there}, gone) == OWNED_BEFORE
     assert partners(CLOSED, {B: state(B, HIGH, TRANSFER_OF_B), **there}) == {B, *there}
     # Under way it may still be in a cell that it is about to give.
-    moving = evolve(CLOSED, moving=True)
+    moving = replace(CLOSED, moving=True)
     assert owned_cells(moving, there, gone) is None
     assert certain_cells(moving, there, gone) == SURE
 
 
 def test_a_vehicle_that_rests_outside_its_start_cell_was_never_ready() -> None:
     """Its controller refused an earlier move; so no gate has opened, even of one that has left."""
-    stranded, other = evolve(CLOSED, hold_cell=STRANDED), state(B, HIGH, TRANSFER_OF_B)
+    stranded, other = replace(CLOSED, hold_cell=STRANDED), state(B, HIGH, TRANSFER_OF_B)
     assert owned_cells(stranded, {B: other}, {C}) == OWNED_BEFORE
     assert partners(stranded, {B: other}) == frozenset()
     assert owned_cells(other, {A: stranded}, {C}) == frozenset(BEFORE[B])
     assert owned_cells(other, {A: CLOSED}, {C}) == frozenset(BEFORE[B]) & {*AFTER[B]}
     # It may be on its way to its start cell, or become ready yet.
-    assert owned_cells(evolve(stranded, moving=True), {}, {C}) is None
-    assert owned_cells(evolve(stranded, promised=MID), {}, {C}) == SURE
+    assert owned_cells(replace(stranded, moving=True), {}, {C}) is None
+    assert owned_cells(replace(stranded, promised=MID), {}, {C}) == SURE
 
 
 def test_states_of_other_vehicles_and_own_older_ones_are_ignored() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
@@ -91,7 +92,7 @@ def test_what_is_no_promise_does_not_count(no_promise: VehicleState) -> None:
 def test_the_plan_is_made_from_the_promises() -> None:
     transfer = issued()
     plan = transfer.plan
-    assert plan == evolve(
+    assert plan == replace(
         make_plan(), formations=plan.formations if plan else (), incarnations={A: 7, B: 7}
     )
     assert plan is not None
@@ -142,10 +143,10 @@ def test_a_closed_transfer_of_an_older_plan_is_resolved_by_the_others() -> None:
 
 WRONG = {
     "A is not in the cell that was planned from": [
-        evolve(state(A, MID), hold_cell=(1, 0)),
+        replace(state(A, MID), hold_cell=(1, 0)),
         state(B, MID),
     ],
-    "B does not own": [state(A, MID), evolve(state(B, MID), hold_cell=TARGET)],
+    "B does not own": [state(A, MID), replace(state(B, MID), hold_cell=TARGET)],
     "no member owned": [state(A, MID), state(B, MID, owned=((2, 1),))],
     "a cell has two owners": [state(A, MID, owned=(*BEFORE[A], (2, 1))), state(B, MID)],
     "the cells of B are not known": [
@@ -156,7 +157,7 @@ WRONG = {
         state(B, MID, PendingTransfer(LOW, BEFORE[B], AFTER[B], (A, B, C))),
     ],
     "outbid": [state(A, MID), state(B, HIGH)],
-    "A has restarted": [state(A, MID), evolve(state(A, LOW), incarnation=8)],
+    "A has restarted": [state(A, MID), replace(state(A, LOW), incarnation=8)],
 }
 
 
@@ -173,10 +174,10 @@ def test_is_given_up_when_it_cannot_succeed(why: str) -> None:
 
 def test_a_vehicle_without_agent_is_not_moved() -> None:
     transfer = make_transfer()
-    hear(transfer, evolve(state(A, MID), attended=False), state(B, MID))
+    hear(transfer, replace(state(A, MID), attended=False), state(B, MID))
     assert transfer.reason == "A is not in the cell that was planned from"
     transfer = make_transfer()
-    hear(transfer, state(A, MID), evolve(state(B, MID), attended=False))
+    hear(transfer, state(A, MID), replace(state(B, MID), attended=False))
     assert (
         transfer.phase is BallotPhase.ISSUING
     )  # a vehicle that only gives cells need not be driven
@@ -184,7 +185,7 @@ def test_a_vehicle_without_agent_is_not_moved() -> None:
 
 @pytest.mark.parametrize(
     ("shown", "why"),
-    [(evolve(state(B, MID), incarnation=8), "B has restarted"), (state(B, HIGH), "outbid")],
+    [(replace(state(B, MID), incarnation=8), "B has restarted"), (state(B, HIGH), "outbid")],
 )
 def test_is_given_up_while_the_plan_is_sent(shown: VehicleState, why: str) -> None:
     transfer = issued()
@@ -219,8 +220,8 @@ def test_histories_take_every_row_of_the_table() -> None:
     promised = state(A, MID), state(B, MID)
     begun(*promised, state(A, MID, accepted=True), state(B, MID, accepted=True))  # in force
     begun(state(A, HIGH))  # outbid
-    begun(*promised, evolve(state(A, MID), incarnation=9))  # restarted
-    begun(evolve(state(A, MID), attended=False), state(B, MID))  # cannot be planned
+    begun(*promised, replace(state(A, MID), incarnation=9))  # restarted
+    begun(replace(state(A, MID), attended=False), state(B, MID))  # cannot be planned
     begun(*promised).abort("late")
     begun(*promised).on_left(A)
     assert {*book.taken} == {*range(len(TRANSFER_RULES.table))}
@@ -228,8 +229,8 @@ def test_histories_take_every_row_of_the_table() -> None:
 
 def test_a_vehicle_that_restarts_while_the_ballot_is_outbid_does_not_revive_it() -> None:
     transfer = issued()
-    hear(transfer, evolve(state(A, HIGH), incarnation=9))
+    hear(transfer, replace(state(A, HIGH), incarnation=9))
     assert (transfer.phase, transfer.reason) == (BallotPhase.ABORTED, "outbid")
-    hear(transfer, evolve(state(A, MID), incarnation=9), evolve(state(A, MID), incarnation=10))
+    hear(transfer, replace(state(A, MID), incarnation=9), replace(state(A, MID), incarnation=10))
     assert (transfer.phase, transfer.reason) == (BallotPhase.ABORTED, "outbid")
     assert list(transfer.outgoing(1e6)) == []

@@ -2,7 +2,7 @@
 
 import queue
 
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.launch.observe.observer import Observer
 from laneweave.launch.observe.road_view import RoadView
@@ -44,7 +44,7 @@ def test_older_clocks_and_censuses_are_ignored() -> None:
 def test_messages_of_an_earlier_bridge_are_ignored() -> None:
     view = RoadView()
     for bridge, tick in ((1, 50), (2, 3), (1, 51), (2, 4)):
-        view.update(evolve(clock(tick), bridge=bridge), 0.0)
+        view.update(replace(clock(tick), bridge=bridge), 0.0)
         view.update(Census(tick / 10, (), (), bridge=bridge), 0.0)
     assert (view.roads, view.bridge, view.t_s) == (2, 2, 0.4)
     assert view.census is not None
@@ -56,9 +56,9 @@ def test_a_view_with_bounds_keeps_its_road_whatever_is_forged() -> None:
     view = RoadView(bounds=Bounds(1000, 0.1, 3600.0))
     for tenth in range(1, 30):
         now_s = tenth / 10
-        view.update(evolve(clock(tenth), bridge=7), now_s)
+        view.update(replace(clock(tenth), bridge=7), now_s)
         view.update(Census(now_s, (), (), closed_to=tenth, bridge=7), now_s)
-        view.update(evolve(clock(tenth), bridge=HUGE), now_s)
+        view.update(replace(clock(tenth), bridge=HUGE), now_s)
         view.update(Census(now_s, (), (), bridge=HUGE), now_s)
         view.update(Census(1e12, (), (), bridge=7), now_s)
         assert (view.roads, view.bridge, view.t_s) == (1, 7, tenth / 10)

@@ -1,7 +1,7 @@
 """The progress of a run: the bar, the pace, and the warning of a slow run."""
 
-import attrs
 import pytest
+from msgspec.structs import replace
 
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.progress import PaceMeter, RunProgress, duration
@@ -13,7 +13,7 @@ VIEWS = (
     RoadView(),
     RoadView(clock=CLOCK),
     RoadView(clock=CLOCK, leader=Name("c1"), term=2),
-    RoadView(clock=attrs.evolve(CLOCK, tick=10**9, t_s=1e8)),
+    RoadView(clock=replace(CLOCK, tick=10**9, t_s=1e8)),
 )
 
 

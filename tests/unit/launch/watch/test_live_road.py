@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.launch.watch.frames import UNATTENDED, UNHEARD, compact
 from laneweave.launch.watch.live_road import STILL_S, LiveRoad
@@ -82,7 +82,7 @@ def test_targets_are_those_of_accepted_plans() -> None:
     )
     for changed in changes:
         hear(road, CONVOY, START + 20)
-        road.update(evolve(done, **changed), 2.0)
+        road.update(replace(done, **changed), 2.0)
         assert shown(road)["vehicles"][0][7] == 0
 
 
@@ -94,7 +94,7 @@ def test_a_vehicle_whose_cell_has_passed_a_stop_line_is_shown_without_a_cell() -
         road = watched(convoy=convoy)
         column = math.floor((end.line_m - DROP.lattice.cell_s_m(0, t_s)) / DROP.lattice.pitch_m)
         cell = (column + (beyond_m > 0.0), 0)
-        standing = evolve(convoy.state(0, START + 20), s_m=end.line_m - 2.0, hold_cell=cell)
+        standing = replace(convoy.state(0, START + 20), s_m=end.line_m - 2.0, hold_cell=cell)
         road.update(standing, 2.0)
         row = shown(road)["vehicles"][0]
         assert (row[1], row[4]) == (end.line_m - 2.0, 0)
@@ -132,7 +132,7 @@ def test_a_vehicle_that_is_not_heard_is_shown_in_its_cell_and_marked() -> None:
 
 def test_a_vehicle_without_an_agent_is_marked() -> None:
     road = watched()
-    road.update(evolve(CONVOY.state(3, START + 20), attended=False), 2.0)
+    road.update(replace(CONVOY.state(3, START + 20), attended=False), 2.0)
     assert [row[8] for row in shown(road)["vehicles"]] == [0, 0, 0, UNATTENDED, 0, 0, 0, 0, 0]
 
 
@@ -159,7 +159,7 @@ def with_formations(
     road = watched(convoy=convoy)
     census = convoy.census(START + 21)
     road.update(convoy.clock(START + 21), 2.0)
-    road.update(evolve(census, formations=closed, closed_to=closed[-1].last_block), 2.0)
+    road.update(replace(census, formations=closed, closed_to=closed[-1].last_block), 2.0)
     return road, convoy
 
 
@@ -172,9 +172,9 @@ def test_formations_of_different_lengths() -> None:
     assert [row[5] for row in frame["vehicles"]] == [0] * 9 + [3] * 15 + [-1] * 3
     # All blocks of one formation are one; only several formations are joined.
     for number, blocks in ((0, (0, 1, 2)), (9, (3, 4, 5, 6, 7)), (24, (8,))):
-        road.update(evolve(convoy.state(number, START + 21), joined=blocks), 2.0)
+        road.update(replace(convoy.state(number, START + 21), joined=blocks), 2.0)
     assert shown(road)["joined"] == []
-    road.update(evolve(convoy.state(1, START + 21), joined=tuple(range(8))), 2.0)
+    road.update(replace(convoy.state(1, START + 21), joined=tuple(range(8))), 2.0)
     assert shown(road)["joined"] == [[0, 3]]
 
 
@@ -185,7 +185,7 @@ def test_formations_of_equal_length_and_those_that_are_joined() -> None:
     assert frame["formations"][-2:] == [[1, -7, -4], [0, -3, 0]]
     assert [row[5] for row in frame["vehicles"]] == [0] * 12 + [1] * 12
     for number, joined in ((0, (0, 1)), (1, (1, 2)), (2, (5, 6)), (3, (4,)), (4, (6, 9))):
-        road.update(evolve(convoy.state(number, START + 21), joined=joined), 2.0)
+        road.update(replace(convoy.state(number, START + 21), joined=joined), 2.0)
     assert shown(road)["joined"] == [[0, 1, 2], [5, 6]]
 
 
@@ -193,7 +193,7 @@ def test_a_vehicle_that_is_not_listed_yet_is_in_the_formation_of_its_block() -> 
     road, _ = with_formations(FORMATIONS, 9, ClosedFormation(0, 2, 5.0))
     entering = Convoy(10, scenario=FORMATIONS).state(9, START + 22)
     for block, formation in ((2, 0), (3, -1)):
-        road.update(evolve(entering, formation=block), 2.0)
+        road.update(replace(entering, formation=block), 2.0)
         row = shown(road)["vehicles"][-1]
         assert (row[0], row[5]) == ("v0009", formation)
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.vehicle.plan_execution import ExecutionPhase, PlanExecution
@@ -54,7 +55,7 @@ def accepted() -> PlanExecution:
 
 
 def with_before_of_a(plan: Plan, *cells: Cell) -> Plan:
-    return evolve(plan, before=BEFORE | {A: cells})
+    return replace(plan, before=BEFORE | {A: cells})
 
 
 UNSOUND: dict[str, dict[str, Any]] = {
@@ -74,7 +75,7 @@ def test_a_sound_plan_has_no_problems() -> None:
 
 @pytest.mark.parametrize("problem", UNSOUND)
 def test_an_unsound_plan_is_refused(problem: str) -> None:
-    plan = evolve(make_plan(), **UNSOUND[problem])
+    plan = replace(make_plan(), **UNSOUND[problem])
     assert problem in ownership_problems(plan)
     assert plan_problems(plan) == []
     execution = promised()
@@ -88,7 +89,7 @@ def test_a_plan_that_claims_more_cells_than_the_vehicle_owns_is_refused() -> Non
     execution = promised()
     assert not execution.on_plan(with_before_of_a(plan, *BEFORE[A], (7, 0)))
     # Fewer cells do no harm: the others then have no owner.
-    less = evolve(plan, before=BEFORE | {A: (HOME,)}, after=AFTER | {A: (HOME, TARGET)})
+    less = replace(plan, before=BEFORE | {A: (HOME,)}, after=AFTER | {A: (HOME, TARGET)})
     assert execution.on_plan(less)
 
 
@@ -105,7 +106,7 @@ def test_cells_of_a_closed_transfer_may_be_owned() -> None:
 
 
 def test_neither_blocks_nor_joined_formations_matter() -> None:
-    plan = evolve(make_plan(), formations=(17,))
+    plan = replace(make_plan(), formations=(17,))
     execution = promised()
     assert execution.on_plan(plan)
     assert execution.wanted_joined == ()
@@ -143,7 +144,7 @@ def test_a_later_promise_drops_the_plan_and_keeps_the_gate_closed() -> None:
     assert execution.go is False
     assert execution.on_prepare(Prepare(HIGH, (), (A, B)))
     assert (execution.plan, execution.wanted_accepted) == (None, None)
-    execution.on_state(evolve(state(B, MID, accepted=True), go=True))
+    execution.on_state(replace(state(B, MID, accepted=True), go=True))
     execution.tick(T0_S)
     assert execution.go is False
     assert execution.transfer == pending(A)  # it says no more than what was accepted
@@ -168,7 +169,7 @@ def test_takes_ownership_with_the_open_gate(
     execution = accepted()
     assert execution.tick(T0_S) is None
     assert execution.transfer == pending(A)
-    execution.on_state(evolve(state(B, MID, accepted=True), **shown))
+    execution.on_state(replace(state(B, MID, accepted=True), **shown))
     assert execution.tick(t_s) == move
     assert execution.transfer == (PendingTransfer(MID, open=True) if owns else pending(A))
     assert execution.go is owns
@@ -180,5 +181,5 @@ def test_where_formations_own_blocks_there_are_no_transfers() -> None:
     assert execution.wanted_promised is None
     assert not execution.on_owned(sense(promised=HIGH))
     assert execution.promised == MID
-    assert execution.on_plan(evolve(make_plan(), formations=(-1, 0), before={}, after={}))
+    assert execution.on_plan(replace(make_plan(), formations=(-1, 0), before={}, after={}))
     assert execution.transfer is None

@@ -8,6 +8,7 @@ import pytest
 from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from laneweave.agents.driving.reference import Reference
 from laneweave.protocol.config.scenario_files import parse_scenario
@@ -269,7 +270,7 @@ def test_no_line_counts_in_a_lane_that_opens_again_for_a_move_behind_its_end(
     reference = Reference.move(KEEPING, (-10, 0), (-10, 1), begin_tick, ticks)
     window = reference.window(begin_tick)
     move = command(begin_tick, *window.jerks.tolist(), hold_cell=(-10, 1), incarnation=7)
-    assert controller.accept_command(evolve(move, motion_origin=(-10, 0)))
+    assert controller.accept_command(replace(move, motion_origin=(-10, 0)))
     for tick in range(begin_tick, begin_tick + len(window.jerks)):
         s, v, a, y, v_y, a_y = controller.plant.state
         controller.perceive((s + error_m, v, a, y, v_y, a_y), controller.neighbours)

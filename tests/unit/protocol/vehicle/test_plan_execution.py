@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
 from laneweave.protocol.scenario.fields import Closure
@@ -198,20 +199,20 @@ def test_v3_accepts_the_plan_of_the_promised_ballot_once(
 
 
 UNFIT = {
-    "older incarnation": evolve(make_plan(), incarnations={A: 6, B: 7}),
-    "newer incarnation": evolve(make_plan(), incarnations={A: 8, B: 7}),
-    "no incarnation": evolve(make_plan(), incarnations={B: 7}),
+    "older incarnation": replace(make_plan(), incarnations={A: 6, B: 7}),
+    "newer incarnation": replace(make_plan(), incarnations={A: 8, B: 7}),
+    "no incarnation": replace(make_plan(), incarnations={B: 7}),
     "lower ballot": make_plan(LOW),
     "higher ballot": make_plan(HIGH),
     "other start cell": make_plan(cells={A: (-4, 2), B: (-3, 0)}, moves={B: ()}),
-    "no start cell": evolve(make_plan(), start_cells={B: (-3, 0)}),
-    "territory": evolve(make_plan(), territory=()),
-    "not in the roster": evolve(make_plan(), roster=(B,)),
+    "no start cell": replace(make_plan(), start_cells={B: (-3, 0)}),
+    "territory": replace(make_plan(), territory=()),
+    "not in the roster": replace(make_plan(), roster=(B,)),
     "drives into B": make_plan(moves={A: ((0, (-4, 0), (-3, 0)),)}),
     "jumps": make_plan(moves={A: ((0, (-4, 0), (-4, 2)),)}),
-    "no time": evolve(make_plan(), slot_s=0.0),
-    "no block": evolve(make_plan(), formations=()),
-    "another block": evolve(make_plan(), formations=(1,)),
+    "no time": replace(make_plan(), slot_s=0.0),
+    "no block": replace(make_plan(), formations=()),
+    "another block": replace(make_plan(), formations=(1,)),
     "a block that is not joined": make_plan(formations=(0, 1)),
 }
 
@@ -232,8 +233,8 @@ def test_v3_the_territory_stays_within_the_blocks_of_the_plan(beyond: Cell) -> N
     execution = vehicle()
     execution.on_prepare(prepare(MID))
     plan = make_plan()
-    assert not execution.on_plan(evolve(plan, territory=(*plan.territory, beyond)))
-    assert execution.on_plan(evolve(plan, territory=(*plan.territory, (-7, 2), (0, 2))))
+    assert not execution.on_plan(replace(plan, territory=(*plan.territory, beyond)))
+    assert execution.on_plan(replace(plan, territory=(*plan.territory, (-7, 2), (0, 2))))
 
 
 def test_v3_a_joint_plan_waits_until_the_controller_has_confirmed_its_formations() -> None:
@@ -412,7 +413,7 @@ def test_overdue_runs_from_the_moment_the_next_move_is_due() -> None:
 def test_how_long_a_move_may_be_due_follows_the_slots_of_its_plan(
     slot_s: float, patience_s: float
 ) -> None:
-    execution = accepted(evolve(make_plan(), slot_s=slot_s))
+    execution = accepted(replace(make_plan(), slot_s=slot_s))
     assert not execution.overdue(T0_S + patience_s - 0.01)
     assert execution.overdue(T0_S + patience_s)
 
@@ -431,10 +432,10 @@ def test_the_state_says_what_the_vehicle_knows_and_senses(*, attended: bool) -> 
     )  # fmt: skip
     assert execution.state(sense, attended=attended) == expected
     execution.end_motion()
-    assert execution.state(sense, attended=attended) == evolve(
+    assert execution.state(sense, attended=attended) == replace(
         expected, moving=False, done=True, completed=1
     )
-    late = evolve(sense, t_s=T0_S + OVERDUE_S)
+    late = replace(sense, t_s=T0_S + OVERDUE_S)
     assert accepted().state(late, attended=attended).overdue
 
 
@@ -507,7 +508,7 @@ def test_a_lane_that_opens_again_does_not_excuse_a_move_beyond_the_stop_line(col
     road = evolve(ROLLING.road, s3_m=20_000.0, closures=(closure,))
     execution = going()
     assert execution.plan is not None
-    execution.plan = evolve(execution.plan, moves={execution.vehicle: ((0, origin, target),)})
+    execution.plan = replace(execution.plan, moves={execution.vehicle: ((0, origin, target),)})
     execution.lane_ends = LaneEnds(evolve(ROLLING, road=road))
     execution.t_s = T0_S
     assert both_lanes_are_open(execution, None)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import random
 from typing import Any
 
-import attrs
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.vehicle.plans import dependencies, plan_problems
@@ -194,7 +194,7 @@ DEFECTS: list[tuple[str, dict[str, Any]]] = [
 
 @pytest.mark.parametrize(("text", "changes"), DEFECTS)
 def test_each_kind_of_defect_is_found(text: str, changes: dict[str, Any]) -> None:
-    problems = plan_problems(attrs.evolve(GOOD, **changes))
+    problems = plan_problems(replace(GOOD, **changes))
     assert any(text in problem for problem in problems), problems
 
 
@@ -203,4 +203,4 @@ def test_each_kind_of_defect_is_found(text: str, changes: dict[str, Any]) -> Non
 def test_every_cell_of_the_territory_is_needed(plan: Plan) -> None:
     for index in range(len(plan.territory)):
         cells = plan.territory[:index] + plan.territory[index + 1 :]
-        assert plan_problems(attrs.evolve(plan, territory=cells))
+        assert plan_problems(replace(plan, territory=cells))

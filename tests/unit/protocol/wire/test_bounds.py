@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.wire.bounds import (
@@ -87,14 +87,14 @@ def test_possible_numbers_pass(message: object) -> None:
 )
 def test_impossible_numbers_are_refused(message: Any, changes: dict[str, Any]) -> None:  # noqa: ANN401
     with pytest.raises(BadInputError):
-        bounds().check(evolve(message, **changes), ROAD_S, 7.0)
+        bounds().check(replace(message, **changes), ROAD_S, 7.0)
 
 
 def test_before_a_road_time_is_known_the_end_of_every_run_is_the_limit() -> None:
-    late = evolve(CLOCK, t_s=999.0, tick=9990)
+    late = replace(CLOCK, t_s=999.0, tick=9990)
     bounds().check(late, float("inf"), 7.0)
     with pytest.raises(BadInputError):
-        bounds().check(evolve(late, t_s=1001.0, tick=10010), float("inf"), 7.0)
+        bounds().check(replace(late, t_s=1001.0, tick=10010), float("inf"), 7.0)
 
 
 def test_incarnations_may_be_two_days_ahead_and_the_limit_moves_with_the_clock() -> None:
@@ -117,7 +117,7 @@ def test_a_claim_may_be_a_day_ahead_or_just_above_the_process_in_charge() -> Non
 
 def test_counters_as_of_simulations_are_far_below_the_limits() -> None:
     made = Bounds(0, tick_s=0.1, max_road_s=1000.0)
-    made.check(evolve(BEAT, incarnation=10**6), 0.0, 0.0)
+    made.check(replace(BEAT, incarnation=10**6), 0.0, 0.0)
     made.check_claim(10**6, 0, 0.0)
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from laneweave.protocol.field_validators import NAME_PATTERN
+from laneweave.protocol.names import NAME_PATTERN
 from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.codec import KINDS
 from support.refusals import refusal

@@ -6,6 +6,7 @@ import attrs
 import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
+from msgspec.structs import astuple
 
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake, last_tick_m
@@ -159,7 +160,7 @@ def drive_behind(
         controller.accept_command(
             command(tick, (15.0, 0.0), hold_cell=(0, 0), motion_origin=(0, 0))
         )
-        around = sensors.measure_neighbours(([attrs.astuple(seen(own, other))], []))
+        around = sensors.measure_neighbours(([astuple(seen(own, other))], []))
         controller.perceive(sensors.measure(own.state), around)
         controller.step(tick)
         if tick >= braking_tick:

@@ -6,6 +6,7 @@ import struct
 
 import pytest
 from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
@@ -115,11 +116,11 @@ def test_an_older_process_is_refused(controller: MotionController) -> None:
     controller.accept_command(command(3, (1.0, 0.0)))
     before = known(controller)
     for cell in (HOME, (1, 1)):
-        late = evolve(command(4, (9.0, 0.0), hold_cell=cell, incarnation=AGENT - 1), joined=(7,))
+        late = replace(command(4, (9.0, 0.0), hold_cell=cell, incarnation=AGENT - 1), joined=(7,))
         assert not controller.accept_command(late)
         assert known(controller) == before
     assert not controller.accept_command(
-        evolve(command(4, incarnation=AGENT - 1), jerks=b"nonsense")
+        replace(command(4, incarnation=AGENT - 1), jerks=b"nonsense")
     )
 
 
@@ -134,7 +135,7 @@ def test_a_newer_process_takes_charge_with_its_command(controller: MotionControl
 
 def test_a_claim_cannot_move_the_vehicle(controller: MotionController) -> None:
     """It could not act for the vehicle before, so no plan can allow its move."""
-    controller.accept_command(evolve(command(3, (1.0, 0.0)), accepted=LOW))
+    controller.accept_command(replace(command(3, (1.0, 0.0)), accepted=LOW))
     before = known(controller)
     assert not controller.accept_command(
         command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1)
@@ -172,12 +173,12 @@ def test_formations_stay_joined_and_only_the_process_in_charge_joins(
     controller: MotionController,
 ) -> None:
     own = LATTICE.block_of(HOME[0])
-    controller.accept_command(evolve(command(3), joined=(own + 2,)))
+    controller.accept_command(replace(command(3), joined=(own + 2,)))
     assert [*controller.joined] == [own, own + 2]
-    controller.accept_command(evolve(command(4), joined=()))
-    controller.accept_command(evolve(command(5), joined=(own + 1, own + 2)))
-    controller.accept_command(evolve(command(6, incarnation=AGENT - 1), joined=(own + 5,)))
-    controller.accept_command(evolve(command(5), joined=(own + 6,)))
+    controller.accept_command(replace(command(4), joined=()))
+    controller.accept_command(replace(command(5), joined=(own + 1, own + 2)))
+    controller.accept_command(replace(command(6, incarnation=AGENT - 1), joined=(own + 5,)))
+    controller.accept_command(replace(command(5), joined=(own + 6,)))
     assert [*controller.joined] == [own, own + 1, own + 2]
 
 
@@ -189,7 +190,7 @@ LOW, HIGH = Ballot(1, Name("c1"), 7, 1), Ballot(1, Name("c1"), 7, 2)
 def asking(
     accepted: Ballot | None, *joined: int, tick: int = 3, incarnation: int = AGENT
 ) -> Command:
-    return evolve(command(tick, incarnation=incarnation), accepted=accepted, joined=joined)
+    return replace(command(tick, incarnation=incarnation), accepted=accepted, joined=joined)
 
 
 def test_requests_of_the_process_in_charge_are_noted_whatever_the_tick(
@@ -198,7 +199,7 @@ def test_requests_of_the_process_in_charge_are_noted_whatever_the_tick(
     controller.accept_command(command(5, (1.0, 0.0)))
     before = known(controller)
     for tick, ballot in ((5, LOW), (4, HIGH)):
-        late = evolve(command(tick, (9.0, 0.0), hold_cell=(1, 1)), accepted=ballot, joined=(7,))
+        late = replace(command(tick, (9.0, 0.0), hold_cell=(1, 1)), accepted=ballot, joined=(7,))
         assert controller.store_requests(late)
         assert not controller.store_requests(late)  # nothing new
         assert (controller.accepted, controller.joined[-1]) == (ballot, 7)
@@ -275,7 +276,7 @@ def test_a_bad_command_is_refused_whole(
     for incarnation in (AGENT, AGENT + 1):
         good = command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=incarnation)
         with pytest.raises(BadInputError):
-            controller.accept_command(evolve(good, **changes))  # type: ignore[arg-type]
+            controller.accept_command(replace(good, **changes))
         assert known(controller) == before
 
 
@@ -393,7 +394,7 @@ def test_a_body_that_had_to_brake_stays_in_its_lane(
     there: Cell = (HOME[0], HOME[1] + 1)
     # The agent wants to move over, too.
     jerks = [(0.0, 2.0)] * 6 + [(0.0, 0.0)] * 20
-    move = evolve(command(0, *jerks, hold_cell=there), motion_origin=origin)
+    move = replace(command(0, *jerks, hold_cell=there), motion_origin=origin)
     assert controller.accept_command(move)
     touched = False
     for tick in range(8):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, VehicleState
@@ -67,7 +67,7 @@ def test_shows_what_the_vehicle_does(caretaker: Caretaker, vehicle: RoadVehicle)
     s_m, speed_mps, _, y_m, *_ = vehicle.state
     state = holding(A, None, HOME, incarnation=CARETAKER, attended=False)
     assert state.formation == FORMATION
-    assert caretaker.state(10) == evolve(state, s_m=s_m, y_m=y_m, speed_mps=speed_mps, t_s=1.0)
+    assert caretaker.state(10) == replace(state, s_m=s_m, y_m=y_m, speed_mps=speed_mps, t_s=1.0)
 
 
 def test_takes_charge_with_an_incarnation_above_all_earlier_ones(vehicle: RoadVehicle) -> None:
@@ -78,7 +78,7 @@ def test_takes_charge_with_an_incarnation_above_all_earlier_ones(vehicle: RoadVe
 
 
 def test_promises_the_highest_ballot_for_its_vehicle(caretaker: Caretaker) -> None:
-    assert caretaker.on_message(evolve(prepare(), roster=(B,)), 0) is None
+    assert caretaker.on_message(replace(prepare(), roster=(B,)), 0) is None
     assert caretaker.state(0).promised is None
     for ballot in (SECOND, SECOND, FIRST):
         assert answer_of(caretaker, prepare(ballot)).promised == SECOND
@@ -112,10 +112,10 @@ def test_what_the_agent_before_it_accepted_is_not_its_own(vehicle: RoadVehicle) 
         plan(own_moves=((1, HOME, NEXT),)),
         plan(SECOND),
         plan(start=NEXT),
-        evolve(plan(), incarnations={A: AGENT, B: 3}),
-        evolve(plan(), formations=(FORMATION, FORMATION + 1)),
-        evolve(plan(), territory=((-2, 0),)),
-        evolve(plan(), moves={B: ()}),
+        replace(plan(), incarnations={A: AGENT, B: 3}),
+        replace(plan(), formations=(FORMATION, FORMATION + 1)),
+        replace(plan(), territory=((-2, 0),)),
+        replace(plan(), moves={B: ()}),
     ],
     ids=["it moves", "ballot", "cell", "incarnation", "not joined", "territory", "not in it"],
 )
@@ -132,7 +132,7 @@ def test_joins_formations_for_the_vehicle(caretaker: Caretaker, vehicle: RoadVeh
     assert answer_of(caretaker, prepare(FIRST, *both)).joined == both
     assert vehicle.controller.joined == both
     assert answer_of(caretaker, prepare(SECOND)).joined == both
-    wide = evolve(plan(SECOND), formations=both)
+    wide = replace(plan(SECOND), formations=both)
     assert answer_of(caretaker, wide).accepted
 
 

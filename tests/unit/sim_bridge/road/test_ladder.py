@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import attrs
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.motion import State, cell_state, commanded_state, hold_law
@@ -172,7 +172,7 @@ def test_an_emergency_ends_only_when_something_is_to_spare() -> None:
         track.command((0.0, 0.0))
         level = Neighbour(HOME[1], 0.0, V_F)
         spare_m = controller._brake.spare_m(plant.state, plant.setpoint[0], (0.0, 0.0), [level])
-        other = attrs.evolve(level, gap_m=wanted_m - spare_m)
+        other = replace(level, gap_m=wanted_m - spare_m)
         controller.perceive(plant.state, Neighbours((other,), ()))
         controller.step(track.tick)
         track.tick += 1

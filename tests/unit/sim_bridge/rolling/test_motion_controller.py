@@ -5,9 +5,9 @@ from __future__ import annotations
 from itertools import permutations, product
 
 import pytest
-from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Command, Name, PendingTransfer, Prepare
@@ -111,7 +111,7 @@ def test_a_promise_binds_this_process_and_the_next(
     controller.store_requests(order(HIGH))
     if process != AGENT:
         controller.put_in_charge(process)
-    controller.store_requests(evolve(ACCEPTANCE, incarnation=process))
+    controller.store_requests(replace(ACCEPTANCE, incarnation=process))
     assert kept(controller) == (HIGH, None, None, frozenset(BEFORE[A]))
 
 

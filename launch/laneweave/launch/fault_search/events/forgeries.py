@@ -9,7 +9,8 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterable, Mapping
 
-from attrs import evolve, frozen
+from attrs import frozen
+from msgspec.structs import replace
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove, territory
@@ -63,27 +64,27 @@ def absurd(message: object, rng: random.Random) -> object | None:
     huge = rng.choice(ABSURD_NUMBERS)
     match message:
         case Heartbeat() if rng.random() < 0.5:
-            return evolve(message, term=huge)
+            return replace(message, term=huge)
         case Heartbeat():
-            return evolve(message, incarnation=huge)
+            return replace(message, incarnation=huge)
         case RoadClock() | Sense() if rng.random() < 0.5:
-            return evolve(message, tick=huge, t_s=ABSURD_S)
+            return replace(message, tick=huge, t_s=ABSURD_S)
         case Census() if rng.random() < 0.5:
-            return evolve(message, t_s=ABSURD_S)
+            return replace(message, t_s=ABSURD_S)
         case RoadClock() | Census():
-            return evolve(message, bridge=huge)
+            return replace(message, bridge=huge)
         case Prepare():
-            return evolve(message, ballot=_above(message.ballot, huge))
+            return replace(message, ballot=_above(message.ballot, huge))
         case VehicleState() if rng.random() < 0.3:
-            return evolve(message, t_s=ABSURD_S)
+            return replace(message, t_s=ABSURD_S)
         case VehicleState(promised=promised) | Command(promised=promised) if (
             promised is not None and rng.random() < 0.5
         ):
-            return evolve(message, promised=_above(promised, huge))
+            return replace(message, promised=_above(promised, huge))
         case VehicleState() | Command():
-            return evolve(message, incarnation=huge)
+            return replace(message, incarnation=huge)
         case Sense():
-            return evolve(message, attendant=huge)
+            return replace(message, attendant=huge)
         case _:
             return None
 
@@ -119,7 +120,7 @@ def _moved(
     """Return a plan with other moves and start cells, and the territory of these."""
     cells, every = dict(start_cells or plan.start_cells), dict(moves)
     occupied = territory(cells.values(), [move for each in every.values() for move in each])
-    return evolve(plan, start_cells=cells, moves=every, territory=tuple(sorted(occupied)))
+    return replace(plan, start_cells=cells, moves=every, territory=tuple(sorted(occupied)))
 
 
 def _with_same_start(plan: Plan, rng: random.Random) -> tuple[Plan, Harm] | None:
@@ -165,7 +166,7 @@ def _for_other_process(plan: Plan, rng: random.Random) -> tuple[Plan, Harm] | No
     name = rng.choice(plan.roster)
     numbers = plan.incarnations | {name: plan.incarnations[name] - 1}
     text = f"made for another process of {name}"
-    return evolve(plan, incarnations=numbers), Harm(frozenset({name}), text)
+    return replace(plan, incarnations=numbers), Harm(frozenset({name}), text)
 
 
 def _beyond_blocks(plan: Plan, rng: random.Random) -> tuple[Plan, Harm] | None:
@@ -185,13 +186,13 @@ def _without_block(plan: Plan, rng: random.Random) -> tuple[Plan, Harm] | None:
         return None
     left_out = rng.choice(plan.formations)
     blocks = tuple(block for block in plan.formations if block != left_out)
-    return evolve(plan, formations=blocks), _all(plan, f"block {left_out} left out")
+    return replace(plan, formations=blocks), _all(plan, f"block {left_out} left out")
 
 
 def _with_another_block(plan: Plan, rng: random.Random) -> tuple[Plan, Harm] | None:
     block = rng.choice((min(plan.formations) - 1, max(plan.formations) + 1))
     blocks = tuple(sorted((*plan.formations, block)))
-    return evolve(plan, formations=blocks), _all(plan, f"block {block} claimed")
+    return replace(plan, formations=blocks), _all(plan, f"block {block} claimed")
 
 
 def _with_foreign_cell(plan: Plan, rng: random.Random) -> tuple[Plan, Harm] | None:
@@ -199,7 +200,7 @@ def _with_foreign_cell(plan: Plan, rng: random.Random) -> tuple[Plan, Harm] | No
     name = rng.choice(plan.roster)
     column, lane = plan.start_cells[name]
     cell = (column + FAR_COLUMNS, lane)
-    changed = evolve(
+    changed = replace(
         plan, before=_with(plan.before, name, cell), after=_with(plan.after, name, cell)
     )
     return changed, Harm(frozenset({name}), f"{name} does not own {cell}")
@@ -210,14 +211,14 @@ def _with_two_owners(plan: Plan, rng: random.Random) -> tuple[Plan, Harm] | None
         return None
     name, other = rng.sample(plan.roster, 2)
     cell = rng.choice(plan.after[other])
-    changed = evolve(plan, after=_with(plan.after, name, cell))
+    changed = replace(plan, after=_with(plan.after, name, cell))
     return changed, _all(plan, f"{name} and {other} both get {cell}")
 
 
 def _with_cell_of_nobody(plan: Plan, rng: random.Random) -> tuple[Plan, Harm] | None:
     name = rng.choice(plan.roster)
     cell = (plan.start_cells[name][0] + FAR_COLUMNS, 0)
-    changed = evolve(plan, after=_with(plan.after, name, cell))
+    changed = replace(plan, after=_with(plan.after, name, cell))
     return changed, _all(plan, f"{name} gets {cell}, which no member owned")
 
 

@@ -11,6 +11,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import attrs
 from attrs import frozen
+from msgspec.structs import replace
 
 from laneweave.agents.driving.driver import Drive, SolverStats
 from laneweave.coordinator.planning.rolling.problem import (
@@ -163,7 +164,7 @@ class LightVehicle(RoadVehicle):
             return sense
         s, v, a, y, v_y, a_y = sense.state
         state = (s + self._speed_mps * ahead_s, v, a, y, v_y, a_y)
-        return attrs.evolve(sense, t_s=sense.t_s + ahead_s, state=state)
+        return replace(sense, t_s=sense.t_s + ahead_s, state=state)
 
 
 class LightDriver:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.launch.fault_search.checks.claims import Claims, Stored, required_before
 from laneweave.launch.fault_search.events.forgeries import Harm
@@ -49,23 +50,23 @@ def scene() -> Scene:
 
 def test_true_states_are_not_reported(scene: Scene) -> None:
     scene.send(ACCEPTED)
-    scene.send(evolve(ACCEPTED, vehicle=B, ready=True, hold_cell=(2, 0)), at_rest=(2, 0))
-    scene.send(evolve(ACCEPTED, go=True, ready=True))
-    scene.send(evolve(ACCEPTED, go=True, completed=1, hold_cell=(0, 1)), 1, (0, 1))
+    scene.send(replace(ACCEPTED, vehicle=B, ready=True, hold_cell=(2, 0)), at_rest=(2, 0))
+    scene.send(replace(ACCEPTED, go=True, ready=True))
+    scene.send(replace(ACCEPTED, go=True, completed=1, hold_cell=(0, 1)), 1, (0, 1))
     assert scene.kinds == []
 
 
 @pytest.mark.parametrize(
     ("state", "finished", "at_rest"),
     [
-        (evolve(ACCEPTED, incarnation=2, accepted=False), 0, (0, 0)),  # never in charge
-        (evolve(ACCEPTED, joined=(BLOCK, 1)), 0, (0, 0)),
-        (evolve(ACCEPTED, promised=BALLOT._replace(seq=2)), 0, (0, 0)),  # not stored
-        (evolve(ACCEPTED, completed=1), 0, (0, 0)),
+        (replace(ACCEPTED, incarnation=2, accepted=False), 0, (0, 0)),  # never in charge
+        (replace(ACCEPTED, joined=(BLOCK, 1)), 0, (0, 0)),
+        (replace(ACCEPTED, promised=BALLOT._replace(seq=2)), 0, (0, 0)),  # not stored
+        (replace(ACCEPTED, completed=1), 0, (0, 0)),
         (ACCEPTED, 0, None),  # holds, but moves
         (ACCEPTED, 0, (0, 1)),  # another cell
-        (evolve(ACCEPTED, owned=((5, 5),)), 0, (0, 0)),
-        (evolve(ACCEPTED, attended=False), 0, (0, 0)),  # moves without an agent
+        (replace(ACCEPTED, owned=((5, 5),)), 0, (0, 0)),
+        (replace(ACCEPTED, attended=False), 0, (0, 0)),  # moves without an agent
     ],
 )
 def test_a_false_state_is_reported(
@@ -76,7 +77,7 @@ def test_a_false_state_is_reported(
 
 
 def test_a_gate_that_opens_too_early_is_reported(scene: Scene) -> None:
-    scene.send(evolve(ACCEPTED, go=True))
+    scene.send(replace(ACCEPTED, go=True))
     assert scene.kinds == ["gate"]
 
 
@@ -84,12 +85,12 @@ def test_who_must_refuse_a_harmful_plan_must_not_accept_it(scene: Scene) -> None
     scene.claims.harmful[BALLOT] = Harm(frozenset({B}), "wrong")
     scene.send(ACCEPTED)
     assert scene.kinds == []
-    scene.send(evolve(ACCEPTED, vehicle=B, hold_cell=(2, 0)), at_rest=(2, 0))
+    scene.send(replace(ACCEPTED, vehicle=B, hold_cell=(2, 0)), at_rest=(2, 0))
     assert scene.kinds == ["harmful"]
 
 
 def test_a_plan_needs_promises_from_its_start_cells(scene: Scene) -> None:
-    scene.claims.record(evolve(ACCEPTED, accepted=False))
+    scene.claims.record(replace(ACCEPTED, accepted=False))
     scene.claims.record(holding(B, BALLOT, (3, 0)))
     scene.claims.on_plan(1.0, PLAN)
     assert scene.kinds == ["basis"]
@@ -106,21 +107,21 @@ def test_a_plan_contains_all_vehicles_of_its_blocks(scene: Scene) -> None:
 
 
 def test_only_a_plan_that_all_have_accepted_is_adopted(scene: Scene) -> None:
-    known = {A: ACCEPTED, B: evolve(ACCEPTED, vehicle=B)}
+    known = {A: ACCEPTED, B: replace(ACCEPTED, vehicle=B)}
     for state in known.values():
         scene.claims.record(state)
     scene.claims.on_adoption(1.0, BALLOT, CELLS, known)
     assert scene.kinds == []
-    scene.claims.on_adoption(1.0, BALLOT, CELLS, known | {B: evolve(known[B], overdue=True)})
+    scene.claims.on_adoption(1.0, BALLOT, CELLS, known | {B: replace(known[B], overdue=True)})
     scene.claims.on_adoption(1.0, BALLOT._replace(seq=2), CELLS, known)
     assert scene.kinds == ["adoption"] * 3
 
 
 def test_promises_of_ended_processes_do_not_count(scene: Scene) -> None:
-    promises = {A: ACCEPTED, B: evolve(ACCEPTED, vehicle=B)}
+    promises = {A: ACCEPTED, B: replace(ACCEPTED, vehicle=B)}
     scene.claims.on_planning(1.0, 1.0, BALLOT, promises, promises)
     assert scene.kinds == []
-    scene.claims.on_planning(2.0, 2.0, BALLOT, promises, {B: evolve(promises[B], incarnation=2)})
+    scene.claims.on_planning(2.0, 2.0, BALLOT, promises, {B: replace(promises[B], incarnation=2)})
     assert scene.kinds == ["basis"]
 
 
@@ -136,7 +137,7 @@ def test_planning_is_not_repeated_at_once(scene: Scene) -> None:
 def test_a_process_keeps_the_stored_promise(scene: Scene) -> None:
     stored = evolve(STORED, promised=BALLOT._replace(seq=2), owned=((0, 0),))
     scene.claims.store(A, stored)
-    scene.send(evolve(ACCEPTED, accepted=False))
+    scene.send(replace(ACCEPTED, accepted=False))
     assert scene.kinds == ["false"]
 
 
@@ -149,7 +150,7 @@ def test_a_ballot_has_one_roster(scene: Scene) -> None:
 def test_a_process_of_an_earlier_road_may_report_anything(scene: Scene) -> None:
     scene.claims.begin_road()
     scene.claims.store(A, evolve(STORED, attendant=2, accepted=None))
-    scene.send(evolve(ACCEPTED, completed=7))
+    scene.send(replace(ACCEPTED, completed=7))
     assert scene.kinds == []
 
 

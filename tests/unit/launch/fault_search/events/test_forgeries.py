@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 import pytest
-from attrs import evolve
+from msgspec.structs import replace
 
 from laneweave.launch.fault_search.events.forgeries import absurd, harmful, malformed
 from laneweave.launch.fault_search.setup import RoadSetup
@@ -32,7 +32,7 @@ LATTICE = RoadSetup(lanes=3).make_scenario().lattice
 BLOCKS = (LATTICE.block_of(0),)
 PLAN = make_plan(CELLS, {B: ((0, (0, 0), (0, 1)),)}, ballot=BALLOT, formations=BLOCKS)
 OWNED: dict[Name, tuple[Cell, ...]] = {A: ((-1, 0),), B: ((0, 0), (0, 1))}
-ROLLING = evolve(PLAN, before=OWNED, after=OWNED)
+ROLLING = replace(PLAN, before=OWNED, after=OWNED)
 
 
 def accepts(name: Name, plan: Plan) -> bool:

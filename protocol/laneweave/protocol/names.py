@@ -1,0 +1,13 @@
+"""Names of vehicles, coordinators, roles and realms, which are parts of Zenoh's keys."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, NewType
+
+from msgspec import Meta
+
+NAME_PATTERN = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+NAME_RULE = "letters, digits, `_`, `-`, `.`; at least 1, at most 64"
+Name = NewType("Name", Annotated[str, Meta(pattern=rf"^{NAME_PATTERN.pattern}\Z")])
+"""Name of a vehicle, coordinator or role: letters, digits, `_`, `-`, `.`; at most 64."""
