@@ -315,7 +315,9 @@ class Road:
             ballot=Ballot(1, Name("c1"), 1, block),
             formations=(block,),
             roster=tuple(cells),
-            incarnations={name: each.controller.attendant for name, each in members.items()},
+            incarnations={
+                name: each.controller.record.incarnation for name, each in members.items()
+            },
             start_cells=cells,
             moves=moves,
             t0_s=start_s,

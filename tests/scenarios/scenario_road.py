@@ -121,7 +121,7 @@ class Vehicle:
         """Return what the process in charge of the vehicle senses."""
         controller = self.road.controller
         self.place_body(tick)
-        return self.road.sense(tick, caretaker=controller.attendant in self.caretakers)
+        return self.road.sense(tick, caretaker=controller.record.incarnation in self.caretakers)
 
     def place_body(self, tick: int) -> None:
         """Put the body where the scenario has it: the lattice keeps moving."""

@@ -23,7 +23,6 @@ import re
 from collections.abc import Callable, Iterator
 
 from attrs import define, field
-from msgspec.structs import replace
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.rolling.transfer import CellTransfer
@@ -34,6 +33,7 @@ from scenarios.scenario_leaders import RESEND_S, Mail, post
 from scenarios.scenario_road import ROLLING, SLOT_S, Agent, Vehicle
 from scenarios.scenario_runner import Runner
 from scenarios.scenario_text import CollisionError, ScenarioError, cell_of, written
+from support.states import changed
 
 Lines = Iterator[str]
 
@@ -75,7 +75,7 @@ class StreamLeader:
     def hear(self, state: VehicleState, now_s: float) -> Lines:
         transfer = self.transfer
         if self.claims and transfer is not None and state.vehicle in transfer.moves:
-            state = replace(state, owned=tuple(sorted({*state.owned, *self.claims})))
+            state = changed(state, owned=tuple(sorted({*state.record.owned, *self.claims})))
         self.states[state.vehicle] = state
         if transfer is None:
             return
@@ -123,7 +123,9 @@ class RollingRunner(Runner):
         for name, vehicle in self.vehicles.items():
             controller = vehicle.road.controller
             body = frozenset(vehicle.occupied)
-            self._estates.update(0.0, name, controller.owned, controller.transfer, body)
+            self._estates.update(
+                0.0, name, controller.record.owned, controller.record.transfer, body
+            )
         if self._wrong:
             wrong, self._wrong = self._wrong, []
             raise CollisionError(f"{command}: {wrong[0]}")
@@ -135,7 +137,7 @@ class RollingRunner(Runner):
     ) -> None:
         vehicle = Vehicle.entering(name, cell_of(cell), int(lane), self.t_s, ROLLING)
         for each in (owned or "").split():
-            vehicle.road.controller.assign_cell(cell_of(each))
+            vehicle.road.controller.store.assign_cell(cell_of(each))
         if origin is not None:
             vehicle.at = cell_of(origin)
         self.vehicles[name] = vehicle
@@ -206,7 +208,7 @@ class RollingRunner(Runner):
         for vehicle in vehicles.split():
             self._deliver_to(vehicle, "PLAN", transfer)
             state = self._shown_by(vehicle)
-            accepts = state.accepted and state.promised == transfer.ballot
+            accepts = state.accepted and state.record.promised == transfer.ballot
             yield f"{vehicle} accepts" if accepts else f"{vehicle} does not accept"
 
     def _deliver_to(self, vehicle: str, kind: str, transfer: CellTransfer) -> None:

@@ -240,7 +240,7 @@ class Runner:
             process.get(message, self.tick)
 
     def _in_charge_of(self, vehicle: str) -> Process:
-        attendant = self.vehicles[vehicle].road.controller.attendant
+        attendant = self.vehicles[vehicle].road.controller.record.incarnation
         for process in self.processes.values():
             if process.vehicle.name == vehicle and process.incarnation == attendant:
                 return process
@@ -337,10 +337,10 @@ class Runner:
         if not isinstance(process, Agent) or process.command is None:
             raise ScenarioError(f"{name} has commanded nothing")
         controller = process.vehicle.road.controller
-        before = controller.attendant
+        before = controller.record.incarnation
         if not controller.accept_command(process.command):
             yield f"{name} is refused"
-        elif controller.attendant != before:
+        elif controller.record.incarnation != before:
             yield f"{name} takes charge"
             for other in self.processes.values():
                 if isinstance(other, CaretakerProcess) and other.vehicle is process.vehicle:

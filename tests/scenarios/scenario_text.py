@@ -33,9 +33,9 @@ def written(ballot: Ballot) -> str:
 def state_text(name: str, state: VehicleState) -> str:
     """Write the state of a vehicle."""
     parts = [f"{name} {'moves to' if state.moving else 'holds'} {shown(state.hold_cell)}"]
-    if state.promised is not None:
+    if state.record.promised is not None:
         has = "accepted" if state.accepted else "promised"
-        parts.append(f"{has} {written(state.promised)}")
+        parts.append(f"{has} {written(state.record.promised)}")
     if state.accepted:
         parts.append(f"completed {state.completed}")
     for word, holds in (
@@ -47,11 +47,11 @@ def state_text(name: str, state: VehicleState) -> str:
     ):
         if holds:
             parts.append(word)
-    if len(state.joined) > 1:
-        parts.append(f"joined {' '.join(map(str, state.joined))}")
-    if state.owned:
-        parts.append(f"owns {' '.join(map(shown, state.owned))}")
-    if state.transfer is not None:
-        gate = "open" if state.transfer.open else "closed"
-        parts.append(f"transfer {written(state.transfer.ballot)} {gate}")
+    if len(state.record.joined) > 1:
+        parts.append(f"joined {' '.join(map(str, state.record.joined))}")
+    if state.record.owned:
+        parts.append(f"owns {' '.join(map(shown, state.record.owned))}")
+    if state.record.transfer is not None:
+        gate = "open" if state.record.transfer.open else "closed"
+        parts.append(f"transfer {written(state.record.transfer.ballot)} {gate}")
     return ", ".join(parts)

@@ -27,7 +27,7 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import Neighbours
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.paper import PAPER
 from support.road_vehicles import vehicle_in
-from support.states import BALLOT, make_plan, sent
+from support.states import BALLOT, changed, make_plan, sent
 
 MakeDriver = Callable[[Scenario], Driver]
 
@@ -105,8 +105,8 @@ class Rig:
         """Note what the agent asks for between two ticks, and confirm it at once."""
         (command,) = sent(effects, Command)
         self.controller.store_requests(command)
-        joined, accepted = self.controller.joined, self.controller.accepted
-        return self.hand(SENSE, replace(self._sensed, joined=joined, accepted=accepted))
+        joined, accepted = self.controller.record.joined, self.controller.record.accepted
+        return self.hand(SENSE, changed(self._sensed, joined=joined, accepted=accepted))
 
     def coast(self, ticks: int) -> None:
         """Drive by the last command, and by the hold law when it runs out."""
@@ -128,7 +128,7 @@ class Rig:
             {ME: self.controller.hold_cell},
             {ME: moves},
             ballot=ballot,
-            incarnations={ME: self.shown[-1].incarnation},
+            incarnations={ME: self.shown[-1].record.incarnation},
             t0_s=(self.tick if t0_tick is None else t0_tick) * TICK_S,
         )
         self.confirm(self.hand(PLAN, plan))

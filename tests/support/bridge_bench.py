@@ -33,7 +33,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.codec import encode
-from laneweave.protocol.wire.messages import Command, Name, Prepare, Report, Sense
+from laneweave.protocol.wire.messages import Command, Name, Prepare, Report, Sense, VehicleRecord
 from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, REPORT, VEHICLE_ALIVE, Keys
 from laneweave.sim_bridge.bodies.bodies_world import BodiesWorld
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
@@ -42,7 +42,7 @@ from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from support.paper import EXACT
 from support.road_vehicles import known
-from support.states import jerks, make_plan, sent
+from support.states import changed, jerks, make_plan, sent
 
 ROAD = {"lanes": 2, "s1_m": 20.0, "s2_m": 20.0, "s3_m": 160.0}
 """As short as the checks allow: a vehicle takes 14 s."""
@@ -179,14 +179,14 @@ class Desk:
         cared_for = name in self.core._attendance
         unchanged: dict[str, Any] = {
             "vehicle": name,
-            "incarnation": max(controller.attendant + cared_for, 1),
+            "record": VehicleRecord(max(controller.record.incarnation + cared_for, 1)),
             "tick": self.core.tick,
             "hold_cell": controller.hold_cell,
             "motion_end_tick": 0,
             "motion_origin": controller.hold_cell,
             "jerks": jerks((0.0, 0.0), ticks=self.scenario.horizon_ticks),
         }
-        return Command(**(unchanged | changes))
+        return changed(Command(**unchanged), **changes)
 
     def known(self, vehicle: str) -> tuple[object, ...]:
         return known(self.core.vehicles[Name(vehicle)].controller)

@@ -22,6 +22,10 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
+from laneweave.sim_bridge.bodies.record_store import RecordStore
+from laneweave.sim_bridge.road.attendance import Attendance
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.states import changed, set_record
 
 Patch = pytest.MonkeyPatch
 
@@ -30,66 +34,76 @@ def obey(patch: Patch) -> None:
     accept_command = MotionController.accept_command
 
     def mutant(self: MotionController, command: Command) -> bool:
-        owned = self.owned
-        self.owned = tuple(sorted({*owned, command.hold_cell}))
+        owned = self.record.owned
+        set_record(self.store, owned=tuple(sorted({*owned, command.hold_cell})))
         taken = accept_command(self, command)
-        self.owned = owned
+        set_record(self.store, owned=owned)
         return taken
 
     patch.setattr(MotionController, "accept_command", mutant)
 
 
 def own_at_once(patch: Patch) -> None:
-    begin_transfer = MotionController.begin_transfer
+    begin_transfer = RecordStore.begin_transfer
 
-    def mutant(self: MotionController, transfer: PendingTransfer) -> None:
+    def mutant(self: RecordStore, transfer: PendingTransfer) -> None:
         begin_transfer(self, transfer)
         self.complete_transfer(transfer.ballot)
 
-    patch.setattr(MotionController, "begin_transfer", mutant)
+    patch.setattr(RecordStore, "begin_transfer", mutant)
 
 
 def note_any_transfer(patch: Patch) -> None:
-    def mutant(self: MotionController, transfer: PendingTransfer) -> None:
-        if transfer != self.transfer:
-            self.transfer, self.owned = transfer, transfer.before
+    def mutant(self: RecordStore, transfer: PendingTransfer) -> None:
+        if transfer != self.record.transfer:
+            set_record(self, transfer=transfer, owned=transfer.before)
 
-    patch.setattr(MotionController, "begin_transfer", mutant)
+    patch.setattr(RecordStore, "begin_transfer", mutant)
 
 
 def forget_promise(patch: Patch) -> None:
-    put_in_charge = MotionController.put_in_charge
+    put_in_charge = RecordStore.put_in_charge
 
-    def mutant(self: MotionController, incarnation: int) -> None:
+    def mutant(self: RecordStore, incarnation: int) -> None:
         put_in_charge(self, incarnation)
-        self.promised = None
+        set_record(self, promised=None)
 
-    patch.setattr(MotionController, "put_in_charge", mutant)
+    patch.setattr(RecordStore, "put_in_charge", mutant)
 
 
 def forget_owned_cells(patch: Patch) -> None:
-    put_in_charge = MotionController.put_in_charge
+    accept_command, take_charge = MotionController.accept_command, Attendance._put_caretaker
 
-    def mutant(self: MotionController, incarnation: int) -> None:
-        first = self.attendant == 0
-        put_in_charge(self, incarnation)
-        if not first:
-            self.owned = (self.hold_cell,)
+    def forget(controller: MotionController, before: int) -> None:
+        if before not in (0, controller.record.incarnation):
+            set_record(controller.store, owned=(controller.hold_cell,))
 
-    patch.setattr(MotionController, "put_in_charge", mutant)
+    def claimed(self: MotionController, command: Command) -> bool:
+        before = self.record.incarnation
+        taken = accept_command(self, command)
+        forget(self, before)
+        return taken
+
+    def cared_for(self: Attendance, vehicle: RoadVehicle, tick: int) -> None:
+        before = vehicle.controller.record.incarnation
+        take_charge(self, vehicle, tick)
+        forget(vehicle.controller, before)
+
+    patch.setattr(MotionController, "accept_command", claimed)
+    patch.setattr(Attendance, "_put_caretaker", cared_for)
 
 
 def show_owned_cells_at_once(patch: Patch) -> None:
     state = PlanExecution.state
 
     def mutant(self: PlanExecution, sense: Sense, *, attended: bool) -> VehicleState:
-        return state(self, replace(sense, promised=self.promised), attended=attended)
+        return state(self, changed(sense, promised=self.promised), attended=attended)
 
     patch.setattr(PlanExecution, "state", mutant)
 
 
 def cancel_closed_transfers(patch: Patch) -> None:
-    patch.setattr(transfer, "owned_cells", lambda state, *_: frozenset(state.owned))
+    patch.setattr(transfer, "owned_cells", lambda state, *_: frozenset(state.record.owned))
 
 
 def cancel_on_common_promise(patch: Patch) -> None:
@@ -98,10 +112,10 @@ def cancel_on_common_promise(patch: Patch) -> None:
     def mutant(
         state: VehicleState, states: States, gone: Collection[Name]
     ) -> frozenset[Cell] | None:
-        transfer = state.transfer
+        transfer = state.record.transfer
         if transfer is not None and not transfer.open:
-            promised = {states[name].promised for name in transfer.roster if name in states}
-            if promised == {state.promised} and state.promised != transfer.ballot:
+            promised = {states[name].record.promised for name in transfer.roster if name in states}
+            if promised == {state.record.promised} and state.record.promised != transfer.ballot:
                 return frozenset(transfer.before)
         return owned_cells(state, states, gone)
 

@@ -25,7 +25,7 @@ def ramps_are_issued_at_the_start(patch: pytest.MonkeyPatch) -> None:
         for one in list(vehicles.values()):
             for lane, entry_m in enumerate(self._entry_m):
                 if entry_m > 0.0 and one.arrival.lane != lane:
-                    one.controller.assign_cell((one.admission.cell[0], lane))
+                    one.controller.store.assign_cell((one.admission.cell[0], lane))
 
     patch.setattr(Roadside, "assign_empty_cells", twice)
 
@@ -39,8 +39,8 @@ def cells_are_passed_on_twice(patch: pytest.MonkeyPatch) -> None:
     ) -> None:
         on_left(self, vehicle, vehicles, t_s)
         for one in list(vehicles.values())[:1]:
-            for cell in vehicle.controller.certain_cells:
-                one.controller.assign_cell(cell)
+            for cell in vehicle.controller.store.certain_cells:
+                one.controller.store.assign_cell(cell)
 
     patch.setattr(Roadside, "on_left", twice)
 

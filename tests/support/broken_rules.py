@@ -38,6 +38,7 @@ from laneweave.protocol.wire.messages import (
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.road.attendance import Caretaker
 from laneweave.sim_bridge.road.formation_building import ColumnBlocks
+from support.states import changed
 
 LEASE_S = 2.0
 FAR_BEHIND = 2**31
@@ -77,7 +78,7 @@ def keep_count(me: PlanExecution, _: object) -> None:
 
 
 def plans_for_some_of_its_blocks(me: PlanExecution, plan: Plan) -> bool:
-    return set(plan.formations) <= set(me.joined)
+    return set(plan.formations) <= set(me.stored.joined)
 
 
 def promise_without_joining(me: PlanExecution, prepare: Prepare) -> None:
@@ -89,7 +90,7 @@ def is_member(me: PlanExecution, state: VehicleState) -> bool:
 
 
 def promised_my_ballot(me: PlanExecution, state: VehicleState) -> bool:
-    return is_member(me, state) and me.plan is not None and state.promised == me.plan.ballot
+    return is_member(me, state) and me.plan is not None and state.record.promised == me.plan.ballot
 
 
 def accepted_anything(me: PlanExecution, state: VehicleState) -> bool:
@@ -105,8 +106,8 @@ def accepted_mine_or_newer(me: PlanExecution, state: VehicleState) -> bool:
     return (
         plan is not None
         and accepted_anything(me, state)
-        and state.promised is not None
-        and state.promised >= plan.ballot
+        and state.record.promised is not None
+        and state.record.promised >= plan.ballot
     )
 
 
@@ -215,12 +216,12 @@ def all_have_accepted(me: FormationLeader, _: object) -> bool:
 
 
 def one_ballot(me: FormationLeader, _: object) -> bool:
-    ballots = {me.states[name].promised for name in me.formation.roster}
+    ballots = {me.states[name].record.promised for name in me.formation.roster}
     return len(ballots) == 1 and all_have_accepted(me, None)
 
 
 def adopt_the_ballot_only(me: FormationLeader, _: object) -> None:
-    me.ballot = next(iter(me.states.values())).promised
+    me.ballot = next(iter(me.states.values())).record.promised
 
 
 def prepare_the_same(me: FormationLeader, _: object) -> None:
@@ -228,11 +229,11 @@ def prepare_the_same(me: FormationLeader, _: object) -> None:
         me.ballot = me.new_ballot(me.highest)
     else:
         # Vehicles that restarted are asked again; the others have promised this ballot.
-        known = {name: each.incarnation for name, each in me.promises.items()}
+        known = {name: each.record.incarnation for name, each in me.promises.items()}
         me.promises = {
             name: promise
             for name, promise in me.promises.items()
-            if name in me.states and me.states[name].incarnation == known[name]
+            if name in me.states and me.states[name].record.incarnation == known[name]
         }
     me.plan, me.accepted, me.failures, me.due_s = None, set(), 0, me.now_s
 
@@ -243,7 +244,7 @@ def prepare_anew(me: FormationLeader, _: object) -> None:
 
 
 def promised_something(_: FormationLeader, state: VehicleState) -> bool:
-    return state.promised is not None and not state.accepted
+    return state.record.promised is not None and not state.accepted
 
 
 def count_entry_cell(me: FormationLeader, state: VehicleState) -> None:
@@ -256,11 +257,11 @@ def time_is_up_unless_issuing(me: FormationLeader, _: object) -> bool:
 
 
 def shows_another_ballot(me: FormationLeader, state: VehicleState) -> bool:
-    return state.promised != me.ballot
+    return state.record.promised != me.ballot
 
 
 def promised_b(me: FormationLeader, state: VehicleState) -> bool:
-    return state.promised == me.ballot
+    return state.record.promised == me.ballot
 
 
 # --- outside the rule books -------------------------------------------------------------------
@@ -325,7 +326,8 @@ def play_any_command(patch: pytest.MonkeyPatch) -> None:
 
     def mutant(self: MotionController, command: Command) -> bool:
         return accept_command(
-            self, replace(command, incarnation=max(command.incarnation, self.attendant))
+            self,
+            changed(command, incarnation=max(command.record.incarnation, self.record.incarnation)),
         )
 
     patch.setattr(MotionController, "accept_command", mutant)
@@ -343,8 +345,10 @@ def note_by_itself(patch: pytest.MonkeyPatch) -> None:
 
     def mutant(self: AgentCore, execution: PlanExecution) -> Iterator[Effect]:
         yield from ask(self, execution)
-        if execution.plan is not None and execution.on_stored(execution.plan.ballot):
-            yield self._state()
+        if execution.plan is not None:
+            noted = replace(execution.stored, accepted=execution.plan.ballot)
+            if execution.on_record(noted):
+                yield self._state()
 
     patch.setattr(AgentCore, "_request_storage", mutant)
 
@@ -354,7 +358,7 @@ def keep_incarnation(patch: pytest.MonkeyPatch) -> None:
 
     def mutant(self: AgentCore, message: Any, now_s: float) -> Any:  # noqa: ANN401
         # As if there had been no caretaker: earlier promises still count.
-        as_before = evolve(message, attendant=self._incarnation, caretaker=False)
+        as_before = changed(message, incarnation=self._incarnation, caretaker=False)
         return sense(self, as_before, now_s)
 
     patch.setattr(AgentCore, "_on_sense", mutant)

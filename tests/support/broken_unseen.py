@@ -42,12 +42,13 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 from laneweave.protocol.wire.topics import PLAN, PREPARE
-from laneweave.sim_bridge.bodies import motion_controller
-from laneweave.sim_bridge.bodies.motion_controller import MotionController
+from laneweave.sim_bridge.bodies import record_store
+from laneweave.sim_bridge.bodies.record_store import RecordStore
 from laneweave.sim_bridge.road.attendance import Attendance, Caretaker
 from laneweave.sim_bridge.road.formation_building import GrowingFormations
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.states import set_record
 
 Patch = pytest.MonkeyPatch
 
@@ -143,7 +144,11 @@ def ignore_promises(patch: Patch) -> None:
 
 def has_higher_term(round_: BallotRound, state: VehicleState) -> bool:
     ballot = round_.ballot
-    return ballot is not None and state.promised is not None and state.promised.term > ballot.term
+    return (
+        ballot is not None
+        and state.record.promised is not None
+        and state.record.promised.term > ballot.term
+    )
 
 
 def join_directly(patch: Patch) -> None:
@@ -234,9 +239,13 @@ def close_on_equal_promise(patch: Patch) -> None:
 
     def mutant(state: VehicleState | None, pending: PendingTransfer) -> ownership._Sign:
         found = sign(state, pending)
-        accepted = state is not None and state.promised == pending.ballot and state.owned
+        accepted = (
+            state is not None and state.record.promised == pending.ballot and state.record.owned
+        )
         if found is ownership._Sign.NONE and state is not None and accepted:
-            known = state.transfer is not None and state.transfer.ballot == pending.ballot
+            known = (
+                state.record.transfer is not None and state.record.transfer.ballot == pending.ballot
+            )
             return ownership._Sign.CLOSED if known else ownership._Sign.NEVER_READY
         return found
 
@@ -249,7 +258,7 @@ def cancel_on_newer_transfer(patch: Patch) -> None:
     def mutant(
         state: VehicleState, states: States, gone: Collection[Name] = ()
     ) -> frozenset[Cell] | None:
-        pending = state.transfer
+        pending = state.record.transfer
         if pending is not None and not pending.open:
             signs = ownership._signs(state, pending, states, gone)
             if ownership._Sign.NEWER in signs and ownership._Sign.OPEN not in signs:
@@ -281,7 +290,7 @@ def guess_unknown_cells(patch: Patch) -> None:
     def mutant(
         state: VehicleState, states: States, gone: Collection[Name] = ()
     ) -> frozenset[Cell] | None:
-        return owned_cells(state, states, gone) or frozenset(state.owned)
+        return owned_cells(state, states, gone) or frozenset(state.record.owned)
 
     patch.setattr(transfer, "owned_cells", mutant)
 
@@ -307,41 +316,44 @@ def keep_late_order(patch: Patch) -> None:
 
 
 def keep_assigned_cells(patch: Patch) -> None:
-    def mutant(self: MotionController, pending: PendingTransfer) -> None:
-        newer = self.transfer is None or pending.ballot > self.transfer.ballot
-        if newer and self.promised is not None and pending.ballot >= self.promised:
+    def mutant(self: RecordStore, pending: PendingTransfer) -> None:
+        stored, promised = self.record.transfer, self.record.promised
+        newer = stored is None or pending.ballot > stored.ballot
+        if newer and promised is not None and pending.ballot >= promised:
             self._granted -= set(pending.after)
-            self.transfer = motion_controller._with_cells(pending, self._granted)
-            self.owned = self.transfer.before
+            begun = record_store._with_cells(pending, self._granted)
+            set_record(self, transfer=begun, owned=begun.before)
 
-    patch.setattr(MotionController, "begin_transfer", mutant)
+    patch.setattr(RecordStore, "begin_transfer", mutant)
 
 
 def store_same_transfer_again(patch: Patch) -> None:
-    def mutant(self: MotionController, pending: PendingTransfer) -> None:
-        newer = self.transfer is None or pending.ballot >= self.transfer.ballot
-        if newer and self.promised is not None and pending.ballot >= self.promised:
+    def mutant(self: RecordStore, pending: PendingTransfer) -> None:
+        stored, promised = self.record.transfer, self.record.promised
+        newer = stored is None or pending.ballot >= stored.ballot
+        if newer and promised is not None and pending.ballot >= promised:
             self._granted -= set(pending.before)
-            self.transfer = motion_controller._with_cells(pending, self._granted)
-            self.owned = self.transfer.before
+            begun = record_store._with_cells(pending, self._granted)
+            set_record(self, transfer=begun, owned=begun.before)
 
-    patch.setattr(MotionController, "begin_transfer", mutant)
+    patch.setattr(RecordStore, "begin_transfer", mutant)
 
 
 def open_any_transfer(patch: Patch) -> None:
-    complete_transfer = MotionController.complete_transfer
+    complete_transfer = RecordStore.complete_transfer
 
-    def mutant(self: MotionController, ballot: Ballot) -> None:
-        complete_transfer(self, ballot if self.transfer is None else self.transfer.ballot)
+    def mutant(self: RecordStore, ballot: Ballot) -> None:
+        stored = self.record.transfer
+        complete_transfer(self, ballot if stored is None else stored.ballot)
 
-    patch.setattr(MotionController, "complete_transfer", mutant)
+    patch.setattr(RecordStore, "complete_transfer", mutant)
 
 
 def replace_joined_blocks(patch: Patch) -> None:
-    def mutant(self: MotionController, blocks: Iterable[int]) -> None:
-        self.joined = tuple(sorted(set(blocks)))
+    def mutant(self: RecordStore, blocks: Iterable[int]) -> None:
+        set_record(self, joined=tuple(sorted(set(blocks))))
 
-    patch.setattr(MotionController, "join", mutant)
+    patch.setattr(RecordStore, "join", mutant)
 
 
 # --- attendance -------------------------------------------------------------------------------
@@ -361,11 +373,11 @@ def await_token(patch: Patch) -> None:
         self: Attendance, vehicle: RoadVehicle, command: Command
     ) -> Generator[Effect, None, bool]:
         controller = vehicle.controller
-        attendant = controller.attendant
+        attendant = controller.record.incarnation
         if not controller.accept_command(command):
             return False
         self.answers.in_time(vehicle.name)
-        if controller.attendant != attendant:
+        if controller.record.incarnation != attendant:
             yield from self._end_caretaker(vehicle.name)
         return True
 

@@ -20,7 +20,7 @@ from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.lattice import Cell, PlannedMove, stretch_of
 from laneweave.protocol.scenario.fields import Scenario, Vehicle
 from laneweave.protocol.vehicle.motion import State, cell_state
-from laneweave.protocol.wire.messages import Command, Motion, Name
+from laneweave.protocol.wire.messages import Command, Motion, Name, VehicleRecord
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose, pose_of
 from laneweave.sim_bridge.bodies.plant import Plant
@@ -148,7 +148,7 @@ class Road:
         drive = one.driver.drive(sense, moving=one.moving)
         command = Command(
             vehicle=one.vehicle.name,
-            incarnation=1,
+            record=VehicleRecord(incarnation=1),
             tick=self.tick,
             hold_cell=one.hold_cell,
             motion_end_tick=drive.motion_end_tick,

@@ -242,9 +242,9 @@ ROWS: Mapping[str, Callable[[Forger], None]] = {
     "state-time": lambda forger: forger.state(t_s=1e12),
     "state-incarnation": lambda forger: forger.state(incarnation=2**62),
     "command-incarnation": lambda forger: forger.change_victims(COMMAND, incarnation=HUGE),
-    "sense-attendant": lambda forger: forger.change_victims(SENSE, attendant=HUGE),
+    "sense-attendant": lambda forger: forger.change_victims(SENSE, incarnation=HUGE),
     "sense-caretaker": lambda forger: forger.change_victims(
-        SENSE, attendant=HUGE, caretaker=True, tick=forger.known(Sense).tick + 1
+        SENSE, incarnation=HUGE, caretaker=True, tick=forger.known(Sense).tick + 1
     ),
     "sense-bridge": lambda forger: forger.change_victims(SENSE, bridge=HUGE),
     "sense-bridge-possible": lambda forger: forger.change_victims(SENSE, bridge=NOW_NS() + HOUR_NS),

@@ -102,7 +102,8 @@ BUGS: tuple[Bug, ...] = (
         "replaced_agent_takes_a_newer_plan",
         replaced={vehicle.is_stored: broken.always}, plant=broken.note_by_itself),
     Bug("lower-ballot-plan-accepted", "V3", "A plan of a lower ballot than promised is accepted.",
-        "plan_of_a_lower_ballot", replaced={vehicle.is_promised_ballot: broken.always}),
+        "plan_of_a_lower_ballot", collides=False,  # acceptances name their ballot
+        replaced={vehicle.is_promised_ballot: broken.always}),
     Bug("plan-taken-twice", "V3", "A repeated PLAN restarts the plan.",
         "plan_repeated", replaced={vehicle.take_plan: broken.accept_anew},
         vehicle_row=broken.plan_in_any_phase),

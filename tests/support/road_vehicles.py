@@ -14,7 +14,7 @@ from support.paper import PAPER
 
 
 def controller_in(
-    cell: Cell, scenario: Scenario = PAPER, *, state: State | None = None, attendant: int = 0
+    cell: Cell, scenario: Scenario = PAPER, *, state: State | None = None, incarnation: int = 0
 ) -> MotionController:
     """Return the motion controller of a vehicle in a cell.
 
@@ -22,22 +22,22 @@ def controller_in(
         cell: where it holds.
         scenario: its limits and its lattice.
         state: of its body; None: at rest in the cell.
-        attendant: incarnation of the process in charge; 0: none.
+        incarnation: of the process in charge; 0: none.
     """
     start = cell_state(scenario.lattice, cell, 0.0) if state is None else state
     plant = Plant(start, scenario.vehicle, scenario.runtime.tick_s)
     controller = MotionController(plant, scenario, cell)
-    if attendant:
-        controller.put_in_charge(attendant)
+    if incarnation:
+        controller.store.put_in_charge(incarnation)
     return controller
 
 
 def known(controller: MotionController) -> tuple[object, ...]:
     """Return all that a motion controller knows."""
     return (
-        controller.attendant,
-        controller.joined,
-        controller.accepted,
+        controller.record.incarnation,
+        controller.record.joined,
+        controller.record.accepted,
         controller.command_tick,
         controller.hold_cell,
         controller.motion_origin,

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from msgspec.structs import replace
-
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
@@ -15,11 +13,13 @@ from laneweave.protocol.wire.messages import (
     PendingTransfer,
     Plan,
     Sense,
+    VehicleRecord,
     VehicleState,
 )
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from support.convoy import ROLLING
 from support.road_vehicles import controller_in
+from support.states import changed
 from support.states import make_plan as plan_of
 
 A, B, C = Name("A"), Name("B"), Name("C")
@@ -38,7 +38,7 @@ def controller_of(cells: Iterable[Cell]) -> MotionController:
     first, *others = cells
     controller = controller_in(first, ROLLING)
     for cell in (first, *others):
-        controller.assign_cell(cell)
+        controller.store.assign_cell(cell)
     return controller
 
 
@@ -61,8 +61,9 @@ def pending(name: Name, ballot: Ballot = MID, roster: tuple[Name, ...] = (A, B))
 
 def vehicle(name: Name = A, rules: RuleBook = VEHICLE_RULES) -> PlanExecution:
     cell = make_plan().start_cells[name]
+    stored = VehicleRecord(incarnation=INCARNATION, owned=BEFORE[name])
     return PlanExecution(
-        name, INCARNATION, cell, ROLLING.lattice, (), rules=rules, owned=frozenset(BEFORE[name])
+        name, INCARNATION, cell, ROLLING.lattice, stored, owns_cells=True, rules=rules
     )
 
 
@@ -74,9 +75,12 @@ def sense(
     owned: tuple[Cell, ...] | None = None,
 ) -> Sense:
     return Sense(
-        name, 1, 1.0, (0.0,) * 6, HOME, 0, HOME, 0, (), (), attendant=INCARNATION,
-        promised=promised, transfer=transfer, accepted=accepted,
-        owned=BEFORE[name] if owned is None else owned,
+        name, 1, 1.0, (0.0,) * 6, HOME, 0, HOME, 0,
+        VehicleRecord(
+            incarnation=INCARNATION, promised=promised, transfer=transfer, accepted=accepted,
+            owned=BEFORE[name] if owned is None else owned,
+        ),
+        (),
     )  # fmt: skip
 
 
@@ -94,7 +98,7 @@ def state(
         owned = BEFORE.get(name, ((9, 2),))
     cell = make_plan().start_cells.get(name, owned[0] if owned else (9, 2))
     shown = vehicle().state(sense(), attended=True)
-    return replace(
+    return changed(
         shown, vehicle=name, hold_cell=cell, promised=promised, transfer=transfer, owned=owned,
         accepted=accepted, ready=accepted, t_s=t_s,
         s_m=ROLLING.lattice.cell_s_m(cell[0], t_s),

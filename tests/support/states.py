@@ -6,16 +6,46 @@ from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
+from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell, PlannedMove, territory
 from laneweave.protocol.runtime.node import Effect, Send
 from laneweave.protocol.vehicle.motion import cell_state
-from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Sense, VehicleState
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Command,
+    Name,
+    Plan,
+    Sense,
+    VehicleRecord,
+    VehicleState,
+)
+from laneweave.sim_bridge.bodies.record_store import RecordStore
 from support.paper import PAPER
 
 T = TypeVar("T")
+Recorded = TypeVar("Recorded", VehicleState, Sense, Command)
+RECORD = frozenset(VehicleRecord.__struct_fields__)
 A, B, C, D, E, F = (Name(letter) for letter in "ABCDEF")
 BALLOT = Ballot(1, Name("c1"), 1, 1)
+
+
+def changed(message: Recorded, **changes: Any) -> Recorded:  # noqa: ANN401 (fields)
+    """Return a message with other fields, of its own or of its record.
+
+    `accepted` of a state may be True: the plan of the promised ballot is accepted.
+    """
+    record = {name: changes.pop(name) for name in RECORD & changes.keys()}
+    if isinstance(message, VehicleState):
+        promised = record.get("promised", message.record.promised)
+        accepted = record.get("accepted", message.accepted)
+        record["accepted"] = promised if accepted else None
+    return replace(message, record=replace(message.record, **record), **changes)
+
+
+def set_record(store: RecordStore, **changes: object) -> None:
+    """Change what a motion controller stores."""
+    store.record = replace(store.record, **changes)
 
 
 def holding(
@@ -24,11 +54,8 @@ def holding(
     """Return the state of a vehicle of formation 0; `more` replaces or adds fields."""
     values: dict[str, Any] = {
         "vehicle": vehicle,
-        "incarnation": 1,
         "formation": 0,
-        "joined": (0,),
-        "promised": promised,
-        "accepted": False,
+        "record": VehicleRecord(incarnation=1, joined=(0,), promised=promised),
         "ready": False,
         "completed": 0,
         "hold_cell": hold_cell,
@@ -42,7 +69,7 @@ def holding(
         "speed_mps": 0.0,
         "t_s": 0.0,
     }
-    return VehicleState(**(values | more))
+    return changed(VehicleState(**values), **more)
 
 
 def make_plan(
@@ -86,11 +113,11 @@ def sense_in(cell: Cell, tick: int = 0, **more: Any) -> Sense:  # noqa: ANN401 (
         "motion_end_tick": 0,
         "motion_origin": cell,
         "preferred_lane": 0,
+        "record": VehicleRecord(joined=(formation,)),
         "ahead": (),
         "formation": formation,
-        "joined": (formation,),
     }
-    return Sense(**(values | more))
+    return changed(Sense(**values), **more)
 
 
 def command(
@@ -99,14 +126,14 @@ def command(
     """Return a command with a jerk for each tick; `more` replaces fields."""
     values: dict[str, Any] = {
         "vehicle": Name("me"),
-        "incarnation": 1,
+        "record": VehicleRecord(incarnation=1),
         "tick": tick,
         "hold_cell": hold_cell,
         "motion_end_tick": tick + len(pairs),
         "motion_origin": (0, 1),
         "jerks": jerks(*pairs),
     }
-    return Command(**(values | more))
+    return changed(Command(**values), **more)
 
 
 def jerks(*pairs: tuple[float, float], ticks: int = 1) -> bytes:

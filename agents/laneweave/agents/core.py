@@ -55,6 +55,7 @@ from laneweave.protocol.wire.messages import (
     Prepare,
     Report,
     Sense,
+    VehicleRecord,
     VehicleState,
 )
 from laneweave.protocol.wire.newest import NewestRoad
@@ -131,7 +132,7 @@ class AgentCore:
         sense = self._sense
         return (
             sense is not None
-            and sense.attendant == self._incarnation
+            and sense.record.incarnation == self._incarnation
             and not sense.caretaker
             and not self.ended
         )
@@ -228,15 +229,16 @@ class AgentCore:
         drove = self.in_charge and self._sense is not None and not self._sense.off_lattice
         self._sense = sense
         # Clocks of different machines may give a caretaker the same incarnation.
-        taken = sense.caretaker and sense.attendant == self._incarnation
-        if taken or sense.attendant > self._incarnation:
+        in_charge = sense.record.incarnation
+        taken = sense.caretaker and in_charge == self._incarnation
+        if taken or in_charge > self._incarnation:
             self._command, self.wanted_motions = None, ()
             if not sense.caretaker:
                 return []  # another agent is in charge
-            self._claim_above(sense.attendant)
-        elif sense.attendant < self._incarnation and self._raised:
-            # The attendant of an earlier SENSE may have been wrong, and the claim too high.
-            self._claim_above(sense.attendant)
+            self._claim_above(in_charge)
+        elif in_charge < self._incarnation and self._raised:
+            # The incarnation in an earlier SENSE may have been wrong, and the claim too high.
+            self._claim_above(in_charge)
         return self._act(sense, in_charge=self.in_charge, drove=drove)
 
     def _set_type(self, vehicle_type: str) -> None:
@@ -272,7 +274,7 @@ class AgentCore:
         """Keep the claim on a vehicle without a cell, which its motion controller drives alone."""
         self._command = Command(
             vehicle=self.vehicle,
-            incarnation=self._incarnation,
+            record=VehicleRecord(incarnation=self._incarnation),
             tick=sense.tick,
             hold_cell=sense.hold_cell,
             motion_end_tick=sense.motion_end_tick,
@@ -294,29 +296,23 @@ class AgentCore:
         assert execution is not None  # noqa: S101 (it has taken over)
         self.wanted_motions = ()
         if sense.off_lattice:
-            execution.on_owned(sense)  # the promise stays
+            execution.on_record(sense.record)  # the promise stays
             return self._wait(sense)
         if in_charge:
             stretch = stretch_of(execution.hold_cell[0])
             self.wanted_motions = stretch - 1, stretch, stretch + 1
-            execution.on_joined(sense.joined)
-            execution.on_stored(sense.accepted)
-            execution.on_owned(sense)
+            execution.on_record(sense.record)
             self._decide(sense, execution)
         drive = self._driver.drive(sense, moving=execution.moving)
         self._command = Command(
             vehicle=self.vehicle,
-            incarnation=self._incarnation,
+            record=execution.wanted,
             tick=sense.tick,
             hold_cell=execution.hold_cell,
             motion_end_tick=drive.motion_end_tick,
             motion_origin=drive.motion_origin,
             motion_ticks=drive.motion_ticks,
             jerks=drive.jerks,
-            joined=execution.wanted_joined,
-            accepted=execution.wanted_accepted,
-            promised=execution.wanted_promised,
-            transfer=execution.transfer,
         )
         effects: list[Effect] = [Send(COMMAND, self._command, self._own)]
         if in_charge:
@@ -331,27 +327,17 @@ class AgentCore:
     def _on_confirmation(self, sense: Sense) -> list[Effect]:
         """Handle a repeated SENSE: the controller may have stored something within the tick."""
         execution = self.execution
-        if execution is None or not self.in_charge or sense.attendant != self._incarnation:
+        in_charge = sense.record.incarnation
+        if execution is None or not self.in_charge or in_charge != self._incarnation:
             return []
         self._sense = sense
-        changes = [
-            execution.on_joined(sense.joined),
-            execution.on_stored(sense.accepted),
-            execution.on_owned(sense),
-        ]
-        return [self._state()] if any(changes) else []
+        return [self._state()] if execution.on_record(sense.record) else []
 
     def _request_storage(self, execution: PlanExecution) -> list[Effect]:
         """Ask the controller to store changes now rather than with the next tick's COMMAND."""
         command = self._command
         assert command is not None  # noqa: S101 (in charge: it has sent one)
-        self._command = replace(
-            command,
-            joined=execution.wanted_joined,
-            accepted=execution.wanted_accepted,
-            promised=execution.wanted_promised,
-            transfer=execution.transfer,
-        )
+        self._command = replace(command, record=execution.wanted)
         return [Send(COMMAND, self._command, self._own)] if self._command != command else []
 
     def _forget_road(self) -> None:
@@ -360,10 +346,10 @@ class AgentCore:
         self._sense = self._command = self._move = self.execution = None
         self.wanted_motions, self.wanted_states = (), ()
 
-    def _claim_above(self, attendant: int) -> None:
+    def _claim_above(self, in_charge: int) -> None:
         """Take a new incarnation, above that of the process in charge."""
         number = self._new_incarnation()
-        self._incarnation = above(number, attendant)
+        self._incarnation = above(number, in_charge)
         self._raised = self._incarnation != number
 
     def _take_over(self, sense: Sense) -> None:
@@ -375,10 +361,10 @@ class AgentCore:
             incarnation=self._incarnation,
             hold_cell=sense.hold_cell,
             lattice=self._scenario.lattice,
-            joined=sense.joined,
+            stored=sense.record,
+            owns_cells=self._scenario.formation.rolling,
             moving=not self._driver.at_rest(sense),
             rules=self._rules,
-            owned=frozenset(sense.owned) if self._scenario.formation.rolling else None,
             lane_ends=self._lane_ends,
             drivable=self._drivable,
         )

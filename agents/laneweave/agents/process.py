@@ -17,7 +17,7 @@ from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.identities import Incarnations
-from laneweave.protocol.wire.messages import Name, Sense
+from laneweave.protocol.wire.messages import Name, Sense, VehicleRecord
 
 
 def warm_up(scenario: Scenario) -> None:
@@ -36,6 +36,7 @@ def warm_up(scenario: Scenario) -> None:
         motion_end_tick=0,
         motion_origin=cell,
         preferred_lane=lane,
+        record=VehicleRecord(),
         ahead=(),
     )
     driver.drive(sense, moving=True)

@@ -270,18 +270,18 @@ class BridgeCore:
         vehicle = self.vehicles.get(name)
         if vehicle is None:
             return effects
-        attendant = vehicle.controller.attendant
+        in_charge, incarnation = vehicle.controller.record.incarnation, command.record.incarnation
         self._bounds.check(command, self.t_s, now_s)
-        self._bounds.check_claim(command.incarnation, attendant, now_s)
+        self._bounds.check_claim(incarnation, in_charge, now_s)
         current = command.tick == self.tick and self.phase is TickPhase.ANSWERS
-        if command.incarnation >= attendant:
+        if incarnation >= in_charge:
             self._answers.received(name, now_s, current=current)
         had_caretaker = name in self._attendance
         if self._attendance.register_command(vehicle, command):
             effects.append(self._sense_of(vehicle))
         if not current:
             # A late answer was computed for a past state and would lead to a wrong position.
-            if command.tick < self.tick and command.incarnation == attendant:
+            if command.tick < self.tick and incarnation == in_charge:
                 self._answers.late(name)
             return effects
         try:
@@ -290,7 +290,7 @@ class BridgeCore:
             log.warning("command ignored", vehicle=name, reason=str(error))
             return effects
         # Only an accepted command can change the process in charge.
-        if attendant not in (0, vehicle.controller.attendant):
+        if in_charge not in (0, vehicle.controller.record.incarnation):
             previous = "caretaker" if had_caretaker else "agent"
             self._record.on_agent_took_over(self.t_s, name, previous)
         return effects

@@ -36,10 +36,10 @@ def watched(street: Street) -> Callable[[], bool]:
         owners: dict[Cell, Name] = {}
         controllers = {name: each.controller for name, each in street.bridge.vehicles.items()}
         for controller in controllers.values():
-            if controller.transfer is not None and controller.transfer.open:
-                opened.add(controller.transfer.ballot)
+            if controller.record.transfer is not None and controller.record.transfer.open:
+                opened.add(controller.record.transfer.ballot)
         for name, controller in controllers.items():
-            transfer, cells = controller.transfer, set(controller.owned)
+            transfer, cells = controller.record.transfer, set(controller.record.owned)
             if transfer is not None and not transfer.open and transfer.ballot in opened:
                 cells = set(transfer.after)
             assert controller.hold_cell in cells

@@ -12,7 +12,7 @@ from laneweave.agents.driving.reference import Reference
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state, integrate
-from laneweave.protocol.wire.messages import Name, Sense
+from laneweave.protocol.wire.messages import Name, Sense, VehicleRecord
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
@@ -140,7 +140,7 @@ def body(offset_m: float, tick: int = BEGIN_TICK) -> Plant:
 
 def sense(plant: Plant, tick: int) -> Sense:
     return Sense(
-        Name("A"), tick, tick * TICK_S, plant.state, CELL, END_TICK, CELL, 0, (), (),
+        Name("A"), tick, tick * TICK_S, plant.state, CELL, END_TICK, CELL, 0, VehicleRecord(), (),
         setpoint=plant.setpoint,
     )  # fmt: skip
 

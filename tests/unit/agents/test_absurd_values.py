@@ -60,7 +60,7 @@ class Seat:
         return self.tick * TICK_S
 
     def sense(self, **changes: Any) -> Sense:  # noqa: ANN401 (fields)
-        values = {"attendant": self.attendant, "caretaker": self.caretaker, "bridge": BRIDGE}
+        values = {"incarnation": self.attendant, "caretaker": self.caretaker, "bridge": BRIDGE}
         return sense_in(HOME, **({"tick": self.tick} | values | changes))
 
     def feel(self, **changes: Any) -> list[Effect]:  # noqa: ANN401 (fields)
@@ -71,9 +71,9 @@ class Seat:
         for _ in range(ticks):
             self.tick += 1
             for command in sent(self.feel(), Command):
-                right = command.tick == self.tick and command.incarnation > self.attendant
-                if right and command.incarnation <= CLAIM_AHEAD_NS:
-                    self.attendant, self.caretaker = command.incarnation, False
+                right = command.tick == self.tick and command.record.incarnation > self.attendant
+                if right and command.record.incarnation <= CLAIM_AHEAD_NS:
+                    self.attendant, self.caretaker = command.record.incarnation, False
 
     def prepare(self, ballot: Ballot) -> list[Effect]:
         message = Prepare(ballot, (0,), (ME,))
@@ -87,8 +87,8 @@ def refused(effects: list[Effect]) -> bool:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"attendant": HUGE},
-        {"attendant": HUGE, "caretaker": True},
+        {"incarnation": HUGE},
+        {"incarnation": HUGE, "caretaker": True},
         {"bridge": HUGE},
         {"tick": HUGE},
         {"tick": 900_000},
@@ -116,9 +116,9 @@ def test_impossible_numbers_change_nothing(changes: dict[str, Any]) -> None:
     [
         {"bridge": DAY_NS},
         {"tick": 100},
-        {"attendant": DAY_NS // 2},
-        {"attendant": DAY_NS // 2, "caretaker": True},
-        {"attendant": 3 * DAY_NS // 2, "caretaker": True},
+        {"incarnation": DAY_NS // 2},
+        {"incarnation": DAY_NS // 2, "caretaker": True},
+        {"incarnation": 3 * DAY_NS // 2, "caretaker": True},
     ],
 )
 def test_what_the_road_does_not_show_is_forgotten(changes: dict[str, Any]) -> None:
@@ -139,7 +139,7 @@ def test_what_the_road_does_not_show_is_forgotten(changes: dict[str, Any]) -> No
 def test_a_claim_above_a_wrong_attendant_is_taken_back() -> None:
     seat = Seat()
     seat.tick += 1
-    seat.feel(attendant=DAY_NS // 2, caretaker=True)
+    seat.feel(incarnation=DAY_NS // 2, caretaker=True)
     assert seat.agent._incarnation > DAY_NS // 2
     seat.drive(3)
     assert seat.agent.in_charge
@@ -161,8 +161,8 @@ def test_a_ballot_of_an_impossible_term_is_not_promised() -> None:
     assert refused(seat.prepare(HIGH))
     assert refused(seat.prepare(BALLOT._replace(term=limit + 1)))
     (state,) = sent(seat.prepare(BALLOT._replace(term=limit)), VehicleState)
-    assert state.promised is not None
-    assert state.promised.term == limit
+    assert state.record.promised is not None
+    assert state.record.promised.term == limit
     seat.drive(1)
     assert sent(seat.prepare(BALLOT._replace(term=limit + 1)), VehicleState)
 

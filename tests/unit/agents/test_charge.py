@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from typing import Any
 
 import pytest
-from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.launch.fault_search.road.stand_ins import LightDriver
@@ -24,7 +23,7 @@ from laneweave.protocol.wire.messages import (
 )
 from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, STATE
 from support.agent_rig import HOME, ME, OTHER, Rig
-from support.states import BALLOT, holding, make_plan, sense_in, sent
+from support.states import BALLOT, changed, holding, make_plan, sense_in, sent
 
 OTHER_IS_READY = holding(OTHER, BALLOT, accepted=True, ready=True, done=True, speed_mps=15.0)
 """The state of the other member, which has accepted the plan."""
@@ -76,7 +75,7 @@ class Seat:
     def feel(self, attendant: int, *, cell: Cell = HOME, **more: Any) -> list[Effect]:  # noqa: ANN401
         """Send it the next tick, with a process in charge."""
         self.tick += 1
-        self.last = sense_in(cell, self.tick, attendant=attendant, **more)
+        self.last = sense_in(cell, self.tick, incarnation=attendant, **more)
         return self.rig.hand(SENSE, self.last)
 
     def repeat(self) -> list[Effect]:
@@ -92,14 +91,14 @@ class Seat:
     ) -> list[Effect]:
         """Show it within the tick what the controller has noted, for the one in charge."""
         if attendant is None:
-            attendant = self.last.attendant
-        noted = replace(self.last, accepted=accepted, joined=joined, attendant=attendant)
+            attendant = self.last.record.incarnation
+        noted = changed(self.last, accepted=accepted, joined=joined, incarnation=attendant)
         return self.rig.hand(SENSE, noted)
 
     def take_charge(self, joined: tuple[int, ...] = (0,)) -> None:
         for _ in range(2):
             self.feel(1, joined=joined)
-        assert self.shown.incarnation == 1
+        assert self.shown.record.incarnation == 1
 
     def prepare(self, *formations: int, ballot: Ballot = BALLOT) -> list[Effect]:
         return self.rig.hand(PREPARE, Prepare(ballot, formations or (0,), (ME, OTHER)))
@@ -132,15 +131,15 @@ def test_the_first_answer_is_a_claim_and_states_follow_once_a_sense_grants_it() 
     effects = seat.feel(0)
     assert kinds(effects) == [Command]
     command = command_of(effects)
-    assert (command.incarnation, command.tick, command.hold_cell) == (1, 1, HOME)
+    assert (command.record.incarnation, command.tick, command.hold_cell) == (1, 1, HOME)
     assert seat.repeat() == effects
     assert not seat.agent.in_charge
     effects = seat.feel(1)
     assert seat.agent.in_charge
     assert kinds(effects) == [Command, VehicleState]
-    assert (seat.shown.incarnation, seat.shown.attended) == (1, True)
+    assert (seat.shown.record.incarnation, seat.shown.attended) == (1, True)
     assert kinds(seat.prepare()) == [VehicleState]
-    assert seat.shown.promised == BALLOT
+    assert seat.shown.record.promised == BALLOT
     assert kinds(seat.repeat()) == [Command]  # the state is not published again
 
 
@@ -156,7 +155,7 @@ def test_it_promises_and_accepts_nothing_before_it_is_in_charge() -> None:
     assert effects() == []
     assert wanted(seat) == ()
     seat.feel(1)
-    assert (seat.shown.promised, seat.shown.accepted) == (None, False)
+    assert (seat.shown.record.promised, seat.shown.accepted) == (None, False)
 
 
 def test_v1_is_repeated_while_a_claim_is_under_way() -> None:
@@ -175,8 +174,8 @@ def test_a_motion_and_joined_formations_are_taken_over_with_the_charge() -> None
     seat = Seat()
     seat.driver.resting = False
     for attendant in (0, 1):
-        assert command_of(seat.feel(attendant, joined=(0, 3))).joined == (0, 3)
-    assert (seat.shown.moving, seat.shown.joined) == (True, (0, 3))
+        assert command_of(seat.feel(attendant, joined=(0, 3))).record.joined == (0, 3)
+    assert (seat.shown.moving, seat.shown.record.joined) == (True, (0, 3))
     seat.driver.resting = True
     seat.feel(1, joined=(0, 3))
     assert (seat.shown.moving, seat.shown.completed) == (False, 0)
@@ -210,14 +209,18 @@ def test_superseded_by_the_caretaker_it_claims_with_a_new_incarnation_and_no_mem
     caretaker = seat.rig.new_incarnation()
     effects = seat.feel(caretaker, caretaker=True)
     assert kinds(effects) == [Command]
-    assert command_of(effects).incarnation == 3 > caretaker
+    assert command_of(effects).record.incarnation == 3 > caretaker
     assert seat.prepare(ballot=BALLOT._replace(seq=2)) == []
     assert seat.plan(incarnation=3) == []
     assert kinds(seat.feel(3)) == [Command, VehicleState]
-    assert (seat.shown.incarnation, seat.shown.promised, seat.shown.accepted) == (3, None, False)
+    assert (seat.shown.record.incarnation, seat.shown.record.promised, seat.shown.accepted) == (
+        3,
+        None,
+        False,
+    )
     seat.prepare()
     assert seat.plan() == []  # for the incarnation that promised long ago
-    assert command_of(seat.plan(incarnation=3)).accepted == BALLOT
+    assert command_of(seat.plan(incarnation=3)).record.accepted == BALLOT
     seat.note()
     assert seat.shown.accepted
 
@@ -227,12 +230,15 @@ def test_a_caretaker_with_the_same_incarnation_is_superseded() -> None:
     seat = Seat()
     seat.take_charge()
     seat.prepare()
-    effects = seat.feel(seat.shown.incarnation, caretaker=True)
+    effects = seat.feel(seat.shown.record.incarnation, caretaker=True)
     assert kinds(effects) == [Command]
     claim = command_of(effects)
-    assert claim.incarnation > seat.shown.incarnation
-    assert kinds(seat.feel(claim.incarnation)) == [Command, VehicleState]
-    assert (seat.shown.incarnation, seat.shown.promised) == (claim.incarnation, None)
+    assert claim.record.incarnation > seat.shown.record.incarnation
+    assert kinds(seat.feel(claim.record.incarnation)) == [Command, VehicleState]
+    assert (seat.shown.record.incarnation, seat.shown.record.promised) == (
+        claim.record.incarnation,
+        None,
+    )
 
 
 def test_a_lost_claim_is_repeated_with_the_same_incarnation_and_without_old_promises() -> None:
@@ -241,8 +247,8 @@ def test_a_lost_claim_is_repeated_with_the_same_incarnation_and_without_old_prom
     seat.prepare(0, 1)
     caretaker = seat.rig.new_incarnation()
     claims = [command_of(seat.feel(caretaker, caretaker=True)) for _ in range(3)]
-    assert [(claim.incarnation, claim.tick) for claim in claims] == [(3, 3), (3, 4), (3, 5)]
-    assert {claim.joined for claim in claims} == {(0,)}
+    assert [(claim.record.incarnation, claim.tick) for claim in claims] == [(3, 3), (3, 4), (3, 5)]
+    assert {claim.record.joined for claim in claims} == {(0,)}
 
 
 def test_it_ends_with_its_vehicle_whatever_process_is_in_charge() -> None:
@@ -263,7 +269,7 @@ def taken() -> Seat:
     seat.take_charge()
     seat.prepare()
     (command,) = sent(seat.repeat(), Command)
-    assert sent(seat.plan(), Command) == [replace(command, accepted=BALLOT)]  # the same motion
+    assert sent(seat.plan(), Command) == [changed(command, accepted=BALLOT)]  # the same motion
     return seat
 
 
@@ -271,7 +277,7 @@ def test_an_acceptance_is_requested_at_once_and_published_when_noted() -> None:
     seat = taken()
     assert kinds(seat.repeat()) == [Command]  # a SENSE from before it was noted
     assert kinds(seat.feel(1)) == [Command, VehicleState]
-    assert (seat.shown.promised, seat.shown.accepted) == (BALLOT, False)
+    assert (seat.shown.record.promised, seat.shown.accepted) == (BALLOT, False)
     assert kinds(seat.note()) == [VehicleState, Command]
     assert (seat.shown.accepted, seat.shown.ready) == (True, True)
     assert kinds(seat.note()) == [Command]  # once
@@ -300,7 +306,7 @@ def test_a_higher_promise_cancels_a_requested_note() -> None:
     seat = taken()
     effects = seat.prepare(ballot=BALLOT._replace(seq=2))
     assert kinds(effects) == [Command, VehicleState]
-    assert command_of(effects).accepted is None
+    assert command_of(effects).record.accepted is None
     seat.note()
     seat.feel(1, accepted=BALLOT)
     assert not seat.shown.accepted
@@ -314,18 +320,18 @@ def test_a_joint_plan_is_accepted_once_the_controller_has_confirmed_its_formatio
     seat.take_charge()
     asked = seat.prepare(0, 1)
     assert kinds(asked) == [Command, VehicleState]
-    assert command_of(asked).joined == (0, 1)
-    assert (seat.shown.promised, seat.shown.joined) == (BALLOT, (0,))
+    assert command_of(asked).record.joined == (0, 1)
+    assert (seat.shown.record.promised, seat.shown.record.joined) == (BALLOT, (0,))
     assert kinds(seat.prepare(0, 1)) == [VehicleState]  # it has asked already
     assert seat.plan(0, 1) == []
-    assert command_of(seat.feel(1)).joined == (0, 1)
+    assert command_of(seat.feel(1)).record.joined == (0, 1)
     assert seat.plan(0, 1) == []
     assert kinds(seat.note(None, joined=(0, 1))) == [VehicleState, Command]
-    assert (seat.shown.joined, seat.shown.accepted) == ((0, 1), False)
+    assert (seat.shown.record.joined, seat.shown.accepted) == ((0, 1), False)
     assert kinds(seat.repeat()) == [Command]  # an older one that comes late takes nothing back
     seat.plan(0, 1)
     seat.note(joined=(0, 1))
-    assert (seat.shown.joined, seat.shown.accepted) == ((0, 1), True)
+    assert (seat.shown.record.joined, seat.shown.accepted) == ((0, 1), True)
     assert wanted(seat) == (0, 1)
 
 

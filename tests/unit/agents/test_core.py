@@ -20,7 +20,7 @@ from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.messages import Command, Name, Neighbour, Prepare, Report
 from support.agent_rig import HOME, ME, MOVE_TICKS, OTHER, SCENARIO, TICK_S, Rig, up_and_running
 from support.closed_lanes import DROP
-from support.states import BALLOT, holding, make_plan, sent
+from support.states import BALLOT, changed, holding, make_plan, sent
 
 BOTH: dict[Name, Cell] = {ME: HOME, OTHER: (0, 0)}
 
@@ -42,10 +42,10 @@ def test_starts_with_its_own_topics_and_the_token_last() -> None:
 
 def test_the_state_contains_measurements_and_the_block_of_entry() -> None:
     rig = Rig()
-    sense = replace(rig.sense(), formation=5, joined=(5, 6))
+    sense = changed(rig.sense(), formation=5, joined=(5, 6))
     rig.hand(topics.SENSE, sense)
     rig.coast(1)
-    sense = replace(rig.sense(), formation=5, joined=(5, 6), attendant=1)
+    sense = changed(rig.sense(), formation=5, joined=(5, 6), incarnation=1)
     command, state = (each for each in rig.hand(topics.SENSE, sense) if isinstance(each, node.Send))
     assert (command.topic, command.parameters) == (topics.COMMAND, {"vehicle": ME})
     assert (state.topic, state.parameters) == (topics.STATE, {"formation": 5, "vehicle": ME})
@@ -81,7 +81,7 @@ def test_answers_each_tick_once_and_repeats_are_the_same_bytes() -> None:
     assert [e.topic for e in effects if isinstance(e, node.Send)] == [topics.COMMAND, topics.STATE]
     (command,) = sent(effects, Command)
     assert (command.tick, command.hold_cell, command.motion_end_tick) == (2, HOME, 0)
-    assert (command.incarnation, command.joined) == (1, (0,))
+    assert (command.record.incarnation, command.record.joined) == (1, (0,))
     for _ in range(3):
         assert rig.hand(topics.SENSE, replace(sense, setpoint=(9.0, 9.0))) == [
             node.Send(topics.COMMAND, command, {"vehicle": ME})
@@ -105,14 +105,14 @@ def test_an_agent_starts_anew_on_the_road_of_a_newer_bridge() -> None:
     old = replace(rig.sense(), tick=late, t_s=late * TICK_S)
     first = Rig().sense()  # of the next road: tick 0, and no process is in charge yet
     (claim,) = sent(rig.hand(topics.SENSE, replace(first, bridge=7)), Command)
-    assert (claim.tick, claim.incarnation, claim.hold_cell) == (0, 2, HOME)
+    assert (claim.tick, claim.record.incarnation, claim.hold_cell) == (0, 2, HOME)
     assert not rig.agent.in_charge
     # A message of the earlier bridge may still be on its way, and its tick is higher.
     assert rig.hand(topics.SENSE, old) == []
-    granted = replace(first, bridge=7, tick=1, t_s=TICK_S, attendant=2)
+    granted = changed(first, bridge=7, tick=1, t_s=TICK_S, incarnation=2)
     rig.hand(topics.SENSE, granted)
     state = rig.shown[-1]
-    assert (state.incarnation, state.promised, state.accepted) == (2, None, False)
+    assert (state.record.incarnation, state.record.promised, state.accepted) == (2, None, False)
     assert rig.hand(topics.SENSE, replace(old, left=True)) == []
     assert not rig.agent.ended
 
@@ -123,11 +123,11 @@ def test_a_lost_note_is_requested_again_with_each_tick() -> None:
     plan = make_plan({ME: HOME}, {ME: ((0, HOME, (-1, 2)),)})
     (asked,) = sent(rig.hand(topics.PLAN, plan), Command)  # it is lost
     assert rig.played is not None
-    assert asked == replace(rig.played, accepted=BALLOT)  # the same motion
+    assert asked == changed(rig.played, accepted=BALLOT)  # the same motion
     for _ in range(3):
         effects = rig.hand(topics.SENSE, rig.sense())
         (command,) = sent(effects, Command)
-        assert (command.accepted, command.hold_cell) == (BALLOT, HOME)
+        assert (command.record.accepted, command.hold_cell) == (BALLOT, HOME)
         assert not rig.shown[-1].accepted
         assert rig.hand(topics.PLAN, plan) == []  # it has asked already
         rig.coast(1)
@@ -208,7 +208,7 @@ def test_restart_takes_the_motion_over(silent_ticks: int) -> None:
     command = rig.claim()
     assert (command.hold_cell, command.motion_end_tick > rig.tick) == ((0, 2), under_way)
     state = rig.run()
-    assert (state.incarnation, state.promised, state.hold_cell) == (2, None, (0, 2))
+    assert (state.record.incarnation, state.record.promised, state.hold_cell) == (2, None, (0, 2))
     assert state.moving == under_way
     if under_way:
         assert rig.controller.motion_origin == HOME
@@ -247,7 +247,11 @@ def test_without_a_cell_it_begins_anew_and_only_keeps_its_claim() -> None:
         (command,) = sent(effects, Command)
         assert controller.accept_command(command)
         # What the earlier process has promised and accepted is void for this one.
-        assert (command.incarnation, command.jerks, command.accepted) == (2, b"", None)
+        assert (command.record.incarnation, command.jerks, command.record.accepted) == (
+            2,
+            b"",
+            None,
+        )
         assert rig.agent.wanted_motions == ()
         # Requests for promises and plans have no effect now.
         plan = make_plan({ME: HOME}, {ME: ((0, HOME, (-1, 2)),)})
@@ -258,7 +262,7 @@ def test_without_a_cell_it_begins_anew_and_only_keeps_its_claim() -> None:
     controller.enter_lattice([there])
     rig.coast(1)
     (command,) = sent(rig.hand(topics.SENSE, rig.sense()), Command)
-    assert (command.hold_cell, command.incarnation) == (there, 2)
+    assert (command.hold_cell, command.record.incarnation) == (there, 2)
     assert rig.shown[-1].hold_cell == there
     assert rig.agent.in_charge
 
@@ -276,7 +280,7 @@ def test_it_begins_anew_if_its_vehicle_has_entered_the_lattice_again_unseen() ->
     for _ in range(2):
         (command,) = sent(rig.hand(topics.SENSE, rig.sense()), Command)
         assert controller.accept_command(command)
-        assert (command.hold_cell, command.incarnation) == (there, 2)
+        assert (command.hold_cell, command.record.incarnation) == (there, 2)
         rig.coast(1)
     assert rig.agent.in_charge
     assert rig.shown[-1].hold_cell == there

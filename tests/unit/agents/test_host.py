@@ -58,7 +58,7 @@ def feel(
     **more: Any,  # noqa: ANN401 (fields)
 ) -> list[node.Effect]:
     """Send a vehicle its SENSE; its agent is in charge, unless another attendant is given."""
-    felt = sense_in(cell, tick, vehicle=vehicle, **({"attendant": 1} | more))
+    felt = sense_in(cell, tick, vehicle=vehicle, **({"incarnation": 1} | more))
     return hand(host, topics.SENSE, vehicle, felt)
 
 
@@ -99,7 +99,7 @@ def test_events_go_to_the_vehicle_that_they_concern() -> None:
     assert [each.vehicle for each in sent(effects, VehicleState)] == [B]
     feel(host, A)
     effects = hand(host, topics.PREPARE, A, Prepare(BALLOT, (0,), (A, B)))
-    assert [(s.vehicle, s.promised) for s in sent(effects, VehicleState)] == [(A, BALLOT)]
+    assert [(s.vehicle, s.record.promised) for s in sent(effects, VehicleState)] == [(A, BALLOT)]
     assert feel(host, C) == []
 
 
@@ -144,7 +144,7 @@ def test_an_agent_that_lost_charge_waits_for_no_states() -> None:
     host = make_host(A)
     feel(host, A)
     assert node.Listen(*STATES_OF_0) in accept(host, {A: FRONT, B: SIDE})
-    effects = feel(host, A, FRONT, 2, attendant=9)
+    effects = feel(host, A, FRONT, 2, incarnation=9)
     assert [e for e in effects if getattr(e, "topic", None) is not topics.MOTION] == [
         node.Unlisten(*STATES_OF_0)
     ]

@@ -31,7 +31,7 @@ from laneweave.protocol.wire.topics import (
 )
 from support.paper import PAPER
 from support.service_desk import T_S, Desk, census, state
-from support.states import A, B
+from support.states import A, B, changed
 
 HUGE = 2**63 - 1
 HIGH = Ballot(HUGE, Name("zz"), HUGE, HUGE)
@@ -109,7 +109,7 @@ def beat(term: int = 1, incarnation: int = 1, name: str = "c2") -> Heartbeat:
         (HEARTBEAT, lambda _: beat(incarnation=HUGE)),
         (STATE, lambda _: state(A, promised=HIGH)),
         (STATE, lambda _: state(A, t_s=1e12)),
-        (STATE, lambda _: replace(state(A), incarnation=2**62)),
+        (STATE, lambda _: changed(state(A), incarnation=2**62)),
     ],
 )  # fmt: skip
 def test_impossible_numbers_change_nothing(topic: Topic, make: Callable[[Road], object]) -> None:
@@ -172,7 +172,7 @@ def test_a_state_that_its_vehicle_does_not_show_is_forgotten(changes: dict[str, 
     road = Road()
     for vehicle, cell in CELLS.items():
         road.send(STATE, state(vehicle, cell, t_s=road.t_s))
-    road.send(STATE, replace(state(A, CELLS[A], t_s=road.t_s), **changes))
+    road.send(STATE, changed(state(A, CELLS[A], t_s=road.t_s), **changes))
     for _ in range(round(FORGET_S / 0.1) + 2):
         road.drive(0.1)
         for vehicle, cell in CELLS.items():

@@ -68,7 +68,7 @@ from laneweave.protocol.wire.topics import (
 )
 from support.paper import PAPER
 from support.service_desk import T_S, Cells, Desk, census, jobs, leading, logged, messages, state
-from support.states import A, B, C, D, E, F
+from support.states import A, B, C, D, E, F, changed
 
 # --- starting, bridges, election --------------------------------------------------------------
 
@@ -149,8 +149,8 @@ def test_states_of_vehicles_that_the_census_does_not_list_are_ignored() -> None:
     theirs = Ballot(4, Name("c9"), 3, 2)
     for stranger in (
         state(C, (0, 0), theirs, joined=(0, 1)),
-        replace(state(A, (0, 0), theirs, joined=(0, 1)), formation=1),
-        replace(state(B, (-5, 0), theirs, joined=(0, 1)), formation=0),
+        changed(state(A, (0, 0), theirs, joined=(0, 1)), formation=1),
+        changed(state(B, (-5, 0), theirs, joined=(0, 1)), formation=0),
     ):
         desk.tell(stranger)
     assert set(desk.leaders) == {0, 1}  # not joined
@@ -397,7 +397,7 @@ def test_cells_that_cannot_be_planned_from_do_not_stop_the_coordinator(cell: Cel
     desk = leading({A: (0, 0), B: (-1, 1)})
     desk.tell(state(A))
     desk.tell(state(B))
-    desk.tell(replace(state(A, promised=desk.ballot, t_s=1.0), hold_cell=cell))
+    desk.tell(changed(state(A, promised=desk.ballot, t_s=1.0), hold_cell=cell))
     (job,) = jobs(desk.tell(state(B, (-1, 1), desk.ballot, t_s=1.0)))
     assert logged(desk.give(run_job(job))) == ["planning-failed"]
 

@@ -43,7 +43,7 @@ from support.bridge_bench import (
     read_events,
     read_summary,
 )
-from support.states import BALLOT, jerks, make_plan, sent
+from support.states import BALLOT, jerks, make_plan, sent, set_record
 
 SCENARIO = make_scenario()
 TICK_S, SILENT_S = SCENARIO.runtime.tick_s, SCENARIO.runtime.agent_silent_s
@@ -101,13 +101,13 @@ def listening(effects: Iterable[Effect]) -> list[Effect]:
 
 
 def test_the_first_agent_is_in_charge_with_its_first_command(desk: Desk) -> None:
-    assert desk.core.vehicles[B].controller.attendant == 0
+    assert desk.core.vehicles[B].controller.record.incarnation == 0
     desk.answer(B, incarnation=AGENT)
     next_tick(desk, A)
     sense = sensed(desk, B)
     block = SCENARIO.lattice.block_of(sense.hold_cell[0])
-    assert (sense.attendant, sense.caretaker) == (AGENT, False)
-    assert (sense.formation, sense.joined) == (block, (block,))
+    assert (sense.record.incarnation, sense.caretaker) == (AGENT, False)
+    assert (sense.formation, sense.record.joined) == (block, (block,))
     assert read_events(desk.folder, "agent-took-over") == []
 
 
@@ -141,13 +141,13 @@ def test_what_is_new_to_the_controller_is_confirmed_at_once(attended: Desk) -> N
     block, tick = attended.core.vehicles[B].block, attended.core.tick
     effects = attended.answer(B, incarnation=AGENT, joined=(block + 1,), accepted=BALLOT)
     sense = sense_of(effects, B, tick)
-    assert (sense.joined, sense.accepted) == ((block, block + 1), BALLOT)
-    assert (sense.attendant, sense.caretaker) == (AGENT, False)
+    assert (sense.record.joined, sense.record.accepted) == ((block, block + 1), BALLOT)
+    assert (sense.record.incarnation, sense.caretaker) == (AGENT, False)
     again = attended.answer(B, incarnation=AGENT, joined=(block + 1,), accepted=BALLOT)
     assert sent(again, Sense) == []  # the next tick confirms it
     next_tick(attended, A)
     sense = sensed(attended, B)
-    assert (sense.joined, sense.accepted) == ((block, block + 1), BALLOT)
+    assert (sense.record.joined, sense.record.accepted) == ((block, block + 1), BALLOT)
 
 
 def test_it_is_confirmed_at_once_whatever_the_tick_and_then_not_played(attended: Desk) -> None:
@@ -158,8 +158,8 @@ def test_it_is_confirmed_at_once_whatever_the_tick_and_then_not_played(attended:
     for tick, ballot in ((-1, BALLOT), (0, BALLOT._replace(seq=2))):
         late = {"incarnation": AGENT, "tick": attended.core.tick + tick, "accepted": ballot}
         effects = attended.answer(B, **late, hold_cell=(-1, 1), jerks=jerks((9.0, 0.0)))
-        assert sense_of(effects, B, attended.core.tick).accepted == ballot
-        attended.core.vehicles[B].controller.accepted = None
+        assert sense_of(effects, B, attended.core.tick).record.accepted == ballot
+        set_record(attended.core.vehicles[B].controller.store, accepted=None)
         assert attended.known(B) == before
 
 
@@ -167,7 +167,7 @@ def test_a_caretaker_inherits_no_acceptance(attended: Desk) -> None:
     attended.answer(B, incarnation=AGENT, accepted=BALLOT)
     attended.down(B)
     (state,) = sent(next_tick(attended, A), VehicleState)
-    assert (sensed(attended, B).accepted, state.accepted) == (None, False)
+    assert (sensed(attended, B).record.accepted, state.accepted) == (None, False)
     assert attended.answer(B, incarnation=AGENT, accepted=BALLOT) == []
 
 
@@ -186,11 +186,11 @@ def test_the_caretaker_takes_charge_when_the_agent_is_gone(attended: Desk) -> No
     attended.down(B)
     next_tick(attended, A)
     check_cared_for(attended, "absent")
-    attendant = sensed(attended, B).attendant
+    attendant = sensed(attended, B).record.incarnation
     assert attendant > AGENT
     for _ in range(5):  # once
         assert listening(next_tick(attended, A)) == []
-        assert sensed(attended, B).attendant == attendant
+        assert sensed(attended, B).record.incarnation == attendant
 
 
 def test_the_caretaker_takes_charge_when_the_agent_is_silent(attended: Desk) -> None:
@@ -231,7 +231,7 @@ def test_an_agent_that_claims_its_vehicle_is_present_without_a_token(tmp_path: P
     desk.start(A)
     desk.drive_to_entry(A, B)
     check_cared_for(desk, "absent")  # its agent never came
-    care = sensed(desk, B).attendant
+    care = sensed(desk, B).record.incarnation
     assert care == 10**9  # as for any process
     assert desk.answer(B, incarnation=care + 1) == CARE_OF_B_ENDS
     assert B in desk.core._answers.up
@@ -260,7 +260,7 @@ def test_caretakers_have_greater_incarnations_than_all_before(desk: Desk) -> Non
     desk.down(B)
     next_tick(desk, A)
     # Not just the next number: another process that steps above the agent may take that.
-    assert sensed(desk, B).attendant == above(5, 10**13) > 10**13
+    assert sensed(desk, B).record.incarnation == above(5, 10**13) > 10**13
 
 
 def test_there_are_no_caretakers_while_the_bridge_is_off_the_network(attended: Desk) -> None:
@@ -285,7 +285,7 @@ def ballot_for(desk: Desk) -> tuple[Prepare, Plan]:
     """Return a ballot for B alone, which only holds."""
     sense = desk.core.vehicles[B].sense(0, caretaker=True)
     prepare = Prepare(BALLOT, (sense.formation,), (B,))
-    incarnations = {B: sense.attendant}
+    incarnations = {B: sense.record.incarnation}
     plan = make_plan({B: sense.hold_cell}, formations=prepare.formations, incarnations=incarnations)
     return prepare, plan
 
@@ -297,15 +297,18 @@ def test_a_caretaker_shows_its_vehicle_at_each_tick(cared_for: Desk) -> None:
         state, vehicle = send.message, cared_for.core.vehicles[B]
         assert send.parameters == {"formation": vehicle.formation, "vehicle": B}
         assert (state.vehicle, state.attended, state.t_s) == (B, False, cared_for.core.t_s)
-        assert (state.incarnation, state.s_m) == (vehicle.controller.attendant, vehicle.state[0])
+        assert (state.record.incarnation, state.s_m) == (
+            vehicle.controller.record.incarnation,
+            vehicle.state[0],
+        )
 
 
 def test_a_caretaker_promises_and_accepts_at_once(cared_for: Desk) -> None:
     prepare, plan = ballot_for(cared_for)
     (state,) = sent(cared_for.give(Arrived(PREPARE, OF_B, prepare)), VehicleState)
-    assert (state.promised, state.accepted) == (prepare.ballot, False)
+    assert (state.record.promised, state.accepted) == (prepare.ballot, False)
     (state,) = sent(cared_for.give(Arrived(PLAN, OF_B, plan)), VehicleState)
-    assert (state.promised, state.accepted) == (prepare.ballot, True)
+    assert (state.record.promised, state.accepted) == (prepare.ballot, True)
 
 
 def test_the_bridge_publishes_no_state_of_a_vehicle_with_an_agent(attended: Desk) -> None:
@@ -335,14 +338,14 @@ def test_an_agent_that_was_silent_takes_its_vehicle_back(attended: Desk) -> None
 
 
 def check_takes_back(desk: Desk) -> None:
-    care = sensed(desk, B).attendant
+    care = sensed(desk, B).record.incarnation
     before = desk.known(B)
     assert desk.answer(B, incarnation=AGENT) == []  # it does not know yet
     assert desk.known(B) == before
     assert desk.answer(B, incarnation=care + 1) == CARE_OF_B_ENDS
     next_tick(desk, A)
     sense = sensed(desk, B)
-    assert (sense.attendant, sense.caretaker) == (care + 1, False)
+    assert (sense.record.incarnation, sense.caretaker) == (care + 1, False)
     (event,) = read_events(desk.folder, "agent-took-over")
     assert (event["vehicle"], event["previous"]) == (B, "caretaker")
     desk.give(Stopping())
@@ -372,14 +375,14 @@ def test_the_next_caretaker_remembers_the_joined_formations_only(cared_for: Desk
     prepare, _ = ballot_for(cared_for)
     both = (prepare.formations[0], prepare.formations[0] + 1)
     cared_for.give(Arrived(PREPARE, OF_B, replace(prepare, formations=both)))
-    first = cared_for.core.vehicles[B].controller.attendant
+    first = cared_for.core.vehicles[B].controller.record.incarnation
     cared_for.up(B)
     next_tick(cared_for, A)
     cared_for.answer(B)
     cared_for.down(B)
     (state,) = sent(next_tick(cared_for, A), VehicleState)
-    assert (state.promised, state.joined) == (None, both)
-    assert state.incarnation > first
+    assert (state.record.promised, state.record.joined) == (None, both)
+    assert state.record.incarnation > first
 
 
 # --- leaving ----------------------------------------------------------------------------------
@@ -448,9 +451,9 @@ def test_a_claim_near_the_limit_leaves_room_for_successors(attended: Desk) -> No
     """A forged claim that is possible takes charge; the caretaker and the agent follow it."""
     limit = DAY_NS
     attended.answer(B, incarnation=limit)
-    assert attended.core.vehicles[B].controller.attendant == limit
+    assert attended.core.vehicles[B].controller.record.incarnation == limit
     attended.drive(lambda: B in attended.core._attendance, B)
-    caretaker = attended.core.vehicles[B].controller.attendant
+    caretaker = attended.core.vehicles[B].controller.record.incarnation
     assert caretaker > limit
     attended.drive_to(attended.core.tick + 1, B)
     attended.answer(B, incarnation=above(5, caretaker))
@@ -461,4 +464,6 @@ def test_a_caretaker_promises_no_ballot_of_an_impossible_term(cared_for: Desk) -
     for ballot, promised in ((HIGH, False), (BALLOT, True)):
         prepare = Prepare(ballot, (0,), (B,))
         effects = cared_for.give(Arrived(PREPARE, {"vehicle": B}, prepare))
-        assert [state.promised for state in sent(effects, VehicleState)] == [ballot] * promised
+        assert [state.record.promised for state in sent(effects, VehicleState)] == [
+            ballot
+        ] * promised

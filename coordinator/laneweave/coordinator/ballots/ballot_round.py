@@ -92,7 +92,7 @@ class BallotRound:
     @property
     def incarnations(self) -> dict[Name, int]:
         """Incarnation of the process that promised for each vehicle."""
-        return {name: self.promises[name].incarnation for name in self.roster}
+        return {name: self.promises[name].record.incarnation for name in self.roster}
 
     def make_plan(
         self,
@@ -154,7 +154,9 @@ _WITHOUT_TIMER = (BallotPhase.PLANNING, BallotPhase.IN_FORCE, BallotPhase.ABORTE
 def has_higher_promise(round_: BallotRound, state: VehicleState) -> bool:
     """The vehicle has promised a ballot above b."""
     ballot = round_.ballot
-    return ballot is not None and state.promised is not None and state.promised > ballot
+    return (
+        ballot is not None and state.record.promised is not None and state.record.promised > ballot
+    )
 
 
 def had_promised(round_: BallotRound, state: VehicleState) -> bool:
@@ -165,12 +167,12 @@ def had_promised(round_: BallotRound, state: VehicleState) -> bool:
 def restarted(round_: BallotRound, state: VehicleState) -> bool:
     """No promise from the reported incarnation is on record."""
     promise = round_.promises.get(state.vehicle)
-    return promise is None or promise.incarnation != state.incarnation
+    return promise is None or promise.record.incarnation != state.record.incarnation
 
 
 def is_promise(round_: BallotRound, state: VehicleState) -> bool:
     """The vehicle has promised but not accepted b."""
-    return state.promised == round_.ballot and not state.accepted
+    return state.record.promised == round_.ballot and not state.accepted
 
 
 def count_promise(round_: BallotRound, state: VehicleState) -> None:
@@ -205,7 +207,7 @@ def issue(round_: BallotRound, plan: Plan) -> None:
 
 def is_acceptance(round_: BallotRound, state: VehicleState) -> bool:
     """The vehicle has accepted b."""
-    return state.promised == round_.ballot and state.accepted
+    return state.record.promised == round_.ballot and state.accepted
 
 
 def is_last(round_: BallotRound, state: VehicleState) -> bool:
@@ -241,12 +243,12 @@ def age(state: VehicleState) -> tuple[object, ...]:
     States sent between two ticks have equal times. Their order follows from the promise and the
     acceptance, which are never undone.
     """
-    transfer = state.transfer
+    transfer = state.record.transfer
     return (
-        state.incarnation,
+        state.record.incarnation,
         state.t_s,
-        state.promised or (),
-        bool(state.owned),
+        state.record.promised or (),
+        bool(state.record.owned),
         state.accepted,
         (transfer.ballot, transfer.open) if transfer is not None else (),
     )

@@ -113,8 +113,8 @@ class FormationLeader(BallotRound):
         """Handle the state of a member (L2, L4, L6, L7, L8)."""
         if self._is_news(state, now_s):
             self.states[state.vehicle] = state
-            if state.promised is not None:
-                self.highest = max(self.highest or state.promised, state.promised)
+            if state.record.promised is not None:
+                self.highest = max(self.highest or state.record.promised, state.record.promised)
             self.take(STATE, now_s, state)
 
     def on_plan(self, plan: Plan, now_s: float, out_of_reach: Iterable[Name] = ()) -> None:
@@ -149,14 +149,14 @@ def all_have_reported(leader: FormationLeader, _: object) -> bool:
 def one_plan_is_in_force(leader: FormationLeader, _: object) -> bool:
     """All members have accepted the same ballot, and none is overdue."""
     states = [leader.states[name] for name in leader.roster]
-    return len({state.promised for state in states}) == 1 and all(
+    return len({state.record.promised for state in states}) == 1 and all(
         state.accepted and not state.overdue for state in states
     )
 
 
 def adopt(leader: FormationLeader, _: object) -> None:
     """Adopt the plan: send nothing, monitor states."""
-    leader.ballot = next(iter(leader.states.values())).promised
+    leader.ballot = next(iter(leader.states.values())).record.promised
     # The promises were given to another leader; acceptance implies a promise.
     leader.promises = dict(leader.states)
     leader.back_offs = 0
@@ -188,7 +188,7 @@ def back_off(leader: FormationLeader, _: object) -> None:
 
 def has_joined(leader: FormationLeader, state: VehicleState) -> bool:
     """The vehicle has joined exactly the blocks of b."""
-    return state.joined == leader.formation.numbers
+    return state.record.joined == leader.formation.numbers
 
 
 def void_promise(leader: FormationLeader, state: VehicleState) -> None:

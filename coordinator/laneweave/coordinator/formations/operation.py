@@ -73,7 +73,7 @@ class FormationsOperation:
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry]:
         """Pass the state to the leader of its formation."""
         # Formations stay joined under any leader.
-        self._groups.join((state.formation, *state.joined))
+        self._groups.join((state.formation, *state.record.joined))
         group = self._groups.of(state.formation)
         leader = self.leaders.get(group[0])
         if leader is None or leader.formation.numbers != group:

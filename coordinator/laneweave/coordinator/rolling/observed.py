@@ -121,7 +121,7 @@ class ObservedRoad:
 
 def _is_older(state: VehicleState, other: VehicleState) -> bool:
     """Return whether a state was sent earlier than another one of the same vehicle."""
-    if state.incarnation == other.incarnation and state.t_s != other.t_s:
+    if state.record.incarnation == other.record.incarnation and state.t_s != other.t_s:
         return state.t_s < other.t_s  # as `age`, which takes longer
     return age(state) < age(other)
 
@@ -133,7 +133,7 @@ def _at(t_s: float, newest: _Message | None, before: _Message | None) -> _Messag
 
 def _gone(states: Iterable[VehicleState], census: Census | None) -> frozenset[Name]:
     listed = {entry.vehicle for entry in census.on_lattice} if census else set[Name]()
-    transfers = [state.transfer for state in states if state.transfer is not None]
+    transfers = [state.record.transfer for state in states if state.record.transfer is not None]
     return frozenset(
         name for transfer in transfers for name in transfer.roster if name not in listed
     )

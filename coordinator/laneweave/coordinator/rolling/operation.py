@@ -118,8 +118,8 @@ class RollingOperation:
         """Handle the state of a vehicle; return None if no unfinished ballot depends on it."""
         if not self.observed.on_state(state, now_s):
             return None
-        if state.promised is not None:
-            self._highest = max(self._highest or state.promised, state.promised)
+        if state.record.promised is not None:
+            self._highest = max(self._highest or state.record.promised, state.record.promised)
         transfer = self._transfer_of.get(state.vehicle)
         if transfer is None or not transfer.unfinished:
             return None
@@ -213,11 +213,13 @@ class RollingOperation:
             late = state.go and not state.done and not state.moving
             owned |= certain_cells(state, snapshot.states, snapshot.gone)
             if late or entry.vehicle in gated:
-                reserved |= {*state.owned} - {state.hold_cell}
+                reserved |= {*state.record.owned} - {state.hold_cell}
             elif entry.ready_s > slot * self._slot_s:
                 # It may still be beside these cells.
                 column, lane = state.hold_cell
-                reserved |= {cell for cell in state.owned if cell[1] == lane and cell[0] > column}
+                reserved |= {
+                    cell for cell in state.record.owned if cell[1] == lane and cell[0] > column
+                }
             settles = entry.ready_s > (slot - 1) * self._slot_s
             held = late or not state.attended or state.t_s < since_s
             held = held or (self._is_displaced(state) and not settles)

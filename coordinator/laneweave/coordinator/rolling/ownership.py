@@ -35,9 +35,9 @@ def owned_cells(
     Returns:
         None: not known yet.
     """
-    transfer = state.transfer
+    transfer = state.record.transfer
     if transfer is None or not transfer.undecided:
-        return frozenset(state.owned)
+        return frozenset(state.record.owned)
     before, after = frozenset(transfer.before), frozenset(transfer.after)
     signs = _signs(state, transfer, states, gone)
     if _Sign.OPEN in signs:
@@ -53,7 +53,7 @@ def certain_cells(
     state: VehicleState, states: States, gone: Collection[Name] = ()
 ) -> frozenset[Cell]:
     """Return the cells that a vehicle owns whether or not its pending transfer opens."""
-    owned, transfer = owned_cells(state, states, gone), state.transfer
+    owned, transfer = owned_cells(state, states, gone), state.record.transfer
     if owned is not None or transfer is None:
         return owned or frozenset()
     return frozenset(transfer.before) & frozenset(transfer.after)
@@ -61,7 +61,7 @@ def certain_cells(
 
 def partners(state: VehicleState, states: States) -> frozenset[Name]:
     """Return the vehicles whose promises determine what a vehicle owns; none if that is known."""
-    transfer = state.transfer
+    transfer = state.record.transfer
     if transfer is None or not transfer.undecided:
         return frozenset()
     signs = _signs(state, transfer, states, ())
@@ -94,7 +94,7 @@ def _signs(
 def _sign(state: VehicleState | None, transfer: PendingTransfer) -> _Sign:
     if state is None:
         return _Sign.NONE
-    theirs = state.transfer
+    theirs = state.record.transfer
     if theirs is not None and theirs.ballot > transfer.ballot:
         return _Sign.NEWER
     if theirs is not None and theirs.withdrawn and theirs.ballot == transfer.ballot:
@@ -103,7 +103,11 @@ def _sign(state: VehicleState | None, transfer: PendingTransfer) -> _Sign:
         theirs = None  # of an earlier plan
     if theirs is not None and theirs.open:
         return _Sign.OPEN
-    if state.promised is None or state.promised <= transfer.ballot or not state.owned:
+    if (
+        state.record.promised is None
+        or state.record.promised <= transfer.ballot
+        or not state.record.owned
+    ):
         return _Sign.NONE
     if theirs is None:
         return _Sign.NEVER_READY  # it has not accepted the plan

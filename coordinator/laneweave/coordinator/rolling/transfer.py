@@ -109,7 +109,7 @@ class CellTransfer(BallotRound):
 
 def reports_owned_cells(_: CellTransfer, state: VehicleState) -> bool:
     """The state reports owned cells: the controller has stored the promise."""
-    return bool(state.owned)
+    return bool(state.record.owned)
 
 
 def record_outbid(transfer: CellTransfer, _: object) -> None:

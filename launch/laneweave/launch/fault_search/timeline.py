@@ -64,15 +64,17 @@ def _text_of(effect: Send) -> str | None:
                 "unattended": not state.attended,
             }
             marks = " ".join(mark for mark, is_set in flags.items() if is_set)
+            record = state.record
             return (
-                f"STATE of {state.vehicle}/{state.incarnation} promised {short(state.promised)} "
-                f"k={state.completed} at {state.hold_cell} joined {state.joined} {marks}"
+                f"STATE of {state.vehicle}/{record.incarnation} promised {short(record.promised)} "
+                f"k={state.completed} at {state.hold_cell} joined {record.joined} {marks}"
                 f"{_ownership(state)}"
             )
         case Command() as command:
+            record = command.record
             return (
-                f"COMMAND of {command.vehicle}/{command.incarnation} hold {command.hold_cell}"
-                f" joined {command.joined}"
+                f"COMMAND of {command.vehicle}/{record.incarnation} hold {command.hold_cell}"
+                f" joined {record.joined}"
             )
         case Prepare() as prepare:
             return (
@@ -95,9 +97,9 @@ def _text_of(effect: Send) -> str | None:
 
 def _ownership(state: VehicleState) -> str:
     """Return owned cells and newest transfer of a vehicle as text (rolling operation)."""
-    transfer = state.transfer
+    transfer = state.record.transfer
     if transfer is None:
-        return f" owns {list(state.owned)}" if state.owned else ""
+        return f" owns {list(state.record.owned)}" if state.record.owned else ""
     change = f"{list(transfer.after)} with {' '.join(transfer.roster)}"
     status = "open" if transfer.open else f"pending, then {change}"
-    return f" owns {list(state.owned)}, transfer {short(transfer.ballot)} {status}"
+    return f" owns {list(state.record.owned)}, transfer {short(transfer.ballot)} {status}"

@@ -265,7 +265,7 @@ def _plans(view: RoadView, leader: Coordinator | None) -> Plans:
     if not states:
         return Plans(in_force, None, None, None)
     # Vehicles own cells and transfer them only in the rolling operation.
-    if any(state.owned or state.transfer for state in states):
+    if any(state.record.owned or state.record.transfer for state in states):
         return Plans(in_force, "rolling", None, None)
     if view.census is None:
         return Plans(in_force, "formations", None, None)

@@ -113,7 +113,7 @@ class LiveRoad:
             "news": self._events.rows,
             "formations": [[one.number, one.rear, one.front] for one in formations.listed],
             "joined": formations.joined(
-                {state.joined for state in view.states.values()}, self.scenario.lattice
+                {state.record.joined for state in view.states.values()}, self.scenario.lattice
             ),
             "vehicles": [row.compact() for row in rows],
         }
@@ -206,7 +206,7 @@ class LiveRoad:
                 hold=None if self._lane_ends.has_passed(state.hold_cell, t_s) else state.hold_cell,
                 target=self._target_of(state),
                 flags=flags | OVERDUE * state.overdue,
-                owned=[cell for cell in state.owned if cell != state.hold_cell],
+                owned=[cell for cell in state.record.owned if cell != state.hold_cell],
                 vehicle_type=vehicle_type,
             )
         cell = state.hold_cell if state is not None else entry.cell if entry is not None else (0, 0)
@@ -228,6 +228,6 @@ class LiveRoad:
 
     def _target_of(self, state: VehicleState) -> Cell | None:
         """Return the last cell of the plan that a vehicle executes, or None if it is unknown."""
-        if state.promised is None or not state.accepted or state.done:
+        if state.record.promised is None or not state.accepted or state.done:
             return None
-        return self._targets.get(state.promised, {}).get(state.vehicle)
+        return self._targets.get(state.record.promised, {}).get(state.vehicle)

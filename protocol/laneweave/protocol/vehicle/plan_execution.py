@@ -16,6 +16,7 @@ from __future__ import annotations
 from enum import Enum
 
 from attrs import define, field
+from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
 from laneweave.protocol.state_machine import RuleBook, Transition
@@ -28,6 +29,7 @@ from laneweave.protocol.wire.messages import (
     Plan,
     Prepare,
     Sense,
+    VehicleRecord,
     VehicleState,
 )
 
@@ -64,16 +66,18 @@ GATE, TICK, REST, BODY = "tick (gate)", "tick (move)", "motion ends", "body out 
 class PlanExecution:
     """State machine of one vehicle: handles messages and ticks, and decides when moves begin.
 
-    The machine begins without a promise or a plan (V1). `hold_cell`, `moving`, `joined`, `owned`
-    and `stored_transfer` mirror the motion controller, which outlives this object.
+    The machine begins without a promise or a plan (V1). `hold_cell`, `moving` and `stored` mirror
+    the motion controller, which outlives this object.
     """
 
     vehicle: Name
     incarnation: int
     hold_cell: Cell
     lattice: Lattice
-    joined: tuple[int, ...]
-    """Blocks that plans must have (ascending), as stored by the motion controller."""
+    stored: VehicleRecord
+    """Record of the vehicle, as last reported; joined blocks are never removed."""
+    owns_cells: bool = False
+    """Whether vehicles own cells (rolling operation); otherwise formations own blocks."""
     moving: bool = False
     phase: ExecutionPhase = ExecutionPhase.FREE
     promised: Ballot | None = None
@@ -91,12 +95,8 @@ class PlanExecution:
     """Road time of the tick."""
     promise_stored: bool = False
     """Whether the motion controller has stored the promise; only then does it count."""
-    owned: frozenset[Cell] | None = None
-    """Cells that the vehicle owns, as stored by the controller; None: formations own blocks."""
     transfer: PendingTransfer | None = None
     """Transfer in the newest plan taken."""
-    stored_transfer: PendingTransfer | None = None
-    """Newest transfer that the controller has stored."""
     lane_ends: LaneEnds | None = None
     """Ends of lanes before the end of the road; None: there are none."""
     drivable: frozenset[Cell] | None = None
@@ -105,7 +105,7 @@ class PlanExecution:
 
     def __attrs_post_init__(self) -> None:
         """Request no additional blocks."""
-        self.wanted_joined = self.joined
+        self.wanted_joined = self.stored.joined
 
     def on_prepare(self, prepare: Prepare) -> bool:
         """V2: promise a ballot; return whether to publish the state at once."""
@@ -115,39 +115,38 @@ class PlanExecution:
         """V3: take the promised ballot's plan, once; return whether it was taken now.
 
         A plan that cannot be executed safely is never taken. A taken plan is accepted once the
-        motion controller has stored it for this process (`on_stored`).
+        motion controller has stored it for this process (`on_record`).
         """
         return self.rules.take(self, PLAN, plan) is not None
 
-    def on_stored(self, ballot: Ballot | None) -> bool:
-        """V3: accept the taken plan once it is stored; return whether it was accepted now."""
-        return self.rules.take(self, STORED, ballot) is not None
+    def on_record(self, record: VehicleRecord) -> bool:
+        """Copy what the controller stores; return whether to publish the state at once.
 
-    def on_joined(self, blocks: tuple[int, ...]) -> bool:
-        """Add the blocks that the controller reports as joined; return whether any is new.
-
-        Joined blocks are never removed, so an old report has no effect.
+        That is so if blocks are newly joined, the taken plan is stored, so that it is accepted now
+        (V3), or the promise is newly stored. A promise from an earlier process binds this one and
+        is treated like a PREPARE.
         """
-        if blocks == self.joined or set(blocks) <= set(self.joined):
-            return False
-        self.joined = tuple(sorted({*self.joined, *blocks}))
-        self.wanted_joined = tuple(sorted({*self.joined, *self.wanted_joined}))
-        return True
+        joined = self._joined_with(record)
+        changed = joined != self.stored.joined
+        if changed:
+            self.wanted_joined = tuple(sorted({*joined, *self.wanted_joined}))
+            self.stored = replace(self.stored, joined=joined)
+        changed |= self.rules.take(self, STORED, record) is not None
+        if self.owns_cells:
+            promised, before = record.promised, self.promise_stored
+            if promised is not None and promised != self.promised:
+                self.on_prepare(Prepare(promised, (), (self.vehicle,)))
+            self.promise_stored = promised == self.promised
+            changed |= self.promise_stored and not before
+        self.stored = record if record.joined == joined else replace(record, joined=joined)
+        return changed
 
-    def on_owned(self, sense: Sense) -> bool:
-        """Copy what the controller stores; return whether the promise is newly stored.
-
-        A promise from an earlier process binds this one and is treated like a PREPARE. No effect if
-        formations own blocks.
-        """
-        if self.owned is None:
-            return False
-        if sense.promised is not None and sense.promised != self.promised:
-            self.on_prepare(Prepare(sense.promised, (), (self.vehicle,)))
-        before = self.promise_stored
-        self.owned, self.stored_transfer = frozenset(sense.owned), sense.transfer
-        self.promise_stored = sense.promised == self.promised
-        return self.promise_stored and not before
+    def _joined_with(self, record: VehicleRecord) -> tuple[int, ...]:
+        """Return all joined blocks: none is ever removed, so an old report has no effect."""
+        known = self.stored.joined
+        if record.joined == known:
+            return known
+        return tuple(sorted({*known, *record.joined}))
 
     def on_state(self, state: VehicleState) -> None:
         """V4: record the progress of another member of the same plan."""
@@ -170,14 +169,15 @@ class PlanExecution:
         self.rules.take(self, BODY, None)
 
     @property
-    def wanted_accepted(self) -> Ballot | None:
-        """Ballot of the plan that the motion controller should store as accepted."""
-        return self.plan.ballot if self.plan is not None else None
-
-    @property
-    def wanted_promised(self) -> Ballot | None:
-        """Promise that the motion controller should store; None if formations own blocks."""
-        return self.promised if self.owned is not None else None
+    def wanted(self) -> VehicleRecord:
+        """Record that the motion controller should store; formations do not store promises."""
+        return VehicleRecord(
+            incarnation=self.incarnation,
+            joined=self.wanted_joined,
+            promised=self.promised if self.owns_cells else None,
+            accepted=self.plan.ballot if self.plan is not None else None,
+            transfer=self.transfer,
+        )
 
     @property
     def go(self) -> bool:
@@ -208,13 +208,18 @@ class PlanExecution:
             sense: the newest measurements.
             attended: whether an agent drives the vehicle.
         """
+        stored = sense.record
         return VehicleState(
             vehicle=self.vehicle,
-            incarnation=self.incarnation,
             formation=sense.formation,
-            joined=self.joined,
-            promised=self.promised,
-            accepted=self.accepted,
+            record=VehicleRecord(
+                incarnation=self.incarnation,
+                joined=self.stored.joined,
+                promised=self.promised,
+                accepted=self.plan.ballot if self.plan is not None and self.accepted else None,
+                owned=stored.owned if stored.promised == self.promised else (),
+                transfer=stored.transfer,
+            ),
             ready=self.ready,
             completed=self.completed,
             hold_cell=self.hold_cell,
@@ -227,8 +232,6 @@ class PlanExecution:
             y_m=sense.state[3],
             speed_mps=sense.state[1],
             t_s=sense.t_s,
-            owned=sense.owned if sense.promised == self.promised else (),
-            transfer=sense.transfer,
         )
 
     def needs_states(self, t_s: float) -> bool:
@@ -270,7 +273,7 @@ def is_in_roster(execution: PlanExecution, prepare: Prepare) -> bool:
     """The vehicle is in the roster, and in one of the formations."""
     # A vehicle that waited at the end of a lane belongs to another formation than before.
     return execution.vehicle in prepare.roster and (
-        execution.owned is not None or not {*prepare.formations}.isdisjoint(execution.joined)
+        execution.owns_cells or not {*prepare.formations}.isdisjoint(execution.stored.joined)
     )
 
 
@@ -282,7 +285,7 @@ def is_above_promise(execution: PlanExecution, prepare: Prepare) -> bool:
 def promise(execution: PlanExecution, prepare: Prepare) -> None:
     """Promise the ballot; request storage of its blocks as joined."""
     execution.promised, execution.promise_stored = prepare.ballot, False
-    if execution.owned is None:
+    if not execution.owns_cells:
         execution.wanted_joined = tuple(sorted({*execution.wanted_joined, *prepare.formations}))
 
 
@@ -301,7 +304,7 @@ def forget_progress(execution: PlanExecution, _: object) -> None:
 
 def publish_state(execution: PlanExecution, _: object) -> None:
     """Publish the state."""
-    # Left to the caller: `on_prepare` and `on_stored` return whether the state must be published.
+    # Left to the caller: `on_prepare` and `on_record` return whether the state must be published.
 
 
 def is_promised_ballot(execution: PlanExecution, plan: Plan) -> bool:
@@ -334,7 +337,7 @@ def drives_its_moves(execution: PlanExecution, plan: Plan) -> bool:
 
 def stays_in_its_blocks(execution: PlanExecution, plan: Plan) -> bool:
     """The territory lies in the blocks of the plan."""
-    if execution.owned is not None:
+    if execution.owns_cells:
         return True
     blocks = set(plan.formations)
     return all(
@@ -345,16 +348,15 @@ def stays_in_its_blocks(execution: PlanExecution, plan: Plan) -> bool:
 
 def has_joined(execution: PlanExecution, plan: Plan) -> bool:
     """The blocks of the plan are exactly those that the controller has stored as joined."""
-    return execution.owned is not None or set(plan.formations) == set(execution.joined)
+    return execution.owns_cells or set(plan.formations) == set(execution.stored.joined)
 
 
 def transfers_only_owned_cells(execution: PlanExecution, plan: Plan) -> bool:
     """The cell transfers are valid, and the vehicle owns the cells attributed to it."""
-    if execution.owned is None:
+    if not execution.owns_cells:
         return True
-    owned = execution.owned | set(
-        execution.stored_transfer.after if execution.stored_transfer is not None else ()
-    )
+    stored = execution.stored
+    owned = {*stored.owned, *(stored.transfer.after if stored.transfer is not None else ())}
     return not ownership_problems(plan) and set(plan.before[execution.vehicle]) <= owned
 
 
@@ -362,16 +364,16 @@ def take_plan(execution: PlanExecution, plan: Plan) -> None:
     """Take the plan; derive its dependencies; request storage of the acceptance."""
     execution.plan = plan
     execution.needs = dependencies(plan, execution.vehicle)
-    if execution.owned is not None:
+    if execution.owns_cells:
         name = execution.vehicle
         execution.transfer = PendingTransfer(
             plan.ballot, plan.before[name], plan.after[name], plan.roster
         )
 
 
-def is_stored(execution: PlanExecution, ballot: Ballot | None) -> bool:
+def is_stored(execution: PlanExecution, record: VehicleRecord) -> bool:
     """The controller has stored the acceptance for this process."""
-    return execution.plan is not None and ballot == execution.plan.ballot
+    return execution.plan is not None and record.accepted == execution.plan.ballot
 
 
 def is_of_same_plan(execution: PlanExecution, state: VehicleState) -> bool:
@@ -379,8 +381,7 @@ def is_of_same_plan(execution: PlanExecution, state: VehicleState) -> bool:
     plan = execution.plan
     return (
         plan is not None
-        and state.accepted
-        and state.promised == plan.ballot
+        and state.record.accepted == plan.ballot
         and state.vehicle in plan.moves
         and state.vehicle != execution.vehicle
     )

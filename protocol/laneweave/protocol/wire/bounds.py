@@ -19,6 +19,7 @@ from laneweave.protocol.wire.messages import (
     Heartbeat,
     RoadClock,
     Sense,
+    VehicleRecord,
     VehicleState,
 )
 from laneweave.protocol.wire.newest import AHEAD_S
@@ -102,16 +103,13 @@ class Bounds:
         match message:
             case VehicleState():
                 self._check_time(message.t_s, road_s)
-                self.check_incarnation(message.incarnation, now_s)
-                _check_ballots(message, road_s)
+                self._check_record(message.record, road_s, now_s)
             case Sense():
                 self._check_tick(message.tick, message.t_s, road_s)
-                self.check_incarnation(message.attendant, now_s)
                 self.check_incarnation(message.bridge, now_s)
-                _check_ballots(message, road_s)
+                self._check_record(message.record, road_s, now_s)
             case Command():
-                self.check_incarnation(message.incarnation, now_s)
-                _check_ballots(message, road_s)
+                self._check_record(message.record, road_s, now_s)
             case RoadClock():
                 self._check_tick(message.tick, message.t_s, road_s)
                 self.check_incarnation(message.bridge, now_s)
@@ -124,7 +122,7 @@ class Bounds:
             case _:
                 pass
 
-    def check_claim(self, incarnation: int, attendant: int, now_s: float) -> None:
+    def check_claim(self, incarnation: int, in_charge: int, now_s: float) -> None:
         """Check the incarnation in a COMMAND for a vehicle with a process in charge.
 
         Raises:
@@ -132,10 +130,17 @@ class Bounds:
         """
         limit = max(
             self.max_incarnation(now_s, CLAIM_AHEAD_NS),
-            min(attendant + SUCCESSION_NS, self.max_incarnation(now_s)),
+            min(in_charge + SUCCESSION_NS, self.max_incarnation(now_s)),
         )
         if not 0 <= incarnation <= limit:
             raise BadInputError("incarnation", incarnation, f"0 to {limit}")
+
+    def _check_record(self, record: VehicleRecord, road_s: float, now_s: float) -> None:
+        self.check_incarnation(record.incarnation, now_s)
+        transfer = None if record.transfer is None else record.transfer.ballot
+        for ballot in (record.promised, record.accepted, transfer):
+            if ballot is not None:
+                check_ballot(ballot, road_s)
 
     def _check_time(self, t_s: float, road_s: float) -> None:
         limit_s = road_s + self.tick_s
@@ -147,15 +152,6 @@ class Bounds:
         tick_s = tick * self.tick_s
         if not 0 <= tick_s <= road_s + self.tick_s or abs(tick_s - t_s) > AHEAD_S:
             raise BadInputError("tick", tick, f"about {t_s / self.tick_s:.0f}, by t_s")
-
-
-def _check_ballots(message: VehicleState | Sense | Command, road_s: float) -> None:
-    if message.promised is not None:
-        check_ballot(message.promised, road_s)
-    if not isinstance(message, VehicleState) and message.accepted is not None:
-        check_ballot(message.accepted, road_s)
-    if message.transfer is not None:
-        check_ballot(message.transfer.ballot, road_s)
 
 
 def check_ballot(ballot: Ballot, road_s: float) -> None:

@@ -94,6 +94,31 @@ class PendingTransfer(Message, frozen=True):
         return not self.open and not self.withdrawn
 
 
+class VehicleRecord(Message, frozen=True):
+    """What the motion controller of a vehicle stores, which outlives the process in charge.
+
+    Part of other messages. It is the durable storage of an acceptor (of ballots), not a property of
+    the motion: promises and acceptances count only once they are stored here. SENSE has the record
+    as stored; COMMAND the one that its sender wants to be stored; STATE the one for which the
+    process in charge vouches: as stored, with its own promise where formations own blocks.
+    """
+
+    incarnation: Int64 = 0
+    """Incarnation of the process in charge of the vehicle [ns]; 0: none yet."""
+    joined: tuple[Int64, ...] = ()
+    """Blocks that the vehicle's plans must cover, ascending; none is removed while the vehicle is
+    on the lattice."""
+    promised: Ballot | None = None
+    """Highest promised ballot; stored in the rolling operation only, where it also binds later
+    processes in charge."""
+    accepted: Ballot | None = None
+    """Ballot of the newest plan that the process in charge has accepted."""
+    owned: tuple[Cell, ...] = ()
+    """Rolling operation: cells that the vehicle owns, ascending."""
+    transfer: PendingTransfer | None = None
+    """Rolling operation: newest transfer of its cells, pending or open."""
+
+
 class Prepare(Message, frozen=True):
     """Leader to each vehicle of the roster that has not promised, every `network.resend_s`.
 
@@ -154,16 +179,11 @@ class VehicleState(Message, frozen=True):
 
     vehicle: Name
     """Vehicle that the state describes; a caretaker sends the state while there is no agent."""
-    incarnation: Int64
-    """Incarnation of the process in charge of the vehicle [ns]."""
     formation: Int64
     """Number of the block in which the vehicle entered."""
-    joined: tuple[Int64, ...]
-    """Blocks that the vehicle's plans must cover, ascending, as stored by its motion controller."""
-    promised: Ballot | None
-    """Highest ballot that the process in charge has promised."""
-    accepted: bool
-    """Whether the plan of that ballot is accepted, and the motion controller has stored this."""
+    record: VehicleRecord
+    """As stored; the promise as made by the process in charge, the acceptance only if it is one of
+    the promised ballot, and the owned cells only once the promise is stored."""
     ready: bool
     """Whether the plan is accepted and the vehicle holds or makes a move of this plan."""
     completed: Int64
@@ -188,11 +208,11 @@ class VehicleState(Message, frozen=True):
     """Speed along the road [m/s]."""
     t_s: Real
     """Road time of the tick [s]."""
-    owned: tuple[Cell, ...] = ()
-    """Rolling operation: cells that the vehicle owns; empty until its motion controller has stored
-    the promise."""
-    transfer: PendingTransfer | None = None
-    """Rolling operation: newest transfer of its cells."""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the plan of the promised ballot is accepted, and this is stored."""
+        return self.record.accepted is not None
 
 
 class Motion(Message, frozen=True):
@@ -260,6 +280,8 @@ class Sense(Message, frozen=True):
     motion_origin: Cell
     """Cell in which the current motion began; `hold_cell` if the vehicle holds."""
     preferred_lane: Int64
+    record: VehicleRecord
+    """As stored by the motion controller."""
     ahead: tuple[Neighbour, ...]
     """Neighbours ahead: at most one per lane that the body touches or is next to."""
     behind: tuple[Neighbour, ...] = ()
@@ -268,24 +290,12 @@ class Sense(Message, frozen=True):
     """Accelerations last commanded to the actuators, along and across the road [m/s2]."""
     formation: Int64 = 0
     """Number of the block in which the vehicle entered."""
-    attendant: Int64 = 0
-    """Incarnation of the process in charge of the vehicle [ns]; 0: none yet."""
     motion_ticks: Int64 = 0
     """Duration of the current move [ticks]; 0: the vehicle settles in its cell, or holds."""
     caretaker: bool = False
     """Whether the caretaker is in charge because the agent is absent or does not answer in time."""
-    joined: tuple[Int64, ...] = ()
-    """Blocks that the controller has stored as joined."""
-    accepted: Ballot | None = None
-    """Ballot of the newest plan that the process in charge has accepted, as stored."""
     left: bool = False
     """Whether the vehicle has left the road; its agent then sends its report and stops."""
-    owned: tuple[Cell, ...] = ()
-    """Rolling operation: cells that the vehicle owns."""
-    promised: Ballot | None = None
-    """Rolling operation: highest ballot that any process in charge has promised, as stored."""
-    transfer: PendingTransfer | None = None
-    """Rolling operation: newest transfer of cells."""
     bridge: Int64 = 0
     """Incarnation of the bridge [ns]; a new value means a new road; 0: not given."""
     off_lattice: bool = False
@@ -303,15 +313,15 @@ class Command(Message, frozen=True):
     arrives in time is executed; a late answer only ends the agent's silence. From an older
     incarnation than the one in charge: refused. From a newer one: that process takes charge, unless
     its incarnation is more than a day ahead of the bridge's clock.
-    `joined`, `accepted`, `promised` and `transfer` are stored for any tick, and confirmed in the
-    next SENSE. With jerks that are not pairs of finite numbers, or cells outside the road's lanes:
-    refused and logged.
+    The record is stored for any tick, and confirmed in the next SENSE. With jerks that are not
+    pairs of finite numbers, or cells outside the road's lanes: refused and logged.
     """
 
     vehicle: Name
     """Sender."""
-    incarnation: Int64
-    """Incarnation of the sending process [ns]."""
+    record: VehicleRecord
+    """To be stored: the incarnation is that of the sending process, the blocks are added to the
+    joined ones, and the transfer is begun or opened; owned cells follow from it."""
     tick: Int64
     """Tick of the SENSE that it answers."""
     hold_cell: Cell
@@ -324,14 +334,6 @@ class Command(Message, frozen=True):
     """Little-endian float32 pairs (along, across) [m/s3], one per tick, from `tick` on."""
     motion_ticks: Int64 = 0
     """Duration of the current move [ticks]; 0: the vehicle settles in its cell, or holds."""
-    joined: tuple[Int64, ...] = ()
-    """Blocks that the controller adds to the joined ones."""
-    accepted: Ballot | None = None
-    """Ballot of the accepted plan, to be stored."""
-    promised: Ballot | None = None
-    """Rolling operation: promised ballot, to be stored."""
-    transfer: PendingTransfer | None = None
-    """Rolling operation: transfer of the newest plan, to be stored or opened."""
 
 
 class OffLattice(Message, frozen=True):

@@ -16,9 +16,8 @@ rung. A vehicle whose cell has passed the line leaves the lattice: it gives up i
 to the line and waits. When the roadside has kept cells free for it, it drives out into the
 neighbouring lane and enters the lattice again. All of this needs neither agent nor messages.
 
-The controller also stores the data that must survive the agent: the process in charge, the joined
-blocks, the newest accepted plan, and in the rolling operation the highest promise and the owned
-cells. Only the process in charge can change the hold cell and the trajectory.
+The controller also stores the vehicle's record (`record_store`), which must survive the agent. Only
+the process in charge can change the hold cell and the trajectory.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ from collections.abc import Iterable, Sequence
 from enum import Enum, IntEnum
 
 from attrs import define, field
-from msgspec.structs import replace
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Lattice
@@ -51,12 +49,11 @@ from laneweave.protocol.vehicle.motion import (
     keep_gap,
     limited_accel,
 )
-from laneweave.protocol.wire.messages import Ballot, Command, Neighbour, PendingTransfer
+from laneweave.protocol.wire.messages import Command, Neighbour, VehicleRecord
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, Neighbours
 from laneweave.sim_bridge.bodies.plant import Plant
+from laneweave.sim_bridge.bodies.record_store import MAX_COLUMN, RecordStore, blocks_in_range
 
-MAX_COLUMN = 2**31 - 1
-"""Maximum column: columns are recorded as 32-bit integers. Block numbers are no larger."""
 MAX_LINE_GAP_M = 200.0
 """Distance from which stop lines are seen; more than any stopping distance."""
 BESIDE_M = 1.0
@@ -99,22 +96,7 @@ class MotionController:
     plant: Plant
     _scenario: Scenario
     hold_cell: Cell
-    attendant: int = 0
-    """Incarnation of the process in charge; 0: none."""
-    joined: tuple[int, ...] = field(init=False)
-    """Blocks that the vehicle's plans must cover, ascending; grows until it leaves the lattice."""
-    accepted: Ballot | None = None
-    """Newest plan that the process in charge has accepted."""
-    promised: Ballot | None = None
-    """Highest promised ballot, which also binds later processes in charge (rolling operation)."""
-    owned: tuple[Cell, ...] = ()
-    """Cells that the vehicle owns, ascending (rolling operation)."""
-    transfer: PendingTransfer | None = None
-    """Newest cell transfer, pending or completed."""
-    _granted: frozenset[Cell] = frozenset()
-    """Cells assigned by the roadside that are not part of any plan yet."""
-    _given_up: frozenset[Cell] = frozenset()
-    """Cells that the vehicle may have owned when it left the lattice."""
+    store: RecordStore = field(init=False)
     motion_origin: Cell = field(init=False)
     motion_end_tick: int = 0
     motion_ticks: int = 0
@@ -148,7 +130,8 @@ class MotionController:
         self.lattice = self._scenario.lattice
         self.tick_s = self._scenario.runtime.tick_s
         # The other blocks of the formation are not known until it is closed.
-        self.joined = (self.lattice.block_of(self.hold_cell[0]),)
+        record = VehicleRecord(joined=(self.lattice.block_of(self.hold_cell[0]),))
+        self.store = RecordStore(record, owns_cells=self._scenario.formation.rolling)
         self.motion_origin = self.hold_cell
         self.rung_ticks = dict.fromkeys(Rung, 0)
         self._jerks = array("f")
@@ -158,9 +141,9 @@ class MotionController:
         self._lane_ends = LaneEnds(self._scenario)
 
     @property
-    def rolling(self) -> bool:
-        """Whether vehicles own cells (rolling operation)."""
-        return self._scenario.formation.rolling
+    def record(self) -> VehicleRecord:
+        """What the controller stores for the process in charge."""
+        return self.store.record
 
     @property
     def measured(self) -> State:
@@ -185,7 +168,7 @@ class MotionController:
             return False
         if self.off_lattice is OffLatticePhase.DRIVING_OUT and self._past_line:
             return False
-        if not self.rolling and self._straddles and self.measured[1] > STANDING_MPS:
+        if not self.store.owns_cells and self._straddles and self.measured[1] > STANDING_MPS:
             return False
         # Behind an exit the lane may belong to a ramp, to whose end the body does not come.
         cell = self.hold_cell[0], self._body_lane
@@ -217,7 +200,7 @@ class MotionController:
         a formation, no other vehicle is led into the cell before the move is complete. Commands
         for earlier ticks, which may repeat the move, are no longer accepted.
         """
-        if self.rolling and self.motion_origin not in self.owned:
+        if self.store.owns_cells and self.motion_origin not in self.record.owned:
             return False
         if self.motion_origin[1] != self._body_lane:
             return False
@@ -243,21 +226,10 @@ class MotionController:
         return goal if first <= goal <= last else int(y_m // self.lattice.lane_width_m)
 
     def leave_lattice(self) -> None:
-        """Give up all cells; from now on no process can move the vehicle.
-
-        The stored transfer tells leaders that the vehicle is gone for all ballots so far. The
-        vehicle stays in its lane.
-        """
+        """Give up all cells; no process can move the vehicle, which stays in its lane."""
         self.off_lattice = OffLatticePhase.WAITING
         self.hold_cell = (self.hold_cell[0], self._body_lane)
-        self._given_up = self.possible_cells
-        self._granted, self.owned = frozenset(), ()
-        ballots = [ballot for ballot in (self.promised, self.accepted) if ballot is not None]
-        if self.transfer is not None:
-            ballots.append(self.transfer.ballot)
-        if ballots and self.rolling:
-            self.transfer = PendingTransfer(max(ballots))
-        self.accepted = None
+        self.store.give_up_cells()
         self._stop_motion()
 
     def drive_out(self, cell: Cell) -> None:
@@ -267,14 +239,9 @@ class MotionController:
         self._stop_motion()
 
     def enter_lattice(self, cells: Iterable[Cell]) -> None:
-        """Take cells, among them the hold cell, in which the vehicle is.
-
-        In formations the vehicle leaves those to which it belonged.
-        """
+        """Take cells, among them the hold cell, in which the vehicle is."""
         self.off_lattice = None
-        self.joined = (self.lattice.block_of(self.hold_cell[0]),)
-        for cell in cells if self.rolling else ():
-            self.assign_cell(cell)
+        self.store.enter_block(self.lattice.block_of(self.hold_cell[0]), cells)
 
     def _stop_motion(self) -> None:
         self._jerks = self._jerks[:0]
@@ -330,19 +297,20 @@ class MotionController:
             BadInputError: the jerks are not pairs of finite numbers, a cell is not in a lane, or a
                 number is out of range.
         """
-        if command.incarnation < self.attendant or command.tick <= self.command_tick:
+        incarnation, in_charge = command.record.incarnation, self.record.incarnation
+        if incarnation < in_charge or command.tick <= self.command_tick:
             return False
         jerks = self._checked_jerks(command)
         leaves = command.hold_cell != self.hold_cell
         if self.off_lattice is not None and (leaves or len(jerks) > 0):
             return False
-        if command.incarnation > self.attendant:
+        if incarnation > in_charge:
             if leaves:
                 return False
-            self.put_in_charge(command.incarnation)
+            self.store.put_in_charge(incarnation)
         self.command_tick = command.tick
         self.store_requests(command)
-        if self.rolling and leaves and command.hold_cell not in self.owned:
+        if self.store.owns_cells and leaves and command.hold_cell not in self.record.owned:
             return False
         lane = command.hold_cell[1]
         if lane != self.hold_cell[1] and (
@@ -360,103 +328,12 @@ class MotionController:
             self.motion_ticks = command.motion_ticks
         return True
 
-    def put_in_charge(self, incarnation: int) -> None:
-        """Put another process in charge; the current motion continues.
-
-        Raises:
-            ValueError: the incarnation is not higher than that of the process in charge.
-        """
-        if incarnation <= self.attendant:
-            raise ValueError(f"incarnation {incarnation} is not above {self.attendant}")
-        self.attendant = incarnation
-        self.accepted = None
-
     def store_requests(self, command: Command) -> bool:
-        """Store joined blocks, promise, transfer and acceptance from a command for any tick.
+        """Store the record of a command for any tick; return whether anything has changed.
 
-        Commands from processes other than the one in charge are ignored. Returns whether anything
-        has changed.
+        Commands from processes other than the one in charge are ignored.
         """
-        if command.incarnation != self.attendant or self.off_lattice is not None:
-            return False
-        requested = command.joined, command.accepted, command.promised, command.transfer
-        if requested == (self.joined, self.accepted, self.promised, self.transfer):
-            return False  # the usual case
-        if not _in_range(command.joined):
-            return False
-        before = self.joined, self.accepted, self.promised, self.transfer
-        self.join(command.joined)
-        if command.transfer is not None and command.transfer.open:
-            self.complete_transfer(command.transfer.ballot)
-        if command.promised is not None:
-            self.store_promise(command.promised)
-        if command.transfer is not None and not command.transfer.open:
-            self.begin_transfer(command.transfer)
-        if command.accepted is not None:
-            self.store_acceptance(command.accepted)
-        return (self.joined, self.accepted, self.promised, self.transfer) != before
-
-    def store_acceptance(self, ballot: Ballot) -> None:
-        """Store an acceptance by the process in charge unless a newer one is stored.
-
-        In the rolling operation the transfer of this ballot must be pending.
-        """
-        transfer = self.transfer
-        if self.rolling and (transfer is None or transfer.ballot != ballot or transfer.withdrawn):
-            return
-        self.accepted = ballot if self.accepted is None else max(self.accepted, ballot)
-
-    def store_promise(self, ballot: Ballot) -> None:
-        """Store a promise unless a newer one is stored."""
-        self.promised = ballot if self.promised is None else max(self.promised, ballot)
-
-    def begin_transfer(self, transfer: PendingTransfer) -> None:
-        """Store the pending transfer of an accepted plan unless a higher ballot is promised.
-
-        The vehicle keeps cells that the roadside has assigned since the plan was made.
-        """
-        newer = self.transfer is None or transfer.ballot > self.transfer.ballot
-        if newer and self.promised is not None and transfer.ballot >= self.promised:
-            self._granted -= set(transfer.before)
-            self.transfer = _with_cells(transfer, self._granted)
-            self.owned = self.transfer.before
-
-    def complete_transfer(self, ballot: Ballot) -> None:
-        """Complete the pending transfer of a plan whose start gate is open."""
-        transfer = self.transfer
-        if transfer is not None and transfer.ballot == ballot and transfer.undecided:
-            self.owned, self.transfer = transfer.after, PendingTransfer(ballot, open=True)
-
-    def assign_cell(self, cell: Cell) -> None:
-        """Add an empty cell that the roadside has assigned to the vehicle."""
-        self._granted |= {cell}
-        self.owned = tuple(sorted({*self.owned, cell}))
-        transfer = self.transfer
-        if transfer is not None and transfer.undecided:
-            self.transfer = _with_cells(transfer, {cell})
-
-    @property
-    def certain_cells(self) -> frozenset[Cell]:
-        """Cells that the vehicle owns whether or not the gate of its pending transfer opens."""
-        transfer = self.transfer
-        if transfer is None or not transfer.undecided:
-            return frozenset(self.owned)
-        return frozenset(transfer.before) & frozenset(transfer.after)
-
-    @property
-    def possible_cells(self) -> frozenset[Cell]:
-        """Cells that the vehicle owns if the gate of its pending transfer opens, or if not.
-
-        Cells that it gave up when it left the lattice are included.
-        """
-        transfer, owned = self.transfer, self._given_up | frozenset(self.owned)
-        if transfer is None or not transfer.undecided:
-            return owned
-        return owned | frozenset(transfer.before) | frozenset(transfer.after)
-
-    def join(self, blocks: Iterable[int]) -> None:
-        """Add joined blocks."""
-        self.joined = tuple(sorted({*self.joined, *blocks}))
+        return self.off_lattice is None and self.store.store(command.record)
 
     def moving(self, tick: int) -> bool:
         """Return whether a motion is still in progress at `tick`.
@@ -528,8 +405,9 @@ class MotionController:
         for cell in (command.hold_cell, command.motion_origin):
             if not (0 <= cell[1] < self.lattice.lanes and abs(cell[0]) <= MAX_COLUMN):
                 raise BadInputError("Command", cell, f"cells in {self.lattice.lanes} lanes")
-        if not _in_range(command.joined):
-            raise BadInputError("Command.joined", command.joined, f"at most {MAX_COLUMN}")
+        joined = command.record.joined
+        if not blocks_in_range(joined):
+            raise BadInputError("Command.record.joined", joined, f"at most {MAX_COLUMN}")
         if len(command.jerks) % 8:
             raise BadInputError("Command.jerks", f"{len(command.jerks)} bytes", "float32 pairs")
         jerks = array("f", command.jerks)
@@ -611,16 +489,3 @@ class MotionController:
         first, last = self.lattice.lanes_touched(y_m, self._scenario.vehicle.width_m)
         goal = self.hold_cell[1]
         return [other for other in others if first <= other.lane <= last or other.lane == goal]
-
-
-def _with_cells(transfer: PendingTransfer, cells: Iterable[Cell]) -> PendingTransfer:
-    """Return a transfer with additional cells that the vehicle keeps."""
-    return replace(
-        transfer,
-        before=tuple(sorted({*transfer.before, *cells})),
-        after=tuple(sorted({*transfer.after, *cells})),
-    )
-
-
-def _in_range(blocks: Iterable[int]) -> bool:
-    return max(map(abs, blocks), default=0) <= MAX_COLUMN

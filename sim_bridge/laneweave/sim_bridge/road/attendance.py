@@ -53,18 +53,18 @@ class Caretaker:
             ValueError: the incarnation is not greater than that of the process in charge.
         """
         controller = vehicle.controller
-        controller.put_in_charge(incarnation)
+        controller.store.put_in_charge(incarnation)
         self._vehicle = vehicle
         self._execution = PlanExecution(
             vehicle=vehicle.name,
             incarnation=incarnation,
             hold_cell=controller.hold_cell,
             lattice=controller.lattice,
-            joined=controller.joined,
+            stored=controller.record,
+            owns_cells=controller.store.owns_cells,
             moving=controller.moving(tick),
-            owned=frozenset(controller.owned) if controller.rolling else None,
         )
-        self._execution.on_owned(vehicle.sense(tick, caretaker=True))
+        self._execution.on_record(controller.record)
 
     def on_message(self, message: Prepare | Plan, tick: int) -> VehicleState | None:
         """Promise a ballot (V2), or accept a plan in which this vehicle does not move (V3).
@@ -72,24 +72,19 @@ class Caretaker:
         Returns:
             The state to publish at once; None if the message has no effect.
         """
-        execution, controller = self._execution, self._vehicle.controller
+        execution, store = self._execution, self._vehicle.controller.store
         if not self.has_cells:
             return None
         if isinstance(message, Prepare):
             accepted = execution.on_prepare(message)
-            controller.join(execution.wanted_joined)
-            execution.on_joined(controller.joined)
-            if execution.promised is not None:
-                controller.store_promise(execution.promised)
         else:
-            execution.on_owned(self._vehicle.sense(tick, caretaker=True))
+            execution.on_record(store.record)
             accepted = not message.moves.get(execution.vehicle) and execution.on_plan(message)
-            if accepted:
-                if execution.transfer is not None:
-                    controller.begin_transfer(execution.transfer)
-                controller.store_acceptance(message.ballot)
-                execution.on_stored(controller.accepted)
-        return self.state(tick) if accepted else None
+        if not accepted:
+            return None
+        store.store(execution.wanted)
+        execution.on_record(store.record)
+        return self.state(tick)
 
     @property
     def has_cells(self) -> bool:
@@ -169,7 +164,8 @@ class Attendance:
         """
         # Late answers also show that an agent is present, but those of a replaced agent say nothing
         # about its successor.
-        if command.incarnation >= vehicle.controller.attendant or vehicle.name in self:
+        in_charge = vehicle.controller.record.incarnation
+        if command.record.incarnation >= in_charge or vehicle.name in self:
             self.answers.on_message(vehicle.name)
         return vehicle.controller.store_requests(command)
 
@@ -185,11 +181,11 @@ class Attendance:
             BadInputError: the command is invalid.
         """
         controller = vehicle.controller
-        attendant = controller.attendant
+        in_charge = controller.record.incarnation
         if not controller.accept_command(command):
             return False
         self.answers.in_time(vehicle.name)
-        if controller.attendant != attendant:
+        if controller.record.incarnation != in_charge:
             # An agent that claims a vehicle is present, even before its token appears.
             self.answers.agent_up(vehicle.name)
             yield from self._end_caretaker(vehicle.name)
@@ -242,7 +238,7 @@ class Attendance:
             self._put_caretaker(vehicle, tick)
 
     def _put_caretaker(self, vehicle: RoadVehicle, tick: int) -> None:
-        incarnation = above(self._new_incarnation(), vehicle.controller.attendant)
+        incarnation = above(self._new_incarnation(), vehicle.controller.record.incarnation)
         self._caretakers[vehicle.name] = Caretaker(vehicle, incarnation, tick)
 
     def on_message(self, vehicle: Name, message: Prepare | Plan, tick: int) -> Iterator[Effect]:

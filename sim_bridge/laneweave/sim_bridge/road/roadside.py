@@ -330,7 +330,7 @@ class Roadside:
             return True
         if self._owned is None:
             self._owned = self._lost.union(
-                *(vehicle.controller.possible_cells for vehicle in self._vehicles.values())
+                *(vehicle.controller.store.possible_cells for vehicle in self._vehicles.values())
             )
         return cell not in self._owned
 
@@ -357,7 +357,7 @@ class Roadside:
             and self._keeps_cells(vehicles[name])
         ]
         if near:
-            vehicles[min(near)[-1]].controller.assign_cell(cell)
+            vehicles[min(near)[-1]].controller.store.assign_cell(cell)
         else:
             self._unassigned.append(cell)
 
@@ -401,10 +401,10 @@ class Roadside:
         self._census_changed = True
         if not self._rolling:
             return
-        lattice, certain = self._lattice, vehicle.controller.certain_cells
+        lattice, certain = self._lattice, vehicle.controller.store.certain_cells
         self._lost |= {
             cell
-            for cell in vehicle.controller.possible_cells - certain
+            for cell in vehicle.controller.store.possible_cells - certain
             if cell[1] in self._shared_lanes
         }
         for cells in (self._given, self._ownerless, self._lost):
@@ -431,7 +431,7 @@ class Roadside:
                         one.name,
                     ),
                 )
-                near.controller.assign_cell((column, lane))
+                near.controller.store.assign_cell((column, lane))
 
     def publish(
         self, tick: int, t_s: float, on_road: Collection[RoadVehicle], *, ended: bool = False

@@ -65,8 +65,8 @@ class RoadVehicle:
             controller.motion_end_tick = round((t_s + settle_s) / tick_s)
         if scenario.formation.rolling:
             for cell in (admission.cell, *admission.more_cells):
-                controller.assign_cell(cell)
-        formation = None if scenario.formation.closes_by_vehicles else controller.joined[0]
+                controller.store.assign_cell(cell)
+        formation = None if scenario.formation.closes_by_vehicles else controller.record.joined[0]
         sensors = Sensors(scenario, name)
         return cls(name, admission, controller, sensors, formation, bridge, t_s + ready_s)
 
@@ -93,7 +93,7 @@ class RoadVehicle:
     def join(self, closed: ClosedFormation) -> None:
         """Join a closed formation: plans must cover all of its blocks."""
         self.formation = closed.first_block
-        self.controller.join(closed.blocks)
+        self.controller.store.join(closed.blocks)
 
     @property
     def arrival(self) -> Arrival:
@@ -135,18 +135,13 @@ class RoadVehicle:
             motion_origin=controller.motion_origin,
             motion_ticks=controller.motion_ticks,
             preferred_lane=self.admission.arrival.preferred_lane,
+            record=controller.record,
             ahead=neighbours.ahead,
             behind=neighbours.behind,
             setpoint=controller.plant.setpoint,
             formation=self.block,
-            attendant=controller.attendant,
             caretaker=caretaker,
-            joined=controller.joined,
-            accepted=controller.accepted,
             left=left,
-            owned=controller.owned,
-            promised=controller.promised,
-            transfer=controller.transfer,
             bridge=self.bridge,
             off_lattice=controller.off_lattice is not None,
             vehicle_type=Name(self.arrival.vehicle_type),

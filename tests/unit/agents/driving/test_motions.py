@@ -111,7 +111,7 @@ def put(
     host: AgentHost, vehicle: Name, stretch: int, tick: int = 1, *, charge: int = 1
 ) -> list[Effect]:
     """Let a vehicle sense that it is in a stretch, and which process is in charge."""
-    felt = sense_in((-stretch * STRETCH_COLUMNS, 0), tick, vehicle=vehicle, attendant=charge)
+    felt = sense_in((-stretch * STRETCH_COLUMNS, 0), tick, vehicle=vehicle, incarnation=charge)
     return list(host.handle(Arrived(SENSE, {"vehicle": vehicle}, felt), 0.0))
 
 

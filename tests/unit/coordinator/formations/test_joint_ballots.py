@@ -14,7 +14,7 @@ from laneweave.protocol.vehicle.plans import plan_problems
 from laneweave.protocol.wire.messages import Ballot, LogEvent, Name, Plan, Prepare, RoadClock
 from support.paper import PAPER, closing_time_s
 from support.service_desk import T_S, Cells, Desk, census, jobs, leading, logged, messages, state
-from support.states import A, B, C, D, E, F
+from support.states import A, B, C, D, E, F, changed
 
 JOINING = evolve(PAPER, formation=evolve(PAPER.formation, max_joined=2))
 FULL: Cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (-2, 2)}
@@ -229,7 +229,7 @@ def test_groups_that_overlap_become_one() -> None:
     desk = leading(cells)
     assert sorted(desk.leaders) == [0, 1, 2]
     desk.tell(state(A, cells[A], joined=(0, 1)))
-    desk.tell(replace(state(C, cells[C]), formation=2, joined=(1, 2)))
+    desk.tell(changed(state(C, cells[C]), formation=2, joined=(1, 2)))
     assert {number: each.formation.numbers for number, each in desk.leaders.items()} == {
         0: (0, 1, 2)
     }

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import pytest
-from msgspec.structs import replace
 
 from laneweave.coordinator.ballots.ballot_round import (
     FAILED,
@@ -30,6 +29,7 @@ from laneweave.coordinator.formations.roster import Formation
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.wire.messages import Ballot, CensusEntry, Name, Plan, Prepare, VehicleState
 from support.rule_books import RuleRecorder
+from support.states import changed
 from support.states import holding as state
 
 A, B, C = Name("A"), Name("B"), Name("C")
@@ -470,7 +470,7 @@ def test_l8_restarted_and_overdue_agents_lead_to_a_new_ballot(
     reach: Reach, changes: dict[str, Any]
 ) -> None:
     leader, ballot = reach(A, B)
-    hear(leader, replace(state(A, ballot), **changes))
+    hear(leader, changed(state(A, ballot), **changes))
     assert prepares_anew(leader, ballot)
 
 
@@ -496,7 +496,7 @@ def astray(**changes: object) -> VehicleState:
     """Return what a member shows that is done on lane 2 and prefers lane 1."""
     ballot = Ballot(1, Name("me"), 1, 1)
     done = state(A, ballot, (0, 2), accepted=True, done=True, t_s=1.0)
-    return replace(done, **changes)
+    return changed(done, **changes)
 
 
 def test_l8_an_adopted_plan_that_ended_on_the_wrong_lane_was_for_other_targets() -> None:

@@ -42,6 +42,7 @@ from laneweave.protocol.wire.messages import (
 from laneweave.protocol.wire.messages import VehicleState as State
 from support.convoy import ROLLING
 from support.rolling_samples import state
+from support.states import changed
 
 A, B, C, D = (Name(letter) for letter in "ABCD")
 SLOT_S = ROLLING.cycles_s[0]
@@ -67,7 +68,7 @@ def shown(
 ) -> State:
     plain = state(name, promised, transfer, owned=OWNED[name], t_s=BEGUN_S + 0.4)
     values: dict[str, Any] = {"hold_cell": HOMES[name], "done": True} | changes
-    return replace(plain, **values)
+    return changed(plain, **values)
 
 
 def census(*names: Name) -> Census:
@@ -419,7 +420,7 @@ def test_a_vehicle_that_has_moved_since_is_left_out() -> None:
     compute = desk.order()
     assert compute is not None
     desk.hear(replace(shown(A, OLD, moving=True), hold_cell=(1, 0), t_s=LOOK_S))
-    desk.hear(replace(shown(B), owned=(*OWNED[B], (2, 2)), t_s=LOOK_S))
+    desk.hear(changed(shown(B), owned=(*OWNED[B], (2, 2)), t_s=LOOK_S))
     desk.finish(compute, LOOK_S)
     assert [set(transfer.moves) for transfer in desk.control.transfers] == [{B}]
 
@@ -521,9 +522,9 @@ def test_an_unheard_vehicle_stays_where_it_entered_and_owns_nothing() -> None:
     ("older", "newer"),
     [
         (shown(A), replace(shown(A), t_s=BEGUN_S + 1.0)),
-        (replace(shown(A), t_s=BEGUN_S + 1.0), replace(shown(A), incarnation=8)),
+        (changed(shown(A), t_s=BEGUN_S + 1.0), changed(shown(A), incarnation=8)),
         (shown(A), shown(A, OLD)),
-        (replace(shown(A, OLD), owned=()), shown(A, OLD)),
+        (changed(shown(A, OLD), owned=()), shown(A, OLD)),
         (shown(A, OLD), shown(A, OLD, accepted=True)),
         (shown(A, OLD), shown(A, OLD, PendingTransfer(OLD))),
         (shown(A, OLD, PendingTransfer(OLD)), shown(A, OLD, PendingTransfer(OLD, open=True))),
@@ -614,7 +615,7 @@ def test_from_the_plan_to_a_ballot_in_force() -> None:
     assert plan.moves == {A: ((0, (0, 0), (0, 1)),), B: ()}
     assert desk.control.in_force == 0
     accepted = [
-        replace(shown(name, plan.ballot, accepted=True), t_s=BEGUN_S + 1.0) for name in (A, B)
+        changed(shown(name, plan.ballot, accepted=True), t_s=BEGUN_S + 1.0) for name in (A, B)
     ]
     assert desk.hear(accepted[0]) == []
     assert desk.hear(accepted[1]) == [

@@ -8,6 +8,7 @@ from msgspec.structs import replace
 from laneweave.coordinator.rolling.ownership import certain_cells, owned_cells, partners
 from laneweave.protocol.wire.messages import Ballot, Name, PendingTransfer, VehicleState
 from support.rolling_samples import AFTER, BEFORE, HIGH, LOW, MID, A, B, C, pending, state
+from support.states import changed
 
 OWNED_BEFORE, OWNED_AFTER = frozenset(BEFORE[A]), frozenset(AFTER[A])
 SURE = OWNED_BEFORE & OWNED_AFTER
@@ -66,7 +67,7 @@ def test_when_all_have_promised_more_with_closed_gates_the_old_cells_are_owned()
     assert owned_cells(CLOSED, others) == certain_cells(CLOSED, others) == OWNED_BEFORE
     assert partners(CLOSED, others) == frozenset()
     assert owned_cells(state(A, MID, TRANSFER), others) is None  # A may open its own gate
-    assert owned_cells(replace(CLOSED, owned=()), others) is None
+    assert owned_cells(changed(CLOSED, owned=()), others) is None
 
 
 @pytest.mark.parametrize("newer", [None, state(C, HIGH, PendingTransfer(BETWEEN, open=True))])
@@ -96,7 +97,7 @@ def test_a_vehicle_that_rests_outside_its_start_cell_was_never_ready() -> None:
     assert owned_cells(other, {A: CLOSED}, {C}) == frozenset(BEFORE[B]) & {*AFTER[B]}
     # It may be on its way to its start cell, or become ready yet.
     assert owned_cells(replace(stranded, moving=True), {}, {C}) is None
-    assert owned_cells(replace(stranded, promised=MID), {}, {C}) == SURE
+    assert owned_cells(changed(stranded, promised=MID), {}, {C}) == SURE
 
 
 def test_states_of_other_vehicles_and_own_older_ones_are_ignored() -> None:

@@ -32,6 +32,7 @@ from support.rolling_samples import (
     state,
 )
 from support.rule_books import RuleRecorder
+from support.states import changed
 
 RESEND_S = 0.2
 
@@ -157,7 +158,7 @@ WRONG = {
         state(B, MID, PendingTransfer(LOW, BEFORE[B], AFTER[B], (A, B, C))),
     ],
     "outbid": [state(A, MID), state(B, HIGH)],
-    "A has restarted": [state(A, MID), replace(state(A, LOW), incarnation=8)],
+    "A has restarted": [state(A, MID), changed(state(A, LOW), incarnation=8)],
 }
 
 
@@ -185,7 +186,7 @@ def test_a_vehicle_without_agent_is_not_moved() -> None:
 
 @pytest.mark.parametrize(
     ("shown", "why"),
-    [(replace(state(B, MID), incarnation=8), "B has restarted"), (state(B, HIGH), "outbid")],
+    [(changed(state(B, MID), incarnation=8), "B has restarted"), (state(B, HIGH), "outbid")],
 )
 def test_is_given_up_while_the_plan_is_sent(shown: VehicleState, why: str) -> None:
     transfer = issued()
@@ -220,7 +221,7 @@ def test_histories_take_every_row_of_the_table() -> None:
     promised = state(A, MID), state(B, MID)
     begun(*promised, state(A, MID, accepted=True), state(B, MID, accepted=True))  # in force
     begun(state(A, HIGH))  # outbid
-    begun(*promised, replace(state(A, MID), incarnation=9))  # restarted
+    begun(*promised, changed(state(A, MID), incarnation=9))  # restarted
     begun(replace(state(A, MID), attended=False), state(B, MID))  # cannot be planned
     begun(*promised).abort("late")
     begun(*promised).on_left(A)
@@ -229,8 +230,8 @@ def test_histories_take_every_row_of_the_table() -> None:
 
 def test_a_vehicle_that_restarts_while_the_ballot_is_outbid_does_not_revive_it() -> None:
     transfer = issued()
-    hear(transfer, replace(state(A, HIGH), incarnation=9))
+    hear(transfer, changed(state(A, HIGH), incarnation=9))
     assert (transfer.phase, transfer.reason) == (BallotPhase.ABORTED, "outbid")
-    hear(transfer, replace(state(A, MID), incarnation=9), replace(state(A, MID), incarnation=10))
+    hear(transfer, changed(state(A, MID), incarnation=9), changed(state(A, MID), incarnation=10))
     assert (transfer.phase, transfer.reason) == (BallotPhase.ABORTED, "outbid")
     assert list(transfer.outgoing(1e6)) == []

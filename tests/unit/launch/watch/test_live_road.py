@@ -19,6 +19,7 @@ from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name
 from support.closed_lanes import DROP
 from support.convoy import BALLOT, ROLLING, Convoy
+from support.states import changed
 
 FORMATIONS: Scenario = parse_scenario({})
 BLOCKS: Scenario = parse_scenario({"formation": {"operation": "paper"}})
@@ -80,9 +81,9 @@ def test_targets_are_those_of_accepted_plans() -> None:
         {"accepted": False},
         {"promised": BALLOT._replace(seq=6)},
     )
-    for changed in changes:
+    for change in changes:
         hear(road, CONVOY, START + 20)
-        road.update(replace(done, **changed), 2.0)
+        road.update(changed(done, **change), 2.0)
         assert shown(road)["vehicles"][0][7] == 0
 
 
@@ -172,9 +173,9 @@ def test_formations_of_different_lengths() -> None:
     assert [row[5] for row in frame["vehicles"]] == [0] * 9 + [3] * 15 + [-1] * 3
     # All blocks of one formation are one; only several formations are joined.
     for number, blocks in ((0, (0, 1, 2)), (9, (3, 4, 5, 6, 7)), (24, (8,))):
-        road.update(replace(convoy.state(number, START + 21), joined=blocks), 2.0)
+        road.update(changed(convoy.state(number, START + 21), joined=blocks), 2.0)
     assert shown(road)["joined"] == []
-    road.update(replace(convoy.state(1, START + 21), joined=tuple(range(8))), 2.0)
+    road.update(changed(convoy.state(1, START + 21), joined=tuple(range(8))), 2.0)
     assert shown(road)["joined"] == [[0, 3]]
 
 
@@ -185,7 +186,7 @@ def test_formations_of_equal_length_and_those_that_are_joined() -> None:
     assert frame["formations"][-2:] == [[1, -7, -4], [0, -3, 0]]
     assert [row[5] for row in frame["vehicles"]] == [0] * 12 + [1] * 12
     for number, joined in ((0, (0, 1)), (1, (1, 2)), (2, (5, 6)), (3, (4,)), (4, (6, 9))):
-        road.update(replace(convoy.state(number, START + 21), joined=joined), 2.0)
+        road.update(changed(convoy.state(number, START + 21), joined=joined), 2.0)
     assert shown(road)["joined"] == [[0, 1, 2], [5, 6]]
 
 

@@ -11,12 +11,13 @@ from msgspec.structs import replace
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.vehicle.plan_execution import ExecutionPhase, PlanExecution
 from laneweave.protocol.vehicle.plans import ownership_problems, plan_problems
-from laneweave.protocol.wire.messages import PendingTransfer, Plan, Prepare
+from laneweave.protocol.wire.messages import PendingTransfer, Plan, Prepare, VehicleRecord
 from support.rolling_samples import (
     AFTER,
     BEFORE,
     HIGH,
     HOME,
+    INCARNATION,
     LOW,
     MID,
     T0_S,
@@ -30,6 +31,7 @@ from support.rolling_samples import (
     state,
     vehicle,
 )
+from support.states import changed
 
 PREPARE = Prepare(MID, (), (A, B))
 
@@ -37,7 +39,7 @@ PREPARE = Prepare(MID, (), (A, B))
 def promised() -> PlanExecution:
     execution = vehicle()
     assert execution.on_prepare(PREPARE)
-    assert execution.on_owned(sense(promised=MID))
+    assert execution.on_record(sense(promised=MID).record)
     return execution
 
 
@@ -46,8 +48,7 @@ def accepted() -> PlanExecution:
     execution = promised()
     assert execution.on_plan(make_plan())
     noted = sense(promised=MID, transfer=pending(A), accepted=MID)
-    assert execution.on_stored(noted.accepted)
-    execution.on_owned(noted)
+    assert execution.on_record(noted.record)
     return execution
 
 
@@ -99,9 +100,9 @@ def test_cells_of_a_closed_transfer_may_be_owned() -> None:
     transfer = PendingTransfer(LOW, BEFORE[A], (*BEFORE[A], (7, 0)), (A, C))
     execution = vehicle()
     execution.on_prepare(Prepare(HIGH, (), (A, B)))
-    execution.on_owned(sense(promised=HIGH))
+    execution.on_record(sense(promised=HIGH).record)
     assert not execution.on_plan(plan)
-    execution.on_owned(sense(promised=HIGH, transfer=transfer))
+    execution.on_record(sense(promised=HIGH, transfer=transfer).record)
     assert execution.on_plan(plan)
 
 
@@ -118,20 +119,20 @@ def test_neither_blocks_nor_joined_formations_matter() -> None:
 def test_a_promise_shows_owned_cells_only_when_the_controller_has_noted_it() -> None:
     execution = vehicle()
     old = sense(transfer=pending(A, LOW))
-    assert execution.state(old, attended=True).owned == BEFORE[A]
+    assert execution.state(old, attended=True).record.owned == BEFORE[A]
     execution.on_prepare(PREPARE)
-    assert execution.wanted_promised == MID
-    assert not execution.on_owned(old)
-    assert execution.state(old, attended=True).owned == ()
+    assert execution.wanted.promised == MID
+    assert not execution.on_record(old.record)
+    assert execution.state(old, attended=True).record.owned == ()
     noted = sense(promised=MID)
-    assert execution.on_owned(noted)
-    assert execution.state(noted, attended=True).owned == BEFORE[A]
-    assert not execution.on_owned(noted)  # nothing new
+    assert execution.on_record(noted.record)
+    assert execution.state(noted, attended=True).record.owned == BEFORE[A]
+    assert not execution.on_record(noted.record)  # nothing new
 
 
 def test_what_an_earlier_process_promised_binds_the_next_one() -> None:
     execution = vehicle()
-    assert execution.on_owned(sense(promised=MID))
+    assert execution.on_record(sense(promised=MID).record)
     assert (execution.promised, execution.phase) == (MID, ExecutionPhase.PROMISED)
     assert execution.on_prepare(Prepare(LOW, (), (A, B)))  # it shows what it has promised
     assert execution.promised == MID
@@ -143,8 +144,8 @@ def test_a_later_promise_drops_the_plan_and_keeps_the_gate_closed() -> None:
     execution = accepted()
     assert execution.go is False
     assert execution.on_prepare(Prepare(HIGH, (), (A, B)))
-    assert (execution.plan, execution.wanted_accepted) == (None, None)
-    execution.on_state(replace(state(B, MID, accepted=True), go=True))
+    assert (execution.plan, execution.wanted.accepted) == (None, None)
+    execution.on_state(changed(state(B, MID, accepted=True), go=True))
     execution.tick(T0_S)
     assert execution.go is False
     assert execution.transfer == pending(A)  # it says no more than what was accepted
@@ -169,17 +170,18 @@ def test_takes_ownership_with_the_open_gate(
     execution = accepted()
     assert execution.tick(T0_S) is None
     assert execution.transfer == pending(A)
-    execution.on_state(replace(state(B, MID, accepted=True), **shown))
+    execution.on_state(changed(state(B, MID, accepted=True), **shown))
     assert execution.tick(t_s) == move
     assert execution.transfer == (PendingTransfer(MID, open=True) if owns else pending(A))
     assert execution.go is owns
 
 
 def test_where_formations_own_blocks_there_are_no_transfers() -> None:
-    execution = evolve(vehicle(), owned=None, joined=(-1, 0))
+    stored = VehicleRecord(incarnation=INCARNATION, joined=(-1, 0))
+    execution = evolve(vehicle(), owns_cells=False, stored=stored)
     execution.on_prepare(Prepare(MID, (-1, 0), (A, B)))
-    assert execution.wanted_promised is None
-    assert not execution.on_owned(sense(promised=HIGH))
+    assert execution.wanted.promised is None
+    assert not execution.on_record(replace(stored, promised=HIGH))
     assert execution.promised == MID
     assert execution.on_plan(replace(make_plan(), formations=(-1, 0), before={}, after={}))
     assert execution.transfer is None

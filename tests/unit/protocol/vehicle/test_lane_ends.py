@@ -228,7 +228,7 @@ def test_no_command_takes_a_vehicle_past_its_stop_line(data: st.DataObject) -> N
     speed_mps = data.draw(st.floats(0.0, 25.0))
     behind_m = data.draw(st.floats(speed_mps**2 / 14.0 + speed_mps + 5.0, 120.0))
     state = (end.line_m - behind_m, speed_mps, 0.0, lattice.cell_y_m(0), 0.0, 0.0)
-    controller = controller_in((0, 0), DROP, state=state, attendant=7)
+    controller = controller_in((0, 0), DROP, state=state, incarnation=7)
     jerks = st.floats(-15.0, 15.0)
     errors, wanted = (0.0, 0.0), 0.0
     for tick in range(200):
@@ -264,8 +264,8 @@ def test_no_line_counts_in_a_lane_that_opens_again_for_a_move_behind_its_end(
     begins_m = 700.0 + KEEPING.longest_body_m - early_start_m(KEEPING)
     begin_tick = math.ceil(lattice.passing_time_s(-10, begins_m) / tick_s)
     state = cell_state(lattice, (-10, 0), begin_tick * tick_s)
-    controller = controller_in((-10, 0), KEEPING, state=state, attendant=7)
-    controller.assign_cell((-10, 1))
+    controller = controller_in((-10, 0), KEEPING, state=state, incarnation=7)
+    controller.store.assign_cell((-10, 1))
     ticks = KEEPING.move_ticks(KEEPING.cycles_s[0])
     reference = Reference.move(KEEPING, (-10, 0), (-10, 1), begin_tick, ticks)
     window = reference.window(begin_tick)

@@ -21,7 +21,15 @@ from laneweave.protocol.vehicle.plan_execution import (
     both_lanes_are_open,
     ends_in_time,
 )
-from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Name,
+    Plan,
+    Prepare,
+    Sense,
+    VehicleRecord,
+    VehicleState,
+)
 from support.convoy import ROLLING
 from support.rule_books import RuleRecorder
 from support.states import holding
@@ -40,7 +48,13 @@ AT: dict[Name, Cell] = {A: (-4, 0), B: (-3, 0)}
 
 
 def vehicle(name: Name = A, cell: Cell = (-4, 0), **more: Any) -> PlanExecution:  # noqa: ANN401
-    return PlanExecution(name, 7, cell, LATTICE, **({"joined": (0,)} | more))
+    stored = VehicleRecord(incarnation=7, joined=more.pop("joined", (0,)))
+    return PlanExecution(name, 7, cell, LATTICE, stored, **more)
+
+
+def note(execution: PlanExecution, ballot: Ballot | None) -> bool:
+    """Let the controller report that it has stored an acceptance."""
+    return execution.on_record(replace(execution.stored, accepted=ballot))
 
 
 def prepare(ballot: Ballot, *roster: Name, formations: tuple[int, ...] = (0,)) -> Prepare:
@@ -81,7 +95,7 @@ def taken(plan: Plan | None = None, name: Name = A) -> PlanExecution:
 
 def accepted(plan: Plan | None = None, name: Name = A) -> PlanExecution:
     execution = taken(plan, name)
-    assert execution.on_stored(MID)
+    assert note(execution, MID)
     return execution
 
 
@@ -106,7 +120,7 @@ def test_v1_starts_with_nothing() -> None:
         None,
     )
     assert not execution.overdue(1e9)
-    assert execution.wanted_joined == execution.joined == (0, 3)
+    assert execution.wanted_joined == execution.stored.joined == (0, 3)
 
 
 def test_v1_takes_a_motion_over() -> None:
@@ -164,7 +178,7 @@ def test_v2_asks_for_the_formations_of_the_ballot_and_never_for_fewer() -> None:
     ):
         execution.on_prepare(prepare(ballot, formations=formations))
         assert execution.wanted_joined == wanted
-        assert execution.joined == (0, 2)  # only the motion controller changes that
+        assert execution.stored.joined == (0, 2)  # only the motion controller changes that
 
 
 def test_late_reports_do_not_undo_joining() -> None:
@@ -177,8 +191,8 @@ def test_late_reports_do_not_undo_joining() -> None:
         ((5, 0), True, (0, 1, 2, 5)),
         ((0, 2), False, (0, 1, 2, 5)),
     ):
-        assert execution.on_joined(heard) == news
-        assert execution.joined == known
+        assert execution.on_record(replace(execution.stored, joined=heard)) == news
+        assert execution.stored.joined == known
 
 
 # --- V3 ---------------------------------------------------------------------------------------
@@ -244,9 +258,9 @@ def test_v3_a_joint_plan_waits_until_the_controller_has_confirmed_its_formations
         moves={A: ((0, (-4, 0), (-4, 1)),)}, cells={A: (-4, 0), B: (-9, 0)}, formations=(0, 1)
     )
     for joined in ((0,), (1,), (), (0, 2)):
-        execution.joined = joined
+        execution.stored = replace(execution.stored, joined=joined)
         assert not execution.on_plan(joint)
-    execution.joined = (0, 1)
+    execution.stored = replace(execution.stored, joined=(0, 1))
     assert execution.on_plan(joint)
 
 
@@ -281,10 +295,10 @@ def test_v3_a_plan_is_accepted_when_the_controller_has_noted_it(name: Name) -> N
         assert waits(execution)  # whatever the others show
     assert execution.needs_states(0.0)
     for other in (None, LOW, HIGH):
-        assert not execution.on_stored(other)
+        assert not note(execution, other)
         assert waits(execution)
-    assert execution.on_stored(MID)
-    assert not execution.on_stored(MID)  # once
+    assert note(execution, MID)
+    assert not note(execution, MID)  # once
     assert execution.phase is ExecutionPhase.GATED
     assert execution.accepted
     assert execution.ready
@@ -421,8 +435,8 @@ def test_how_long_a_move_may_be_due_follows_the_slots_of_its_plan(
 @pytest.mark.parametrize("attended", [True, False])
 def test_the_state_says_what_the_vehicle_knows_and_senses(*, attended: bool) -> None:
     sense = Sense(
-        A, 1001, 100.1, (7.0, 14.0, 0.5, 2.0, 0.1, 0.0), (-4, 1), 1038, (-4, 0), 2, (),
-        formation=3, joined=(0,),
+        A, 1001, 100.1, (7.0, 14.0, 0.5, 2.0, 0.1, 0.0), (-4, 1), 1038, (-4, 0), 2,
+        VehicleRecord(joined=(0,)), (), formation=3,
     )  # fmt: skip
     execution = going()
     assert execution.tick(T0_S) is not None
@@ -529,7 +543,7 @@ def test_a_history_takes_every_row_of_the_table() -> None:
     for _ in range(2):
         execution.on_plan(make_plan())
     for _ in range(2):
-        execution.on_stored(MID)
+        note(execution, MID)
     execution.on_state(shown())
     for _ in range(2):
         execution.tick(T0_S)
@@ -537,7 +551,7 @@ def test_a_history_takes_every_row_of_the_table() -> None:
         execution.end_motion()
     execution.on_prepare(prepare(HIGH))
     assert execution.on_plan(make_plan(HIGH, {A: ()}, {A: (-4, 1), B: (-3, 0)}))
-    assert execution.on_stored(HIGH)
+    assert note(execution, HIGH)
     for _ in range(2):
         execution.on_state(shown(ballot=HIGH, go=True))
     for _ in range(2):

@@ -24,8 +24,11 @@ from laneweave.protocol.wire.messages import (
     Name,
     PendingTransfer,
     RoadClock,
+    Sense,
+    VehicleRecord,
+    VehicleState,
 )
-from support.states import A, holding, sense_in
+from support.states import A, changed, holding, sense_in
 
 HUGE = 2**63 - 1
 ROAD_S = 100.0
@@ -37,8 +40,8 @@ CLOCK = RoadClock(500, 50.0, 1, 1, 1, 0, ended=False, bridge=OWN)
 CENSUS = Census(50.0, (), (), bridge=OWN)
 BEAT = Heartbeat(Name("c2"), OWN, 3, leading=True, formations=1)
 STATE = holding(A, t_s=50.0, incarnation=OWN)
-SENSE = sense_in((0, 0), 500, attendant=OWN, bridge=OWN)
-COMMAND = Command(A, OWN, 500, (0, 0), 0, (0, 0), b"")
+SENSE = sense_in((0, 0), 500, incarnation=OWN, bridge=OWN)
+COMMAND = Command(A, VehicleRecord(OWN), 500, (0, 0), 0, (0, 0), b"")
 POSSIBLE = (CLOCK, CENSUS, BEAT, STATE, SENSE, COMMAND)
 
 
@@ -74,7 +77,7 @@ def test_possible_numbers_pass(message: object) -> None:
         (STATE, {"incarnation": -1}),
         (SENSE, {"tick": HUGE}),
         (SENSE, {"t_s": 1e12}),
-        (SENSE, {"attendant": HUGE}),
+        (SENSE, {"incarnation": HUGE}),
         (SENSE, {"bridge": HUGE}),
         (SENSE, {"promised": BALLOT}),
         (SENSE, {"accepted": BALLOT}),
@@ -86,8 +89,9 @@ def test_possible_numbers_pass(message: object) -> None:
     ids=lambda each: "-".join(each) if isinstance(each, dict) else type(each).__name__,
 )
 def test_impossible_numbers_are_refused(message: Any, changes: dict[str, Any]) -> None:  # noqa: ANN401
+    change = changed if isinstance(message, VehicleState | Sense | Command) else replace
     with pytest.raises(BadInputError):
-        bounds().check(replace(message, **changes), ROAD_S, 7.0)
+        bounds().check(change(message, **changes), ROAD_S, 7.0)
 
 
 def test_before_a_road_time_is_known_the_end_of_every_run_is_the_limit() -> None:

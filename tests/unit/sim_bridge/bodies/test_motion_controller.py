@@ -12,11 +12,13 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.motion import Jerk, cell_state
 from laneweave.protocol.wire.messages import Ballot, Command, Name, Neighbour
-from laneweave.sim_bridge.bodies.motion_controller import MAX_COLUMN, MotionController, Rung
+from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Neighbours
+from laneweave.sim_bridge.bodies.record_store import MAX_COLUMN
 from support import states
 from support.paper import PAPER
 from support.road_vehicles import controller_in, known
+from support.states import changed
 
 SCENARIO = PAPER
 LATTICE, TICK_S = SCENARIO.lattice, SCENARIO.runtime.tick_s
@@ -27,7 +29,7 @@ AGENT = 5
 
 @pytest.fixture
 def controller() -> MotionController:
-    return controller_in(HOME, attendant=AGENT)
+    return controller_in(HOME, incarnation=AGENT)
 
 
 def command(
@@ -108,26 +110,26 @@ def test_a_command_without_jerks_leaves_the_motion_as_it_is_unless_it_names_anot
 
 def test_a_new_vehicle_has_no_process_in_charge() -> None:
     controller = controller_in((-9, 1))
-    assert (controller.attendant, controller.joined) == (0, (LATTICE.block_of(-9),))
-    assert controller.accepted is None
+    assert (controller.record.incarnation, controller.record.joined) == (0, (LATTICE.block_of(-9),))
+    assert controller.record.accepted is None
 
 
 def test_an_older_process_is_refused(controller: MotionController) -> None:
     controller.accept_command(command(3, (1.0, 0.0)))
     before = known(controller)
     for cell in (HOME, (1, 1)):
-        late = replace(command(4, (9.0, 0.0), hold_cell=cell, incarnation=AGENT - 1), joined=(7,))
+        late = changed(command(4, (9.0, 0.0), hold_cell=cell, incarnation=AGENT - 1), joined=(7,))
         assert not controller.accept_command(late)
         assert known(controller) == before
     assert not controller.accept_command(
-        replace(command(4, incarnation=AGENT - 1), jerks=b"nonsense")
+        changed(command(4, incarnation=AGENT - 1), jerks=b"nonsense")
     )
 
 
 def test_a_newer_process_takes_charge_with_its_command(controller: MotionController) -> None:
     controller.accept_command(command(3, (1.0, 0.0)))
     assert controller.accept_command(command(4, (2.0, 0.0), incarnation=AGENT + 1))
-    assert controller.attendant == AGENT + 1
+    assert controller.record.incarnation == AGENT + 1
     assert plays(controller, 4) == (2.0, 0.0)
     assert not controller.accept_command(command(5, (3.0, 0.0)))
     assert plays(controller, 4) == (2.0, 0.0)
@@ -135,7 +137,7 @@ def test_a_newer_process_takes_charge_with_its_command(controller: MotionControl
 
 def test_a_claim_cannot_move_the_vehicle(controller: MotionController) -> None:
     """It could not act for the vehicle before, so no plan can allow its move."""
-    controller.accept_command(replace(command(3, (1.0, 0.0)), accepted=LOW))
+    controller.accept_command(changed(command(3, (1.0, 0.0)), accepted=LOW))
     before = known(controller)
     assert not controller.accept_command(
         command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1)
@@ -153,33 +155,33 @@ def test_a_claim_that_came_second_is_tried_again_with_the_next_tick(
     """The one before has begun to move in this tick, of which the claim does not know."""
     assert controller.accept_command(command(3, (1.0, 0.0), hold_cell=(1, 1)))
     assert not controller.accept_command(command(3, (2.0, 0.0), incarnation=AGENT + 1))
-    assert (controller.attendant, controller.hold_cell) == (AGENT, (1, 1))
+    assert (controller.record.incarnation, controller.hold_cell) == (AGENT, (1, 1))
     claim = command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1)
     assert controller.accept_command(claim)
-    assert controller.attendant == AGENT + 1
+    assert controller.record.incarnation == AGENT + 1
 
 
 def test_handing_over_leaves_the_motion_as_it_is(controller: MotionController) -> None:
     controller.accept_command(command(3, *[(1.0, 0.0)] * 9, hold_cell=(1, 1)))
     before = known(controller)
-    controller.put_in_charge(AGENT + 7)
+    controller.store.put_in_charge(AGENT + 7)
     assert known(controller) == (AGENT + 7, *before[1:])
     for incarnation in (AGENT, AGENT + 7):
         with pytest.raises(ValueError, match="not above"):
-            controller.put_in_charge(incarnation)
+            controller.store.put_in_charge(incarnation)
 
 
 def test_formations_stay_joined_and_only_the_process_in_charge_joins(
     controller: MotionController,
 ) -> None:
     own = LATTICE.block_of(HOME[0])
-    controller.accept_command(replace(command(3), joined=(own + 2,)))
-    assert [*controller.joined] == [own, own + 2]
-    controller.accept_command(replace(command(4), joined=()))
-    controller.accept_command(replace(command(5), joined=(own + 1, own + 2)))
-    controller.accept_command(replace(command(6, incarnation=AGENT - 1), joined=(own + 5,)))
-    controller.accept_command(replace(command(5), joined=(own + 6,)))
-    assert [*controller.joined] == [own, own + 1, own + 2]
+    controller.accept_command(changed(command(3), joined=(own + 2,)))
+    assert [*controller.record.joined] == [own, own + 2]
+    controller.accept_command(changed(command(4), joined=()))
+    controller.accept_command(changed(command(5), joined=(own + 1, own + 2)))
+    controller.accept_command(changed(command(6, incarnation=AGENT - 1), joined=(own + 5,)))
+    controller.accept_command(changed(command(5), joined=(own + 6,)))
+    assert [*controller.record.joined] == [own, own + 1, own + 2]
 
 
 # --- what it notes ----------------------------------------------------------------------------
@@ -190,7 +192,7 @@ LOW, HIGH = Ballot(1, Name("c1"), 7, 1), Ballot(1, Name("c1"), 7, 2)
 def asking(
     accepted: Ballot | None, *joined: int, tick: int = 3, incarnation: int = AGENT
 ) -> Command:
-    return replace(command(tick, incarnation=incarnation), accepted=accepted, joined=joined)
+    return changed(command(tick, incarnation=incarnation), accepted=accepted, joined=joined)
 
 
 def test_requests_of_the_process_in_charge_are_noted_whatever_the_tick(
@@ -199,10 +201,10 @@ def test_requests_of_the_process_in_charge_are_noted_whatever_the_tick(
     controller.accept_command(command(5, (1.0, 0.0)))
     before = known(controller)
     for tick, ballot in ((5, LOW), (4, HIGH)):
-        late = replace(command(tick, (9.0, 0.0), hold_cell=(1, 1)), accepted=ballot, joined=(7,))
+        late = changed(command(tick, (9.0, 0.0), hold_cell=(1, 1)), accepted=ballot, joined=(7,))
         assert controller.store_requests(late)
         assert not controller.store_requests(late)  # nothing new
-        assert (controller.accepted, controller.joined[-1]) == (ballot, 7)
+        assert (controller.record.accepted, controller.record.joined[-1]) == (ballot, 7)
     assert known(controller)[3:] == before[3:]  # it is not played
 
 
@@ -215,7 +217,7 @@ def test_the_newest_acceptance_counts(controller: MotionController, *, with_comm
             if with_command
             else controller.store_requests(request) is noted
         )
-        assert controller.accepted == HIGH
+        assert controller.record.accepted == HIGH
 
 
 @pytest.mark.parametrize("incarnation", [AGENT - 1, AGENT + 1])
@@ -239,14 +241,14 @@ def test_an_acceptance_is_forgotten_when_another_takes_charge(
     controller: MotionController, claim: str
 ) -> None:
     controller.accept_command(asking(LOW, 7))
-    joined = controller.joined
+    joined = controller.record.joined
     if claim == "command":
         assert controller.accept_command(asking(None, tick=4, incarnation=AGENT + 1))
     else:
-        controller.put_in_charge(AGENT + 1)
-    assert (controller.accepted, controller.joined) == (None, joined)
+        controller.store.put_in_charge(AGENT + 1)
+    assert (controller.record.accepted, controller.record.joined) == (None, joined)
     assert not controller.store_requests(asking(HIGH, tick=4))  # its time is over
-    assert controller.accepted is None
+    assert controller.record.accepted is None
     assert controller.store_requests(asking(LOW, tick=4, incarnation=AGENT + 1))
 
 
@@ -276,7 +278,7 @@ def test_a_bad_command_is_refused_whole(
     for incarnation in (AGENT, AGENT + 1):
         good = command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=incarnation)
         with pytest.raises(BadInputError):
-            controller.accept_command(replace(good, **changes))
+            controller.accept_command(changed(good, **changes))
         assert known(controller) == before
 
 
@@ -353,13 +355,13 @@ def test_no_lane_change_begins_before_a_body_that_could_not_brake(
     gap_m: float, faster_mps: float, *, accepted: bool
 ) -> None:
     """It catches up with a cell farther ahead, and passes the cells of others."""
-    controller = controller_in(HOME, KEEPING, attendant=AGENT)
+    controller = controller_in(HOME, KEEPING, incarnation=AGENT)
     speed_mps = controller.plant.state[1] + faster_mps
     behind = (Neighbour(2, gap_m, speed_mps),)
     controller.perceive(controller.plant.state, Neighbours((), behind))
     there: Cell = (HOME[0], 2)
     assert controller.accept_command(command(1, (0.0, 0.1), hold_cell=there)) == accepted
-    other_lane = controller_in(HOME, KEEPING, attendant=AGENT)
+    other_lane = controller_in(HOME, KEEPING, incarnation=AGENT)
     other_lane.perceive(other_lane.plant.state, Neighbours((), behind))
     assert other_lane.accept_command(command(1, (0.0, 0.1), hold_cell=(HOME[0], 0)))
 
@@ -390,7 +392,7 @@ def test_a_body_that_had_to_brake_stays_in_its_lane(
     """Beside it are cells of others; one that is partly in the other lane goes on."""
     s, v, a, y, v_y, a_y = cell_state(LATTICE, HOME, 0.0)
     state = (s - behind_m, v - slower_mps, a, y + across_m, v_y, a_y)
-    controller = controller_in(HOME, attendant=AGENT, state=state)
+    controller = controller_in(HOME, incarnation=AGENT, state=state)
     there: Cell = (HOME[0], HOME[1] + 1)
     # The agent wants to move over, too.
     jerks = [(0.0, 2.0)] * 6 + [(0.0, 0.0)] * 20

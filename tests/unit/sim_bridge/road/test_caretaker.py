@@ -29,7 +29,7 @@ FIRST, SECOND = Ballot(1, Name("c1"), 7, 1), Ballot(1, Name("c1"), 7, 2)
 def vehicle() -> RoadVehicle:
     """A vehicle that an agent was in charge of; road time is 0."""
     vehicle = vehicle_in(HOME)
-    vehicle.controller.put_in_charge(AGENT)
+    vehicle.controller.store.put_in_charge(AGENT)
     return vehicle
 
 
@@ -74,14 +74,14 @@ def test_takes_charge_with_an_incarnation_above_all_earlier_ones(vehicle: RoadVe
     with pytest.raises(ValueError, match="not above"):
         Caretaker(vehicle, AGENT, 0)
     Caretaker(vehicle, AGENT + 1, 0)
-    assert vehicle.controller.attendant == AGENT + 1
+    assert vehicle.controller.record.incarnation == AGENT + 1
 
 
 def test_promises_the_highest_ballot_for_its_vehicle(caretaker: Caretaker) -> None:
     assert caretaker.on_message(replace(prepare(), roster=(B,)), 0) is None
-    assert caretaker.state(0).promised is None
+    assert caretaker.state(0).record.promised is None
     for ballot in (SECOND, SECOND, FIRST):
-        assert answer_of(caretaker, prepare(ballot)).promised == SECOND
+        assert answer_of(caretaker, prepare(ballot)).record.promised == SECOND
 
 
 def test_accepts_a_plan_in_which_its_vehicle_holds_and_the_controller_notes_it(
@@ -89,21 +89,21 @@ def test_accepts_a_plan_in_which_its_vehicle_holds_and_the_controller_notes_it(
 ) -> None:
     for ballot in (FIRST, SECOND):
         state = answer_of(caretaker, prepare(ballot))
-        assert (state.promised, state.accepted) == (ballot, False)  # it ends the plan before
+        assert (state.record.promised, state.accepted) == (ballot, False)  # it ends the plan before
         state = answer_of(caretaker, plan(ballot))
         assert (state.accepted, state.ready, state.done, state.go) == (True, True, True, False)
-        assert vehicle.controller.accepted == ballot
+        assert vehicle.controller.record.accepted == ballot
         assert caretaker.on_message(plan(ballot), 0) is None
         assert caretaker.state(1).accepted
 
 
 def test_what_the_agent_before_it_accepted_is_not_its_own(vehicle: RoadVehicle) -> None:
-    vehicle.controller.store_acceptance(SECOND)
+    vehicle.controller.store.store_acceptance(SECOND)
     caretaker = Caretaker(vehicle, CARETAKER, 0)
     answer_of(caretaker, prepare())
     assert not caretaker.state(0).accepted
     assert answer_of(caretaker, plan()).accepted
-    assert vehicle.controller.accepted == FIRST
+    assert vehicle.controller.record.accepted == FIRST
 
 
 @pytest.mark.parametrize(
@@ -123,15 +123,15 @@ def test_accepts_no_other_plan(caretaker: Caretaker, vehicle: RoadVehicle, refus
     answer_of(caretaker, prepare())
     assert caretaker.on_message(refused, 0) is None
     assert not caretaker.state(0).accepted
-    assert vehicle.controller.accepted is None
+    assert vehicle.controller.record.accepted is None
     assert answer_of(caretaker, plan()).accepted  # the right one may still come
 
 
 def test_joins_formations_for_the_vehicle(caretaker: Caretaker, vehicle: RoadVehicle) -> None:
     both = (FORMATION, FORMATION + 1)
-    assert answer_of(caretaker, prepare(FIRST, *both)).joined == both
-    assert vehicle.controller.joined == both
-    assert answer_of(caretaker, prepare(SECOND)).joined == both
+    assert answer_of(caretaker, prepare(FIRST, *both)).record.joined == both
+    assert vehicle.controller.record.joined == both
+    assert answer_of(caretaker, prepare(SECOND)).record.joined == both
     wide = replace(plan(SECOND), formations=both)
     assert answer_of(caretaker, wide).accepted
 
@@ -158,7 +158,7 @@ def test_the_move_of_the_agent_before_it_counts_until_its_end(vehicle: RoadVehic
     drive(vehicle, range(5))
     caretaker = Caretaker(vehicle, CARETAKER, 5)
     state = answer_of(caretaker, prepare(), 5)
-    assert (state.hold_cell, state.moving, state.promised) == (NEXT, True, FIRST)
+    assert (state.hold_cell, state.moving, state.record.promised) == (NEXT, True, FIRST)
     state = answer_of(caretaker, plan(start=NEXT), 5)
     assert (state.accepted, state.ready) == (True, False)  # no move begins before it has ended
     ends = []

@@ -19,6 +19,7 @@ from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.lane_end_control import LaneEndControl
 from laneweave.sim_bridge.road.roadside import Roadside
 from support.closed_lanes import LonelyRoad, road_with
+from support.states import set_record
 
 DROP = road_with(Closure(0, 400.0), s3_m=450.0)
 BLOCKED = road_with(Closure(1, 300.0, 400.0), s3_m=450.0)
@@ -43,8 +44,8 @@ def check(road: LonelyRoad) -> None:
             controller = vehicle.controller
             assert controller.rung is not Rung.EMERGENCY
             assert vehicle.state[2] > HARDEST_MPS2
-            assert (controller.owned == ()) == (controller.off_lattice is not None)
-            for cell in controller.owned:
+            assert (controller.record.owned == ()) == (controller.off_lattice is not None)
+            for cell in controller.record.owned:
                 owner = owners.setdefault(cell, name)
                 assert owner == name or owner not in road.vehicles, "a cell has two owners"
                 owners[cell] = name
@@ -77,8 +78,8 @@ def test_a_single_vehicle_waits_for_the_gap_that_comes_from_the_entrance() -> No
     # It has entered the rearmost of the columns, and owns all of them.
     controller = road.vehicles[name].controller
     columns = drive_out(DROP).columns
-    assert controller.hold_cell == controller.owned[0]
-    assert len(controller.owned) == columns
+    assert controller.hold_cell == controller.record.owned[0]
+    assert len(controller.record.owned) == columns
     assert road.vehicles[name].admission.cell == controller.hold_cell
 
 
@@ -202,9 +203,9 @@ def line_at_the_end(patch: pytest.MonkeyPatch) -> None:
 
 def keeps_its_cells(patch: pytest.MonkeyPatch) -> None:
     def leave(self: MotionController) -> None:
-        owned = self.owned
+        owned = self.record.owned
         leave_lattice(self)
-        self.owned = owned
+        set_record(self.store, owned=owned)
 
     patch.setattr(MotionController, "leave_lattice", leave)
 

@@ -10,13 +10,14 @@ from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.vehicle.lane_ends import dead_ends
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.events import DRIVES_OUT, LEFT_LATTICE, MISSED_EXIT
-from laneweave.protocol.wire.messages import Ballot, Command, Name, PendingTransfer
+from laneweave.protocol.wire.messages import Ballot, Command, Name, PendingTransfer, VehicleRecord
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase, Rung
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.demand import arrivals
 from laneweave.sim_bridge.road.roadside import Roadside
 from support.closed_lanes import LonelyRoad, ramp_road
 from support.road_vehicles import vehicle_in
+from support.states import set_record
 
 ON_RAMP = ramp_road()
 WEAVING = ramp_road(exit_name="off")
@@ -33,7 +34,7 @@ def run(road: LonelyRoad, *, owners_checked: bool = True) -> None:
         assert road.overlaps == []
         for name, vehicle in road.vehicles.items():
             assert vehicle.controller.rung is not Rung.EMERGENCY
-            for cell in vehicle.controller.owned if owners_checked else ():
+            for cell in vehicle.controller.record.owned if owners_checked else ():
                 owner = owners.setdefault(cell, name)
                 assert owner == name or owner not in road.vehicles, "a cell has two owners"
                 owners[cell] = name
@@ -78,7 +79,7 @@ def test_the_cells_of_a_ramp_get_owners_where_it_begins_and_no_two() -> None:
     lattice = ON_RAMP.lattice
     for _ in range(300):
         road.step()
-        owned = [cell for one in road.vehicles.values() for cell in one.controller.owned]
+        owned = [cell for one in road.vehicles.values() for cell in one.controller.record.owned]
         assert len(owned) == len(set(owned))
         reach_m = lattice.speed_mps * ON_RAMP.formation.entry_spread_s + lattice.pitch_m
         assert all(
@@ -135,33 +136,33 @@ def departed(transfer: PendingTransfer | None) -> tuple[MotionController, Motion
         vehicle_in(cell, name, WEAVING) for cell, name in (((0, 1), "A"), ((-3, 1), "B"))
     )
     far = vehicle_in((-30, 1), "C", WEAVING)
-    gone.controller.assign_cell((-1, 0))
+    gone.controller.store.assign_cell((-1, 0))
     if transfer is not None:
-        gone.controller.store_promise(transfer.ballot)
-        gone.controller.begin_transfer(transfer)
+        gone.controller.store.store_promise(transfer.ballot)
+        gone.controller.store.begin_transfer(transfer)
     others = {vehicle.name: vehicle for vehicle in (behind, far)}
     roadside.on_left(gone, others, 20.0)
-    assert far.controller.owned == ((-30, 1),)
+    assert far.controller.record.owned == ((-30, 1),)
     return gone.controller, behind.controller
 
 
 def test_the_cells_of_a_vehicle_that_has_left_go_to_the_nearest_one() -> None:
     _, behind = departed(None)
-    assert set(behind.owned) == {(-3, 1), (0, 1), (-1, 0)}
+    assert set(behind.record.owned) == {(-3, 1), (0, 1), (-1, 0)}
 
 
 def test_cells_that_a_pending_transfer_may_have_given_away_stay_without_owner() -> None:
     before, after = ((-1, 0), (0, 1)), ((0, 1),)
     transfer = PendingTransfer(BALLOT, before, after, (Name("A"), Name("D")))
     _, behind = departed(transfer)
-    assert set(behind.owned) == {(-3, 1), (0, 1)}
+    assert set(behind.record.owned) == {(-3, 1), (0, 1)}
 
 
 def test_cells_that_a_pending_transfer_may_bring_stay_without_owner() -> None:
     before, after = ((-1, 0), (0, 1)), ((-1, 0), (0, 1), (1, 1))
     transfer = PendingTransfer(BALLOT, before, after, (Name("A"), Name("D")))
     _, behind = departed(transfer)
-    assert set(behind.owned) == {(-3, 1), (0, 1), (-1, 0)}
+    assert set(behind.record.owned) == {(-3, 1), (0, 1), (-1, 0)}
 
 
 def place(controller: MotionController, state: State) -> None:
@@ -178,8 +179,8 @@ def changing(*, late: bool) -> tuple[MotionController, float]:
     The command comes in time for the exit; a late body has not begun to move much later.
     """
     controller = vehicle_in((0, 1), "A", WEAVING).controller
-    controller.put_in_charge(1)
-    controller.assign_cell((0, 0))
+    controller.store.put_in_charge(1)
+    controller.store.assign_cell((0, 0))
     assert controller.accept_command(change_at(1.1))
     return controller, time_before_line(0.3 if late else 1.1)
 
@@ -194,8 +195,8 @@ def change_at(moves: float) -> Command:
     """Return the command to change from lane 1 into lane 0, some moves before the line."""
     tick = round(time_before_line(moves) / WEAVING.runtime.tick_s)
     return Command(
-        vehicle=Name("A"), incarnation=1, tick=tick, hold_cell=(0, 0), motion_end_tick=tick + 58,
-        motion_origin=(0, 1), jerks=b"", motion_ticks=58,
+        vehicle=Name("A"), record=VehicleRecord(incarnation=1), tick=tick, hold_cell=(0, 0),
+        motion_end_tick=tick + 58, motion_origin=(0, 1), jerks=b"", motion_ticks=58,
     )  # fmt: skip
 
 
@@ -209,8 +210,8 @@ def test_a_lane_change_that_begins_too_late_for_the_exit_is_taken_back() -> None
 
 def test_a_command_that_comes_too_late_for_the_exit_is_refused() -> None:
     controller = vehicle_in((0, 1), "A", WEAVING).controller
-    controller.put_in_charge(1)
-    controller.assign_cell((0, 0))
+    controller.store.put_in_charge(1)
+    controller.store.assign_cell((0, 0))
     assert not controller.accept_command(change_at(0.3))
     assert controller.hold_cell == (0, 1)
 
@@ -222,7 +223,7 @@ def test_one_that_begins_in_time_is_not() -> None:
 
 def test_a_vehicle_does_not_return_to_a_cell_that_it_does_not_own() -> None:
     controller, t_s = changing(late=True)
-    controller.owned = ((0, 0),)
+    set_record(controller.store, owned=((0, 0),))
     assert not controller.return_to_origin(t_s)
     assert controller.hold_cell == (0, 0)
 
@@ -238,7 +239,7 @@ def test_the_roadside_takes_it_back_and_the_vehicle_drives_past_the_exit() -> No
     line_s = WEAVING.lattice.passing_time_s(column, 450.0)
     while road.t_s < line_s - 0.3 * WEAVING.move_s:
         road.step()
-    controller.assign_cell((column, 0))
+    controller.store.assign_cell((column, 0))
     controller.motion_origin, controller.hold_cell = controller.hold_cell, (column, 0)
     road.step()
     assert (MISSED_EXIT, vehicle.name) in [(kind, name) for _, kind, name in road.events]

@@ -74,7 +74,7 @@ def test_the_bodies_of_leaving_and_entering_vehicles_are_apart_on_the_road() -> 
 def owners_of(road: LonelyRoad) -> dict[Cell, list[Name]]:
     owners: dict[Cell, list[Name]] = {}
     for name, vehicle in road.vehicles.items():
-        for cell in vehicle.controller.owned:
+        for cell in vehicle.controller.record.owned:
             owners.setdefault(cell, []).append(name)
     return owners
 
@@ -96,7 +96,7 @@ def test_no_cell_has_two_owners_and_leaving_vehicles_have_that_of_their_exit() -
             column, lane = vehicle.admission.cell
             leaves = vehicle.arrival.destination == "off"
             if name not in seen and lane != 0:
-                assert ((column, 0) in vehicle.controller.owned) == leaves
+                assert ((column, 0) in vehicle.controller.record.owned) == leaves
             seen.add(name)
         assert all(len(names) == 1 for names in owners_of(road).values())
     drive(road)
@@ -140,7 +140,7 @@ def test_a_cell_that_a_vehicle_may_own_is_not_entered_from_the_ramp() -> None:
     assert free == [first, first - 1, first - 2]
     owner = vehicle_in((first, 1), "A", INTERCHANGE)
     assert admitted_columns(owner) == free
-    owner.controller.assign_cell((first, 0))
+    owner.controller.store.assign_cell((first, 0))
     assert admitted_columns(owner) == [first - 1, first - 2, first - 3]
     # The owner has left by the exit: the cell is free again.
     assert admitted_columns(owner, left=True) == free
@@ -155,8 +155,8 @@ def test_a_cell_of_an_undecided_transfer_is_not_entered(*, before: bool) -> None
     transfer = PendingTransfer(
         BALLOT, both if before else one, one if before else both, (Name("A"), Name("B"))
     )
-    vehicle.controller.store_promise(BALLOT)
-    vehicle.controller.begin_transfer(transfer)
+    vehicle.controller.store.store_promise(BALLOT)
+    vehicle.controller.store.begin_transfer(transfer)
     later = [first - 1, first - 2, first - 3]
     assert admitted_columns(vehicle) == later
     # Nobody knows the outcome when it has left: another vehicle may get the cell.
@@ -166,9 +166,9 @@ def test_a_cell_of_an_undecided_transfer_is_not_entered(*, before: bool) -> None
 def test_cells_given_up_at_the_end_of_a_lane_may_still_be_transferred() -> None:
     first, *_ = admitted_columns(None)
     vehicle = vehicle_in((first, 1), "A", INTERCHANGE)
-    vehicle.controller.assign_cell((first, 0))
+    vehicle.controller.store.assign_cell((first, 0))
     vehicle.controller.leave_lattice()
-    assert vehicle.controller.owned == ()
+    assert vehicle.controller.record.owned == ()
     assert admitted_columns(vehicle) == [first - 1, first - 2, first - 3]
 
 

@@ -232,7 +232,7 @@ class CensusWatch:
             self.vehicles[vehicle.name] = vehicle
             assert vehicle.block > self.closed_to, "a vehicle entered a closed block"
             assert vehicle.formation is None
-            assert vehicle.controller.joined == (vehicle.block,)
+            assert vehicle.controller.record.joined == (vehicle.block,)
         closed = roadside.close_formations(t_s)
         for formation in closed:
             for vehicle in self.vehicles.values():
@@ -268,7 +268,7 @@ class CensusWatch:
                 continue
             (mine,) = (one for one in census.formations if vehicle.block in one.blocks)
             assert vehicle.formation == mine.first_block
-            assert vehicle.controller.joined == mine.blocks
+            assert vehicle.controller.record.joined == mine.blocks
             present.add(mine)
         assert set(census.formations) == present
 

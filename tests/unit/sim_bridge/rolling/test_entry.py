@@ -116,12 +116,12 @@ class Entrance:
         return self
 
     def owned(self, name: str) -> list[Cell]:
-        return sorted(self.vehicles[Name(name)].controller.owned, reverse=True)
+        return sorted(self.vehicles[Name(name)].controller.record.owned, reverse=True)
 
     def owners(self) -> dict[Cell, Name]:
         owners: dict[Cell, Name] = {}
         for name, vehicle in self.vehicles.items():
-            for cell in vehicle.controller.owned:
+            for cell in vehicle.controller.record.owned:
                 assert cell not in owners, f"{cell} is of {owners[cell]} and of {name}"
                 owners[cell] = name
         return owners
@@ -175,9 +175,9 @@ def test_most_get_no_more_than_some_cells() -> None:
 def test_cells_behind_a_departed_vehicle_have_no_owner() -> None:
     entrance = Entrance([Arrival("first", 1, 0, 0.0)]).run(3.0)
     gone = entrance.vehicles.pop(Name("first"))
-    owned = gone.controller.owned
+    owned = gone.controller.record.owned
     entrance.run(8.0)
-    assert gone.controller.owned == owned
+    assert gone.controller.record.owned == owned
     assert entrance.owners() == {}
 
 

@@ -7,10 +7,16 @@ from itertools import permutations, product
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.wire.messages import Ballot, Command, Name, PendingTransfer, Prepare
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Command,
+    Name,
+    PendingTransfer,
+    Prepare,
+    VehicleRecord,
+)
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.road.attendance import Caretaker
 from support.road_vehicles import controller_in, vehicle_in
@@ -27,6 +33,7 @@ from support.rolling_samples import (
     make_plan,
     pending,
 )
+from support.states import changed
 
 AGENT = 7
 
@@ -39,7 +46,7 @@ def controller() -> MotionController:
 
 def make_controller() -> MotionController:
     controller = controller_of(BEFORE[A])
-    controller.put_in_charge(AGENT)
+    controller.store.put_in_charge(AGENT)
     return controller
 
 
@@ -51,15 +58,14 @@ def order(
 ) -> Command:
     return Command(
         A,
-        incarnation,
+        VehicleRecord(
+            incarnation=incarnation, promised=promised, transfer=transfer, accepted=accepted
+        ),
         0,
         HOME,
         0,
         HOME,
         b"",
-        promised=promised,
-        transfer=transfer,
-        accepted=accepted,
     )
 
 
@@ -71,8 +77,13 @@ POSSESSION = order(MID, OPEN, MID)
 
 
 def kept(controller: MotionController) -> tuple[object, ...]:
-    transfer = controller.transfer
-    return controller.promised, controller.accepted, transfer, frozenset(controller.owned)
+    transfer = controller.record.transfer
+    return (
+        controller.record.promised,
+        controller.record.accepted,
+        transfer,
+        frozenset(controller.record.owned),
+    )
 
 
 def test_orders_one_after_the_other(controller: MotionController) -> None:
@@ -89,9 +100,9 @@ def test_orders_one_after_the_other(controller: MotionController) -> None:
 
 def test_without_its_deed_a_plan_is_not_accepted(controller: MotionController) -> None:
     controller.store_requests(order(MID, None, MID))
-    assert controller.accepted is None
+    assert controller.record.accepted is None
     controller.store_requests(order(MID, pending(A, LOW), MID))
-    assert (controller.accepted, controller.transfer) == (None, None)
+    assert (controller.record.accepted, controller.record.transfer) == (None, None)
 
 
 def test_only_the_newest_deed_can_be_opened(controller: MotionController) -> None:
@@ -99,8 +110,8 @@ def test_only_the_newest_deed_can_be_opened(controller: MotionController) -> Non
     newer = PendingTransfer(HIGH, BEFORE[A], BEFORE[A], (A,))
     controller.store_requests(order(HIGH, newer, HIGH))
     controller.store_requests(POSSESSION)
-    assert controller.transfer == newer
-    assert set(controller.owned) == set(BEFORE[A])
+    assert controller.record.transfer == newer
+    assert set(controller.record.owned) == set(BEFORE[A])
 
 
 @pytest.mark.parametrize("process", [AGENT, AGENT + 1])
@@ -110,8 +121,8 @@ def test_a_promise_binds_this_process_and_the_next(
     """No transfer of less than was promised is drawn up."""
     controller.store_requests(order(HIGH))
     if process != AGENT:
-        controller.put_in_charge(process)
-    controller.store_requests(replace(ACCEPTANCE, incarnation=process))
+        controller.store.put_in_charge(process)
+    controller.store_requests(changed(ACCEPTANCE, incarnation=process))
     assert kept(controller) == (HIGH, None, None, frozenset(BEFORE[A]))
 
 
@@ -119,16 +130,16 @@ def test_a_deed_outlives_the_process_and_its_acceptance_does_not(
     controller: MotionController,
 ) -> None:
     controller.store_requests(ACCEPTANCE)
-    controller.put_in_charge(AGENT + 1)
+    controller.store.put_in_charge(AGENT + 1)
     assert kept(controller) == (MID, None, pending(A), frozenset(BEFORE[A]))
     assert not controller.store_requests(POSSESSION)  # of the process that was replaced
-    assert controller.transfer == pending(A)
+    assert controller.record.transfer == pending(A)
 
 
 def test_where_formations_own_blocks_acceptance_needs_no_deed() -> None:
-    controller = controller_in(HOME, attendant=AGENT)
+    controller = controller_in(HOME, incarnation=AGENT)
     controller.store_requests(order(accepted=MID))
-    assert (controller.accepted, controller.owned) == (MID, ())
+    assert (controller.record.accepted, controller.record.owned) == (MID, ())
 
 
 # --- any order --------------------------------------------------------------------------------
@@ -146,15 +157,15 @@ def test_any_order_of_one_plan_ends_sound(orders: tuple[Command, ...]) -> None:
 
 def check(controller: MotionController) -> None:
     """Check that what is kept fits together."""
-    transfer = controller.transfer
+    transfer = controller.record.transfer
     if transfer is not None and not transfer.open:
-        assert set(controller.owned) == set(transfer.before)
-    if controller.accepted is not None:
+        assert set(controller.record.owned) == set(transfer.before)
+    if controller.record.accepted is not None:
         assert transfer is not None
-        assert transfer.ballot >= controller.accepted
+        assert transfer.ballot >= controller.record.accepted
     if transfer is not None:
-        assert controller.promised is not None
-        assert transfer.ballot <= controller.promised
+        assert controller.record.promised is not None
+        assert transfer.ballot <= controller.record.promised
 
 
 BALLOTS = [Ballot(term, Name("c1"), 1, seq) for term in (1, 2) for seq in (1, 2)]
@@ -194,21 +205,21 @@ def test_however_orders_arrive_what_is_kept_is_sound(
     granted = set()
     for index, each in enumerate(history):
         if index == restart:
-            controller.put_in_charge(AGENT + 1)
-        before = controller.promised, controller.transfer
+            controller.store.put_in_charge(AGENT + 1)
+        before = controller.record.promised, controller.record.transfer
         if isinstance(each, Command):
             controller.store_requests(each)
         else:
-            controller.assign_cell(each)
+            controller.store.assign_cell(each)
             granted.add(each)
         check(controller)
-        assert granted <= set(controller.owned)
-        assert before[0] is None or (controller.promised or LOW) >= before[0]
+        assert granted <= set(controller.record.owned)
+        assert before[0] is None or (controller.record.promised or LOW) >= before[0]
         if before[1] is not None:
-            assert controller.transfer is not None
-            assert controller.transfer.ballot >= before[1].ballot
+            assert controller.record.transfer is not None
+            assert controller.record.transfer.ballot >= before[1].ballot
         # With a promise, which transfer is the newest of the older ones is final.
-        promised, transfer = controller.promised, controller.transfer
+        promised, transfer = controller.record.promised, controller.record.transfer
         if promised is not None and (transfer is None or transfer.ballot < promised):
             newest = final.setdefault(promised, transfer)
             assert (newest and newest.ballot) == (transfer and transfer.ballot)
@@ -224,28 +235,28 @@ def test_a_cell_that_comes_at_any_time_is_kept(controller: MotionController, whe
     """The plan was made before the cell was assigned; a closed transfer has it on both sides."""
     for step, each in enumerate((PROMISE, ACCEPTANCE, POSSESSION, POSSESSION)):
         if when == step:
-            controller.assign_cell(GIVEN)
-            if (transfer := controller.transfer) is not None and not transfer.open:
+            controller.store.assign_cell(GIVEN)
+            if (transfer := controller.record.transfer) is not None and not transfer.open:
                 assert GIVEN in transfer.before
                 assert GIVEN in transfer.after
         controller.store_requests(each)
-    assert set(controller.owned) == {*AFTER[A], GIVEN}
+    assert set(controller.record.owned) == {*AFTER[A], GIVEN}
 
 
 @pytest.mark.parametrize(("when", "opened"), list(product(range(2), (False, True))))
 def test_a_cell_that_a_plan_knew_is_not_kept_by_force(when: int, *, opened: bool) -> None:
     controller = make_controller()
-    controller.assign_cell(GIVEN)
+    controller.store.assign_cell(GIVEN)
     if when:
         controller.store_requests(PROMISE)
     given_away = PendingTransfer(MID, (*BEFORE[A], GIVEN), AFTER[A], (A, B))
     controller.store_requests(order(MID, given_away, MID))
     if opened:
         controller.store_requests(POSSESSION)
-    assert (GIVEN in controller.owned) is not opened
+    assert (GIVEN in controller.record.owned) is not opened
     later = PendingTransfer(HIGH, AFTER[A], AFTER[A], (A,))
     controller.store_requests(order(HIGH, later, HIGH))
-    assert GIVEN not in controller.owned
+    assert GIVEN not in controller.record.owned
 
 
 # --- the caretaker ----------------------------------------------------------------------------
@@ -257,15 +268,15 @@ def test_the_caretaker_hands_cells_over_and_moves_nothing() -> None:
     plan = make_plan()
     state = caretaker.on_message(Prepare(MID, (), (A, B)), 0)
     assert state is not None
-    assert (state.promised, state.owned) == (MID, controller.owned)
+    assert (state.record.promised, state.record.owned) == (MID, controller.record.owned)
     state = caretaker.on_message(plan, 0)
     assert state is not None
     assert state.accepted
-    assert state.transfer == controller.transfer == pending(B)
-    assert controller.accepted == MID
+    assert state.record.transfer == controller.record.transfer == pending(B)
+    assert controller.record.accepted == MID
 
 
 def test_the_caretaker_is_bound_by_what_the_agent_promised(controller: MotionController) -> None:
     controller.store_requests(order(HIGH))
     shown = Caretaker(vehicle_in(HOME, A, controller=controller), AGENT + 1, 0).state(0)
-    assert (shown.promised, shown.owned) == (HIGH, tuple(sorted(BEFORE[A])))
+    assert (shown.record.promised, shown.record.owned) == (HIGH, tuple(sorted(BEFORE[A])))

@@ -32,7 +32,7 @@ from collections.abc import Callable, Iterable, Iterator
 from attrs import define
 
 from laneweave.launch.fault_search.checks.cell_ownership import CellOwnership
-from laneweave.launch.fault_search.checks.claims import Claims, Stored, required_before, short
+from laneweave.launch.fault_search.checks.claims import Claims, required_before, short
 from laneweave.launch.fault_search.checks.geometry import Body, Geometry, overlap_between
 from laneweave.launch.fault_search.checks.violations import Violation
 from laneweave.protocol.lattice import Cell
@@ -42,6 +42,7 @@ from laneweave.protocol.wire.messages import (
     Plan,
     Prepare,
     Sense,
+    VehicleRecord,
     VehicleState,
 )
 
@@ -132,7 +133,7 @@ class Checker:
         if self._ownership is None:
             self.claims.enter(t_s, vehicle, block)
 
-    def store(self, t_s: float, vehicle: str, stored: Stored) -> None:
+    def store(self, t_s: float, vehicle: str, stored: VehicleRecord) -> None:
         """Record what a motion controller has stored."""
         self.claims.store(vehicle, stored)
         if self._ownership is not None:
@@ -321,36 +322,36 @@ class Checker:
 
     def _on_sense(self, t_s: float, sense: Sense) -> None:
         attendant, joined = self._charge.get(sense.vehicle, (0, frozenset()))
-        if sense.attendant < attendant:
-            text = f"{sense.attendant} is in charge after {attendant}"
+        if sense.record.incarnation < attendant:
+            text = f"{sense.record.incarnation} is in charge after {attendant}"
             self._report("monotone", t_s, [sense.vehicle], text)
-        if not joined.issubset(sense.joined):
-            text = f"its controller reports joined {sense.joined} after {sorted(joined)}"
+        if not joined.issubset(sense.record.joined):
+            text = f"its controller reports joined {sense.record.joined} after {sorted(joined)}"
             self._report("monotone", t_s, [sense.vehicle], text)
-        if sense.attendant != attendant or len(joined) != len(sense.joined):
-            self._charge[sense.vehicle] = sense.attendant, frozenset(sense.joined)
+        if sense.record.incarnation != attendant or len(joined) != len(sense.record.joined):
+            self._charge[sense.vehicle] = sense.record.incarnation, frozenset(sense.record.joined)
 
     def _on_state(self, t_s: float, state: VehicleState) -> None:
         self._check_claims(t_s, state)
-        if self.claims.is_earlier(state.vehicle, state.incarnation):
+        if self.claims.is_earlier(state.vehicle, state.record.incarnation):
             return
         states = self._states.setdefault(state.vehicle, {})
-        before = states.get(state.incarnation)
-        states[state.incarnation] = state
+        before = states.get(state.record.incarnation)
+        states[state.record.incarnation] = state
         if before is None:
             # A new process inherits the joined formations of earlier processes.
-            earlier = [one for number, one in states.items() if number < state.incarnation]
-            joined = {number for one in earlier for number in one.joined}
+            earlier = [one for number, one in states.items() if number < state.record.incarnation]
+            joined = {number for one in earlier for number in one.record.joined}
         else:
-            joined = set(before.joined)
+            joined = set(before.record.joined)
         texts = []
-        if not joined.issubset(state.joined):
-            texts.append(f"it reports joined {state.joined} after {sorted(joined)}")
+        if not joined.issubset(state.record.joined):
+            texts.append(f"it reports joined {state.record.joined} after {sorted(joined)}")
         if before is not None:
             texts += _revoked(before, state)
             if state.moving and before.hold_cell != state.hold_cell:
-                key = (state.vehicle, state.incarnation, state.hold_cell)
-                self._begun[key] = state.promised if state.accepted else None
+                key = (state.vehicle, state.record.incarnation, state.hold_cell)
+                self._begun[key] = state.record.promised if state.accepted else None
         for text in texts:
             self._report("monotone", t_s, [state.vehicle], text)
 
@@ -364,7 +365,9 @@ class Checker:
             cell = None
         elif cell is None:
             (cell,) = self._bodies[name].cells
-        finished = 0 if state.promised is None else self._finished(t_s, name, state.promised)
+        finished = (
+            0 if state.record.promised is None else self._finished(t_s, name, state.record.promised)
+        )
         self.claims.on_state(t_s, state, finished, cell)
 
     def computes(self, t_s: float, process: str) -> None:
@@ -391,14 +394,14 @@ class Checker:
 
 def _revoked(before: VehicleState, state: VehicleState) -> Iterator[str]:
     """Yield a description of each part of its previous state that a process has revoked."""
-    if before.promised is None:
+    if before.record.promised is None:
         return
-    if state.promised is None or state.promised < before.promised:
-        yield f"it promises {short(state.promised)} after {short(before.promised)}"
-    elif state.promised == before.promised:
+    if state.record.promised is None or state.record.promised < before.record.promised:
+        yield f"it promises {short(state.record.promised)} after {short(before.record.promised)}"
+    elif state.record.promised == before.record.promised:
         if before.accepted and not state.accepted:
-            yield f"it no longer accepts {short(state.promised)}"
+            yield f"it no longer accepts {short(state.record.promised)}"
         if state.completed < before.completed:
             yield f"it has completed {state.completed} moves after {before.completed}"
         if before.go and not state.go:
-            yield f"its gate for {short(state.promised)} closed again"
+            yield f"its gate for {short(state.record.promised)} closed again"

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
-from attrs import define, field, frozen
+from attrs import define, field
 
 from laneweave.launch.fault_search.checks.violations import Report, once
 from laneweave.launch.fault_search.events.forgeries import Harm
@@ -28,9 +28,9 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import (
     Ballot,
     Name,
-    PendingTransfer,
     Plan,
     Prepare,
+    VehicleRecord,
     VehicleState,
 )
 
@@ -38,18 +38,6 @@ PAUSE_S = 0.9
 """Minimum time between two attempts to plan under one ballot."""
 LOWEST = Ballot(-1, Name(""), 0, 0)
 States = Mapping[Name, VehicleState]
-
-
-@frozen
-class Stored:
-    """What a motion controller has stored."""
-
-    attendant: int
-    joined: tuple[int, ...]
-    accepted: Ballot | None
-    promised: Ballot | None
-    owned: tuple[Cell, ...]
-    transfer: PendingTransfer | None
 
 
 @define
@@ -61,7 +49,7 @@ class Claims:
     """All plans sent so far; shared with the checker."""
     harmful: dict[Ballot, Harm] = field(factory=dict)
     """Plans that were changed on their way."""
-    _stored: dict[str, Stored] = field(factory=dict)
+    _stored: dict[str, VehicleRecord] = field(factory=dict)
     """Newest content of each motion controller."""
     _in_charge: set[tuple[str, int]] = field(factory=set)
     """(vehicle, incarnation) of each process that has been in charge."""
@@ -107,25 +95,25 @@ class Claims:
         """Record that a vehicle has left the road."""
         self._blocks.pop(vehicle, None)
 
-    def store(self, vehicle: str, stored: Stored) -> None:
+    def store(self, vehicle: str, stored: VehicleRecord) -> None:
         """Record what a motion controller has stored."""
         if self._stored.get(vehicle) == stored:
             return
         self._stored[vehicle] = stored
-        self._in_charge.add((vehicle, stored.attendant))
+        self._in_charge.add((vehicle, stored.incarnation))
         self._holdings.add((vehicle, stored.promised, stored.owned))
         if stored.accepted is not None:
-            self._acceptances.add((vehicle, stored.attendant, stored.accepted))
+            self._acceptances.add((vehicle, stored.incarnation, stored.accepted))
 
     # --- messages -----------------------------------------------------------------------------
 
     def record(self, state: VehicleState) -> None:
         """Record what leaders and other vehicles may conclude from a state."""
-        name, ballot = state.vehicle, state.promised
+        name, ballot = state.vehicle, state.record.promised
         if ballot is None:
             return
-        about = name, state.incarnation, ballot, state.hold_cell
-        self._promises.add((*about, () if state.owned else state.joined))
+        about = name, state.record.incarnation, ballot, state.hold_cell
+        self._promises.add((*about, () if state.record.owned else state.record.joined))
         if state.accepted:
             self._accepted.setdefault(ballot, set()).add(name)
             if state.ready:
@@ -142,21 +130,21 @@ class Claims:
             finished: number of motions that the body has completed under the promised ballot.
             cell_at_rest: cell in which the body rests; None while it moves.
         """
-        name, ballot = state.vehicle, state.promised
+        name, ballot = state.vehicle, state.record.promised
         stored = self._stored.get(name)
-        if stored is None or self.is_earlier(name, state.incarnation):
+        if stored is None or self.is_earlier(name, state.record.incarnation):
             return
-        if (name, state.incarnation) not in self._in_charge:
+        if (name, state.record.incarnation) not in self._in_charge:
             self._false(t_s, state, "its process has never been in charge")
-        if not set(state.joined) <= set(stored.joined):
-            self._false(t_s, state, f"joined {state.joined}, but stored are {stored.joined}")
-        if stored.owned and state.attended and state.incarnation == stored.attendant:
+        if not set(state.record.joined) <= set(stored.joined):
+            self._false(t_s, state, f"joined {state.record.joined}, but stored are {stored.joined}")
+        if stored.owned and state.attended and state.record.incarnation == stored.incarnation:
             binding = stored.promised or LOWEST
             if (ballot or LOWEST) < binding:
                 self._false(t_s, state, f"promises {short(ballot)} below {short(binding)}")
-        if state.owned and (name, ballot, state.owned) not in self._holdings:
-            self._false(t_s, state, f"owns {list(state.owned)} with {short(ballot)}")
-        if state.incarnation == stored.attendant and not state.moving:
+        if state.record.owned and (name, ballot, state.record.owned) not in self._holdings:
+            self._false(t_s, state, f"owns {list(state.record.owned)} with {short(ballot)}")
+        if state.record.incarnation == stored.incarnation and not state.moving:
             if cell_at_rest is None:
                 self._false(t_s, state, "holds, but its body moves")
             elif cell_at_rest != state.hold_cell:
@@ -168,7 +156,7 @@ class Claims:
         self, t_s: float, state: VehicleState, ballot: Ballot, finished: int
     ) -> None:
         name, plan, harm = state.vehicle, self.plans.get(ballot), self.harmful.get(ballot)
-        if (name, state.incarnation, ballot) not in self._acceptances:
+        if (name, state.record.incarnation, ballot) not in self._acceptances:
             self._false(t_s, state, f"accepted {short(ballot)}, which is not stored")
         if state.completed > finished:
             self._false(t_s, state, f"completed {state.completed} moves, its body {finished}")
@@ -198,7 +186,7 @@ class Claims:
             if (
                 name not in self._accepted.get(ballot, ())
                 or state is None
-                or (state.promised, state.accepted, state.overdue) != (ballot, True, False)
+                or (state.record.promised, state.accepted, state.overdue) != (ballot, True, False)
             ):
                 self._tell("adoption", t_s, name, f"does not execute {short(ballot)}")
 
@@ -218,7 +206,7 @@ class Claims:
             self._tell("busy", t_s, min(promises), f"planned again at once under {short(ballot)}")
         self._planned_s[ballot] = leader_s
         for name, promise in promises.items():
-            if name in known and known[name].incarnation != promise.incarnation:
+            if name in known and known[name].record.incarnation != promise.record.incarnation:
                 self._tell("basis", t_s, name, "the process that promised has ended")
 
     def on_prepare(self, t_s: float, prepare: Prepare) -> None:

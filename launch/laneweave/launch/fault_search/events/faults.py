@@ -65,7 +65,9 @@ def draw_events(profile: Profile, fault_s: float, rng: random.Random) -> tuple[F
 
 def _is_promise(message: object) -> bool:
     return (
-        isinstance(message, VehicleState) and message.promised is not None and not message.accepted
+        isinstance(message, VehicleState)
+        and message.record.promised is not None
+        and not message.accepted
     )
 
 
@@ -84,8 +86,8 @@ def _is_motion(message: object) -> bool:
 def _is_transfer(message: object) -> bool:
     return (
         isinstance(message, Command)
-        and message.transfer is not None
-        and message.transfer.open == (message.tick % 2 == 0)
+        and message.record.transfer is not None
+        and message.record.transfer.open == (message.tick % 2 == 0)
     )
 
 

@@ -77,14 +77,13 @@ def absurd(message: object, rng: random.Random) -> object | None:
             return replace(message, ballot=_above(message.ballot, huge))
         case VehicleState() if rng.random() < 0.3:
             return replace(message, t_s=ABSURD_S)
-        case VehicleState(promised=promised) | Command(promised=promised) if (
-            promised is not None and rng.random() < 0.5
+        case VehicleState(record=record) | Command(record=record) if (
+            record.promised is not None and rng.random() < 0.5
         ):
-            return replace(message, promised=_above(promised, huge))
-        case VehicleState() | Command():
-            return replace(message, incarnation=huge)
-        case Sense():
-            return replace(message, attendant=huge)
+            forged = replace(record, promised=_above(record.promised, huge))
+            return replace(message, record=forged)
+        case VehicleState() | Command() | Sense():
+            return replace(message, record=replace(message.record, incarnation=huge))
         case _:
             return None
 

@@ -67,8 +67,10 @@ class _OldMessages:
             if isinstance(effect.message, VehicleState)
         ]
         for _, state in states:
-            newest[state.vehicle] = max(newest.get(state.vehicle, 0), state.incarnation)
-        return [effect for effect, state in states if state.incarnation < newest[state.vehicle]]
+            newest[state.vehicle] = max(newest.get(state.vehicle, 0), state.record.incarnation)
+        return [
+            effect for effect, state in states if state.record.incarnation < newest[state.vehicle]
+        ]
 
 
 class InjectedMessages:

@@ -119,7 +119,7 @@ class DrawnEntrance:
         while self._grants and self._grants[0].t_s <= self._now_s + TOLERANCE_S:
             grant = self._grants.pop(0)
             if grant.owner in vehicles:
-                vehicles[grant.owner].controller.assign_cell(grant.cell)
+                vehicles[grant.owner].controller.store.assign_cell(grant.cell)
 
     def control_lane_ends(
         self, vehicles: Mapping[Name, RoadVehicle], t_s: float

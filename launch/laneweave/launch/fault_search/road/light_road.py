@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
 
 from laneweave.launch.fault_search.checks.checker import Checker
-from laneweave.launch.fault_search.checks.claims import Stored
 from laneweave.launch.fault_search.road.drawn_entrance import Entrance
 from laneweave.launch.fault_search.road.stand_ins import LightVehicle, Visit
 from laneweave.protocol.errors import BadInputError
@@ -158,7 +157,7 @@ class LightRoad:
         controller = vehicle.controller
         held, name = controller.hold_cell, command.vehicle
         self._bounds.check(command, self.t_s, now_s)
-        self._bounds.check_claim(command.incarnation, controller.attendant, now_s)
+        self._bounds.check_claim(command.record.incarnation, controller.record.incarnation, now_s)
         if self._attendance.register_command(vehicle, command):
             self._report_stored(name, now_s)
             if self._reception(name) is not Reception.LOST:
@@ -174,7 +173,9 @@ class LightRoad:
         if controller.hold_cell != held:
             lasts_s = self._move_lasts_s()
             move = (held, controller.hold_cell)
-            self._checker.begin(now_s, name, command.incarnation, move, lasts_s, vehicle.latest_s)
+            self._checker.begin(
+                now_s, name, command.record.incarnation, move, lasts_s, vehicle.latest_s
+            )
             (column, lane), (to_column, to_lane) = move
             if (to_column - column, to_lane - lane) not in vehicle.drivable:
                 self._checker.undrivable(now_s, name, move)
@@ -263,15 +264,7 @@ class LightRoad:
         controller = self.vehicles[name].controller
         if controller.off_lattice is not None:
             return
-        stored = Stored(
-            controller.attendant,
-            controller.joined,
-            controller.accepted,
-            controller.promised,
-            controller.owned,
-            controller.transfer,
-        )
-        self._checker.store(now_s, name, stored)
+        self._checker.store(now_s, name, controller.record)
 
     def _let_leave(self, now_s: float) -> Iterator[Effect]:
         leaving = [

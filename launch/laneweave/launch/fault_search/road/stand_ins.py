@@ -125,9 +125,9 @@ class LightVehicle(RoadVehicle):
             bridge=bridge,
         )
         if scenario.formation.rolling:
-            self.controller.assign_cell(admission.cell)
+            self.controller.store.assign_cell(admission.cell)
         if not scenario.formation.closes_by_vehicles:
-            self.formation = self.controller.joined[0]
+            self.formation = self.controller.record.joined[0]
         self.clock_jump_s = 0.0
         """Error of the vehicle's clock by jumps, in addition to that of the visit."""
         self.latest_s = 0.0

@@ -9,7 +9,7 @@ import pytest
 from laneweave.launch.fault_search.checks.checker import MAX_VIOLATIONS, Checker
 from laneweave.launch.fault_search.checks.geometry import Geometry
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.wire.messages import Ballot, Name, Sense, VehicleState
+from laneweave.protocol.wire.messages import Ballot, Name, Sense, VehicleRecord, VehicleState
 from support.states import holding, make_plan
 
 GEOMETRY = Geometry(pitch_m=15.0, lane_width_m=3.5, length_m=5.0, width_m=1.8)
@@ -32,9 +32,7 @@ def state(vehicle: Name, seq: int | None, hold_cell: Cell = (0, 0), **more: obje
 
 
 def sense(attendant: int, joined: tuple[int, ...] = (0,)) -> Sense:
-    return Sense(
-        A, 1, 0.1, (0.0,) * 6, (0, 0), 0, (0, 0), 0, (), attendant=attendant, joined=joined
-    )
+    return Sense(A, 1, 0.1, (0.0,) * 6, (0, 0), 0, (0, 0), 0, VehicleRecord(attendant, joined), ())
 
 
 class Scene:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import pytest
-from attrs import evolve
 from msgspec.structs import replace
 
-from laneweave.launch.fault_search.checks.claims import Claims, Stored, required_before
+from laneweave.launch.fault_search.checks.claims import Claims, required_before
 from laneweave.launch.fault_search.events.forgeries import Harm
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.wire.messages import Ballot, Name, Prepare, VehicleState
-from support.states import holding, make_plan
+from laneweave.protocol.wire.messages import Ballot, Name, Prepare, VehicleRecord, VehicleState
+from support.states import changed, holding, make_plan
 
 A, B = Name("a"), Name("b")
 BALLOT = Ballot(1, Name("c1"), 1, 1)
 BLOCK = 0
-STORED = Stored(
-    attendant=1, joined=(BLOCK,), accepted=BALLOT, promised=None, owned=(), transfer=None
+STORED = VehicleRecord(
+    incarnation=1, joined=(BLOCK,), accepted=BALLOT, promised=None, owned=(), transfer=None
 )
 CELLS: dict[Name, Cell] = {A: (0, 0), B: (2, 0)}
 PLAN = make_plan(CELLS, {A: ((0, (0, 0), (0, 1)),), B: ()}, ballot=BALLOT)
@@ -59,13 +58,13 @@ def test_true_states_are_not_reported(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("state", "finished", "at_rest"),
     [
-        (replace(ACCEPTED, incarnation=2, accepted=False), 0, (0, 0)),  # never in charge
-        (replace(ACCEPTED, joined=(BLOCK, 1)), 0, (0, 0)),
-        (replace(ACCEPTED, promised=BALLOT._replace(seq=2)), 0, (0, 0)),  # not stored
+        (changed(ACCEPTED, incarnation=2, accepted=False), 0, (0, 0)),  # never in charge
+        (changed(ACCEPTED, joined=(BLOCK, 1)), 0, (0, 0)),
+        (changed(ACCEPTED, promised=BALLOT._replace(seq=2)), 0, (0, 0)),  # not stored
         (replace(ACCEPTED, completed=1), 0, (0, 0)),
         (ACCEPTED, 0, None),  # holds, but moves
         (ACCEPTED, 0, (0, 1)),  # another cell
-        (replace(ACCEPTED, owned=((5, 5),)), 0, (0, 0)),
+        (changed(ACCEPTED, owned=((5, 5),)), 0, (0, 0)),
         (replace(ACCEPTED, attended=False), 0, (0, 0)),  # moves without an agent
     ],
 )
@@ -90,7 +89,7 @@ def test_who_must_refuse_a_harmful_plan_must_not_accept_it(scene: Scene) -> None
 
 
 def test_a_plan_needs_promises_from_its_start_cells(scene: Scene) -> None:
-    scene.claims.record(replace(ACCEPTED, accepted=False))
+    scene.claims.record(changed(ACCEPTED, accepted=False))
     scene.claims.record(holding(B, BALLOT, (3, 0)))
     scene.claims.on_plan(1.0, PLAN)
     assert scene.kinds == ["basis"]
@@ -121,7 +120,7 @@ def test_promises_of_ended_processes_do_not_count(scene: Scene) -> None:
     promises = {A: ACCEPTED, B: replace(ACCEPTED, vehicle=B)}
     scene.claims.on_planning(1.0, 1.0, BALLOT, promises, promises)
     assert scene.kinds == []
-    scene.claims.on_planning(2.0, 2.0, BALLOT, promises, {B: replace(promises[B], incarnation=2)})
+    scene.claims.on_planning(2.0, 2.0, BALLOT, promises, {B: changed(promises[B], incarnation=2)})
     assert scene.kinds == ["basis"]
 
 
@@ -135,9 +134,9 @@ def test_planning_is_not_repeated_at_once(scene: Scene) -> None:
 
 
 def test_a_process_keeps_the_stored_promise(scene: Scene) -> None:
-    stored = evolve(STORED, promised=BALLOT._replace(seq=2), owned=((0, 0),))
+    stored = replace(STORED, promised=BALLOT._replace(seq=2), owned=((0, 0),))
     scene.claims.store(A, stored)
-    scene.send(replace(ACCEPTED, accepted=False))
+    scene.send(changed(ACCEPTED, accepted=False))
     assert scene.kinds == ["false"]
 
 
@@ -149,7 +148,7 @@ def test_a_ballot_has_one_roster(scene: Scene) -> None:
 
 def test_a_process_of_an_earlier_road_may_report_anything(scene: Scene) -> None:
     scene.claims.begin_road()
-    scene.claims.store(A, evolve(STORED, attendant=2, accepted=None))
+    scene.claims.store(A, replace(STORED, incarnation=2, accepted=None))
     scene.send(replace(ACCEPTED, completed=7))
     assert scene.kinds == []
 

@@ -22,6 +22,7 @@ from laneweave.protocol.wire.messages import (
     Plan,
     Prepare,
     RoadClock,
+    VehicleRecord,
 )
 from support.states import holding, make_plan
 
@@ -43,8 +44,8 @@ def accepts(name: Name, plan: Plan) -> bool:
         incarnation=PLAN.incarnations[name],
         hold_cell=CELLS[name],
         lattice=LATTICE,
-        joined=PLAN.formations,
-        owned=frozenset(OWNED[name]) if rolling else None,
+        stored=VehicleRecord(joined=PLAN.formations, owned=OWNED[name]),
+        owns_cells=rolling,
     )
     execution.on_prepare(Prepare(BALLOT, PLAN.formations, PLAN.roster))
     return execution.on_plan(plan)

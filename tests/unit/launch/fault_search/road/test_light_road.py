@@ -23,6 +23,7 @@ from laneweave.protocol.wire.messages import (
     Name,
     Prepare,
     Sense,
+    VehicleRecord,
     VehicleState,
 )
 from laneweave.protocol.wire.topics import COMMAND, PREPARE, VEHICLE_ALIVE
@@ -66,7 +67,8 @@ class Bench:
         self, incarnation: int, cell: Cell, tick: int | None = None, accepted: Ballot | None = None
     ) -> list[object]:
         tick = self.road.tick if tick is None else tick
-        command = Command(A, incarnation, tick, cell, tick + 8, (4, 1), b"", accepted=accepted)
+        record = VehicleRecord(incarnation=incarnation, accepted=accepted)
+        command = Command(A, record, tick, cell, tick + 8, (4, 1), b"")
         return messages(self.road.handle(Arrived(COMMAND, OWN, command), self.now_s))
 
     def agent(self, *, up: bool) -> None:
@@ -113,7 +115,7 @@ def test_a_late_command_is_stored_but_not_executed(bench: Bench) -> None:
     promised = Ballot(1, Name("c1"), 1, 1)
     bench.command(7, (4, 2), accepted=promised)
     assert len(bench.log) == 1
-    assert bench.road.vehicles[A].controller.accepted == promised
+    assert bench.road.vehicles[A].controller.record.accepted == promised
 
 
 def test_a_late_command_counts_unless_a_newer_one_was_there(bench: Bench) -> None:
@@ -137,11 +139,11 @@ def test_a_vehicle_without_agent_gets_a_caretaker_that_gives_way(bench: Bench) -
     assert [message.attended for message in sent if isinstance(message, VehicleState)] == [False]
     sense = next(message for message in sent if isinstance(message, Sense))
     assert sense.caretaker
-    assert sense.attendant == 100
+    assert sense.record.incarnation == 100
     prepare = Prepare(Ballot(1, Name("c1"), 1, 1), (-1,), (A,))
     (state,) = messages(bench.road.handle(Arrived(PREPARE, OWN, prepare), bench.now_s))
     assert isinstance(state, VehicleState)
-    assert state.promised == prepare.ballot
+    assert state.record.promised == prepare.ballot
     bench.agent(up=True)
     bench.command(101, (4, 1))
     assert not bench.sense().caretaker
