@@ -9,7 +9,8 @@ import pytest
 from attrs import evolve
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.fields import Closure, Demand, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import Closure, Demand
 from laneweave.protocol.vehicle.lane_ends import LaneEnd, LaneEnds, dead_ends, drive_out
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
 from laneweave.protocol.wire.messages import Name
