@@ -41,25 +41,23 @@ def _check_shares(
     name: str, shares: Sequence[float], possible: Collection[int], lanes: int
 ) -> None:
     """Check shares of lanes: none, or one for each lane, above 0 only in possible lanes."""
-    require(
-        len(shares) in (0, lanes),
-        name,
-        list(shares),
-        f"one share for each of the {lanes} lanes of road.lanes, or none",
-    )
-    require(
-        all(share >= 0 for share in shares) and sum(shares) < math.inf,
-        name,
-        list(shares),
-        "numbers >= 0, not all 0, with a finite sum",
-    )
-    require(
-        not any(share for lane, share in enumerate(shares) if lane not in possible),
-        name,
-        list(shares),
-        f"0 for all lanes but {', '.join(map(str, sorted(possible)))}",
-    )
-    require(not shares or sum(shares) > 0, name, list(shares), "numbers >= 0, not all 0")
+    others = ", ".join(map(str, sorted(possible)))
+    for ok, allowed in (
+        (
+            len(shares) in (0, lanes),
+            f"one share for each of the {lanes} lanes of road.lanes, or none",
+        ),
+        (
+            all(share >= 0 for share in shares) and sum(shares) < math.inf,
+            "numbers >= 0, not all 0, with a finite sum",
+        ),
+        (
+            not any(share for lane, share in enumerate(shares) if lane not in possible),
+            f"0 for all lanes but {others}",
+        ),
+        (not shares or sum(shares) > 0, "numbers >= 0, not all 0"),
+    ):
+        require(ok, name, list(shares), allowed)
 
 
 def check_volumes(scenario: Scenario) -> None:
@@ -105,18 +103,14 @@ def _check_capacity(scenario: Scenario) -> None:
     if not road.closures:
         return  # the bound of the entrance holds everywhere
     exits_m = {one.name: one.at_m for one in scenario.exit}
+    entry_m, flow, formation = scenario.geometry.entry_m, scenario.flow, scenario.formation
     parts = [
-        (
-            scenario.geometry.entry_m[lane],
-            inflow.volume_veh_per_h * share,
-            exits_m.get(name, math.inf),
-        )
-        for lane, inflow in scenario.flow.inflows.items()
+        (entry_m[lane], inflow.volume_veh_per_h * share, exits_m.get(name, math.inf))
+        for lane, inflow in flow.inflows.items()
         for name, share in _shares(inflow)
     ]
     volume = scenario.demand.volume_veh_per_lane_h
-    if not scenario.formation.rolling:
-        formation = scenario.formation
+    if not formation.rolling:
         columns = formation_columns(formation.max_vehicles, road.narrowest_lanes)
         require(
             not formation.closes_by_vehicles or columns <= formation.max_columns,
@@ -126,22 +120,20 @@ def _check_capacity(scenario: Scenario) -> None:
             f"{road.narrowest_lanes} lanes are open",
         )
         change_columns = scenario.types.all_change_columns
-        formations = math.floor(
-            scenario.flow.formation_bound_veh_per_lane_h(change_columns=change_columns)
-        )
+        most = math.floor(flow.formation_bound_veh_per_lane_h(change_columns=change_columns))
         require(
-            volume <= formations,
+            volume <= most,
             "demand.volume_veh_per_lane_h",
             volume,
-            f"at most {formations}: where {road.narrowest_lanes} lanes are open, formations of "
-            f"{scenario.formation.max_vehicles} (formation.max_vehicles) need more columns"
+            f"at most {most}: where {road.narrowest_lanes} lanes are open, formations of "
+            f"{formation.max_vehicles} (formation.max_vehicles) need more columns"
             + ("" if change_columns else ", and those with weaker types one more"),
         )
-    for s_m in sorted({0.0, *scenario.geometry.entry_m, *(one.from_m for one in road.closures)}):
-        flows = [(from_m, flow) for from_m, flow, to_m in parts if from_m <= s_m < to_m]
-        from_ramps = sum(flow for from_m, flow in flows if from_m > 0.0)
-        main_lanes = sum(flow for from_m, flow in flows if from_m <= 0.0) / volume
-        count = scenario.road.open_lanes_at(s_m)
+    for s_m in sorted({0.0, *entry_m, *(one.from_m for one in road.closures)}):
+        flows = [(from_m, own) for from_m, own, to_m in parts if from_m <= s_m < to_m]
+        from_ramps = sum(own for from_m, own in flows if from_m > 0.0)
+        main_lanes = sum(own for from_m, own in flows if from_m <= 0.0) / volume
+        count = road.open_lanes_at(s_m)
         room = bound * count - from_ramps
         ramps = f" and {from_ramps:g} vehicles per hour come from ramps" if from_ramps else ""
         require(
@@ -177,16 +169,15 @@ def check_destinations(scenario: Scenario) -> None:
 
 def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str) -> None:
     """Check that a vehicle from a lane has room for all lane changes to its destination."""
-    own = min(
-        (one for one in scenario.geometry.sections if one.lane == lane), key=lambda one: one.from_m
-    )
-    from_m, room_m = max(own.from_m, own.moves_from_m, scenario.geometry.moves_from_m), 0.0
+    geometry = scenario.geometry
+    own = min((one for one in geometry.sections if one.lane == lane), key=lambda one: one.from_m)
+    from_m, room_m = max(own.from_m, own.moves_from_m, geometry.moves_from_m), 0.0
     if scenario.road.closures and not scenario.formation.rolling:
         # At the volumes at which vehicles must cross lanes one after another, formations are full.
         formation = scenario.formation
         vehicles = formation.max_vehicles + scenario.flow.vehicles_from_ramps
         columns = formation_columns(vehicles, scenario.road.narrowest_lanes)
-        from_m = max(from_m, *scenario.geometry.entry_m) + (columns - 1) * formation.gap_m
+        from_m = max(from_m, *geometry.entry_m) + (columns - 1) * formation.gap_m
         room_m = drive_out(scenario).room_m
     from_m += scenario.types.longest_body_m
     advance_m = scenario.formation.speed_mps * scenario.timing.cycles_s[0]
@@ -196,7 +187,7 @@ def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str)
         room = [
             (section.to_m - room_m if section.to_m < scenario.road.length_m else section.to_m)
             - (from_m + abs(section.lane - lane) * advance_m)
-            for section in scenario.geometry.sections
+            for section in geometry.sections
             if section.serves(preferred, destination)
         ]
         require(

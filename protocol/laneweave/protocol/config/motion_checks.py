@@ -148,9 +148,8 @@ def _in_ticks(scenario: Scenario, time_s: float, min_ticks: int) -> bool:
 def check_braking(scenario: Scenario) -> None:
     """Check that vehicles that hold behind each other need no emergency braking."""
     reaction_s = scenario.braking.reaction_s
-    allowed = (
-        f"a multiple of runtime.tick_s = {scenario.runtime.tick_s:g}: sensors measure each tick"
-    )
+    tick_s = scenario.runtime.tick_s
+    allowed = f"a multiple of runtime.tick_s = {tick_s:g}: sensors measure each tick"
     require(_in_ticks(scenario, reaction_s, 1), "braking.reaction_s", reaction_s, allowed)
     gap_m = scenario.formation.gap_m
     hardest_mps2 = max(scenario.braking.lead_brake_mps2, -scenario.vehicle.min_accel_mps2)

@@ -105,11 +105,12 @@ def check_lane_rules(scenario: Scenario) -> None:
 
 def _check_permitted_lanes(scenario: Scenario) -> None:
     """Check that each type has a lane to enter by, and one to leave by if its demand is drawn."""
-    if not scenario.road.restrictions:
+    road, demand = scenario.road, scenario.demand
+    if not road.restrictions:
         return
-    demand = scenario.demand
+    sections, entry_m = scenario.geometry.sections, scenario.geometry.entry_m
     shares = [TypeShare(one.name, one.share) for one in scenario.vehicle_type]
-    entrances = [(MAIN_ENTRANCE, scenario.road.first_lanes, shares, demand.destinations)]
+    entrances = [(MAIN_ENTRANCE, road.first_lanes, shares, demand.destinations)]
     entrances += [
         (one.name, (one.lane,), list(one.vehicle_types) or shares, one.destinations)
         for one in scenario.entrance
@@ -120,25 +121,17 @@ def _check_permitted_lanes(scenario: Scenario) -> None:
         if sum(one.share for one in destinations) < 1.0:
             wanted.append(END_OF_ROAD)
         for name in [one.type for one in (*types, cars) if one.share > ROUNDED_SHARE]:
-            enters = any(
-                not scenario.road.is_restricted(lane, scenario.geometry.entry_m[lane], name)
-                for lane in lanes
-            )
-            allowed = f"types other than {name}, which has no lane left at entrance {entrance}"
-            _require_lane(enters, scenario, name, lanes, allowed)
+            enters = any(not road.is_restricted(lane, entry_m[lane], name) for lane in lanes)
+            _require_lane(enters, scenario, name, lanes, f"at entrance {entrance}")
             for destination in wanted if not scenario.sumo.config else ():
-                ends = [
-                    one for one in scenario.geometry.sections if one.serves(ANY_LANE, destination)
-                ]
-                leaves = not ends or any(scenario.road.may_leave_by(one, name) for one in ends)
-                allowed = (
-                    f"types other than {name}, which has no lane left to leave by {destination}"
-                )
-                _require_lane(leaves, scenario, name, [one.lane for one in ends], allowed)
+                ends = [one for one in sections if one.serves(ANY_LANE, destination)]
+                leaves = not ends or any(road.may_leave_by(one, name) for one in ends)
+                where = f"to leave by {destination}"
+                _require_lane(leaves, scenario, name, [one.lane for one in ends], where)
 
 
 def _require_lane(
-    ok: bool, scenario: Scenario, vehicle_type: str, lanes: Collection[int], allowed: str
+    ok: bool, scenario: Scenario, vehicle_type: str, lanes: Collection[int], where: str
 ) -> None:
     """Require a lane for a type; the error names the first restriction of these lanes."""
     if not ok:
@@ -148,6 +141,7 @@ def _require_lane(
             if one.lane in lanes and one.applies_to(vehicle_type)
         )
         field = f"road.restrictions[{number}].vehicle_types"
+        allowed = f"types other than {vehicle_type}, which has no lane left {where}"
         raise BadInputError(field, list(one.vehicle_types), allowed)
 
 
@@ -168,11 +162,8 @@ def check_entrances(scenario: Scenario) -> None:
         _check_opening(scenario, f"{name}.at_m", entrance, opens_m)
         formation = scenario.formation
         low_m = entrance.at_m + formation.speed_mps * formation.settle_s
-        ends_m = [
-            one.to_m
-            for one in scenario.geometry.sections
-            if one.lane == entrance.lane and one.to_m > entrance.at_m
-        ]
+        sections = [one for one in scenario.geometry.sections if one.lane == lane]
+        ends_m = [one.to_m for one in sections if one.to_m > entrance.at_m]
         high_m = min(ends_m, default=road.length_m) - scenario.types.step_m
         require(
             low_m <= entrance.merge_m <= high_m,
@@ -191,16 +182,12 @@ def _check_opening(
     if scenario.formation.change_columns:
         require(entrance.at_m == opens_m[0], field, entrance.at_m, f"{opens_m[0]:g}, {where}")
         return
-    before = [
-        section
-        for section in scenario.geometry.sections
-        if section.lane == entrance.lane and section.to_m <= entrance.at_m
-    ]
-    after_m = max((section.to_m for section in before), default=-math.inf)
+    sections = [one for one in scenario.geometry.sections if one.lane == entrance.lane]
+    before = [one for one in sections if one.to_m <= entrance.at_m]
     # The bodies of vehicles that leave and of vehicles that enter must not overlap on the road.
-    after_m += (
-        scenario.types.longest_body_m + scenario.vehicle.max_speed_mps * scenario.runtime.tick_s
-    )
+    tick_m = scenario.vehicle.max_speed_mps * scenario.runtime.tick_s
+    after_m = max((one.to_m for one in before), default=-math.inf)
+    after_m += scenario.types.longest_body_m + tick_m
     possible = [one for one in opens_m if one >= after_m and all(each.exit for each in before)]
     allowed = f"{' or '.join(f'{one:g}' for one in possible) or 'no position'}, {where}"
     if before:

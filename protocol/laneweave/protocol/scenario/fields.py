@@ -23,13 +23,14 @@ from laneweave.protocol.scenario.deployment_fields import (
     SumoSettings,
 )
 from laneweave.protocol.scenario.formation_table import FormationSettings
-from laneweave.protocol.scenario.method_tables import Lc2013Settings, RuleSettings
 from laneweave.protocol.scenario.road_geometry import RoadGeometry
 from laneweave.protocol.scenario.road_tables import Demand, Entrance, Exit, Road, TypeShare
 from laneweave.protocol.scenario.timing import Timing
 from laneweave.protocol.scenario.traffic_flow import TrafficFlow
 from laneweave.protocol.scenario.vehicle_tables import (
     Braking,
+    Lc2013Settings,
+    RuleSettings,
     Sensing,
     Tracking,
     Vehicle,

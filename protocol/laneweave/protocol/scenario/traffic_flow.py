@@ -73,8 +73,7 @@ class TrafficFlow:
             for lane, volume in volumes.items()
             if volume > 0.0
         }
-        if self._road.restrictions and found:
-            found = self._permitted(found)
+        found = self._permitted(found)
         every = range(self._road.lanes)
         for one in self._entrances:
             preferring = _normalised(one.lane_shares, every) if one.lane_shares else ()
@@ -84,9 +83,7 @@ class TrafficFlow:
                 preferring or self.lane_shares,
                 one.vehicle_types or types,
             )
-            found |= (
-                self._permitted({one.lane: own}) if self._road.restrictions else {one.lane: own}
-            )
+            found |= self._permitted({one.lane: own})
         return MappingProxyType(dict(sorted(found.items())))
 
     def _permitted(self, inflows: Mapping[int, Inflow]) -> dict[int, Inflow]:
@@ -95,6 +92,8 @@ class TrafficFlow:
         A type enters in its other lanes, in proportion to the volumes of these. Types
         without a lane do not enter, and there are more vehicles of the others.
         """
+        if not self._road.restrictions or not inflows:
+            return dict(inflows)
         shares = {one.type: one.share for one in next(iter(inflows.values())).types}
         shares[CAR] = max(0.0, 1.0 - sum(shares.values()))
         lanes_of = {

@@ -16,8 +16,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.scenario.method_tables import Lc2013Settings
-from laneweave.protocol.scenario.vehicle_tables import Vehicle
+from laneweave.protocol.scenario.vehicle_tables import Lc2013Settings, Vehicle
 from laneweave.sim_bridge.sumo.road_edges import (
     Edge,
     RoadEdges,
