@@ -132,13 +132,9 @@ def nearest() -> list[dict[str, Any]]:
 def _gaps_m(pair: Pair, max_late: int) -> NDArray[np.float64]:
     """Return the minimum gap (2 n + 1,) with B up to n ticks early or late."""
     scenario = Scenario()
-    body = scenario.vehicle.length_m, scenario.vehicle.width_m
+    own, body = (scenario, scenario.vehicle), scenario.vehicle.size_m
     a, b = (
-        np.pad(
-            move_profile(scenario, scenario.vehicle, *step).states,
-            ((max_late, max_late), (0, 0)),
-            mode="edge",
-        )
+        np.pad(move_profile(*own, *step).states, ((max_late, max_late), (0, 0)), mode="edge")
         + cell_state(scenario.lattice, cell, 0.0)
         for cell, step in (((0, 0), pair[1]), (pair[0], pair[2]))
     )

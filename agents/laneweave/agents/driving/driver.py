@@ -105,7 +105,8 @@ class TrackingDriver:
             limits: those of the vehicle's type.
             stopwatch: clock [s] that measures how long solves take.
         """
-        self._scenario = scenario
+        self._own, self._limits = (scenario, limits), limits
+        self._room_ahead_m = scenario.types.room_ahead_m
         self._tracker = Tracker(scenario, limits, stopwatch)
         self._reference: Reference | None = None
         self._settling: Reference | None = None
@@ -115,7 +116,6 @@ class TrackingDriver:
         self._ticks = 0
         """Duration of the newest move [ticks]."""
         self._lattice = scenario.lattice
-        self._limits = limits
         self._speed_mps = scenario.lattice.speed_mps
         self._surroundings = Surroundings(scenario, limits)
         self._stop_lines = StopLines(scenario, limits)
@@ -130,29 +130,21 @@ class TrackingDriver:
 
     def take_over(self, sense: Sense) -> None:
         """Continue the motion controller's current motion."""
-        scenario = self._scenario
         self._goal, self._settling = sense.hold_cell, None
         if sense.motion_origin == sense.hold_cell and sense.motion_end_tick > sense.tick + 3:
             state = commanded_state(sense.state, sense.setpoint, self._limits, self._speed_mps)
             self._reference = self._settling = Reference.settling(
-                scenario,
-                self._limits,
-                sense.hold_cell,
-                state,
-                sense.tick,
-                sense.motion_end_tick,
+                *self._own, sense.hold_cell, state, sense.tick, sense.motion_end_tick
             )
         elif sense.motion_end_tick > sense.tick and sense.motion_ticks in self._durations:
             begin_tick = sense.motion_end_tick - sense.motion_ticks
             self.begin((0, sense.motion_origin, sense.hold_cell), begin_tick, sense.motion_ticks)
         else:
-            self._reference = Reference.hold(scenario, self._limits, sense.hold_cell)
+            self._reference = Reference.hold(*self._own, sense.hold_cell)
 
     def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
         """Begin a move at `tick` that lasts `ticks` ticks."""
-        self._reference = Reference.move(
-            self._scenario, self._limits, move[1], move[2], tick, ticks
-        )
+        self._reference = Reference.move(*self._own, move[1], move[2], tick, ticks)
         # The same move may begin again, if the command with its beginning was lost.
         if self._settling is not None and self._settling.origin == move[1]:
             self._reference.settle_meanwhile(self._settling)
@@ -163,7 +155,7 @@ class TrackingDriver:
 
         One that settles may still fall back to its cell if others have the room.
         """
-        reference, room_ahead_m = self._current, self._scenario.types.room_ahead_m
+        reference, room_ahead_m = self._current, self._room_ahead_m
         if room_ahead_m > 0.0 and reference.origin == self._goal:
             return nearly_settled(sense.state, self._lattice, self._goal, sense.t_s, room_ahead_m)
         return sense.tick >= reference.rest_tick and at_rest_in_cell(

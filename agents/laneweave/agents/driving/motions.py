@@ -50,10 +50,8 @@ class _MoveTable:
     @classmethod
     def of(cls, scenario: Scenario, dx: int, dy: int, ticks: int) -> _MoveTable:
         """Tabulate a move of a car."""
-        n, states = (
-            scenario.timing.horizon_ticks,
-            move_profile(scenario, scenario.vehicle, dx, dy, ticks).states,
-        )
+        n = scenario.timing.horizon_ticks
+        states = move_profile(scenario, scenario.vehicle, dx, dy, ticks).states
         along = np.concatenate([states[:, 0], np.full(n, states[-1, 0])])
         starts = np.arange(ticks)[:, None]
         advance_m = scenario.formation.speed_mps * scenario.runtime.tick_s

@@ -107,9 +107,8 @@ def bench_tracker(
     for name in SITUATIONS:
         cpu_ms, osqp, unusable = [], 0, 0
         for index in range(instances):
-            ticks = list(
-                drive(Tracker(scenario, scenario.vehicle), scenario, name, f"{seed} {name} {index}")
-            )
+            tracker = Tracker(scenario, scenario.vehicle)
+            ticks = list(drive(tracker, scenario, name, f"{seed} {name} {index}"))
             cpu_ms.append(np.median([_replay(scenario, ticks) for _ in range(repeats)], axis=0))
             osqp += sum(tick.result.iterations > 0 for tick in ticks)
             unusable += sum(not tick.result.usable for tick in ticks)
@@ -212,9 +211,8 @@ def _net_gap_m(scenario: Scenario, cells: int) -> float:
 def _slower_ahead(scenario: Scenario, rng: random.Random) -> Episode:
     start_s, decel, speed_mps = rng.uniform(0.5, 2.0), rng.uniform(2.0, 5.0), rng.uniform(4.0, 12.0)
     rear = _braking(scenario, _net_gap_m(scenario, 1), start_s, decel, speed_mps)
-    return Episode(
-        Reference.hold(scenario, scenario.vehicle, (0, 1)), 80, rear, planned=_is_planned(rng)
-    )
+    reference = Reference.hold(scenario, scenario.vehicle, (0, 1))
+    return Episode(reference, 80, rear, planned=_is_planned(rng))
 
 
 def _closing(scenario: Scenario, rng: random.Random) -> Episode:
@@ -262,10 +260,9 @@ def _is_planned(rng: random.Random) -> bool:
 def _undisturbed(scenario: Scenario, rng: random.Random) -> Episode:
     """Return a hold or a move; in half of the episodes there is a vehicle two cells ahead."""
     dx, dy = rng.choice([(0, 0), (0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
-    reference = (
-        Reference.move(scenario, scenario.vehicle, (0, 1), (dx, 1 + dy), 10) if dx or dy else None
-    )
-    reference = reference or Reference.hold(scenario, scenario.vehicle, (0, 1))
+    reference = Reference.hold(scenario, scenario.vehicle, (0, 1))
+    if dx or dy:
+        reference = Reference.move(scenario, scenario.vehicle, (0, 1), (dx, 1 + dy), 10)
     rear = _braking(scenario, _net_gap_m(scenario, 2), 0.0, 1.0, scenario.lattice.speed_mps)
     return Episode(reference, 60, rng.choice((None, rear)), planned=_is_planned(rng))
 

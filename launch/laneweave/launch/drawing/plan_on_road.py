@@ -128,17 +128,15 @@ def _drive_vehicle(
     scenario: Scenario, path: Sequence[Cell], slot_ticks: int, ticks: int
 ) -> NDArray[np.float64]:
     """Simulate one vehicle; return its states (ticks + 1, 6)."""
-    reference, tracker = (
-        Reference.hold(scenario, scenario.vehicle, path[0]),
-        Tracker(scenario, scenario.vehicle),
-    )
+    own = scenario, scenario.vehicle
+    reference, tracker = Reference.hold(*own, path[0]), Tracker(*own)
     start = cell_state(scenario.lattice, path[0], 0.0)
     plant = Plant(start, scenario.vehicle, scenario.runtime.tick_s)
     states, speed_mps = [start], scenario.formation.speed_mps
     for tick in range(ticks):
         step, since = divmod(tick, slot_ticks)
         if since == 0 and path[step] != path[step + 1]:
-            reference = Reference.move(scenario, scenario.vehicle, path[step], path[step + 1], tick)
+            reference = Reference.move(*own, path[step], path[step + 1], tick)
         state = commanded_state(plant.state, plant.setpoint, scenario.vehicle, speed_mps)
         jerk_s, jerk_y = tracker.solve(state, reference.window(tick)).jerk[0].tolist()
         states.append(plant.step(jerk_s, jerk_y))

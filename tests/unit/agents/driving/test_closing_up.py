@@ -23,14 +23,9 @@ LIMITS, LATTICE, TICK_S = SCENARIO.vehicle, SCENARIO.lattice, SCENARIO.runtime.t
 V_F = LATTICE.speed_mps
 SLOT_TICKS = round(SCENARIO.timing.cycles_s[0] / TICK_S)
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
-BRAKE = EmergencyBrake(LIMITS, SCENARIO.braking, SCENARIO.runtime.tick_s)
-PROMISED_M = (
-    ERROR_SIGMAS
-    * spare_error_m(
-        LIMITS, SCENARIO.braking, SCENARIO.sensing, 1.5 * V_F, SCENARIO.formation.speed_mps
-    )
-    + _TRACKING_ERROR_M
-)
+BRAKE = EmergencyBrake(LIMITS, SCENARIO.braking, TICK_S)
+ERROR_M = spare_error_m(LIMITS, SCENARIO.braking, SCENARIO.sensing, 1.5 * V_F, V_F)
+PROMISED_M = ERROR_SIGMAS * ERROR_M + _TRACKING_ERROR_M
 """What moves forwards leave beyond the margin."""
 
 

@@ -274,10 +274,8 @@ def test_a_distant_vehicle_changes_nothing(distance: float) -> None:
 @pytest.mark.parametrize("side", ["ahead", "behind"])
 @pytest.mark.parametrize("scenario", [SCENARIO, ALWAYS])
 def test_gap_rows_leave_nothing_behind(scenario: Scenario, side: str) -> None:
-    window, state = (
-        Reference.hold(SCENARIO, LIMITS, (0, 1)).window(0),
-        cell_state(LATTICE, (0, 1), 0.0),
-    )
+    window = Reference.hold(SCENARIO, LIMITS, (0, 1)).window(0)
+    state = cell_state(LATTICE, (0, 1), 0.0)
     tracker = Tracker(scenario, scenario.vehicle)
     if side == "ahead":
         pressed = tracker.solve(state, window, behind_of(np.full(N + 1, state[0] + 6.0)))

@@ -108,12 +108,9 @@ def test_slots_are_from_four_to_seven_seconds_unless_they_are_given() -> None:
     assert scenario.timing.move_durations == set(range(38, 70, 2))
     assert (scenario.timing.move_s, scenario.timing.horizon_ticks) == (3.8, 70)
     given = parse_scenario({"formation": {"cycle_s": 5.0}})
-    assert (given.timing.slots_s, given.timing.horizon_ticks, given.timing.move_s) == (
-        (5.0,),
-        50,
-        4.8,
-    )
-    assert given.timing.move_durations == {48}
+    timing = given.timing
+    assert (timing.slots_s, timing.horizon_ticks, timing.move_s) == ((5.0,), 50, 4.8)
+    assert timing.move_durations == {48}
     slower = parse_scenario({"formation": {"cycle_s": 5.0, "move_s": 4.0}})
     assert slower.timing.move_durations == {40}
     rolling = parse_scenario({"formation": {"operation": "rolling"}})

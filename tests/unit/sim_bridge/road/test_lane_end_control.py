@@ -229,7 +229,7 @@ def gap_is_entered(patch: pytest.MonkeyPatch) -> None:
 def gap_too_short(patch: pytest.MonkeyPatch) -> None:
     short = evolve(drive_out(DROP), columns=1)
     for name in ("drive_out", "own_drive_out"):
-        patch.setattr(lane_end_control, name, lambda _: short)
+        patch.setattr(lane_end_control, name, lambda *_: short)
 
 
 def starts_without_a_gap(patch: pytest.MonkeyPatch) -> None:
