@@ -37,7 +37,9 @@ from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.lattice import territory
 from laneweave.protocol.runtime.node import Node, Started, read_message
 from laneweave.protocol.runtime.transport import Received
-from laneweave.protocol.scenario.fields import FormationSettings, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import FormationSettings
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Prepare, Sense
@@ -75,9 +77,9 @@ class CpuTimer:
 class TimedDriver(TrackingDriver):
     """The real driver with measured `drive`."""
 
-    def __init__(self, scenario: Scenario, timer: CpuTimer) -> None:
+    def __init__(self, scenario: Scenario, limits: Vehicle, timer: CpuTimer) -> None:
         """Create a driver that adds its CPU time to a timer."""
-        super().__init__(scenario)
+        super().__init__(scenario, limits)
         self._timer = timer
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
@@ -211,7 +213,7 @@ class Road:
                 name,
                 incarnations.__next__,
                 self.scenario,
-                lambda scenario: TimedDriver(scenario, self.tracking),
+                lambda scenario, limits: TimedDriver(scenario, limits, self.tracking),
             ),
             next(incarnations),
             self.scenario.runtime,
@@ -306,7 +308,7 @@ class Road:
         task = SortingTask((block,), cells, goal_lanes, (), scenario, LONGEST_DEADLINE_S)
         moves = sort_lanes(task, scenario.formation.max_nodes, plan, time.monotonic).moves
         every = [move for each in moves.values() for move in each]
-        slot_s = scenario.cycles_s[0]
+        slot_s = scenario.timing.cycles_s[0]
         if max(step for step, _, _ in every) >= steps_left(
             cells.values(), start_s, slot_s, scenario
         ):

@@ -105,7 +105,7 @@ def nearest() -> list[dict[str, Any]]:
     The moves are those of agents in the default scenario, without tracking errors; gaps are bumper
     to bumper between the turned bodies, negative if they overlap.
     """
-    tick_s, move_s = Scenario().runtime.tick_s, Scenario().move_s
+    tick_s, move_s = Scenario().runtime.tick_s, Scenario().timing.move_s
     ticks_late = {f"{late_s:g} s": round(late_s / tick_s) for late_s in (0.0, 0.5, move_s)}
     gaps_m = {
         pair: _gaps_m(pair, max(ticks_late.values()))
@@ -132,9 +132,9 @@ def nearest() -> list[dict[str, Any]]:
 def _gaps_m(pair: Pair, max_late: int) -> NDArray[np.float64]:
     """Return the minimum gap (2 n + 1,) with B up to n ticks early or late."""
     scenario = Scenario()
-    body = scenario.vehicle.length_m, scenario.vehicle.width_m
+    own, body = (scenario, scenario.vehicle), scenario.vehicle.size_m
     a, b = (
-        np.pad(move_profile(scenario, *step).states, ((max_late, max_late), (0, 0)), mode="edge")
+        np.pad(move_profile(*own, *step).states, ((max_late, max_late), (0, 0)), mode="edge")
         + cell_state(scenario.lattice, cell, 0.0)
         for cell, step in (((0, 0), pair[1]), (pair[0], pair[2]))
     )

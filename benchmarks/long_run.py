@@ -211,7 +211,7 @@ def run_deployment(scenario: Scenario, folder: Path) -> dict[str, Any]:
     summary = read_summary(folder / "run")
     assert summary is not None  # noqa: S101 (the bridge has ended)
     road_s, lanes = summary.simulated_s, scenario.road.lanes
-    on_road = scenario.free_flow_s * scenario.demand.volume_veh_per_lane_h * lanes / 3600.0
+    on_road = scenario.geometry.free_flow_s * scenario.demand.volume_veh_per_lane_h * lanes / 3600.0
     return {
         "road_s": round(road_s),
         "left": summary.vehicles.left,

@@ -37,7 +37,8 @@ from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.config.source_files import read_toml
 from laneweave.protocol.files import write_atomically
-from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.summary import read_summary
 
 HERE: Final = Path(__file__).resolve().parent
@@ -308,7 +309,7 @@ def _beyond_limits(tracks: Tracks, trips: Mapping[str, Any], scenario: Scenario)
     """Return the number of rows in which a vehicle exceeds the limits of its type."""
     count = 0
     for name, accel in _by_type(tracks, trips):
-        vehicle = scenario.types[name].vehicle
+        vehicle = scenario.types[name].limits
         low, high = vehicle.min_accel_mps2 - 1e-3, vehicle.max_accel_mps2 + 1e-3
         count += int(np.sum((accel < low) | (accel > high)))
     return count

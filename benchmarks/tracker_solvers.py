@@ -145,7 +145,7 @@ def record(scenario: Scenario, *, instances: int, seed: int) -> Recording:
         RuntimeError: the exact solution of a program was not found.
     """
     scenario = always_solving(scenario)
-    program = Tracker(scenario).program
+    program = Tracker(scenario, scenario.vehicle).program
     parts = Parts.of(program.cost, program.constraints)
     exact = QuadraticProgram(
         program.cost, program.constraints, program.low.all, program.high.all, settings=_EXACT
@@ -153,7 +153,7 @@ def record(scenario: Scenario, *, instances: int, seed: int) -> Recording:
     recording = Recording(parts, [], [])
     for name in SITUATIONS:
         for index in range(instances):
-            tracker, problems = Tracker(scenario), []
+            tracker, problems = Tracker(scenario, scenario.vehicle), []
             for tick in drive(tracker, scenario, name, f"{seed} {name} {index}"):
                 lower, upper = tracker.program.low.all.copy(), tracker.program.high.all.copy()
                 exact.update(lower, upper)
@@ -394,8 +394,8 @@ def solvers(scenario: Scenario, parts: Parts) -> dict[str, Solver]:
     condensed = Condensed.of(parts)
     always = always_solving(scenario)
     return {
-        "tracker": TrackerSolver(lambda: Tracker(scenario)),
-        "no-shortcut": TrackerSolver(lambda: Tracker(always)),
+        "tracker": TrackerSolver(lambda: Tracker(scenario, scenario.vehicle)),
+        "no-shortcut": TrackerSolver(lambda: Tracker(always, always.vehicle)),
         "osqp": OsqpSolver(parts),
         "daqp": DaqpSolver(parts, condensed),
         "lq": LqSolver(parts, condensed),

@@ -17,7 +17,8 @@ import attrs
 
 from laneweave.protocol.field_validators import HOST_PORT_RULE
 from laneweave.protocol.names import NAME_RULE
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS
 
 MISSING = "?"
 """Meaning of a field that the document does not describe yet."""
@@ -103,16 +104,8 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
             "tuple[float, ...]": "list of numbers",
             "tuple[str, ...]": "list of texts",
             "bool": "`true`, `false`",
-            "tuple[Closure, ...]": "list of tables",
-            "tuple[Restriction, ...]": "list of tables",
-            "tuple[SolidLine, ...]": "list of tables",
-            "tuple[DestinationShare, ...]": "list of tables",
-            "tuple[Entrance, ...]": "list of tables",
-            "tuple[Exit, ...]": "list of tables",
-            "tuple[VehicleType, ...]": "list of tables",
-            "tuple[DrivingStructure, ...]": "list of tables",
         }
-        return kinds[re.sub(r"[a-z]+\.", "", kind)]
+        return kinds.get(kind, "list of tables")
     found = limits_of(attribute)
     if "choices" in found:
         return ", ".join(f"`{json.dumps(one)}`" for one in found["choices"] if one is not None)

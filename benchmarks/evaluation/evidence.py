@@ -86,7 +86,7 @@ def setting_of(runs: Sequence[Run]) -> Setting:
     return Setting(
         duration_s=scenario.demand.duration_s,
         road_m=scenario.road.length_m,
-        free_flow_s=round(scenario.free_flow_s, 3),
+        free_flow_s=round(scenario.geometry.free_flow_s, 3),
         pitch_m=formation.gap_m,
         speed_mps=formation.speed_mps,
         min_accel_mps2=vehicle.min_accel_mps2,

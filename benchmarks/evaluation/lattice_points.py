@@ -72,7 +72,7 @@ def _settled(tracks: Tracks, ticks: Ints, scenario: Scenario) -> Bools:
     first, changed = np.zeros(len(ticks), dtype=np.bool_), tracks.changed
     first[tracks.starts[:-1]] = True
     about_to_move = np.append(changed[1:], False)[: len(ticks)]
-    shortest_s, longest_s = scenario.cycles_s
+    shortest_s, longest_s = scenario.timing.cycles_s
     period = round(shortest_s / tick_s)
     at_end: Bools = ticks % period == _slot_phase(ticks[changed], period)
     at_end |= np.isin(ticks, ticks[about_to_move])

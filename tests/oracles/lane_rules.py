@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
-from laneweave.protocol.scenario.fields import LaneRule, Restriction
+from laneweave.protocol.scenario.road_tables import LaneRule, Restriction
 
 Cell = tuple[int, int]
 

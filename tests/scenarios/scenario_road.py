@@ -16,8 +16,10 @@ from laneweave.agents.driving.driver import Drive
 from laneweave.launch.fault_search.road.stand_ins import LightDriver
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Arrived, Effect, Send, Started
-from laneweave.protocol.scenario.deployment_fields import Network
-from laneweave.protocol.scenario.fields import FormationSettings, Road, Runtime, Scenario
+from laneweave.protocol.scenario.deployment_fields import Network, Runtime
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import FormationSettings
+from laneweave.protocol.scenario.road_tables import Road
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.motion import at_rest_in_cell, cell_state
 from laneweave.protocol.vehicle.plan_execution import PlanExecution

@@ -16,7 +16,8 @@ from laneweave.launch.recordings.trajectories import read_trajectories, read_tri
 from laneweave.launch.report.corridor_comparison import ALONE_FOLDER, compare
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
-from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.sim_bridge.corridors import corridor_setup, sumo_statistics
 from laneweave.sim_bridge.corridors.corridor_reading import WHOLE, read_corridor
 from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow

@@ -12,6 +12,7 @@ from laneweave.agents.driving.driver import Driver, TrackingDriver
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.runtime.node import Arrived, Effect, Event
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import (
     Ballot,
@@ -29,11 +30,11 @@ from support.paper import PAPER
 from support.road_vehicles import vehicle_in
 from support.states import BALLOT, changed, make_plan, sent
 
-MakeDriver = Callable[[Scenario], Driver]
+MakeDriver = Callable[[Scenario, Vehicle], Driver]
 
 SCENARIO = PAPER
 LATTICE, TICK_S = SCENARIO.lattice, SCENARIO.runtime.tick_s
-MOVE_TICKS = round(SCENARIO.move_s / TICK_S)
+MOVE_TICKS = round(SCENARIO.timing.move_s / TICK_S)
 ME, OTHER = Name("me"), Name("other")
 HOME: Cell = (-1, 1)
 

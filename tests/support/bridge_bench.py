@@ -184,7 +184,7 @@ class Desk:
             "hold_cell": controller.hold_cell,
             "motion_end_tick": 0,
             "motion_origin": controller.hold_cell,
-            "jerks": jerks((0.0, 0.0), ticks=self.scenario.horizon_ticks),
+            "jerks": jerks((0.0, 0.0), ticks=self.scenario.timing.horizon_ticks),
         }
         return changed(Command(**unchanged), **changes)
 
@@ -365,7 +365,7 @@ class Street:
             formations=formations,
             incarnations={name: agent._incarnation},
             t0_s=t0_s,
-            slot_s=self.scenario.cycles_s[0],
+            slot_s=self.scenario.timing.cycles_s[0],
         )
         prepare = Prepare(plan.ballot, formations, (name,))
         for topic, message in ((PREPARE, prepare), (PLAN, plan)):

@@ -6,7 +6,8 @@ from attrs import define, evolve, field
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.road_layout import Exits
-from laneweave.protocol.scenario.fields import Closure, DestinationShare, Road, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import Closure, DestinationShare, Road
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose, pose_of
@@ -98,7 +99,7 @@ class LonelyRoad:
         for vehicle in self.vehicles.values():
             vehicle.step(self.tick)
         self.tick += 1
-        exits = Exits(scenario.sections, scenario.road.length_m)
+        exits = Exits(scenario.geometry.sections, scenario.road.length_m)
         for name, vehicle in list(self.vehicles.items()):
             section = exits.left_by(vehicle.body_lane, vehicle.state[0])
             if section is not None:

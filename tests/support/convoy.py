@@ -8,7 +8,8 @@ from attrs import frozen
 
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.runtime.node import Send
-from laneweave.protocol.scenario.fields import FormationSettings, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import FormationSettings
 from laneweave.protocol.wire.messages import (
     Ballot,
     Census,

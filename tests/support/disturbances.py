@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from laneweave.agents.driving.reference import Reference
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.fields import Scenario, Vehicle
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import Name
@@ -123,11 +124,13 @@ class Ideal:
         if motion != self._motion:
             self._motion, (origin, target) = motion, motion
             self._tick = tick
-            self._reference = Reference.hold(scenario, target)
+            self._reference = Reference.hold(scenario, scenario.vehicle, target)
             if origin != target:
                 ticks = controller.motion_ticks
                 self._tick = controller.motion_end_tick - ticks
-                self._reference = Reference.move(scenario, origin, target, self._tick, ticks)
+                self._reference = Reference.move(
+                    scenario, scenario.vehicle, origin, target, self._tick, ticks
+                )
             start = cell_state(scenario.lattice, origin, self._tick * tick_s)
             self._plant = Plant(start, scenario.vehicle, tick_s)
         while self._tick < tick:

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.lattice import Cell, PlannedMove, stretch_of
-from laneweave.protocol.scenario.fields import Scenario, Vehicle
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import Command, Motion, Name, VehicleRecord
 from laneweave.sim_bridge.bodies.motion_controller import Rung
@@ -72,7 +73,7 @@ class Road:
     def __init__(self, scenario: Scenario, cells: Mapping[Name, Cell]) -> None:
         """Put vehicles into cells; `scenario.road.lanes` must be enough for them."""
         self.scenario = scenario
-        self.move_ticks = scenario.move_ticks(scenario.cycles_s[0])
+        self.move_ticks = scenario.timing.move_ticks(scenario.timing.cycles_s[0])
         """How long each move takes."""
         self.tick = 0
         self.messages = True
@@ -87,7 +88,9 @@ class Road:
         self.driven: dict[Name, Driven] = {}
         for name, cell in cells.items():
             vehicle = vehicle_in(cell, name, scenario, exact=False)
-            self.driven[vehicle.name] = Driven(vehicle, TrackingDriver(scenario), cell)
+            self.driven[vehicle.name] = Driven(
+                vehicle, TrackingDriver(scenario, scenario.vehicle), cell
+            )
         self.vehicles = {name: one.vehicle for name, one in self.driven.items()}
         self._show()
         for one in self.driven.values():

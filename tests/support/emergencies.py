@@ -117,7 +117,7 @@ def random_situation(seed: int, index: int) -> Situation:
     if rng.random() < _THIRD_SHARE:
         # Behind where the second one comes from or, in a lane-entry, where it goes.
         cells.append((origin[0] - 1, rng.choice((origin[1], lane))))
-    move_ticks = round(scenario.move_s / scenario.runtime.tick_s)
+    move_ticks = round(scenario.timing.move_s / scenario.runtime.tick_s)
     return Situation(
         scenario=scenario,
         kind=kind,

@@ -6,7 +6,9 @@ from collections.abc import Iterable
 
 from attrs import evolve, fields
 
-from laneweave.protocol.scenario.fields import FormationSettings, Scenario, Sensing
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import FormationSettings
+from laneweave.protocol.scenario.vehicle_tables import Sensing
 from laneweave.protocol.wire.messages import CensusEntry, ClosedFormation
 from laneweave.sim_bridge.road.formation_building import formation_builder
 

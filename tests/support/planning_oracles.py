@@ -17,7 +17,7 @@ from laneweave.coordinator.planning.problem import Bans, Path
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.lattice import Mode, displacements
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS, SOLVERS
+from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS, SOLVERS
 from oracles import joint_search
 from oracles.moving_bodies import Bodies, drive
 from oracles.path_rules import check_paths

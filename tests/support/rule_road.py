@@ -59,7 +59,7 @@ class RuleRoad:
     def __attrs_post_init__(self) -> None:
         """Put the vehicles on the road."""
         world = PlainWorld()
-        self._exits = Exits(self.scenario.sections, self.scenario.road.length_m)
+        self._exits = Exits(self.scenario.geometry.sections, self.scenario.road.length_m)
         self.entrance = Entrance(self.scenario)
         self.traffic = RuleTraffic(self.scenario, world, Rules(self.scenario))
         for one in self.vehicles:

@@ -147,7 +147,7 @@ def _legal(switch: Switch) -> Switch:
         {name: path[0] for name, path in _paths(switch)},
         {name: tuple(b[name] for b in by_step if name in b) for name in switch.names},
         t0_s=_LEAD_S,
-        slot_s=switch.scenario.cycles_s[0],
+        slot_s=switch.scenario.timing.cycles_s[0],
     )
     if problems := plan_problems(plan):
         raise RuntimeError("an illegal plan: " + "; ".join(problems))
@@ -172,7 +172,7 @@ def _paths(switch: Switch) -> Iterable[tuple[Name, tuple[Cell, ...]]]:
 def _ticks(scenario: Scenario) -> tuple[int, int]:
     """Return the tick of t0 and the ticks of a slot."""
     tick_s = scenario.runtime.tick_s
-    return round(_LEAD_S / tick_s), round(scenario.cycles_s[0] / tick_s)
+    return round(_LEAD_S / tick_s), round(scenario.timing.cycles_s[0] / tick_s)
 
 
 def switch_result(

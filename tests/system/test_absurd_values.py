@@ -16,7 +16,7 @@ from msgspec.structs import fields
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.runtime.transport import Delivery
 from laneweave.protocol.scenario.deployment_fields import Shard
-from laneweave.protocol.scenario.fields import SNAPSHOT_S
+from laneweave.protocol.scenario.formation_table import SNAPSHOT_S
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.codec import VERSION

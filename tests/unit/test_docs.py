@@ -239,7 +239,7 @@ def _gaps_of_pairs(scenario: Scenario, late_ticks: Sequence[int]) -> Iterator[fl
 @lru_cache(maxsize=1024)
 def _motion(scenario: Scenario, cell: Cell, step: Cell, late: int) -> NDArray[np.float64]:
     """Return states (60, 6) of a move that begins `late` ticks late, relative to the lattice."""
-    states = move_profile(scenario, *step).states
+    states = move_profile(scenario, scenario.vehicle, *step).states
     at = np.clip(np.arange(60) - late, 0, len(states) - 1)
     moved: NDArray[np.float64] = states[at] + np.array(cell_state(scenario.lattice, cell, 0.0))
     return moved

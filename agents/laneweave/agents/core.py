@@ -40,6 +40,7 @@ from laneweave.protocol.runtime.node import (
     Withdraw,
 )
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import displaced
@@ -79,7 +80,7 @@ class AgentCore:
         vehicle: Name,
         new_incarnation: Callable[[], int],
         scenario: Scenario,
-        make_driver: Callable[[Scenario], Driver] = TrackingDriver,
+        make_driver: Callable[[Scenario, Vehicle], Driver] = TrackingDriver,
         rules: RuleBook = VEHICLE_RULES,
     ) -> None:
         """Make an agent that has not yet received a SENSE (V1).
@@ -87,8 +88,9 @@ class AgentCore:
         Args:
             vehicle: name of the vehicle.
             new_incarnation: returns a number greater than all previous incarnations.
-            scenario: lattice, limits, timing.
-            make_driver: returns the vehicle's driver; the fault search passes a cheaper one.
+            scenario: lattice, types of vehicles, timing.
+            make_driver: returns the driver of a vehicle with some limits; the fault search passes
+                a cheaper one.
             rules: rules of plan execution; tests plant bugs here.
         """
         self.vehicle = vehicle
@@ -105,7 +107,7 @@ class AgentCore:
         self._road = NewestRoad(runtime.max_pace)
         self._make_driver = make_driver
         self._vehicle_type: str = CAR
-        self._driver = make_driver(scenario.types[CAR])
+        self._driver = make_driver(scenario, scenario.vehicle)
         self._drivable: frozenset[Cell] | None = None
         self._lane_ends = LaneEnds(scenario)
         self._rules = rules
@@ -249,10 +251,9 @@ class AgentCore:
         if vehicle_type not in types:
             allowed = f"one of the scenario's types: {', '.join(types)}"
             raise BadInputError("vehicle_type", vehicle_type, allowed)
-        own = types[vehicle_type]
         self._vehicle_type = vehicle_type
-        self._drivable = own.moves_of(vehicle_type)
-        self._driver = self._make_driver(own)
+        self._drivable = types.moves_of(vehicle_type)
+        self._driver = self._make_driver(self._scenario, types[vehicle_type].limits)
 
     def _has_lost_track(self, sense: Sense) -> bool:
         """Return whether the vehicle holds a cell to which this process has not moved it.
@@ -379,13 +380,17 @@ class AgentCore:
             execution.end_motion()
         scenario = self._scenario
         if displaced(
-            sense.state, scenario.lattice, execution.hold_cell, sense.t_s, scenario.room_ahead_m
+            sense.state,
+            scenario.lattice,
+            execution.hold_cell,
+            sense.t_s,
+            scenario.types.room_ahead_m,
         ):
             execution.displace()
         move = execution.tick(sense.t_s)
         if move is not None and execution.plan is not None:
             self._move = move
-            self._move_ticks = self._scenario.move_ticks(execution.plan.slot_s)
+            self._move_ticks = self._scenario.timing.move_ticks(execution.plan.slot_s)
             self._driver.begin(move, sense.tick, self._move_ticks)
 
     # --- messages to other processes -----------------------------------------------------------

@@ -25,8 +25,7 @@ from laneweave.protocol.runtime.node import (
     Wakeup,
     Watch,
 )
-from laneweave.protocol.scenario.deployment_fields import Shard
-from laneweave.protocol.scenario.fields import Runtime
+from laneweave.protocol.scenario.deployment_fields import Runtime, Shard
 from laneweave.protocol.wire.messages import Census, Motion, Name, VehicleState
 from laneweave.protocol.wire.newest import NewestRoad
 from laneweave.protocol.wire.topics import (

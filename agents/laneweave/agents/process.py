@@ -22,10 +22,10 @@ from laneweave.protocol.wire.messages import Name, Sense, VehicleRecord
 
 def warm_up(scenario: Scenario) -> None:
     """Plan every move and drive one tick, to fill the caches that forked processes inherit."""
-    driver = TrackingDriver(scenario)
+    driver = TrackingDriver(scenario, scenario.vehicle)
     column, lane = cell = (0, 1)
     moves = displacements(scenario.formation.mode)[1:]
-    for ticks, (dx, dy) in product(scenario.move_durations, moves):
+    for ticks, (dx, dy) in product(scenario.timing.move_durations, moves):
         driver.begin((0, cell, (column + dx, lane + dy)), 0, ticks)
     sense = Sense(
         vehicle=Name("warm-up"),

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from laneweave.coordinator.planning.rolling.problem import StreamRoad, StreamVehicle
 from laneweave.coordinator.planning.rolling.requested_moves import is_possible
 from laneweave.protocol.lattice import Cell, displacements, footprint
-from laneweave.protocol.scenario.fields import READY_LATE_S, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import READY_LATE_S
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
@@ -123,9 +124,9 @@ class Observer:
 
     def _planned(self, name: str, vehicle: RoadVehicle, slot: int) -> StreamVehicle:
         """Return a vehicle as the planner sees it."""
-        slot_s = self.scenario.cycles_s[0]
+        slot_s = self.scenario.timing.cycles_s[0]
         waits = math.ceil((vehicle.ready_s - READY_LATE_S) / slot_s - slot - 1e-9)
-        moves = self.scenario.moves_of(vehicle.arrival.vehicle_type)
+        moves = self.scenario.types.moves_of(vehicle.arrival.vehicle_type)
         targets = self._targets_of(vehicle)
         return StreamVehicle(
             name,
@@ -140,12 +141,12 @@ class Observer:
         own = vehicle.arrival
         wanted = own.preferred_lane, own.destination, own.vehicle_type
         if wanted not in self._targets:
-            self._targets[wanted] = self.scenario.goal_sections(*wanted)
+            self._targets[wanted] = self.scenario.geometry.goal_sections(*wanted)
         return self._targets[wanted]
 
     def _to_target(self, vehicle: RoadVehicle) -> float:
         """Return the lanes to the nearest target lane, left positive, by the largest distance."""
-        sections, lane = self.scenario.sections, vehicle.cell[1]
+        sections, lane = self.scenario.geometry.sections, vehicle.cell[1]
         distances = [sections[number].lane - lane for number in self._targets_of(vehicle)]
         return min(distances, key=abs, default=0) / max(self.scenario.road.lanes - 1, 1)
 
@@ -154,7 +155,7 @@ class Observer:
         lattice = self.scenario.lattice
         at_m = np.array([lattice.cell_s_m(column, t_s) for column in columns])[:, None]
         is_open = np.zeros((len(columns), self.scenario.road.lanes), np.bool_)
-        for section in self.scenario.sections:
+        for section in self.scenario.geometry.sections:
             inside = (section.from_m <= at_m) & (at_m <= section.to_m)
             is_open[:, section.lane : section.lane + 1] |= inside
         return is_open
@@ -166,13 +167,13 @@ class Observer:
         column, lane = controller.hold_cell
         ends_m = [
             section.to_m
-            for section in scenario.sections
+            for section in scenario.geometry.sections
             if section.lane == lane and section.from_m <= s_m <= section.to_m
         ]
         along_m = 0.0 if column is None else s_m - lattice.cell_s_m(column, t_s)
         return (
             s_m / length_m,
-            max(0.0, scenario.moves_from_m - s_m) / length_m,
+            max(0.0, scenario.geometry.moves_from_m - s_m) / length_m,
             (min(ends_m, default=s_m) - s_m) / length_m,
             lane / max(lattice.lanes - 1, 1),
             self._to_target(vehicle),

@@ -49,7 +49,7 @@ class EpisodeRecord:
         self.missed_ticks = 0
         self.ending: Ending | None = None
         """How the episode has ended; None: it goes on."""
-        self._exits = Exits(scenario.sections, scenario.road.length_m)
+        self._exits = Exits(scenario.geometry.sections, scenario.road.length_m)
         self._lane_m = scenario.road.lane_width_m
         self._tick_s = scenario.runtime.tick_s
 

@@ -27,7 +27,8 @@ from laneweave.protocol.config.participants import vehicle_name
 from laneweave.protocol.config.scenario_files import load_scenario, scenario_of, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import WAIT, Cell
-from laneweave.protocol.scenario.fields import SNAPSHOT_S, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import SNAPSHOT_S
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.road.demand import arrivals
 
@@ -95,7 +96,7 @@ class VehiclesEnv(ParallelEnv[str, Observation, int]):
         """Prepare the spaces; see `parallel_env`."""
         self.scenario = scenario
         self._rewards = rewards
-        self._slot_s = scenario.cycles_s[0]
+        self._slot_s = scenario.timing.cycles_s[0]
         road = stream_road(scenario)
         self._planner = RequestPlanner(road)
         self._plan = checked(road, self._planner.plan)
@@ -295,6 +296,6 @@ def _bound(scenario: Scenario) -> int:
 
     The mean and six standard deviations of a Poisson distribution; regular headways vary less.
     """
-    per_s = sum(inflow.volume_veh_per_h for inflow in scenario.inflows.values()) / 3600.0
+    per_s = sum(inflow.volume_veh_per_h for inflow in scenario.flow.inflows.values()) / 3600.0
     mean = per_s * scenario.demand.duration_s
     return math.ceil(mean + 6.0 * math.sqrt(mean)) + 1

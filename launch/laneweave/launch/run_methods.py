@@ -11,7 +11,8 @@ from attrs import field, frozen
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.plug_ins import PlugIns
-from laneweave.protocol.scenario.fields import PAPERS_FORMATIONS, FormationSettings, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import PAPERS_FORMATIONS, FormationSettings
 
 if TYPE_CHECKING:
     from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import attrs
+from attrs.validators import optional
 
 from laneweave.protocol.errors import BadInputError, unknown_name
 from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
@@ -42,6 +43,11 @@ def within(low: float, high: float, *, open_low: bool = False) -> Validator:
             raise BadInputError(attribute.name, value, f"{bracket}{low:g}, {high:g}]")
 
     return check
+
+
+def within_or_none(low: float, high: float, *, open_low: bool = False) -> Validator:
+    """Return a validator for None or a number `within` a range."""
+    return optional(within(low, high, open_low=open_low))
 
 
 def one_of(*choices: object) -> Validator:

@@ -14,6 +14,8 @@ from types import MappingProxyType
 
 from attrs import frozen
 
+LONGEST_ROAD_M = 60_000.0
+"""Upper bound on positions on the road: the sum of those of its three segments."""
 ANY_LANE = -1
 """Preferred lane of vehicles that may leave the road in every lane that reaches its end."""
 END_OF_ROAD = "end"

@@ -147,7 +147,7 @@ class BridgeCore:
         self._world = world
         self._record = record
         self._roadside = Roadside(scenario, incarnation, stream, outside_traffic)
-        self._exits = Exits(scenario.sections, scenario.road.length_m)
+        self._exits = Exits(scenario.geometry.sections, scenario.road.length_m)
         runtime = scenario.runtime
         self._tick_duration_s = runtime.tick_s / (pace or runtime.max_pace)
         self._min_tick_duration_s = min(self._tick_duration_s, runtime.tick_s / runtime.max_pace)

@@ -34,7 +34,7 @@ def beside(offset_m: float, tick: int = BEGIN_TICK, *, faster_mps: float = 0.0) 
 
 
 def settling(state: State, tick: int = BEGIN_TICK) -> Reference:
-    return Reference.settling(SCENARIO, CELL, state, tick, END_TICK)
+    return Reference.settling(SCENARIO, LIMITS, CELL, state, tick, END_TICK)
 
 
 def path(reference: Reference, tick: int = BEGIN_TICK) -> np.ndarray:
@@ -84,7 +84,7 @@ def test_takes_all_the_time_there_is() -> None:
     """To be there earlier takes more jerk."""
 
     def cost(end_tick: int) -> float:
-        reference = Reference.settling(SCENARIO, CELL, beside(7.5), BEGIN_TICK, end_tick)
+        reference = Reference.settling(SCENARIO, LIMITS, CELL, beside(7.5), BEGIN_TICK, end_tick)
         ticks = range(BEGIN_TICK, END_TICK)
         return sum(float((reference.window(tick).jerks[0] ** 2).sum()) for tick in ticks)
 
@@ -149,7 +149,7 @@ def sense(plant: Plant, tick: int) -> Sense:
 @pytest.mark.parametrize("offset_m", [-7.5, 7.5])
 def test_a_driver_takes_over_in_the_middle(offset_m: float, takes_over: int) -> None:
     """The next driver goes on from where the vehicle is, and is there at the same time."""
-    first, second = TrackingDriver(SCENARIO), TrackingDriver(SCENARIO)
+    first, second = TrackingDriver(SCENARIO, LIMITS), TrackingDriver(SCENARIO, LIMITS)
     plant = body(offset_m)
     first.take_over(sense(plant, BEGIN_TICK))
     assert not first.at_rest(sense(plant, BEGIN_TICK))
@@ -169,14 +169,14 @@ def test_a_driver_takes_over_in_the_middle(offset_m: float, takes_over: int) -> 
 
 def test_settling_is_not_published() -> None:
     """Only moves between cells are."""
-    driver = TrackingDriver(SCENARIO)
+    driver = TrackingDriver(SCENARIO, LIMITS)
     driver.take_over(sense(body(7.5), BEGIN_TICK))
     assert [tick for tick in range(BEGIN_TICK, END_TICK) if driver.motion(tick)] == []
 
 
 @pytest.mark.parametrize("ticks_left", [0, 1, 3])
 def test_with_no_time_left_the_driver_holds(ticks_left: int) -> None:
-    driver = TrackingDriver(SCENARIO)
+    driver = TrackingDriver(SCENARIO, LIMITS)
     tick = END_TICK - ticks_left
     here = sense(body(0.01, tick), tick)
     driver.take_over(here)

@@ -12,6 +12,7 @@ from laneweave.launch.fault_search.road.stand_ins import LightDriver
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect, Send, Wakeup
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.wire.messages import (
     Ballot,
     Command,
@@ -32,9 +33,9 @@ OTHER_IS_READY = holding(OTHER, BALLOT, accepted=True, ready=True, done=True, sp
 class Passenger(LightDriver):
     """A driver that records when it takes over, and is at rest when the test says so."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, limits: Vehicle) -> None:
         """Begin without calls."""
-        super().__init__(scenario)
+        super().__init__(scenario, limits)
         self.taken_over: list[int] = []
         self.resting = True
 
@@ -56,8 +57,8 @@ class Seat:
         self.rig = Rig(self._make_driver)
         self.tick = 0
 
-    def _make_driver(self, scenario: Scenario) -> Passenger:
-        self.drivers.append(Passenger(scenario))
+    def _make_driver(self, scenario: Scenario, limits: Vehicle) -> Passenger:
+        self.drivers.append(Passenger(scenario, limits))
         return self.drivers[-1]
 
     @property

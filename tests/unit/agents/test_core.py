@@ -12,7 +12,8 @@ from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime import node
-from laneweave.protocol.scenario.fields import Scenario, VehicleType
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle, VehicleTypeSettings
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import ARRIVED_ACROSS_M, ARRIVED_ALONG_M
 from laneweave.protocol.vehicle.plan_execution import drives_its_moves
@@ -287,22 +288,22 @@ def test_it_begins_anew_if_its_vehicle_has_entered_the_lattice_again_unseen() ->
 
 
 def test_an_agent_drives_its_type_and_takes_no_plan_that_the_type_cannot_drive() -> None:
-    truck = VehicleType("truck", 0.5, length_m=12.0, max_accel_mps2=1.3)
+    truck = VehicleTypeSettings("truck", 0.5, length_m=12.0, max_accel_mps2=1.3)
     scenario = attrs.evolve(
         SCENARIO,
         formation=attrs.evolve(SCENARIO.formation, operation="rolling", gap_m=20.0),
         vehicle_type=(truck,),
     )
-    made: list[Scenario] = []
+    made: list[Vehicle] = []
 
-    def make_driver(own: Scenario) -> TrackingDriver:
-        made.append(own)
-        return TrackingDriver(own)
+    def make_driver(scenario: Scenario, limits: Vehicle) -> TrackingDriver:
+        made.append(limits)
+        return TrackingDriver(scenario, limits)
 
     agent = AgentCore(ME, count(1).__next__, scenario, make_driver)
     sense = replace(Rig().sense(), vehicle_type=Name("truck"))
     agent.handle(node.Arrived(topics.SENSE, {"vehicle": ME}, sense), 0.0)
-    assert [own.vehicle.length_m for own in made] == [5.0, 12.0]
+    assert [limits.length_m for limits in made] == [5.0, 12.0]
     assert agent.execution is not None
     assert agent.execution.drivable == frozenset({(0, 1), (0, -1)})
     for (dx, dy), taken in (((0, 1), True), ((1, 0), False), ((-1, 0), False)):

@@ -51,7 +51,7 @@ def test_a_recorded_program_is_that_of_its_tick(recording: Recording) -> None:
         states = condensed.drift @ problem.lower[: parts.states] + condensed.drive @ no_input
         values = parts.rows @ np.concatenate([states, no_input])
         np.testing.assert_allclose(values[: parts.states], problem.lower[: parts.states], atol=1e-9)
-        tracker = Tracker(always_solving(SCENARIO))
+        tracker = Tracker(always_solving(SCENARIO), SCENARIO.vehicle)
         tracker.solve(problem.state, problem.window, problem.gaps)
         assert tracker.program.low.all.tobytes() == problem.lower.tobytes()
         assert tracker.program.high.all.tobytes() == problem.upper.tobytes()

@@ -455,7 +455,7 @@ def test_every_plan_is_executable_and_serves_all_preferences(
     assert plan.roster == tuple(cells)
     assert plan.start_cells == cells
     assert set(plan.territory) <= PAPER.lattice.block_cells(0)
-    assert plan.slot_s == PAPER.cycles_s[0]
+    assert plan.slot_s == PAPER.timing.cycles_s[0]
     now_s = max(t_s, T_S)
     assert plan.t0_s == start_time_s(cells.values(), now_s + START_MARGIN_S, PAPER) > now_s
     for name, moves in plan.moves.items():

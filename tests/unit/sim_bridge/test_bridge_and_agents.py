@@ -32,7 +32,7 @@ HOME: Cell = (-1, 1)
 """Where vehicle A is: in the middle of its block, and of the road."""
 MOVE_TICK = 70
 SILENT_S, MISSES = LONG_ROAD.runtime.agent_silent_s, deadlines_until_silent(LONG_ROAD)
-MOVE_TICKS = round(LONG_ROAD.move_s / TICK_S)
+MOVE_TICKS = round(LONG_ROAD.timing.move_s / TICK_S)
 PACE = 5.0
 """A tick takes 20 ms if all agents answer."""
 PLAY_M = 0.5

@@ -23,6 +23,7 @@ from laneweave.agents.driving.tracker import Tracker
 from laneweave.agents.driving.tracking_problem import NO_GAPS
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import (
     at_rest_in_cell,
     cell_state,
@@ -92,28 +93,32 @@ class TrackingDriver:
     """Driver that tracks a reference at each tick."""
 
     def __init__(
-        self, scenario: Scenario, stopwatch: Callable[[], float] = time.thread_time
+        self,
+        scenario: Scenario,
+        limits: Vehicle,
+        stopwatch: Callable[[], float] = time.thread_time,
     ) -> None:
         """Make a driver without a reference; call `take_over` first.
 
         Args:
-            scenario: the scenario of the vehicle's type.
+            scenario: lattice, timing, sizes of other vehicles.
+            limits: those of the vehicle's type.
             stopwatch: clock [s] that measures how long solves take.
         """
-        self._scenario = scenario
-        self._tracker = Tracker(scenario, stopwatch)
+        self._own, self._limits = (scenario, limits), limits
+        self._room_ahead_m = scenario.types.room_ahead_m
+        self._tracker = Tracker(scenario, limits, stopwatch)
         self._reference: Reference | None = None
         self._settling: Reference | None = None
         """The reference with which the vehicle settles in the cell in which it has entered."""
         self._goal: Cell = (0, 0)
-        self._durations = scenario.move_durations
+        self._durations = scenario.timing.move_durations
         self._ticks = 0
         """Duration of the newest move [ticks]."""
         self._lattice = scenario.lattice
-        self._vehicle = scenario.vehicle
         self._speed_mps = scenario.lattice.speed_mps
-        self._surroundings = Surroundings(scenario)
-        self._stop_lines = StopLines(scenario)
+        self._surroundings = Surroundings(scenario, limits)
+        self._stop_lines = StopLines(scenario, limits)
         self._solve_ms: list[float] = []
         self._unusable = self._osqp_solves = 0
 
@@ -125,22 +130,21 @@ class TrackingDriver:
 
     def take_over(self, sense: Sense) -> None:
         """Continue the motion controller's current motion."""
-        scenario = self._scenario
         self._goal, self._settling = sense.hold_cell, None
         if sense.motion_origin == sense.hold_cell and sense.motion_end_tick > sense.tick + 3:
-            state = commanded_state(sense.state, sense.setpoint, self._vehicle, self._speed_mps)
+            state = commanded_state(sense.state, sense.setpoint, self._limits, self._speed_mps)
             self._reference = self._settling = Reference.settling(
-                scenario, sense.hold_cell, state, sense.tick, sense.motion_end_tick
+                *self._own, sense.hold_cell, state, sense.tick, sense.motion_end_tick
             )
         elif sense.motion_end_tick > sense.tick and sense.motion_ticks in self._durations:
             begin_tick = sense.motion_end_tick - sense.motion_ticks
             self.begin((0, sense.motion_origin, sense.hold_cell), begin_tick, sense.motion_ticks)
         else:
-            self._reference = Reference.hold(scenario, sense.hold_cell)
+            self._reference = Reference.hold(*self._own, sense.hold_cell)
 
     def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
         """Begin a move at `tick` that lasts `ticks` ticks."""
-        self._reference = Reference.move(self._scenario, move[1], move[2], tick, ticks)
+        self._reference = Reference.move(*self._own, move[1], move[2], tick, ticks)
         # The same move may begin again, if the command with its beginning was lost.
         if self._settling is not None and self._settling.origin == move[1]:
             self._reference.settle_meanwhile(self._settling)
@@ -151,7 +155,7 @@ class TrackingDriver:
 
         One that settles may still fall back to its cell if others have the room.
         """
-        reference, room_ahead_m = self._current, self._scenario.room_ahead_m
+        reference, room_ahead_m = self._current, self._room_ahead_m
         if room_ahead_m > 0.0 and reference.origin == self._goal:
             return nearly_settled(sense.state, self._lattice, self._goal, sense.t_s, room_ahead_m)
         return sense.tick >= reference.rest_tick and at_rest_in_cell(
@@ -161,7 +165,7 @@ class TrackingDriver:
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         """Track the reference; return the motion and the jerks from this tick on."""
         reference, tick = self._current, sense.tick
-        state = commanded_state(sense.state, sense.setpoint, self._vehicle, self._speed_mps)
+        state = commanded_state(sense.state, sense.setpoint, self._limits, self._speed_mps)
         gaps = self._surroundings.gaps(sense, state, self._goal[1])
         window = None
         if self._stop_lines:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from laneweave.agents.driving.trajectory import move_profile
 from laneweave.protocol.lattice import Cell, displacements
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.wire.messages import CAR, Motion, Name
+from laneweave.protocol.wire.messages import Motion, Name
 
 Array = NDArray[np.float64]
 
@@ -49,12 +49,13 @@ class _MoveTable:
 
     @classmethod
     def of(cls, scenario: Scenario, dx: int, dy: int, ticks: int) -> _MoveTable:
-        """Tabulate a move."""
-        n, states = scenario.horizon_ticks, move_profile(scenario, dx, dy, ticks).states
+        """Tabulate a move of a car."""
+        n = scenario.timing.horizon_ticks
+        states = move_profile(scenario, scenario.vehicle, dx, dy, ticks).states
         along = np.concatenate([states[:, 0], np.full(n, states[-1, 0])])
         starts = np.arange(ticks)[:, None]
         advance_m = scenario.formation.speed_mps * scenario.runtime.tick_s
-        reach_m = scenario.widest_body_m / 2.0 + TURNED_M
+        reach_m = scenario.types.widest_body_m / 2.0 + TURNED_M
         aside, half_m = np.abs(states[:, 3]), scenario.road.lane_width_m / 2.0
         # Without a lane change, the lane of origin is the target lane throughout.
         return cls(
@@ -92,7 +93,7 @@ class Motions:
         self._pitch_m = formation.gap_m
         self._moves = displacements(formation.mode)[1:]
         self._advance_m = formation.speed_mps * scenario.runtime.tick_s
-        self._durations = scenario.move_durations
+        self._durations = scenario.timing.move_durations
         self._tables: dict[tuple[int, int, int], _MoveTable] = {}
         self.known: dict[Name, _Known] = {}
         """Motions by vehicle; may include outdated ones until `advance` drops them."""
@@ -120,8 +121,7 @@ class Motions:
         table = self._tables.get((dx, dy, ticks))
         if table is None:
             # A motion does not name the type. Cars drive every move; profiles differ little.
-            cars = self._scenario.types[CAR]
-            table = self._tables[dx, dy, ticks] = _MoveTable.of(cars, dx, dy, ticks)
+            table = self._tables[dx, dy, ticks] = _MoveTable.of(self._scenario, dx, dy, ticks)
         start_m, end_m = column * self._pitch_m, to_column * self._pitch_m
         low_m, high_m = min(start_m, end_m) - NEAR_M, max(start_m, end_m) + NEAR_M
         self.known[motion.vehicle] = _Known(motion, table, motion.tick, start_m, low_m, high_m)

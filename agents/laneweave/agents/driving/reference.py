@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from laneweave.agents.driving.tracking_problem import ErrorBounds
 from laneweave.agents.driving.trajectory import Trajectory, move_profile, settling_trajectory
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.fields import Scenario, Vehicle
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State, cell_state, integrate, limited_jerk
 
 Array = NDArray[np.float64]
@@ -49,6 +50,7 @@ class Reference:
     def __init__(
         self,
         scenario: Scenario,
+        limits: Vehicle,
         origin: Cell,
         trajectory: Trajectory | None = None,
         start_tick: int = 0,
@@ -57,11 +59,12 @@ class Reference:
 
         Args:
             scenario: lattice, tick and horizon.
+            limits: those of the vehicle.
             origin: cell held before the motion; the trajectory is relative to it.
             trajectory: the motion; None: hold the cell.
             start_tick: tick at which the trajectory begins.
         """
-        n = self._horizon = scenario.horizon_ticks
+        n = self._horizon = scenario.timing.horizon_ticks
         self._advance_m = scenario.formation.speed_mps * scenario.runtime.tick_s
         self.origin = origin
         self.start_tick = start_tick
@@ -84,19 +87,20 @@ class Reference:
         self._jerks = np.concatenate(jerks)
         self._jerks.flags.writeable = False
         self._ramp = self._advance_m * np.arange(n + 1)
-        self._limits = scenario.vehicle
+        self._limits = limits
         self._bounds: ErrorBounds | None = None
         """Bounds for the whole reference, independent of road time; None: not computed."""
 
     @classmethod
-    def hold(cls, scenario: Scenario, cell: Cell) -> Reference:
+    def hold(cls, scenario: Scenario, limits: Vehicle, cell: Cell) -> Reference:
         """Return the reference that holds a cell."""
-        return cls(scenario, cell)
+        return cls(scenario, limits, cell)
 
     @classmethod
     def move(
         cls,
         scenario: Scenario,
+        limits: Vehicle,
         origin: Cell,
         target: Cell,
         start_tick: int,
@@ -108,20 +112,27 @@ class Reference:
             InfeasibleTrajectoryError: the move cannot be driven within the limits.
             ValueError: the cells are not neighbours.
         """
-        profile = move_profile(scenario, target[0] - origin[0], target[1] - origin[1], ticks)
-        return cls(scenario, origin, profile, start_tick)
+        dx, dy = target[0] - origin[0], target[1] - origin[1]
+        profile = move_profile(scenario, limits, dx, dy, ticks)
+        return cls(scenario, limits, origin, profile, start_tick)
 
     @classmethod
     def settling(
-        cls, scenario: Scenario, cell: Cell, state: State, tick: int, end_tick: int
+        cls,
+        scenario: Scenario,
+        limits: Vehicle,
+        cell: Cell,
+        state: State,
+        tick: int,
+        end_tick: int,
     ) -> Reference:
         """Return the reference from a commanded state at `tick` to rest in a cell at `end_tick`.
 
         The motion must last at least three ticks; see `settling_trajectory`.
         """
         goal = cell_state(scenario.lattice, cell, tick * scenario.runtime.tick_s)
-        trajectory = settling_trajectory(scenario, np.array(state) - goal, end_tick - tick)
-        return cls(scenario, cell, trajectory, tick)
+        trajectory = settling_trajectory(scenario, limits, np.array(state) - goal, end_tick - tick)
+        return cls(scenario, limits, cell, trajectory, tick)
 
     def settle_meanwhile(self, before: Reference) -> None:
         """Add what is left of an earlier motion along the road into the origin of this move."""

@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from laneweave.protocol.scenario.fields import Vehicle
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 
 Array = NDArray[np.float64]
 

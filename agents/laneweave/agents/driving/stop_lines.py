@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from laneweave.agents.driving.tracking_problem import Gaps
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.lane_ends import LaneEnd, LaneEnds
 
 Array = NDArray[np.float64]
@@ -22,11 +23,10 @@ Array = NDArray[np.float64]
 class StopLines:
     """The stop lines of a road, for the tracker of one vehicle."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, limits: Vehicle) -> None:
         """Read the lines from a scenario."""
         self._ends = LaneEnds(scenario)
         self._lattice = scenario.lattice
-        limits = scenario.vehicle
         self._touch_m = 0.5 * (scenario.road.lane_width_m + limits.width_m)
         # In commanded positions: a standing body is this far ahead of its commanded state.
         self._before_m = (

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from laneweave.agents.driving.motions import Motions
 from laneweave.agents.driving.tracking_problem import NO_GAPS, Gaps
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Motion, Neighbour, Sense
 
@@ -53,14 +54,13 @@ _BEHIND = _Side(-1.0, np.maximum, -np.inf)
 class Surroundings:
     """Predicts the gaps around one vehicle."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        """Read sizes, limits and horizon from a scenario."""
-        limits = scenario.vehicle
+    def __init__(self, scenario: Scenario, limits: Vehicle) -> None:
+        """Take the limits of the vehicle; read the sizes of others from a scenario."""
         self._motions = Motions(scenario)
         self._lattice = scenario.lattice
         self._width_m = limits.width_m
         self._length_m = limits.length_m
-        self._lengths_m = sorted({one.vehicle.length_m for one in scenario.types.values()})
+        self._lengths_m = sorted({one.limits.length_m for one in scenario.types.values()})
         """Lengths of the bodies of all types, since sensors do not report types."""
         self._lag_s = limits.actuator_lag_s
         self._speed_mps = scenario.formation.speed_mps
@@ -68,7 +68,7 @@ class Surroundings:
         self._slow_mps = SLOW_SHARE * scenario.formation.speed_mps
         # Accelerations with which this vehicle can approach its neighbours.
         self._gain_mps2, self._loss_mps2 = limits.max_accel_mps2, limits.min_accel_mps2
-        self._times_s = np.arange(scenario.horizon_ticks + 1) * scenario.runtime.tick_s
+        self._times_s = np.arange(scenario.timing.horizon_ticks + 1) * scenario.runtime.tick_s
         self._beyond = self._times_s > SENSED_S + 1e-9
         self._beyond_slow = self._times_s > SLOW_S + 1e-9
 

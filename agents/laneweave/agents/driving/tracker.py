@@ -30,6 +30,7 @@ from laneweave.agents.driving.reference import Window, yield_behind
 from laneweave.agents.driving.regulator import axis_matrices, shared_regulator
 from laneweave.agents.driving.tracking_problem import NO_GAPS, ErrorBounds, Gaps, TrackingProgram
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State, hold_law, integrate, limited_jerk
 
 Array = NDArray[np.float64]
@@ -62,26 +63,30 @@ class Tracker:
     """Tracks the references of one vehicle."""
 
     def __init__(
-        self, scenario: Scenario, stopwatch: Callable[[], float] = time.thread_time
+        self,
+        scenario: Scenario,
+        limits: Vehicle,
+        stopwatch: Callable[[], float] = time.thread_time,
     ) -> None:
         """Prepare the program, and the fast path unless `tracking.always_solve` is set.
 
         Args:
-            scenario: limits, horizon, weights.
+            scenario: tick, horizon.
+            limits: those of the vehicle.
             stopwatch: clock [s] that measures how long solves take.
         """
         self._stopwatch = stopwatch
-        n = self._n = scenario.horizon_ticks
+        n = self._n = scenario.timing.horizon_ticks
         self._tick_s = scenario.runtime.tick_s
         self._axis = axis_matrices(self._tick_s)
-        limits = self._limits = scenario.vehicle
+        self._limits = limits
         self._shapes = (n + 1, 6), (n, 2)
         self._kept = np.empty(14 * n, dtype=np.bool_)
         """Buffer for comparisons with bounds on the fast path; its blocks follow as views."""
         kept = self._kept
         self._kept_low, self._kept_high = kept[: 10 * n].reshape(2, 5, n)
         self._kept_low_jerk, self._kept_high_jerk = kept[10 * n :].reshape(2, n, 2)
-        self.program = TrackingProgram(scenario)
+        self.program = TrackingProgram(scenario, limits)
         self._regulator = None
         self.unconstrained_errors: tuple[float, ...] = ()
         """Errors up to which no constraint binds while a cell is held."""

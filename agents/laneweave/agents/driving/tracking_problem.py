@@ -33,7 +33,8 @@ from laneweave.agents.driving.regulator import (
     axis_matrices,
     cost_to_go,
 )
-from laneweave.protocol.scenario.fields import Scenario, Vehicle
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State, integrate
 
 Array = NDArray[np.float64]
@@ -155,14 +156,14 @@ class ConstraintBounds:
 class TrackingProgram:
     """The quadratic program of one vehicle; its bounds change at each tick."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, limits: Vehicle) -> None:
         """Prepare the bounds; OSQP is set up on first use.
 
         Most vehicles never need OSQP, and its set-up takes as long as hundreds of ticks.
         """
-        n = self._n = scenario.horizon_ticks
+        n = self._n = scenario.timing.horizon_ticks
         self._tick_s = scenario.runtime.tick_s
-        self._limits = scenario.vehicle
+        self._limits = limits
         self.jerk_limits = np.array(
             [self._limits.max_jerk_mps3, self._limits.max_lateral_jerk_mps3]
         )

@@ -37,7 +37,8 @@ from laneweave.agents.driving.qp_solver import MAX_ITERATIONS, QPSettings, Quadr
 from laneweave.agents.driving.regulator import axis_matrices
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import displacements
-from laneweave.protocol.scenario.fields import Scenario, Vehicle
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.emergency_brake import (
     ERROR_SIGMAS,
     last_tick_m,
@@ -106,25 +107,31 @@ class Envelope:
     """Upper bound of s + (v_F + v)^2 / (2 brake), with s and v relative to the lattice."""
 
     @classmethod
-    def behind(cls, scenario: Scenario, gap_m: float) -> Envelope:
+    def behind(cls, scenario: Scenario, limits: Vehicle, gap_m: float) -> Envelope:
         """Return the envelope for a move that starts with a net gap of `gap_m` to the vehicle."""
         speed_mps, braking = scenario.formation.speed_mps, scenario.braking
         ticks = max(round(braking.reaction_s / scenario.runtime.tick_s), 1)
-        lost_s = scenario.vehicle.actuator_lag_s + ticks * scenario.runtime.tick_s
-        errors_m = ERROR_SIGMAS * spare_error_m(scenario, (1.0 + _CLOSING_SPEEDUP) * speed_mps)
-        brake_mps2, tick_s = own_braking_mps2(scenario), scenario.runtime.tick_s
+        lost_s = limits.actuator_lag_s + ticks * scenario.runtime.tick_s
+        closing_mps = (1.0 + _CLOSING_SPEEDUP) * speed_mps
+        errors_m = ERROR_SIGMAS * spare_error_m(
+            limits, braking, scenario.sensing, closing_mps, speed_mps
+        )
+        brake_mps2, tick_s = own_braking_mps2(limits, braking), scenario.runtime.tick_s
         kept_m = braking.margin_m + errors_m + _TRACKING_ERROR_M + last_tick_m(brake_mps2, tick_s)
-        lead_m = lead_path_m(speed_mps, 0.0, braking.lead_brake_mps2, lead_lag_s(scenario))
+        lead_m = lead_path_m(speed_mps, 0.0, braking.lead_brake_mps2, lead_lag_s(limits, braking))
         max_m = gap_m + lead_m - kept_m - lost_s * speed_mps
         return cls(ticks, brake_mps2, max_m)
 
 
 @lru_cache(maxsize=256)
-def move_profile(scenario: Scenario, dx: int, dy: int, ticks: int | None = None) -> Trajectory:
+def move_profile(
+    scenario: Scenario, limits: Vehicle, dx: int, dy: int, ticks: int | None = None
+) -> Trajectory:
     """Return the move by `dx` columns and `dy` lanes, from rest at the origin; cached per process.
 
     Args:
-        scenario: limits, tick, lattice.
+        scenario: tick, lattice, sensors and brakes.
+        limits: those of the vehicle.
         dx: columns, -1 to 1.
         dy: lanes, -1 to 1.
         ticks: duration; None: that of a move in the scenario's shortest T_F.
@@ -136,16 +143,16 @@ def move_profile(scenario: Scenario, dx: int, dy: int, ticks: int | None = None)
     if abs(dx) > 1 or abs(dy) > 1:
         raise ValueError(f"({dx}, {dy}) does not lead to a neighbouring cell")
     if ticks is None:
-        ticks = scenario.move_ticks(scenario.cycles_s[0])
-    beyond_m = 2.0 * scenario.formation.gap_m - scenario.longest_body_m
+        ticks = scenario.timing.move_ticks(scenario.timing.cycles_s[0])
+    beyond_m = 2.0 * scenario.formation.gap_m - scenario.types.longest_body_m
     return plan_trajectory(
-        scenario.vehicle,
+        limits,
         scenario.formation.speed_mps,
         scenario.runtime.tick_s,
         ticks,
         dx * scenario.formation.gap_m,
         dy * scenario.road.lane_width_m,
-        Envelope.behind(scenario, beyond_m) if dx > 0 else None,
+        Envelope.behind(scenario, limits, beyond_m) if dx > 0 else None,
     )
 
 
@@ -157,12 +164,12 @@ def check_moves(scenario: Scenario) -> None:
     """
     for name, own in scenario.types.items():
         whose = "vehicle" if name == CAR else f"vehicle_type of {name}"
-        for slot_s in scenario.slots_s:
-            for dx, dy in displacements(own.formation.mode)[1:]:
-                if (dx, dy) not in own.drivable_moves:
+        for slot_s in scenario.timing.slots_s:
+            for dx, dy in displacements(scenario.formation.mode)[1:]:
+                if (dx, dy) not in own.moves:
                     continue
                 try:
-                    move_profile(own, dx, dy, own.move_ticks(slot_s))
+                    move_profile(scenario, own.limits, dx, dy, scenario.timing.move_ticks(slot_s))
                 except InfeasibleTrajectoryError as error:
                     change = f"the lateral limits in table {whose}"
                     if dx != 0:
@@ -338,7 +345,9 @@ def _both(limit: float) -> tuple[float, float]:
     return -limit, limit
 
 
-def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Trajectory:
+def settling_trajectory(
+    scenario: Scenario, limits: Vehicle, start: Array, ticks: int
+) -> Trajectory:
     """Return the trajectory of minimum squared jerk from a state to rest at the origin.
 
     Vehicles that keep their columns may enter far more slowly than v_F. In the short time that they
@@ -346,7 +355,8 @@ def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Traject
     the cell. If none is found, the limits are ignored: the tracker keeps them.
 
     Args:
-        scenario: source of the tick length and the limits.
+        scenario: source of the tick length.
+        limits: those of the vehicle.
         start: state (6,) relative to the final lattice point.
         ticks: duration, at least three.
     """
@@ -357,12 +367,11 @@ def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Traject
     free = _integrated(jerks, tick_s, start)
     behind_m = min(start[0], 0.0) - _MAX_BEHIND_M
     if scenario.formation.change_columns or (
-        _excess(free, scenario.vehicle, speed_mps) < _LIMIT_TOLERANCE
-        and free.states[:, 0].min() >= behind_m
+        _excess(free, limits, speed_mps) < _LIMIT_TOLERANCE and free.states[:, 0].min() >= behind_m
     ):
         return free
     unit_s = ticks * tick_s / 8.0
-    program = _settling_program(scenario.vehicle, speed_mps, tick_s, ticks, start, behind_m)
+    program = _settling_program(limits, speed_mps, tick_s, ticks, start, behind_m)
     solution = program.solve()
     if not solution.usable:
         return free

@@ -39,10 +39,10 @@ def steps_of(plan: Plan) -> int:
 
 def comfortable_steps(start_s: float, end_s: float, scenario: Scenario) -> int:
     """Return how many steps of comfortable length, or of a given T_F, fit between two times."""
-    shortest_s, longest_s = scenario.cycles_s
+    shortest_s, longest_s = scenario.timing.cycles_s
     if shortest_s == longest_s:
         return int((end_s - start_s) / longest_s)
-    return max(1, int((end_s - start_s - RESERVE_S) / scenario.comfortable_cycle_s))
+    return max(1, int((end_s - start_s - RESERVE_S) / scenario.timing.comfortable_cycle_s))
 
 
 def paced(
@@ -66,8 +66,8 @@ def paced(
         scenario: road, lattice, T_F.
         from_m: position from which vehicles may change lanes; None: the start of S3.
     """
-    slots_s, slack_s = scenario.slots_s[::-1], scenario.formation.slack_s
-    comfortable = [slot_s for slot_s in slots_s if slot_s >= scenario.comfortable_cycle_s]
+    slots_s, slack_s = scenario.timing.slots_s[::-1], scenario.formation.slack_s
+    comfortable = [slot_s for slot_s in slots_s if slot_s >= scenario.timing.comfortable_cycle_s]
     best = plan
     # Prefer a smaller reserve to shorter slots.
     for slot_s, reserve_s in (

@@ -153,7 +153,7 @@ class FormationPlanner:
         of_road = stages(scenario)
         stage, is_last = of_road[formation.stage], formation.stage == len(of_road) - 1
         start_s = self._start_s(formation, cells, t_s)
-        soonest_s = start_s + scenario.cycles_s[0]
+        soonest_s = start_s + scenario.timing.cycles_s[0]
         stage_s = stage_end_s(numbers, formation.stage, scenario)
         ends_s = {} if is_last else self._ends_s(leader)
         too_late = frozenset(name for name, each_s in ends_s.items() if each_s < soonest_s)
@@ -164,7 +164,7 @@ class FormationPlanner:
                 yield LogEntry(STRUCTURE_TOO_LATE, data)
             leader.take(FAILED, now_s)
             return
-        if steps_left(cells, start_s, scenario.cycles_s[0], scenario) == 0:
+        if steps_left(cells, start_s, scenario.timing.cycles_s[0], scenario) == 0:
             leader.take(TOO_LATE, now_s)
             yield LogEntry(FORMATION_TOO_LATE, {"formation": numbers[0]})
             return
@@ -182,7 +182,7 @@ class FormationPlanner:
             moves={
                 member.vehicle: moves
                 for member in formation.members
-                if (moves := scenario.moves_of(member.vehicle_type)) is not None
+                if (moves := scenario.types.moves_of(member.vehicle_type)) is not None
             },
         )
         nodes = scenario.formation.max_nodes * 2 ** min(leader.failures, MAX_DOUBLINGS)
@@ -281,7 +281,7 @@ class FormationPlanner:
         from_m = stages(scenario)[stage].from_m
         start_s = sorting_start_s(cells, t_s + START_MARGIN_S, scenario, from_m)
         end_s = moves_end_s(cells, tuple(sorted(numbers)), stage, scenario)
-        return int((end_s - start_s) / scenario.cycles_s[0] + 1e-6)
+        return int((end_s - start_s) / scenario.timing.cycles_s[0] + 1e-6)
 
     def _block_cells(self, numbers: Numbers) -> list[Cell]:
         lattice = self._scenario.lattice
@@ -300,13 +300,13 @@ class FormationPlanner:
         if formation.closes_by_vehicles or len(numbers) >= formation.max_joined:
             return False
         rear = lattice.block_range(numbers[-1] + 1)[0]
-        entered_s = lattice.passing_time_s(rear, max(self._scenario.entry_m))
+        entered_s = lattice.passing_time_s(rear, max(self._scenario.geometry.entry_m))
         closes_s = entered_s + formation.entry_spread_s
         return closes_s - ROOM_S < t_s <= closes_s + START_MARGIN_S
 
     def _plan(self, leader: FormationLeader, sorting: Sorting, t_s: float) -> Plan:
         t0_s = self._start_s(leader.formation, leader.hold_cells.values(), t_s)
-        slot_s = self._scenario.cycles_s[0]
+        slot_s = self._scenario.timing.cycles_s[0]
         return leader.make_plan(leader.formation.numbers, sorting.moves, t0_s, slot_s)
 
     def _paced(self, plan: Plan, leader: FormationLeader, t_s: float) -> Plan:

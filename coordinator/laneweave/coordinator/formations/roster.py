@@ -177,7 +177,7 @@ def stage_begin_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
     """Return the road time at which all bodies in some blocks have passed the start of a stage."""
     lattice, from_m = scenario.lattice, stages(scenario)[stage].from_m
     rear = lattice.block_range(numbers[-1])[0]
-    return lattice.passing_time_s(rear, from_m + scenario.longest_body_m)
+    return lattice.passing_time_s(rear, from_m + scenario.types.longest_body_m)
 
 
 def stage_end_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
@@ -242,7 +242,7 @@ def start_time_s(
     if from_m is None:
         from_m = scenario.road.sorting_start_m
     rear = min(column for column, _ in cells)
-    begin_s = scenario.lattice.passing_time_s(rear, from_m + scenario.longest_body_m)
+    begin_s = scenario.lattice.passing_time_s(rear, from_m + scenario.types.longest_body_m)
     return on_tick(max(begin_s, not_before_s), scenario)
 
 
@@ -254,7 +254,7 @@ def sorting_start_s(
     The rearmost body has passed `from_m` by then, and vehicles from ramps have settled. Others have
     S1 and S2 to settle; where these are too short, the start gate waits for them.
     """
-    if from_ramps := [cell for cell in cells if scenario.entry_m[cell[1]] > 0.0]:
+    if from_ramps := [cell for cell in cells if scenario.geometry.entry_m[cell[1]] > 0.0]:
         not_before_s = max(not_before_s, settled_s(from_ramps, scenario))
     return start_time_s(cells, not_before_s, scenario, from_m)
 
@@ -263,7 +263,7 @@ def settled_s(cells: Iterable[Cell], scenario: Scenario) -> float:
     """Return the road time by which vehicles that entered in these cells have settled."""
     formation, lattice = scenario.formation, scenario.lattice
     entered_s = max(
-        lattice.passing_time_s(column, scenario.entry_m[lane]) for column, lane in cells
+        lattice.passing_time_s(column, scenario.geometry.entry_m[lane]) for column, lane in cells
     )
     return entered_s + formation.entry_spread_s + formation.settle_s
 

@@ -32,7 +32,8 @@ from laneweave.coordinator.planning.targets import (
 )
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.scenario.fields import DrivingStructure, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import DrivingStructure
 from laneweave.protocol.wire.messages import Name
 
 MAX_PLACEMENTS = 6

@@ -16,7 +16,8 @@ from itertools import pairwise
 from attrs import frozen
 
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection
-from laneweave.protocol.scenario.fields import DrivingStructure, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import DrivingStructure
 from laneweave.protocol.vehicle.lane_ends import sections_to_lines
 
 
@@ -102,14 +103,14 @@ def stages(scenario: Scenario) -> tuple[Stage, ...]:
     start_m, end_m = road.sorting_start_m, road.length_m
     changes_m = {
         position_m
-        for one, line_m in zip(scenario.sections, lines_m, strict=True)
+        for one, line_m in zip(scenario.geometry.sections, lines_m, strict=True)
         for position_m in (max(one.from_m, one.moves_from_m), line_m)
         if start_m < position_m < end_m
     }
-    ends_m, shortest_m = {*lines_m, end_m}, scenario.longest_formation_m + scenario.step_m
+    ends_m, shortest_m = {*lines_m, end_m}, scenario.formation.longest_m + scenario.types.step_m
     parts_m, from_m = [*pairwise([*(one.from_m for one in structures), start_m])], start_m
     for position_m in sorted({*changes_m, end_m}):
-        known_m = max(from_m, *scenario.entry_m)
+        known_m = max(from_m, *scenario.geometry.entry_m)
         # Before a lane that begins, a stage is left out that is too short for a formation.
         if position_m in ends_m or position_m >= known_m + shortest_m:
             parts_m.append((from_m, position_m))
@@ -119,7 +120,7 @@ def stages(scenario: Scenario) -> tuple[Stage, ...]:
             begins_m,
             to_m,
             structures[number] if number < len(structures) else None,
-            scenario.sections,
+            scenario.geometry.sections,
             lines_m,
         )
         for number, (begins_m, to_m) in enumerate(parts_m)

@@ -22,7 +22,7 @@ from typing import Final
 import attrs
 
 from laneweave.protocol.lattice import Cell, Mode, displacements, footprint
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS
+from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS
 
 Move = tuple[Cell, Cell]
 """From-cell and to-cell of one step; the same cell if the vehicle waits."""

@@ -37,7 +37,7 @@ from laneweave.protocol.errors import (
 )
 from laneweave.protocol.lattice import Cell, Mode, displacements
 from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS, DEFAULT_CONFLICTS
+from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS, DEFAULT_CONFLICTS
 from laneweave.protocol.structuring import as_lists, structure, without
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"

@@ -21,7 +21,7 @@ from laneweave.coordinator.planning.problem import Problem, Search
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse, Status
 from laneweave.coordinator.planning.shortest_paths import without_needless_moves
-from laneweave.protocol.scenario.fields import DEFAULT_SOLVER
+from laneweave.protocol.scenario.formation_table import DEFAULT_SOLVER
 
 TAPPA_SHARE: Final = 0.75
 """Share of the deadline, and of the node limit, after which branching replaces TAPPA.

@@ -16,7 +16,8 @@ from laneweave.coordinator.planning.rolling.problem import (
 )
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
 from laneweave.protocol.lattice import Cell, Mode
-from laneweave.protocol.scenario.fields import READY_LATE_S, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import READY_LATE_S
 from laneweave.protocol.vehicle.lane_ends import early_start_m, sections_to_lines
 
 REWARD = -0.5
@@ -71,14 +72,14 @@ def stream_road(scenario: Scenario) -> StreamRoad:
     formation, road = scenario.formation, scenario.road
     mode: Mode = 1 if formation.mode == 1 else 2
     # A vehicle that settles may begin a move late, and ahead of its cell.
-    ahead_m = formation.speed_mps * READY_LATE_S + scenario.room_ahead_m
+    ahead_m = formation.speed_mps * READY_LATE_S + scenario.types.room_ahead_m
     return StreamRoad(
         lanes=road.lanes,
         pitch_m=formation.gap_m,
-        advance_m=formation.speed_mps * scenario.cycles_s[0],
-        sorting_m=(scenario.moves_from_m, road.length_m),
+        advance_m=formation.speed_mps * scenario.timing.cycles_s[0],
+        sorting_m=(scenario.geometry.moves_from_m, road.length_m),
         length_m=road.length_m,
-        body_m=scenario.longest_body_m,
+        body_m=scenario.types.longest_body_m,
         mode=mode,
         model=ConflictModel(formation.conflict_kinds),
         sections=sections_to_lines(scenario),

@@ -25,7 +25,8 @@ from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
-from laneweave.protocol.scenario.fields import READY_LATE_S, SNAPSHOT_S, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.motion import DISPLACED_ALONG_M
 from laneweave.protocol.wire.events import (
@@ -82,8 +83,8 @@ class RollingOperation:
         self._new_ballot = new_ballot
         self._new_job = new_job
         self._planner = planner
-        self._slot_s = scenario.cycles_s[0]
-        self._sections = scenario.sections
+        self._slot_s = scenario.timing.cycles_s[0]
+        self._sections = scenario.geometry.sections
         self.observed = ObservedRoad()
         self.transfers: list[CellTransfer] = []
         self._transfer_of: dict[Name, CellTransfer] = {}
@@ -188,7 +189,7 @@ class RollingOperation:
         owned, reserved = set[Cell](), set[Cell]()
         # States from an earlier term of this leader do not report current positions.
         since_s = self._since[0] - 1e-6 if self._since is not None else 0.0
-        far_m = self._scenario.moves_from_m - LOOKAHEAD_M
+        far_m = self._scenario.geometry.moves_from_m - LOOKAHEAD_M
         snapshot = self.observed.at(snapshot_s)
         gated = self._gated(snapshot, slot - 1)
         # Vehicles without a state come last: they may have moved, and others may hold their cells.
@@ -201,7 +202,7 @@ class RollingOperation:
             if s_m < far_m:
                 continue
             targets = self._targets(entry, s_m)
-            moves = self._scenario.moves_of(entry.vehicle_type)
+            moves = self._scenario.types.moves_of(entry.vehicle_type)
             if state is None:
                 unknown = StreamVehicle(
                     entry.vehicle, entry.cell, targets, True, vehicle_type=entry.vehicle_type
@@ -262,7 +263,7 @@ class RollingOperation:
 
         On a ramp, plans count on cells behind it: they will be assigned before moves begin there.
         """
-        lattice, entry_m = self._scenario.lattice, self._scenario.entry_m[lane]
+        lattice, entry_m = self._scenario.lattice, self._scenario.geometry.entry_m[lane]
         if entry_m <= 0.0:
             return columns
         first = math.ceil((entry_m - lattice.cell_s_m(0, t_s)) / lattice.pitch_m)
@@ -273,7 +274,7 @@ class RollingOperation:
 
         A vehicle that has passed its exit drives to the end of the road.
         """
-        goals, own = self._scenario.goal_sections, entry.vehicle_type
+        goals, own = self._scenario.geometry.goal_sections, entry.vehicle_type
         wanted = goals(entry.preferred_lane, entry.destination, own)
         ahead = frozenset(number for number in wanted if self._sections[number].to_m > s_m)
         return ahead or goals(ANY_LANE, END_OF_ROAD, own)

@@ -50,7 +50,7 @@ from laneweave.protocol.runtime.node import (
     StopJob,
 )
 from laneweave.protocol.scenario.deployment_fields import Service
-from laneweave.protocol.scenario.fields import DEFAULT_SOLVER
+from laneweave.protocol.scenario.formation_table import DEFAULT_SOLVER
 
 AHEAD_BELOW_S = 0.02
 """Mean time of plans below which each worker has one job ahead, so that it is not idle between two.

@@ -19,7 +19,7 @@ from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.targets import placements
 from laneweave.protocol.lattice import Cell, Mode
-from laneweave.protocol.scenario.fields import DEFAULT_CONFLICTS
+from laneweave.protocol.scenario.formation_table import DEFAULT_CONFLICTS
 from laneweave.protocol.wire.messages import Name
 
 _SPARE_COLUMNS = (2, 4)

@@ -102,8 +102,8 @@ def bench_runtime(
         BadInputError: the fault file or preset does not exist, or is invalid.
     """
     base = load_scenario(None)
-    volume = vehicles / (base.free_flow_s * base.road.lanes) * 3600.0
-    begin_s = base.free_flow_s + WARM_UP_S
+    volume = vehicles / (base.geometry.free_flow_s * base.road.lanes) * 3600.0
+    begin_s = base.geometry.free_flow_s + WARM_UP_S
     scenario = load_scenario(
         None,
         seed=seed,

@@ -72,7 +72,7 @@ def drive(tracker: Tracker, scenario: Scenario, name: str, seed: str) -> Iterato
     rng = random.Random(seed)  # noqa: S311 (not for secrets)
     episode = SITUATIONS[name](scenario, rng)
     tick_s = scenario.runtime.tick_s
-    ahead_s = np.array([tick_s * k for k in range(scenario.horizon_ticks + 1)])
+    ahead_s = np.array([tick_s * k for k in range(scenario.timing.horizon_ticks + 1)])
     body = _as_state(episode.reference.window(0).states[0])
     for tick in range(episode.ticks):
         if tick and tick % _PUSH_TICKS == 0 and tick // _PUSH_TICKS <= len(episode.pushes):
@@ -107,7 +107,8 @@ def bench_tracker(
     for name in SITUATIONS:
         cpu_ms, osqp, unusable = [], 0, 0
         for index in range(instances):
-            ticks = list(drive(Tracker(scenario), scenario, name, f"{seed} {name} {index}"))
+            tracker = Tracker(scenario, scenario.vehicle)
+            ticks = list(drive(tracker, scenario, name, f"{seed} {name} {index}"))
             cpu_ms.append(np.median([_replay(scenario, ticks) for _ in range(repeats)], axis=0))
             osqp += sum(tick.result.iterations > 0 for tick in ticks)
             unusable += sum(not tick.result.usable for tick in ticks)
@@ -129,7 +130,7 @@ def bench_tracker(
 
 def _replay(scenario: Scenario, ticks: Sequence[Tick]) -> Array:
     """Solve the ticks of an episode again; return the CPU time [ms] of each."""
-    tracker = Tracker(scenario)
+    tracker = Tracker(scenario, scenario.vehicle)
     tracker.program.set_up()
     times_s = [time.thread_time()]
     for tick in ticks:
@@ -210,13 +211,14 @@ def _net_gap_m(scenario: Scenario, cells: int) -> float:
 def _slower_ahead(scenario: Scenario, rng: random.Random) -> Episode:
     start_s, decel, speed_mps = rng.uniform(0.5, 2.0), rng.uniform(2.0, 5.0), rng.uniform(4.0, 12.0)
     rear = _braking(scenario, _net_gap_m(scenario, 1), start_s, decel, speed_mps)
-    return Episode(Reference.hold(scenario, (0, 1)), 80, rear, planned=_is_planned(rng))
+    reference = Reference.hold(scenario, scenario.vehicle, (0, 1))
+    return Episode(reference, 80, rear, planned=_is_planned(rng))
 
 
 def _closing(scenario: Scenario, rng: random.Random) -> Episode:
     start_s, decel, speed_mps = rng.uniform(0.5, 3.0), rng.uniform(1.5, 2.5), rng.uniform(5.0, 11.0)
     rear = _braking(scenario, _net_gap_m(scenario, 2), start_s, decel, speed_mps)
-    reference = Reference.move(scenario, (0, 1), (1, 1), rng.randrange(10))
+    reference = Reference.move(scenario, scenario.vehicle, (0, 1), (1, 1), rng.randrange(10))
     return Episode(reference, 80, rear, planned=_is_planned(rng))
 
 
@@ -224,7 +226,7 @@ def _falling_back(scenario: Scenario, rng: random.Random) -> Episode:
     """Return a late backward move that begins close behind a braking vehicle."""
     start_s, decel, speed_mps = rng.uniform(0.5, 2.0), rng.uniform(1.0, 3.0), rng.uniform(8.0, 12.0)
     rear = _braking(scenario, rng.uniform(4.0, 10.0), start_s, decel, speed_mps)
-    reference = Reference.move(scenario, (0, 1), (-1, 1), rng.randrange(15))
+    reference = Reference.move(scenario, scenario.vehicle, (0, 1), (-1, 1), rng.randrange(15))
     return Episode(reference, 80, rear, planned=_is_planned(rng), pushes=_pushes(rng))
 
 
@@ -232,7 +234,7 @@ def _close_behind(scenario: Scenario, rng: random.Random) -> Episode:
     """Return a hold behind a vehicle, at slightly more than the minimum gap."""
     gap_m = scenario.tracking.min_gap_m + rng.uniform(0.1, 2.0)
     rear = _braking(scenario, gap_m, 0.0, 1.0, scenario.lattice.speed_mps)
-    reference = Reference.hold(scenario, (0, 1))
+    reference = Reference.hold(scenario, scenario.vehicle, (0, 1))
     return Episode(reference, 80, rear, planned=_is_planned(rng), pushes=_pushes(rng))
 
 
@@ -246,7 +248,7 @@ def _entering(scenario: Scenario, rng: random.Random) -> Episode:
     seen_s, gap_m, speed_mps = start * tick_s, rng.uniform(4.0, 10.0), rng.uniform(8.0, 12.0)
     # The vehicle ahead is at its final speed when it is first seen.
     rear = _braking(scenario, gap_m, seen_s - tick_s, 15.0 / tick_s, speed_mps)
-    reference = Reference.move(scenario, (0, 1), (0, rng.choice((0, 2))), start)
+    reference = Reference.move(scenario, scenario.vehicle, (0, 1), (0, rng.choice((0, 2))), start)
     return Episode(reference, 80, rear, seen_s, planned=_is_planned(rng))
 
 
@@ -258,8 +260,9 @@ def _is_planned(rng: random.Random) -> bool:
 def _undisturbed(scenario: Scenario, rng: random.Random) -> Episode:
     """Return a hold or a move; in half of the episodes there is a vehicle two cells ahead."""
     dx, dy = rng.choice([(0, 0), (0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
-    reference = Reference.move(scenario, (0, 1), (dx, 1 + dy), 10) if dx or dy else None
-    reference = reference or Reference.hold(scenario, (0, 1))
+    reference = Reference.hold(scenario, scenario.vehicle, (0, 1))
+    if dx or dy:
+        reference = Reference.move(scenario, scenario.vehicle, (0, 1), (dx, 1 + dy), 10)
     rear = _braking(scenario, _net_gap_m(scenario, 2), 0.0, 1.0, scenario.lattice.speed_mps)
     return Episode(reference, 60, rng.choice((None, rear)), planned=_is_planned(rng))
 

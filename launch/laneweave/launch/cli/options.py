@@ -12,7 +12,8 @@ import typer
 
 from laneweave.launch.run.logs import LogFormat, LogLevel
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.fields import SOLVERS, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import SOLVERS
 
 MAX_SEEDS = 10_000_000
 MAX_JOBS = 256

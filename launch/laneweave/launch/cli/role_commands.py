@@ -32,7 +32,8 @@ from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.runtime.processes import stop_signal_received
-from laneweave.protocol.scenario.fields import Scenario, check_pace
+from laneweave.protocol.scenario.deployment_fields import check_pace
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
 
 log = structlog.get_logger(__name__)

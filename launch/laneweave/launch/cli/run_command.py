@@ -24,7 +24,8 @@ from laneweave.launch.cli.options import (
 from laneweave.launch.run_methods import FORMATION, LC2013, RULE, SUMO_HAS_DEMAND, checked_method
 from laneweave.protocol.config.scenario_files import load_scenario, scenario_of
 from laneweave.protocol.errors import NO_VALUE, BadInputError
-from laneweave.protocol.scenario.fields import Scenario, check_pace
+from laneweave.protocol.scenario.deployment_fields import check_pace
+from laneweave.protocol.scenario.fields import Scenario
 
 if TYPE_CHECKING:
     from laneweave.launch.run.live_page import LivePage

@@ -73,7 +73,7 @@ def text_colour(colour: str) -> str:
 
 def has_preferences(scenario: Scenario) -> bool:
     """Return whether vehicles have preferred lanes or exits, which colours then show."""
-    return bool(scenario.lane_shares or scenario.exit)
+    return bool(scenario.flow.lane_shares or scenario.exit)
 
 
 def trip_lane(scenario: Scenario, trip: Mapping[str, Any]) -> int:
@@ -86,7 +86,7 @@ def trip_lane(scenario: Scenario, trip: Mapping[str, Any]) -> int:
         return int(trip.get("arrival_lane", ANY_LANE))
     preferred = int(trip.get("preferred_lane", ANY_LANE))
     if preferred == ANY_LANE and trip.get("destination") in {one.name for one in scenario.exit}:
-        return scenario.exit_lane(trip["destination"])
+        return scenario.geometry.exit_lane(trip["destination"])
     return preferred
 
 
@@ -112,11 +112,11 @@ def vehicle_legend(scenario: Scenario, *, recorded: bool = False) -> tuple[tuple
         names[0] += " (rightmost)" * ("right" not in names[0])
         arrived = (f"arrived in {name}" for name in names)
         return tuple(zip(lane_colours(lanes), arrived, strict=True))[::-1]
-    if not scenario.lane_shares:
+    if not scenario.flow.lane_shares:
         exits = tuple(
             (vehicle_colour(lanes, lane), f"{lane}: leaves by {exit_in_words(one.name)}")
             for one in scenario.exit
-            for lane in (scenario.exit_lane(one.name),)
+            for lane in (scenario.geometry.exit_lane(one.name),)
         )
         return (*exits, (NEUTRAL, "leaves at the end" if exits else "no preferred lane"))
     words = (f"{lane}: prefers {name}" for lane, name in enumerate(lane_names(lanes)))

@@ -110,7 +110,7 @@ def drive_plan(scenario: Scenario, names: Sequence[str], paths: Sequence[Sequenc
         names: names of the vehicles.
         paths: cells of each vehicle at all time points; with one time point, all vehicles hold.
     """
-    slot_ticks = round(scenario.cycles_s[0] / scenario.runtime.tick_s)
+    slot_ticks = round(scenario.timing.cycles_s[0] / scenario.runtime.tick_s)
     ticks = slot_ticks * (len(paths[0]) - 1)
     states = np.array([_drive_vehicle(scenario, path, slot_ticks, ticks) for path in paths])
     overlaps: dict[tuple[str, str], int] = {}
@@ -128,14 +128,15 @@ def _drive_vehicle(
     scenario: Scenario, path: Sequence[Cell], slot_ticks: int, ticks: int
 ) -> NDArray[np.float64]:
     """Simulate one vehicle; return its states (ticks + 1, 6)."""
-    reference, tracker = Reference.hold(scenario, path[0]), Tracker(scenario)
+    own = scenario, scenario.vehicle
+    reference, tracker = Reference.hold(*own, path[0]), Tracker(*own)
     start = cell_state(scenario.lattice, path[0], 0.0)
     plant = Plant(start, scenario.vehicle, scenario.runtime.tick_s)
     states, speed_mps = [start], scenario.formation.speed_mps
     for tick in range(ticks):
         step, since = divmod(tick, slot_ticks)
         if since == 0 and path[step] != path[step + 1]:
-            reference = Reference.move(scenario, path[step], path[step + 1], tick)
+            reference = Reference.move(*own, path[step], path[step + 1], tick)
         state = commanded_state(plant.state, plant.setpoint, scenario.vehicle, speed_mps)
         jerk_s, jerk_y = tracker.solve(state, reference.window(tick)).jerk[0].tolist()
         states.append(plant.step(jerk_s, jerk_y))
@@ -333,7 +334,7 @@ def _plain(name: str) -> str:
 
 def _title(response: PlanResponse, drive: Drive) -> str:
     """Return the title, with the smallest gap between bodies."""
-    formation, slot_s = drive.scenario.formation, drive.scenario.cycles_s[0]
+    formation, slot_s = drive.scenario.formation, drive.scenario.timing.cycles_s[0]
     if not response.paths:
         return f"{response.status}: the start"
     title = (

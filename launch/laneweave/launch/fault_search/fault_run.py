@@ -380,9 +380,9 @@ class FaultRun:
     def _move_lasts_s(self) -> float:
         rng = self._rng
         if not self.faults.healed and rng.random() < self.setup.lasting.slow_moves:
-            slot_s = self.setup.scenario.cycles_s[0]
+            slot_s = self.setup.scenario.timing.cycles_s[0]
             return rng.uniform(slot_s, MAX_MOTION_SLOTS * slot_s)
-        return self.setup.scenario.move_s
+        return self.setup.scenario.timing.move_s
 
     def _reception(self, vehicle: Name) -> Reception:
         lasting = self.setup.lasting
@@ -453,7 +453,7 @@ class FaultRun:
     @property
     def _healthy_s(self) -> float:
         """Time after the fault phase for which slots are planned (rolling operation)."""
-        return HEALTHY_SLOTS * self.setup.scenario.cycles_s[0]
+        return HEALTHY_SLOTS * self.setup.scenario.timing.cycles_s[0]
 
     @property
     def _standing(self) -> list[Name]:
@@ -467,7 +467,7 @@ class FaultRun:
         scenario = self.setup.scenario
         changes_m = {
             position_m
-            for section in scenario.sections
+            for section in scenario.geometry.sections
             for position_m in (section.from_m, section.to_m)
             if 0.0 < position_m < scenario.road.length_m
         }

@@ -31,15 +31,11 @@ from laneweave.launch.fault_search.road.drawn_roads import (
 from laneweave.launch.fault_search.road.stand_ins import Visit
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import END_OF_ROAD
-from laneweave.protocol.scenario.deployment_fields import Network
-from laneweave.protocol.scenario.fields import (
-    Closure,
-    FormationSettings,
-    Road,
-    Runtime,
-    Scenario,
-    VehicleType,
-)
+from laneweave.protocol.scenario.deployment_fields import Network, Runtime
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import FormationSettings
+from laneweave.protocol.scenario.road_tables import Closure, Road
+from laneweave.protocol.scenario.vehicle_tables import VehicleTypeSettings
 from laneweave.protocol.wire.messages import CAR, ClosedFormation, Name
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.roadside import Roadside
@@ -82,7 +78,7 @@ LANE_ENDS_M = (150.0, 300.0)
 """Range of distances between the first position of moves and the end of lane 0."""
 WITH_TRUCKS = 0.3
 """Share of drawn roads with trucks."""
-TRUCK = VehicleType("truck", 0.3, max_accel_mps2=4.0)
+TRUCK = VehicleTypeSettings("truck", 0.3, max_accel_mps2=4.0)
 """A type that cannot change columns in the short slots of the fault search. It has the size of
 cars, since sizes and brakes do not matter to light bodies."""
 LEAVING = 0.4
@@ -259,7 +255,7 @@ class Setup:
                 straight = road.make_scenario()
                 before_m = rng.choice(BEFORE_COLUMNS) * straight.formation.gap_m
                 step_m = straight.formation.speed_mps * road.slot_s
-                drawn = draw_road(lanes, before_m, step_m, rng, straight.longest_formation_m)
+                drawn = draw_road(lanes, before_m, step_m, rng, straight.formation.longest_m)
                 seed = rng.randrange(2**31)
                 road = evolve(road, before_m=before_m, drawn=drawn, seed=seed)
         if profile.roads:
@@ -267,7 +263,7 @@ class Setup:
         scenario = road.make_scenario()
         lasting = LastingFaults.drawn(profile, rng)
         mean_s = rng.uniform(*MEAN_HEADWAYS_S)
-        entered = [*scenario.inflows]
+        entered = [*scenario.flow.inflows]
         next_s = {lane: rng.uniform(0.0, mean_s) for lane in entered}
         visits, types_rng = [], _types_rng(road, "vehicles")
         for number in range(1, rng.randint(*profile.vehicles) + 1):
@@ -320,7 +316,7 @@ class Setup:
         if self.road.rolling or self.road.roadside:
             room = [self.stretch_columns] * lanes
             length_m = self.scenario.road.length_m
-            reaching = {one.lane for one in self.scenario.sections if one.to_m >= length_m}
+            reaching = {one.lane for one in self.scenario.geometry.sections if one.to_m >= length_m}
             for lane in {*range(lanes)} - reaching:
                 room[lane] = 0
             weights = [6.0 if self.crowded and lane == 0 else 1.0 for lane in range(lanes)]

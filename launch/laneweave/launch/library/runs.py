@@ -24,7 +24,8 @@ from laneweave.launch.run_methods import FORMATION, checked_method, reference_me
 from laneweave.protocol.config import scenario_files
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.errors import BadInputError, CommandFailedError
-from laneweave.protocol.scenario.fields import Scenario, check_pace
+from laneweave.protocol.scenario.deployment_fields import check_pace
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import RunSummary
 from laneweave.sim_bridge.road_sources import demanded
 

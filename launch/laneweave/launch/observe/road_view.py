@@ -16,7 +16,7 @@ from laneweave.launch.observe.message_loss import LossMeter
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import Arrived, PeerDown, PeerUp
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
-from laneweave.protocol.scenario.fields import HIGHEST_PACE
+from laneweave.protocol.scenario.deployment_fields import HIGHEST_PACE
 from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.messages import (
     Census,

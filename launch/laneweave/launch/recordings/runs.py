@@ -71,7 +71,7 @@ class Run:
 
         None: no vehicle left, or vehicles have no preferred lanes.
         """
-        if self.summary is None or not self.scenario.lane_shares:
+        if self.summary is None or not self.scenario.flow.lane_shares:
             return None
         return self.summary.preferred_percent
 

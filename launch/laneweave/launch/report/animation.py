@@ -47,7 +47,7 @@ def animation_data(run: Run, tracks: Tracks) -> dict[str, Any]:
         "step_s": samples.step_s,
         "end_s": round(samples.end_s, 3),
         # When the first vehicle reaches the end of the road.
-        "start_s": round(min(scenario.free_flow_s, 0.5 * samples.end_s), 3),
+        "start_s": round(min(scenario.geometry.free_flow_s, 0.5 * samples.end_s), 3),
         **road_scene(scenario, recorded=True),
         "formations": [[one.number, one.rear, one.front] for one in reversed(formations.listed)],
         "vehicles": samples.vehicles,

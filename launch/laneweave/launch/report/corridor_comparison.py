@@ -14,7 +14,8 @@ from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
-from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.summary import HARD_BRAKE_MPS2, read_summary
 from laneweave.sim_bridge.corridors.corridor_setup import CorridorArrival
 from laneweave.sim_bridge.corridors.sumo_alone import drive_alone

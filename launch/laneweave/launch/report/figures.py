@@ -74,7 +74,7 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
         for axes in panels.flat:
             _draw_boxes(axes, times)
             axes.grid(visible=False, axis="x")
-        for t_s in sorted({run.scenario.free_flow_s for run in comparison.runs}):
+        for t_s in sorted({run.scenario.geometry.free_flow_s for run in comparison.runs}):
             lower.axhline(t_s, zorder=0, **REFERENCE)
             lower.annotate(
                 f"free flow\n{t_s:.1f} s",
@@ -198,7 +198,7 @@ def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
 
 def shares_differ(comparison: Comparison) -> bool:
     """Return whether vehicles have preferred lanes, and not all are known to have left in them."""
-    percents = [run.preferred_percent for run in comparison.runs if run.scenario.lane_shares]
+    percents = [run.preferred_percent for run in comparison.runs if run.scenario.flow.lane_shares]
     return any(percent is None or percent < 100.0 for percent in percents)
 
 
@@ -287,7 +287,7 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
                 norm=norm,
                 rasterized=True,
             )
-            start_m = run.scenario.moves_from_m
+            start_m = run.scenario.geometry.moves_from_m
             axes.axhline(start_m, color=INK, linewidth=0.7, linestyle="--")
             _mark_closed_parts(axes, run)
         axes.set_xlim(0.0, max(one.edges_s[-1] for one in maps.values()))

@@ -162,7 +162,7 @@ def _arrived(
     scenario: Scenario, preferred_lane: int, cells: Sequence[Cell], rear: int, times_s: Floats
 ) -> tuple[bool, ...]:
     """Return whether each cell is in a section of a lane by which the vehicle may leave."""
-    lattice, sections = scenario.lattice, scenario.sections
+    lattice, sections = scenario.lattice, scenario.geometry.sections
     allowed = [sections[number] for number in sections_for(sections, preferred_lane)]
     places = [
         (lane, lattice.cell_s_m(rear + column, t_s))
@@ -180,7 +180,7 @@ def _driven_slots(
 
     Both are from the last plan under which the formation moved, if there is one.
     """
-    tick_s, slot_s = run.scenario.runtime.tick_s, run.scenario.cycles_s[0]
+    tick_s, slot_s = run.scenario.runtime.tick_s, run.scenario.timing.cycles_s[0]
     last_s = max(changes_s, default=math.inf) + 0.5 * tick_s
     together, found = {formation}, None
     for event in read_events(run.folder, FORMATIONS_JOINED, PLAN_MADE):

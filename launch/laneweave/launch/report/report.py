@@ -159,9 +159,9 @@ def report_run(
     lead = _sentences(
         f"{run.title}.",
         f"{road.lanes} lanes, {road.length_m:g} m; {sorting_start(run.scenario)} at "
-        f"{run.scenario.moves_from_m:g} m.",
+        f"{run.scenario.geometry.moves_from_m:g} m.",
         describe_closed_parts(run.scenario),
-        "" if run.scenario.lane_shares else "Vehicles have no preferred lanes.",
+        "" if run.scenario.flow.lane_shares else "Vehicles have no preferred lanes.",
         f"Vehicles arrive for {run.scenario.demand.duration_s:g} s.",
     )
     names = {"travel_times.png": "travel_time.png", "speeds.png": "speed.png"}
@@ -281,7 +281,7 @@ def _snapshots(report: _Report, run: Run, tracks: Tracks) -> list[Picture]:
         )
         colours += "are lighter; a pale stripe is at the front."
     caption = _sentences(
-        f"{run.title}. The four times, {run.scenario.cycles_s[0]:g} s apart, {times}",
+        f"{run.title}. The four times, {run.scenario.timing.cycles_s[0]:g} s apart, {times}",
         colours,
         "Hatched: closed; thick line: stop line before it." if run.scenario.road.closures else "",
     )

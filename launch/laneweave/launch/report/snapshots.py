@@ -39,6 +39,7 @@ from laneweave.launch.recordings.trajectories import (
 from laneweave.launch.report.style import fitted_legend, picture
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.wire.messages import CAR
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def road_snapshots(
         times = _instants(tracks, scenario, stretch_m)
     trips = read_trips(folder)
     formations = closed_formations(folder, scenario)
-    beyond_m = 2.0 * scenario.longest_body_m
+    beyond_m = 2.0 * scenario.types.longest_body_m
     width_in = 9.6
     road_m = _below_m(scenario) + road.lanes * road.lane_width_m + _ABOVE_M
     length_m = stretch_m[1] - stretch_m[0]
@@ -117,10 +118,12 @@ def road_snapshots(
                 if pose is not None and stretch_m[0] <= pose[0] <= stretch_m[1] + beyond_m:
                     trip = trips.get(name, {})
                     own = scenario.types[trip.get("vehicle_type", CAR)]
-                    _draw_vehicle(axes, pose, trip_lane(scenario, trip), own, scale_pt_per_m)
+                    _draw_vehicle(
+                        axes, pose, own.limits, trip_lane(scenario, trip), scenario, scale_pt_per_m
+                    )
         strips[-1].tick_params(axis="x", bottom=True, labelbottom=True)
         strips[-1].set_xlabel("position on the road (m)")
-        starts = stretch_m[0] < scenario.moves_from_m < stretch_m[1]
+        starts = stretch_m[0] < scenario.geometry.moves_from_m < stretch_m[1]
         _draw_legend(figure, scenario, starts=starts, shaded=shaded)
 
 
@@ -146,7 +149,7 @@ def default_stretch_m(scenario: Scenario) -> tuple[float, float]:
         first_m = max(opens_m) if exit_first and opens_m else min(places_m)
         start_m, end_m = first_m - _BEYOND_M, max([*places_m, *inner_m]) + _BEYOND_M
         return max(0.0, start_m, end_m - _MAX_STRETCH_M), min(road.length_m, end_m)
-    start_m, length_m = max(0.0, scenario.moves_from_m - 20.0), 320.0
+    start_m, length_m = max(0.0, scenario.geometry.moves_from_m - 20.0), 320.0
     if closed := closed_parts(scenario):
         first = min(closed, key=lambda part: part.from_m)
         short = first.to_m - first.from_m <= _MAX_CLOSED_M
@@ -202,8 +205,8 @@ def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -
             zorder=1,
         )
     _draw_closed_parts(axes, scenario)
-    if stretch_m[0] < scenario.moves_from_m < stretch_m[1]:
-        place = ([scenario.moves_from_m] * 2, [0.0, width_m])
+    if stretch_m[0] < scenario.geometry.moves_from_m < stretch_m[1]:
+        place = ([scenario.geometry.moves_from_m] * 2, [0.0, width_m])
         axes.plot(*place, color=INK, linewidth=1.0, linestyle=":", zorder=2)
     axes.set_yticks([])
     axes.tick_params(axis="x", bottom=False, labelbottom=False)
@@ -275,6 +278,7 @@ def _draw_formations(
 def _draw_vehicle(
     axes: Axes,
     pose: tuple[float, float, float, float],
+    limits: Vehicle,
     lane: int,
     scenario: Scenario,
     scale_pt_per_m: float,
@@ -286,14 +290,15 @@ def _draw_vehicle(
     Args:
         axes: axes of the strip.
         pose: (s m, y m, heading rad, speed m/s).
+        limits: size of the vehicle.
         lane: see `trip_lane`.
-        scenario: scenario of the vehicle's type.
+        scenario: lanes, v_F.
         scale_pt_per_m: scale across the road.
     """
     from matplotlib.patches import Polygon  # noqa: PLC0415 - lazily
 
     s_m, y_m, heading, speed_mps = pose
-    length_m, width_m = scenario.vehicle.length_m, scenario.vehicle.width_m
+    length_m, width_m = limits.size_m
     turn = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
     centre = np.array([s_m - 0.5 * length_m * np.cos(heading), y_m])
 
@@ -388,7 +393,7 @@ def _instants(tracks: Tracks, scenario: Scenario, stretch_m: tuple[float, float]
     inside = (s_m >= stretch_m[0]) & (s_m <= stretch_m[1])
     ticks = np.rint(t_s / tick_s).astype(np.int64)
     seen = np.bincount(ticks, weights=inside * (off_centre + 1e-3))
-    slot = round(scenario.cycles_s[0] / tick_s)
+    slot = round(scenario.timing.cycles_s[0] / tick_s)
     padded = np.pad(seen, (0, 3 * slot))
     sums = sum(padded[number * slot : number * slot + len(seen)] for number in range(4))
     start = int(np.argmax(sums))

@@ -10,7 +10,9 @@ from collections import Counter
 from collections.abc import Iterator
 
 from laneweave.launch.run_methods import FORMATION
-from laneweave.protocol.scenario.fields import COMFORT_MPS2, ROLLING_SOLVER, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import ROLLING_SOLVER
+from laneweave.protocol.scenario.timing import COMFORT_MPS2
 from laneweave.protocol.summary import HARD_BRAKE_MPS2, Planning, RunSummary, Safety
 
 Row = tuple[str, str]
@@ -24,7 +26,7 @@ def summary_rows(summary: RunSummary, scenario: Scenario | None = None) -> list[
         summary: summary of the run.
         scenario: scenario of the run; None: unknown, such as of a run without trips.
     """
-    preferences = scenario is None or bool(scenario.lane_shares)
+    preferences = scenario is None or bool(scenario.flow.lane_shares)
     rows = [*_demand_rows(summary, scenario), *_traffic_rows(summary, preferences=preferences)]
     rows += _safety_rows(summary.safety)
     if summary.planning.plans or summary.tracking.solves or summary.failover.leader_changes:

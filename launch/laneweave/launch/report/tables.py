@@ -78,7 +78,7 @@ def tables_of(comparison: Comparison) -> list[Table]:
     if len(comparison.runs) == 1 and not comparison.failed:
         return [run_table(comparison.runs[0]), technical_table(comparison.runs[0])]
     results, traffic = results_table(comparison.runs), _TRAFFIC
-    if not any(run.scenario.lane_shares for run in comparison.runs):
+    if not any(run.scenario.flow.lane_shares for run in comparison.runs):
         traffic = tuple(column for column in _TRAFFIC if column[1] != PREFERRED)
     by_solver = tuple(_solver_columns(results))
     columns = (*_TRAFFIC, *_SAFETY, *_PLANNING, *by_solver)

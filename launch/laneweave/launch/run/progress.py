@@ -90,7 +90,7 @@ class RunProgress(Progress):
             disable=not show,
             transient=True,
         )
-        self.meter = PaceMeter(scenario.demand.duration_s + scenario.free_flow_s)
+        self.meter = PaceMeter(scenario.demand.duration_s + scenario.geometry.free_flow_s)
         self._task: TaskID = self.add_task(
             "run",
             total=self.meter.total_s,

@@ -64,7 +64,8 @@ from attrs import define, field, frozen
 
 from laneweave.launch.drawing.road_scene import road_scene
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.fields import Scenario, solver_of_event
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import solver_of_event
 from laneweave.protocol.wire.events import (
     ENTERED,
     FORMATION_CLOSED,

@@ -28,7 +28,7 @@ def max_vehicles(scenario: Scenario) -> int:
     lane has at most one arrival per `demand.min_headway_s`.
     """
     demand = scenario.demand
-    volumes = [inflow.volume_veh_per_h for inflow in scenario.inflows.values()]
+    volumes = [inflow.volume_veh_per_h for inflow in scenario.flow.inflows.values()]
     lanes = len(volumes)
     mean = sum(volumes) * demand.duration_s / 3600.0
     likely = math.ceil(mean + 6.0 * math.sqrt(mean)) + 10

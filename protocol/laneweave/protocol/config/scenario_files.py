@@ -3,22 +3,60 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import attrs
 
-from laneweave.protocol.config.cross_checks import (
-    check_scenario,
-    effect_problems,
-    scenario_problems,
-)
+from laneweave.protocol.config import demand_checks, deployment_checks, motion_checks, road_checks
 from laneweave.protocol.config.source_files import read_toml_source
 from laneweave.protocol.errors import BadInputError, raise_all
 from laneweave.protocol.scenario.deployment_fields import Security
-from laneweave.protocol.scenario.fields import PAPERS_FORMATIONS, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import PAPERS_FORMATIONS
 from laneweave.protocol.structuring import structure
+
+_CHECKS = (
+    (
+        motion_checks.check_types,
+        road_checks.check_lane_rules,
+        demand_checks.check_lanes,
+        motion_checks.check_motion,
+        road_checks.check_closures,
+        road_checks.check_entrances,
+        road_checks.check_dead_ends,
+        road_checks.check_exits,
+        demand_checks.check_drawn_capacity,
+        demand_checks.check_destinations,
+        motion_checks.check_structures,
+        motion_checks.check_timing,
+        motion_checks.check_braking,
+        motion_checks.check_settling,
+    ),
+    (deployment_checks.check_periods,),
+    (deployment_checks.check_sumo,),
+    (deployment_checks.check_security,),
+)
+"""Checks in the order in which they run. One may use what those before it in its group have
+established, so that a group reports its first error only; the groups are independent."""
+ROLLING_ONLY = ("sort_in_s2", "reward_drift", "change_columns")
+"""Fields of `formation` that only the rolling operation reads."""
+FORMATIONS_ONLY = (
+    "entry",
+    "close",
+    "max_vehicles",
+    "max_columns",
+    "max_joined",
+    "join",
+    "structures",
+    "solver",
+    "weight_straight",
+    "weight_oblique",
+    "planning_deadline_s",
+    "max_nodes",
+)
+"""Fields of `formation` that the rolling operation does not read."""
 
 
 def load_scenario(path: Path | None, **overrides: object) -> Scenario:
@@ -104,3 +142,38 @@ def _with_current_names(data: Mapping[str, Any]) -> Mapping[str, Any]:
 def to_tables(scenario: Scenario) -> dict[str, Any]:
     """Return the nested tables from which `parse_scenario` builds this scenario."""
     return attrs.asdict(scenario)
+
+
+def check_scenario(scenario: Scenario) -> None:
+    """Check the fields against each other.
+
+    Raises:
+        BadInputError: fields violate rules.
+    """
+    raise_all(scenario_problems(scenario))
+
+
+def scenario_problems(scenario: Scenario) -> Iterator[BadInputError]:
+    """Yield errors of fields that contradict each other, the first one of each group of checks."""
+    for group in _CHECKS:
+        try:
+            for check in group:
+                check(scenario)
+        except BadInputError as error:
+            yield error
+
+
+def effect_problems(data: Mapping[str, Any], scenario: Scenario) -> Iterator[BadInputError]:
+    """Yield an error for each value in a file that has no effect in the resulting scenario."""
+    formation, given = scenario.formation, data.get("formation", {})
+    by_vehicles = formation.closes_by_vehicles
+    for fields, has_effect, allowed in (
+        (ROLLING_ONLY, formation.rolling, 'none, unless formation.operation is "rolling"'),
+        (FORMATIONS_ONLY, not formation.rolling, 'none where formation.operation is "rolling"'),
+        (("max_columns",), by_vehicles, 'none, unless formation.close is "vehicles"'),
+        (("join",), formation.max_joined > 1, "none, unless formation.max_joined is above 1"),
+        (("block_columns",), not by_vehicles, 'none, unless formation.close is "columns"'),
+    ):
+        if not has_effect:
+            for name in given.keys() & set(fields):
+                yield BadInputError(f"formation.{name}", given[name], allowed)

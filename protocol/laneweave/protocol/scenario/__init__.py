@@ -1,5 +1,5 @@
-"""The tables of a scenario file as frozen attrs classes, with the range of each field.
+"""The tables of a scenario file as frozen attrs classes, and what follows from them.
 
-Entry point: `fields.Scenario`. `protocol.config` reads files and checks fields against each other.
-Any package may import it.
+Entry point: `fields.Scenario`, whose properties lead to derived figures. `protocol.config` reads
+files and checks fields against each other. Any package may import it.
 """

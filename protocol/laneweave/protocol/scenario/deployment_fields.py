@@ -1,7 +1,4 @@
-"""Tables of a scenario file about the deployment of roles: network, security, service, observation.
-
-Every role reads the same file (see `fields`).
-"""
+"""Tables of a scenario file about execution and deployment: runtime, network, security, service."""
 
 from __future__ import annotations
 
@@ -13,11 +10,21 @@ import attrs
 from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.field_validators import host_port, key_part, key_parts, one_of, within
+from laneweave.protocol.field_validators import (
+    host_port,
+    key_part,
+    key_parts,
+    one_of,
+    within,
+    within_or_none,
+)
+from laneweave.protocol.wire.bounds import Bounds
 
 FleetMembers = str | tuple[str, ...]
 """A shard `I/N` of the announced vehicles, or vehicles by name."""
 MAX_SHARDS = 10_000
+LOWEST_PACE, HIGHEST_PACE = 0.01, 1000.0
+"""Bounds of `runtime.max_pace`."""
 
 
 @frozen
@@ -43,6 +50,16 @@ def parse_shard(text: str, name: str) -> Shard:
     if not digits or not int(index) < int(count) <= MAX_SHARDS:
         raise BadInputError(name, text, f"I/N with 0 <= I < N <= {MAX_SHARDS}")
     return Shard(int(index), int(count))
+
+
+def check_pace(pace: float | None, name: str) -> None:
+    """Check a pace that replaces `runtime.max_pace`; None: it replaces nothing.
+
+    Raises:
+        BadInputError: the pace is out of range; names the option or argument `name`.
+    """
+    if pace is not None and not LOWEST_PACE <= pace <= HIGHEST_PACE:
+        raise BadInputError(name, pace, f"[{LOWEST_PACE:g}, {HIGHEST_PACE:g}]")
 
 
 @frozen
@@ -124,6 +141,36 @@ class Service:
 
 
 @frozen
+class Runtime:
+    """Execution of a run."""
+
+    tick_s: float = field(default=0.1, validator=within(0.01, 1.0))
+    tick_resend_s: float = field(default=0.05, validator=within(0.005, 10.0))
+    """Interval for resending SENSE to agents that have not answered (wall-clock seconds)."""
+    tick_deadline_s: float = field(default=0.3, validator=within(0.02, 60.0))
+    """Time after which a tick ends; vehicles that did not answer keep their trajectories
+    (wall-clock seconds)."""
+    agent_silent_s: float = field(default=3.0, validator=within(0.1, 600.0))
+    """Time without an answer after which ticks no longer wait for an agent, and its vehicle's
+    caretaker takes charge (wall-clock seconds)."""
+    agent_start_s: float = field(default=15.0, validator=within(0.1, 120.0))
+    """Maximum wait at the entrance for a vehicle's agent (wall-clock seconds)."""
+    announce_s: float = field(default=6.0, validator=within(0.0, 600.0))
+    """Time by which announcements precede arrivals, so that agents can start (road seconds)."""
+    max_pace: float = field(default=10.0, validator=within(LOWEST_PACE, HIGHEST_PACE))
+    """Maximum road seconds per wall-clock second. Network and planning take wall-clock time, which
+    must be short compared with the time between a plan and its start."""
+    coordinators: int = field(default=3, validator=within(1, 9))
+    vehicles_per_process: int = field(default=1, validator=within(1, 1000))
+    max_road_s: float = field(default=100_000.0, validator=within(1.0, 1e6))
+    """Road time after which an incomplete run is stopped and counts as failed."""
+
+    def bounds(self, incarnation: int) -> Bounds:
+        """Return the bounds of numbers that a process with this incarnation receives."""
+        return Bounds(incarnation, self.tick_s, self.max_road_s)
+
+
+@frozen
 class Observation:
     """Observation of a deployment."""
 
@@ -139,13 +186,9 @@ class SumoSettings:
     """SUMO's configuration file; empty: the road of the scenario itself."""
     corridor: str = ""
     """Its first and its last edge: FIRST_EDGE:LAST_EDGE."""
-    begin_s: float | None = field(
-        default=None, validator=attrs.validators.optional(within(0.0, 1e9))
-    )
+    begin_s: float | None = field(default=None, validator=within_or_none(0.0, 1e9))
     """SUMO's time at which the run begins; default: `begin` of the configuration."""
-    scale: float | None = field(
-        default=None, validator=attrs.validators.optional(within(0.0, 1e3, open_low=True))
-    )
+    scale: float | None = field(default=None, validator=within_or_none(0.0, 1e3, open_low=True))
     """Factor for SUMO's demand; default: `scale` of the configuration."""
     gui: bool = False
     """Whether sumo-gui shows the run; with `config` or without."""

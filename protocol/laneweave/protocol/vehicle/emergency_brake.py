@@ -11,7 +11,7 @@ A body that moves at v with acceleration a and brakes with b through a first-ord
     (v + L (a + b))^2 / (2 b)  -  L^2 (a + b)
 
 until it stands still: the lag acts like an additional speed of L (a + b). Cells of length d_F and
-moves of duration T_F are possible only up to some reaction time, which `config.cross_checks` and
+moves of duration T_F are possible only up to some reaction time, which `config.motion_checks` and
 `check_moves` of the agents check.
 """
 
@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Braking, Sensing, Vehicle
 from laneweave.protocol.wire.messages import Neighbour
 
 ERROR_SIGMAS = 4.5
@@ -45,17 +45,17 @@ def stopping_distance_m(
     return max(travelled, speed_mps * speed_mps / (2.0 * brake_mps2))
 
 
-def own_braking_mps2(scenario: Scenario) -> float:
+def own_braking_mps2(limits: Vehicle, assumed: Braking) -> float:
     """Return the deceleration a vehicle assumes for itself: at most that of the vehicle ahead.
 
     With harder braking, the gap could reach its minimum before both vehicles have stopped.
     """
-    return min(-scenario.vehicle.min_accel_mps2, scenario.braking.lead_brake_mps2)
+    return min(-limits.min_accel_mps2, assumed.lead_brake_mps2)
 
 
-def lead_lag_s(scenario: Scenario) -> float:
+def lead_lag_s(limits: Vehicle, assumed: Braking) -> float:
     """Return the brake lag assumed for the vehicle ahead: at most the vehicle's own."""
-    return min(scenario.braking.lead_lag_s, scenario.vehicle.actuator_lag_s)
+    return min(assumed.lead_lag_s, limits.actuator_lag_s)
 
 
 def lead_path_m(speed_mps: float, accel_mps2: float, brake_mps2: float, lag_s: float) -> float:
@@ -65,16 +65,21 @@ def lead_path_m(speed_mps: float, accel_mps2: float, brake_mps2: float, lag_s: f
     return stopping_distance_m(max(speed_mps, 0.0), accel, brake_mps2, lag_s)
 
 
-def spare_error_m(scenario: Scenario, speed_mps: float) -> float:
+def spare_error_m(
+    limits: Vehicle, assumed: Braking, noise: Sensing, speed_mps: float, lead_mps: float
+) -> float:
     """Return the standard deviation of `EmergencyBrake.spare_m` that sensor errors cause.
 
     Args:
-        scenario: tables `sensing`, `braking` and `vehicle`.
-        speed_mps: speed of the vehicle; the vehicle ahead drives at v_F.
+        limits: those of the vehicle.
+        assumed: assumptions about the vehicle ahead.
+        noise: measurement errors.
+        speed_mps: speed of the vehicle.
+        lead_mps: speed of the vehicle ahead.
     """
-    noise, assumed, limits = scenario.sensing, scenario.braking, scenario.vehicle
-    own_s = limits.actuator_lag_s + assumed.reaction_s + speed_mps / own_braking_mps2(scenario)
-    other_s = scenario.formation.speed_mps / assumed.lead_brake_mps2 + assumed.lead_lag_s
+    own_mps2 = own_braking_mps2(limits, assumed)
+    own_s = limits.actuator_lag_s + assumed.reaction_s + speed_mps / own_mps2
+    other_s = lead_mps / assumed.lead_brake_mps2 + assumed.lead_lag_s
     return math.hypot(
         noise.gap_noise_m,
         noise.speed_noise_mps * own_s,
@@ -95,13 +100,15 @@ def last_tick_m(brake_mps2: float, tick_s: float) -> float:
 class EmergencyBrake:
     """Decides when a vehicle must brake, independently of its commands."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        """Read the tick and the assumptions (tables `braking` and `vehicle`) from a scenario."""
-        limits, assumed = scenario.vehicle, scenario.braking
-        self._brake_mps2 = own_braking_mps2(scenario)
+    def __init__(self, limits: Vehicle, assumed: Braking, tick_s: float) -> None:
+        """Take the limits of the vehicle, and assumptions about the vehicle ahead."""
+        self._brake_mps2 = own_braking_mps2(limits, assumed)
         self._lag_s = limits.actuator_lag_s
-        self._lead_brake_mps2, self._lead_lag_s = assumed.lead_brake_mps2, lead_lag_s(scenario)
-        self._tick_s = scenario.runtime.tick_s
+        self._lead_brake_mps2, self._lead_lag_s = (
+            assumed.lead_brake_mps2,
+            lead_lag_s(limits, assumed),
+        )
+        self._tick_s = tick_s
         self._last_tick_m = last_tick_m(self._brake_mps2, self._tick_s)
         self._later_s = max(assumed.reaction_s - self._tick_s, 0.0)
         self._margin_m = assumed.margin_m
@@ -150,16 +157,3 @@ class EmergencyBrake:
         ahead_m = ahead_m + speed * later_s + accel * (later_s * later_s / 2.0)
         speed = max(speed + accel * later_s, 0.0)
         return ahead_m + speed * speed / (2.0 * self._brake_mps2) + self._last_tick_m
-
-
-def min_pitch_m(scenario: Scenario) -> float:
-    """Return the minimum column pitch at which a vehicle that holds behind another does not brake.
-
-    The vehicle is of the type that the table `vehicle` describes, the other of the longest type.
-    The pitch allows for measurement errors up to `ERROR_SIGMAS`.
-    """
-    speed_mps, pitch_m = scenario.formation.speed_mps, scenario.formation.gap_m
-    ahead = Neighbour(0, pitch_m - scenario.longest_body_m, speed_mps)
-    holding = (0.0, speed_mps, 0.0, 0.0, 0.0, 0.0)
-    spare_m = EmergencyBrake(scenario).spare_m(holding, 0.0, (0.0, 0.0), [ahead])
-    return pitch_m - spare_m + ERROR_SIGMAS * spare_error_m(scenario, speed_mps)

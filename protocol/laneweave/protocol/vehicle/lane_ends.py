@@ -20,6 +20,7 @@ from attrs import evolve, frozen
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import LaneSection
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.emergency_brake import ERROR_SIGMAS, EmergencyBrake, spare_error_m
 from laneweave.protocol.vehicle.motion import (
     ARRIVED_ALONG_M,
@@ -90,16 +91,18 @@ class LaneEnds:
         lanes = range(scenario.road.lanes)
         self._dead_ends = _by_lane(dead_ends(scenario), lanes)
         self._exits = _by_lane(exit_lanes(scenario), lanes)
-        self._touching_s = (1.0 - BEFORE_TOUCHING) * scenario.move_s
+        self._touching_s = (1.0 - BEFORE_TOUCHING) * scenario.timing.move_s
         early_m = 0.0 if scenario.formation.change_columns else early_start_m(scenario)
         self._begins_m = [
             [
                 (
-                    max(section.from_m, section.moves_from_m) + scenario.longest_body_m - early_m,
+                    max(section.from_m, section.moves_from_m)
+                    + scenario.types.longest_body_m
+                    - early_m,
                     section.from_m,
                     section.to_m,
                 )
-                for section in scenario.sections
+                for section in scenario.geometry.sections
                 if section.lane == lane
             ]
             for lane in lanes
@@ -209,7 +212,7 @@ def exit_lanes(scenario: Scenario) -> tuple[LaneEnd, ...]:
 
 def _ends(scenario: Scenario) -> Iterator[tuple[LaneSection, LaneEnd]]:
     """Yield the sections that end before the road, and their ends."""
-    sections = scenario.sections
+    sections = scenario.geometry.sections
     for number, section in enumerate(sections):
         if not section.exit or section.to_m < scenario.road.length_m:
             later = [each.from_m for each in sections[number + 1 :] if each.lane == section.lane]
@@ -249,7 +252,7 @@ def lane_beside(scenario: Scenario, end: LaneEnd) -> int | None:
     needed = drive_out(scenario)
     pitch_m = scenario.lattice.pitch_m
     sections = sections_to_lines(scenario)
-    from_m = end.line_m - needed.columns * pitch_m - scenario.longest_body_m
+    from_m = end.line_m - needed.columns * pitch_m - scenario.types.longest_body_m
     to_m = min(end.line_m + needed.distance_m, scenario.road.length_m)
     for lane in (end.lane + 1, end.lane - 1):
         for section in sections:
@@ -263,7 +266,8 @@ def sections_to_lines(scenario: Scenario) -> tuple[LaneSection, ...]:
     """Return the sections of a road as far as plans may use them, up to the lines before ends."""
     lines_m = {section: end.line_m for section, end in _ends(scenario)}
     return tuple(
-        evolve(section, to_m=lines_m.get(section, section.to_m)) for section in scenario.sections
+        evolve(section, to_m=lines_m.get(section, section.to_m))
+        for section in scenario.geometry.sections
     )
 
 
@@ -274,11 +278,11 @@ def early_start_m(scenario: Scenario) -> float:
     share x of its time; a fifth of the distance is kept for tracking errors.
     """
     lane_m = scenario.road.lane_width_m
-    untouched = 0.5 * (lane_m - scenario.widest_body_m) / lane_m
-    ticks = scenario.move_ticks(scenario.cycles_s[0])
+    untouched = 0.5 * (lane_m - scenario.types.widest_body_m) / lane_m
+    ticks = scenario.timing.move_ticks(scenario.timing.cycles_s[0])
     shares = (tick / ticks for tick in range(ticks + 1))
     before = [x for x in shares if x**3 * (10.0 - 15.0 * x + 6.0 * x * x) <= untouched]
-    return 0.8 * max(before) * scenario.move_s * scenario.formation.speed_mps
+    return 0.8 * max(before) * scenario.timing.move_s * scenario.formation.speed_mps
 
 
 def drive_out(scenario: Scenario) -> DriveOut:
@@ -291,19 +295,19 @@ def drive_out(scenario: Scenario) -> DriveOut:
     Raises:
         ValueError: the vehicle does not arrive in a cell (its limits are too low).
     """
-    first, *others = map(own_drive_out, scenario.types.values())
+    first, *others = (own_drive_out(scenario, one.limits) for one in scenario.types.values())
     return reduce(DriveOut.covering, others, first)
 
 
 @lru_cache(maxsize=256)
-def own_drive_out(scenario: Scenario) -> DriveOut:
-    """Return what the type of vehicle that `vehicle` describes needs; see `drive_out`.
+def own_drive_out(scenario: Scenario, limits: Vehicle) -> DriveOut:
+    """Return what vehicles with some limits need; see `drive_out`.
 
     Raises:
         ValueError: the vehicle does not arrive in a cell.
     """
     for columns in range(2, _MAX_COLUMNS + 1):
-        found = [_drive_out(scenario, columns, late_s) for late_s in (0.0, START_S)]
+        found = [_drive_out(scenario, limits, columns, late_s) for late_s in (0.0, START_S)]
         possible = [each for each in found if each is not None]
         if len(possible) == len(found):
             room_m, distance_m = (max(each) for each in zip(*possible, strict=True))
@@ -313,20 +317,24 @@ def own_drive_out(scenario: Scenario) -> DriveOut:
     raise ValueError("vehicles that stand cannot get into the lattice within their limits")
 
 
-def _drive_out(scenario: Scenario, columns: int, late_s: float) -> tuple[float, float] | None:
+def _drive_out(
+    scenario: Scenario, limits: Vehicle, columns: int, late_s: float
+) -> tuple[float, float] | None:
     """Return the `room_m` and `distance_m` of one motion of `drive_out`, not rounded.
 
     Args:
-        scenario: the vehicle's limits, the lattice.
+        scenario: lattice, tick, sensors and brakes.
+        limits: those of the vehicle.
         columns: number of free columns; the vehicle is to settle in the rearmost.
         late_s: time between the foremost column passing the vehicle and the start.
 
     Returns:
         None: the vehicle falls behind the columns, or does not settle.
     """
-    lattice, limits, tick_s = scenario.lattice, scenario.vehicle, scenario.runtime.tick_s
+    lattice, tick_s = scenario.lattice, scenario.runtime.tick_s
+    assumed, noise = scenario.braking, scenario.sensing
     goal: Cell = (1 - columns, 1)
-    brake, lag_s = EmergencyBrake(scenario), limits.actuator_lag_s
+    brake, lag_s = EmergencyBrake(limits, assumed, tick_s), limits.actuator_lag_s
     standing: State = (0.0, 0.0, 0.0, lattice.cell_y_m(0), 0.0, 0.0)
     state = commanded_state(standing, (0.0, 0.0), limits, lattice.speed_mps)
     clear_m = 0.5 * (lattice.lane_width_m + limits.width_m)
@@ -345,7 +353,9 @@ def _drive_out(scenario: Scenario, columns: int, late_s: float) -> tuple[float, 
             ahead = Neighbour(0, _FAR_M, 0.0)
             body = (0.0, speed_mps, 0.0, 0.0, 0.0, 0.0)
             needed_m = _FAR_M - brake.spare_m(body, state[2], jerk, [ahead])
-            errors_m = ERROR_SIGMAS * spare_error_m(scenario, speed_mps)
+            errors_m = ERROR_SIGMAS * spare_error_m(
+                limits, assumed, noise, speed_mps, lattice.speed_mps
+            )
             # A tick of travel covers starts between the two that are computed.
             room_m = max(room_m, s_m + needed_m + errors_m + speed_mps * tick_s)
             clear = state[3] - lattice.cell_y_m(0) > clear_m

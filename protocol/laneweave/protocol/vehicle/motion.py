@@ -24,7 +24,7 @@ import math
 from collections.abc import Iterable
 
 from laneweave.protocol.lattice import Cell, Lattice
-from laneweave.protocol.scenario.fields import Vehicle
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 
 State = tuple[float, float, float, float, float, float]
 """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""
@@ -43,7 +43,7 @@ NEARLY_SETTLED_MPS = 4.0
 DISPLACED_ALONG_M = 1.0
 DISPLACED_ACROSS_M = 0.5
 """Distances from its cell from which a vehicle no longer holds it, for example after an emergency
-brake: the minimum gaps between bodies in neighbouring cells (`config.cross_checks`)."""
+brake: the minimum gaps between bodies in neighbouring cells (modules `config.*_checks`)."""
 
 # Poles of the hold law near -0.6 and -1.2 +- 0.8i 1/s: hardly any overshoot, and slow enough for
 # ticks of 0.1 s.
@@ -140,7 +140,7 @@ def nearly_settled(
         lattice: the lattice.
         cell: the cell.
         t_s: road time.
-        room_ahead_m: how far ahead of its cell a body may be (`Scenario.room_ahead_m`).
+        room_ahead_m: how far ahead of its cell a body may be (`VehicleTypes.room_ahead_m`).
     """
     goal = cell_state(lattice, cell, t_s)
     return (

@@ -149,7 +149,7 @@ def _check_closures(scenario: Scenario) -> None:
     road = scenario.road
     numbers = {(one.lane, one.from_m): number for number, one in enumerate(road.closures)}
     sorting_m = 0.0 if scenario.lc2013.lane_changes == "everywhere" else road.sorting_start_m
-    for section in scenario.sections:
+    for section in scenario.geometry.sections:
         if section.exit:
             continue
         changes_from_m = max(sorting_m, section.from_m, section.moves_from_m)
@@ -158,7 +158,7 @@ def _check_closures(scenario: Scenario) -> None:
             name = f"road.closures[{numbers[section.lane, section.to_m]}].from_m"
             allowed = f"more than {min_m:g}, so that vehicles can change lanes before"
             raise BadInputError(name, section.to_m, allowed)
-    max_m = road.length_m - scenario.longest_body_m
+    max_m = road.length_m - scenario.types.longest_body_m
     for number, closure in enumerate(road.closures):
         if max_m <= closure.to_m < road.length_m:
             name = f"road.closures[{number}].to_m"

@@ -77,7 +77,7 @@ class Entrance:
     def __init__(self, scenario: Scenario) -> None:
         """Create empty queues."""
         self._queues: list[deque[Arrival]] = [deque() for _ in range(scenario.road.lanes)]
-        self._entry_m = scenario.entry_m
+        self._entry_m = scenario.geometry.entry_m
         self._speed_mps = scenario.formation.speed_mps
         self._tick_s = scenario.runtime.tick_s
 
@@ -143,7 +143,7 @@ class ReferenceRoad:
         self._demanded = 0
         self._left = 0
         self._entrance = Entrance(scenario)
-        self._exits = Exits(scenario.sections, scenario.road.length_m)
+        self._exits = Exits(scenario.geometry.sections, scenario.road.length_m)
 
     @property
     def t_s(self) -> float:

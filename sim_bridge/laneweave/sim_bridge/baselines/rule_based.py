@@ -54,7 +54,7 @@ class RuleTraffic:
         self._limits = scenario.vehicle
         self._rule = scenario.rule
         self._road = scenario.road
-        self._entry_m = scenario.entry_m
+        self._entry_m = scenario.geometry.entry_m
         self._centre_m = scenario.lattice.cell_y_m
         self._speed_mps = scenario.formation.speed_mps
         self._tick_s = scenario.runtime.tick_s
@@ -202,7 +202,7 @@ def check_rule(scenario: Scenario) -> None:
             f"less than {sorting}",
         )
     change_m = safe_change_m(scenario)
-    for section in scenario.sections:
+    for section in scenario.geometry.sections:
         begins_m = max(section.from_m, section.moves_from_m) + scenario.vehicle.length_m
         if section.to_m < road.length_m and section.to_m - begins_m <= change_m:
             raise BadInputError(

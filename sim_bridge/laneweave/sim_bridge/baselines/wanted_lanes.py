@@ -34,7 +34,7 @@ class WantedLanes:
         """Read the road."""
         road = scenario.road
         self._sections = [
-            [section for section in scenario.sections if section.lane == lane]
+            [section for section in scenario.geometry.sections if section.lane == lane]
             for lane in range(road.lanes)
         ]
         self._end_m = road.length_m

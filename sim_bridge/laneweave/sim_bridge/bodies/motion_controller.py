@@ -33,6 +33,7 @@ from attrs import define, field
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Lattice
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import (
@@ -135,15 +136,20 @@ class MotionController:
         self.motion_origin = self.hold_cell
         self.rung_ticks = dict.fromkeys(Rung, 0)
         self._jerks = array("f")
-        self._brake = EmergencyBrake(self._scenario)
-        types = self._scenario.types.values()
-        self._weakest_brake = EmergencyBrake(max(types, key=lambda one: one.vehicle.min_accel_mps2))
+        types, assumed = self._scenario.types.values(), self._scenario.braking
+        weakest = max((one.limits for one in types), key=lambda one: one.min_accel_mps2)
+        self._brake = EmergencyBrake(self._limits, assumed, self.tick_s)
+        self._weakest_brake = EmergencyBrake(weakest, assumed, self.tick_s)
         self._lane_ends = LaneEnds(self._scenario)
 
     @property
     def record(self) -> VehicleRecord:
         """What the controller stores for the process in charge."""
         return self.store.record
+
+    def _limits(self) -> Vehicle:
+        """Size and limits of the vehicle."""
+        return self.plant.limits
 
     @property
     def measured(self) -> State:
@@ -177,7 +183,7 @@ class MotionController:
     @property
     def _straddles(self) -> bool:
         """Whether the body touches two lanes."""
-        width_m = self._scenario.vehicle.width_m
+        width_m = self._limits.width_m
         first, last = self.lattice.lanes_touched(self.measured[3], width_m)
         return first != last
 
@@ -212,7 +218,7 @@ class MotionController:
     @property
     def size_m(self) -> tuple[float, float]:
         """Length and width of the body."""
-        return self._scenario.vehicle.size_m
+        return self._limits.size_m
 
     @property
     def _body_lane(self) -> int:
@@ -222,7 +228,7 @@ class MotionController:
     def _body_lane_for(self, goal: int) -> int:
         """Return a lane if the body touches it; otherwise the lane of the body's centre."""
         y_m = self.measured[3]
-        first, last = self.lattice.lanes_touched(y_m, self._scenario.vehicle.width_m)
+        first, last = self.lattice.lanes_touched(y_m, self._limits.width_m)
         return goal if first <= goal <= last else int(y_m // self.lattice.lane_width_m)
 
     def leave_lattice(self) -> None:
@@ -254,7 +260,7 @@ class MotionController:
         it, the end of the lane counts instead.
         """
         s_m, speed_mps, goal = measured[0], measured[1], self.hold_cell[1]
-        first, last = self.lattice.lanes_touched(measured[3], self._scenario.vehicle.width_m)
+        first, last = self.lattice.lanes_touched(measured[3], self._limits.width_m)
         in_lane_m = dict.fromkeys(range(first, last + 1), s_m)
         if goal not in in_lane_m and not self._must_stay_in_lane(tick):
             # The lane may open ahead, behind the end of another section.
@@ -351,7 +357,7 @@ class MotionController:
     def displaced(self, tick: int) -> bool:
         """Return whether the body is too far from its cell to hold it at `tick`."""
         t_s = tick * self.tick_s
-        room_ahead_m = self._scenario.room_ahead_m
+        room_ahead_m = self._scenario.types.room_ahead_m
         return displaced(self.measured, self.lattice, self.hold_cell, t_s, room_ahead_m)
 
     def step(self, tick: int) -> None:
@@ -390,7 +396,7 @@ class MotionController:
         """
         if self._scenario.formation.change_columns:
             return False
-        speed_mps, touching_s = self.measured[1], BEFORE_ENTERING * self._scenario.move_s
+        speed_mps, touching_s = self.measured[1], BEFORE_ENTERING * self._scenario.timing.move_s
         for other in self.neighbours[1]:
             if other.lane != lane or other.speed_mps < self.lattice.speed_mps + CATCHING_UP_MPS:
                 continue
@@ -424,7 +430,7 @@ class MotionController:
         stays_in_lane = self._must_stay_in_lane(tick)
         if 0 <= index < len(self._jerks) and not stays_in_lane:
             return Rung.EXECUTE, (self._jerks[index], self._jerks[index + 1])
-        limits, speed_mps = self._scenario.vehicle, self.lattice.speed_mps
+        limits, speed_mps = self._limits, self.lattice.speed_mps
         body = self.measured
         state = commanded_state(body, self.plant.setpoint, limits, speed_mps)
         goal = cell_state(self.lattice, self.hold_cell, tick * self.tick_s)
@@ -469,12 +475,12 @@ class MotionController:
         slower_mps = SLOWED_MPS if s_m <= front_m + DISPLACED_ALONG_M else NEARLY_SETTLED_MPS
         # Only moves along the road change the speed.
         slowed = columns[0] == columns[1] and speed_mps < self.lattice.speed_mps - slower_mps
-        front_m += max(DISPLACED_ALONG_M, self._scenario.room_ahead_m)
+        front_m += max(DISPLACED_ALONG_M, self._scenario.types.room_ahead_m)
         return slowed or not rear_m <= s_m <= front_m
 
     def _must_brake(self, measured: State, jerk: Jerk, near: Iterable[Neighbour]) -> bool:
         """Return whether an emergency begins or continues."""
-        limits, tick_s = self._scenario.vehicle, self.tick_s
+        limits, tick_s = self._limits, self.tick_s
         accel = self.plant.setpoint[0]
         # The jerk that the body will execute within its limits.
         speed = measured[1] + limits.actuator_lag_s * measured[2]
@@ -486,6 +492,6 @@ class MotionController:
 
     def _relevant(self, others: Iterable[Neighbour], y_m: float) -> list[Neighbour]:
         """Return the neighbours in lanes that the body touches or enters."""
-        first, last = self.lattice.lanes_touched(y_m, self._scenario.vehicle.width_m)
+        first, last = self.lattice.lanes_touched(y_m, self._limits.width_m)
         goal = self.hold_cell[1]
         return [other for other in others if first <= other.lane <= last or other.lane == goal]

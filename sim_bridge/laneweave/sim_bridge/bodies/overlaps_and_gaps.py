@@ -166,7 +166,9 @@ class Bodies:
         """
         pairs = []
         lane_m = scenario.road.lane_width_m
-        for number, closed in enumerate(scenario.closed_to_bodies):
+        tick_m = scenario.vehicle.max_speed_mps * scenario.runtime.tick_s
+        closures = scenario.geometry.closed_to_bodies(scenario.types.longest_body_m, tick_m)
+        for number, closed in enumerate(closures):
             low_m = closed.lane * lane_m + _TOUCH_M
             high_m = low_m + lane_m - 2.0 * _TOUCH_M
             for name, (rear, front, low, high) in zip(self._names, self._extents, strict=True):

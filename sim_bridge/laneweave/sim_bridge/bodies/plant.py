@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from laneweave.protocol.scenario.fields import Vehicle
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import Jerk, State, commanded_state, integrate, limited_jerk
 
 Axis = tuple[float, float, float]
@@ -24,7 +24,7 @@ class Plant:
         """Start at a state, with its accelerations as set-points."""
         self._state = state
         self._setpoint = (state[2], state[5])
-        self._limits = limits
+        self.limits = limits
         # Used in each tick.
         self._lag_s, self._lag_y_s = limits.actuator_lag_s, limits.lateral_actuator_lag_s
         self._slip_ratio = limits.max_slip_ratio
@@ -44,8 +44,8 @@ class Plant:
 
     def step(self, jerk_s: float, jerk_y: float) -> State:
         """Move by one tick with limited jerks [m/s3]; return the new state."""
-        commanded = commanded_state(self._state, self._setpoint, self._limits, 0.0)
-        self._move(commanded, limited_jerk(commanded, (jerk_s, jerk_y), self._limits, self._tick_s))
+        commanded = commanded_state(self._state, self._setpoint, self.limits, 0.0)
+        self._move(commanded, limited_jerk(commanded, (jerk_s, jerk_y), self.limits, self._tick_s))
         return self._state
 
     def brake(self, jerk_y: float) -> State:
@@ -53,11 +53,11 @@ class Plant:
 
         The lateral jerk [m/s3] is limited. Returns the new state.
         """
-        s, v, _, y, v_y, a_y = commanded_state(self._state, self._setpoint, self._limits, 0.0)
+        s, v, _, y, v_y, a_y = commanded_state(self._state, self._setpoint, self.limits, 0.0)
         # The commanded state stops before the body does.
-        accel = max(self._limits.min_accel_mps2, -v / self._tick_s)
+        accel = max(self.limits.min_accel_mps2, -v / self._tick_s)
         now = (s, v, accel, y, v_y, a_y)
-        _, allowed_y = limited_jerk(now, (0.0, jerk_y), self._limits, self._tick_s)
+        _, allowed_y = limited_jerk(now, (0.0, jerk_y), self.limits, self._tick_s)
         self._move(now, (0.0, allowed_y))
         if v + accel * self._tick_s <= 1e-9:
             self._setpoint = (0.0, self._setpoint[1])

@@ -20,7 +20,7 @@ from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
-from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Closure
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE, Closure
 from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network
 
 MAX_LANES = 8

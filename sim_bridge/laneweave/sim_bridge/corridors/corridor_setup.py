@@ -19,7 +19,8 @@ from attrs import frozen
 from laneweave.protocol.config.participants import vehicle_name
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import ANY_LANE
-from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.corridors.corridor import Corridor
 from laneweave.sim_bridge.corridors.sumo_config import NO_OPTIONS, SumoConfig
@@ -232,7 +233,7 @@ def _types_in(scenario: Scenario, names: Mapping[SumoType, str]) -> Mapping[Sumo
         BadInputError: there is none.
     """
     limits = {
-        name: {field: getattr(own.vehicle, field) for field in LIMITS}
+        name: {field: getattr(own.limits, field) for field in LIMITS}
         for name, own in scenario.types.items()
     }
     found = {}
@@ -258,7 +259,7 @@ class _LaneChoice:
 
     def lane(self, t_s: float, destination: str, vehicle_type: str) -> int:
         """Return the lane of the next vehicle, in which its type may drive."""
-        is_closed = partial(self._scenario.is_restricted, s_m=0.0, vehicle_type=vehicle_type)
+        is_closed = partial(self._scenario.road.is_restricted, s_m=0.0, vehicle_type=vehicle_type)
         lanes: Sequence[int] = [lane for lane in self._free_s if not is_closed(lane)]
         lanes = lanes or [*self._free_s]
         if destination in self._exit_lanes:

@@ -59,12 +59,12 @@ class ExitRoom:
         """
         self._seen_m = seen_m
         self._braking_m = scenario.formation.speed_mps**2 / (2.0 * QUEUE_DECEL_MPS2)
-        self._place_m = scenario.longest_body_m + SPACE_M
+        self._place_m = scenario.types.longest_body_m + SPACE_M
         self._ways: dict[str, list[_Way]] = {}
         names = {one.name for one in scenario.exit}
-        for section in scenario.sections:
+        for section in scenario.geometry.sections:
             if section.exit in names:
-                way = _Way(section.lane, section.to_m, _inside_m(section, scenario.step_m))
+                way = _Way(section.lane, section.to_m, _inside_m(section, scenario.types.step_m))
                 self._ways.setdefault(section.exit, []).append(way)
 
     def has_room(

@@ -8,20 +8,16 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from laneweave.protocol.config.cross_checks import MIN_SIDE_GAP_M, check_volumes
+from laneweave.protocol.config.demand_checks import MIN_SIDE_GAP_M, check_volumes
+from laneweave.protocol.config.motion_checks import min_pitch_m
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
-from laneweave.protocol.scenario.fields import (
-    CYCLE_STEP_S,
-    MAIN_ENTRANCE,
-    SHORTEST_CYCLE_S,
-    SLACK_S,
-    Closure,
-    Scenario,
-)
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import SLACK_S
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE, Closure
+from laneweave.protocol.scenario.timing import CYCLE_STEP_S, SHORTEST_CYCLE_S
 from laneweave.protocol.structuring import structure
-from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
 from laneweave.protocol.vehicle.lane_ends import drive_out, own_drive_out
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.corridors.corridor import (
@@ -326,7 +322,7 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
     }
     kinds = {name: tables[name] for name in ("road", "vehicle", "vehicle_type")}
     wide = structure({"formation": formation | {"gap_m": _WIDE_M}, **kinds}, Scenario)
-    least_m = max(min_pitch_m(own) for own in wide.types.values()) + SPARE_PITCH_M
+    least_m = max(min_pitch_m(wide, own.limits) for own in wide.types.values()) + SPARE_PITCH_M
     pitch_m = math.ceil(max(least_m, HEADWAY_S * speed_mps))
     ramps_m = {one["name"]: one["merge_m"] - one["at_m"] for one in tables["entrance"]}
     settle_s = min([MAX_SETTLE_S, *(length_m / speed_mps for length_m in ramps_m.values())])
@@ -345,9 +341,9 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
     found = structure({"formation": formation, **kinds}, Scenario)
     for own in found.types.values():
         try:
-            own_drive_out(own)
+            own_drive_out(found, own.limits)
         except ValueError as error:
-            max_accel_mps2 = own.vehicle.max_accel_mps2
+            max_accel_mps2 = own.limits.max_accel_mps2
             field = (
                 f"{OPTION} {corridor.name}, vehicles that accelerate with {max_accel_mps2:g} m/s2"
             )
@@ -363,14 +359,14 @@ def _cycle_s(scenario: Scenario, corridor: Corridor) -> float:
     The minimum-jerk motion over d in T has a peak acceleration of 10/sqrt(3) d/T^2 and a peak jerk
     of 60 d/T^3; vehicles use at most 90 % of their limits.
     """
-    lane_m, limits = scenario.road.lane_width_m, [one.vehicle for one in scenario.types.values()]
+    lane_m, limits = scenario.road.lane_width_m, [one.limits for one in scenario.types.values()]
     accel_mps2 = 0.9 * min(one.max_lateral_accel_mps2 for one in limits)
     jerk_mps3 = 0.9 * min(one.max_lateral_jerk_mps3 for one in limits)
     move_s = max(
         math.sqrt(10.0 / math.sqrt(3.0) * lane_m / accel_mps2), math.cbrt(60.0 * lane_m / jerk_mps3)
     )
     shortest_s = CYCLE_STEP_S * math.ceil((move_s + SLACK_S) / CYCLE_STEP_S)
-    needed_m = drive_out(scenario).room_m + scenario.longest_body_m
+    needed_m = drive_out(scenario).room_m + scenario.types.longest_body_m
     rooms_m = [
         one.at_m - corridor.opens_m(one.lanes, one.at_m) - needed_m for one in corridor.ways_out
     ]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
-from laneweave.protocol.scenario.fields import Vehicle
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import NEARLY_SETTLED_MPS
 
 LIMIT_SHARE = 0.9
@@ -69,7 +69,7 @@ def before_rest_s(room_ahead_m: float, limits: Vehicle) -> float:
     """Return how long before it is in its cell a vehicle is ready for plans, at least.
 
     Args:
-        room_ahead_m: how far ahead of the cell it may be (`Scenario.room_ahead_m`).
+        room_ahead_m: how far ahead of the cell it may be (`VehicleTypes.room_ahead_m`).
         limits: its limits.
     """
     accel_mps2 = limits.max_accel_mps2

@@ -19,7 +19,7 @@ from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError, Described
 from laneweave.protocol.road_layout import END_OF_ROAD
-from laneweave.protocol.scenario.fields import MAIN_ENTRANCE
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.sim_bridge.corridors.corridor import Corridor, unique_name
 from laneweave.sim_bridge.corridors.sumo_config import SumoConfig
 from laneweave.sim_bridge.sumo.simulation import SumoProcess

@@ -17,7 +17,8 @@ from typing import Protocol
 from attrs import evolve, frozen
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.fields import READY_LATE_S, SNAPSHOT_S, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
 from laneweave.protocol.vehicle.lane_ends import dead_ends
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
@@ -102,15 +103,15 @@ class TakeOver:
         """
         self._view = view
         self._lattice = scenario.lattice
-        self._limits = {name: one.vehicle for name, one in scenario.types.items()}
+        self._limits = {name: one.limits for name, one in scenario.types.items()}
         self._at_m = {one.lane: one.at_m for one in scenario.entrance}
         """Positions of the entrances, by lane."""
         self._at_m |= dict.fromkeys(view.start_lanes, 0.0)
         self._before_rest_s = {
-            name: before_rest_s(scenario.room_ahead_m, one.vehicle)
+            name: before_rest_s(scenario.types.room_ahead_m, one.limits)
             for name, one in scenario.types.items()
         }
-        self._slot_s = scenario.cycles_s[0]
+        self._slot_s = scenario.timing.cycles_s[0]
         ends = dead_ends(scenario)
         self._lines_m = {
             lane: min(

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from laneweave.protocol.scenario.fields import SOLVERS, solver_of_event
+from laneweave.protocol.scenario.formation_table import SOLVERS, solver_of_event
 from laneweave.protocol.summary import Planning, PlanningMs
 from laneweave.protocol.wire.events import PLAN_EVENTS
 from laneweave.sim_bridge.recording.trips import percentiles_of

@@ -151,7 +151,7 @@ class RunRecord:
             folder / "trajectories.parquet",
             metadata,
             scenario.lattice,
-            max(own.vehicle.min_accel_mps2 for own in scenario.types.values()),
+            max(own.limits.min_accel_mps2 for own in scenario.types.values()),
             self._min_accel_of if scenario.vehicle_type else None,
         )
         self._trips = Trips(folder / "trips.parquet", metadata)
@@ -166,7 +166,7 @@ class RunRecord:
         self._missed_exits = 0
         self._stopped = set[Name]()
         """Vehicles that have left the lattice at the end of a lane."""
-        self._exits = Exits(scenario.sections, scenario.road.length_m)
+        self._exits = Exits(scenario.geometry.sections, scenario.road.length_m)
         self._closed = False
         self.missed_ticks = 0
         """Number of answers that were missing at their tick's deadline."""
@@ -180,8 +180,8 @@ class RunRecord:
     def on_demanded(self, arrival: Arrival) -> None:
         """Record the arrival of a vehicle."""
         scenario = self._scenario
-        free_s = scenario.free_flow_trip_s(arrival.lane, arrival.destination)
-        entrance = scenario.entrance_of(arrival.lane)
+        free_s = scenario.geometry.free_flow_trip_s(arrival.lane, arrival.destination)
+        entrance = scenario.geometry.entrance_of(arrival.lane)
         self._trips.add(Trip(arrival, entrance=entrance, free_flow_s=round(free_s, 6)))
 
     def on_entered(self, vehicle: RecordedVehicle) -> None:
@@ -214,7 +214,7 @@ class RunRecord:
     def _min_accel_of(self, vehicle: str) -> float:
         """Return the braking limit of a vehicle on the road [m/s2]."""
         arrival = self._trips[Name(vehicle)].arrival
-        return self._scenario.types[arrival.vehicle_type].vehicle.min_accel_mps2
+        return self._scenario.types[arrival.vehicle_type].limits.min_accel_mps2
 
     def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
         """Record a vehicle that has left the road since the last tick, by its end or an exit.

@@ -17,7 +17,8 @@ from attrs import define
 from numpy.typing import NDArray
 
 from laneweave.protocol.config.scenario_files import to_tables
-from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.summary import TravelTime, TripTimes
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.recording.columns import SCENARIO_KEY, TRIPS, Metadata

@@ -23,7 +23,8 @@ from numpy.random import SeedSequence, default_rng
 
 from laneweave.protocol.config.participants import vehicle_name
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
-from laneweave.protocol.scenario.fields import Inflow, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.traffic_flow import Inflow
 from laneweave.protocol.wire.messages import CAR
 
 _HEADWAYS, _PREFERENCES, _TYPES = 0, 1, 2
@@ -52,7 +53,7 @@ def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
     """Return the seeded arrivals in [0, demand.duration_s], sorted by time, then lane."""
     drawn = sorted(
         one
-        for lane, inflow in scenario.inflows.items()
+        for lane, inflow in scenario.flow.inflows.items()
         for one in _arrivals_in(lane, inflow, scenario)
     )
     return tuple(
@@ -111,7 +112,7 @@ def _destinations(
     else:
         yield to_end, ANY_LANE, END_OF_ROAD
     for one in exits:
-        yield one.share, scenario.exit_lane(one.exit), one.exit
+        yield one.share, scenario.geometry.exit_lane(one.exit), one.exit
 
 
 def _lane_shares(inflow: Inflow, scenario: Scenario, vehicle_type: str) -> Sequence[float]:
@@ -121,8 +122,8 @@ def _lane_shares(inflow: Inflow, scenario: Scenario, vehicle_type: str) -> Seque
     """
     ends = [
         section.lane
-        for section in scenario.sections
-        if section.serves(ANY_LANE) and scenario.may_leave_by(section, vehicle_type)
+        for section in scenario.geometry.sections
+        if section.serves(ANY_LANE) and scenario.road.may_leave_by(section, vehicle_type)
     ]
     permitted = [share if lane in ends else 0.0 for lane, share in enumerate(inflow.lane_shares)]
     total = sum(permitted)

@@ -8,14 +8,14 @@ of arrival, at least one column's time apart.
 
 With formations, `formation_building` decides whether a formation admits a vehicle.
 
-Vehicles of some types (trucks) do not change columns (`Scenario.drivable_moves`). Two of them in a
+Vehicles of some types (trucks) do not change columns (`VehicleType.moves`). Two of them in a
 column could not pass each other, so they enter the same column only if they can leave the road in
 lanes of the same order. They enter exactly in their cells: a weak vehicle would take long to
 settle, and a long one behind another has little room to approach it.
 
-A ramp may follow an exit in the same lane (`Scenario.shared_exit_lanes`). Cells of such a lane are
-not assigned to vehicles near them before the ramp: each vehicle that leaves by the exit enters with
-the cell of its column, and if it has left, the ramp can use the cell.
+A ramp may follow an exit in the same lane (`RoadGeometry.shared_exit_lanes`). Cells of such a lane
+are not assigned to vehicles near them before the ramp: each vehicle that leaves by the exit enters
+with the cell of its column, and if it has left, the ramp can use the cell.
 
 Decisions do not depend on later arrivals: they are made in order of time and, at equal times, from
 the rightmost lane to the leftmost.

@@ -32,7 +32,8 @@ from attrs import define, field, frozen
 
 from laneweave.protocol.lattice import Cell, Lattice
 from laneweave.protocol.road_layout import ANY_LANE
-from laneweave.protocol.scenario.fields import Scenario, formation_columns
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import formation_columns
 from laneweave.protocol.wire.messages import ClosedFormation
 
 
@@ -53,8 +54,8 @@ class Entrances:
     def of(cls, scenario: Scenario) -> Entrances:
         """Return the entrances of a scenario."""
         ramps = frozenset(one.lane for one in scenario.entrance)
-        from_ramps = scenario.vehicles_from_ramps
-        return cls(scenario.narrowest_lanes, ramps, max(scenario.entry_m), from_ramps)
+        from_ramps = scenario.flow.vehicles_from_ramps
+        return cls(scenario.road.narrowest_lanes, ramps, max(scenario.geometry.entry_m), from_ramps)
 
     def first_column(self, lattice: Lattice) -> int:
         """Return the foremost column that vehicles can enter: the next to pass the last ramp."""
@@ -345,4 +346,4 @@ def formation_builder(scenario: Scenario) -> FormationBuilder | None:
     most, spread_s = formation.max_vehicles, formation.entry_spread_s
     if formation.closes_by_vehicles:
         return GrowingFormations(lattice, most, formation.max_columns, spread_s, entrances)
-    return ColumnBlocks(lattice, scenario.block_vehicles, spread_s, entrances)
+    return ColumnBlocks(lattice, scenario.flow.block_vehicles, spread_s, entrances)

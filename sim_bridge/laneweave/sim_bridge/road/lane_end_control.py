@@ -74,7 +74,7 @@ class LaneEndControl:
     def __init__(self, scenario: Scenario, meter: EntryMeter) -> None:
         """Begin without vehicles."""
         self._meter = meter
-        self._types = scenario.types
+        self._scenario = scenario
         self._lattice = scenario.lattice
         ends = LaneEnds(scenario)
         self._any = bool(ends)
@@ -84,7 +84,7 @@ class LaneEndControl:
         self._columns = needed.columns if needed is not None else 0
         self._distance_m = needed.distance_m if needed is not None else 0.0
         """Distance behind a slow vehicle that is needed for driving out."""
-        self._queue_m = scenario.longest_body_m + scenario.tracking.min_gap_m
+        self._queue_m = scenario.types.longest_body_m + scenario.tracking.min_gap_m
         """Distance between the fronts of vehicles that stand in a queue."""
         self._gaps: dict[LaneEnd, list[Gap]] = {end: [] for end in self._ends}
         self._last_gap_column: list[float] = [math.inf] * scenario.road.lanes
@@ -150,7 +150,7 @@ class LaneEndControl:
     def _request(self, lane: int | None, gaps: list[Gap], t_s: float) -> None:
         """Keep the next columns of a lane free, unless the last gap was too close ahead."""
         if lane is None:
-            return  # `cross_checks` refuses such roads
+            return  # `road_checks` refuses such roads
         waiting = self._meter.waiting
         if self._rolling:
             crowded, taken = any(arrival.lane == lane for arrival in waiting), {lane}
@@ -195,7 +195,8 @@ class LaneEndControl:
             if gap.vehicle is None and 0.0 <= passed_s <= START_S and self._is_free(vehicle, gap):
                 gap.vehicle = vehicle.name
                 # Weak types need more columns than strong ones, which arrive earlier.
-                own = own_drive_out(self._types[vehicle.arrival.vehicle_type])
+                limits = self._scenario.types[vehicle.arrival.vehicle_type].limits
+                own = own_drive_out(self._scenario, limits)
                 vehicle.controller.drive_out((gap.columns[-own.columns], gap.lane))
                 yield LaneEndChange(vehicle.name, DRIVES_OUT, gap.lane)
                 return

@@ -76,10 +76,11 @@ class Roadside:
         self._lanes = scenario.road.lanes
         lattice, formation = scenario.lattice, scenario.formation
         self._lattice = lattice
-        weakest = min(scenario.types.values(), key=lambda one: -one.vehicle.min_accel_mps2)
-        self._brake = EmergencyBrake(weakest)
-        longest_m = scenario.longest_body_m
-        stopping_m = lattice.speed_mps**2 / -weakest.vehicle.min_accel_mps2
+        limits = [one.limits for one in scenario.types.values()]
+        weakest = min(limits, key=lambda one: -one.min_accel_mps2)
+        self._brake = EmergencyBrake(weakest, scenario.braking, self._tick_s)
+        longest_m = scenario.types.longest_body_m
+        stopping_m = lattice.speed_mps**2 / -weakest.min_accel_mps2
         self._room_m = longest_m + stopping_m + lattice.speed_mps + QUEUE_ROOM_M
         """Distance from an entrance within which bodies may keep others from entering."""
         ahead_s = self._announce_s + self._tick_s
@@ -87,7 +88,7 @@ class Roadside:
         self._rolling = formation.rolling
         self._length_m = scenario.road.length_m
         self._builder = formation_builder(scenario)
-        self._shared_lanes = scenario.shared_exit_lanes
+        self._shared_lanes = scenario.geometry.shared_exit_lanes
         self._keep_columns = not formation.change_columns
         self._vehicles = NO_VEHICLES
         """The vehicles on the road."""
@@ -100,7 +101,7 @@ class Roadside:
             formation.entry_spread_s,
             self._builder,
             interlaced=formation.interlaced,
-            entry_m=scenario.entry_m,
+            entry_m=scenario.geometry.entry_m,
             column_bound=[name for name, one in scenario.types.items() if not one.changes_columns],
             goals_of=partial(_goals, scenario),
             shared_lanes=self._shared_lanes,
@@ -117,9 +118,11 @@ class Roadside:
         with formations."""
         self._unassigned: list[Cell] = []
         """Empty cells without an owner."""
-        self._entry_m = scenario.entry_m
+        self._entry_m = scenario.geometry.entry_m
         """Where the cells of each lane are assigned."""
-        self._merging_m = {one.lane: one.merge_m + scenario.step_m for one in scenario.entrance}
+        self._merging_m = {
+            one.lane: one.merge_m + scenario.types.step_m for one in scenario.entrance
+        }
         """Where a queue on a ramp leaves room for merging, by lane."""
         self._near_m = max(
             self._room_m + max(self._entry_m),
@@ -136,7 +139,7 @@ class Roadside:
         """Cells that have never had an owner, since no vehicle was near them at the entrance."""
         self._given = set[Cell]()
         """Cells of these columns that have been assigned since."""
-        columns = int(scenario.moves_from_m / lattice.pitch_m)
+        columns = int(scenario.geometry.moves_from_m / lattice.pitch_m)
         self._max_empty = max(0, min(MAX_EMPTY, columns - 2))
         self._arrivals = arrivals(scenario) if stream is None else stream
         self._outside_traffic = outside_traffic
@@ -547,9 +550,9 @@ class Roadside:
 
 def _goals(scenario: Scenario, arrival: Arrival) -> Goals:
     """Return where a vehicle may leave the road."""
-    numbers = scenario.goal_sections(
+    numbers = scenario.geometry.goal_sections(
         arrival.preferred_lane, arrival.destination, arrival.vehicle_type
     )
-    sections = [scenario.sections[number] for number in numbers]
+    sections = [scenario.geometry.sections[number] for number in numbers]
     lanes = {section.lane for section in sections}
     return Goals(tuple(sorted(lanes)), max(section.to_m for section in sections))

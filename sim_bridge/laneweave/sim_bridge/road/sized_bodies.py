@@ -14,8 +14,8 @@ def bodies_of(poses: Mapping[str, Pose], arrivals: Iterable[Arrival], scenario: 
     """Return the bodies of vehicles, each with the size of its type."""
     types = scenario.types
     sizes = {
-        one.vehicle: types[one.vehicle_type].vehicle.size_m
+        one.vehicle: types[one.vehicle_type].limits.size_m
         for one in arrivals
         if one.vehicle_type != CAR
     }
-    return Bodies(poses, *types[CAR].vehicle.size_m, sizes)
+    return Bodies(poses, *scenario.vehicle.size_m, sizes)

@@ -25,7 +25,7 @@ from collections.abc import Iterable
 
 from attrs import define, field
 
-from laneweave.protocol.scenario.fields import Runtime
+from laneweave.protocol.scenario.deployment_fields import Runtime
 from laneweave.protocol.wire.messages import Name
 
 MAX_STRETCH = 8.0

@@ -57,9 +57,9 @@ class RoadVehicle:
             s_m, speed_mps = start.s_m, start.speed_mps
             settle_s, ready_s = start.settle_s, start.ready_s
         name = Name(admission.arrival.vehicle)
-        own = scenario.types[admission.arrival.vehicle_type]
+        limits = scenario.types[admission.arrival.vehicle_type].limits
         controller = MotionController(
-            Plant((s_m, speed_mps, *rest[2:]), own.vehicle, tick_s), own, admission.cell
+            Plant((s_m, speed_mps, *rest[2:]), limits, tick_s), scenario, admission.cell
         )
         if settle_s > 0.0:
             controller.motion_end_tick = round((t_s + settle_s) / tick_s)

@@ -15,7 +15,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from laneweave.protocol.scenario.fields import Lc2013Settings, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Lc2013Settings, Vehicle
 from laneweave.sim_bridge.sumo.road_edges import (
     Edge,
     RoadEdges,
@@ -136,7 +137,7 @@ def _routes(scenario: Scenario, edges: RoadEdges, *, sumo_drives: bool) -> Itera
     yield "<routes>"
     for name, own in scenario.types.items():
         yield f'<vType id="{name}"'
-        for key, value in _vehicle_type(own, sumo_drives=sumo_drives).items():
+        for key, value in _vehicle_type(scenario, own.limits, sumo_drives=sumo_drives).items():
             yield f'{key}="{value}"' if isinstance(value, str) else f'{key}="{value:.6f}"'
         yield "/>"
     for name, route in edges.routes().items():
@@ -144,13 +145,14 @@ def _routes(scenario: Scenario, edges: RoadEdges, *, sumo_drives: bool) -> Itera
     yield "</routes>"
 
 
-def _vehicle_type(scenario: Scenario, *, sumo_drives: bool) -> dict[str, float | str]:
-    """Return the attributes of the type of vehicle that a scenario describes.
+def _vehicle_type(
+    scenario: Scenario, limits: Vehicle, *, sumo_drives: bool
+) -> dict[str, float | str]:
+    """Return the attributes of a type of vehicle.
 
     Drivers have the same desired speed (speedDev). If SUMO does not drive, `tau` and `minGap` are
     close to zero; the defaults would delay insertions.
     """
-    limits = scenario.vehicle
     kind: dict[str, float | str] = {
         "length": limits.length_m,
         "width": limits.width_m,

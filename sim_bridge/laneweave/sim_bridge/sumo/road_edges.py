@@ -15,7 +15,8 @@ from itertools import pairwise
 from attrs import frozen
 
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, end_exit
-from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.sim_bridge.road.demand import Arrival
 
 ROAD = "road"
@@ -107,7 +108,7 @@ def route_of(scenario: Scenario, arrival: Arrival) -> str:
     end = arrival.destination
     if end == END_OF_ROAD and arrival.preferred_lane != ANY_LANE:
         end = end_exit(arrival.preferred_lane)
-    return route_name(scenario.entrance_of(arrival.lane), end)
+    return route_name(scenario.geometry.entrance_of(arrival.lane), end)
 
 
 def margin_m(scenario: Scenario) -> float:
@@ -116,7 +117,7 @@ def margin_m(scenario: Scenario) -> float:
     Vehicles are removed up to one tick's travel beyond the end of the road.
     """
     tick_m = scenario.vehicle.max_speed_mps * scenario.runtime.tick_s
-    return max(MIN_MARGIN_M, tick_m + scenario.longest_body_m)
+    return max(MIN_MARGIN_M, tick_m + scenario.types.longest_body_m)
 
 
 def single_edge(scenario: Scenario) -> RoadEdges:
@@ -129,10 +130,10 @@ def single_edge(scenario: Scenario) -> RoadEdges:
 def road_edges(scenario: Scenario) -> RoadEdges:
     """Return the edges of a road on which SUMO drives the vehicles."""
     margin, end_m = margin_m(scenario), scenario.road.length_m
-    by_lane = bool(scenario.lane_shares)
+    by_lane = bool(scenario.flow.lane_shares)
     closed = [*_closed_parts(scenario)]
     bounds = [at_m for part in closed for at_m in (part.from_m, part.to_m, part.opens_m)]
-    bounds += [ramp.merge_m + scenario.longest_body_m for ramp in scenario.entrance]
+    bounds += [ramp.merge_m + scenario.types.longest_body_m for ramp in scenario.entrance]
     inner_m = {at_m for at_m in bounds if 0.0 < at_m < end_m}
     bounds_m = [-margin, *sorted(inner_m), end_m if by_lane else end_m + margin]
     road = tuple(_parts_of_road(scenario, bounds_m, closed, "end" if by_lane else "east"))
@@ -231,7 +232,7 @@ def _closed_parts(scenario: Scenario) -> Iterator[_ClosedPart]:
         if (one.lane, to_m) in merges_m:
             to_m = opens_m = merges_m[one.lane, to_m]
         else:
-            opens_m = to_m + scenario.longest_body_m
+            opens_m = to_m + scenario.types.longest_body_m
         yield _ClosedPart(one.lane, from_m, to_m, opens_m)
 
 
@@ -261,7 +262,7 @@ def _parts_of_road(
             separate=frozenset(
                 ramp.lane
                 for ramp in scenario.entrance
-                if ramp.merge_m <= from_m < ramp.merge_m + scenario.longest_body_m
+                if ramp.merge_m <= from_m < ramp.merge_m + scenario.types.longest_body_m
             ),
         )
         origin = destination

@@ -29,7 +29,7 @@ class SumoSession(SumoProcess):
 
     def set_type(self, vehicle: str, vehicle_type: str) -> None:
         """Set the type of a vehicle that is about to be added."""
-        self._half_bodies_m[vehicle] = 0.5 * self._types[vehicle_type].vehicle.length_m
+        self._half_bodies_m[vehicle] = 0.5 * self._types[vehicle_type].limits.length_m
 
     def forget(self, vehicle: str) -> None:
         """Remove a vehicle from SUMO."""

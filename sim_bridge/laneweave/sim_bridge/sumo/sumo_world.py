@@ -17,7 +17,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from laneweave.protocol.road_layout import END_OF_ROAD
-from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of

@@ -21,10 +21,11 @@ from laneweave.sim_bridge.bodies.plant import Plant
 SCENARIO = Scenario()
 LIMITS, LATTICE, TICK_S = SCENARIO.vehicle, SCENARIO.lattice, SCENARIO.runtime.tick_s
 V_F = LATTICE.speed_mps
-SLOT_TICKS = round(SCENARIO.cycles_s[0] / TICK_S)
+SLOT_TICKS = round(SCENARIO.timing.cycles_s[0] / TICK_S)
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
-BRAKE = EmergencyBrake(SCENARIO)
-PROMISED_M = ERROR_SIGMAS * spare_error_m(SCENARIO, 1.5 * V_F) + _TRACKING_ERROR_M
+BRAKE = EmergencyBrake(LIMITS, SCENARIO.braking, TICK_S)
+ERROR_M = spare_error_m(LIMITS, SCENARIO.braking, SCENARIO.sensing, 1.5 * V_F, V_F)
+PROMISED_M = ERROR_SIGMAS * ERROR_M + _TRACKING_ERROR_M
 """What moves forwards leave beyond the margin."""
 
 
@@ -33,7 +34,7 @@ def mover(origin: Cell) -> Plant:
 
 
 def jerk_of(dx: int, dy: int, tick: int) -> Jerk:
-    profile = move_profile(SCENARIO, dx, dy)
+    profile = move_profile(SCENARIO, LIMITS, dx, dy)
     return tuple(profile.jerks[tick].tolist()) if tick < profile.ticks else (0.0, 0.0)
 
 
@@ -51,7 +52,7 @@ def test_a_body_is_in_its_cell_when_the_move_is_over_and_closer_when_the_slot_is
     for tick in range(SLOT_TICKS + 1):
         goal = cell_state(LATTICE, (dx, 1 + dy), tick * TICK_S)
         errors = abs(own.state[0] - goal[0]), abs(own.state[3] - goal[3])
-        if tick == move_profile(SCENARIO, dx, dy).ticks:
+        if tick == move_profile(SCENARIO, LIMITS, dx, dy).ticks:
             assert max(errors) <= 0.12
         if tick == SLOT_TICKS:
             assert max(errors) <= 0.05

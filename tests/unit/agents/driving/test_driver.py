@@ -34,7 +34,7 @@ from support.driving import Road
 from support.paper import EXACT
 from support.states import sense_in, sent
 
-N = SCENARIO.horizon_ticks
+N = SCENARIO.timing.horizon_ticks
 MOVE: PlannedMove = (0, HOME, (-1, 2))
 
 
@@ -43,7 +43,7 @@ class Probe(Tracker):
 
     def __init__(self, scenario: Scenario) -> None:
         """Begin unbroken."""
-        super().__init__(scenario)
+        super().__init__(scenario, scenario.vehicle)
         self.broken = False
         self.gaps = NO_GAPS
         self.state: State | None = None
@@ -75,7 +75,7 @@ def sense(
 
 def driver() -> TrackingDriver:
     """Return a driver that holds the home cell since tick 10."""
-    made = TrackingDriver(SCENARIO)
+    made = TrackingDriver(SCENARIO, SCENARIO.vehicle)
     made.take_over(sense())
     return made
 
@@ -137,7 +137,7 @@ def test_a_move_ends_after_its_time_and_its_horizon_ends_in_the_target() -> None
 )
 def test_a_motion_under_way_is_taken_over_where_it_is(scenario: Scenario, ticks: int) -> None:
     """A new process knows no plan: the motion controller has kept how long the move takes."""
-    made = TrackingDriver(scenario)
+    made = TrackingDriver(scenario, scenario.vehicle)
     made.take_over(sense())
     made.begin(MOVE, 10, ticks)
     drive, body = follow(made, scenario, 20)
@@ -148,7 +148,7 @@ def test_a_motion_under_way_is_taken_over_where_it_is(scenario: Scenario, ticks:
     }
     assert {name: getattr(drive, name) for name in motion} == motion
     felt = sense(30, MOVE[2], **motion, **body)
-    heir = TrackingDriver(scenario)
+    heir = TrackingDriver(scenario, scenario.vehicle)
     heir.take_over(felt)
     assert not heir.at_rest(felt)
     theirs, mine = made.drive(felt, moving=True), heir.drive(felt, moving=True)
@@ -165,7 +165,7 @@ def test_a_motion_under_way_is_taken_over_where_it_is(scenario: Scenario, ticks:
 def test_a_motion_that_is_over_or_of_an_impossible_duration_is_taken_over_as_a_hold(
     end_tick: int, ticks: int
 ) -> None:
-    made, felt = TrackingDriver(SCENARIO), sense(25, MOVE[2])
+    made, felt = TrackingDriver(SCENARIO, SCENARIO.vehicle), sense(25, MOVE[2])
     made.take_over(replace(felt, motion_end_tick=end_tick, motion_origin=HOME, motion_ticks=ticks))
     assert made.at_rest(felt)
     drive = made.drive(felt, moving=False)

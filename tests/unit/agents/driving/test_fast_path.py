@@ -27,7 +27,7 @@ from laneweave.protocol.vehicle.motion import State, cell_state, integrate
 
 SCENARIO = Scenario()
 LIMITS, LATTICE, TICK_S = SCENARIO.vehicle, SCENARIO.lattice, SCENARIO.runtime.tick_s
-N = SCENARIO.horizon_ticks
+N = SCENARIO.timing.horizon_ticks
 ALWAYS = evolve(SCENARIO, tracking=evolve(SCENARIO.tracking, always_solve=True))
 TIMES_S = TICK_S * np.arange(N + 1)
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
@@ -46,7 +46,7 @@ def problems(count: int, seed: int = 2) -> Iterator[Problem]:
     rng = random.Random(seed)
     for number in range(count):
         dx, dy = rng.choice(MOVES)
-        reference = Reference.move(SCENARIO, (0, 1), (dx, 1 + dy), 0)
+        reference = Reference.move(SCENARIO, LIMITS, (0, 1), (dx, 1 + dy), 0)
         window = reference.window(rng.randrange(-5, 45))
         scale = 10.0 if number % 2 else 1.0
         state = tuple(
@@ -71,7 +71,7 @@ def exact(monkeypatch: pytest.MonkeyPatch) -> Tracker:
     """Return a tracker that always runs OSQP, with tight tolerances."""
     tight = evolve(program_module.SETTINGS, eps_abs=1e-7, max_iter=20_000, tolerance=1e-3)
     monkeypatch.setattr(program_module, "SETTINGS", tight)
-    return Tracker(ALWAYS)
+    return Tracker(ALWAYS, ALWAYS.vehicle)
 
 
 def states_of(problem: Problem, result: TrackResult) -> np.ndarray:
@@ -120,7 +120,7 @@ def regulated(problem: Problem) -> np.ndarray:
 def test_the_fast_path_gives_the_programs_solution_where_no_row_binds(
     exact: Tracker,
 ) -> None:
-    fast = Tracker(SCENARIO)
+    fast = Tracker(SCENARIO, LIMITS)
     taken, refused = 0, 0
     for problem in problems(200):
         result = fast.solve(problem.state, problem.window, problem.gaps)
@@ -154,22 +154,22 @@ def test_the_fast_path_gives_the_programs_solution_where_no_row_binds(
     ],
 )
 def test_the_fast_path_is_not_taken_where_a_limit_binds(change: tuple[float, ...]) -> None:
-    window = Reference.hold(SCENARIO, (0, 1)).window(0)
+    window = Reference.hold(SCENARIO, LIMITS, (0, 1)).window(0)
     state = tuple(a + b for a, b in zip(cell_state(LATTICE, (0, 1), 0.0), change, strict=True))
-    assert Tracker(SCENARIO).solve(state, window).iterations > 0  # type: ignore[arg-type]
+    assert Tracker(SCENARIO, LIMITS).solve(state, window).iterations > 0  # type: ignore[arg-type]
 
 
 # --- gaps -----------------------------------------------------------------------------------------
 
 
 def at_rest() -> tuple[State, Window]:
-    return cell_state(LATTICE, (0, 1), 0.0), Reference.hold(SCENARIO, (0, 1)).window(0)
+    return cell_state(LATTICE, (0, 1), 0.0), Reference.hold(SCENARIO, LIMITS, (0, 1)).window(0)
 
 
 def first_metres(gaps: Gaps, ticks: int = 15) -> float:
     """Return how far it gets ahead of its reference in some ticks."""
     state, window = at_rest()
-    result = Tracker(SCENARIO).solve(state, window, gaps)
+    result = Tracker(SCENARIO, LIMITS).solve(state, window, gaps)
     assert result.usable
     problem = Problem(state, window, gaps)
     return float(states_of(problem, result)[ticks - 1, 0] - window.states[ticks, 0])
@@ -180,7 +180,9 @@ def test_vehicles_behind_push_but_not_far() -> None:
     s = window.states[:, 0]
     assert first_metres(Gaps(earliest=s - 0.5)) == 0.0
     assert first_metres(Gaps(earliest=s + 0.8)) > 0.3
-    one, far = (Tracker(SCENARIO).solve(state, window, Gaps(earliest=s + by)) for by in (1.0, 9.0))
+    one, far = (
+        Tracker(SCENARIO, LIMITS).solve(state, window, Gaps(earliest=s + by)) for by in (1.0, 9.0)
+    )
     assert (one.jerk == far.jerk).all()
     assert first_metres(Gaps(earliest=s + 9.0), N) < 1.1
 
@@ -188,8 +190,10 @@ def test_vehicles_behind_push_but_not_far() -> None:
 def test_gaps_ahead_take_precedence_over_gaps_behind() -> None:
     state, window = at_rest()
     s = window.states[:, 0]
-    alone = Tracker(SCENARIO).solve(state, window, Gaps(latest=s - 1.5))
-    squeezed = Tracker(SCENARIO).solve(state, window, Gaps(earliest=s + 0.9, latest=s - 1.5))
+    alone = Tracker(SCENARIO, LIMITS).solve(state, window, Gaps(latest=s - 1.5))
+    squeezed = Tracker(SCENARIO, LIMITS).solve(
+        state, window, Gaps(earliest=s + 0.9, latest=s - 1.5)
+    )
     assert squeezed.usable
     assert squeezed.jerk[0, 0] < -0.5
     problem = Problem(state, window, Gaps())
@@ -212,21 +216,21 @@ def test_at_rest_the_jerks_are_the_same_without_the_program(
     shares: tuple[float, ...], cell: tuple[int, int], tick: int
 ) -> None:
     """Whatever the errors for which rows are not looked at: none of them binds."""
-    tracker = Tracker(SCENARIO)
+    tracker = Tracker(SCENARIO, LIMITS)
     goal = cell_state(LATTICE, cell, tick * TICK_S)
     state: State = tuple(  # type: ignore[assignment]
         at + 0.999 * share * most
         for at, share, most in zip(goal, shares, tracker.unconstrained_errors, strict=True)
     )
     quick = tracker.rest(state, goal)
-    whole = tracker.solve(state, Reference.hold(SCENARIO, cell).window(tick))
+    whole = tracker.solve(state, Reference.hold(SCENARIO, LIMITS, cell).window(tick))
     assert quick is not None
     assert whole.iterations == 0
     np.testing.assert_allclose(quick.jerk, whole.jerk, atol=1e-9)
 
 
 def test_a_vehicle_farther_from_its_cell_is_not_at_rest() -> None:
-    tracker = Tracker(SCENARIO)
+    tracker = Tracker(SCENARIO, LIMITS)
     goal = cell_state(LATTICE, (0, 0), 0.0)
     for axis, most in enumerate(tracker.unconstrained_errors):
         state = tuple(at + 1.01 * most * (index == axis) for index, at in enumerate(goal))

@@ -87,7 +87,7 @@ def test_hold_law_takes_over_from_a_move_without_leaving_the_footprint(
     dx: int, dy: int, tick: int
 ) -> None:
     """Commands run out during a move: the vehicle goes on to its target, not far beyond."""
-    window = Reference.move(SCENARIO, (0, 1), (dx, 1 + dy), 0).window(tick)
+    window = Reference.move(SCENARIO, LIMITS, (0, 1), (dx, 1 + dy), 0).window(tick)
     state: State = tuple(window.states[0].tolist())
     worst_s = worst_y = 0.0
     for now in range(tick, tick + 300):

@@ -175,7 +175,7 @@ def motion(
 
 def path(tick: int, cells: tuple[Cell, Cell] = BACK) -> Array:
     """Return the reference (N + 1, 6) of another vehicle's motion from a tick on."""
-    return Reference.move(SCENARIO, *cells, BEGIN).window(tick).states
+    return Reference.move(SCENARIO, SCENARIO.vehicle, *cells, BEGIN).window(tick).states
 
 
 def neighbour(
@@ -203,7 +203,7 @@ def gaps(
 
 
 def hearing(*motions: Motion) -> Surroundings:
-    around = Surroundings(SCENARIO)
+    around = Surroundings(SCENARIO, SCENARIO.vehicle)
     for each in motions:
         around.on_motion(each)
     return around
@@ -252,7 +252,10 @@ def test_a_sensed_vehicle_counts_whatever_its_motion() -> None:
     scenario = attrs.evolve(SCENARIO, tracking=attrs.evolve(SCENARIO.tracking, min_gap_m=9.0))
     away: tuple[Cell, Cell] = ((0, 1), (1, 1))
     seen = neighbour(path(BEGIN, away), 1, BEGIN, off_m=-0.5, off_mps=-0.8)
-    plain, misled = Surroundings(scenario), Surroundings(scenario)
+    plain, misled = (
+        Surroundings(scenario, scenario.vehicle),
+        Surroundings(scenario, scenario.vehicle),
+    )
     misled.on_motion(motion(away))
     sensed, both = gaps(plain, BEGIN, (seen,)).latest, gaps(misled, BEGIN, (seen,)).latest
     assert sensed is not None

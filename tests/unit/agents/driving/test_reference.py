@@ -25,7 +25,7 @@ from laneweave.protocol.vehicle.motion import State, cell_state, integrate
 
 SCENARIO = Scenario()
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
-TICK_S, N = SCENARIO.runtime.tick_s, SCENARIO.horizon_ticks
+TICK_S, N = SCENARIO.runtime.tick_s, SCENARIO.timing.horizon_ticks
 WEAK = evolve(
     SCENARIO,
     formation=evolve(SCENARIO.formation, speed_mps=25.0, gap_m=27.0, change_columns=False),
@@ -58,7 +58,7 @@ def check_limits(trajectory: Trajectory, scenario: Scenario = SCENARIO) -> None:
 
 @pytest.mark.parametrize(("dx", "dy"), MOVES)
 def test_moves_keep_all_limits_and_go_straight_to_rest_in_the_next_cell(dx: int, dy: int) -> None:
-    profile = move_profile(SCENARIO, dx, dy)
+    profile = move_profile(SCENARIO, SCENARIO.vehicle, dx, dy)
     assert profile.states.shape == (39, 6)
     assert profile.jerks.shape == (38, 2)
     np.testing.assert_array_equal(profile.states[0], np.zeros(6))
@@ -74,10 +74,12 @@ def test_moves_keep_all_limits_and_go_straight_to_rest_in_the_next_cell(dx: int,
 
 
 def test_move_to_a_neighbouring_cell_is_planned_once_per_process() -> None:
-    assert move_profile(SCENARIO, 1, -1) is move_profile(Scenario(), 1, -1)
-    assert not move_profile(SCENARIO, 1, -1).states.flags.writeable
+    assert move_profile(SCENARIO, SCENARIO.vehicle, 1, -1) is move_profile(
+        Scenario(), Scenario().vehicle, 1, -1
+    )
+    assert not move_profile(SCENARIO, SCENARIO.vehicle, 1, -1).states.flags.writeable
     with pytest.raises(ValueError, match="neighbouring"):
-        move_profile(SCENARIO, 2, 0)
+        move_profile(SCENARIO, SCENARIO.vehicle, 2, 0)
 
 
 @pytest.mark.parametrize(
@@ -91,13 +93,13 @@ def test_move_to_a_neighbouring_cell_is_planned_once_per_process() -> None:
 )
 def test_impossible_moves_raise(table: dict[str, dict[str, float]]) -> None:
     with pytest.raises(InfeasibleTrajectoryError, match=r"15 m|30 m"):
-        move_profile(parse_scenario(table), 1, 1)
+        move_profile(parse_scenario(table), parse_scenario(table).vehicle, 1, 1)
 
 
 @settings(max_examples=25)
 @given(st.sampled_from(MOVES), st.integers(38, 60))
 def test_slower_moves_keep_all_limits_and_end_at_rest(move: tuple[int, int], ticks: int) -> None:
-    profile = move_profile(SCENARIO, *move, ticks)
+    profile = move_profile(SCENARIO, SCENARIO.vehicle, *move, ticks)
     assert profile.ticks == ticks
     end = [15.0 * move[0], 0.0, 0.0, 3.5 * move[1], 0.0, 0.0]
     np.testing.assert_allclose(profile.states[-1], end, atol=1e-3)
@@ -123,9 +125,9 @@ def test_impossible_trajectories_raise(ticks: int, ds_m: float) -> None:
 
 def test_reference_before_during_and_after_a_move() -> None:
     origin, target, start = (-3, 0), (-2, 1), 100
-    reference = Reference.move(SCENARIO, origin, target, start)
+    reference = Reference.move(SCENARIO, SCENARIO.vehicle, origin, target, start)
     assert (reference.start_tick, reference.end_tick) == (100, 138)
-    profile = move_profile(SCENARIO, 1, 1)
+    profile = move_profile(SCENARIO, SCENARIO.vehicle, 1, 1)
     lattice = SCENARIO.lattice
     n_before = start - N
     for tick in (
@@ -146,7 +148,7 @@ def test_reference_before_during_and_after_a_move() -> None:
 
 
 def test_reference_of_a_hold() -> None:
-    reference = Reference.hold(SCENARIO, (4, 2))
+    reference = Reference.hold(SCENARIO, SCENARIO.vehicle, (4, 2))
     window = reference.window(-7)
     for k in (0, 40):
         expected = cell_state(SCENARIO.lattice, (4, 2), (k - 7) * TICK_S)
@@ -157,7 +159,7 @@ def test_reference_of_a_hold() -> None:
 
 
 def test_reference_follows_any_trajectory() -> None:
-    reference = Reference(SCENARIO, (0, 0), planned(70, 20.0, 3.5), 5)
+    reference = Reference(SCENARIO, SCENARIO.vehicle, (0, 0), planned(70, 20.0, 3.5), 5)
     for tick in range(0, 120, 40):
         window = reference.window(tick)
         check_exact(window.states, window.jerks)
@@ -166,7 +168,7 @@ def test_reference_follows_any_trajectory() -> None:
 
 
 def test_window_is_cheap() -> None:
-    reference = Reference.move(SCENARIO, (0, 0), (1, 1), 10)
+    reference = Reference.move(SCENARIO, SCENARIO.vehicle, (0, 0), (1, 1), 10)
     best = min(_window_time_s(reference) for _ in range(20))
     assert best < 15e-6
 
@@ -185,20 +187,18 @@ def test_a_vehicle_settles_within_its_limits_if_it_has_little_time() -> None:
     """The trajectory of least jerk would exceed them."""
     start = np.array([40.0, -7.5, 0.0, 0.0, 0.0, 0.0])
     ticks = 68
-    profile = settling_trajectory(WEAK, start, ticks)
+    profile = settling_trajectory(WEAK, WEAK.vehicle, start, ticks)
     np.testing.assert_array_equal(profile.states[0], start)
     np.testing.assert_allclose(profile.states[-1], np.zeros(6), atol=1e-3)
     check_limits(profile, WEAK)
     assert profile.states[:, 0].min() >= -0.5
-    unlimited = settling_trajectory(
-        evolve(WEAK, vehicle=evolve(WEAK.vehicle, max_accel_mps2=9.0)), start, ticks
-    )
+    unlimited = settling_trajectory(WEAK, evolve(WEAK.vehicle, max_accel_mps2=9.0), start, ticks)
     assert unlimited.states[:, 2].max() > WEAK.vehicle.max_accel_mps2
 
 
 def test_a_vehicle_without_enough_time_gets_the_trajectory_of_least_jerk() -> None:
     start = np.array([2.0, -7.5, 0.0, 0.0, 0.0, 0.0])
-    profile = settling_trajectory(WEAK, start, 30)
+    profile = settling_trajectory(WEAK, WEAK.vehicle, start, 30)
     np.testing.assert_allclose(profile.states[-1], np.zeros(6), atol=1e-6)
     assert profile.states[:, 2].max() > WEAK.vehicle.max_accel_mps2
 
@@ -206,7 +206,9 @@ def test_a_vehicle_without_enough_time_gets_the_trajectory_of_least_jerk() -> No
 def settling(cell: Cell, tick: int, end_tick: int) -> Reference:
     """Return the reference of a vehicle that is 60 m ahead of its cell, and slower."""
     s, v, a, y, v_y, a_y = cell_state(WEAK.lattice, cell, tick * TICK_S)
-    return Reference.settling(WEAK, cell, (s + 60.0, v - 7.0, a, y, v_y, a_y), tick, end_tick)
+    return Reference.settling(
+        WEAK, WEAK.vehicle, cell, (s + 60.0, v - 7.0, a, y, v_y, a_y), tick, end_tick
+    )
 
 
 @pytest.mark.parametrize("left_ticks", [25, 60])
@@ -216,8 +218,8 @@ def test_a_vehicle_changes_lanes_while_it_settles(left_ticks: int) -> None:
     end_tick = tick + 80
     before = settling(cell, tick, end_tick)
     begin = end_tick - left_ticks
-    move = Reference.move(WEAK, cell, target, begin)
-    plain = Reference.move(WEAK, cell, target, begin)
+    move = Reference.move(WEAK, WEAK.vehicle, cell, target, begin)
+    plain = Reference.move(WEAK, WEAK.vehicle, cell, target, begin)
     move.settle_meanwhile(before)
     assert move.rest_tick == max(plain.end_tick, end_tick)
     for now in range(begin - 3, move.rest_tick + 5):
@@ -234,7 +236,7 @@ def test_a_vehicle_changes_lanes_while_it_settles(left_ticks: int) -> None:
 
 def test_a_settled_vehicle_moves_as_before() -> None:
     before = settling((4, 0), 100, 180)
-    move, plain = (Reference.move(WEAK, (4, 0), (4, 1), 180) for _ in range(2))
+    move, plain = (Reference.move(WEAK, WEAK.vehicle, (4, 0), (4, 1), 180) for _ in range(2))
     move.settle_meanwhile(before)
     np.testing.assert_array_equal(move.window(185).states, plain.window(185).states)
     assert move.rest_tick == plain.end_tick

@@ -28,8 +28,8 @@ def tick_at(s_m: float) -> int:
 def test_a_reference_that_stays_in_a_lane_is_limited_to_its_line() -> None:
     (end,) = dead_ends(KEEPING)
     tick = tick_at(end.line_m - 10.0)
-    states = Reference.hold(KEEPING, (COLUMN, 1)).window(tick).states
-    limited = StopLines(KEEPING).limit(NO_GAPS, states, states[0, 0])
+    states = Reference.hold(KEEPING, KEEPING.vehicle, (COLUMN, 1)).window(tick).states
+    limited = StopLines(KEEPING, KEEPING.vehicle).limit(NO_GAPS, states, states[0, 0])
     assert limited.latest is not None
     assert np.all(limited.latest < end.line_m)
 
@@ -40,10 +40,10 @@ def test_a_reference_into_a_lane_that_opens_again_is_not_limited(
     origin: int, target: int, s_m: float
 ) -> None:
     """Neither before the lane opens nor behind that."""
-    begins_m = 700.0 + KEEPING.longest_body_m - early_start_m(KEEPING)
+    begins_m = 700.0 + KEEPING.types.longest_body_m - early_start_m(KEEPING)
     cells: tuple[Cell, Cell] = (COLUMN, origin), (COLUMN, target)
     begin_tick = tick_at(begins_m)
-    ticks = KEEPING.move_ticks(KEEPING.cycles_s[0])
-    reference = Reference.move(KEEPING, *cells, begin_tick, ticks)
+    ticks = KEEPING.timing.move_ticks(KEEPING.timing.cycles_s[0])
+    reference = Reference.move(KEEPING, KEEPING.vehicle, *cells, begin_tick, ticks)
     states = reference.window(begin_tick + round(s_m / LATTICE.speed_mps / TICK_S)).states
-    assert StopLines(KEEPING).limit(NO_GAPS, states, states[0, 0]) is NO_GAPS
+    assert StopLines(KEEPING, KEEPING.vehicle).limit(NO_GAPS, states, states[0, 0]) is NO_GAPS

@@ -20,7 +20,7 @@ SCENARIO = Scenario()
 LIMITS, LATTICE, TICK_S = SCENARIO.vehicle, SCENARIO.lattice, SCENARIO.runtime.tick_s
 V_F, LAG_S = LATTICE.speed_mps, LIMITS.actuator_lag_s
 LEAST_M = SCENARIO.tracking.min_gap_m
-N = SCENARIO.horizon_ticks
+N = SCENARIO.timing.horizon_ticks
 TIMES_S = TICK_S * np.arange(N + 1)
 KNOWN = TIMES_S <= SENSED_S + 1e-9
 HOME: Cell = (0, 1)
@@ -40,7 +40,7 @@ def sense(
 
 def gaps_of(felt: Sense, lane: int = HOME[1], *, all_of_them: bool = False) -> Gaps:
     """Return the gaps; if wished, also those that the module takes to be out of question."""
-    surroundings = Surroundings(SCENARIO)
+    surroundings = Surroundings(SCENARIO, LIMITS)
     if all_of_them:
         surroundings._gain_mps2, surroundings._loss_mps2 = 1e6, -1e6
     state = commanded_state(felt.state, felt.setpoint, LIMITS, V_F)

@@ -24,7 +24,7 @@ ALWAYS = evolve(SCENARIO, tracking=evolve(SCENARIO.tracking, always_solve=True))
 LIMITS = SCENARIO.vehicle
 LATTICE = SCENARIO.lattice
 TICK_S = SCENARIO.runtime.tick_s
-N = SCENARIO.horizon_ticks
+N = SCENARIO.timing.horizon_ticks
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if (dx, dy) != (0, 0)]
 TIMES_S = TICK_S * np.arange(N + 1)
 
@@ -69,7 +69,7 @@ def drive(
     tracker: Tracker | None = None,
 ) -> list[tuple[State, TrackResult]]:
     """Close the loop with the exact plant; return each tick's next state and result."""
-    tracker = tracker or Tracker(SCENARIO)
+    tracker = tracker or Tracker(SCENARIO, LIMITS)
     log = []
     for tick in range(ticks):
         gaps = behind_of(predict(tick)) if predict else Gaps()
@@ -102,7 +102,7 @@ def braking(gap_m: float, decel: float, start_tick: int, end_speed: float = 0.0)
 
 @pytest.mark.parametrize(("dx", "dy"), MOVES)
 def test_ideal_move_ends_in_the_target_cell_within_limits(dx: int, dy: int) -> None:
-    reference = Reference.move(SCENARIO, (0, 1), (dx, 1 + dy), 5)
+    reference = Reference.move(SCENARIO, LIMITS, (0, 1), (dx, 1 + dy), 5)
     log = drive(reference, cell_state(LATTICE, (0, 1), 0.0), 43)
     for state, result in log:
         assert excess(state, first_jerk(result)) <= 1e-6
@@ -125,7 +125,7 @@ def test_far_starts_converge_within_limits(ds: float, dv: float, a: float, dy: f
     keepable = a * a / 30.0 + abs(a) * TICK_S
     if v < keepable or v > LIMITS.max_speed_mps - keepable:
         return
-    log = drive(Reference.hold(SCENARIO, (0, 1)), start, 420)
+    log = drive(Reference.hold(SCENARIO, LIMITS, (0, 1)), start, 420)
     assert max(excess(state, first_jerk(result)) for state, result in log) <= 1e-3
     assert np.abs(error(log[-1][0], (0, 1), 420)).max() < 0.05
 
@@ -143,7 +143,7 @@ def test_far_starts_converge_within_limits(ds: float, dv: float, a: float, dy: f
     ],
 )
 def test_states_that_break_a_limit_are_recovered_from(start: State) -> None:
-    log = drive(Reference.hold(SCENARIO, (0, 1)), start, 400)
+    log = drive(Reference.hold(SCENARIO, LIMITS, (0, 1)), start, 400)
     assert all(excess(state, first_jerk(result)) <= 1e-3 for state, result in log[20:])
     assert np.abs(error(log[-1][0], (0, 1), 400)).max() < 0.02
 
@@ -173,14 +173,14 @@ def test_the_whole_plan_keeps_the_limits(
     by: tuple[float, ...], move: tuple[int, int], tick: int
 ) -> None:
     """What the fallback may have to play is within the limits too, not only the first tick."""
-    window = Reference.move(SCENARIO, (0, 1), (move[0], 1 + move[1]), 0).window(tick)
+    window = Reference.move(SCENARIO, LIMITS, (0, 1), (move[0], 1 + move[1]), 0).window(tick)
     now: State = tuple(window.states[0].tolist())
     start = shifted(now, *by)
     if excess(start, (0.0, 0.0)) > 0.0 or _doomed(start):
         return
     if LIMITS.max_slip_ratio * start[1] - abs(start[4]) < 1.0:
         return  # where the slip limit holds a body back, its lateral jerk gives way
-    result = Tracker(SCENARIO).solve(start, window)
+    result = Tracker(SCENARIO, LIMITS).solve(start, window)
     assert result.usable
     for state, (along, across) in predicted(start, result):
         room = LIMITS.max_slip_ratio * state[1] - abs(state[4])
@@ -204,7 +204,9 @@ def _doomed(state: State) -> bool:
 @pytest.mark.parametrize("decel", [1.0, 3.0, 6.0, 9.0])
 def test_stays_behind_a_vehicle_that_brakes_to_standstill(decel: float) -> None:
     predict = braking(10.0, decel, 10)
-    log = drive(Reference.hold(SCENARIO, (0, 1)), cell_state(LATTICE, (0, 1), 0.0), 220, predict)
+    log = drive(
+        Reference.hold(SCENARIO, LIMITS, (0, 1)), cell_state(LATTICE, (0, 1), 0.0), 220, predict
+    )
     gaps = [predict(tick + 1)[0] - state[0] for tick, (state, _) in enumerate(log)]
     assert min(gaps) >= SCENARIO.tracking.min_gap_m - 0.2
     assert gaps[-1] <= SCENARIO.tracking.min_gap_m + 1.5
@@ -217,7 +219,7 @@ def test_stays_behind_a_vehicle_that_brakes_to_standstill(decel: float) -> None:
 def test_a_vehicle_that_stops_ahead_during_a_move(dx: int, dy: int) -> None:
     """Braking to standstill in the middle of a lane change: no collision, no sideways slide."""
     predict = braking(10.0 + 15.0 * max(dx, 0), 6.0, 18)
-    reference = Reference.move(SCENARIO, (0, 1), (dx, 1 + dy), 0)
+    reference = Reference.move(SCENARIO, LIMITS, (0, 1), (dx, 1 + dy), 0)
     log = drive(reference, cell_state(LATTICE, (0, 1), 0.0), 120, predict)
     gaps = [predict(tick + 1)[0] - state[0] for tick, (state, _) in enumerate(log)]
     assert min(gaps) >= SCENARIO.tracking.min_gap_m - 0.5
@@ -233,7 +235,7 @@ def test_a_vehicle_that_stops_ahead_during_a_move(dx: int, dy: int) -> None:
 
 def test_follows_a_slower_vehicle_and_returns_to_its_cell_when_it_has_gone() -> None:
     slow = braking(10.0, 2.0, 10, end_speed=10.0)
-    reference = Reference.hold(SCENARIO, (0, 1))
+    reference = Reference.hold(SCENARIO, LIMITS, (0, 1))
 
     def predict(tick: int) -> np.ndarray:
         return slow(tick) if tick < 100 else np.full(N + 1, np.inf)
@@ -249,7 +251,9 @@ def test_a_vehicle_cutting_in_opens_the_gap_again() -> None:
     def predict(tick: int) -> np.ndarray:
         return 1.0 + 15.0 * (tick * TICK_S + TIMES_S)
 
-    log = drive(Reference.hold(SCENARIO, (0, 1)), cell_state(LATTICE, (0, 1), 0.0), 200, predict)
+    log = drive(
+        Reference.hold(SCENARIO, LIMITS, (0, 1)), cell_state(LATTICE, (0, 1), 0.0), 200, predict
+    )
     gaps = [predict(tick + 1)[0] - state[0] for tick, (state, _) in enumerate(log)]
     assert min(gaps) >= 0.9
     assert gaps[40] >= SCENARIO.tracking.min_gap_m - 0.1
@@ -259,8 +263,8 @@ def test_a_vehicle_cutting_in_opens_the_gap_again() -> None:
 
 @pytest.mark.parametrize("distance", [1e3, 1e9, math.inf])
 def test_a_distant_vehicle_changes_nothing(distance: float) -> None:
-    reference = Reference.move(SCENARIO, (0, 1), (1, 2), 0)
-    alone, behind = Tracker(SCENARIO), Tracker(SCENARIO)
+    reference = Reference.move(SCENARIO, LIMITS, (0, 1), (1, 2), 0)
+    alone, behind = Tracker(SCENARIO, LIMITS), Tracker(SCENARIO, LIMITS)
     start = shifted(cell_state(LATTICE, (0, 1), 0.0), 0.3, -0.2, 0.0, 0.1, 0.0, 0.0)
     expected = alone.solve(start, reference.window(0))
     result = behind.solve(start, reference.window(0), behind_of(np.full(N + 1, distance)))
@@ -270,8 +274,9 @@ def test_a_distant_vehicle_changes_nothing(distance: float) -> None:
 @pytest.mark.parametrize("side", ["ahead", "behind"])
 @pytest.mark.parametrize("scenario", [SCENARIO, ALWAYS])
 def test_gap_rows_leave_nothing_behind(scenario: Scenario, side: str) -> None:
-    window, state = Reference.hold(SCENARIO, (0, 1)).window(0), cell_state(LATTICE, (0, 1), 0.0)
-    tracker = Tracker(scenario)
+    window = Reference.hold(SCENARIO, LIMITS, (0, 1)).window(0)
+    state = cell_state(LATTICE, (0, 1), 0.0)
+    tracker = Tracker(scenario, scenario.vehicle)
     if side == "ahead":
         pressed = tracker.solve(state, window, behind_of(np.full(N + 1, state[0] + 6.0)))
         assert pressed.jerk[0, 0] < -1.0
@@ -290,8 +295,8 @@ def script(tracker: Tracker) -> bytes:
     predict = braking(14.0, 2.0, 60, end_speed=9.0)
     state, jerks = cell_state(LATTICE, (0, 1), 0.0), b""
     moves = [
-        Reference.move(SCENARIO, (0, 1), (-1, 2), 10),
-        Reference.move(SCENARIO, (-1, 2), (-1, 1), 50),
+        Reference.move(SCENARIO, LIMITS, (0, 1), (-1, 2), 10),
+        Reference.move(SCENARIO, LIMITS, (-1, 2), (-1, 1), 50),
     ]
     for tick in range(110):
         reference = moves[tick >= 50]
@@ -304,11 +309,11 @@ def script(tracker: Tracker) -> bytes:
 
 
 def test_two_trackers_agree_to_the_last_bit() -> None:
-    assert script(Tracker(SCENARIO)) == script(Tracker(SCENARIO))
+    assert script(Tracker(SCENARIO, LIMITS)) == script(Tracker(SCENARIO, LIMITS))
 
 
 def good_input() -> tuple[State, Window, Gaps]:
-    window = Reference.hold(SCENARIO, (0, 1)).window(0)
+    window = Reference.hold(SCENARIO, LIMITS, (0, 1)).window(0)
     gaps = Gaps(np.full(N + 1, -500.0), np.full(N + 1, 500.0))
     return cell_state(LATTICE, (0, 1), 0.0), window, gaps
 
@@ -318,7 +323,7 @@ def good_input() -> tuple[State, Window, Gaps]:
 def test_bad_numbers_raise_and_leave_nothing_behind(part: str, number: float) -> None:
     if part in ("earliest", "latest") and not math.isnan(number):
         return
-    used, fresh = Tracker(SCENARIO), Tracker(SCENARIO)
+    used, fresh = Tracker(SCENARIO, LIMITS), Tracker(SCENARIO, LIMITS)
     state, window, gaps = good_input()
     bad_state, bad_window, bad_gaps = good_input()
     if part == "state":
@@ -345,4 +350,4 @@ def test_bad_shapes_raise() -> None:
         ("earliest", window, Gaps(earliest=-short)),
     ):
         with pytest.raises(ValueError, match=name):
-            Tracker(SCENARIO).solve(state, bad_window, bad_gaps)
+            Tracker(SCENARIO, LIMITS).solve(state, bad_window, bad_gaps)

@@ -19,7 +19,7 @@ from support.states import A, B, C, D, E, F, make_plan
 
 SCENARIO = evolve(PAPER, formation=evolve(FORMATIONS, solver="branching"))
 """Of the plans with equal cost, those of branching close up across the border."""
-SLOT_S, MOVE_S = SCENARIO.cycles_s[0], SCENARIO.move_s
+SLOT_S, MOVE_S = SCENARIO.timing.cycles_s[0], SCENARIO.timing.move_s
 SLACK_S = SCENARIO.formation.slack_s
 CLOSING = ConflictModel(("closing",))
 T0_S = 30.0

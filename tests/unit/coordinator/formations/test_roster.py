@@ -18,7 +18,8 @@ from laneweave.coordinator.formations.roster import (
     steps_left,
 )
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.fields import Road, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import Road
 from laneweave.protocol.wire.messages import Census, CensusEntry, ClosedFormation, Name
 from support.paper import FORMATIONS, PAPER, closed_blocks, closing_time_s
 
@@ -166,7 +167,7 @@ def test_no_vehicle_changes_lanes_before_the_rear_body_is_in_s3(
     assert start_s - tick_s < not_before_s or rear_bumper_m - 15.0 * tick_s < sorting_m + 1e-3
 
 
-@given(slot_s=st.sampled_from(GROWING.slots_s), left_s=st.floats(-5.0, 100.0))
+@given(slot_s=st.sampled_from(GROWING.timing.slots_s), left_s=st.floats(-5.0, 100.0))
 def test_longer_slots_are_fewer(slot_s: float, left_s: float) -> None:
     """The last one ends before the foremost cell is at the end of the road."""
     cells: list[Cell] = [(-3, 0), (-1, 2)]

@@ -9,7 +9,8 @@ from laneweave.coordinator.formations import pacing
 from laneweave.coordinator.formations.pacing import MIN_RESERVE_S, RESERVE_S, steps_of, with_pauses
 from laneweave.coordinator.formations.roster import exit_time_s, start_time_s
 from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.scenario.fields import FormationSettings, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import FormationSettings
 from laneweave.protocol.wire.messages import Plan
 from support.states import A, make_plan
 
@@ -23,7 +24,7 @@ def climbing(steps: int) -> Plan:
     cells: list[Cell] = [(FRONT, step % 2) for step in range(steps + 1)]
     moves = tuple((step, cells[step], cells[step + 1]) for step in range(steps))
     t0_s = start_time_s(cells, 0.0, SCENARIO)
-    return make_plan({A: cells[0]}, {A: moves}, t0_s=t0_s, slot_s=SCENARIO.cycles_s[0])
+    return make_plan({A: cells[0]}, {A: moves}, t0_s=t0_s, slot_s=SCENARIO.timing.cycles_s[0])
 
 
 def paced(plan: Plan, scenario: Scenario = SCENARIO) -> Plan:
@@ -44,12 +45,12 @@ def test_slots_are_the_longest_that_leave_a_reserve(steps: int, late_s: float) -
     assert chosen == replace(plan, slot_s=chosen.slot_s)
     leisurely, hasty = (
         max(
-            (s for s in SCENARIO.slots_s if steps * s <= left_s(plan) - reserve_s),
-            default=SCENARIO.slots_s[0],
+            (s for s in SCENARIO.timing.slots_s if steps * s <= left_s(plan) - reserve_s),
+            default=SCENARIO.timing.slots_s[0],
         )
         for reserve_s in (RESERVE_S, MIN_RESERVE_S)
     )
-    comfortable = leisurely >= SCENARIO.comfortable_cycle_s
+    comfortable = leisurely >= SCENARIO.timing.comfortable_cycle_s
     assert chosen.slot_s == pytest.approx(leisurely if comfortable else hasty)
 
 
@@ -58,7 +59,7 @@ def test_more_steps_have_shorter_slots() -> None:
     assert slots == sorted(slots, reverse=True)
     assert (slots[0], slots[-1]) == (7.0, 4.0)
     assert len(set(slots)) > 2
-    assert set(slots) <= set(SCENARIO.slots_s)
+    assert set(slots) <= set(SCENARIO.timing.slots_s)
 
 
 def test_a_plan_begins_before_its_rear_is_in_s3_unless_a_lane_change_does() -> None:
@@ -82,7 +83,7 @@ def test_a_plan_begins_before_its_rear_is_in_s3_unless_a_lane_change_does() -> N
 
 def test_a_given_cycle_leaves_no_choice() -> None:
     scenario = Scenario(formation=FormationSettings(cycle_s=5.0))
-    assert scenario.slots_s == (5.0,)
+    assert scenario.timing.slots_s == (5.0,)
     assert {paced(climbing(steps), scenario).slot_s for steps in (1, 6, 12)} == {5.0}
 
 

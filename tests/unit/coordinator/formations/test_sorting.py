@@ -18,7 +18,9 @@ from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.road_layout import ANY_LANE
-from laneweave.protocol.scenario.fields import Closure, DrivingStructure, Road, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import DrivingStructure
+from laneweave.protocol.scenario.road_tables import Closure, Road
 from laneweave.protocol.wire.messages import Name
 from support.paper import FORMATIONS, PAPER
 

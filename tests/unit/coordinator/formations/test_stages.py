@@ -18,15 +18,9 @@ from laneweave.coordinator.formations.roster import (
 )
 from laneweave.coordinator.formations.stages import Stage, stages
 from laneweave.protocol.road_layout import ANY_LANE
-from laneweave.protocol.scenario.fields import (
-    Closure,
-    DrivingStructure,
-    Entrance,
-    Exit,
-    FormationSettings,
-    Road,
-    Scenario,
-)
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import DrivingStructure, FormationSettings
+from laneweave.protocol.scenario.road_tables import Closure, Entrance, Exit, Road
 from laneweave.protocol.vehicle.lane_ends import drive_out
 
 ROOM_M = drive_out(Scenario(road=Road(closures=(Closure(0, 800.0),)))).room_m
@@ -125,13 +119,17 @@ def test_goal_lanes_are_open_and_go_on_or_lead_to_the_destination(
     for stage in stages(scenario):
         goals = stage.goal_lanes(preferred, destination)
         assert goals
-        leaving = {one.lane for one in scenario.sections if one.serves(preferred, destination)}
+        leaving = {
+            one.lane for one in scenario.geometry.sections if one.serves(preferred, destination)
+        }
         assert goals <= stage.through_lanes | leaving
         assert stage.through_lanes <= stage.lanes
         assert stage.through_lanes, "nobody can go on"
-        for one in scenario.sections:
+        for one in scenario.geometry.sections:
             closed = one.to_m <= stage.from_m or one.from_m >= stage.to_m
-            others = [two for two in scenario.sections if two.lane == one.lane and two != one]
+            others = [
+                two for two in scenario.geometry.sections if two.lane == one.lane and two != one
+            ]
             assert not closed or others or one.lane not in stage.lanes
 
 
@@ -171,7 +169,7 @@ def test_vehicles_from_a_ramp_settle_later() -> None:
 def test_formations_sort_when_vehicles_from_ramps_have_settled() -> None:
     main, from_ramp = [(-4, 1), (-6, 3)], (-5, 0)
     from_m, tick_s = 150.0, WEAVING.runtime.tick_s
-    rear_m = from_m + WEAVING.longest_body_m
+    rear_m = from_m + WEAVING.types.longest_body_m
     in_stage_s = WEAVING.lattice.passing_time_s(-6, rear_m)
     assert 0.0 <= sorting_start_s(main, 0.0, WEAVING, from_m) - in_stage_s < tick_s
     settled = settled_s([from_ramp], WEAVING)

@@ -10,7 +10,7 @@ from laneweave.coordinator.planning.exact.arrays import move_arrays
 from laneweave.coordinator.planning.exact.cliques import Clique, clique_patterns
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.protocol.lattice import Mode, displacements
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS
+from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS
 from oracles.instances import EVERY_VARIANT
 
 MODELS: list[tuple[Mode, tuple[str, ...]]] = [

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
 from laneweave.protocol.lattice import Cell, displacements, footprint
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS
+from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS
 from oracles.path_rules import conflict_kinds
 
 CELLS = st.tuples(st.integers(0, 4), st.integers(0, 3))

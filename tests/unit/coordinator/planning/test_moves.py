@@ -10,7 +10,7 @@ from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import MoveTable, bits
 from laneweave.protocol.lattice import Cell, Mode, displacements
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS
+from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS
 
 GRIDS = [
     Grid(4, 3, []),

@@ -23,7 +23,7 @@ from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import block_request, formation_request
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS, SOLVERS
+from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS, SOLVERS
 from support.planning_oracles import CountingClock, cheapest_plan, faults, requests
 
 

@@ -23,7 +23,8 @@ from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Mode, displacements
-from laneweave.protocol.scenario.fields import SOLVERS, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import SOLVERS
 from oracles import joint_search
 from oracles.instances import random_request, small_request
 from oracles.moving_bodies import Bodies, Profile, drive, least_gap_of_plan_m
@@ -186,9 +187,11 @@ def test_a_ring_can_only_turn_as_a_whole(geometry: dict[str, float], cost: int |
 def driven() -> Profile:
     """The trajectories of agents in the default scenario."""
     scenario = Scenario()
-    states = {step: move_profile(scenario, *step).states for step in displacements(2)}
+    states = {
+        step: move_profile(scenario, scenario.vehicle, *step).states for step in displacements(2)
+    }
     return Profile(
-        scenario.move_s,
+        scenario.timing.move_s,
         {step: array[:, [0, 3]] for step, array in states.items()},
         {step: array[:, [1, 4]] for step, array in states.items()},
     )

@@ -12,7 +12,7 @@ from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import TAPPA_SHARE, plan
 from laneweave.launch.bench.request_families import block_request, formation_request
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.fields import SOLVERS
+from laneweave.protocol.scenario.formation_table import SOLVERS
 from support.planning_oracles import CountingClock
 
 EASY = block_request(1, vehicles=3, deadline_s=3600.0)

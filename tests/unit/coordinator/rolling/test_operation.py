@@ -28,7 +28,8 @@ from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Compute, Computed
-from laneweave.protocol.scenario.fields import READY_LATE_S, SNAPSHOT_S, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
 from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
@@ -45,7 +46,7 @@ from support.rolling_samples import state
 from support.states import changed
 
 A, B, C, D = (Name(letter) for letter in "ABCD")
-SLOT_S = ROLLING.cycles_s[0]
+SLOT_S = ROLLING.timing.cycles_s[0]
 SLOT = 5
 BEGUN_S = SLOT * SLOT_S
 LOOK_S = BEGUN_S + SNAPSHOT_S + 0.1
@@ -496,7 +497,7 @@ def test_vehicles_far_from_where_moves_begin_are_not_planned_for() -> None:
     road = parse_scenario({"formation": {"operation": "rolling"}, "road": {"s2_m": 2000.0}})
     desk = Bench()
     desk.control = RollingOperation(road, desk.new_ballot, desk.new_job, desk.plan)
-    far_s = (road.moves_from_m - LOOKAHEAD_M) / 15.0
+    far_s = (road.geometry.moves_from_m - LOOKAHEAD_M) / 15.0
     slot = math.ceil(far_s / SLOT_S)
     desk.control.on_census(census(A, D))  # D is 120 m behind A
     assert desk.order(slot * SLOT_S - 2.0) is None

@@ -27,7 +27,9 @@ def test_every_situation_gets_a_row() -> None:
 
 def test_episodes_repeat() -> None:
     for name in SITUATIONS:
-        first, again = (list(drive(Tracker(SCENARIO), SCENARIO, name, "3")) for _ in range(2))
+        first, again = (
+            list(drive(Tracker(SCENARIO, SCENARIO.vehicle), SCENARIO, name, "3")) for _ in range(2)
+        )
         assert [tick.state for tick in first] == [tick.state for tick in again]
         jerks = [[tick.result.jerk.tobytes() for tick in ticks] for ticks in (first, again)]
         assert jerks[0] == jerks[1]

@@ -16,7 +16,8 @@ from laneweave.launch.run.logs import last_error
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.fields import Scenario, check_pace
+from laneweave.protocol.scenario.deployment_fields import check_pace
+from laneweave.protocol.scenario.fields import Scenario
 from support.commands import Here
 
 

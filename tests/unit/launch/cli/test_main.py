@@ -25,7 +25,8 @@ def solve(_: list[str]) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     signal.alarm(90)  # end even if the test has died
     scenario = Scenario()
-    tracker, window = Tracker(scenario), Reference.hold(scenario, (3, 1)).window(0)
+    tracker = Tracker(scenario, scenario.vehicle)
+    window = Reference.hold(scenario, scenario.vehicle, (3, 1)).window(0)
     s, *rest = cell_state(scenario.lattice, (3, 1), 0.0)
     for _ in range(int(sys.argv[1])):
         try:

@@ -12,7 +12,8 @@ from laneweave.launch.drawing.colours import NEUTRAL, lane_colours, vehicle_colo
 from laneweave.launch.drawing.road_scene import closed_parts_script, road_scene
 from laneweave.launch.web import road_script
 from laneweave.protocol.road_layout import ANY_LANE
-from laneweave.protocol.scenario.fields import Closure, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.protocol.vehicle.lane_ends import drive_out
 from support.closed_lanes import BLOCKED, DROP, DROP_M
 from support.javascript import needs_node, printed_json

@@ -63,7 +63,7 @@ def errors_m(drive: Drive, paths: tuple[tuple[Cell, ...], ...]) -> NDArray[np.fl
 def test_all_vehicles_are_in_their_cells_when_a_step_ends(driven: Drive) -> None:
     assert PLAN.steps is not None
     assert driven.states.shape == (5, PLAN.steps * driven.slot_ticks + 1, 6)
-    assert driven.time_s(driven.ticks) == pytest.approx(PLAN.steps * SCENARIO.cycles_s[0])
+    assert driven.time_s(driven.ticks) == pytest.approx(PLAN.steps * SCENARIO.timing.cycles_s[0])
     assert errors_m(driven, PLAN.paths).max() < 0.2
 
 

@@ -10,9 +10,9 @@ from attrs import evolve
 from laneweave.launch.fault_search.profiles import PROFILES, profiles_named
 from laneweave.launch.fault_search.road.stand_ins import Visit
 from laneweave.launch.fault_search.setup import BLOCK_COLUMNS, Setup
-from laneweave.protocol.config.cross_checks import check_scenario
+from laneweave.protocol.config.scenario_files import check_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.fields import Demand
+from laneweave.protocol.scenario.road_tables import Demand
 from laneweave.protocol.wire.messages import ClosedFormation, Name
 
 EVERY = pytest.mark.parametrize(

@@ -38,7 +38,8 @@ from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.report.tables import run_table, tables_of
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.road_layout import ANY_LANE
-from laneweave.protocol.scenario.fields import Closure, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import Trip, metadata_of, trips_table
 from laneweave.sim_bridge.road.demand import Arrival

@@ -12,7 +12,8 @@ from laneweave.launch.recordings.runs import Run, write_point
 from laneweave.launch.sweep.folder import SweepFolder
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.deployment_fields import Security
-from laneweave.protocol.scenario.fields import Road, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import Road
 from laneweave.protocol.summary import read_summary, write_summary
 from support.summaries import make_summary
 

@@ -54,15 +54,15 @@ def test_labels_bring_their_settings(
     assert (formation.operation, formation.entry, formation.close) == (
         "formations", "interlaced", "columns",
     )  # fmt: skip
-    assert METHODS[label].settings(base).cycles_s == (4.0, 4.0)
-    assert METHODS[label].settings(base).move_s == pytest.approx(3.8)
+    assert METHODS[label].settings(base).timing.cycles_s == (4.0, 4.0)
+    assert METHODS[label].settings(base).timing.move_s == pytest.approx(3.8)
     assert METHODS["formation"].settings(base) == base
 
 
 def test_the_label_formations_has_the_default_settings_in_any_scenario() -> None:
     default, paper = load_scenario(None), load_scenario(ROOT / "scenarios" / "paper.toml")
     found = METHODS["formations"].settings(paper)
-    assert found.cycles_s == default.cycles_s == (4.0, 7.0)
+    assert found.timing.cycles_s == default.timing.cycles_s == (4.0, 7.0)
     assert found.formation.closes_by_vehicles
     assert not found.formation.interlaced
     assert found.formation.max_vehicles == 6

@@ -10,7 +10,8 @@ import pytest
 
 from laneweave.launch.watch.frames import Row, scene_of
 from laneweave.launch.web import road_script, text_of
-from laneweave.protocol.scenario.fields import Scenario, VehicleType
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import VehicleTypeSettings
 from support.javascript import needs_node, printed_json
 
 pytestmark = needs_node
@@ -125,7 +126,7 @@ def test_formations_that_plan_together_are_one() -> None:
 
 
 def test_bodies_have_the_sizes_of_their_types() -> None:
-    truck = VehicleType("truck", 0.2, length_m=12.0, width_m=2.5)
+    truck = VehicleTypeSettings("truck", 0.2, length_m=12.0, width_m=2.5)
     scenario = attrs.evolve(Scenario(), vehicle_type=(truck,))
     rows = [
         Row("a", 1.0, 2.0, 15.0, -1, -1, None, None, 0).compact(),

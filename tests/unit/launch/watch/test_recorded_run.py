@@ -16,7 +16,7 @@ from laneweave.launch.recordings.trajectories import read_tracks
 from laneweave.launch.watch.frames import MOVING
 from laneweave.launch.watch.recorded_run import Recording
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.fields import Closure
+from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from support.commands import Here
 from support.older_recordings import older_recording

@@ -9,8 +9,9 @@ import pytest
 
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
-from laneweave.protocol.scenario.fields import LONGEST_ROAD_M, Restriction, Scenario, SolidLine
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LONGEST_ROAD_M
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import Restriction, SolidLine
 
 ROLLING = {"operation": "rolling", "gap_m": 20.0}
 TYPES = [{"name": "truck", "share": 0.15, "length_m": 12.0}, {"name": "bus", "share": 0.05}]
@@ -30,13 +31,13 @@ def scenario(
 
 
 def shares(found: Scenario, lane: int) -> dict[str, float]:
-    return {one.type: one.share for one in found.inflows[lane].types}
+    return {one.type: one.share for one in found.flow.inflows[lane].types}
 
 
 def test_without_rules_a_scenario_is_as_before() -> None:
     found = scenario()
     assert (found.road.restrictions, found.road.solid_lines) == ((), ())
-    assert [one.volume_veh_per_h for one in found.inflows.values()] == [1000.0] * 3
+    assert [one.volume_veh_per_h for one in found.flow.inflows.values()] == [1000.0] * 3
     assert shares(found, 2) == {"truck": 0.15, "bus": 0.05}
 
 
@@ -139,7 +140,7 @@ def test_only_the_rolling_operation_knows_them(rules: dict[str, Any]) -> None:
 
 def test_a_type_enters_in_its_other_lanes() -> None:
     found = scenario(BAN, {"lane": 0, "vehicle_types": ["car", "truck"]})
-    volumes = {lane: inflow.volume_veh_per_h for lane, inflow in found.inflows.items()}
+    volumes = {lane: inflow.volume_veh_per_h for lane, inflow in found.flow.inflows.items()}
     # 450 trucks in lane 1, 50 buses in each lane, and the cars in lanes 1 and 2.
     assert volumes == pytest.approx({0: 50.0, 1: 450.0 + 50.0 + 1200.0, 2: 50.0 + 1200.0})
     assert shares(found, 0) == pytest.approx({"bus": 1.0})
@@ -162,7 +163,7 @@ def test_a_type_that_may_not_enter_by_a_ramp_is_refused_there() -> None:
 
 def test_goals_are_lanes_in_which_the_type_may_drive_at_their_ends() -> None:
     found = scenario(BAN, {"lane": 0, "vehicle_types": ["bus"], "to_m": 900.0})
-    goals = found.goal_sections
+    goals = found.geometry.goal_sections
     assert goals(2, END_OF_ROAD, "car") == {2}
     assert goals(2, END_OF_ROAD, "truck") == {0, 1}
     assert goals(1, END_OF_ROAD, "truck") == {1}

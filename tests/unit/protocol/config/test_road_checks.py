@@ -142,7 +142,7 @@ def test_roads_that_are_not_possible_are_refused_in_one_line(
 
 
 def test_sections_begin_at_ramps_and_end_at_exits() -> None:
-    sections = parse_scenario(WEAVING).sections
+    sections = parse_scenario(WEAVING).geometry.sections
     first = sections[0]
     assert (first.lane, first.from_m, first.to_m, first.exit) == (0, 250.0, 700.0, "off")
     assert first.moves_from_m == 400.0
@@ -154,9 +154,9 @@ def test_sections_begin_at_ramps_and_end_at_exits() -> None:
 
 def test_the_time_at_v_f_counts_from_the_entrance_to_the_destination() -> None:
     scenario = parse_scenario(WEAVING)
-    assert scenario.free_flow_trip_s(0) == pytest.approx(50.0)
-    assert scenario.free_flow_trip_s(1, "off") == pytest.approx(700.0 / 15.0)
-    assert [scenario.entrance_of(lane) for lane in (0, 1)] == ["on", "main"]
+    assert scenario.geometry.free_flow_trip_s(0) == pytest.approx(50.0)
+    assert scenario.geometry.free_flow_trip_s(1, "off") == pytest.approx(700.0 / 15.0)
+    assert [scenario.geometry.entrance_of(lane) for lane in (0, 1)] == ["on", "main"]
 
 
 @pytest.mark.parametrize("name", ["on-ramp", "off-ramp", "weaving", "motorway"])
@@ -184,4 +184,4 @@ def test_slots_are_short_enough_for_the_lanes_of_ramps(
     tables["road"]["closures"][0].update(to_m=100.0)
     tables["formation"].update(formation)
     tables["demand"] = {"volume_veh_per_lane_h": volume}
-    assert parse_scenario(tables).cycles_s == pytest.approx((slot_s, slot_s))
+    assert parse_scenario(tables).timing.cycles_s == pytest.approx((slot_s, slot_s))

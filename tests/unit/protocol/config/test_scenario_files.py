@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario, to_tables
-from laneweave.protocol.scenario.fields import FormationSettings, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import FormationSettings
 from support.refusals import refusal
 
 FOLDER = Path(__file__).parents[4] / "scenarios"

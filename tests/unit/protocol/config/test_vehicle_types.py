@@ -9,12 +9,13 @@ import attrs
 import pytest
 
 from laneweave.agents.driving.trajectory import check_moves, move_profile
+from laneweave.protocol.config.motion_checks import min_pitch_m
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import displacements
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
-from laneweave.protocol.vehicle.lane_ends import drive_out
+from laneweave.protocol.scenario.vehicle_types import VehicleType
+from laneweave.protocol.vehicle.lane_ends import drive_out, own_drive_out
 
 ROLLING = {"operation": "rolling", "gap_m": 20.0}
 TRUCK: dict[str, Any] = {
@@ -40,24 +41,23 @@ def scenario(*types: dict[str, Any], **tables: Any) -> Scenario:  # noqa: ANN401
 
 def test_without_other_types_all_vehicles_are_cars() -> None:
     only = Scenario()
-    assert dict(only.types) == {"car": only}
-    assert only.drivable_moves == frozenset(displacements(1)[1:])
+    every = frozenset(displacements(1)[1:])
+    assert dict(only.types) == {"car": VehicleType("car", only.vehicle, every)}
 
 
 def test_a_type_has_the_limits_of_cars_except_its_own() -> None:
     cars = {"max_slip_ratio": 0.2, "max_jerk_mps3": 12.0}
     found = scenario(TRUCK, SPORTS_CAR, vehicle=cars)
     assert list(found.types) == ["car", "truck", "sports-car"]
-    truck = found.types["truck"].vehicle
+    truck = found.types["truck"].limits
     own = {name: value for name, value in TRUCK.items() if name not in ("name", "share")}
     assert truck == attrs.evolve(found.vehicle, **own)
-    assert found.types["sports-car"].vehicle == attrs.evolve(found.vehicle, max_accel_mps2=9.0)
-    assert found.types["car"].vehicle == found.vehicle
-    assert (found.longest_body_m, found.widest_body_m) == (12.0, 2.5)
+    assert found.types["sports-car"].limits == attrs.evolve(found.vehicle, max_accel_mps2=9.0)
+    assert found.types["car"].limits == found.vehicle
+    assert (found.types.longest_body_m, found.types.widest_body_m) == (12.0, 2.5)
 
 
-@pytest.mark.parametrize("name", ["car", "truck", "sports-car"])
-def test_the_scenario_of_a_type_knows_the_same_types(name: str) -> None:
+def test_what_concerns_all_types_suits_the_longest_and_weakest() -> None:
     # On this road, T_F follows from the ramp and from what cars can drive.
     found = scenario(
         TRUCK,
@@ -72,14 +72,12 @@ def test_the_scenario_of_a_type_knows_the_same_types(name: str) -> None:
             {"name": "on", "lane": 0, "at_m": 50.0, "merge_m": 250.0, "volume_veh_per_h": 300.0}
         ],
     )
-    assert found.cycles_s == pytest.approx((5.2, 5.2))
-    own = found.types[name]
-    assert dict(own.types) == dict(found.types)
-    assert own.types[name] == own
-    # What all vehicles must agree on is the same for all.
-    assert drive_out(own) == drive_out(found)
-    assert own.cycles_s == found.cycles_s
-    assert own.longest_body_m == 12.0
+    assert found.timing.cycles_s == pytest.approx((5.2, 5.2))
+    needed = [own_drive_out(found, one.limits) for one in found.types.values()]
+    for name in ("room_m", "columns", "distance_m"):
+        assert getattr(drive_out(found), name) == max(getattr(one, name) for one in needed)
+    assert len(set(needed)) > 1
+    assert found.types.longest_body_m == 12.0
 
 
 @pytest.mark.parametrize(
@@ -100,8 +98,8 @@ def test_a_type_changes_columns_if_its_limits_allow(
     found = scenario({"name": "other", "share": 0.1, **limits}, braking={"lead_brake_mps2": 3.0})
     lateral = frozenset({(0, 1), (0, -1)})
     every = frozenset(displacements(1)[1:])
-    assert found.types["other"].drivable_moves == (every if all_moves else lateral)
-    assert found.types["car"].drivable_moves == every
+    assert found.types["other"].moves == (every if all_moves else lateral)
+    assert found.types["car"].moves == every
 
 
 @pytest.mark.parametrize(
@@ -113,16 +111,16 @@ def test_types_as_strong_as_cars_drive_all_moves(limits: dict[str, float]) -> No
     types = [{"name": "other", "share": 0.1, **limits}]
     found = parse_scenario({"vehicle_type": types, "formation": {"structures": structures}})
     assert found.vehicle.max_accel_mps2 == 5.0
-    assert found.moves_of("other") is None
+    assert found.types.moves_of("other") is None
 
 
 def test_the_moves_that_are_planned_for_a_type_can_be_driven() -> None:
     found = scenario(TRUCK)
     check_moves(found)
     truck = found.types["truck"]
-    for dx, dy in truck.drivable_moves:
-        states = move_profile(truck, dx, dy).states
-        assert abs(states[:, 5]).max() <= truck.vehicle.max_lateral_accel_mps2
+    for dx, dy in truck.moves:
+        states = move_profile(found, truck.limits, dx, dy).states
+        assert abs(states[:, 5]).max() <= truck.limits.max_lateral_accel_mps2
     weak = scenario({**TRUCK, "max_lateral_accel_mps2": 0.3})
     with pytest.raises(BadInputError, match=r"a move of a truck by 1 lane .*lateral limits"):
         check_moves(weak)
@@ -130,7 +128,7 @@ def test_the_moves_that_are_planned_for_a_type_can_be_driven() -> None:
 
 def test_moves_of_types() -> None:
     found = scenario(TRUCK, VAN)
-    moves = [found.moves_of(name) for name in ("car", "truck", "van", "bus")]
+    moves = [found.types.moves_of(name) for name in ("car", "truck", "van", "bus")]
     assert moves == [None, frozenset({(0, 1), (0, -1)}), None, frozenset()]
 
 
@@ -148,17 +146,19 @@ def test_formations_have_longer_slots_only_where_moves_need_them(
     tables: dict[str, Any], shortest_s: float
 ) -> None:
     found = parse_scenario(tables)
-    assert found.cycles_s == pytest.approx((shortest_s, 7.0))
+    assert found.timing.cycles_s == pytest.approx((shortest_s, 7.0))
     check_moves(found)
 
 
 def test_the_pitch_suits_every_pair_of_types() -> None:
     found = scenario(TRUCK)
-    needed = {name: min_pitch_m(own) for name, own in found.types.items()}
+    needed = {name: min_pitch_m(found, own.limits) for name, own in found.types.items()}
     # A truck brakes less than the vehicle ahead may.
     assert needed["truck"] > needed["car"] + 3.0
     # Behind a truck, a car needs the length of its body more.
-    assert needed["car"] == pytest.approx(min_pitch_m(Scenario()) + 7.0, abs=0.01)
+    assert needed["car"] == pytest.approx(
+        min_pitch_m(Scenario(), Scenario().vehicle) + 7.0, abs=0.01
+    )
 
 
 @pytest.mark.parametrize(

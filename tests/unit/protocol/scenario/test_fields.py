@@ -11,7 +11,8 @@ import attrs
 import pytest
 
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
-from laneweave.protocol.scenario.fields import FormationSettings, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import FormationSettings
 from support.refusals import refusal
 
 FOLDER = Path(__file__).parents[4] / "scenarios"
@@ -35,7 +36,7 @@ def test_defaults_are_the_table_of_the_paper() -> None:
     scenario = load_scenario(None)
     formation, vehicle, road = scenario.formation, scenario.vehicle, scenario.road
     assert formation.gap_m == 15.0
-    assert scenario.cycles_s == (4.0, 7.0)
+    assert scenario.timing.cycles_s == (4.0, 7.0)
     assert formation.speed_mps == 15.0
     assert vehicle.max_speed_mps == 25.0
     assert vehicle.min_accel_mps2 == -10.0
@@ -49,7 +50,7 @@ def test_defaults_are_the_table_of_the_paper() -> None:
     assert scenario.demand.volume_veh_per_lane_h == 1000.0
     assert road.length_m == 1000.0
     assert road.sorting_start_m == 400.0
-    assert scenario.lane_shares == pytest.approx((1 / 3,) * 3)
+    assert scenario.flow.lane_shares == pytest.approx((1 / 3,) * 3)
 
 
 @pytest.mark.parametrize(
@@ -98,27 +99,28 @@ def test_the_lattice_is_that_of_the_tables() -> None:
 
 def test_lane_shares_sum_to_one() -> None:
     scenario = parse_scenario({"demand": {"lane_shares": [2, 1, 1]}})
-    assert scenario.lane_shares == (0.5, 0.25, 0.25)
+    assert scenario.flow.lane_shares == (0.5, 0.25, 0.25)
 
 
 def test_slots_are_from_four_to_seven_seconds_unless_they_are_given() -> None:
     scenario = Scenario()
-    assert scenario.slots_s == pytest.approx([4.0 + 0.2 * number for number in range(16)])
-    assert scenario.move_durations == set(range(38, 70, 2))
-    assert (scenario.move_s, scenario.horizon_ticks) == (3.8, 70)
+    assert scenario.timing.slots_s == pytest.approx([4.0 + 0.2 * number for number in range(16)])
+    assert scenario.timing.move_durations == set(range(38, 70, 2))
+    assert (scenario.timing.move_s, scenario.timing.horizon_ticks) == (3.8, 70)
     given = parse_scenario({"formation": {"cycle_s": 5.0}})
-    assert (given.slots_s, given.horizon_ticks, given.move_s) == ((5.0,), 50, 4.8)
-    assert given.move_durations == {48}
+    timing = given.timing
+    assert (timing.slots_s, timing.horizon_ticks, timing.move_s) == ((5.0,), 50, 4.8)
+    assert timing.move_durations == {48}
     slower = parse_scenario({"formation": {"cycle_s": 5.0, "move_s": 4.0}})
-    assert slower.move_durations == {40}
+    assert slower.timing.move_durations == {40}
     rolling = parse_scenario({"formation": {"operation": "rolling"}})
-    assert (rolling.slots_s, rolling.horizon_ticks) == ((6.0,), 60)
+    assert (rolling.timing.slots_s, rolling.timing.horizon_ticks) == ((6.0,), 60)
     dense = parse_scenario(
         {"formation": {"operation": "rolling"}, "demand": {"volume_veh_per_lane_h": 2001.0}}
     )
-    assert (dense.slots_s, dense.horizon_ticks) == ((4.0,), 40)
+    assert (dense.timing.slots_s, dense.timing.horizon_ticks) == ((4.0,), 40)
     long = parse_scenario({"tracking": {"horizon_ticks": 80}})
-    assert long.horizon_ticks == 80
+    assert long.timing.horizon_ticks == 80
 
 
 # --- one field that is wrong ------------------------------------------------------------------

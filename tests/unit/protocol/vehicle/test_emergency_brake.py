@@ -12,14 +12,15 @@ from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from laneweave.protocol.config.motion_checks import min_pitch_m
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Sensing
 from laneweave.protocol.vehicle.emergency_brake import (
     ERROR_SIGMAS,
     EmergencyBrake,
     lead_lag_s,
     lead_path_m,
-    min_pitch_m,
     spare_error_m,
     stopping_distance_m,
 )
@@ -31,12 +32,12 @@ SCENARIO = Scenario()
 LIMITS, ASSUMED, NOISE = SCENARIO.vehicle, SCENARIO.braking, SCENARIO.sensing
 V_F = SCENARIO.formation.speed_mps
 CELL_GAP_M = SCENARIO.formation.gap_m - LIMITS.length_m
-BRAKE = EmergencyBrake(SCENARIO)
+BRAKE = EmergencyBrake(LIMITS, SCENARIO.braking, SCENARIO.runtime.tick_s)
 NO_JERK: Jerk = (0.0, 0.0)
 
 
 def lead_m(speed_mps: float, accel_mps2: float = 0.0) -> float:
-    brake_mps2, lag_s = ASSUMED.lead_brake_mps2, lead_lag_s(SCENARIO)
+    brake_mps2, lag_s = ASSUMED.lead_brake_mps2, lead_lag_s(LIMITS, SCENARIO.braking)
     return lead_path_m(speed_mps, accel_mps2, brake_mps2, lag_s)
 
 
@@ -155,21 +156,22 @@ def test_errors_of_sensors_make_it_err_as_much_as_is_said(v_mps: float) -> None:
             -2.0 + rng.gauss(0.0, NOISE.other_accel_noise_mps2),
         )
         found.append(BRAKE.spare_m(body(v, a), 0.0, NO_JERK, [other]))
-    assert 0.85 <= statistics.stdev(found) / spare_error_m(SCENARIO, v_mps) <= 1.05
+    assert 0.85 <= statistics.stdev(found) / error_m(v_mps) <= 1.05
+
+
+def error_m(v_mps: float, noise: Sensing = NOISE) -> float:
+    return spare_error_m(LIMITS, ASSUMED, noise, v_mps, V_F)
 
 
 def test_each_noise_adds_to_the_error() -> None:
-    whole = spare_error_m(SCENARIO, V_F)
+    whole = error_m(V_F)
     for name in (
         "gap_noise_m", "speed_noise_mps", "accel_noise_mps2", "other_speed_noise_mps",
         "other_accel_noise_mps2",
     ):  # fmt: skip
-        less = evolve(SCENARIO, sensing=evolve(NOISE, **{name: 0.0}))
-        assert spare_error_m(less, V_F) < whole
+        assert error_m(V_F, evolve(NOISE, **{name: 0.0})) < whole
     # Positions come in as a gap only.
-    assert (
-        spare_error_m(evolve(SCENARIO, sensing=evolve(NOISE, position_noise_m=3.0)), V_F) == whole
-    )
+    assert error_m(V_F, evolve(NOISE, position_noise_m=3.0)) == whole
 
 
 # --- what it asks of a scenario -------------------------------------------------------------------
@@ -181,11 +183,11 @@ def with_pitch(gap_m: float, **sensing: float) -> Scenario:
 
 
 def test_the_least_pitch_leaves_room_for_errors_of_measurement_and_for_nothing_more() -> None:
-    least_m = min_pitch_m(SCENARIO)
+    least_m = min_pitch_m(SCENARIO, LIMITS)
     assert with_pitch(least_m + 1e-6).formation.gap_m == pytest.approx(least_m)
     state, ahead = body(V_F), Neighbour(0, least_m - LIMITS.length_m, V_F)
     spare_m = BRAKE.spare_m(state, 0.0, NO_JERK, [ahead])
-    assert spare_m == pytest.approx(ERROR_SIGMAS * spare_error_m(SCENARIO, V_F))
+    assert spare_m == pytest.approx(ERROR_SIGMAS * error_m(V_F))
     error = refusal(with_pitch, least_m - 1e-3)
     assert error.field == "formation.gap_m"
     allowed = re.search(r"at least (\S+):", error.allowed)

@@ -14,7 +14,8 @@ from laneweave.agents.driving.reference import Reference
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE, LaneSection, open_sections, sections_for
-from laneweave.protocol.scenario.fields import Closure, Exit, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import Closure, Exit
 from laneweave.protocol.vehicle.lane_ends import (
     LaneEnd,
     LaneEnds,
@@ -46,7 +47,7 @@ def with_closures(*closures: Closure) -> Scenario:
 def test_a_road_without_closures_has_no_dead_ends() -> None:
     assert dead_ends(ROLLING) == ()
     assert not LaneEnds(ROLLING)
-    assert sections_to_lines(ROLLING) == ROLLING.sections
+    assert sections_to_lines(ROLLING) == ROLLING.geometry.sections
     assert open_sections(2, 500.0) == (
         LaneSection(0, -INF, 500.0, "lane-0"),
         LaneSection(1, -INF, 500.0, "lane-1"),
@@ -108,7 +109,7 @@ def test_cells_pass_the_line_with_the_lattice() -> None:
 
 def test_a_cell_is_in_a_lane_that_opens_again_as_soon_as_moves_into_it_may_begin() -> None:
     ends, lattice = LaneEnds(KEEPING), KEEPING.lattice
-    begins_m = 700.0 + KEEPING.longest_body_m - early_start_m(KEEPING)
+    begins_m = 700.0 + KEEPING.types.longest_body_m - early_start_m(KEEPING)
     assert begins_m < 700.0
     begins_s = lattice.passing_time_s(-10, begins_m)
     assert ends.has_passed((-10, 1), begins_s - 0.01)
@@ -122,7 +123,7 @@ def test_the_exit_before_does_not_end_moves_that_begin_before_the_lane_opens_aga
     road = evolve(KEEPING.road, closures=closed)
     scenario = evolve(KEEPING, road=road, exit=exits)
     ends, lattice = LaneEnds(scenario), scenario.lattice
-    begins_m = 700.0 + scenario.longest_body_m - early_start_m(scenario)
+    begins_m = 700.0 + scenario.types.longest_body_m - early_start_m(scenario)
     assert begins_m < 700.0
     begins_s = lattice.passing_time_s(-10, begins_m)
     assert ends.too_late_to_move((-10, 1), (-10, 0), begins_s - 0.01)
@@ -261,13 +262,13 @@ def test_no_line_counts_in_a_lane_that_opens_again_for_a_move_behind_its_end(
 ) -> None:
     """The move may begin before the lane opens, and the body may be measured behind its cell."""
     lattice, tick_s = KEEPING.lattice, KEEPING.runtime.tick_s
-    begins_m = 700.0 + KEEPING.longest_body_m - early_start_m(KEEPING)
+    begins_m = 700.0 + KEEPING.types.longest_body_m - early_start_m(KEEPING)
     begin_tick = math.ceil(lattice.passing_time_s(-10, begins_m) / tick_s)
     state = cell_state(lattice, (-10, 0), begin_tick * tick_s)
     controller = controller_in((-10, 0), KEEPING, state=state, incarnation=7)
     controller.store.assign_cell((-10, 1))
-    ticks = KEEPING.move_ticks(KEEPING.cycles_s[0])
-    reference = Reference.move(KEEPING, (-10, 0), (-10, 1), begin_tick, ticks)
+    ticks = KEEPING.timing.move_ticks(KEEPING.timing.cycles_s[0])
+    reference = Reference.move(KEEPING, KEEPING.vehicle, (-10, 0), (-10, 1), begin_tick, ticks)
     window = reference.window(begin_tick)
     move = command(begin_tick, *window.jerks.tolist(), hold_cell=(-10, 1), incarnation=7)
     assert controller.accept_command(replace(move, motion_origin=(-10, 0)))

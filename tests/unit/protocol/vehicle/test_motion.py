@@ -13,7 +13,8 @@ from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.protocol.scenario.fields import Scenario, Vehicle
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import (
     ARRIVED_ACROSS_M,
     ARRIVED_ALONG_M,
@@ -244,7 +245,7 @@ def moving_back(before_s: float) -> Motion:
     """Hold the cell two columns ahead, then move into the next one, as a plan may ask for."""
 
     def motion(t_s: float) -> tuple[float, float]:
-        move_s = SCENARIO.move_s
+        move_s = SCENARIO.timing.move_s
         share = min(max((t_s - before_s) / move_s, 0.0), 1.0)
         way = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
         speed = 30.0 * share**2 * (1.0 - share) ** 2 / move_s

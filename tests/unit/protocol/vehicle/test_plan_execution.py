@@ -10,7 +10,7 @@ from attrs import evolve
 from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
-from laneweave.protocol.scenario.fields import Closure
+from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.protocol.vehicle.lane_ends import LaneEnds, drive_out, early_start_m
 from laneweave.protocol.vehicle.plan_execution import (
     LATE_S,
@@ -501,7 +501,7 @@ def test_a_move_begins_where_both_lanes_are_open(lane: int, closed_m: float) -> 
     early = evolve(ROLLING, formation=evolve(ROLLING.formation, change_columns=False))
     cell_m = early.lattice.cell_s_m(-4, T0_S)
     # Its front may begin 20 m beyond the cell: the body, without the part that may be early.
-    opens_m = cell_m + 20.0 - early.longest_body_m + early_start_m(early)
+    opens_m = cell_m + 20.0 - early.types.longest_body_m + early_start_m(early)
     closure = Closure(lane, max(0.0, opens_m - closed_m) if closed_m else 0.0, opens_m)
     road = evolve(early.road, s3_m=20_000.0, closures=(closure,))
     execution = going()

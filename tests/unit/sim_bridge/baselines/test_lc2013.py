@@ -12,14 +12,9 @@ from laneweave.launch.run_methods import LC2013, METHODS
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import ANY_LANE, Exits
-from laneweave.protocol.scenario.fields import (
-    Demand,
-    Restriction,
-    Road,
-    Scenario,
-    SolidLine,
-    VehicleType,
-)
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import Demand, Restriction, Road, SolidLine
+from laneweave.protocol.scenario.vehicle_tables import VehicleTypeSettings
 from laneweave.sim_bridge.baselines.lc2013 import Lc2013Traffic, check_lc2013
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
 from laneweave.sim_bridge.baselines.rule_based import check_rule
@@ -59,7 +54,7 @@ def drive(scenario: Scenario, folder: Path) -> dict[ReferenceVehicle, float]:
     left: dict[ReferenceVehicle, float] = {}
     before: dict[str, Pose] = {}
     queued = tick = 0
-    exits = Exits(scenario.sections, road.length_m)
+    exits = Exits(scenario.geometry.sections, road.length_m)
     with SumoTraffic(scenario, folder / "sumo") as sumo:
         traffic = Lc2013Traffic(scenario, sumo)
         while len(left) < len(demand):
@@ -108,7 +103,7 @@ def test_vehicles_without_preferred_lanes_pass_closed_parts(
     lanes = {one.lane for one in left}
     assert lanes >= {1, 2}
     assert 0 not in lanes or closures is BLOCKED
-    free_s = scenario.free_flow_s
+    free_s = scenario.geometry.free_flow_s
     assert min(left.values()) >= free_s - 0.1
     assert sum(left.values()) / len(left) < 1.05 * free_s
 
@@ -125,7 +120,7 @@ def test_vehicles_leave_on_their_preferred_lanes(
     scenario = METHODS[label].settings(closed_road(closures, volume=1000.0, shares=shares))
     left = drive(scenario, tmp_path)
     assert all(one.lane == one.preferred_lane for one in left)
-    assert sum(left.values()) / len(left) < 1.1 * scenario.free_flow_s
+    assert sum(left.values()) / len(left) < 1.1 * scenario.geometry.free_flow_s
 
 
 @pytest.mark.slow
@@ -161,7 +156,7 @@ def test_vehicles_enter_by_ramps_and_leave_by_their_exits(
     scenario = METHODS[label].settings(scenario)
     left = drive(scenario, tmp_path)
     for vehicle, travel_s in left.items():
-        free_s = scenario.free_flow_trip_s(vehicle.arrival.lane, vehicle.destination)
+        free_s = scenario.geometry.free_flow_trip_s(vehicle.arrival.lane, vehicle.destination)
         assert free_s - 0.1 <= travel_s < 1.4 * free_s
     ways = {(one.arrival.lane == 0, one.destination) for one in left}
     assert ways >= {(True, "end"), (False, "end")}
@@ -181,7 +176,7 @@ def test_a_ramp_that_leaves_no_room_for_lane_changes_is_refused(merge_m: float) 
 
 
 def test_trucks_drive_among_cars_within_their_limits(tmp_path: Path) -> None:
-    truck = VehicleType("truck", 0.3, length_m=12.0, width_m=2.5, max_accel_mps2=1.3)
+    truck = VehicleTypeSettings("truck", 0.3, length_m=12.0, width_m=2.5, max_accel_mps2=1.3)
     demand = Demand(volume_veh_per_lane_h=1000.0, duration_s=30.0)
     scenario = Scenario(vehicle_type=(truck,), demand=demand)
     left = drive(scenario, tmp_path)

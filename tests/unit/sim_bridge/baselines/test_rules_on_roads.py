@@ -176,7 +176,7 @@ def test_all_vehicles_pass_closed_parts(
         step(road)
         left_s += [road.t_s - one.arrival.t_s for one in road.left[len(left_s) :]]
     assert all(one.arrival.preferred_lane in (one.lane, ANY_LANE) for one in road.left)
-    assert sum(left_s) / len(left_s) < 1.1 * scenario.free_flow_s
+    assert sum(left_s) / len(left_s) < 1.1 * scenario.geometry.free_flow_s
 
 
 # --- ramps and exits --------------------------------------------------------------------------
@@ -277,7 +277,7 @@ def test_all_vehicles_leave_at_their_destinations(scenario: Scenario, rule: dict
     demand = evolve(scenario.demand, duration_s=30.0, volume_veh_per_lane_h=1000.0)
     scenario = evolve(scenario, rule=evolve(scenario.rule, **rule), demand=demand)
     check_rule(scenario)
-    road, exits = RuleRoad(scenario), Exits(scenario.sections, scenario.road.length_m)
+    road, exits = RuleRoad(scenario), Exits(scenario.geometry.sections, scenario.road.length_m)
     waiting = list(arrivals(scenario))
     count, delays_s = len(waiting), list[float]()
     while len(delays_s) < count:
@@ -289,7 +289,7 @@ def test_all_vehicles_leave_at_their_destinations(scenario: Scenario, rule: dict
             section = exits.left_by(one.lane, one.s_m)
             assert section is not None
             assert section.serves(one.preferred_lane, one.destination)
-            free_s = scenario.free_flow_trip_s(one.arrival.lane, one.destination)
+            free_s = scenario.geometry.free_flow_trip_s(one.arrival.lane, one.destination)
             delays_s.append(road.t_s - one.arrival.t_s - free_s)
     assert min(delays_s) > -0.2
     assert sum(delays_s) / count < 7.0

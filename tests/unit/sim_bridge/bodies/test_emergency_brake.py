@@ -25,7 +25,7 @@ LIMITS, TICK_S = SCENARIO.vehicle, SCENARIO.runtime.tick_s
 MARGIN_M = SCENARIO.braking.margin_m
 WITHIN_A_TICK_M = 10.0 * TICK_S**2 / 8.0
 """A body that stops within a tick goes so much farther than with full brake all the time."""
-BRAKE = EmergencyBrake(SCENARIO)
+BRAKE = EmergencyBrake(LIMITS, SCENARIO.braking, SCENARIO.runtime.tick_s)
 
 
 def plant_at(front_m: float, v_mps: float, a_mps2: float = 0.0) -> Plant:
@@ -126,7 +126,7 @@ def test_no_vehicle_hits_one_with_other_brakes_than_its_own(
 ) -> None:
     """Behind a vehicle that brakes less hard, the gap is smallest before both have stopped."""
     braking = attrs.evolve(SCENARIO.braking, lead_brake_mps2=lead_brake_mps2, lead_lag_s=lead_lag_s)
-    brake = EmergencyBrake(attrs.evolve(SCENARIO, braking=braking))
+    brake = EmergencyBrake(LIMITS, braking, TICK_S)
     limits = attrs.evolve(LIMITS, min_accel_mps2=-lead_brake_mps2, actuator_lag_s=lead_lag_s)
 
     def other_at(gap_m: float) -> Plant:

@@ -10,7 +10,7 @@ from attrs import evolve
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from laneweave.protocol.scenario.fields import Vehicle
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.emergency_brake import stopping_distance_m
 from laneweave.protocol.vehicle.motion import Jerk, State, commanded_state, integrate
 from laneweave.sim_bridge.bodies.plant import Plant

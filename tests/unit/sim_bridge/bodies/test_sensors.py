@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from laneweave.protocol.scenario.fields import Scenario, Sensing
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Sensing
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name, Neighbour
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, ExactNeighbours, Neighbours

@@ -11,7 +11,7 @@ from attrs import evolve
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.fields import Closure
+from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.sim_bridge.corridors.corridor import (
     HANDOVER_M,
     MIN_AT_M,
@@ -199,7 +199,7 @@ def test_vehicles_of_a_corridor_prefer_no_lane(tmp_path: Path) -> None:
     """A plain road would otherwise have to be long enough for random preferences."""
     vehicles = [vehicle(f"m{number}", 3.0 * number, "main") for number in range(3)]
     found = read_corridor(write_interchange(tmp_path, vehicles), "main1:main1")
-    assert parse_scenario(checked(found.corridor, found.demand)).lane_shares == ()
+    assert parse_scenario(checked(found.corridor, found.demand)).flow.lane_shares == ()
 
 
 def test_vehicles_of_a_corridor_do_not_give_way(tmp_path: Path) -> None:
@@ -279,10 +279,10 @@ def test_vehicles_that_are_too_wide_are_named(tmp_path: Path) -> None:
 def test_the_tables_are_a_valid_scenario(tmp_path: Path) -> None:
     found = read_corridor(write_interchange(tmp_path, stream(90), types=TRUCKS), CORRIDOR)
     scenario = parse_scenario(scenario_tables(found.corridor, found.demand))
-    assert scenario.shared_exit_lanes == {0}
+    assert scenario.geometry.shared_exit_lanes == {0}
     assert scenario.formation.speed_mps == 25.0
     assert not scenario.formation.change_columns
-    truck = scenario.types["truck"].vehicle
+    truck = scenario.types["truck"].limits
     assert (truck.length_m, truck.max_accel_mps2) == (7.1, 1.3)
     # SUMO's trucks brake with 7 m/s2 in an emergency.
     assert truck.min_accel_mps2 == -7.0

@@ -43,7 +43,7 @@ def test_an_exit_without_a_queue_has_room(scenario: Scenario) -> None:
 def test_all_on_the_way_fit_between_the_queue_and_where_they_brake(scenario: Scenario) -> None:
     # They brake in the deceleration lane, without the distance for a move into it.
     braking_m = scenario.formation.speed_mps**2 / (2.0 * QUEUE_DECEL_MPS2)
-    assert braking_m < 246.0 - scenario.step_m
+    assert braking_m < 246.0 - scenario.types.step_m
     for tail_m in (5.0, 40.0, 150.0):
         fit = (4.0 + tail_m) / (7.1 + SPACE_M)
         first = int(tail_m > 20.0)  # one may always try if there is room behind the exit

@@ -42,8 +42,8 @@ def test_trucks_keep_out_of_lanes_that_ban_them(tmp_path: Path) -> None:
     (rule,) = tables["road"]["restrictions"]
     assert rule == {"lane": 3, "from_m": 950.0, "to_m": 1110.0, "vehicle_types": ["truck"]}
     scenario = parse_scenario(tables)
-    assert scenario.is_restricted(3, 1000.0, "truck")
-    assert not scenario.is_restricted(3, 1000.0, "car")
+    assert scenario.road.is_restricted(3, 1000.0, "truck")
+    assert not scenario.road.is_restricted(3, 1000.0, "car")
 
 
 def test_vehicles_enter_in_lanes_that_allow_them(tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from laneweave.agents.driving.trajectory import settling_trajectory
-from laneweave.protocol.scenario.fields import Scenario, Vehicle
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.sim_bridge.corridors.settling import (
     BRAKE_MPS2,
     LIMIT_SHARE,
@@ -41,7 +42,7 @@ def test_a_vehicle_settles_within_its_limits_and_not_behind_its_cell(
     own = evolve(ROAD, vehicle=limits, formation=evolve(ROAD.formation, change_columns=False))
     late_m = ahead_m - slower_mps * TICK_S
     start = np.array([late_m, -slower_mps, 0.0, 0.0, 0.0, 0.0])
-    trajectory = settling_trajectory(own, start, round(time_s / TICK_S) - 1)
+    trajectory = settling_trajectory(own, own.vehicle, start, round(time_s / TICK_S) - 1)
     position, speed, accel = trajectory.states.T[:3]
     assert abs(position[-1]) + abs(speed[-1]) + abs(accel[-1]) < 1e-3
     assert position.min() >= -0.5

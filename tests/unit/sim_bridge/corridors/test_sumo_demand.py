@@ -11,7 +11,8 @@ import pytest
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
-from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
 from laneweave.sim_bridge.corridors.corridor_setup import (
     FIRST_ENTRY_S,

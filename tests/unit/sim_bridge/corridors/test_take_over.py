@@ -41,7 +41,7 @@ def meter_of(scenario: Scenario, taken: frozenset[Cell] = frozenset()) -> EntryM
     return EntryMeter(
         scenario.lattice,
         0.5,
-        entry_m=scenario.entry_m,
+        entry_m=scenario.geometry.entry_m,
         column_bound={"car", "truck"},
         is_free=lambda cell: cell not in taken,
     )

@@ -80,7 +80,7 @@ def test_preferences_follow_the_lane_shares(shares: tuple[float, ...]) -> None:
     stream = arrivals(chosen)
     for lane in range(3):
         mine = [arrival.preferred_lane for arrival in stream if arrival.lane == lane]
-        for preferred, share in enumerate(chosen.lane_shares):
+        for preferred, share in enumerate(chosen.flow.lane_shares):
             assert mine.count(preferred) / len(mine) == pytest.approx(share, abs=0.02)
 
 
@@ -134,7 +134,7 @@ def road_with_ramp(demand: dict[str, object], **ramp: object) -> Scenario:
 def test_vehicles_arrive_in_lanes_by_their_shares() -> None:
     volume = 600.0
     chosen = road_with_ramp({"volume_veh_per_lane_h": volume, "arrival_shares": [0, 1, 2, 0]})
-    assert list(chosen.inflows) == [0, 1, 2]
+    assert list(chosen.flow.inflows) == [0, 1, 2]
     stream = arrivals(chosen)
     for lane, of_mean in ((0, 1.5), (1, 1.0), (2, 2.0), (3, 0.0)):
         count = sum(one.lane == lane for one in stream)

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.protocol.lattice import Lattice
-from laneweave.protocol.scenario.fields import FormationSettings, Scenario, formation_columns
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import FormationSettings, formation_columns
 from laneweave.protocol.wire.messages import ClosedFormation
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter

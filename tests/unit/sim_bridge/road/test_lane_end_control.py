@@ -9,7 +9,8 @@ import pytest
 from attrs import evolve
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.fields import Closure, Demand, Scenario
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import Closure, Demand
 from laneweave.protocol.vehicle.lane_ends import LaneEnd, LaneEnds, dead_ends, drive_out
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
 from laneweave.protocol.wire.messages import Name
@@ -229,7 +230,7 @@ def gap_is_entered(patch: pytest.MonkeyPatch) -> None:
 def gap_too_short(patch: pytest.MonkeyPatch) -> None:
     short = evolve(drive_out(DROP), columns=1)
     for name in ("drive_out", "own_drive_out"):
-        patch.setattr(lane_end_control, name, lambda _: short)
+        patch.setattr(lane_end_control, name, lambda *_: short)
 
 
 def starts_without_a_gap(patch: pytest.MonkeyPatch) -> None:

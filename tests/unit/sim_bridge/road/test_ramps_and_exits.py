@@ -106,7 +106,7 @@ def test_a_queue_on_a_ramp_keeps_vehicles_from_entering_until_there_is_room_to_m
     full = evolve(full, entrance=(evolve(full.entrance[0], volume_veh_per_h=1200.0),))
     road = LonelyRoad(full)
     (end,) = dead_ends(full)
-    room_m = full.entrance[0].merge_m + full.formation.speed_mps * full.cycles_s[0]
+    room_m = full.entrance[0].merge_m + full.formation.speed_mps * full.timing.cycles_s[0]
     waiting: list[float] = []
     while road.t_s < 240.0:
         entered = len(road.vehicles)
@@ -187,7 +187,7 @@ def changing(*, late: bool) -> tuple[MotionController, float]:
 
 def time_before_line(moves: float) -> float:
     """Return the time at which column 0 is some moves before the line of the exit."""
-    move_m = WEAVING.lattice.speed_mps * WEAVING.move_s
+    move_m = WEAVING.lattice.speed_mps * WEAVING.timing.move_s
     return WEAVING.lattice.passing_time_s(0, 450.0 - moves * move_m)
 
 
@@ -237,7 +237,7 @@ def test_the_roadside_takes_it_back_and_the_vehicle_drives_past_the_exit() -> No
     column = vehicle.admission.cell[0]
     controller = vehicle.controller
     line_s = WEAVING.lattice.passing_time_s(column, 450.0)
-    while road.t_s < line_s - 0.3 * WEAVING.move_s:
+    while road.t_s < line_s - 0.3 * WEAVING.timing.move_s:
         road.step()
     controller.store.assign_cell((column, 0))
     controller.motion_origin, controller.hold_cell = controller.hold_cell, (column, 0)
@@ -263,7 +263,7 @@ def test_a_body_between_two_lanes_stops_before_they_part() -> None:
 
 
 def test_exits_tell_who_has_left() -> None:
-    exits = Exits(WEAVING.sections, WEAVING.road.length_m)
+    exits = Exits(WEAVING.geometry.sections, WEAVING.road.length_m)
     assert exits.left_by(0, 499.9) is None
     section = exits.left_by(0, 500.0)
     assert section is not None

@@ -59,7 +59,7 @@ LATTICE = INTERCHANGE.lattice
 
 
 def test_such_a_road_needs_vehicles_that_keep_their_columns() -> None:
-    assert INTERCHANGE.shared_exit_lanes == {0}
+    assert INTERCHANGE.geometry.shared_exit_lanes == {0}
     with pytest.raises(BadInputError, match=r"entrance\[0\].at_m: got 520.0; allowed: 300"):
         parse_scenario(tables(change_columns=True))
 

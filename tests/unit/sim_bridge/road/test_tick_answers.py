@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from attrs import evolve
 
-from laneweave.protocol.scenario.fields import Runtime
+from laneweave.protocol.scenario.deployment_fields import Runtime
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.road.tick_answers import (
     COPIES,

@@ -12,7 +12,7 @@ from attrs import Attribute, Factory, evolve, field, frozen
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.protocol.lattice import WAIT, Cell, Mode
 from laneweave.protocol.road_layout import LaneChange, LaneSection, open_sections
-from laneweave.protocol.scenario.fields import LaneRule, Restriction, SolidLine
+from laneweave.protocol.scenario.road_tables import LaneRule, Restriction, SolidLine
 from laneweave.protocol.wire.messages import CAR
 
 ROUNDING_M = 1e-6

@@ -10,7 +10,7 @@ import random
 
 from attrs import frozen
 
-from laneweave.protocol.scenario.fields import Closure, Entrance, Exit
+from laneweave.protocol.scenario.road_tables import Closure, Entrance, Exit
 
 KINDS = ("drop", "blocked", "on-ramp", "on-ramp", "off-ramp", "weaving", "weaving")
 """Kinds to draw from."""

@@ -102,7 +102,7 @@ class LightRoad:
         self._attendance = Attendance(scenario, new_incarnation)
         self._bounds = scenario.runtime.bounds(bridge)
         self._lane_ends = LaneEnds(scenario)
-        self._exits = Exits(scenario.sections, scenario.road.length_m)
+        self._exits = Exits(scenario.geometry.sections, scenario.road.length_m)
         self._tick_m = 1.5 * scenario.lattice.speed_mps * self._tick_s
         """Distance beyond an exit at which a vehicle has left the road."""
 

@@ -23,6 +23,7 @@ from laneweave.coordinator.planning.rolling.problem import (
 from laneweave.coordinator.rolling.checked_planner import stream_road
 from laneweave.protocol.lattice import Cell, PlannedMove, displacements, footprint
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State, at_rest_in_cell
 from laneweave.protocol.wire.messages import CAR, Motion, Name, Sense
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
@@ -56,9 +57,9 @@ class Visit:
 class LightBody(Plant):
     """Body that moves straight from cell to cell in given times."""
 
-    def __init__(self, scenario: Scenario, cell: Cell) -> None:
+    def __init__(self, scenario: Scenario, limits: Vehicle, cell: Cell) -> None:
         """Start at rest in a cell."""
-        super().__init__((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), scenario.vehicle, scenario.runtime.tick_s)
+        super().__init__((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), limits, scenario.runtime.tick_s)
         self.t_s = 0.0
         """Time of the newest tick."""
         self._lattice = scenario.lattice
@@ -115,13 +116,13 @@ class LightVehicle(RoadVehicle):
     ) -> None:
         """Start at rest in the cell of the admission."""
         own = scenario.types[admission.arrival.vehicle_type]
-        self.drivable = own.drivable_moves
+        self.drivable = own.moves
         """Moves (columns, lanes) that the type of the vehicle drives."""
-        self.body = LightBody(own, admission.cell)
+        self.body = LightBody(scenario, own.limits, admission.cell)
         super().__init__(
             visit.vehicle,
             admission,
-            MotionController(self.body, own, admission.cell),
+            MotionController(self.body, scenario, admission.cell),
             bridge=bridge,
         )
         if scenario.formation.rolling:
@@ -174,8 +175,9 @@ class LightDriver:
     the target cell.
     """
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, limits: Vehicle) -> None:
         """Create a driver that has not taken over a vehicle yet."""
+        del limits
         self._lattice = scenario.lattice
         self._origin: Cell = (0, 0)
         self._goal: Cell = (0, 0)

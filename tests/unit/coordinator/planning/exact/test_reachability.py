@@ -18,7 +18,7 @@ from laneweave.coordinator.planning.plan_validator import problems_of_paths, pro
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS
+from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS
 from support.planning_oracles import CountingClock, cheapest_plan, requests
 
 

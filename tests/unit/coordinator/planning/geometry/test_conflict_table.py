@@ -61,7 +61,10 @@ def footprints_meet(pair: Pair) -> bool:
 @cache
 def actual_paths() -> dict[Cell, Floats]:
     """The trajectories of agents in the default scenario."""
-    return {step: move_profile(Scenario(), *step).states[:, [0, 3]] for step in STEPS}
+    return {
+        step: move_profile(Scenario(), Scenario().vehicle, *step).states[:, [0, 3]]
+        for step in STEPS
+    }
 
 
 @st.composite

@@ -23,8 +23,8 @@ def test_defaults_are_those_of_the_default_scenario() -> None:
     assert geometry.width_m == scenario.vehicle.width_m
     assert geometry.lane_width_m == scenario.road.lane_width_m
     assert geometry.pitch_m == scenario.formation.gap_m
-    assert geometry.move_s == scenario.move_s
-    assert geometry.slot_s == scenario.cycles_s[0]
+    assert geometry.move_s == scenario.timing.move_s
+    assert geometry.slot_s == scenario.timing.cycles_s[0]
     assert geometry.speed_mps == scenario.formation.speed_mps
     assert geometry.clearance_along_m > scenario.tracking.min_gap_m
 

@@ -22,7 +22,7 @@ from laneweave.coordinator.planning.paper.constraints import (
 from laneweave.coordinator.planning.problem import Bans, Diagram, MoveTable, Path, bits
 from laneweave.coordinator.planning.shortest_paths import choose_path, shortest_paths
 from laneweave.protocol.lattice import Mode
-from laneweave.protocol.scenario.fields import CONFLICT_KINDS
+from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS
 from support.planning_oracles import move_at, obeys
 
 STEPS = 3

@@ -17,7 +17,7 @@ from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import PLUG_IN_SHARE, plan, prepare
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.fields import SOLVERS
+from laneweave.protocol.scenario.formation_table import SOLVERS
 from support.plug_ins import Install, installing
 
 REQUEST = PlanRequest(

@@ -20,7 +20,8 @@ from laneweave.coordinator.planning.rolling.rolling_validator import (
 from laneweave.coordinator.rolling.checked_planner import stream_road
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.fields import READY_LATE_S, LaneRule, Restriction, SolidLine
+from laneweave.protocol.scenario.formation_table import READY_LATE_S
+from laneweave.protocol.scenario.road_tables import LaneRule, Restriction, SolidLine
 from oracles.lane_rules import broken_rules
 from support.rolling_oracles import ROAD, Stream, streams
 
@@ -238,6 +239,6 @@ def test_the_road_of_a_scenario_has_its_rules_with_room_for_late_moves() -> None
         }
     )
     road = stream_road(scenario)
-    late_m = READY_LATE_S * scenario.formation.speed_mps + scenario.room_ahead_m
+    late_m = READY_LATE_S * scenario.formation.speed_mps + scenario.types.room_ahead_m
     assert road.restrictions == (Restriction(2, TRUCKS, 600.0 - late_m),)
     assert road.solid_lines == (SolidLine(0, "left", 0.0, 700.0),)

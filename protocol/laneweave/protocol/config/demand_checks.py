@@ -1,0 +1,199 @@
+"""Checks of the demand: shares, volumes that lanes and formations carry, destinations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+
+import attrs
+
+from laneweave.protocol.config.rules import compare, require
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.formation_table import formation_columns
+from laneweave.protocol.scenario.traffic_flow import Inflow
+from laneweave.protocol.vehicle.lane_ends import drive_out
+
+MIN_SIDE_GAP_M = 0.5
+"""Minimum lateral gap between bodies side by side; covers rotation and tracking errors."""
+
+
+def check_lanes(scenario: Scenario) -> None:
+    """Check shares of lanes, and that lanes are wide enough and carry their volumes."""
+    road, demand = scenario.road, scenario.demand
+    every = range(road.lanes)
+    _check_shares("demand.lane_shares", demand.lane_shares, every, road.lanes)
+    if road.first_lanes:  # otherwise, the closures are reported
+        _check_shares("demand.arrival_shares", demand.arrival_shares, road.first_lanes, road.lanes)
+    for number, entrance in enumerate(scenario.entrance):
+        name, shares = f"entrance[{number}].lane_shares", entrance.lane_shares
+        _check_shares(name, shares, every, road.lanes)
+        allowed = "none, unless demand.lane_shares is given"
+        require(bool(demand.lane_shares) or not shares, name, list(shares), allowed)
+    width_m = scenario.types.widest_body_m + MIN_SIDE_GAP_M
+    what = f"the largest width_m and {MIN_SIDE_GAP_M:g} between bodies side by side"
+    compare(scenario, [("road.lane_width_m", "at least", width_m, what)])
+    if not scenario.sumo.config:
+        _check_lane_volumes(scenario)
+
+
+def _check_shares(
+    name: str, shares: Sequence[float], possible: Collection[int], lanes: int
+) -> None:
+    """Check shares of lanes: none, or one for each lane, above 0 only in possible lanes."""
+    others = ", ".join(map(str, sorted(possible)))
+    for ok, allowed in (
+        (
+            len(shares) in (0, lanes),
+            f"one share for each of the {lanes} lanes of road.lanes, or none",
+        ),
+        (
+            all(share >= 0 for share in shares) and sum(shares) < math.inf,
+            "numbers >= 0, not all 0, with a finite sum",
+        ),
+        (
+            not any(share for lane, share in enumerate(shares) if lane not in possible),
+            f"0 for all lanes but {others}",
+        ),
+        (not shares or sum(shares) > 0, "numbers >= 0, not all 0"),
+    ):
+        require(ok, name, list(shares), allowed)
+
+
+def check_volumes(scenario: Scenario) -> None:
+    """Check that the lanes carry the volumes, whether vehicles are drawn or those of SUMO.
+
+    Vehicles of SUMO that cannot enter wait, so that `check_scenario` allows any volume of them.
+
+    Raises:
+        BadInputError: a volume is too high.
+    """
+    _check_lane_volumes(scenario)
+    _check_capacity(scenario)
+
+
+def _check_lane_volumes(scenario: Scenario) -> None:
+    """Check that vehicles can enter each lane as often as its volume says."""
+    road, demand = scenario.road, scenario.demand
+    ramps = {
+        one.lane: (f"entrance[{number}].volume_veh_per_h", one.volume_veh_per_h)
+        for number, one in enumerate(scenario.entrance)
+    }
+    most, because = min(3600.0 / max(demand.min_headway_s, 1e-9), 3600.0), "demand.min_headway_s"
+    if road.closures and scenario.formation.bound_veh_per_lane_h < most:
+        most, because = scenario.formation.bound_veh_per_lane_h, "one in each cell of the lattice"
+    main = ("demand.volume_veh_per_lane_h", demand.volume_veh_per_lane_h)
+    for lane, inflow in scenario.flow.inflows.items():
+        name, value = ramps.get(lane, main)
+        volume, allowed = inflow.volume_veh_per_h, f"at most {most:g}"
+        if lane not in ramps and demand.arrival_shares:
+            allowed += f" vehicles per hour in each lane; lane {lane} has {volume:g}"
+        require(volume <= most * (1.0 + 1e-9), name, value, f"{allowed} ({because})")
+
+
+def check_drawn_capacity(scenario: Scenario) -> None:
+    """Check that the lanes carry the demand if vehicles are drawn."""
+    if not scenario.sumo.config:
+        _check_capacity(scenario)
+
+
+def _check_capacity(scenario: Scenario) -> None:
+    """Check that the lanes that are open can carry the demand everywhere."""
+    road, bound = scenario.road, scenario.formation.bound_veh_per_lane_h
+    if not road.closures:
+        return  # the bound of the entrance holds everywhere
+    exits_m = {one.name: one.at_m for one in scenario.exit}
+    entry_m, flow, formation = scenario.geometry.entry_m, scenario.flow, scenario.formation
+    parts = [
+        (entry_m[lane], inflow.volume_veh_per_h * share, exits_m.get(name, math.inf))
+        for lane, inflow in flow.inflows.items()
+        for name, share in _shares(inflow)
+    ]
+    volume = scenario.demand.volume_veh_per_lane_h
+    if not formation.rolling:
+        columns = formation_columns(formation.max_vehicles, road.narrowest_lanes)
+        require(
+            not formation.closes_by_vehicles or columns <= formation.max_columns,
+            "formation.max_columns",
+            formation.max_columns,
+            f"at least {columns}, for formation.max_vehicles = {formation.max_vehicles} where "
+            f"{road.narrowest_lanes} lanes are open",
+        )
+        change_columns = scenario.types.all_change_columns
+        most = math.floor(flow.formation_bound_veh_per_lane_h(change_columns=change_columns))
+        require(
+            volume <= most,
+            "demand.volume_veh_per_lane_h",
+            volume,
+            f"at most {most}: where {road.narrowest_lanes} lanes are open, formations of "
+            f"{formation.max_vehicles} (formation.max_vehicles) need more columns"
+            + ("" if change_columns else ", and those with weaker types one more"),
+        )
+    for s_m in sorted({0.0, *entry_m, *(one.from_m for one in road.closures)}):
+        flows = [(from_m, own) for from_m, own, to_m in parts if from_m <= s_m < to_m]
+        from_ramps = sum(own for from_m, own in flows if from_m > 0.0)
+        main_lanes = sum(own for from_m, own in flows if from_m <= 0.0) / volume
+        count = road.open_lanes_at(s_m)
+        room = bound * count - from_ramps
+        ramps = f" and {from_ramps:g} vehicles per hour come from ramps" if from_ramps else ""
+        require(
+            volume * main_lanes <= room,
+            "demand.volume_veh_per_lane_h",
+            volume,
+            f"at most {max(room, 0.0) / main_lanes if main_lanes else 0.0:g}, since {count} of "
+            f"{road.lanes} lanes are open at {s_m:g} m{ramps}",
+        )
+
+
+def _shares(inflow: Inflow) -> list[tuple[str, float]]:
+    """Return (destination, share) of vehicles that enter in a lane; the end of the road last."""
+    shares = [(one.exit, one.share) for one in inflow.destinations]
+    return [*shares, (END_OF_ROAD, 1.0 - sum(share for _, share in shares))]
+
+
+def check_destinations(scenario: Scenario) -> None:
+    """Check that destinations exist, and that the vehicles of each entrance can reach theirs."""
+    names = [one.name for one in scenario.exit]
+    tables = {one.lane: f"entrance[{number}]" for number, one in enumerate(scenario.entrance)}
+    for lane, inflow in scenario.flow.inflows.items():
+        name, shares = f"{tables.get(lane, 'demand')}.destinations", _shares(inflow)
+        listed = [*map(attrs.astuple, inflow.destinations)]
+        require(shares[-1][1] >= -1e-9, name, listed, "shares whose sum is at most 1")
+        for destination, share in shares:
+            if destination != END_OF_ROAD:
+                allowed = f"an exit: {', '.join(names) or 'there is none'}"
+                require(destination in names, f"{name}.exit", destination, allowed)
+            if share > 0.0:
+                _check_reachable(scenario, name, lane, destination)
+
+
+def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str) -> None:
+    """Check that a vehicle from a lane has room for all lane changes to its destination."""
+    geometry = scenario.geometry
+    own = min((one for one in geometry.sections if one.lane == lane), key=lambda one: one.from_m)
+    from_m, room_m = max(own.from_m, own.moves_from_m, geometry.moves_from_m), 0.0
+    if scenario.road.closures and not scenario.formation.rolling:
+        # At the volumes at which vehicles must cross lanes one after another, formations are full.
+        formation = scenario.formation
+        vehicles = formation.max_vehicles + scenario.flow.vehicles_from_ramps
+        columns = formation_columns(vehicles, scenario.road.narrowest_lanes)
+        from_m = max(from_m, *geometry.entry_m) + (columns - 1) * formation.gap_m
+        room_m = drive_out(scenario).room_m
+    from_m += scenario.types.longest_body_m
+    advance_m = scenario.formation.speed_mps * scenario.timing.cycles_s[0]
+    preferring = scenario.flow.inflows[lane].lane_shares
+    wanted = [lane for lane, share in enumerate(preferring) if share] or [ANY_LANE]
+    for preferred in wanted if destination == END_OF_ROAD else [ANY_LANE]:
+        room = [
+            (section.to_m - room_m if section.to_m < scenario.road.length_m else section.to_m)
+            - (from_m + abs(section.lane - lane) * advance_m)
+            for section in geometry.sections
+            if section.serves(preferred, destination)
+        ]
+        require(
+            max(room, default=-math.inf) >= 0.0,
+            name,
+            destination,
+            f"destinations with {advance_m:g} m for each lane change: from lane {lane}, where "
+            f"moves begin at {from_m:g} m, {destination} is too near",
+        )

@@ -1,0 +1,124 @@
+"""The geometry of a road: where lanes are open, where vehicles enter, leave and change lanes."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+from attrs import frozen
+
+from laneweave.protocol.road_layout import (
+    ANY_LANE,
+    END_OF_ROAD,
+    LaneSection,
+    open_sections,
+    sections_for,
+)
+from laneweave.protocol.scenario.formation_table import FormationSettings
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE, Closure, Entrance, Exit, Road
+
+
+@frozen
+class RoadGeometry:
+    """Sections of lanes, entrances, exits, and times at v_F between them."""
+
+    _road: Road
+    _entrances: tuple[Entrance, ...]
+    _exits: tuple[Exit, ...]
+    _formation: FormationSettings
+
+    @cached_property
+    def sections(self) -> tuple[LaneSection, ...]:
+        """The open sections of all lanes."""
+        road = self._road
+        return open_sections(
+            road.lanes,
+            road.length_m,
+            [(one.lane, one.from_m, one.to_m) for one in road.closures],
+            {(lane, one.at_m): one.name for one in self._exits for lane in one.lanes},
+            {(one.lane, one.at_m): one.merge_m for one in self._entrances},
+        )
+
+    def goal_sections(
+        self, preferred_lane: int, destination: str, vehicle_type: str
+    ) -> frozenset[int]:
+        """Return the numbers of the sections that serve a vehicle (`LaneSection.serves`).
+
+        Where its type may not drive at their ends, those of other lanes to its destination; if
+        there are none either, the type is ignored.
+        """
+        wanted = sections_for(self.sections, preferred_lane, destination)
+        if not self._road.restrictions:
+            return wanted
+        for numbers in (wanted, sections_for(self.sections, ANY_LANE, destination)):
+            permitted = frozenset(
+                number
+                for number in numbers
+                if self._road.may_leave_by(self.sections[number], vehicle_type)
+            )
+            if permitted:
+                return permitted
+        return wanted
+
+    @cached_property
+    def entry_m(self) -> tuple[float, ...]:
+        """Where the cells of each lane are assigned and vehicles enter: at 0, or on a ramp."""
+        at_m = {entrance.lane: entrance.at_m for entrance in self._entrances}
+        return tuple(at_m.get(lane, 0.0) for lane in range(self._road.lanes))
+
+    @cached_property
+    def shared_exit_lanes(self) -> frozenset[int]:
+        """Lanes in which a ramp follows an exit, as in most interchanges."""
+        return frozenset(
+            section.lane for section in self.sections if section.to_m <= self.entry_m[section.lane]
+        )
+
+    def closed_to_bodies(self, body_m: float, tick_m: float) -> tuple[Closure, ...]:
+        """Return the closed parts of lanes that no body may touch.
+
+        Vehicles enter a ramp with their rears before it, and leave by an exit up to a tick behind.
+
+        Args:
+            body_m: length of the longest body.
+            tick_m: maximum distance that a vehicle drives in a tick.
+        """
+        entries = {(one.lane, one.at_m) for one in self._entrances}
+        exits = {(lane, one.at_m) for one in self._exits for lane in one.lanes}
+        parts = []
+        for one in self._road.closures:
+            from_m, to_m = one.from_m, one.to_m
+            if (one.lane, from_m) in exits:
+                from_m += tick_m
+            if (one.lane, to_m) in entries:
+                to_m -= body_m
+            if from_m < to_m:
+                parts.append(Closure(one.lane, from_m, to_m))
+        return tuple(parts)
+
+    def entrance_of(self, lane: int) -> str:
+        """Return the name of the entrance of vehicles that arrive in a lane."""
+        names = {entrance.lane: entrance.name for entrance in self._entrances}
+        return names.get(lane, MAIN_ENTRANCE)
+
+    def exit_lane(self, destination: str) -> int:
+        """Return the lane of an exit; `ANY_LANE` if it has several, or for `END_OF_ROAD`."""
+        lanes = next((one.lanes for one in self._exits if one.name == destination), ())
+        return lanes[0] if len(lanes) == 1 else ANY_LANE
+
+    @property
+    def free_flow_s(self) -> float:
+        """Time [s] in which a vehicle passes the whole road at v_F."""
+        return self._road.length_m / self._formation.speed_mps
+
+    def free_flow_trip_s(self, lane: int, destination: str = END_OF_ROAD) -> float:
+        """Return the time [s] at v_F from the entrance of a lane to a destination."""
+        ends_m = {one.name: one.at_m for one in self._exits}
+        to_m = ends_m.get(destination, self._road.length_m)
+        return (to_m - self.entry_m[lane]) / self._formation.speed_mps
+
+    @property
+    def moves_from_m(self) -> float:
+        """Position [m] from which vehicles may move between cells: in S2, or the start of S3."""
+        start_m, formation = self._road.sorting_start_m, self._formation
+        if not (formation.rolling and formation.sort_in_s2):
+            return start_m
+        return min(start_m, max(self._road.s1_m, formation.speed_mps * (formation.settle_s + 4.0)))

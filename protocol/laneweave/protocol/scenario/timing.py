@@ -1,0 +1,132 @@
+"""Timing: the possible values of T_F, durations of moves, and the tracker's horizon."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+
+from attrs import frozen
+
+from laneweave.protocol.road_layout import LaneSection
+from laneweave.protocol.scenario.formation_table import FormationSettings
+from laneweave.protocol.scenario.vehicle_tables import PEAK_ACCEL, Vehicle
+
+SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
+"""Range of T_F if `formation.cycle_s` is not set; the lower end is the paper's value."""
+COMFORT_MPS2 = 3.0
+"""Maximum comfortable acceleration, along and across the road."""
+ROLLING_CYCLE_S = 6.0
+MIN_MERGING_SLOTS = 4
+"""Number of slots that the rolling operation should have in a lane that begins and ends on the
+road, as that of a ramp; with three, up to 1 % of the vehicles did not change lanes in time at 2000
+vehicles/(lane h)."""
+COMFORTABLE_VOLUME_VEH_PER_LANE_H = 2000.0
+"""Maximum volume at which T_F of the rolling operation is the comfortable `ROLLING_CYCLE_S`. Denser
+traffic needs more steps on the same road: at 2400, 1 % of the vehicles miss their lanes with 6 s,
+but less than 0.1 % with 4 s (`benchmarks/stream.py`)."""
+CYCLE_STEP_S = 0.2
+"""Step between values of T_F; few values keep the number of planned trajectories low."""
+FORMATION_CLOSING_MPS = 8.0
+"""Speed at which a member of a formation may close up to another if T_F is not given; vehicles can
+brake from it in nearly all scenarios."""
+
+
+@frozen
+class Timing:
+    """The slots of a scenario, which are the same for all types of vehicles."""
+
+    _formation: FormationSettings
+    _cars: Vehicle
+    _volume_veh_per_lane_h: float
+    _sections: Sequence[LaneSection]
+    _length_m: float
+    """Length of the road."""
+    _tick_s: float
+    _horizon_ticks: int | None
+    """Horizon of the tracker; None: the longest T_F."""
+
+    @cached_property
+    def cycles_s(self) -> tuple[float, float]:
+        """Shortest and longest T_F [s]; equal in the rolling operation."""
+        cycle_s = self._formation.cycle_s
+        if cycle_s is not None:
+            return cycle_s, cycle_s
+        if self._formation.rolling:
+            cycle_s = ROLLING_CYCLE_S
+            if self._volume_veh_per_lane_h > COMFORTABLE_VOLUME_VEH_PER_LANE_H:
+                cycle_s = SHORTEST_CYCLE_S
+            longest_s = self._shortest_merging_s / MIN_MERGING_SLOTS
+            if cycle_s > longest_s:
+                steps = math.floor(longest_s / CYCLE_STEP_S + 1e-9)
+                cycle_s = min(cycle_s, max(CYCLE_STEP_S * steps, self._shortest_cycle_s))
+            return cycle_s, cycle_s
+        return self._shortest_cycle_s, max(self._shortest_cycle_s, LONGEST_CYCLE_S)
+
+    @property
+    def _shortest_cycle_s(self) -> float:
+        """Shortest T_F for which moves are likely to be possible, at least `SHORTEST_CYCLE_S`.
+
+        A minimum-jerk move over d in T closes up with at most 15/8 d/T and accelerates with
+        10 / sqrt(3) d / T^2 at most. Moves are possible if these do not exceed v_F / 2 and 1.2
+        times the limit (which a trajectory within the limit can replace), in nearly all cases. For
+        formations, whose plans need short slots where many steps must fit, these are
+        `FORMATION_CLOSING_MPS` and 1.3 times the limit: the check of moves refuses a few scenarios
+        more, and asks for a longer T_F.
+        """
+        if not self._formation.change_columns:
+            return SHORTEST_CYCLE_S
+        # T_F is the same for all types; those that are weaker drive fewer moves.
+        d_m, accel_mps2 = self._formation.gap_m, self._cars.max_accel_mps2
+        closing_mps, ratio = FORMATION_CLOSING_MPS, 1.3
+        if self._formation.rolling:
+            closing_mps, ratio = self._formation.speed_mps / 2.0, 1.2
+        by_speed_s = 15.0 / 8.0 * d_m / closing_mps
+        by_accel_s = math.sqrt(PEAK_ACCEL * d_m / (ratio * accel_mps2))
+        slot_s = max(by_speed_s, by_accel_s) + self._formation.slack_s
+        return max(SHORTEST_CYCLE_S, CYCLE_STEP_S * math.ceil(slot_s / CYCLE_STEP_S - 1e-9))
+
+    @property
+    def _shortest_merging_s(self) -> float:
+        """Shortest time at v_F in a section that begins and ends on the road."""
+        sections_m = (
+            section.to_m - max(section.from_m, section.moves_from_m)
+            for section in self._sections
+            if section.from_m > 0.0 and section.to_m < self._length_m
+        )
+        return min(sections_m, default=math.inf) / self._formation.speed_mps
+
+    @property
+    def slots_s(self) -> tuple[float, ...]:
+        """Possible values of T_F [s], ascending in steps of `CYCLE_STEP_S`."""
+        shortest_s, longest_s = self.cycles_s
+        count = round((longest_s - shortest_s) / CYCLE_STEP_S)
+        return tuple(shortest_s + CYCLE_STEP_S * number for number in range(count + 1))
+
+    @property
+    def comfortable_cycle_s(self) -> float:
+        """Shortest T_F [s] in which no move exceeds `COMFORT_MPS2`, or the longest."""
+        formation = self._formation
+        min_s = math.sqrt(PEAK_ACCEL * formation.gap_m / COMFORT_MPS2)
+        comfortable = [slot_s for slot_s in self.slots_s if slot_s >= min_s + formation.slack_s]
+        return min(comfortable, default=self.slots_s[-1])
+
+    @property
+    def horizon_ticks(self) -> int:
+        """Horizon of the tracker in ticks."""
+        ticks = self._horizon_ticks
+        return round(self.cycles_s[1] / self._tick_s) if ticks is None else ticks
+
+    @property
+    def move_s(self) -> float:
+        """Duration of a move in the shortest T_F [s]."""
+        return self.cycles_s[0] - self._formation.slack_s
+
+    def move_ticks(self, slot_s: float) -> int:
+        """Return the duration of a move [ticks] in slots of this length."""
+        return round((slot_s - self._formation.slack_s) / self._tick_s)
+
+    @property
+    def move_durations(self) -> frozenset[int]:
+        """Possible durations of a move in ticks."""
+        return frozenset(map(self.move_ticks, self.slots_s))
