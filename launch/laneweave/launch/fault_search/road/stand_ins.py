@@ -123,8 +123,7 @@ class LightVehicle(RoadVehicle):
             MotionController(self.body, own, admission.cell),
             bridge=bridge,
         )
-        if scenario.formation.rolling:
-            self.controller.assign_cell(admission.cell)
+        self.controller.enter_lattice((admission.cell,))
         if not scenario.formation.closes_by_vehicles:
             self.formation = self.controller.joined[0]
         self.clock_jump_s = 0.0
