@@ -100,6 +100,7 @@ class LocalRun:
     start_page: StartPage | None = None
     """Starts the live page of this run once the router listens; see `LivePage.start`."""
     demand: RunDemand = Factory(lambda self: demand_of(self.scenario), takes_self=True)
+    """The vehicles of the run, if the caller has drawn them already."""
     _processes: RoleProcesses = field(init=False)
     _options: dict[str, Any] = field(init=False)
     """Options that every role receives."""

@@ -122,6 +122,7 @@ class SimulatedRun:
     watch: Callable[[RoadView], None] | None = None
     """Called every `PROGRESS_EVERY_TICKS` with the observed state."""
     demand: RunDemand = Factory(lambda self: demand_of(self.scenario), takes_self=True)
+    """The vehicles of the run, if the caller has drawn them already."""
     _view: RoadView = field(factory=RoadView)
     _roles: SimulatedRoles = field(init=False)
     _injection: FaultInjection | None = None
