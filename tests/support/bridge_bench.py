@@ -40,6 +40,7 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.core import BRIDGE, BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.demand import arrivals as scenario_arrivals
 from support.paper import EXACT
 from support.road_vehicles import known
 from support.states import changed, jerks, make_plan, sent
@@ -95,13 +96,12 @@ def make_bridge(
         scenario,
         world,
         record,
+        scenario_arrivals(scenario) if arrivals is None else tuple(arrivals),
         new_incarnation=new_incarnation or count(1).__next__,
         pace=pace,
         incarnation=incarnation,
         stopwatch=lambda: 0.0,
     )
-    if arrivals is not None:
-        core._roadside._arrivals = tuple(arrivals)
     return core, world
 
 

@@ -23,7 +23,7 @@ def ramps_are_issued_at_the_start(patch: pytest.MonkeyPatch) -> None:
     def twice(self: Roadside, vehicles: Mapping[Name, RoadVehicle]) -> None:
         assign(self, vehicles)
         for one in list(vehicles.values()):
-            for lane, entry_m in enumerate(self._entry_m):
+            for lane, entry_m in enumerate(self._meter._entry_m):
                 if entry_m > 0.0 and one.arrival.lane != lane:
                     one.controller.store.assign_cell((one.admission.cell[0], lane))
 

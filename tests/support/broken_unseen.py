@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from itertools import count
 
 import pytest
@@ -44,9 +44,10 @@ from laneweave.protocol.wire.messages import (
 from laneweave.protocol.wire.topics import PLAN, PREPARE
 from laneweave.sim_bridge.bodies import record_store
 from laneweave.sim_bridge.bodies.record_store import RecordStore
+from laneweave.sim_bridge.road.allocation import CellAllocation
 from laneweave.sim_bridge.road.attendance import Attendance, Caretaker
+from laneweave.sim_bridge.road.census import CensusPublisher
 from laneweave.sim_bridge.road.formation_building import GrowingFormations
-from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.states import set_record
 
@@ -388,26 +389,28 @@ def await_token(patch: Patch) -> None:
 
 
 def keep_waiting_cells(patch: Patch) -> None:
-    assign_empty_cells = Roadside.assign_empty_cells
+    assign_empty_cells = CellAllocation.assign_empty_cells
 
-    def mutant(self: Roadside, vehicles: Mapping[Name, RoadVehicle]) -> None:
+    def mutant(
+        self: CellAllocation, vehicles: Mapping[Name, RoadVehicle], closed: Sequence[int]
+    ) -> None:
         waiting = list(self._unassigned)
-        assign_empty_cells(self, vehicles)
+        assign_empty_cells(self, vehicles, closed)
         self._unassigned = [*waiting, *(one for one in self._unassigned if one not in waiting)]
 
-    patch.setattr(Roadside, "assign_empty_cells", mutant)
+    patch.setattr(CellAllocation, "assign_empty_cells", mutant)
 
 
 def list_by_block(patch: Patch) -> None:
-    make = Roadside.census
+    make = CensusPublisher.census
 
-    def mutant(self: Roadside, t_s: float, on_road: Iterable[RoadVehicle]) -> Census:
+    def mutant(self: CensusPublisher, t_s: float, on_road: Iterable[RoadVehicle]) -> Census:
         vehicles = tuple(on_road)
         present = {vehicle.block for vehicle in vehicles}
         self._closed = [closed for closed in self._closed if closed.first_block in present]
         return make(self, t_s, vehicles)
 
-    patch.setattr(Roadside, "census", mutant)
+    patch.setattr(CensusPublisher, "census", mutant)
 
 
 def begin_behind_last_vehicle(patch: Patch) -> None:

@@ -11,6 +11,7 @@ from laneweave.protocol.scenario.road_tables import Closure, DestinationShare, R
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose, pose_of
+from laneweave.sim_bridge.road.demand import arrivals
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.convoy import ROLLING
@@ -80,7 +81,7 @@ class LonelyRoad:
 
     def __attrs_post_init__(self) -> None:
         """Open the entrance, with the scenario's arrivals."""
-        self.roadside = Roadside(self.scenario, bridge=1)
+        self.roadside = Roadside(self.scenario, arrivals(self.scenario), bridge=1)
 
     @property
     def t_s(self) -> float:
@@ -89,7 +90,7 @@ class LonelyRoad:
     def step(self) -> None:
         """Drive one tick."""
         scenario, t_s = self.scenario, self.t_s
-        self.roadside.newly_demanded(t_s)
+        self.roadside.demand.newly_demanded(t_s)
         for admission in self.roadside.admit(t_s, self.vehicles):
             vehicle = RoadVehicle.entering(admission, t_s, scenario, 1)
             self.vehicles[vehicle.name] = vehicle

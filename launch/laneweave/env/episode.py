@@ -41,14 +41,14 @@ class Episode:
         self,
         scenario: Scenario,
         make_coordinator: Callable[[Name, int, Scenario], CoordinatorCore],
-        stream: tuple[Arrival, ...] | None = None,
+        stream: tuple[Arrival, ...],
     ) -> None:
         """Start all roles; the road time is 0.
 
         Args:
             scenario: road, demand, vehicles; its seed determines everything that is drawn.
             make_coordinator: returns the core of a coordinator of this name and incarnation.
-            stream: the arrivals, by time; None: drawn from the scenario's seed.
+            stream: the arrivals, by time.
         """
         self.scenario = scenario
         self.record = EpisodeRecord(scenario)
@@ -58,10 +58,10 @@ class Episode:
             scenario,
             BodiesWorld(),
             self.record,
+            stream,
             new_incarnation=self._incarnations.__next__,
             pace=1.0,
             stopwatch=_no_time,
-            stream=stream,
         )
         agents = AgentHost(
             self._make_agent, next(self._incarnations), scenario.runtime, shard=Shard(0, 1)

@@ -101,7 +101,7 @@ class VehiclesEnv(ParallelEnv[str, Observation, int]):
         self._planner = RequestPlanner(road)
         self._plan = checked(road, self._planner.plan)
         self._observer = Observer(scenario, road, columns)
-        self._stream = arrivals(scenario)
+        self._stream = () if vary_demand else arrivals(scenario)
         self._varies = vary_demand
         count = _bound(scenario) if vary_demand else len(self._stream)
         self.possible_agents = [vehicle_name(number) for number in range(1, count + 1)]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
 from itertools import groupby
 from typing import ClassVar
@@ -62,7 +62,7 @@ from laneweave.sim_bridge.recording.record_interface import Record
 from laneweave.sim_bridge.recording.run_record import Ending
 from laneweave.sim_bridge.road.attendance import Attendance, notify_left
 from laneweave.sim_bridge.road.demand import Arrival
-from laneweave.sim_bridge.road.outside_traffic import OutsideTraffic
+from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, OutsideTraffic
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from laneweave.sim_bridge.world_interface import World, show_bodies
@@ -117,13 +117,13 @@ class BridgeCore:
         scenario: Scenario,
         world: World,
         record: Record,
+        stream: Sequence[Arrival],
         *,
         new_incarnation: Callable[[], int],
         pace: float | None,
         incarnation: int = 0,
         stopwatch: Callable[[], float] = time.perf_counter,
-        stream: tuple[Arrival, ...] | None = None,
-        outside_traffic: OutsideTraffic | None = None,
+        outside_traffic: OutsideTraffic = NO_OUTSIDE_TRAFFIC,
     ) -> None:
         """Create the bridge before the first tick.
 
@@ -131,14 +131,13 @@ class BridgeCore:
             scenario: road, demand, vehicles.
             world: an empty world.
             record: receives the measurements.
+            stream: the arrivals, by time.
             new_incarnation: returns an unused incarnation, for caretakers.
             pace: road seconds per second of the node's clock, if answers arrive in time; None: the
                 scenario's `max_pace`.
             incarnation: distinguishes this road from earlier roads of the same deployment.
             stopwatch: clock [s] that measures how long ticks take.
-            stream: the arrivals, by time; None: drawn from the scenario's seed.
-            outside_traffic: further vehicles, which a simulator drives to entrances; None: there
-                are none.
+            outside_traffic: further vehicles, which a simulator drives to entrances.
         """
         self.scenario = scenario
         self.tick = 0
@@ -146,7 +145,7 @@ class BridgeCore:
         self.vehicles: dict[Name, RoadVehicle] = {}
         self._world = world
         self._record = record
-        self._roadside = Roadside(scenario, incarnation, stream, outside_traffic)
+        self._roadside = Roadside(scenario, stream, incarnation, outside_traffic)
         self._exits = Exits(scenario.geometry.sections, scenario.road.length_m)
         runtime = scenario.runtime
         self._tick_duration_s = runtime.tick_s / (pace or runtime.max_pace)
@@ -176,7 +175,7 @@ class BridgeCore:
     @property
     def metrics(self) -> tuple[MetricsSnapshot, ...]:
         """Counters of the bridge."""
-        clock = self._roadside.clock(self.tick, self.t_s, len(self.vehicles))
+        clock = self._roadside.publisher.clock(self.tick, self.t_s, len(self.vehicles))
         return (
             BridgeMetrics(
                 road_seconds=self.t_s,
@@ -324,7 +323,7 @@ class BridgeCore:
         """Admit vehicles at the entrance and start waiting for their agents."""
         self._opened_s = now_s
         self._tick_began = self._stopwatch()
-        for arrival in self._roadside.newly_demanded(self.t_s):
+        for arrival in self._roadside.demand.newly_demanded(self.t_s):
             self._record.on_demanded(arrival)
         for admission in self._roadside.admit(self.t_s, self.vehicles):
             self._at_entrance.append(
@@ -449,7 +448,7 @@ class BridgeCore:
     def _finish(self, ending: Ending) -> None:
         if self.phase is not TickPhase.ENDED:
             self.phase = TickPhase.ENDED
-            for arrival in self._roadside.never_came if ending is Ending.COMPLETE else ():
+            for arrival in self._roadside.outside.never_came if ending is Ending.COMPLETE else ():
                 self._record.on_demanded(arrival)
             for vehicle in self.vehicles.values():
                 self._record.on_still_on_road(vehicle)

@@ -15,7 +15,7 @@ from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.sim_bridge.core import BridgeCore
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
-from laneweave.sim_bridge.road_sources import open_road
+from laneweave.sim_bridge.road_sources import demand_of, open_road
 
 
 def run_bridge(
@@ -41,7 +41,7 @@ def run_bridge(
         SumoUnavailableError: libsumo cannot be loaded.
     """
     access = access_of(scenario, "bridge")
-    with open_road(scenario, folder) as road, ExitStack() as closing:
+    with open_road(demand_of(scenario), folder) as road, ExitStack() as closing:
         # A signal must not leave a record behind that is not closed.
         with interrupts_deferred():
             record = RunRecord(folder, scenario, method, time.perf_counter, road.left_out)
@@ -50,10 +50,10 @@ def run_bridge(
                 scenario,
                 road.world,
                 record,
+                road.stream,
                 new_incarnation=incarnations,
                 pace=pace,
                 incarnation=incarnations(),
-                stream=road.stream,
                 outside_traffic=road.outside_traffic,
             )
             # Also after an error, to save the recorded data.

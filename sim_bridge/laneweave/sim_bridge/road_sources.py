@@ -12,12 +12,12 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
-from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor
+from laneweave.sim_bridge.corridors.corridor_setup import CorridorSetup, SumoCorridor
 from laneweave.sim_bridge.corridors.corridor_world import CorridorWorld
 from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
 from laneweave.sim_bridge.corridors.take_over import TakeOver
 from laneweave.sim_bridge.road.demand import Arrival, arrivals
-from laneweave.sim_bridge.road.outside_traffic import OutsideTraffic
+from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, OutsideTraffic
 from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 from laneweave.sim_bridge.world_interface import World
 
@@ -26,52 +26,71 @@ TOLERANCE_M = 0.05
 
 
 @frozen
+class RunDemand:
+    """All vehicles that may arrive in a run."""
+
+    scenario: Scenario
+    arrivals: tuple[Arrival, ...]
+    """By time; those from SUMO with the times of their departures."""
+    corridor: CorridorSetup | None = None
+    """The vehicles from SUMO, and their corridor; None: the vehicles have been drawn."""
+
+    @property
+    def vehicles(self) -> tuple[str, ...]:
+        """Names of the vehicles."""
+        return tuple(arrival.vehicle for arrival in self.arrivals)
+
+
+def demand_of(scenario: Scenario) -> RunDemand:
+    """Draw the vehicles of a run from the scenario's seed, or read those of a SUMO simulation.
+
+    Once in each process that needs them, which passes them on: the launcher of a run needs their
+    names, for faults, certificates and agents; the bridge needs their arrivals. If the bridge is
+    a process of its own, it gets the scenario with its seed only, from which the same follow.
+
+    Raises:
+        BadInputError: the SUMO simulation cannot be read, or has another road.
+    """
+    if not scenario.sumo.config:
+        return RunDemand(scenario, arrivals(scenario))
+    setup = sumo_corridor(scenario).setup(scenario)
+    return RunDemand(scenario, tuple(one.arrival for one in setup.arrivals), setup)
+
+
+@frozen
 class RoadSource:
     """A world, and the vehicles that come to it."""
 
     world: World
-    stream: tuple[Arrival, ...] | None = None
-    """The arrivals, by time; None: drawn from the scenario's seed."""
-    outside_traffic: OutsideTraffic | None = None
+    stream: tuple[Arrival, ...]
+    """Arrivals at the entrances, by time."""
+    outside_traffic: OutsideTraffic = NO_OUTSIDE_TRAFFIC
     left_out: Mapping[str, int] = field(factory=dict)
     """Number of vehicles with routes through a corridor that it cannot serve, by reason."""
 
 
 @contextmanager
-def open_road(scenario: Scenario, results: Path) -> Iterator[RoadSource]:
-    """Open the world of a scenario.
-
-    Args:
-        scenario: road, demand, vehicles.
-        results: the run's folder, for SUMO's own statistics.
+def open_road(demand: RunDemand, results: Path) -> Iterator[RoadSource]:
+    """Open the world to which vehicles come; `results` is the run's folder, for SUMO's statistics.
 
     Raises:
-        BadInputError: the SUMO simulation cannot be read, or has another road.
         CommandFailedError: libsumo cannot be loaded, or SUMO rejects a file.
     """
+    scenario, setup = demand.scenario, demand.corridor
     with temporary_folder("sumo") as folder:
-        if not scenario.sumo.config:
+        if setup is None:
             with SumoWorld(scenario, folder) as world:
                 if scenario.sumo.gui:
                     world.show(scenario.runtime.tick_s)
-                yield RoadSource(world)
+                yield RoadSource(world, demand.arrivals)
             return
-        found = sumo_corridor(scenario)
-        setup = found.setup(scenario)
         with CorridorWorld(setup, folder, results) as world_of_sumo:
             if scenario.sumo.gui:
                 world_of_sumo.show(scenario.runtime.tick_s)
             ramps = TakeOver(scenario, world_of_sumo)
             stream = tuple(one.arrival for one in setup.arrivals if one.departs_at_start)
-            yield RoadSource(world_of_sumo, stream, ramps, found.demand.missing)
+            yield RoadSource(world_of_sumo, stream, ramps, setup.found.demand.missing)
             world_of_sumo.drive_on()
-
-
-def demanded(scenario: Scenario) -> tuple[Arrival, ...]:
-    """Return all vehicles that may arrive; those from SUMO with the times of their departures."""
-    if not scenario.sumo.config:
-        return arrivals(scenario)
-    return tuple(one.arrival for one in sumo_corridor(scenario).setup(scenario).arrivals)
 
 
 def sumo_corridor(scenario: Scenario) -> SumoCorridor:

@@ -302,7 +302,7 @@ class Setup:
             )
             for visit in sorted(self.visits, key=lambda visit: visit.enters_s)
         )
-        return Roadside(self.scenario, bridge, stream)
+        return Roadside(self.scenario, stream, bridge)
 
     def preferences(self, rng: random.Random, *, last: bool) -> dict[Name, int]:
         """Draw the preferred lane of each vehicle.

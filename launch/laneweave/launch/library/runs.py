@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 
 from laneweave.agents.driving.trajectory import check_moves
 from laneweave.coordinator.planning.solve import prepare
-from laneweave.launch.faults.specification import FaultSpec, load_faults
+from laneweave.launch.faults.specification import load_faults
 from laneweave.launch.report.report import draw_report
 from laneweave.launch.run.local_run import LocalRun, StartPage
 from laneweave.launch.run.logs import log_by_default
@@ -27,7 +27,7 @@ from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario.deployment_fields import check_pace
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import RunSummary
-from laneweave.sim_bridge.road_sources import demanded
+from laneweave.sim_bridge.road_sources import demand_of
 
 ZENOH: Final = "zenoh"
 SIMULATED: Final = "simulated"
@@ -192,24 +192,25 @@ def _run_formations(
     out: Path | None,
     transport: str | None,
     faults: str | None,
-    local: Callable[[Scenario, Path, FaultSpec], LocalRun],
+    local: partial[LocalRun],
     *,
     show: bool,
 ) -> Outcome:
     check_moves(scenario)
-    vehicles = {arrival.vehicle for arrival in demanded(scenario)}
-    specification = load_faults(faults, coordinator_names(scenario), vehicles)
+    demand = demand_of(scenario)
+    specification = load_faults(faults, coordinator_names(scenario), {*demand.vehicles})
     # Coordinators in other processes load the solver there; errors are reported here.
     prepare(scenario.formation.solver, "formation.solver", keep=transport == SIMULATED)
     if transport != SIMULATED:
         with new_folder(out, scenario, FORMATION) as folder:
-            return local(scenario, folder, specification).run()
+            return local(scenario, folder, specification, demand=demand).run()
     with (
         _only_run(),
         new_folder(out, scenario, FORMATION) as folder,
         tuned_garbage_collector(),
     ):
-        return SimulatedRun(scenario, folder, faults=specification, show_progress=show).run()
+        run = SimulatedRun(scenario, folder, specification, show_progress=show, demand=demand)
+        return run.run()
 
 
 @contextmanager

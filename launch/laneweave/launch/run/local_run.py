@@ -10,13 +10,13 @@ import contextlib
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
 
 import attrs
-from attrs import define, field
+from attrs import Factory, define, field
 
 from laneweave.coordinator.planning.kernels import KERNELS
 from laneweave.launch.faults.injection import FaultInjection
@@ -44,7 +44,7 @@ from laneweave.protocol.security.certificates import check_credentials
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.topics import Keys
-from laneweave.sim_bridge.road_sources import demanded
+from laneweave.sim_bridge.road_sources import RunDemand, demand_of
 
 OBSERVER = "observer.watch"
 """Identity of the launcher in a secured network."""
@@ -99,6 +99,8 @@ class LocalRun:
     """Called with a line if the run is slower than real time."""
     start_page: StartPage | None = None
     """Starts the live page of this run once the router listens; see `LivePage.start`."""
+    demand: RunDemand = Factory(lambda self: demand_of(self.scenario), takes_self=True)
+    """The vehicles of the run, if the caller has drawn them already."""
     _processes: RoleProcesses = field(init=False)
     _options: dict[str, Any] = field(init=False)
     """Options that every role receives."""
@@ -113,9 +115,9 @@ class LocalRun:
     def __attrs_post_init__(self) -> None:
         """Assign the demanded vehicles to groups."""
         per_process = self.scenario.runtime.vehicles_per_process
-        names = [arrival.vehicle for arrival in demanded(self.scenario)]
+        names = self.demand.vehicles
         for first in range(0, len(names), per_process):
-            group = tuple(names[first : first + per_process])
+            group = names[first : first + per_process]
             self._group_of |= dict.fromkeys(group, group)
 
     def run(self) -> Outcome:
@@ -127,7 +129,7 @@ class LocalRun:
             KeyboardInterrupt: a signal has stopped the run before the bridge began.
         """
         check_temporary_folder()
-        check_network(self.scenario)
+        check_network(self.scenario, self.demand.vehicles)
         formation = self.scenario.formation
         needed = "rolling" if formation.rolling else formation.solver
         context = fork_server({needed} & KERNELS.keys())
@@ -298,8 +300,8 @@ class LocalRun:
         self._stop = True
 
 
-def check_network(scenario: Scenario) -> None:
-    """Check that the processes of a run can use the network of a scenario.
+def check_network(scenario: Scenario, vehicles: Iterable[str]) -> None:
+    """Check that the processes of a run, with its vehicles, can use the network of a scenario.
 
     Raises:
         BadInputError: they cannot; for example, a certificate is missing.
@@ -315,8 +317,7 @@ def check_network(scenario: Scenario) -> None:
         value = runtime.vehicles_per_process
         raise BadInputError("runtime.vehicles_per_process", value, allowed)
     roles = ("bridge", OBSERVER, *(f"coordinator.{name}" for name in coordinator_names(scenario)))
-    vehicles = (f"vehicle.{arrival.vehicle}" for arrival in demanded(scenario))
-    for identity in (*roles, *vehicles):
+    for identity in (*roles, *(f"vehicle.{vehicle}" for vehicle in vehicles)):
         credentials = access_of(scenario, identity).credentials
         assert credentials is not None  # noqa: S101 (the network is secured)
         check_credentials(credentials, identity)

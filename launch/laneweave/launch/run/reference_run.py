@@ -17,6 +17,7 @@ from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.reference_road import ReferenceRoad, ReferenceVehicle
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.road_sources import demand_of
 
 PROGRESS_EVERY_TICKS = 50
 STANDSTILL_S = 300.0
@@ -78,7 +79,8 @@ class ReferenceRun:
             RunProgress(self.scenario, show=self.show_progress) as progress,
         ):
             record = RunRecord(self.folder, self.scenario, self.method, time.perf_counter)
-            road = ReferenceRoad(self.scenario, traffic, record)
+            stream = demand_of(self.scenario).arrivals
+            road = ReferenceRoad(self.scenario, stream, traffic, record)
             standstill, problem = Standstill(), None
             try:
                 while road.ending is None and problem is None and not self._stop:

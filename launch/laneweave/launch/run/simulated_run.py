@@ -8,7 +8,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from attrs import define, field
+from attrs import Factory, define, field
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
@@ -31,7 +31,7 @@ from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.messages import Census, Name
 from laneweave.sim_bridge.core import BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
-from laneweave.sim_bridge.road_sources import open_road
+from laneweave.sim_bridge.road_sources import RunDemand, demand_of, open_road
 
 STALL_S = 600.0
 """Virtual time after which a run fails if the road clock does not advance."""
@@ -121,6 +121,8 @@ class SimulatedRun:
     show_progress: bool = True
     watch: Callable[[RoadView], None] | None = None
     """Called every `PROGRESS_EVERY_TICKS` with the observed state."""
+    demand: RunDemand = Factory(lambda self: demand_of(self.scenario), takes_self=True)
+    """The vehicles of the run, if the caller has drawn them already."""
     _view: RoadView = field(factory=RoadView)
     _roles: SimulatedRoles = field(init=False)
     _injection: FaultInjection | None = None
@@ -153,7 +155,7 @@ class SimulatedRun:
             )
         with (
             stop_signals(self._request_stop),
-            open_road(scenario, self.folder) as road,
+            open_road(self.demand, self.folder) as road,
             RunProgress(scenario, show=self.show_progress) as progress,
         ):
             record = RunRecord(self.folder, scenario, FORMATION, time.perf_counter, road.left_out)
@@ -161,9 +163,9 @@ class SimulatedRun:
                 scenario,
                 road.world,
                 record,
+                road.stream,
                 new_incarnation=self._incarnations.__next__,
                 pace=1.0,
-                stream=road.stream,
                 outside_traffic=road.outside_traffic,
             )
             try:

@@ -194,14 +194,11 @@ class Decline:
 
 @frozen
 class Compute:
-    """Run `work` in another thread, after earlier jobs; `Computed` carries the result.
-
-    `work` is called with the clock for its deadlines, which stands still in simulated time: there,
-    results do not depend on the speed of the machine.
-    """
+    """Run `work` in another thread, after earlier jobs; `Computed` carries the result."""
 
     job: int
     work: Callable[[Clock], Any]
+    """Called with the clock for its deadlines, which stands still in simulated time."""
 
 
 @frozen
@@ -489,10 +486,7 @@ def run_job(job: Compute, clock: Clock = time.monotonic) -> Computed:
 
 
 def run_delegated(job: Delegate, now_s: Clock, clock: Clock = time.monotonic) -> Computed:
-    """Run a delegated computation in this process unless its deadline has passed by `now_s`.
-
-    The computation reads `clock`, which may raise `StoppedError`.
-    """
+    """Run a delegated computation with a clock, unless its deadline has passed by `now_s`."""
     left_s = job.deadline_s - now_s()
     if left_s <= 0:
         return Computed(job.job, None, TOO_LATE)

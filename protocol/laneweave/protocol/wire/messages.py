@@ -20,7 +20,7 @@ from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.wire.field_types import Cell, Int64, Message, PlannedMove, Real
 
 CAR: Final = "car"
-"""Name of the type of vehicle that the scenario's table `vehicle` describes."""
+"""Name of the type that the scenario's table `vehicle` describes."""
 
 
 class Ballot(NamedTuple):
@@ -95,28 +95,24 @@ class PendingTransfer(Message, frozen=True):
 
 
 class VehicleRecord(Message, frozen=True):
-    """What the motion controller of a vehicle stores, which outlives the process in charge.
+    """Durable storage of an acceptor of ballots: what outlives the process in charge of a vehicle.
 
-    Part of other messages. It is the durable storage of an acceptor (of ballots), not a property of
-    the motion: promises and acceptances count only once they are stored here. SENSE has the record
-    as stored; COMMAND the one that its sender wants to be stored; STATE the one for which the
-    process in charge vouches: as stored, with its own promise where formations own blocks.
+    Part of other messages. SENSE has the record as stored by the motion controller; COMMAND as its
+    sender wants it; STATE as stored, with the sender's promise where formations own blocks.
     """
 
     incarnation: Int64 = 0
     """Incarnation of the process in charge of the vehicle [ns]; 0: none yet."""
     joined: tuple[Int64, ...] = ()
-    """Blocks that the vehicle's plans must cover, ascending; none is removed while the vehicle is
-    on the lattice."""
+    """Blocks that the vehicle's plans must cover, ascending; none is removed on the lattice."""
     promised: Ballot | None = None
-    """Highest promised ballot; stored in the rolling operation only, where it also binds later
-    processes in charge."""
+    """Highest promised ballot; stored in the rolling operation, where it binds later processes."""
     accepted: Ballot | None = None
     """Ballot of the newest plan that the process in charge has accepted."""
     owned: tuple[Cell, ...] = ()
     """Rolling operation: cells that the vehicle owns, ascending."""
     transfer: PendingTransfer | None = None
-    """Rolling operation: newest transfer of its cells, pending or open."""
+    """Rolling operation: newest transfer of its cells."""
 
 
 class Prepare(Message, frozen=True):

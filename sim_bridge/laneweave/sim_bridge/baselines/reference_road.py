@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Protocol
 
 from attrs import define
@@ -16,7 +16,7 @@ from laneweave.protocol.wire.messages import RoadClock
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
-from laneweave.sim_bridge.road.demand import Arrival, arrivals, count_until
+from laneweave.sim_bridge.road.demand import Arrival, count_until
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S
 from laneweave.sim_bridge.road.sized_bodies import bodies_of
 
@@ -133,13 +133,15 @@ class Traffic(Protocol):
 class ReferenceRoad:
     """The road of a reference method; call `advance` until `ending` is set."""
 
-    def __init__(self, scenario: Scenario, traffic: Traffic, record: RunRecord) -> None:
+    def __init__(
+        self, scenario: Scenario, stream: Sequence[Arrival], traffic: Traffic, record: RunRecord
+    ) -> None:
         """Create the road before the first tick."""
         self.tick = 0
         self._scenario = scenario
         self._traffic = traffic
         self._record = record
-        self._arrivals = arrivals(scenario)
+        self._arrivals = stream
         self._demanded = 0
         self._left = 0
         self._entrance = Entrance(scenario)

@@ -147,6 +147,7 @@ class MotionController:
         """What the controller stores for the process in charge."""
         return self.store.record
 
+    @property
     def _limits(self) -> Vehicle:
         """Size and limits of the vehicle."""
         return self.plant.limits

@@ -10,7 +10,8 @@ and a traffic light may be red for longer.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 
 from attrs import frozen
 
@@ -18,6 +19,7 @@ from laneweave.protocol.road_layout import END_OF_ROAD, LaneSection
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.corridors.corridor import HANDOVER_M
+from laneweave.sim_bridge.road.demand import Arrival
 
 QUEUEING_MPS = 3.0
 """Speed below which vehicles are in a queue."""
@@ -25,6 +27,8 @@ QUEUE_DECEL_MPS2 = 3.0
 """Deceleration with which vehicles brake for a queue."""
 SPACE_M = 2.5
 """Net gap in a queue, SUMO's default."""
+HELD_ANNOUNCED = 4
+"""Maximum number of vehicles for each exit that are announced while they are held back."""
 
 
 @frozen
@@ -48,7 +52,7 @@ class _Queue:
 
 
 class ExitRoom:
-    """Knows which exits have room for another vehicle."""
+    """Holds vehicles at the start back while their exits have no room for them."""
 
     def __init__(self, scenario: Scenario, seen_m: float) -> None:
         """Read the exits of a road.
@@ -60,12 +64,51 @@ class ExitRoom:
         self._seen_m = seen_m
         self._braking_m = scenario.formation.speed_mps**2 / (2.0 * QUEUE_DECEL_MPS2)
         self._place_m = scenario.types.longest_body_m + SPACE_M
+        self._held: list[Arrival] = []
+        """Vehicles whose exits have no room."""
+        self._was_held = Counter[str]()
+        """Their number by exit, at the last call."""
         self._ways: dict[str, list[_Way]] = {}
         names = {one.name for one in scenario.exit}
         for section in scenario.geometry.sections:
             if section.exit in names:
                 way = _Way(section.lane, section.to_m, _inside_m(section, scenario.types.step_m))
                 self._ways.setdefault(section.exit, []).append(way)
+
+    def release(
+        self,
+        coming: Sequence[Arrival],
+        ahead: Iterable[Arrival],
+        others: Callable[[], Sequence[OtherBody]],
+    ) -> Sequence[Arrival]:
+        """Return which vehicles at the start may enter; see `OutsideTraffic.release`.
+
+        `others` returns the bodies behind the exits.
+        """
+        held = [*self._held, *coming]
+        if not held:
+            return ()
+        going = Counter(one.destination for one in ahead)
+        waiting, released = Counter[str](), []
+        self._held.clear()
+        for arrival in held:
+            to = arrival.destination
+            if not waiting[to] and self.has_room(to, going[to], self._was_held[to], others()):
+                going[to] += 1
+                released.append(arrival)
+            else:
+                waiting[to] += 1
+                self._held.append(arrival)
+        self._was_held = waiting
+        return released
+
+    @property
+    def announced(self) -> Sequence[Arrival]:
+        """The first vehicles that are held back for each exit."""
+        by_exit: dict[str, list[Arrival]] = {}
+        for arrival in self._held:
+            by_exit.setdefault(arrival.destination, []).append(arrival)
+        return [one for held in by_exit.values() for one in held[:HELD_ANNOUNCED]]
 
     def has_room(
         self, destination: str, going: int, waiting: int, others: Sequence[OtherBody]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 from attrs import evolve, frozen
@@ -25,6 +25,7 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.corridors.exit_room import ExitRoom
 from laneweave.sim_bridge.corridors.settling import LONGEST_S, before_rest_s, fall_back, settling_s
 from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.demand_queue import OutsideTraffic
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter, EntryState
 
 ADVICE_SHARE = 0.9
@@ -43,6 +44,8 @@ BESIDE_COLUMNS = 1
 """Number of columns by which a vehicle rather falls back than entering beside another vehicle."""
 SEEN_BEYOND_M = 200.0
 """Distance behind an exit up to which SUMO's vehicles are seen."""
+STANDING_S = 120.0
+"""Time for which all vehicles stand in queues behind exits when a run ends, after all entries."""
 MAX_COLUMNS = 40
 """Maximum number of columns that are tried."""
 
@@ -91,8 +94,8 @@ class OutsideView(Protocol):
         """The vehicles that have not been taken over."""
 
 
-class TakeOver:
-    """Takes vehicles over from SUMO; see `OutsideTraffic`."""
+class TakeOver(OutsideTraffic):
+    """Takes vehicles over from SUMO."""
 
     def __init__(self, scenario: Scenario, view: OutsideView) -> None:
         """Begin without vehicles.
@@ -130,6 +133,8 @@ class TakeOver:
         self._departing = deque(view.departing)
         self._due: dict[Name, Arrival] = {}
         """Announced vehicles that have not departed."""
+        self._moved_s = 0.0
+        """Road time at which a vehicle on the road moved the last time."""
 
     def demanded(self, t_s: float) -> Sequence[Arrival]:
         """Return the vehicles that have come near an entrance since the last call."""
@@ -151,7 +156,7 @@ class TakeOver:
         while self._departing and self._departing[0].t_s <= t_s + self._announce_s:
             first = self._departing.popleft()
             self._due[Name(first.vehicle)] = first
-        return [*self._known.values(), *self._due.values()]
+        return [*self._known.values(), *self._due.values(), *self._exit_room.announced]
 
     @property
     def exhausted(self) -> bool:
@@ -168,9 +173,9 @@ class TakeOver:
         """Lanes to whose beginning vehicles come from upstream."""
         return self._view.start_lanes
 
-    def has_room(self, destination: str, going: int, waiting: int) -> bool:
-        """Return whether a vehicle that waits at the start may enter; see `ExitRoom`."""
-        return self._exit_room.has_room(destination, going, waiting, self._view.others())
+    def release(self, coming: Sequence[Arrival], ahead: Iterable[Arrival]) -> Sequence[Arrival]:
+        """Return which of the vehicles at the start may enter; see `ExitRoom`."""
+        return self._exit_room.release(coming, ahead, self._view.others)
 
     def full_lanes(self) -> set[int]:
         """Return the lanes to whose start a vehicle is too close for another to enter before it."""
@@ -182,7 +187,7 @@ class TakeOver:
             if one.s_m > -NEAR_S * max(one.speed_mps, self._lattice.speed_mps)
         }
 
-    def admit(self, t_s: float, meter: EntryMeter, occupied: Collection[Cell]) -> list[Admission]:
+    def admit(self, t_s: float, meter: EntryMeter, occupied: Iterable[Cell]) -> list[Admission]:
         """Take over the vehicles whose fronts are at their entrances, and advise the others."""
         admissions = []
         self._occupied = set(occupied)
@@ -200,6 +205,15 @@ class TakeOver:
                 column = admissions[-1].cell[0] - 1
                 del self._known[name]
         return admissions
+
+    def is_stuck(self, t_s: float, *, moving: bool) -> bool:
+        """Return whether all vehicles have stood for long in queues, and no more will come.
+
+        A queue may reach back to the start, where more vehicles wait.
+        """
+        if moving:
+            self._moved_s = t_s
+        return self.exhausted and t_s >= self._moved_s + STANDING_S
 
     def _take(self, one: Approaching, first: int, t_s: float, meter: EntryMeter) -> Admission:
         """Return the entry of a vehicle whose front is at its entrance."""

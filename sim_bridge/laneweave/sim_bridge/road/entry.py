@@ -146,15 +146,16 @@ class EntryMeter:
         )
 
     def keep_free(self, lane: int, count: int, t_s: float) -> range:
-        """Return the next columns of a lane, which no vehicle may enter any more.
-
-        With formations, no vehicle may enter them in any lane.
-        """
+        """Return the next columns of a lane, which no vehicle may enter any more."""
         first = self.next_column(lane)
         if self._builder is not None:
             return self._builder.reserve(first, count, t_s)
         self._columns[lane] = first - count
         return range(first - count + 1, first + 1)
+
+    def lanes_kept_free(self, lane: int) -> Collection[int]:
+        """Return the lanes in which `keep_free` keeps columns free: with formations, all."""
+        return (lane,) if self._builder is None else range(self._lattice.lanes)
 
     def closed_column(self, lane: int) -> int:
         """Return the rearmost column of a lane that vehicles can no longer enter."""

@@ -28,7 +28,7 @@ from laneweave.protocol.vehicle.lane_ends import (
     own_drive_out,
 )
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
-from laneweave.protocol.wire.messages import ClosedFormation, Name, OffLattice
+from laneweave.protocol.wire.messages import Name, OffLattice
 from laneweave.sim_bridge.bodies.motion_controller import (
     BESIDE_M,
     STANDING_MPS,
@@ -71,9 +71,10 @@ class LaneEndChange:
 class LaneEndControl:
     """Vehicles without cells, and the gaps that are kept free for them."""
 
-    def __init__(self, scenario: Scenario, meter: EntryMeter) -> None:
-        """Begin without vehicles."""
+    def __init__(self, scenario: Scenario, meter: EntryMeter, *, gives_up_cells: bool) -> None:
+        """Begin without vehicles; see `CellAllocation.gives_up_cells`."""
         self._meter = meter
+        self._gives_up_cells = gives_up_cells
         self._scenario = scenario
         self._lattice = scenario.lattice
         ends = LaneEnds(scenario)
@@ -89,9 +90,8 @@ class LaneEndControl:
         self._gaps: dict[LaneEnd, list[Gap]] = {end: [] for end in self._ends}
         self._last_gap_column: list[float] = [math.inf] * scenario.road.lanes
         """Rearmost column of the last gap of each lane."""
-        self.formations: list[ClosedFormation] = []
-        """Formations of vehicles that have entered the lattice; the reader removes them."""
-        self._rolling = scenario.formation.rolling
+        self._entered_gaps: list[range] = []
+        """Columns of gaps that vehicles have entered, since they were last taken."""
         self._end_of: dict[Name, LaneEnd | None] = {}
         """Dead end at which each vehicle without cells waits or waited; None: its lane has none."""
 
@@ -102,6 +102,11 @@ class LaneEndControl:
             for gaps in self._gaps.values()
             for gap in gaps
         )
+
+    def pop_entered_gaps(self) -> list[range]:
+        """Return the columns of gaps that vehicles have entered since the last call."""
+        gaps, self._entered_gaps = self._entered_gaps, []
+        return gaps
 
     def update(self, vehicles: Mapping[Name, RoadVehicle], t_s: float) -> Iterator[LaneEndChange]:
         """Advance to road time `t_s`; yield what has changed."""
@@ -114,7 +119,7 @@ class LaneEndControl:
             missed = controller.has_missed_exit(t_s)
             if missed and controller.return_to_origin(t_s):
                 yield LaneEndChange(name, MISSED_EXIT, controller.hold_cell[1])
-            elif (missed and self._rolling) or controller.has_lost_cell(t_s):
+            elif (missed and self._gives_up_cells) or controller.has_lost_cell(t_s):
                 # While it drives out, a vehicle may come to another dead end.
                 self._forget(name)
                 yield self._take_off(name, vehicle)
@@ -151,11 +156,8 @@ class LaneEndControl:
         """Keep the next columns of a lane free, unless the last gap was too close ahead."""
         if lane is None:
             return  # `road_checks` refuses such roads
-        waiting = self._meter.waiting
-        if self._rolling:
-            crowded, taken = any(arrival.lane == lane for arrival in waiting), {lane}
-        else:
-            crowded, taken = bool(waiting), {*range(self._lattice.lanes)}
+        taken = self._meter.lanes_kept_free(lane)
+        crowded = any(arrival.lane in taken for arrival in self._meter.waiting)
         between = (CROWDED_GAPS if crowded else OPEN_GAPS) * self._columns
         if self._meter.next_column(lane) < self._last_gap_column[lane] - between:
             columns = self._meter.keep_free(lane, self._columns, t_s)
@@ -224,9 +226,7 @@ class LaneEndControl:
             vehicles[name].enter_lattice(gap.cells)
             gaps.remove(gap)
             del self._end_of[name]
-            if not self._rolling:
-                first, last = map(self._lattice.block_of, (gap.columns[-1], gap.columns[0]))
-                self.formations.append(ClosedFormation(first, last, t_s))
+            self._entered_gaps.append(gap.columns)
             yield LaneEndChange(name, ENTERED_LATTICE, gap.lane)
 
     def _is_over(self, gap: Gap, end: LaneEnd, t_s: float) -> bool:

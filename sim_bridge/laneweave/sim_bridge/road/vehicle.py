@@ -63,9 +63,7 @@ class RoadVehicle:
         )
         if settle_s > 0.0:
             controller.motion_end_tick = round((t_s + settle_s) / tick_s)
-        if scenario.formation.rolling:
-            for cell in (admission.cell, *admission.more_cells):
-                controller.store.assign_cell(cell)
+        controller.enter_lattice((admission.cell, *admission.more_cells))
         formation = None if scenario.formation.closes_by_vehicles else controller.record.joined[0]
         sensors = Sensors(scenario, name)
         return cls(name, admission, controller, sensors, formation, bridge, t_s + ready_s)

@@ -18,6 +18,7 @@ from laneweave.launch.run.reference_run import ReferenceRun, Standstill
 from laneweave.launch.run_methods import LC2013, RULE, reference_method
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.sim_bridge import road_sources
 from laneweave.sim_bridge.baselines import reference_road as road
 from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod
 from laneweave.sim_bridge.baselines.reference_road import ReferenceVehicle
@@ -99,7 +100,7 @@ def test_a_lone_vehicle_takes_as_long_as_the_road_is(
     tmp_path: Path, method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lone = Arrival("v0001", 0, 2, 61.234)
-    monkeypatch.setattr(road, "arrivals", lambda _: (lone,))
+    monkeypatch.setattr(road_sources, "arrivals", lambda _: (lone,))
     finished(Scenario(), tmp_path, method)
     travel_time_s = read_summary(tmp_path)["travel_time_s"]
     assert travel_time_s["mean"] == pytest.approx(1000.0 / 15.0, abs=1e-3)

@@ -18,7 +18,7 @@ from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffL
 from laneweave.sim_bridge.road import lane_end_control
 from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.lane_end_control import LaneEndControl
-from laneweave.sim_bridge.road.roadside import Roadside
+from laneweave.sim_bridge.road.roadside import EntranceRoom
 from support.closed_lanes import LonelyRoad, road_with
 from support.states import set_record
 
@@ -37,7 +37,7 @@ def lonely_road(scenario: Scenario, volume: float, duration_s: float, seed: int 
 def check(road: LonelyRoad) -> None:
     """Step until all vehicles have left the road; each tick is checked."""
     owners: dict[Cell, Name] = {}
-    while not road.roadside.exhausted(road.t_s) or road.vehicles:
+    while not road.roadside.demand.exhausted(road.t_s) or road.vehicles:
         road.step()
         assert road.t_s < MAX_S, "a vehicle is still on the road"
         assert road.overlaps == []
@@ -106,7 +106,7 @@ def test_the_census_tells_where_they_stand() -> None:
     (end,) = dead_ends(DROP)
     while sum(kind == LEFT_LATTICE for _, kind, _ in road.events) < 3 or road.t_s < 90.0:
         road.step()
-    census = road.roadside.census(road.t_s, road.vehicles.values())
+    census = road.roadside.publisher.census(road.t_s, road.vehicles.values())
     bodies = {
         entry.vehicle: entry.off_lattice
         for entry in census.on_road
@@ -127,10 +127,10 @@ def test_a_queue_that_reaches_the_entrance_keeps_vehicles_from_entering(
     monkeypatch: pytest.MonkeyPatch, *, blind: bool
 ) -> None:
     if blind:
-        monkeypatch.setattr(Roadside, "_full_lanes", lambda *_: set())
+        monkeypatch.setattr(EntranceRoom, "full_lanes", lambda *_: set())
     road = lonely_road(road_with(Closure(0, 300.0), s3_m=350.0), 2200.0, 80.0)
     longest = 0
-    while not road.overlaps and (road.vehicles or not road.roadside.exhausted(road.t_s)):
+    while not road.overlaps and (road.vehicles or not road.roadside.demand.exhausted(road.t_s)):
         road.step()
         assert road.t_s < MAX_S
         longest = max(longest, sum(one.state[1] < 1.0 for one in road.vehicles.values()))
@@ -140,11 +140,11 @@ def test_a_queue_that_reaches_the_entrance_keeps_vehicles_from_entering(
 
 def test_a_vehicle_may_leave_the_road_while_it_drives_out() -> None:
     road = lonely_road(road_with(Closure(0, 590.0), s3_m=450.0), 20.0, 200.0)
-    while road.vehicles or not road.roadside.exhausted(road.t_s):
+    while road.vehicles or not road.roadside.demand.exhausted(road.t_s):
         road.step()
         assert road.t_s < MAX_S
         # Also in the tick in which it has left.
-        road.roadside.census(road.t_s, road.vehicles.values())
+        road.roadside.publisher.census(road.t_s, road.vehicles.values())
     assert DRIVES_OUT in {kind for _, kind, _ in road.events}
 
 
@@ -154,7 +154,7 @@ def test_one_gap_for_each_vehicle() -> None:
     keep_free = EntryMeter.keep_free
     road.roadside._lane_ends._meter = meter = road.roadside._meter
     meter.keep_free = lambda lane, *more: asked.append(lane) or keep_free(meter, lane, *more)  # type: ignore[method-assign, func-returns-value]
-    while road.vehicles or not road.roadside.exhausted(road.t_s):
+    while road.vehicles or not road.roadside.demand.exhausted(road.t_s):
         road.step()
     out = [one for _, kind, one in road.events if kind == DRIVES_OUT]
     assert len(asked) == len(out) > 0
@@ -169,7 +169,7 @@ def test_a_vehicle_that_cannot_drive_out_in_time_waits_at_the_next_end() -> None
     controller = road.vehicles[name].controller
     # As if it had been delayed: its cell is far ahead.
     controller.hold_cell = (controller.hold_cell[0] + 12, 1)
-    while road.vehicles or not road.roadside.exhausted(road.t_s):
+    while road.vehicles or not road.roadside.demand.exhausted(road.t_s):
         road.step()
         assert road.overlaps == []
         assert road.t_s < MAX_S

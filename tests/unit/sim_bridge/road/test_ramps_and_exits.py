@@ -28,7 +28,7 @@ BALLOT = Ballot(1, Name("c"), 1, 1)
 def run(road: LonelyRoad, *, owners_checked: bool = True) -> None:
     """Step until all vehicles have left; no body touches another, no cell has two owners."""
     owners: dict[Cell, Name] = {}
-    while road.vehicles or not road.roadside.exhausted(road.t_s):
+    while road.vehicles or not road.roadside.demand.exhausted(road.t_s):
         road.step()
         assert road.t_s < MAX_S, "a vehicle is still on the road"
         assert road.overlaps == []
@@ -131,7 +131,7 @@ def test_a_queue_on_a_ramp_keeps_vehicles_from_entering_until_there_is_room_to_m
 
 def departed(transfer: PendingTransfer | None) -> tuple[MotionController, MotionController]:
     """Let a vehicle with two cells leave; return its controller and that of the one behind it."""
-    roadside = Roadside(WEAVING)
+    roadside = Roadside(WEAVING, ())
     gone, behind = (
         vehicle_in(cell, name, WEAVING) for cell, name in (((0, 1), "A"), ((-3, 1), "B"))
     )

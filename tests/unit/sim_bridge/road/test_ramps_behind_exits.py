@@ -81,7 +81,7 @@ def owners_of(road: LonelyRoad) -> dict[Cell, list[Name]]:
 
 def drive(road: LonelyRoad) -> None:
     """Drive until nobody is left; no cell ever has two owners."""
-    while road.vehicles or not road.roadside.exhausted(road.t_s):
+    while road.vehicles or not road.roadside.demand.exhausted(road.t_s):
         road.step()
         assert road.t_s < 900.0
         assert all(len(names) == 1 for names in owners_of(road).values())

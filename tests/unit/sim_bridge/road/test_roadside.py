@@ -15,10 +15,13 @@ from laneweave.protocol.runtime.node import Send
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.structuring import structure
 from laneweave.protocol.wire.messages import Census, ClosedFormation, Name, RoadClock
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.bodies.plant import Plant
-from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.corridors.exit_room import HELD_ANNOUNCED
+from laneweave.sim_bridge.corridors.take_over import STANDING_S, Approaching, TakeOver
+from laneweave.sim_bridge.road.demand import Arrival, arrivals
 from laneweave.sim_bridge.road.entry import Admission
-from laneweave.sim_bridge.road.roadside import HELD_ANNOUNCED, STANDING_S, Roadside
+from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.paper import closing_time_s, paper
 from support.road_vehicles import vehicle_in
@@ -59,7 +62,7 @@ class Watch:
 
     def __init__(self, scenario: Scenario) -> None:
         """Prepare a roadside."""
-        self.roadside = Roadside(scenario)
+        self.roadside = Roadside(scenario, arrivals(scenario))
         self.demanded: set[str] = set()
         self.announced: set[str] = set()
         self.entered: list[str] = []
@@ -68,25 +71,25 @@ class Watch:
 
     def run(self) -> None:
         tick = 0
-        while not self.roadside.exhausted(tick * self._scenario.runtime.tick_s):
+        while not self.roadside.demand.exhausted(tick * self._scenario.runtime.tick_s):
             self.tick(tick)
             tick += 1
             assert tick < 1_000_000
-        counts = self.roadside.clock(tick, 0.0, on_road=0)
+        counts = self.roadside.publisher.clock(tick, 0.0, on_road=0)
         assert counts.demanded == counts.entered == len(self.entered) == len(set(self.entered))
 
     def tick(self, tick: int) -> None:
         roadside, t_s = self.roadside, tick * self._scenario.runtime.tick_s
-        self.demanded |= {arrival.vehicle for arrival in roadside.newly_demanded(t_s)}
+        self.demanded |= {arrival.vehicle for arrival in roadside.demand.newly_demanded(t_s)}
         for admission in roadside.admit(t_s):
             vehicle = admission.arrival.vehicle
             assert vehicle in self.demanded
             assert vehicle in self.announced
             self.entered.append(vehicle)
-        counts = roadside.clock(tick, t_s, on_road=0)
+        counts = roadside.publisher.clock(tick, t_s, on_road=0)
         assert (counts.demanded, counts.entered) == (len(self.demanded), len(self.entered))
-        roadside.update_announcements(t_s)
-        announced = roadside.census(t_s, ()).announced
+        roadside.publisher.update_announcements(t_s)
+        announced = roadside.publisher.census(t_s, ()).announced
         assert [(a.arrival_s, a.vehicle) for a in announced] == sorted(
             (a.arrival_s, a.vehicle) for a in announced
         )
@@ -130,29 +133,30 @@ def test_demand_is_counted_before_the_entry_however_awkward_or_long_the_ticks(
 
 def test_announcements_come_in_time_and_say_what_is_known() -> None:
     scenario = parse_scenario({"demand": {"volume_veh_per_lane_h": 200, "duration_s": 100}})
-    roadside = Roadside(scenario)
+    stream = arrivals(scenario)
+    roadside = Roadside(scenario, stream)
     seen: dict[str, float] = {}
     for tick in range(1200):
         t_s = 0.1 * tick
-        roadside.newly_demanded(t_s)
+        roadside.demand.newly_demanded(t_s)
         roadside.admit(t_s)
-        roadside.update_announcements(t_s)
-        assert not roadside.update_announcements(t_s)
-        for announcement in roadside.census(t_s, ()).announced:
+        roadside.publisher.update_announcements(t_s)
+        assert not roadside.publisher.update_announcements(t_s)
+        for announcement in roadside.publisher.census(t_s, ()).announced:
             seen.setdefault(announcement.vehicle, t_s)
-            arrival = next(a for a in roadside._arrivals if a.vehicle == announcement.vehicle)
+            arrival = next(a for a in stream if a.vehicle == announcement.vehicle)
             assert announcement.lane == arrival.lane
             assert announcement.preferred_lane == arrival.preferred_lane
             assert announcement.arrival_s == arrival.t_s
-    assert len(seen) == len(roadside._arrivals) > 5
-    for arrival in roadside._arrivals:
+    assert len(seen) == len(stream) > 5
+    for arrival in stream:
         # The queues are short here: no vehicle waits for an announcement.
         assert arrival.t_s - seen[arrival.vehicle] > min(arrival.t_s, 5.9) - 0.2
 
 
 def test_the_census_lists_the_road_as_it_was_entered() -> None:
     scenario = Scenario()
-    roadside = Roadside(scenario)
+    roadside = Roadside(scenario, arrivals(scenario))
     admissions: list[Admission] = []
     tick = 0
     while not admissions:
@@ -161,22 +165,22 @@ def test_the_census_lists_the_road_as_it_was_entered() -> None:
     vehicles = [RoadVehicle.entering(each, 0.1 * tick, scenario) for each in admissions]
     for vehicle in vehicles:
         vehicle.controller.hold_cell = (9, 9)  # wherever it is by now
-    entries = roadside.census(9.0, vehicles).on_road
+    entries = roadside.publisher.census(9.0, vehicles).on_road
     assert [(e.vehicle, e.cell, e.entered_s) for e in entries] == [
         (a.arrival.vehicle, a.cell, a.t_s) for a in admissions
     ]
 
 
 def test_the_clock_has_the_counts() -> None:
-    roadside = Roadside(Scenario())
+    roadside = Roadside(Scenario(), ())
     roadside.on_left(vehicle_in((0, 1)), {}, 1.0)
-    clock = roadside.clock(5, 0.5, 7, ended=True)
+    clock = roadside.publisher.clock(5, 0.5, 7, ended=True)
     assert clock == RoadClock(5, 0.5, demanded=0, entered=0, on_road=7, left=1, ended=True)
 
 
 @pytest.mark.parametrize("ended", [False, True])
 def test_all_news_name_the_bridge_that_they_come_from(*, ended: bool) -> None:
-    news = list(Roadside(Scenario(), 17).publish(0, 0.0, (), ended=ended))
+    news = list(Roadside(Scenario(), (), 17).publish(0, 0.0, (), ended=ended))
     messages = [effect.message for effect in news if isinstance(effect, Send)]
     assert [type(message) for message in messages] == [RoadClock, Census]
     assert [message.bridge for message in messages] == [17, 17]
@@ -184,20 +188,20 @@ def test_all_news_name_the_bridge_that_they_come_from(*, ended: bool) -> None:
 
 def test_is_not_exhausted_before_the_last_arrival() -> None:
     scenario = parse_scenario({"demand": {"volume_veh_per_lane_h": 60, "duration_s": 60}})
-    roadside = Roadside(scenario)
-    last_s = roadside._arrivals[-1].t_s
-    assert not roadside.exhausted(last_s + 1.0)  # none has been queued
+    stream = arrivals(scenario)
+    roadside, last_s = Roadside(scenario, stream), stream[-1].t_s
+    assert not roadside.demand.exhausted(last_s + 1.0)  # none has been queued
     roadside.admit(last_s - 0.01)
-    assert not roadside.exhausted(last_s + 1.0)  # a vehicle waits
+    assert not roadside.demand.exhausted(last_s + 1.0)  # a vehicle waits
     roadside.admit(last_s + 60.0)
-    assert not roadside.exhausted(last_s - 0.01)
-    assert roadside.exhausted(last_s)
+    assert not roadside.demand.exhausted(last_s - 0.01)
+    assert roadside.demand.exhausted(last_s)
 
 
 def test_a_census_reports_a_closed_block_at_once() -> None:
     """The leader need not wait for the next second to know a roster."""
     scenario = paper(load_scenario(None, seed=1, demand__duration_s=0.001))
-    roadside = Roadside(scenario)
+    roadside = Roadside(scenario, arrivals(scenario))
     tick_s, reported = scenario.runtime.tick_s, {}
     for tick in range(100):
         roadside.close_formations(tick * tick_s)
@@ -222,7 +226,8 @@ class CensusWatch:
     left: int = 0
 
     def run(self, end_s: float) -> None:
-        roadside, tick_s = Roadside(self.scenario), self.scenario.runtime.tick_s
+        tick_s = self.scenario.runtime.tick_s
+        roadside = Roadside(self.scenario, arrivals(self.scenario))
         for tick in range(round(end_s / tick_s)):
             self._tick(roadside, tick, tick * tick_s)
 
@@ -288,11 +293,12 @@ def test_a_census_reports_owners_of_columns_and_closed_ones(volume: float) -> No
 
 
 def test_a_census_of_the_rolling_operation_has_no_formations() -> None:
-    roadside = Roadside(load_scenario(None, formation__operation="rolling"))
+    scenario = load_scenario(None, formation__operation="rolling")
+    roadside = Roadside(scenario, arrivals(scenario))
     for tick in range(600):
         roadside.admit(0.1 * tick)
         assert roadside.close_formations(0.1 * tick) == []
-    census = roadside.census(60.0, ())
+    census = roadside.publisher.census(60.0, ())
     assert (census.formations, census.closed_to) == ((), -1)
 
 
@@ -311,59 +317,53 @@ OFF_RAMP = {
 
 
 @define
-class Gate:
-    """Outside traffic without vehicles, which may hold back those that wait at the start."""
+class Outside:
+    """No traffic outside but a queue, which leaves no room behind the exit."""
 
-    room: bool = True
+    full: bool = True
     exhausted: bool = False
     start_lanes: tuple[int, ...] = ()
-    never_came: tuple[Arrival, ...] = ()
+    departing: tuple[Arrival, ...] = ()
+    outside: tuple[Arrival, ...] = ()
 
-    def demanded(self, _: float) -> list[Arrival]:
+    def approaching(self, _: int) -> list[Approaching]:
         return []
 
-    def announced(self, _: float) -> list[Arrival]:
-        return []
+    def advise(self, *_: object) -> None:
+        """Do nothing."""
 
-    def has_room(self, destination: str, going: int, waiting: int) -> bool:
-        del going, waiting
-        return self.room or destination != "off"
-
-    def full_lanes(self) -> set[int]:
-        return set()
-
-    def admit(self, *_: object) -> list[Admission]:
-        return []
+    def others(self) -> list[OtherBody]:
+        return [OtherBody("queue", 0, 800.0, 801.0, 0.0, 0.0)] if self.full else []
 
 
-def held_roadside(gate: Gate, exits: int) -> tuple[Roadside, Scenario]:
+def held_roadside(outside: Outside, exits: int) -> tuple[Roadside, Scenario]:
     scenario = parse_scenario(OFF_RAMP)
     stream = tuple(
         Arrival(f"v{n:04}", 1, ANY_LANE, 2.0 + 2.0 * n, "off" if n <= exits else END_OF_ROAD)
         for n in range(1, 9)
     )
-    return Roadside(scenario, stream=stream, outside_traffic=gate), scenario
+    return Roadside(scenario, stream, outside_traffic=TakeOver(scenario, outside)), scenario
 
 
 def admitted(roadside: Roadside, scenario: Scenario, from_s: float, to_s: float) -> list[Admission]:
     found: list[Admission] = []
     tick_s = scenario.runtime.tick_s
     for tick in range(round(from_s / tick_s), round(to_s / tick_s)):
-        roadside.newly_demanded(tick * tick_s)
+        roadside.demand.newly_demanded(tick * tick_s)
         found += roadside.admit(tick * tick_s)
-        roadside.update_announcements(tick * tick_s)
+        roadside.publisher.update_announcements(tick * tick_s)
     return found
 
 
 def test_a_vehicle_that_is_held_back_is_announced_and_enters_when_it_is_released() -> None:
-    gate = Gate(room=False)
-    roadside, scenario = held_roadside(gate, exits=1)
+    outside = Outside()
+    roadside, scenario = held_roadside(outside, exits=1)
     before = admitted(roadside, scenario, 0.0, 60.0)
     # It does not keep those behind it back.
     assert [one.arrival.vehicle for one in before] == [f"v{n:04}" for n in range(2, 9)]
-    assert [one.vehicle for one in roadside.census(60.0, ()).announced] == ["v0001"]
-    assert not roadside.exhausted(60.0)
-    gate.room = True
+    assert [one.vehicle for one in roadside.publisher.census(60.0, ()).announced] == ["v0001"]
+    assert not roadside.demand.exhausted(60.0)
+    outside.full = False
     (late,) = admitted(roadside, scenario, 60.0, 65.0)
     assert late.arrival.vehicle == "v0001"
     # It does not enter in the past, where its body would be on the road already.
@@ -371,22 +371,22 @@ def test_a_vehicle_that_is_held_back_is_announced_and_enters_when_it_is_released
 
 
 def test_few_vehicles_of_those_that_are_held_back_are_announced() -> None:
-    roadside, scenario = held_roadside(Gate(room=False), exits=7)
+    roadside, scenario = held_roadside(Outside(), exits=7)
     assert len(admitted(roadside, scenario, 0.0, 60.0)) == 1
-    assert len(roadside.census(60.0, ()).announced) == HELD_ANNOUNCED
+    assert len(roadside.publisher.census(60.0, ()).announced) == HELD_ANNOUNCED
 
 
 def test_a_road_on_which_all_stand_is_over_when_no_more_vehicles_come() -> None:
-    gate = Gate(room=False)
-    roadside, scenario = held_roadside(gate, exits=7)
+    outside = Outside()
+    roadside, scenario = held_roadside(outside, exits=7)
     (one,) = admitted(roadside, scenario, 0.0, 60.0)
     vehicle = RoadVehicle.entering(one, 20.0, scenario, 0)
     vehicles = {vehicle.name: vehicle}
     assert not roadside.is_over(60.0, vehicles)
     standing = (100.0, 0.0, 0.0, 1.75, 0.0, 0.0)
     vehicle.controller.plant = Plant(standing, scenario.vehicle, 0.1)
-    gate.exhausted = True
+    outside.exhausted = True
     assert not roadside.is_over(60.0 + 0.5 * STANDING_S, vehicles)
     assert roadside.is_over(60.0 + STANDING_S, vehicles)
-    gate.exhausted = False
+    outside.exhausted = False
     assert not roadside.is_over(60.0 + STANDING_S, vehicles)

@@ -11,9 +11,10 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell, Lattice
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.road.allocation import MAX_EMPTY
 from laneweave.sim_bridge.road.demand import Arrival, arrivals
 from laneweave.sim_bridge.road.entry import EntryMeter
-from laneweave.sim_bridge.road.roadside import MAX_EMPTY, Roadside
+from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 LANES = 3
@@ -101,9 +102,8 @@ class Entrance:
     tick: int = 0
 
     def __attrs_post_init__(self) -> None:
-        """Replace the demand."""
-        self.roadside = Roadside(self.scenario)
-        self.roadside._arrivals = tuple(self.stream)
+        """Make the roadside."""
+        self.roadside = Roadside(self.scenario, self.stream)
 
     def run(self, until_s: float) -> Entrance:
         while self.tick * self.tick_s <= until_s:

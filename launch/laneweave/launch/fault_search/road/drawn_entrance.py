@@ -7,7 +7,6 @@ vehicles are on the road at the start, in drawn cells, formations and owners of 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Protocol
 
 from attrs import frozen
 
@@ -16,10 +15,11 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect, Send
 from laneweave.protocol.wire.messages import Census, CensusEntry, ClosedFormation, Name, RoadClock
 from laneweave.protocol.wire.topics import CENSUS, CLOCK
+from laneweave.sim_bridge.road.census import CENSUS_EVERY_TICKS
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.lane_end_control import LaneEndChange
-from laneweave.sim_bridge.road.roadside import CENSUS_EVERY_TICKS
+from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 CLOCK_EVERY_TICKS = 2
@@ -35,32 +35,6 @@ class Grant:
     t_s: float
     owner: Name
     cell: Cell
-
-
-class Entrance(Protocol):
-    """What the road needs of its entrance; times are road times. See `Roadside`."""
-
-    def admit(self, t_s: float) -> list[Admission]:
-        """Return the vehicles that have entered since the last call."""
-
-    def close_formations(self, t_s: float) -> list[ClosedFormation]:
-        """Return the formations closed since the last call."""
-
-    def assign_empty_cells(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
-        """Assign empty cells to vehicles (rolling operation)."""
-
-    def control_lane_ends(
-        self, vehicles: Mapping[Name, RoadVehicle], t_s: float
-    ) -> Sequence[LaneEndChange]:
-        """Take vehicles off the lattice whose lanes end, and bring them back."""
-
-    def on_left(
-        self, vehicle: RoadVehicle, vehicles: Mapping[Name, RoadVehicle], t_s: float
-    ) -> None:
-        """Count a vehicle that has left the road, and pass its cells on."""
-
-    def publish(self, tick: int, t_s: float, on_road: Collection[RoadVehicle]) -> Iterator[Effect]:
-        """Publish clock and census."""
 
 
 class DrawnEntrance:
@@ -155,3 +129,6 @@ class DrawnEntrance:
             present = {each.formation for each in on_road}
             closed = tuple(one for one in self._closed if one.first_block in present)
             yield Send(CENSUS, Census(t_s, entries, (), closed, self._closed_to, self._bridge))
+
+
+Entrance = DrawnEntrance | Roadside

@@ -125,8 +125,7 @@ class LightVehicle(RoadVehicle):
             MotionController(self.body, scenario, admission.cell),
             bridge=bridge,
         )
-        if scenario.formation.rolling:
-            self.controller.store.assign_cell(admission.cell)
+        self.controller.enter_lattice((admission.cell,))
         if not scenario.formation.closes_by_vehicles:
             self.formation = self.controller.record.joined[0]
         self.clock_jump_s = 0.0

@@ -1,0 +1,301 @@
+"""What vehicles get at the entrances besides their cells, depending on the operation.
+
+In formations, blocks of columns belong to a formation as soon as it is closed. In the rolling
+operation, every cell belongs to at most one vehicle. `allocation_of` selects one of them; no other
+part of the roadside depends on the operation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+
+from attrs import evolve
+
+from laneweave.protocol.lattice import Cell, Lattice
+from laneweave.protocol.road_layout import END_OF_ROAD
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.wire.messages import ClosedFormation, Name
+from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.formation_building import FormationBuilder, formation_builder
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+
+NO_VEHICLES: Mapping[Name, RoadVehicle] = MappingProxyType({})
+"""The empty road, as a default argument."""
+MAX_EMPTY = 12
+"""Maximum distance in columns between a vehicle and empty cells assigned to it; smaller if moves
+begin near the entrance, since all cells must be assigned before a plan can transfer them."""
+
+
+class BlockAllocation:
+    """Blocks of columns for formations; vehicles own no cells."""
+
+    gives_up_cells = False
+
+    def __init__(self, builder: FormationBuilder) -> None:
+        """Begin without formations."""
+        self.builder = builder
+
+    @property
+    def closed_to(self) -> int:
+        """Block up to which all blocks are closed."""
+        return self.builder.closed_to
+
+    def close_formations(self, t_s: float, gaps: Sequence[range]) -> list[ClosedFormation]:
+        """Return the formations closed since the last call.
+
+        A vehicle that has entered the columns of one of the `gaps` is a formation of its own.
+        """
+        block_of = self.builder.lattice.block_of
+        alone = [ClosedFormation(block_of(gap[-1]), block_of(gap[0]), t_s) for gap in gaps]
+        return self.builder.closed(t_s) + alone
+
+    def is_free(self, cell: Cell) -> bool:
+        """Return True: the builder decides whether a vehicle on a ramp can use a cell."""
+        del cell
+        return True
+
+    def begin_tick(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
+        """Begin a tick."""
+
+    def admit(self, admissions: list[Admission]) -> list[Admission]:
+        """Return the vehicles that enter, without further cells."""
+        return admissions
+
+    def assign_empty_cells(
+        self, vehicles: Mapping[Name, RoadVehicle], closed: Sequence[int]
+    ) -> None:
+        """Assign no cells."""
+
+    def on_left(
+        self, vehicle: RoadVehicle, vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> None:
+        """Pass on no cells."""
+
+
+class CellAllocation:
+    """Cells of the rolling operation: each belongs to at most one vehicle."""
+
+    builder: FormationBuilder | None = None
+    closed_to = -1
+    gives_up_cells = True
+    """Whether a vehicle that misses an exit, and cannot return to its lane, gives up its cells."""
+
+    def __init__(self, scenario: Scenario, is_kept_free: Callable[[Cell], bool]) -> None:
+        """Begin without vehicles.
+
+        Args:
+            scenario: road, types of vehicles.
+            is_kept_free: returns whether a cell belongs to a gap (`LaneEndControl`).
+        """
+        self._lattice: Lattice = scenario.lattice
+        self._length_m = scenario.road.length_m
+        self._entry_m = scenario.geometry.entry_m
+        """Where the cells of each lane are assigned."""
+        self._shared_lanes = scenario.geometry.shared_exit_lanes
+        self._keep_columns = not scenario.formation.change_columns
+        self._is_kept_free = is_kept_free
+        columns = int(scenario.geometry.moves_from_m / self._lattice.pitch_m)
+        self._max_empty = max(0, min(MAX_EMPTY, columns - 2))
+        self._vehicles = NO_VEHICLES
+        """The vehicles on the road."""
+        self._lost = set[Cell]()
+        """Cells of shared lanes that may belong to a vehicle that nothing on the road knows yet."""
+        self._owned: set[Cell] | None = None
+        """Cells that a vehicle may own, and those in `_lost`; None: not determined yet."""
+        self._recent: list[tuple[int, int, Name]] = []
+        """(column, lane, name) of recently entered vehicles."""
+        self._next: list[list[tuple[int, Name]]] = [[] for _ in self._entry_m]
+        """Vehicles that have entered since cells were last assigned, by lane, foremost first."""
+        self._unassigned: list[Cell] = []
+        """Empty cells without an owner."""
+        self._assigned_to = [
+            MAX_EMPTY + int(at_m // self._lattice.pitch_m) + 1 for at_m in self._entry_m
+        ]
+        """Last column of each lane whose cells have been processed."""
+        self._ownerless_from = tuple(self._assigned_to)
+        """First column of each lane that had passed its entrance before the road began."""
+        self._ownerless = set[Cell]()
+        """Cells that have never had an owner, since no vehicle was near them at the entrance."""
+        self._given = set[Cell]()
+        """Cells of these columns that have been assigned since."""
+
+    def close_formations(self, t_s: float, gaps: Sequence[range]) -> list[ClosedFormation]:
+        """Return nothing: there are no formations."""
+        del t_s, gaps
+        return []
+
+    def begin_tick(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
+        """Begin a tick, before vehicles enter behind those on the road."""
+        self._vehicles, self._owned = vehicles, None
+
+    def admit(self, admissions: list[Admission]) -> list[Admission]:
+        """Return the vehicles that enter, with all cells that they get."""
+        admissions = [self._with_ownerless(admission) for admission in admissions]
+        for admission in admissions:
+            column, lane = admission.cell
+            self._next[lane].append((column, Name(admission.arrival.vehicle)))
+            self._given.update(admission.more_cells)
+        return admissions
+
+    def _with_ownerless(self, admission: Admission) -> Admission:
+        """Add cells beside a vehicle from a ramp that have never had an owner.
+
+        Without an owner no vehicle could enter them. A vehicle that changes columns reaches others.
+        """
+        column, lane = admission.cell
+        if self._entry_m[lane] <= 0.0 or not self._keep_columns:
+            return admission
+        beside = [(column, other) for other in range(len(self._entry_m)) if other != lane]
+        free = [cell for cell in beside if self._is_ownerless(cell)]
+        self._given.update(free)
+        self._ownerless.difference_update(free)
+        self._unassigned = [cell for cell in self._unassigned if cell not in self._given]
+        return evolve(admission, more_cells=(*admission.more_cells, *free))
+
+    def _is_ownerless(self, cell: Cell) -> bool:
+        """Return whether a cell has never had an owner."""
+        first = self._ownerless_from[cell[1]]
+        return cell not in self._given and (
+            cell[0] >= first or cell in self._ownerless or cell in self._unassigned
+        )
+
+    def assign_empty_cells(
+        self, vehicles: Mapping[Name, RoadVehicle], closed: Sequence[int]
+    ) -> None:
+        """Assign empty cells at the entrances to vehicles near them.
+
+        A cell is assigned once no vehicle can enter it any more: up to the `closed` column of each
+        lane. A cell without a vehicle nearby waits for the next vehicles; if it is too far ahead of
+        them, it remains without an owner.
+        """
+        self._owned = None
+        for lane, last in enumerate(closed):
+            for column in range(self._assigned_to[lane] - 1, last - 1, -1):
+                if self._next[lane] and self._next[lane][0][0] == column:
+                    self._store_recent(column, lane, self._next[lane].pop(0)[1])
+                elif (
+                    not self._is_kept_free((column, lane))
+                    and (column, lane) not in self._given
+                    and (lane not in self._shared_lanes or self.is_free((column, lane)))
+                ):
+                    self._assign((column, lane), vehicles)
+            self._assigned_to[lane] = last
+        unassigned, self._unassigned = self._unassigned, []
+        for cell in unassigned:
+            if cell[0] <= self._assigned_to[cell[1]] + 2 * self._max_empty:
+                self._assign(cell, vehicles)
+            else:
+                self._ownerless.add(cell)
+
+    def is_free(self, cell: Cell) -> bool:
+        """Return whether a vehicle on a ramp can use a cell.
+
+        Behind an exit in the same lane, no vehicle may own it. A pending transfer may give the cell
+        to a vehicle later; those of vehicles that have left are in `_lost`. Vehicles that do not
+        change columns must not enter beside a gap that is kept free, which they could not enter.
+        """
+        column, lane = cell
+        if self._keep_columns and any(
+            self._is_kept_free((column, beside)) for beside in (lane - 1, lane + 1)
+        ):
+            return False
+        if lane not in self._shared_lanes:
+            return True
+        if self._owned is None:
+            self._owned = self._lost.union(
+                *(vehicle.controller.store.possible_cells for vehicle in self._vehicles.values())
+            )
+        return cell not in self._owned
+
+    def _assign(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
+        """Assign an empty cell to a nearby vehicle, preferably one ahead of it in its lane.
+
+        If vehicles keep their columns, only those of its column need the cell: preferably one of
+        them, so that few vehicles have to agree to a move.
+        """
+        column, lane = cell
+        first, last = column - self._max_empty, column + self._max_empty
+        near = [
+            (
+                self._keep_columns and entered != column,
+                entered < column,
+                number != lane,
+                abs(entered - column),
+                name,
+            )
+            for entered, number, name in self._recent
+            if first <= entered <= last
+            and name in vehicles
+            and vehicles[name].controller.off_lattice is None
+            and self._keeps_cells(vehicles[name])
+        ]
+        if near:
+            vehicles[min(near)[-1]].controller.store.assign_cell(cell)
+        else:
+            self._unassigned.append(cell)
+
+    def _keeps_cells(self, vehicle: RoadVehicle) -> bool:
+        """Return whether a vehicle may get empty cells.
+
+        Where a ramp follows an exit, vehicles that leave by the exit get none: those from the ramp
+        need the agreement of the owners of such cells, while these leave.
+        """
+        return not self._shared_lanes or vehicle.arrival.destination == END_OF_ROAD
+
+    def _store_recent(self, column: int, lane: int, name: Name) -> None:
+        """Add an entered vehicle to the recent ones, and drop those far ahead of it."""
+        far = max(self._assigned_to) + 2 * self._max_empty
+        self._recent = [one for one in self._recent if one[0] <= far]
+        self._recent.append((column, lane, name))
+
+    def on_left(
+        self, vehicle: RoadVehicle, vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> None:
+        """Pass on the cells of a vehicle that has left the road.
+
+        No later plan can contain it, so the cells that it owns whichever way its pending transfer
+        resolves can be assigned again.
+        """
+        lattice, certain = self._lattice, vehicle.controller.store.certain_cells
+        self._lost |= {
+            cell
+            for cell in vehicle.controller.store.possible_cells - certain
+            if cell[1] in self._shared_lanes
+        }
+        for cells in (self._given, self._ownerless, self._lost):
+            cells -= {
+                cell for cell in cells if lattice.passing_time_s(cell[0], self._length_m) < t_s
+            }
+        on_lattice = [
+            one
+            for one in vehicles.values()
+            if one.controller.off_lattice is None and self._keeps_cells(one)
+        ]
+        if not on_lattice:
+            return
+        for column, lane in sorted(certain):
+            s_m = lattice.cell_s_m(column, t_s)
+            if lane in self._shared_lanes and s_m < self._entry_m[lane]:
+                continue  # for vehicles on the ramp
+            if s_m < self._length_m:
+                near = min(
+                    on_lattice,
+                    key=lambda one: (
+                        abs(one.controller.hold_cell[0] - column),
+                        abs(one.controller.hold_cell[1] - lane),
+                        one.name,
+                    ),
+                )
+                near.controller.store.assign_cell((column, lane))
+
+
+Allocation = BlockAllocation | CellAllocation
+
+
+def allocation_of(scenario: Scenario, is_kept_free: Callable[[Cell], bool]) -> Allocation:
+    """Return the allocation of a scenario's operation; see `CellAllocation`."""
+    builder = formation_builder(scenario)
+    if builder is None:
+        return CellAllocation(scenario, is_kept_free)
+    return BlockAllocation(builder)
