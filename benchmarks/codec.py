@@ -6,6 +6,7 @@ SENSE, COMMAND and STATE of a vehicle of a formation that moves beside others, w
 from __future__ import annotations
 
 import statistics
+import sys
 import time
 from collections.abc import Callable
 
@@ -82,7 +83,7 @@ def main() -> None:
     encode_us = median_us(lambda: [encode(message) for message in MESSAGES])
     decode_us = median_us(lambda: [decode(*payload) for payload in payloads])
     size = sum(len(payload) for payload, _ in payloads)
-    print(f"encode {encode_us:.1f} us, decode {decode_us:.1f} us, {size} bytes")
+    sys.stdout.write(f"encode {encode_us:.1f} us, decode {decode_us:.1f} us, {size} bytes\n")
 
 
 if __name__ == "__main__":
