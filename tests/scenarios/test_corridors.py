@@ -32,14 +32,21 @@ from support.interchange import (
     vehicle,
     write_interchange,
 )
+from support.sharing import made_once
 
 Events = list[dict[str, Any]]
+SECONDS = 20
+"""Duration of the stream of the run that several tests look at."""
 
 
 def scenario(folder: Path, vehicles: Sequence[str], network: Network = EXIT_FIRST) -> Scenario:
-    config = write_interchange(folder, vehicles, types=TRUCKS, network=network)
-    found = read_corridor(config, CORRIDOR)
-    return parse_scenario(corridor_tables(found, config, WHOLE))
+    return parse_scenario(
+        _tables(write_interchange(folder, vehicles, types=TRUCKS, network=network))
+    )
+
+
+def _tables(config: Path) -> dict[str, Any]:
+    return corridor_tables(read_corridor(config, CORRIDOR), config, WHOLE)
 
 
 def standing_vehicle(depart_s: int, at_m: int, stop: str) -> str:
@@ -71,33 +78,41 @@ def hardest_braking_mps2(folder: Path) -> float:
 def drive(own: Scenario, folder: Path) -> tuple[dict[str, Any], Events]:
     outcome = SimulatedRun(own, folder, show_progress=False).run()
     assert not outcome.problems
+    return _results(folder)
+
+
+def _results(folder: Path) -> tuple[dict[str, Any], Events]:
     events = (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()
     return json.loads((folder / "summary.json").read_text()), [*map(json.loads, events)]
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path, dict[str, Any], Events]:
-    files, folder = tmp_path_factory.mktemp("files"), tmp_path_factory.mktemp("run")
-    own = scenario(files, stream(50))
-    return own, folder, *drive(own, folder)
+    def drive_once(folder: Path) -> None:
+        (folder / "files").mkdir(parents=True)
+        drive(scenario(folder / "files", stream(SECONDS)), folder / "run")
+
+    shared = made_once(tmp_path_factory, "corridor-in-one-process", drive_once)
+    own = parse_scenario(_tables(shared / "files" / "small.sumocfg"))
+    return own, shared / "run", *_results(shared / "run")
 
 
 def test_everybody_gets_where_the_route_leads(
     run: tuple[Scenario, Path, dict[str, Any], Events],
 ) -> None:
     _, folder, summary, events = run
-    assert summary["vehicles"]["left"] == summary["vehicles"]["demanded"] == 59
-    assert summary["vehicles"]["at_destination"] == 59
+    assert summary["vehicles"]["left"] == summary["vehicles"]["demanded"] == 24
+    assert summary["vehicles"]["at_destination"] == 24
     assert summary["safety"]["overlaps"] == summary["safety"]["sumo_collisions"] == 0
     assert summary["tracking"]["emergency_ticks"] == 0
     assert summary["safety"]["min_gap_m"] >= 8.0
-    assert summary["travel_time_s"]["n"] == 59
+    assert summary["travel_time_s"]["n"] == 24
     kinds = {event["kind"] for event in events}
     assert kinds.isdisjoint({"left-lattice", "missed-exit", "agent-missing", "planning-failed"})
     trips = read_trips(folder).values()
     assert {trip["sumo_id"] for trip in trips} == {
-        *(f"m#{second}" for second in range(50)),
-        *(f"r.{second}" for second in range(0, 50, 6)),
+        *(f"m#{second}" for second in range(SECONDS)),
+        *(f"r.{second}" for second in range(0, SECONDS, 6)),
     }
 
 
@@ -125,9 +140,9 @@ def test_sumo_drives_the_same_vehicles_alone(
     routes = compare(own, folder)
     counts = {(one.entrance, one.destination): (one.vehicles, *one.arrived) for one in routes}
     assert counts == {
-        (MAIN_ENTRANCE, "end"): (44, 44, 44),
-        (MAIN_ENTRANCE, "off"): (6, 6, 6),
-        ("on", "end"): (9, 9, 9),
+        (MAIN_ENTRANCE, "end"): (18, 18, 18),
+        (MAIN_ENTRANCE, "off"): (2, 2, 2),
+        ("on", "end"): (4, 4, 4),
     }
     for one in routes:
         ours_s, sumos_s = one.mean_s
@@ -279,6 +294,7 @@ def test_a_queue_behind_the_exit_is_braked_for(
     assert checked > 0
 
 
+@pytest.mark.more
 def test_a_truck_does_not_brake_hard_behind_one_that_has_left(tmp_path: Path) -> None:
     """The limit behind the exit is lower than v_F, and SUMO slows down for it."""
     seconds = [first + second for first in range(0, 20, 5) for second in (0, 1)]

@@ -79,6 +79,11 @@ def test_corridors_are_listed_described_and_written(lab: Lab, config: Path) -> N
     written = lab.run_forked("corridor", config, "--corridor", CORRIDOR, "--toml")
     tables = tomllib.loads(written.out)
     assert tables["sumo"] == {"config": str(config), "corridor": CORRIDOR}
+
+
+@pytest.mark.more
+def test_what_was_written_and_edited_is_run(lab: Lab, config: Path) -> None:
+    written = lab.run_forked("corridor", config, "--corridor", CORRIDOR, "--toml")
     file = lab.path("edited.toml", written.out.replace("cycle_s = 4.0", "cycle_s = 3.8"))
     folder = lab.folder / "edited"
     ended = lab.run("run", file, "--transport", "simulated", "--out", folder)
