@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 import yaml
 
+from support.tables import for_each
+
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
@@ -62,14 +64,14 @@ def test_every_page_is_in_the_navigation_once() -> None:
     assert sorted(listed) == sorted([*outside, *(path.name for path in PAGES)])
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+@for_each("path", PAGES)
 def test_a_page_opens_with_whom_it_is_for(path: Path) -> None:
     title, opening = path.read_text(encoding="utf-8").split("\n\n", 2)[:2]
     assert title.startswith("# ")
     assert re.match(r"\*?For ", opening), opening
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+@for_each("path", PAGES)
 def test_long_tables_are_in_the_reference(path: Path) -> None:
     if path.name in pages_of(navigation()["Reference"]):
         return

@@ -27,6 +27,7 @@ from laneweave.protocol.wire.messages import (
     Sense,
 )
 from support.refusals import refusal
+from support.tables import for_each
 from support.wire_samples import HINTS, different, filled
 
 SAMPLES: dict[type, Any] = {kind: filled(kind, different()) for kind in KINDS.values()}
@@ -206,7 +207,7 @@ WRONG_ENVELOPES: list[tuple[object, str]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("whole", "field"), WRONG_ENVELOPES)
+@for_each(("whole", "field"), WRONG_ENVELOPES)
 def test_a_wrong_envelope_is_refused_by_its_part(whole: object, field: str) -> None:
     assert VERSION == 1
     packed: bytes = msgpack.packb(whole)
@@ -317,7 +318,7 @@ def right_value(hint: Any) -> Any:  # noqa: ANN401
     return {int: 1, float: 1.0, bool: True, bytes: b"", Name: "v1", Ballot: [1, "c", 2, 3]}[hint]
 
 
-@pytest.mark.parametrize(("sample", "name"), FIELDS)
+@for_each(("sample", "name"), FIELDS)
 def test_every_wrong_value_of_a_field_is_refused_by_name(sample: object, name: str) -> None:
     version, kind, body = envelope(sample)
     wrongs = wrong_values(HINTS[type(sample)][name])
@@ -327,7 +328,7 @@ def test_every_wrong_value_of_a_field_is_refused_by_name(sample: object, name: s
         assert error.field.startswith(f"{kind}.{name}"), (wrong, error)
 
 
-@pytest.mark.parametrize(("sample", "name"), FIELDS)
+@for_each(("sample", "name"), FIELDS)
 def test_a_missing_field_is_refused_by_name(sample: object, name: str) -> None:
     version, kind, body = envelope(sample)
     del body[key_of(name)]
@@ -390,15 +391,15 @@ def test_the_path_leads_into_maps() -> None:
 # --- anything at all --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("opening", [b"\x91", b"\x81", b"\x81\xa1a", b"\x93\x01\xa4Plan\x81\xa1a"])
-@pytest.mark.parametrize("depth", [100, 500, 1000, 5000, 100_000])
+@for_each("opening", [b"\x91", b"\x81", b"\x81\xa1a", b"\x93\x01\xa4Plan\x81\xa1a"])
+@for_each("depth", [100, 500, 1000, 5000, 100_000])
 def test_deep_nesting_is_refused(opening: bytes, depth: int) -> None:
     refusal(decode, opening * depth)
     refusal(decode, opening * depth + b"\x01")
 
 
-@pytest.mark.parametrize(("sample", "name"), FIELDS)
-@pytest.mark.parametrize("depth", [50, 900, 1100])
+@for_each(("sample", "name"), FIELDS)
+@for_each("depth", [50, 900, 1100])
 def test_a_deeply_nested_field_is_refused(sample: object, name: str, depth: int) -> None:
     version, kind, body = envelope(sample)
     body[key_of(name)] = "HERE"

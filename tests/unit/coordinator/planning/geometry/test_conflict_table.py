@@ -34,6 +34,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Mode, displacements, footprint
 from laneweave.protocol.scenario.fields import Scenario
 from oracles.moving_bodies import Bodies, least_gap_m
+from support.tables import for_each
 
 NEAR = range(-MAX_OFFSET, MAX_OFFSET + 1)
 STEPS = displacements(2)
@@ -93,8 +94,8 @@ def geometries(draw: st.DrawFn) -> BodyGeometry:
 # --------------------------------------------------------------------- the table at any delay
 
 
-@pytest.mark.parametrize("mode", [1, 2])
-@pytest.mark.parametrize("kind", PAPER_KINDS)
+@for_each("mode", [1, 2])
+@for_each("kind", PAPER_KINDS)
 def test_at_any_delay_it_contains_the_kinds_of_the_paper(mode: Mode, kind: str) -> None:
     model = ConflictModel([kind])
     named = {pair for pair in every_pair(mode) if model.kind(*moves(pair)) is not None}
