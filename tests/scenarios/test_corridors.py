@@ -18,35 +18,29 @@ from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import MAIN_ENTRANCE, Scenario
 from laneweave.sim_bridge.corridors import corridor_setup, sumo_statistics
-from laneweave.sim_bridge.corridors.corridor_reading import WHOLE, read_corridor
+from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
 from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
 from laneweave.sim_bridge.corridors.sumo_statistics import read_statistics
 from support.interchange import (
     CORRIDOR,
+    DRIVEN_S,
     EXIT_FIRST,
     RAMP_FIRST,
     RAMP_SPEED_MPS,
     TRUCKS,
     Network,
+    driven_interchange,
+    scenario_of,
     stream,
     vehicle,
     write_interchange,
 )
-from support.sharing import made_once
 
 Events = list[dict[str, Any]]
-SECONDS = 20
-"""Duration of the stream of the run that several tests look at."""
 
 
 def scenario(folder: Path, vehicles: Sequence[str], network: Network = EXIT_FIRST) -> Scenario:
-    return parse_scenario(
-        _tables(write_interchange(folder, vehicles, types=TRUCKS, network=network))
-    )
-
-
-def _tables(config: Path) -> dict[str, Any]:
-    return corridor_tables(read_corridor(config, CORRIDOR), config, WHOLE)
+    return scenario_of(write_interchange(folder, vehicles, types=TRUCKS, network=network))
 
 
 def standing_vehicle(depart_s: int, at_m: int, stop: str) -> str:
@@ -88,31 +82,26 @@ def _results(folder: Path) -> tuple[dict[str, Any], Events]:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path, dict[str, Any], Events]:
-    def drive_once(folder: Path) -> None:
-        (folder / "files").mkdir(parents=True)
-        drive(scenario(folder / "files", stream(SECONDS)), folder / "run")
-
-    shared = made_once(tmp_path_factory, "corridor-in-one-process", drive_once)
-    own = parse_scenario(_tables(shared / "files" / "small.sumocfg"))
-    return own, shared / "run", *_results(shared / "run")
+    own, folder = driven_interchange(tmp_path_factory)
+    return own, folder, *_results(folder)
 
 
 def test_everybody_gets_where_the_route_leads(
     run: tuple[Scenario, Path, dict[str, Any], Events],
 ) -> None:
     _, folder, summary, events = run
-    assert summary["vehicles"]["left"] == summary["vehicles"]["demanded"] == 24
-    assert summary["vehicles"]["at_destination"] == 24
+    assert summary["vehicles"]["left"] == summary["vehicles"]["demanded"] == 18
+    assert summary["vehicles"]["at_destination"] == 18
     assert summary["safety"]["overlaps"] == summary["safety"]["sumo_collisions"] == 0
     assert summary["tracking"]["emergency_ticks"] == 0
     assert summary["safety"]["min_gap_m"] >= 8.0
-    assert summary["travel_time_s"]["n"] == 24
+    assert summary["travel_time_s"]["n"] == 18
     kinds = {event["kind"] for event in events}
     assert kinds.isdisjoint({"left-lattice", "missed-exit", "agent-missing", "planning-failed"})
     trips = read_trips(folder).values()
     assert {trip["sumo_id"] for trip in trips} == {
-        *(f"m#{second}" for second in range(SECONDS)),
-        *(f"r.{second}" for second in range(0, SECONDS, 6)),
+        *(f"m#{second}" for second in range(DRIVEN_S)),
+        *(f"r.{second}" for second in range(0, DRIVEN_S, 6)),
     }
 
 
@@ -140,9 +129,9 @@ def test_sumo_drives_the_same_vehicles_alone(
     routes = compare(own, folder)
     counts = {(one.entrance, one.destination): (one.vehicles, *one.arrived) for one in routes}
     assert counts == {
-        (MAIN_ENTRANCE, "end"): (18, 18, 18),
+        (MAIN_ENTRANCE, "end"): (13, 13, 13),
         (MAIN_ENTRANCE, "off"): (2, 2, 2),
-        ("on", "end"): (4, 4, 4),
+        ("on", "end"): (3, 3, 3),
     }
     for one in routes:
         ours_s, sumos_s = one.mean_s

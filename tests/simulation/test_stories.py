@@ -16,6 +16,8 @@ from simulation.search_bugs import STORIES
 from support.bug_register import EVERY_BUG
 
 PATHS = sorted(STORIES.glob("*.json"))
+LONG = {"superseded-command-played"}
+"""Stories that take seconds; text scenarios catch their bugs, too."""
 
 
 def test_there_are_stories() -> None:
@@ -24,7 +26,14 @@ def test_there_are_stories() -> None:
 
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, id=path.stem, marks=pytest.mark.catches(path.stem)) for path in PATHS],
+    [
+        pytest.param(
+            path,
+            id=path.stem,
+            marks=[pytest.mark.catches(path.stem), *([pytest.mark.more] * (path.stem in LONG))],
+        )
+        for path in PATHS
+    ],
 )
 def test_story(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     story, bug = Story.read(path), EVERY_BUG[path.stem]

@@ -11,14 +11,14 @@ Parameters = Any
 """Values of one call of a test: a tuple, or a single value."""
 
 
-def first(variants: Iterable[Parameters], count: int = 1) -> list[Any]:
+def variants(every: Iterable[Parameters], count: int = 1) -> list[Any]:
     """Return parameters for `pytest.mark.parametrize`; all but the first are marked `more`.
 
     Args:
-        variants: parameters of the calls, or what `pytest.param` returns.
+        every: parameters of the calls, or what `pytest.param` returns.
         count: number of those that `make test` runs.
     """
-    return [each if n < count else _marked(each) for n, each in enumerate(variants)]
+    return [each if n < count else _marked(each) for n, each in enumerate(every)]
 
 
 def _marked(each: Parameters) -> Any:  # noqa: ANN401 (pytest's class of parameters is private)

@@ -63,11 +63,11 @@ OVER_ZENOH = (*FEW_PROCESSES, "--pace", "10")
     ("options", "to_group"),
     [
         (OVER_ZENOH, True),
-        (SIMULATED, False),
         *(
             pytest.param(options, to_group, marks=pytest.mark.more)
             for options, to_group in (
                 (OVER_ZENOH, False),
+                (SIMULATED, False),
                 (SIMULATED, True),
                 (("--method", "rule"), False),
                 (("--method", "rule"), True),

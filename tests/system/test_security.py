@@ -350,6 +350,7 @@ def test_nobody_else_passes_for_the_router(network: Network, name: str) -> None:
         assert connects(endpoint, **client) == (name == "router")
 
 
+@pytest.mark.more
 def test_a_role_says_in_one_line_what_is_wrong_with_its_certificate(
     network: Network, lab: Lab
 ) -> None:

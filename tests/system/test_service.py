@@ -35,7 +35,7 @@ from laneweave.protocol.wire.topics import SERVICE, Keys
 from support.harness import END_S, Ended, laboratory
 from support.mutations import ask_all, mutants
 from support.service_lab import REALM, Load, ServiceLab, request, slow_request
-from support.variants import first
+from support.variants import variants
 
 QUEUE_LIMIT, CLIENT_LIMIT = 64, 32
 FLOOD = 500
@@ -326,7 +326,7 @@ def leave_by_death(service: ServiceLab, asked: PlanRequest, begun: Callable[[], 
 
 
 @pytest.mark.parametrize(
-    "leave", first([leave_by_cancelling, leave_by_death, leave_by_timeout, leave_by_task], 2)
+    "leave", variants([leave_by_cancelling, leave_by_death, leave_by_timeout, leave_by_task], 2)
 )
 def test_a_request_whose_client_leaves_frees_its_worker(
     service: ServiceLab,

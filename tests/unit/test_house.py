@@ -16,7 +16,7 @@ import laneweave
 from laneweave.launch.cli.commands import COMMANDS
 from support.commands import LANEWEAVE, python, run
 from support.extras import normal, only_extras, only_for
-from support.variants import first
+from support.variants import variants
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOTS = ("agents", "coordinator", "protocol", "sim_bridge", "launch")
@@ -80,6 +80,7 @@ def run_with(extras: str, command: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_packages_of_other_extras_are_hidden() -> None:
     # As the bridge did that drew its report with modules of the agents.
     environment = os.environ | only_for("bridge")
@@ -92,7 +93,7 @@ def test_packages_of_other_extras_are_hidden() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("extras", "command", "says"),
-    first(
+    variants(
         [
             ("plan", f"plan {CASE_STUDY} --format table", "cost 7"),
             ("", "config check scenarios/compose.toml", "tls/router:7447"),

@@ -106,6 +106,7 @@ def pages(site: Path) -> dict[str, str]:
 
 @needs_mkdocs
 @pytest.mark.slow
+@pytest.mark.more
 def test_the_site_builds_without_a_warning(pages: dict[str, str]) -> None:
     for path in PAGES:
         assert f"{path.stem}.html" in pages

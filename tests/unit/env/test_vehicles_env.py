@@ -21,7 +21,7 @@ from laneweave.env.record import EpisodeRecord, Trip
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.sim_bridge.road.demand import arrivals
-from support.variants import first
+from support.variants import variants
 
 ROOT = Path(__file__).parents[3]
 ROAD = {"s1_m": 75.0, "s2_m": 75.0, "s3_m": 600.0}
@@ -91,7 +91,7 @@ def same(one: object, other: object) -> bool:
     return one == other
 
 
-@pytest.mark.parametrize("vary_demand", first([True, False]))
+@pytest.mark.parametrize("vary_demand", variants([True, False]))
 def test_api_of_pettingzoo(vary_demand: bool) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -164,8 +164,8 @@ LANE_DROP = pytest.param(
 )
 
 
-@pytest.mark.parametrize("policy", first([any_move, into_others, into_one_lane]))
-@pytest.mark.parametrize("tables", first([LANE_DROP, STRAIGHT, OBLIQUE]))
+@pytest.mark.parametrize("policy", variants([any_move, into_others, into_one_lane]))
+@pytest.mark.parametrize("tables", variants([LANE_DROP, STRAIGHT, OBLIQUE]))
 def test_no_action_makes_bodies_overlap(
     policy: Policy, tables: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

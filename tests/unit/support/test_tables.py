@@ -7,7 +7,7 @@ import inspect
 import pytest
 
 from support.tables import for_each
-from support.variants import first
+from support.variants import variants
 
 
 def test_a_failure_names_its_rows() -> None:
@@ -46,7 +46,7 @@ def test_an_empty_table_is_refused() -> None:
 
 
 def test_variants_but_the_first_are_for_make_test_more() -> None:
-    kept, *others = first([1, 2, pytest.param(3, id="three")])
+    kept, *others = variants([1, 2, pytest.param(3, id="three")])
     assert kept == 1
     assert [(one.values, one.id) for one in others] == [((2,), None), ((3,), "three")]
     assert all([mark.name for mark in one.marks] == ["more"] for one in others)

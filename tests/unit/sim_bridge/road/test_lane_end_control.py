@@ -30,7 +30,7 @@ from support.broken_lane_end_control import (
 from support.broken_lane_ends import gaps_are_given_away
 from support.bug_register import Plant, catches, name_of
 from support.closed_lanes import LonelyRoad, road_with
-from support.variants import first
+from support.variants import variants
 
 DROP = road_with(Closure(0, 400.0), s3_m=450.0)
 BLOCKED = road_with(Closure(1, 300.0, 400.0), s3_m=450.0)
@@ -67,7 +67,7 @@ def check(road: LonelyRoad, within_s: float = MAX_S) -> None:
 
 @pytest.mark.parametrize(
     ("scenario", "volume", "seed"),
-    first([(DROP, 300.0, 1), (BLOCKED, 1000.0, 1), (DROP, 1800.0, 2)], 2),
+    variants([(DROP, 300.0, 1), (BLOCKED, 1000.0, 1), (DROP, 1800.0, 2)], 2),
     ids=["few", "blocked lane", "many"],
 )  # fmt: skip
 def test_all_vehicles_leave_the_road_and_none_overlaps_another_body(
