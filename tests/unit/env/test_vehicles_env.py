@@ -91,14 +91,16 @@ def same(one: object, other: object) -> bool:
     return one == other
 
 
-@pytest.mark.parametrize("vary_demand", variants([True, False]))
-def test_api_of_pettingzoo(vary_demand: bool) -> None:
+@pytest.mark.parametrize(
+    ("vary_demand", "cycles"), variants([(True, 12), (True, 500), (False, 500)])
+)
+def test_api_of_pettingzoo(cycles: int, *, vary_demand: bool) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         if vary_demand:  # an episode need not have the largest possible number of vehicles
             warnings.filterwarnings("ignore", "No agents present but not all possible_agents")
-        parallel_api_test(parallel_env(SHORT, vary_demand=vary_demand))
-        parallel_seed_test(lambda: parallel_env(SHORT, vary_demand=vary_demand))
+        parallel_api_test(parallel_env(SHORT, vary_demand=vary_demand), cycles)
+        parallel_seed_test(lambda: parallel_env(SHORT, vary_demand=vary_demand), cycles)
 
 
 @pytest.fixture(scope="module")
