@@ -22,8 +22,6 @@ QUICK: list[tuple[str, Plant, int]] = [
     (FORMATIONS, broken_formations_on_roads.columns_ahead_are_closed, 66),
 ]
 """Profiles, bugs, and a seed that catches each in a few seconds."""
-QUICK_SEEDS = {0}
-"""Seeds without a bug that `make test` runs; those of planted bugs run without them, too."""
 LONG: list[tuple[str, Plant, int]] = [
     (LANE_ENDS, broken_lane_ends.never_leaves, 4),
     (LANE_ENDS, broken_lane_ends.agents_move_vehicles_without_cells, 17),
@@ -67,13 +65,10 @@ def test_an_agent_gives_up_a_move_that_its_lane_end_does_not_allow_any_more(
     assert [one.kind for one in run_story(story).violations] == ["stuck"]
 
 
+@pytest.mark.more
 @pytest.mark.parametrize(
     ("profile", "seed"),
-    [
-        pytest.param(profile, n, marks=() if n in QUICK_SEEDS else pytest.mark.more)
-        for profile, count in ((ROADS, 20), (FORMATIONS, 6))
-        for n in range(count)
-    ],
+    [(profile, n) for profile, count in ((ROADS, 20), (FORMATIONS, 6)) for n in range(count)],
 )
 def test_runs_without_violations(profile: str, seed: int) -> None:
     assert run_story(Story.drawn(seed, PROFILES[profile])).violations == ()

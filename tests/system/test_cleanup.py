@@ -235,7 +235,8 @@ def test_ctrl_c_ends_a_run_whose_fork_server_is_not_ready(lab: Lab, road: Path) 
     assert len(list(cache.rglob("*.nbi"))) < 15
 
 
-@pytest.mark.parametrize("role", [pytest.param("router", marks=pytest.mark.more), "bridge"])
+@pytest.mark.parametrize("role", ["router", "bridge"])
+@pytest.mark.more
 def test_ctrl_c_ends_a_run_that_is_starting(lab: Lab, road: Path, role: str) -> None:
     process = lab.start("run", road, *DEMAND, "--coordinators", "1", "--out", "out")
     lab.wait_until(lambda: role in lab.roles())

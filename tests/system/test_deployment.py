@@ -135,6 +135,7 @@ def test_roles_end_while_the_router_is_away(lab: Lab) -> None:
     lab.check_nothing_left()
 
 
+@pytest.mark.more
 def test_roles_wait_for_their_router(lab: Lab) -> None:
     config = deployment(lab, free_tcp(), "connect_timeout_s = 60.0\n")
     text = config.read_text(encoding="utf-8").replace("connect_timeout_s = 60.0\n", "")

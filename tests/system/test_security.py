@@ -393,7 +393,7 @@ def test_a_role_says_in_one_line_what_is_wrong_with_its_certificate(
 def test_a_secured_deployment_runs_to_its_end(lab: Lab, link: str) -> None:
     config = secured_deployment(lab, link.format(free_port()))
     text = config.read_text(encoding="utf-8")
-    config.write_text(text.replace("duration_s = 14.0", "duration_s = 7.0"), encoding="utf-8")
+    config.write_text(text.replace("duration_s = 14.0", "duration_s = 5.0"), encoding="utf-8")
     assert lab.run("certs", "init", "certs", "--config", config).status == 0
     network = Network(lab.folder / "certs", load_scenario(config))
     router = start_router(lab, config)

@@ -44,7 +44,7 @@ SLOW_S = 60.0
 FLAT_MB = 20.0
 KEY = Keys(REALM).key(SERVICE)
 NAMES = ("c1", "c2", "c3")
-THREADS = 12
+THREADS = 6
 
 
 def start(folder: Path, names: tuple[str, ...]) -> Iterator[ServiceLab]:

@@ -118,6 +118,7 @@ def test_the_site_builds_without_a_warning(pages: dict[str, str]) -> None:
 
 @needs_mkdocs
 @pytest.mark.slow
+@pytest.mark.more
 def test_the_site_needs_no_network(pages: dict[str, str]) -> None:
     for address, text in pages.items():
         loaded = re.findall(
@@ -129,6 +130,7 @@ def test_the_site_needs_no_network(pages: dict[str, str]) -> None:
 
 @needs_mkdocs
 @pytest.mark.slow
+@pytest.mark.more
 def test_links_between_pages_lead_to_files(site: Path, pages: dict[str, str]) -> None:
     for address, text in pages.items():
         if address == "404.html":  # its links begin at the root of a server

@@ -92,7 +92,7 @@ def same(one: object, other: object) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("vary_demand", "cycles"), variants([(True, 12), (True, 500), (False, 500)])
+    ("vary_demand", "cycles"), variants([(True, 2), (True, 500), (False, 500)])
 )
 def test_api_of_pettingzoo(cycles: int, *, vary_demand: bool) -> None:
     with warnings.catch_warnings():
@@ -195,6 +195,7 @@ def test_no_action_makes_bodies_overlap(
     assert all(trip.left_s is not None for trip in env.record.trips.values())
 
 
+@pytest.mark.more
 def test_granted_requests_are_driven_and_others_are_not() -> None:
     env = parallel_env(SHORT)
     _, infos = env.reset(seed=1)

@@ -43,7 +43,7 @@ def test_a_malformed_story_is_refused_in_one_line(
     laneweave: Here, tmp_path: Path, change: dict[str, object], words: str
 ) -> None:
     path = tmp_path / "story.json"
-    table = json.loads(Story.drawn(1, PROFILES["calm"]).text()) | change
+    table = json.loads(Story.drawn(1, PROFILES["small"]).text()) | change
     path.write_text(json.dumps(table), "utf-8")
     assert words in laneweave.refused("simulate", "--story", str(path))
 
@@ -55,7 +55,7 @@ def test_the_command_runs_a_story(tmp_path: Path) -> None:
     done = commands.laneweave("simulate", "--story", str(path), "--verbose")
     assert done.returncode == 0
     lines = done.stdout.splitlines()
-    assert lines[0] == "calm 1:"
+    assert lines[0] == "small 1:"
     assert lines[-1] == "passed"
 
 

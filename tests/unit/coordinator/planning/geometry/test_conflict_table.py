@@ -190,6 +190,7 @@ def test_backwards_it_forbids_the_same_or_more(geometry: BodyGeometry) -> None:
 @pytest.mark.slow
 @settings(max_examples=15)
 @given(geometries(), st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 0.5))
+@pytest.mark.more
 def test_more_clearance_or_more_lateness_removes_nothing(
     geometry: BodyGeometry, along: float, across: float, late_s: float
 ) -> None:
