@@ -139,7 +139,8 @@ Results = dict[str, Any]
 
 def _forked(tests: Mapping[str, Sequence[pytest.Item]]) -> Iterator[tuple[str, Results]]:
     """Run tests with each bug planted, in `JOBS` processes at a time; the empty name: no bug."""
-    waiting, running = list(tests), {}
+    waiting = list(tests)
+    running: dict[int, tuple[str, int, bytearray]] = {}
     while waiting or running:
         while waiting and len(running) < JOBS:
             bug = waiting.pop(0)

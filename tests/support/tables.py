@@ -30,7 +30,7 @@ def for_each(names: str | tuple[str, ...], rows: Iterable[Any]) -> Callable[[Tes
     def decorate(test: Test) -> Test:
         @wraps(test)
         def run(**others: object) -> None:
-            failures = []
+            failures: list[tuple[BaseException, object]] = []
             for row in table:
                 try:
                     test(**row, **others)
@@ -40,11 +40,11 @@ def for_each(names: str | tuple[str, ...], rows: Iterable[Any]) -> Callable[[Tes
                     failure.add_note(f"row: {row!r:.500}")
                     failures.append((failure, row))
             if failures:
-                failure = failures[0][0]
+                earliest = failures[0][0]
                 further = "".join(f"\n  {row!r:.100}" for _, row in failures[1:20])
                 if further:
-                    failure.add_note(f"{len(failures) - 1} further rows fail:{further}")
-                raise failure
+                    earliest.add_note(f"{len(failures) - 1} further rows fail:{further}")
+                raise earliest
 
         signature = inspect.signature(test)
         kept = [one for name, one in signature.parameters.items() if name not in keys]
