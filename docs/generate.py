@@ -63,12 +63,15 @@ from laneweave.protocol.wire.topics import TOPICS, Exchange, Party, Topic
 from laneweave.sim_bridge.core import BridgeMetrics
 from laneweave.sim_bridge.recording.columns import TICKS, TRAJECTORIES, TRIPS, Table
 from scenario_reference import meanings_in, scenario_table
-from support.planted_bugs import BUGS
+from support.bug_register import ROAD_BUGS
+from support.planted_bugs import BUGS, Bug
 from support.unseen_bugs import UNSEEN
 
 DOCS = Path(__file__).resolve().parent
 FOUND = DOCS / "evidence" / "planted-bugs-found.json"
 """Output of `tests/simulation/search_bugs.py`."""
+CAUGHT = DOCS / "evidence" / "kill_matrix.json"
+"""Output of `tests/simulation/kill_matrix.py`."""
 MEASURED = DOCS / "evidence" / "resilience.json"
 """Output of `benchmarks/resilience.py`."""
 PLANNED = DOCS / "evidence" / "planner.json"
@@ -287,14 +290,14 @@ def _planted_bugs() -> str:
     """Return the table of planted bugs."""
     found = json.loads(FOUND.read_text(encoding="utf-8"))["found"]
     lines = [
-        "| planted bug | rule | what is broken | failed scenario | outcome | random search |",
+        "| planted bug | rule | what is broken | caught by | outcome | random search |",
         "|---|---|---|---|---|---|",
     ]
     for bug in BUGS:
         end = "two vehicles in one cell" if bug.collides else "another error, or a vehicle waits"
         seed = found.get(bug.name, "-")
         lines.append(
-            f"| `{bug.name}` | {bug.rule} | {bug.text} | `{bug.scenario}` | {end} | {seed} |"
+            f"| `{bug.name}` | {bug.rule} | {bug.text} | {_caught_by(bug)} | {end} | {seed} |"
         )
     return "\n".join(lines)
 
@@ -302,10 +305,50 @@ def _planted_bugs() -> str:
 def _unseen_bugs() -> str:
     """Return the table of planted bugs for which neither scenarios nor search were written."""
     found = json.loads(FOUND.read_text(encoding="utf-8"))["found"]
-    lines = ["| planted bug | rule | what is broken | random search |", "|---|---|---|---|"]
-    lines += [
-        f"| `{bug.name}` | {bug.rule} | {bug.text} | {found.get(bug.name, '-')} |" for bug in UNSEEN
+    lines = [
+        "| planted bug | rule | what is broken | caught by | random search |",
+        "|---|---|---|---|---|",
     ]
+    lines += [
+        f"| `{bug.name}` | {bug.rule} | {bug.text} | {_caught_by(bug)} | "
+        f"{found.get(bug.name, '-')} |"
+        for bug in UNSEEN
+    ]
+    return "\n".join(lines)
+
+
+def _road_bugs() -> str:
+    """Return the table of planted bugs of lane ends, ramps and exits."""
+    lines = ["| planted bug | part | what is broken | caught by |", "|---|---|---|---|"]
+    lines += [
+        f"| `{bug.name}` | {bug.rule} | {bug.text} | {_caught_by(bug)} |" for bug in ROAD_BUGS
+    ]
+    return "\n".join(lines)
+
+
+def _caught_by(bug: Bug) -> str:
+    """Return the test that catches a bug, and its target if that is not `make test`."""
+    caught = json.loads(CAUGHT.read_text(encoding="utf-8"))[bug.name]
+    if bug.scenario:
+        return f"`{bug.scenario}`"
+    for target, suffix in (("test", ""), ("more", " (`make test-more`)")):
+        if caught[target]:
+            return f"`{caught[target][0].removeprefix('tests/')}`{suffix}"
+    return "-"
+
+
+def _caught_bugs() -> str:
+    """Return the number of planted bugs that tests catch, by target of the Makefile."""
+    caught = json.loads(CAUGHT.read_text(encoding="utf-8"))
+    lines = ["| planted bugs | caught by `make test` | by `make test-more` only |", "|---|---|---|"]
+    kinds = (
+        ("with a scenario", BUGS), ("unseen", UNSEEN), ("of lane ends, ramps and exits", ROAD_BUGS)
+    )  # fmt: skip
+    for text, bugs in (*kinds, ("in all", [*BUGS, *UNSEEN, *ROAD_BUGS])):
+        entries = [caught[bug.name] for bug in bugs]
+        quick = sum(bool(entry["test"]) for entry in entries)
+        later = sum(bool(entry["more"]) and not entry["test"] for entry in entries)
+        lines.append(f"| {len(bugs)} {text} | {quick} | {later} |")
     return "\n".join(lines)
 
 
@@ -790,6 +833,8 @@ def parts() -> dict[str, str]:
         "transfer phases": _phase_diagram(TRANSFER_RULES, BallotPhase.PREPARING),
         "planted bugs": _planted_bugs(),
         "unseen bugs": _unseen_bugs(),
+        "road bugs": _road_bugs(),
+        "caught bugs": _caught_bugs(),
         "found bugs": _found_bugs(),
         "profiles": _profiles(),
         "resilience": _resilience(),

@@ -19,16 +19,19 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.sim_bridge.corridors import corridor_setup, sumo_statistics
-from laneweave.sim_bridge.corridors.corridor_reading import WHOLE, read_corridor
+from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
 from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
 from laneweave.sim_bridge.corridors.sumo_statistics import read_statistics
 from support.interchange import (
     CORRIDOR,
+    DRIVEN_S,
     EXIT_FIRST,
     RAMP_FIRST,
     RAMP_SPEED_MPS,
     TRUCKS,
     Network,
+    driven_interchange,
+    scenario_of,
     stream,
     vehicle,
     write_interchange,
@@ -38,9 +41,7 @@ Events = list[dict[str, Any]]
 
 
 def scenario(folder: Path, vehicles: Sequence[str], network: Network = EXIT_FIRST) -> Scenario:
-    config = write_interchange(folder, vehicles, types=TRUCKS, network=network)
-    found = read_corridor(config, CORRIDOR)
-    return parse_scenario(corridor_tables(found, config, WHOLE))
+    return scenario_of(write_interchange(folder, vehicles, types=TRUCKS, network=network))
 
 
 def standing_vehicle(depart_s: int, at_m: int, stop: str) -> str:
@@ -72,33 +73,36 @@ def hardest_braking_mps2(folder: Path) -> float:
 def drive(own: Scenario, folder: Path) -> tuple[dict[str, Any], Events]:
     outcome = SimulatedRun(own, folder, show_progress=False).run()
     assert not outcome.problems
+    return _results(folder)
+
+
+def _results(folder: Path) -> tuple[dict[str, Any], Events]:
     events = (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()
     return json.loads((folder / "summary.json").read_text()), [*map(json.loads, events)]
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path, dict[str, Any], Events]:
-    files, folder = tmp_path_factory.mktemp("files"), tmp_path_factory.mktemp("run")
-    own = scenario(files, stream(50))
-    return own, folder, *drive(own, folder)
+    own, folder = driven_interchange(tmp_path_factory)
+    return own, folder, *_results(folder)
 
 
 def test_everybody_gets_where_the_route_leads(
     run: tuple[Scenario, Path, dict[str, Any], Events],
 ) -> None:
     _, folder, summary, events = run
-    assert summary["vehicles"]["left"] == summary["vehicles"]["demanded"] == 59
-    assert summary["vehicles"]["at_destination"] == 59
+    assert summary["vehicles"]["left"] == summary["vehicles"]["demanded"] == 18
+    assert summary["vehicles"]["at_destination"] == 18
     assert summary["safety"]["overlaps"] == summary["safety"]["sumo_collisions"] == 0
     assert summary["tracking"]["emergency_ticks"] == 0
     assert summary["safety"]["min_gap_m"] >= 8.0
-    assert summary["travel_time_s"]["n"] == 59
+    assert summary["travel_time_s"]["n"] == 18
     kinds = {event["kind"] for event in events}
     assert kinds.isdisjoint({"left-lattice", "missed-exit", "agent-missing", "planning-failed"})
     trips = read_trips(folder).values()
     assert {trip["sumo_id"] for trip in trips} == {
-        *(f"m#{second}" for second in range(50)),
-        *(f"r.{second}" for second in range(0, 50, 6)),
+        *(f"m#{second}" for second in range(DRIVEN_S)),
+        *(f"r.{second}" for second in range(0, DRIVEN_S, 6)),
     }
 
 
@@ -126,9 +130,9 @@ def test_sumo_drives_the_same_vehicles_alone(
     routes = compare(own, folder)
     counts = {(one.entrance, one.destination): (one.vehicles, *one.arrived) for one in routes}
     assert counts == {
-        (MAIN_ENTRANCE, "end"): (44, 44, 44),
-        (MAIN_ENTRANCE, "off"): (6, 6, 6),
-        ("on", "end"): (9, 9, 9),
+        (MAIN_ENTRANCE, "end"): (13, 13, 13),
+        (MAIN_ENTRANCE, "off"): (2, 2, 2),
+        ("on", "end"): (3, 3, 3),
     }
     for one in routes:
         ours_s, sumos_s = one.mean_s
@@ -280,6 +284,7 @@ def test_a_queue_behind_the_exit_is_braked_for(
     assert checked > 0
 
 
+@pytest.mark.more
 def test_a_truck_does_not_brake_hard_behind_one_that_has_left(tmp_path: Path) -> None:
     """The limit behind the exit is lower than v_F, and SUMO slows down for it."""
     seconds = [first + second for first in range(0, 20, 5) for second in (0, 1)]

@@ -10,6 +10,7 @@ import pytest
 from scenarios.scenario_files import check_scenario, ends_in_collision, read_scenario
 from scenarios.scenario_runner import Runner
 from scenarios.scenario_text import CollisionError, ScenarioError
+from support.tables import for_each
 
 HERE = Path(__file__).parent
 SCENARIOS = sorted(HERE.glob("*.txt"))
@@ -20,7 +21,7 @@ def test_scenario(path: Path) -> None:
     check_scenario(path)
 
 
-@pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
+@for_each("path", SCENARIOS)
 def test_scenario_says_first_what_it_shows(path: Path) -> None:
     lines = path.read_text(encoding="utf-8").splitlines()
     head = [line for line in lines[:5] if line.startswith("#")]

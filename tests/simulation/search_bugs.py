@@ -28,6 +28,7 @@ from laneweave.launch.fault_search.coverage import Coverage
 from laneweave.launch.fault_search.profiles import GUIDED, PROFILES, profiles_named
 from laneweave.launch.fault_search.search import rounds, run_story, shrunk, silence_logs
 from laneweave.launch.fault_search.story import Story
+from support.bug_register import EVERY_BUG
 from support.planted_bugs import BUGS, Bug
 from support.unseen_bugs import UNSEEN
 
@@ -75,14 +76,9 @@ def _first_failure(bug: Bug, seeds: range, profile: str) -> Catch | None:
     return None
 
 
-def bug_named(name: str) -> Bug:
-    """Return a planted bug."""
-    return next(bug for bug in (*BUGS, *UNSEEN) if bug.name == name)
-
-
 def _search(name: str, count: int) -> Catch | None:
     silence_logs()
-    return first_catch(bug_named(name), range(count))
+    return first_catch(EVERY_BUG[name], range(count))
 
 
 def shrunk_story(bug: Bug, catch: Catch) -> Story:
@@ -96,9 +92,9 @@ def write_stories(names: Sequence[str]) -> None:
     """Write a shrunk story for each bug to `STORIES`."""
     silence_logs()
     for name in names:
-        catch = first_catch(bug_named(name), range(SEEDS))
+        catch = first_catch(EVERY_BUG[name], range(SEEDS))
         if catch is not None:
-            story = evolve(shrunk_story(bug_named(name), catch), name=name)
+            story = evolve(shrunk_story(EVERY_BUG[name], catch), name=name)
             (STORIES / f"{name}.json").write_text(story.text(), "utf-8")
 
 

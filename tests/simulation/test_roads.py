@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,27 +10,25 @@ from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.search import run_story
 from laneweave.launch.fault_search.story import Story
 from support import broken_formations_on_roads, broken_lane_ends, broken_roads
+from support.bug_register import Plant, catches
 
-Bug = Callable[[pytest.MonkeyPatch], None]
 LANE_ENDS, ROADS, FORMATIONS = "lane-ends", "roads", "entry-roads"
-QUICK: list[tuple[str, Bug, int]] = [
+QUICK: list[tuple[str, Plant, int]] = [
+    (ROADS, broken_roads.ramps_are_issued_at_the_start, 0),
+    (ROADS, broken_roads.cells_are_passed_on_twice, 0),
+    (ROADS, broken_roads.late_commands_repeat_moves, 386),
+    (ROADS, broken_roads.agents_insist, 337),
+    (FORMATIONS, broken_formations_on_roads.ramps_are_forgotten, 2),
+    (FORMATIONS, broken_formations_on_roads.columns_ahead_are_closed, 66),
+]
+"""Profiles, bugs, and a seed that catches each in a few seconds."""
+LONG: list[tuple[str, Plant, int]] = [
     (LANE_ENDS, broken_lane_ends.never_leaves, 4),
     (LANE_ENDS, broken_lane_ends.agents_move_vehicles_without_cells, 17),
     (LANE_ENDS, broken_lane_ends.agent_remembers, 17),
-    (ROADS, broken_roads.ramps_are_issued_at_the_start, 0),
-    (ROADS, broken_roads.cells_are_passed_on_twice, 0),
     (ROADS, broken_roads.exits_are_closed, 1),
-    (ROADS, broken_roads.late_commands_repeat_moves, 386),
-    (ROADS, broken_roads.agents_insist, 337),
     (ROADS, broken_roads.types_are_ignored, 2),
-    (FORMATIONS, broken_formations_on_roads.ramps_are_forgotten, 2),
-    (FORMATIONS, broken_formations_on_roads.columns_ahead_are_closed, 66),
     (FORMATIONS, broken_lane_ends.never_leaves, 6),
-]
-"""Profiles, bugs, and a seed that catches each in a few seconds."""
-QUICK_SEEDS = {0, 1, 9, 14}
-"""Seeds without a bug whose runs take a few seconds."""
-LONG: list[tuple[str, Bug, int]] = [
     (LANE_ENDS, broken_lane_ends.gaps_are_given_away, 3),
     (LANE_ENDS, broken_lane_ends.still_listed, 78),
     (LANE_ENDS, broken_lane_ends.gap_taken_too_early, 3),
@@ -43,10 +40,13 @@ LONG: list[tuple[str, Bug, int]] = [
 
 @pytest.mark.parametrize(
     ("profile", "bug", "seed"),
-    [*QUICK, *(pytest.param(*one, marks=pytest.mark.more) for one in LONG)],
+    [
+        *(pytest.param(*one, marks=catches(one[1])) for one in QUICK),
+        *(pytest.param(*one, marks=[catches(one[1]), pytest.mark.more]) for one in LONG),
+    ],
 )
 def test_planted_bugs_are_noticed(
-    profile: str, bug: Bug, seed: int, monkeypatch: pytest.MonkeyPatch
+    profile: str, bug: Plant, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     story = Story.drawn(seed, PROFILES[profile])
     assert run_story(story).violations == ()
@@ -55,6 +55,7 @@ def test_planted_bugs_are_noticed(
 
 
 @pytest.mark.more
+@catches(broken_roads.gates_stay_open)
 def test_an_agent_gives_up_a_move_that_its_lane_end_does_not_allow_any_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -64,13 +65,10 @@ def test_an_agent_gives_up_a_move_that_its_lane_end_does_not_allow_any_more(
     assert [one.kind for one in run_story(story).violations] == ["stuck"]
 
 
+@pytest.mark.more
 @pytest.mark.parametrize(
     ("profile", "seed"),
-    [
-        pytest.param(profile, n, marks=() if n in QUICK_SEEDS else pytest.mark.more)
-        for profile, count in ((ROADS, 20), (FORMATIONS, 6))
-        for n in range(count)
-    ],
+    [(profile, n) for profile, count in ((ROADS, 20), (FORMATIONS, 6)) for n in range(count)],
 )
 def test_runs_without_violations(profile: str, seed: int) -> None:
     assert run_story(Story.drawn(seed, PROFILES[profile])).violations == ()

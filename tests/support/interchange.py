@@ -20,15 +20,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import pytest
 from attrs import frozen
 
+from laneweave.launch.cli.corridor_command import corridor_tables
+from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.corridors import sumo_network
-from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
+from laneweave.sim_bridge.corridors.corridor_reading import WHOLE, read_corridor
 from laneweave.sim_bridge.corridors.network_reading import read_network
 from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
+from support.sharing import made_once
 
 LANE_M = 3.2
 CORRIDOR = "main1:main5"
@@ -183,6 +187,28 @@ def interchange_scenario(folder: Path) -> Scenario:
     """Return the scenario of the corridor with a stream of vehicles of a minute."""
     found = read_corridor(write_interchange(folder, stream(60), types=TRUCKS), CORRIDOR)
     return parse_scenario(scenario_tables(found.corridor, found.demand))
+
+
+DRIVEN_S = 15
+"""Duration of the stream of `driven_interchange`."""
+
+
+def scenario_of(config: Path) -> Scenario:
+    """Return the scenario of the corridor of a simulation, for the whole of its demand."""
+    return parse_scenario(corridor_tables(read_corridor(config, CORRIDOR), config, WHOLE))
+
+
+def driven_interchange(factory: pytest.TempPathFactory) -> tuple[Scenario, Path]:
+    """Return the scenario and the folder of a run in one process, which tests share."""
+
+    def drive(folder: Path) -> None:
+        (folder / "files").mkdir(parents=True)
+        config = write_interchange(folder / "files", stream(DRIVEN_S), types=TRUCKS)
+        outcome = SimulatedRun(scenario_of(config), folder / "run", show_progress=False).run()
+        assert not outcome.problems
+
+    folder = made_once(factory, "interchange", drive)
+    return scenario_of(folder / "files" / "small.sumocfg"), folder / "run"
 
 
 def _network(network: Network, state: str) -> Iterator[str]:

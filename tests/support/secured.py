@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 import zenoh
 from attrs import define, field
 
@@ -41,6 +42,8 @@ COME_S = 60.0
 
 LINKS = ("tls/127.0.0.1:{}", "quic/127.0.0.1:{}?mixed_rel=1")
 """Encrypted endpoints with a port to fill in."""
+ONE_LINK = (LINKS[0], pytest.param(LINKS[1], marks=pytest.mark.more))
+"""Parameters of tests, of which `make test` uses one."""
 
 
 def secured_deployment(lab: Lab, endpoint: str) -> Path:

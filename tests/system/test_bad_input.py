@@ -12,6 +12,7 @@ import pytest
 
 from support.harness import END_S, Ended, Lab
 from support.service_lab import request
+from support.variants import variants
 
 NOBODY = "unixsock-stream/nobody.sock"
 
@@ -54,7 +55,7 @@ def test_endpoints_that_cannot_be(lab: Lab, endpoint: str) -> None:
         assert f"network.endpoint: got '{endpoint}'" in told
 
 
-@pytest.mark.parametrize("role", ["coordinator", "agent", "bridge", "ping", "plan"])
+@pytest.mark.parametrize("role", variants(["plan", "bridge", "coordinator", "agent", "ping"], 2))
 def test_an_endpoint_without_a_router_is_refused(lab: Lab, role: str) -> None:
     file = lab.path("request.json", json.dumps(request()))
     options: dict[str, list[object]] = {
@@ -87,6 +88,7 @@ def silent_server() -> Iterator[str]:
             connection.close()
 
 
+@pytest.mark.more
 def test_an_endpoint_of_another_server_is_refused(lab: Lab, silent_server: str) -> None:
     started = [lab.start(role, "--endpoint", silent_server) for role in ("ping", "router")]
     for process in started:
@@ -141,6 +143,7 @@ def test_every_command_names_all_errors_of_its_file(lab: Lab, command: str) -> N
     lab.check_nothing_left()
 
 
+@pytest.mark.more
 def test_the_temporary_folder_is_too_deep_for_sockets(lab: Lab) -> None:
     deep = lab.folder / ("d" * 100)
     deep.mkdir()

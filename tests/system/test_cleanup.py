@@ -59,8 +59,22 @@ SIMULATED = ("--transport", "simulated")
 OVER_ZENOH = (*FEW_PROCESSES, "--pace", "10")
 
 
-@pytest.mark.parametrize("to_group", [False, True])
-@pytest.mark.parametrize("options", [OVER_ZENOH, SIMULATED, ("--method", "rule")])
+@pytest.mark.parametrize(
+    ("options", "to_group"),
+    [
+        (OVER_ZENOH, True),
+        *(
+            pytest.param(options, to_group, marks=pytest.mark.more)
+            for options, to_group in (
+                (OVER_ZENOH, False),
+                (SIMULATED, False),
+                (SIMULATED, True),
+                (("--method", "rule"), False),
+                (("--method", "rule"), True),
+            )
+        ),
+    ],
+)
 def test_a_signal_ends_a_run(
     lab: Lab, road: Path, options: tuple[str, ...], *, to_group: bool
 ) -> None:
@@ -126,6 +140,7 @@ def has_entered(folder: Path, vehicles: int) -> bool:
     return len(events(folder, "entered")) > vehicles
 
 
+@pytest.mark.more
 def test_a_run_goes_on_if_its_terminal_is_closed_under_nohup(lab: Lab, road: Path) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
@@ -141,6 +156,7 @@ def test_a_run_goes_on_if_its_terminal_is_closed_under_nohup(lab: Lab, road: Pat
     assert lab.finish(process, END_S).complaints[0].startswith("interrupted at ")
 
 
+@pytest.mark.more
 def test_a_run_ends_in_good_order_when_its_terminal_is_closed(lab: Lab, road: Path) -> None:
     terminal, process = start_in_terminal(
         lab, "run", road, *DEMAND, "--duration", "600", *OVER_ZENOH, "--out", "out"
@@ -198,6 +214,7 @@ def test_what_killed_runs_left_is_removed_at_the_next_start(lab: Lab, road: Path
     shutil.rmtree(own)
 
 
+@pytest.mark.more
 def test_ctrl_c_ends_a_run_whose_fork_server_is_not_ready(lab: Lab, road: Path) -> None:
     # With an empty cache a rolling run waits for half a minute.
     cache = lab.folder / "cache"
@@ -219,6 +236,7 @@ def test_ctrl_c_ends_a_run_whose_fork_server_is_not_ready(lab: Lab, road: Path) 
 
 
 @pytest.mark.parametrize("role", ["router", "bridge"])
+@pytest.mark.more
 def test_ctrl_c_ends_a_run_that_is_starting(lab: Lab, road: Path, role: str) -> None:
     process = lab.start("run", road, *DEMAND, "--coordinators", "1", "--out", "out")
     lab.wait_until(lambda: role in lab.roles())
@@ -242,6 +260,7 @@ def test_roles_end_when_the_supervisor_is_killed(lab: Lab, road: Path) -> None:
     check_files(lab.folder / "out")
 
 
+@pytest.mark.more
 def test_a_run_ends_when_the_fork_server_is_killed(lab: Lab, road: Path) -> None:
     process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "10")
     server = psutil.Process(lab.roles()["bridge"]).parent()

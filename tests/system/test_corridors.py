@@ -14,7 +14,15 @@ import pytest
 from support.commands import run
 from support.drawn_corridors import draw_corridor, problems
 from support.harness import Ended, Lab, check_safe_and_complete, summary, trips
-from support.interchange import CORRIDOR, LONGEST_CORRIDOR, TRUCKS, stream, write_interchange
+from support.interchange import (
+    CORRIDOR,
+    DRIVEN_S,
+    LONGEST_CORRIDOR,
+    TRUCKS,
+    driven_interchange,
+    stream,
+    write_interchange,
+)
 
 
 def refused(lab: Lab, *words: object, expected: str, status: int = 2) -> Ended:
@@ -29,24 +37,23 @@ def refused(lab: Lab, *words: object, expected: str, status: int = 2) -> Ended:
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
-    return write_interchange(tmp_path, stream(15), types=TRUCKS)
+    return write_interchange(tmp_path, stream(DRIVEN_S), types=TRUCKS)
 
 
-def test_real_processes_drive_the_same_trips_as_a_simulated_run(lab: Lab, config: Path) -> None:
-    folders = lab.folder / "zenoh", lab.folder / "simulated"
+def test_real_processes_drive_the_same_trips_as_a_simulated_run(
+    lab: Lab, config: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = lab.folder / "zenoh"
     options = "--sumocfg", config, "--corridor", CORRIDOR
     faults = lab.path("killed.toml", "[[kill]]\ntarget = 'leader'\nat_s = 25.0\n")
     processes = "--vehicles-per-process", "10", "--faults", faults
-    ended = lab.run("run", *options, *processes, "--out", folders[0], "--compare")
+    ended = lab.run("run", *options, *processes, "--out", folder)
     assert (ended.status, ended.complaints) == (0, []), ended
-    assert "comparison:" in ended.out
-    assert (folders[0] / "comparison.html").is_file()
-    check_safe_and_complete(folders[0])
-    vehicles = summary(folders[0])["vehicles"]
+    check_safe_and_complete(folder)
+    vehicles = summary(folder)["vehicles"]
     assert vehicles["at_destination"] == vehicles["demanded"] == 18
-    ended = lab.run("run", *options, "--transport", "simulated", "--out", folders[1])
-    assert ended.status == 0, ended
-    ours, theirs = (trips(folder) for folder in folders)
+    _, simulated = driven_interchange(tmp_path_factory)
+    ours, theirs = trips(folder), trips(simulated)
     assert ours.keys() == theirs.keys()
     for name, trip in ours.items():
         assert trip["entered_s"] == pytest.approx(theirs[name]["entered_s"], abs=0.11)
@@ -79,10 +86,17 @@ def test_corridors_are_listed_described_and_written(lab: Lab, config: Path) -> N
     written = lab.run_forked("corridor", config, "--corridor", CORRIDOR, "--toml")
     tables = tomllib.loads(written.out)
     assert tables["sumo"] == {"config": str(config), "corridor": CORRIDOR}
+
+
+@pytest.mark.more
+def test_what_was_written_and_edited_is_run(lab: Lab, config: Path) -> None:
+    written = lab.run_forked("corridor", config, "--corridor", CORRIDOR, "--toml")
     file = lab.path("edited.toml", written.out.replace("cycle_s = 4.0", "cycle_s = 3.8"))
     folder = lab.folder / "edited"
-    ended = lab.run("run", file, "--transport", "simulated", "--out", folder)
+    ended = lab.run("run", file, "--transport", "simulated", "--out", folder, "--compare")
     assert (ended.status, ended.complaints) == (0, []), ended
+    assert "comparison:" in ended.out
+    assert (folder / "comparison.html").is_file()
     assert summary(folder)["vehicles"]["at_destination"] == 18
 
 

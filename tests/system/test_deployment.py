@@ -23,6 +23,7 @@ from system.conftest import FinishedRun
 REQUEST = request()
 
 
+@pytest.mark.more
 def test_roles_by_hand(finished_run: FinishedRun, lab: Lab) -> None:
     # The other tests here use TCP. Each role has only the packages of its image.
     config = deployment(lab, "unixsock-stream/router.sock")
@@ -74,6 +75,7 @@ def test_the_planning_service(lab: Lab) -> None:
     lab.check_nothing_left()
 
 
+@pytest.mark.more
 def test_an_end_does_not_wait_for_a_long_computation(lab: Lab) -> None:
     config = deployment(lab, free_tcp())
     router = start_router(lab, config)
@@ -93,6 +95,7 @@ def test_an_end_does_not_wait_for_a_long_computation(lab: Lab) -> None:
     stop(lab, router)
 
 
+@pytest.mark.more
 def test_the_bridge_ends_while_it_waits_for_agents(lab: Lab) -> None:
     endpoint = free_tcp()
     config = deployment(lab, endpoint)
@@ -117,6 +120,7 @@ def test_the_bridge_ends_while_it_waits_for_agents(lab: Lab) -> None:
     lab.check_nothing_left()
 
 
+@pytest.mark.more
 def test_roles_end_while_the_router_is_away(lab: Lab) -> None:
     config = deployment(lab, free_tcp())
     router = start_router(lab, config)
@@ -131,6 +135,7 @@ def test_roles_end_while_the_router_is_away(lab: Lab) -> None:
     lab.check_nothing_left()
 
 
+@pytest.mark.more
 def test_roles_wait_for_their_router(lab: Lab) -> None:
     config = deployment(lab, free_tcp(), "connect_timeout_s = 60.0\n")
     text = config.read_text(encoding="utf-8").replace("connect_timeout_s = 60.0\n", "")
@@ -154,6 +159,7 @@ def test_roles_wait_for_their_router(lab: Lab) -> None:
 
 
 @pytest.mark.parametrize("operation", ["formations", "rolling"])
+@pytest.mark.more
 def test_a_coordinator_ends_while_it_compiles(lab: Lab, operation: str) -> None:
     cache = lab.folder / "cache"
     config = deployment(lab, free_tcp(), f'[formation]\noperation = "{operation}"\n')

@@ -52,6 +52,7 @@ def _run(example: str, endpoint: str) -> str:
     return ended.out
 
 
+@pytest.mark.more
 def test_a_plan_waits_for_router_and_coordinator(lab: Lab) -> None:
     endpoint = free_tcp()
     config = deployment(lab, endpoint)

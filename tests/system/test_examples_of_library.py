@@ -61,6 +61,7 @@ def script(name: str, *arguments: object) -> str:
     return done.stdout
 
 
+@pytest.mark.more
 def test_run_and_read(tmp_path: Path) -> None:
     out = tmp_path / "run"
     lines = script("run_and_read.py", out).splitlines()

@@ -216,7 +216,7 @@ def test_a_fault_that_never_came_fails_the_run(lab: Lab, short: Path) -> None:
     )
 
     ended = lab.run(
-        *("run", short, *DEMAND, "--transport", "simulated"),
+        *("run", short, *DEMAND, "--duration", "2", "--transport", "simulated"),
         *("--faults", faults, "--out", lab.folder / "out"),
     )
 
@@ -225,6 +225,7 @@ def test_a_fault_that_never_came_fails_the_run(lab: Lab, short: Path) -> None:
     assert "FAILED: the run ended before messages[0] came into force at 6000 s" in ended.out
 
 
+@pytest.mark.more
 def test_no_process_stays_paused_when_the_launcher_is_killed(lab: Lab, short: Path) -> None:
     faults = lab.path(
         "faults.toml", '[[pause]]\ntarget = "agent"\ncount = 2\nat_s = 8\nfor_s = 500\n'

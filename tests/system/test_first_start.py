@@ -140,6 +140,7 @@ def test_a_run_that_needs_a_solver_waits_for_it(
     assert not (lab.folder / "out").exists()
 
 
+@pytest.mark.more
 def test_a_run_whose_solver_cannot_be_compiled_says_why(lab: Lab, road: Path) -> None:
     ended = lab.run(
         *("run", road, *DEMAND, "--operation", "rolling", "--out", "out"),

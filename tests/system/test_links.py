@@ -144,6 +144,7 @@ def test_a_link_loses_a_share_of_its_packets(network: GroupNetwork) -> None:
     assert lost(network, "one") == set()
 
 
+@pytest.mark.more
 def test_a_link_loses_successive_packets(network: GroupNetwork) -> None:
     network.set_links({"one": Link(loss=0.05, burst=20)})
     missing = lost(network, "one")
@@ -153,6 +154,7 @@ def test_a_link_loses_successive_packets(network: GroupNetwork) -> None:
 
 
 @pytest.mark.parametrize("protocol", ["udp", "tcp"])
+@pytest.mark.more
 def test_a_link_delays_packets_in_both_directions(network: GroupNetwork, protocol: str) -> None:
     network.set_links({"other": Link(delay_s=DELAY_S)})
     delayed = round_trips_s(network, "other", protocol)
@@ -163,6 +165,7 @@ def test_a_link_delays_packets_in_both_directions(network: GroupNetwork, protoco
     assert min(round_trips_s(network, "one", protocol)) < DELAY_S
 
 
+@pytest.mark.more
 def test_a_link_delays_and_loses_packets_and_is_cut(network: GroupNetwork) -> None:
     network.set_links({"other": Link(delay_s=0.01, loss=0.1)})
     assert 0.06 < len(lost(network, "other")) / PACKETS < 0.14

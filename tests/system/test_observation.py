@@ -9,6 +9,7 @@ import socket
 import urllib.request
 from pathlib import Path
 
+import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from laneweave.launch.cli.status_command import listen
@@ -64,6 +65,7 @@ def names(found: dict[str, float]) -> set[str]:
     return {name.partition(" ")[0] for name in found}
 
 
+@pytest.mark.more
 def test_status_of_a_deployment(lab: Lab) -> None:
     # Longer than the test takes; and c1 leads until it is killed, even on a busy machine.
     config = deployment(lab, free_tcp(), "election_s = 3.0\n")

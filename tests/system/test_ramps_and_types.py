@@ -45,6 +45,7 @@ vehicles_per_process = 1
 """
 
 
+@pytest.mark.more
 def test_cars_and_trucks_enter_by_a_ramp_and_leave_by_their_exits(lab: Lab) -> None:
     folder = lab.folder / "run"
     ended = lab.run("run", lab.path("road.toml", ROAD), "--out", folder)

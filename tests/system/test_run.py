@@ -93,6 +93,7 @@ def test_the_number_of_processes_is_as_asked(finished_run: FinishedRun) -> None:
     assert packed["runtime"]["vehicles_per_process"] == 8
 
 
+@pytest.mark.more
 def test_messages_are_counted_once_however_vehicles_are_packed(finished_run: FinishedRun) -> None:
     single, packed = summary(finished_run("zenoh")), summary(finished_run("packed"))
 
@@ -106,7 +107,7 @@ def test_messages_are_counted_once_however_vehicles_are_packed(finished_run: Fin
     assert per_vehicle(packed) == pytest.approx(per_vehicle(single), rel=0.5)
 
 
-@pytest.mark.parametrize("name", ["zenoh", "packed"])
+@pytest.mark.parametrize("name", ["zenoh", pytest.param("packed", marks=pytest.mark.more)])
 def test_processes_and_simulation_agree(finished_run: FinishedRun, name: str) -> None:
     real, simulated = finished_run(name), finished_run("simulated")
 
@@ -114,6 +115,7 @@ def test_processes_and_simulation_agree(finished_run: FinishedRun, name: str) ->
     assert mean_travel_time_s(real) == pytest.approx(mean_travel_time_s(simulated), rel=0.01)
 
 
+@pytest.mark.more
 def test_a_simulated_run_repeats_itself(finished_run: FinishedRun, lab: Lab, road: Path) -> None:
     first, second = finished_run("simulated"), lab.folder / "second"
 

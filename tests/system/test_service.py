@@ -35,6 +35,7 @@ from laneweave.protocol.wire.topics import SERVICE, Keys
 from support.harness import END_S, Ended, laboratory
 from support.mutations import ask_all, mutants
 from support.service_lab import REALM, Load, ServiceLab, request, slow_request
+from support.variants import variants
 
 QUEUE_LIMIT, CLIENT_LIMIT = 64, 32
 FLOOD = 500
@@ -43,7 +44,7 @@ SLOW_S = 60.0
 FLAT_MB = 20.0
 KEY = Keys(REALM).key(SERVICE)
 NAMES = ("c1", "c2", "c3")
-THREADS = 12
+THREADS = 6
 
 
 def start(folder: Path, names: tuple[str, ...]) -> Iterator[ServiceLab]:
@@ -102,7 +103,7 @@ def check_malformed(service: ServiceLab, seed: int, count: int) -> None:
 
 
 def test_malformed_requests(service: ServiceLab) -> None:
-    check_malformed(service, seed=100, count=3000)
+    check_malformed(service, seed=100, count=1500)
 
 
 @pytest.mark.full
@@ -229,6 +230,7 @@ def test_a_client_that_is_closed_says_so(service: ServiceLab) -> None:
 # --- limits -----------------------------------------------------------------------------------
 
 
+@pytest.mark.more
 def test_a_queue_that_is_full_refuses_and_drops_what_is_late(
     service: ServiceLab, transport: ZenohTransport, client: PlanClient
 ) -> None:
@@ -324,7 +326,7 @@ def leave_by_death(service: ServiceLab, asked: PlanRequest, begun: Callable[[], 
 
 
 @pytest.mark.parametrize(
-    "leave", [leave_by_timeout, leave_by_cancelling, leave_by_task, leave_by_death]
+    "leave", variants([leave_by_cancelling, leave_by_death, leave_by_timeout, leave_by_task], 2)
 )
 def test_a_request_whose_client_leaves_frees_its_worker(
     service: ServiceLab,
@@ -361,6 +363,7 @@ def check_load(load: Load, fault_s: float) -> None:
     assert load.in_flight(fault_s) >= 3
 
 
+@pytest.mark.more
 def test_a_coordinator_that_hangs(service: ServiceLab, client: PlanClient) -> None:
     process = service.coordinators["c3"]
     with Load(client.plan, threads=THREADS) as load:
@@ -374,6 +377,7 @@ def test_a_coordinator_that_hangs(service: ServiceLab, client: PlanClient) -> No
     service.lab.wait_until(lambda: service.alive == set(NAMES), END_S)
 
 
+@pytest.mark.more
 def test_a_worker_that_is_killed(service: ServiceLab, client: PlanClient) -> None:
     with Load(client.plan, threads=THREADS) as load:
         load.wait_answers(2 * THREADS)
@@ -405,6 +409,7 @@ def test_a_coordinator_that_is_killed(service: ServiceLab, client: PlanClient) -
     check_load(of_tasks, killed_s)
 
 
+@pytest.mark.more
 def test_an_end_while_requests_are_in_flight(processes: ServiceLab) -> None:
     processes.revive(least=2)
     name = max(processes.coordinators)

@@ -232,6 +232,7 @@ def _says(page: Page, identity: str, words: str) -> bool:
     return page.text(identity) == words
 
 
+@pytest.mark.more
 def test_a_deployment_is_shown_as_it_is(lab: Lab) -> None:
     config = lab.path("short.toml", SHORT)
     router = start_router(lab, config)

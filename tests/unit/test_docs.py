@@ -51,6 +51,7 @@ from scenario_reference import (
     scenario_fields,
     scenario_table,
 )
+from support.tables import for_each
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -72,8 +73,7 @@ def project_files(pattern: str) -> list[Path]:
 
 
 MARKDOWN = sorted([*ROOT.glob("*.md"), *project_files("*.md")])
-IDS = [str(path.relative_to(ROOT)) for path in MARKDOWN]
-each_document = pytest.mark.parametrize("path", MARKDOWN, ids=IDS)
+each_document = for_each("path", MARKDOWN)
 
 
 def read(name: str) -> str:
@@ -386,9 +386,7 @@ def test_scenario_files_that_documents_name_exist(path: Path) -> None:
         assert (ROOT / name).is_file(), name
 
 
-@pytest.mark.parametrize(
-    "path", sorted([*(ROOT / "scenarios").rglob("*.toml"), *DOCS.rglob("*.toml")]), ids=str
-)
+@for_each("path", sorted([*(ROOT / "scenarios").rglob("*.toml"), *DOCS.rglob("*.toml")]))
 def test_scenario_files_load(path: Path) -> None:
     if path.parent.name == "faults":
         assert load_faults(path, COORDINATORS)

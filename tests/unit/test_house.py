@@ -16,6 +16,7 @@ import laneweave
 from laneweave.launch.cli.commands import COMMANDS
 from support.commands import LANEWEAVE, python, run
 from support.extras import normal, only_extras, only_for
+from support.variants import variants
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOTS = ("agents", "coordinator", "protocol", "sim_bridge", "launch")
@@ -92,6 +93,7 @@ def run_with(extras: str, command: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_packages_of_other_extras_are_hidden() -> None:
     # As the bridge did that drew its report with modules of the agents.
     environment = os.environ | only_for("bridge")
@@ -104,15 +106,17 @@ def test_packages_of_other_extras_are_hidden() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("extras", "command", "says"),
-    [
-        ("", "config check scenarios/compose.toml", "tls/router:7447"),
-        ("plan", f"plan {CASE_STUDY} --format table", "cost 7"),
-        ("certs", "certs init {folder}/certs --separate", "coordinator.c3"),
-        # Nothing is at the endpoint: these commands fail last, with all that they import.
-        ("", "ping --endpoint tcp/127.0.0.1:1", "tcp/127.0.0.1:1"),
-        ("", "status --endpoint tcp/127.0.0.1:1", "tcp/127.0.0.1:1"),
-        ("watch", "watch --endpoint tcp/127.0.0.1:1 --listen 127.0.0.1:0", "tcp/127.0.0.1:1"),
-    ],
+    variants(
+        [
+            ("plan", f"plan {CASE_STUDY} --format table", "cost 7"),
+            ("", "config check scenarios/compose.toml", "tls/router:7447"),
+            ("certs", "certs init {folder}/certs --separate", "coordinator.c3"),
+            # Nothing is at the endpoint: these commands fail last, with all that they import.
+            ("", "ping --endpoint tcp/127.0.0.1:1", "tcp/127.0.0.1:1"),
+            ("", "status --endpoint tcp/127.0.0.1:1", "tcp/127.0.0.1:1"),
+            ("watch", "watch --endpoint tcp/127.0.0.1:1 --listen 127.0.0.1:0", "tcp/127.0.0.1:1"),
+        ]
+    ),
 )
 def test_commands_need_only_their_extra(
     extras: str, command: str, says: str, tmp_path: Path

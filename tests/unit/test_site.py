@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 import yaml
 
+from support.tables import for_each
+
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
@@ -62,14 +64,14 @@ def test_every_page_is_in_the_navigation_once() -> None:
     assert sorted(listed) == sorted([*outside, *(path.name for path in PAGES)])
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+@for_each("path", PAGES)
 def test_a_page_opens_with_whom_it_is_for(path: Path) -> None:
     title, opening = path.read_text(encoding="utf-8").split("\n\n", 2)[:2]
     assert title.startswith("# ")
     assert re.match(r"\*?For ", opening), opening
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+@for_each("path", PAGES)
 def test_long_tables_are_in_the_reference(path: Path) -> None:
     if path.name in pages_of(navigation()["Reference"]):
         return
@@ -104,6 +106,7 @@ def pages(site: Path) -> dict[str, str]:
 
 @needs_mkdocs
 @pytest.mark.slow
+@pytest.mark.more
 def test_the_site_builds_without_a_warning(pages: dict[str, str]) -> None:
     for path in PAGES:
         assert f"{path.stem}.html" in pages
@@ -115,6 +118,7 @@ def test_the_site_builds_without_a_warning(pages: dict[str, str]) -> None:
 
 @needs_mkdocs
 @pytest.mark.slow
+@pytest.mark.more
 def test_the_site_needs_no_network(pages: dict[str, str]) -> None:
     for address, text in pages.items():
         loaded = re.findall(
@@ -126,6 +130,7 @@ def test_the_site_needs_no_network(pages: dict[str, str]) -> None:
 
 @needs_mkdocs
 @pytest.mark.slow
+@pytest.mark.more
 def test_links_between_pages_lead_to_files(site: Path, pages: dict[str, str]) -> None:
     for address, text in pages.items():
         if address == "404.html":  # its links begin at the root of a server

@@ -9,12 +9,13 @@ from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.protocol.state_machine import RuleBook, Transition
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
 from support.planted_bugs import BUGS, ROWS_OF_OTHERS, Bug, unchanged
+from support.tables import for_each
 from support.unseen_bugs import UNSEEN
 
 RULES_IN_PROSE = {"V1", "C9"}
 """Rules of docs/PROTOCOL.md that are in no rule book."""
 
-each_bug = pytest.mark.parametrize("bug", UNSEEN, ids=lambda bug: bug.name)
+each_bug = for_each("bug", UNSEEN)
 
 
 @each_bug

@@ -59,6 +59,7 @@ def run(folder: Path, conditions: Conditions) -> Street:
     return street
 
 
+@pytest.mark.more
 def test_all_vehicles_reach_their_lanes(tmp_path: Path) -> None:
     run(tmp_path, Conditions())
     summary = read_summary(tmp_path)

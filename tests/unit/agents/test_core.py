@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import TrackingDriver
-from laneweave.protocol.lattice import Cell
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.runtime import node
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle, VehicleTypeSettings
@@ -321,3 +321,36 @@ def test_an_agent_drives_its_type_and_takes_no_plan_that_the_type_cannot_drive()
     assert "vehicle_type: got 'tank'; allowed: one of the scenario's types: car, truck" in str(
         refused.error
     )
+
+
+def test_an_agent_that_takes_charge_again_resumes_no_move_of_its_earlier_time_in_charge() -> None:
+    begun: list[PlannedMove] = []
+
+    class NotingDriver(TrackingDriver):
+        def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
+            begun.append(move)
+            super().begin(move, tick, ticks)
+
+    rig = up_and_running(NotingDriver)
+    first, there = rig.agent, (-1, 2)
+    rig.accept((0, HOME, there))
+    rig.run(MOVE_TICKS + 30)
+    assert ({*begun}, rig.controller.hold_cell) == ({(0, HOME, there)}, there)
+    # Another agent begins the next move, and ends.
+    rig.restart()
+    rig.claim()
+    rig.run()
+    rig.accept((0, there, HOME), ballot=BALLOT._replace(seq=BALLOT.seq + 1))
+    rig.run(3)
+    assert begun[-1] == (0, there, HOME)
+
+    begun.clear()
+    rig.agent = first
+    effects = rig.hand(topics.SENSE, replace(rig.sense(), caretaker=True))
+    (command,) = sent(effects, Command)
+    assert rig.controller.accept_command(command)
+    rig.coast(1)
+    rig.run(2)
+
+    assert rig.agent.in_charge
+    assert {*begun} == {(0, there, HOME)}

@@ -23,6 +23,7 @@ from laneweave.coordinator.planning.conflict_kinds import Pair
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.protocol.lattice import Cell, displacements
+from support.variants import variants
 
 NEAR = range(-2, 3)
 OFFSETS = [offset for offset in product(NEAR, NEAR) if offset != (0, 0)]
@@ -42,7 +43,9 @@ def drawn(axes: Axes) -> Counter[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("geometry", [BodyGeometry(), BodyGeometry(clearance_along_m=7.0)])
+@pytest.mark.parametrize(
+    "geometry", variants([BodyGeometry(), BodyGeometry(clearance_along_m=7.0)])
+)
 def test_each_pair_is_drawn_once_in_the_colour_of_its_severity(geometry: BodyGeometry) -> None:
     tables = ConflictTables.of(geometry)
     panels = conflict_figure(geometry).axes

@@ -6,9 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 import roads
+from support.tables import for_each
 
 EVIDENCE = Path(__file__).parents[3] / "docs" / "evidence" / roads.RECORD
 ROWS: dict[str, dict[str, Any]] = json.loads(EVIDENCE.read_text(encoding="utf-8"))
@@ -34,7 +33,7 @@ def test_every_point_has_a_scenario() -> None:
         assert point.settings(1).demand.volume_veh_per_lane_h == point.volume
 
 
-@pytest.mark.parametrize("key", RUNS)
+@for_each("key", RUNS)
 def test_no_run_has_overlaps_and_every_vehicle_leaves(key: str) -> None:
     point, row = RUNS[key]
     assert (row["ending"], row["overlaps"], row["beyond_limits"]) == ("complete", 0, 0)
@@ -44,16 +43,14 @@ def test_no_run_has_overlaps_and_every_vehicle_leaves(key: str) -> None:
         assert row["problems"] == []
 
 
-@pytest.mark.parametrize(
-    "point", [one for one in roads.POINTS if not one.faults], ids=lambda one: one.name
-)
+@for_each("point", [one for one in roads.POINTS if not one.faults])
 def test_vehicles_reach_their_destinations(point: roads.Point) -> None:
     rows = [row for one, row in RUNS.values() if one == point]
     demanded = sum(row["demanded"] for row in rows)
     assert sum(row["at_destination"] for row in rows) >= point.reached_goal * demanded
 
 
-@pytest.mark.parametrize("key", RUNS)
+@for_each("key", RUNS)
 def test_travel_times_reach_their_goals(key: str) -> None:
     point, row = RUNS[key]
     if point.goal is not None:

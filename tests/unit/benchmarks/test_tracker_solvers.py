@@ -27,6 +27,7 @@ def recording() -> Recording:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_every_family_and_solver_gets_a_row() -> None:
     rows = compare(SCENARIO, instances=1, seed=3, repeats=1)
     names = list(dict.fromkeys(row["solver"] for row in rows))

@@ -32,6 +32,7 @@ from laneweave.protocol.wire.topics import (
 from support.paper import PAPER
 from support.service_desk import T_S, Desk, census, state
 from support.states import A, B, changed
+from support.tables import for_each
 
 HUGE = 2**63 - 1
 HIGH = Ballot(HUGE, Name("zz"), HUGE, HUGE)
@@ -95,9 +96,7 @@ def beat(term: int = 1, incarnation: int = 1, name: str = "c2") -> Heartbeat:
     return Heartbeat(Name(name), incarnation, term, leading=False, formations=0)
 
 
-@pytest.mark.parametrize(
-    ("topic", "make"),
-    [
+@for_each(("topic", "make"), [
         (CLOCK, lambda road: clock(road.t_s, bridge=HUGE)),
         (CLOCK, lambda _: clock(1e12)),
         (CLOCK, lambda _: clock(9e4)),
@@ -110,8 +109,7 @@ def beat(term: int = 1, incarnation: int = 1, name: str = "c2") -> Heartbeat:
         (STATE, lambda _: state(A, promised=HIGH)),
         (STATE, lambda _: state(A, t_s=1e12)),
         (STATE, lambda _: changed(state(A), incarnation=2**62)),
-    ],
-)  # fmt: skip
+    ])  # fmt: skip
 def test_impossible_numbers_change_nothing(topic: Topic, make: Callable[[Road], object]) -> None:
     road = Road()
     term, leaders = road.core.election.term, dict(road.leaders)

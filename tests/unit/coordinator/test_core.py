@@ -439,7 +439,7 @@ def rosters(draw: st.DrawFn) -> tuple[Cells, dict[Name, int]]:
 
 
 @pytest.mark.slow
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(roster=rosters(), t_s=st.floats(4.1, 40.0))
 def test_every_plan_is_executable_and_serves_all_preferences(
     roster: tuple[Cells, dict[Name, int]], t_s: float

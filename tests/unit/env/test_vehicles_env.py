@@ -21,6 +21,7 @@ from laneweave.env.record import EpisodeRecord, Trip
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.sim_bridge.road.demand import arrivals
+from support.variants import variants
 
 ROOT = Path(__file__).parents[3]
 ROAD = {"s1_m": 75.0, "s2_m": 75.0, "s3_m": 600.0}
@@ -90,20 +91,29 @@ def same(one: object, other: object) -> bool:
     return one == other
 
 
-@pytest.mark.parametrize("vary_demand", [False, True])
-def test_api_of_pettingzoo(vary_demand: bool) -> None:
+@pytest.mark.parametrize(
+    ("vary_demand", "cycles"), variants([(True, 2), (True, 500), (False, 500)])
+)
+def test_api_of_pettingzoo(cycles: int, *, vary_demand: bool) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         if vary_demand:  # an episode need not have the largest possible number of vehicles
             warnings.filterwarnings("ignore", "No agents present but not all possible_agents")
-        parallel_api_test(parallel_env(SHORT, vary_demand=vary_demand))
-        parallel_seed_test(lambda: parallel_env(SHORT, vary_demand=vary_demand))
+        parallel_api_test(parallel_env(SHORT, vary_demand=vary_demand), cycles)
+        parallel_seed_test(lambda: parallel_env(SHORT, vary_demand=vary_demand), cycles)
 
 
-def test_possible_agents_are_the_demanded_vehicles() -> None:
-    env = parallel_env(SHORT)
+@pytest.fixture(scope="module")
+def held() -> tuple[VehiclesEnv, list[Any]]:
+    """Return an environment in which all vehicles held, and its results."""
+    weights = Rewards(arrived=10.0, missed=-20.0, second=-1.0, move=0.0, discomfort=0.0)
+    env = parallel_env(SHORT, rewards=weights)
+    return env, play(env, hold, 1)
+
+
+def test_possible_agents_are_the_demanded_vehicles(held: tuple[VehiclesEnv, list[Any]]) -> None:
+    env, _ = held
     assert env.possible_agents == [one.vehicle for one in arrivals(env.scenario)]
-    play(env, hold, 3)
     assert [*env.record.trips] != []
     assert {*env.record.trips} == {*env.possible_agents}
 
@@ -146,18 +156,18 @@ def test_episodes_without_seeds_differ_but_repeat_after_the_same_first_seed() ->
     assert not same(pairs[0][0], pairs[0][1])
 
 
-@pytest.mark.parametrize("policy", [any_move, into_others, into_one_lane])
-@pytest.mark.parametrize(
-    "tables",
-    [
-        SHORT,
-        pytest.param(
-            SHORT | {"formation": {"mode": 2, "conflicts": ["geometric"]}}, marks=pytest.mark.more
-        ),
-        SHORT | {"road": ROAD | {"closures": [{"lane": 0, "from_m": 550.0, "to_m": 750.0}]}},
-    ],
-    ids=["straight", "oblique moves", "lane drop"],
+STRAIGHT = pytest.param(SHORT, id="straight")
+OBLIQUE = pytest.param(
+    SHORT | {"formation": {"mode": 2, "conflicts": ["geometric"]}}, id="oblique moves"
 )
+LANE_DROP = pytest.param(
+    SHORT | {"road": ROAD | {"closures": [{"lane": 0, "from_m": 550.0, "to_m": 750.0}]}},
+    id="lane drop",
+)
+
+
+@pytest.mark.parametrize("policy", variants([any_move, into_others, into_one_lane]))
+@pytest.mark.parametrize("tables", variants([LANE_DROP, STRAIGHT, OBLIQUE]))
 def test_no_action_makes_bodies_overlap(
     policy: Policy, tables: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,6 +195,7 @@ def test_no_action_makes_bodies_overlap(
     assert all(trip.left_s is not None for trip in env.record.trips.values())
 
 
+@pytest.mark.more
 def test_granted_requests_are_driven_and_others_are_not() -> None:
     env = parallel_env(SHORT)
     _, infos = env.reset(seed=1)
@@ -211,6 +222,7 @@ def test_granted_requests_are_driven_and_others_are_not() -> None:
     assert refused > 5
 
 
+@pytest.mark.more
 def test_opposite_requests_have_opposite_effects() -> None:
     lanes = {}
     for side in (-1, 1):
@@ -227,9 +239,10 @@ def test_opposite_requests_have_opposite_effects() -> None:
     assert lanes[1] > lanes[-1] + 0.5
 
 
-def test_who_holds_stays_in_its_cell_and_arrives_only_if_it_entered_in_its_lane() -> None:
-    env = parallel_env(SHORT)
-    results = play(env, hold, 1)
+def test_who_holds_stays_in_its_cell_and_arrives_only_if_it_entered_in_its_lane(
+    held: tuple[VehiclesEnv, list[Any]],
+) -> None:
+    env, results = held
     entered = {one.vehicle: one for one in arrivals(env.scenario)}
     cells: dict[str, set[Any]] = {}
     for *_, infos in results:
@@ -243,10 +256,8 @@ def test_who_holds_stays_in_its_cell_and_arrives_only_if_it_entered_in_its_lane(
     assert all(len(each) == 1 for each in cells.values())
 
 
-def test_rewards_sum_up_over_a_trip() -> None:
-    weights = Rewards(arrived=10.0, missed=-20.0, second=-1.0, move=0.0, discomfort=0.0)
-    env = parallel_env(SHORT, rewards=weights)
-    results = play(env, hold, 1)
+def test_rewards_sum_up_over_a_trip(held: tuple[VehiclesEnv, list[Any]]) -> None:
+    env, results = held
     total: dict[str, float] = {}
     for _, rewards, _, _, _ in results[1:]:
         for name, reward in rewards.items():

@@ -11,6 +11,7 @@ import pytest
 
 import laneweave
 from support.commands import python, run
+from support.tables import for_each
 
 ROOT = Path(__file__).resolve().parents[3]
 FRONT_DOOR = ROOT / "launch" / "laneweave" / "__init__.py"
@@ -35,7 +36,7 @@ def test_type_checkers_and_python_see_the_same_names() -> None:
     assert list(laneweave.__all__) == sorted(laneweave.__all__)
 
 
-@pytest.mark.parametrize("name", laneweave.__all__)
+@for_each("name", laneweave.__all__)
 def test_public_names_exist(name: str) -> None:
     assert getattr(laneweave, name)
     assert name in dir(laneweave)

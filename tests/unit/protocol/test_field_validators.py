@@ -14,6 +14,7 @@ from laneweave.protocol.field_validators import (
     link_of,
 )
 from support.refusals import refusal
+from support.tables import for_each
 
 
 @pytest.mark.parametrize(
@@ -29,11 +30,8 @@ def test_addresses(text: str, host: str, port: int) -> None:
     assert load_scenario(None, observation__metrics=text).observation.metrics == text
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["9464", ":9464", "host:", "host:0", "host:65536", "host:-1", "host:+1", "::1:80", "[]:80",
-     "[host]:80", "a b:80", "host:80 ", "host:\u0661", "host:1e3"],
-)  # fmt: skip
+@for_each("text", ["9464", ":9464", "host:", "host:0", "host:65536", "host:-1", "host:+1", "::1:80",
+     "[]:80", "[host]:80", "a b:80", "host:80 ", "host:\u0661", "host:1e3"])  # fmt: skip
 def test_no_addresses(text: str) -> None:
     with pytest.raises(BadInputError, match=r"metrics: got .*HOST:PORT"):
         load_scenario(None, observation__metrics=text)
@@ -61,14 +59,11 @@ def test_the_host_and_the_link_of_an_endpoint(
     assert (host_of(endpoint), link_of(endpoint), is_encrypted(endpoint)) == (host, link, encrypted)
 
 
-@pytest.mark.parametrize(
-    "endpoint",
-    ["", "tcp/", "tcp/host", "tcp/host:", "tcp/host:70000", "tcp/:7447", "ws/host:1", "tls",
-     "host:7447", "tls/::1:7447", "unixsock-stream/", "tls/host:7447?x=1",
+@for_each("endpoint", ["", "tcp/", "tcp/host", "tcp/host:", "tcp/host:70000", "tcp/:7447",
+     "ws/host:1", "tls", "host:7447", "tls/::1:7447", "unixsock-stream/", "tls/host:7447?x=1",
      "tls/host:7447#verify_name_on_connect=false", "tls/host:7447;tcp/host:1", "tcp/a b:1",
      "tcp/host:1?rel=0", "tls/host:1?mixed_rel=1", "quic/host:1?prio=1", "udp/host",
      "quic/host:0x1", "quic/host:1?rel=0#verify_name_on_connect=false",
-     "quic/host:1?rel=0;mixed_rel=1", "quic/host:1?", "unixsock-stream/x?rel=0"],
-)  # fmt: skip
+     "quic/host:1?rel=0;mixed_rel=1", "quic/host:1?", "unixsock-stream/x?rel=0"])  # fmt: skip
 def test_what_is_no_endpoint_is_refused(endpoint: str) -> None:
     assert refusal(check_endpoint, endpoint, "network.listen").field == "network.listen"

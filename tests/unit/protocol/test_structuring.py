@@ -12,6 +12,7 @@ from laneweave.protocol.errors import MAX_PROBLEMS, BadInputError
 from laneweave.protocol.field_validators import within
 from laneweave.protocol.structuring import NumberOrRange, structure, without
 from support.refusals import refusal
+from support.tables import for_each
 
 
 @frozen
@@ -68,7 +69,7 @@ def test_good_data_becomes_the_class() -> None:
     assert type(whole.part.size) is float
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("change", "path"),
     [
         ({"count": True}, "count"),

@@ -22,6 +22,7 @@ from support.bridge_bench import (
     read_events,
     read_summary,
 )
+from support.variants import variants
 
 LONG_ROAD = make_scenario(road={"lanes": 3, "s1_m": 20.0, "s2_m": 20.0, "s3_m": 400.0})
 SHORT_ROAD = make_scenario(sensing={})
@@ -100,7 +101,7 @@ def sleep(street: Street, agent: Sleeper, target: Cell, tick: int, asleep_ticks:
 
 
 @pytest.mark.parametrize("target", MOVES)
-@pytest.mark.parametrize("asleep_ticks", [3, 5, 7])
+@pytest.mark.parametrize("asleep_ticks", variants([7, 3, 5]))
 def test_an_agent_that_slept_while_its_move_began_moves_from_where_the_body_is(
     street: Street, agent: Sleeper, target: Cell, asleep_ticks: int
 ) -> None:
@@ -115,7 +116,7 @@ def test_an_agent_that_slept_while_its_move_began_moves_from_where_the_body_is(
 
 
 @pytest.mark.parametrize("target", MOVES)
-@pytest.mark.parametrize("asleep_ticks", [25, 60])
+@pytest.mark.parametrize("asleep_ticks", variants([25, 60]))
 def test_an_agent_that_slept_until_its_vehicle_was_taken_care_of_does_not_move(
     street: Street, agent: Sleeper, target: Cell, asleep_ticks: int
 ) -> None:
@@ -145,7 +146,7 @@ def check_in_charge_without_plan(street: Street, cell: Cell) -> None:
 
 
 @pytest.mark.parametrize("target", [(0, 1), (-1, 2), (0, 2)])
-@pytest.mark.parametrize("asleep_ticks", [MISSES - 1, 25, 40])
+@pytest.mark.parametrize("asleep_ticks", variants([25, MISSES - 1, 40]))
 def test_an_agent_that_slept_in_its_move_finds_the_body_further_on(
     street: Street, agent: Sleeper, target: Cell, asleep_ticks: int
 ) -> None:
@@ -316,7 +317,7 @@ def test_at_half_of_all_messages_lost_the_road_keeps_real_time_and_agents_stay_i
     assert read_events(tmp_path, "caretaker-took-over") == []
 
 
-@pytest.mark.parametrize("delay_s", [0.002, 0.02])
+@pytest.mark.parametrize("delay_s", variants([0.02, 0.002]))
 def test_messages_that_are_not_lost_are_waited_for(tmp_path: Path, delay_s: float) -> None:
     """A process that is late now and then, or a long way, is no reason to hurry."""
     conditions = Conditions(delay_s=delay_s, jitter_s=0.07)
@@ -352,7 +353,7 @@ def test_the_clock_does_not_race_while_the_bridge_is_off_the_network(tmp_path: P
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("end_of_first", ["in good order", "killed"])
+@pytest.mark.parametrize("end_of_first", variants(["killed", "in good order"]))
 def test_all_roles_start_anew_with_the_next_bridge(tmp_path: Path, end_of_first: str) -> None:
     """Its vehicles have the names of the last ones, and its road time begins at 0 again."""
     street = Street(SHORT_ROAD, tmp_path / "first", MANY)

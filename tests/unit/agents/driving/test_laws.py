@@ -20,6 +20,7 @@ from laneweave.protocol.vehicle.motion import (
     integrate,
     limited_jerk,
 )
+from support.tables import for_each
 
 SCENARIO = Scenario()
 LIMITS = SCENARIO.vehicle
@@ -81,8 +82,8 @@ def test_hold_law_brings_the_vehicle_to_rest_in_the_cell(state: State) -> None:
     assert np.abs(error(state, (0, 1), 600)).max() < 0.02
 
 
-@pytest.mark.parametrize(("dx", "dy"), MOVES)
-@pytest.mark.parametrize("tick", [10, 19, 28])
+@for_each(("dx", "dy"), MOVES)
+@for_each("tick", [10, 19, 28])
 def test_hold_law_takes_over_from_a_move_without_leaving_the_footprint(
     dx: int, dy: int, tick: int
 ) -> None:

@@ -18,6 +18,7 @@ from laneweave.agents.driving.tracking_problem import Gaps
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import Jerk, State, cell_state, integrate, limited_jerk
+from support.tables import for_each
 
 SCENARIO = Scenario()
 ALWAYS = evolve(SCENARIO, tracking=evolve(SCENARIO.tracking, always_solve=True))
@@ -318,8 +319,8 @@ def good_input() -> tuple[State, Window, Gaps]:
     return cell_state(LATTICE, (0, 1), 0.0), window, gaps
 
 
-@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("part", ["state", "states", "jerks", "earliest", "latest"])
+@for_each("number", [math.nan, math.inf, -math.inf])
+@for_each("part", ["state", "states", "jerks", "earliest", "latest"])
 def test_bad_numbers_raise_and_leave_nothing_behind(part: str, number: float) -> None:
     if part in ("earliest", "latest") and not math.isnan(number):
         return

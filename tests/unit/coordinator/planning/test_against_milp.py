@@ -32,7 +32,8 @@ from oracles.proven import Oracle, by_oracle
 from support.planning_oracles import assert_agreement
 
 INSTANCES = 200
-QUICK_INSTANCES = 120
+QUICK_INSTANCES = 30
+CI_INSTANCES = 120
 """Number of instances that `make test` solves; `make test-full` solves all."""
 LONG_INSTANCES = (27,)
 """Instances that TAPPA solves in 8 s; it solves most others in less than 0.1 s."""
@@ -47,11 +48,14 @@ CHUNK = 10
 def chunks(instances: int, first: int = 0) -> pytest.MarkDecorator:
     """Run a test with `CHUNK` seeds at a time."""
     every = range(first, first + instances, CHUNK)
-    chosen = [
-        pytest.param(range(k, k + CHUNK), marks=() if k < QUICK_INSTANCES else pytest.mark.full)
-        for k in every
-    ]
+    chosen = [pytest.param(range(k, k + CHUNK), marks=_marks_from(k)) for k in every]
     return pytest.mark.parametrize("seeds", chosen, ids=str)
+
+
+def _marks_from(seed: int) -> list[pytest.MarkDecorator]:
+    if seed < QUICK_INSTANCES:
+        return []
+    return [pytest.mark.more if seed < CI_INSTANCES else pytest.mark.full]
 
 
 @pytest.mark.slow

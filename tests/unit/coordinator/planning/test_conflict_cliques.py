@@ -12,6 +12,7 @@ from laneweave.coordinator.planning.grid import Grid
 from laneweave.protocol.lattice import Mode, displacements
 from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS
 from oracles.instances import EVERY_VARIANT
+from support.tables import for_each
 
 MODELS: list[tuple[Mode, tuple[str, ...]]] = [
     (1 if mode == 1 else 2, tuple(kinds)) for mode, kinds in EVERY_VARIANT if kinds is not None
@@ -30,7 +31,7 @@ def moves_of(pattern: Clique, mode: Mode, column: int, lane: int) -> set[Move]:
     return moves
 
 
-@pytest.mark.parametrize(("mode", "kinds"), MODELS)
+@for_each(("mode", "kinds"), MODELS)
 def test_every_conflict_is_in_a_clique_and_every_clique_excludes(
     mode: Mode, kinds: tuple[str, ...]
 ) -> None:
@@ -60,7 +61,7 @@ def test_every_conflict_is_in_a_clique_and_every_clique_excludes(
                 assert any(a in clique and b in clique for clique in cliques), (a, b)
 
 
-@pytest.mark.parametrize(("mode", "kinds"), MODELS)
+@for_each(("mode", "kinds"), MODELS)
 def test_from_cells_of_a_clique_have_different_residues(mode: Mode, kinds: tuple[str, ...]) -> None:
     """See `MoveArrays.residue`."""
     grid, model = Grid(9, 5), ConflictModel(kinds)

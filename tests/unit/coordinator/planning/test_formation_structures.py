@@ -20,6 +20,7 @@ from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
+from support.tables import for_each
 
 INTERLACED = [[5, 1], [4, 0], [4, 2], [3, 1], [2, 0], [2, 2]]
 LANE_DROP: dict[str, Any] = {
@@ -202,7 +203,7 @@ def test_targets_of_another_structure_are_detected() -> None:
     assert not problems_of_response(request, response)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("changes", "line"),
     [
         ({"structure": "wedge"}, "structure: got 'wedge'; allowed: one of parallel, interlaced"),

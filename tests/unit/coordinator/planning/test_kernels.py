@@ -109,6 +109,7 @@ LOAD_IF_COMPILED = "print(json.dumps([fake.load_if_compiled(), fake.known_missin
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_kernels_are_compiled_once(workshop: Workshop) -> None:
     assert workshop.result(LOAD_IF_COMPILED) == [False, True]
     assert not workshop.compiled_files()

@@ -11,6 +11,7 @@ from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import MoveTable, bits
 from laneweave.protocol.lattice import Cell, Mode, displacements
 from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS
+from support.tables import for_each
 
 GRIDS = [
     Grid(4, 3, []),
@@ -48,9 +49,9 @@ def test_there_is_one_bit_per_possible_move(grid: Grid, mode: Mode) -> None:
         assert table.cell(table.landing(number)) == move[1]
 
 
-@pytest.mark.parametrize("grid", GRIDS)
-@pytest.mark.parametrize("mode", [1, 2])
-@pytest.mark.parametrize("model", MODELS)
+@for_each("grid", GRIDS)
+@for_each("mode", [1, 2])
+@for_each("model", MODELS)
 def test_conflict_sets_hold_exactly_the_conflicting_moves(
     grid: Grid, mode: Mode, model: ConflictModel
 ) -> None:

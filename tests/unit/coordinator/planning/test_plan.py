@@ -204,6 +204,7 @@ class TestRepeatable:
         assert _without_time(first) == _without_time(second)
 
     @pytest.mark.slow
+    @pytest.mark.more
     def test_hash_seed_does_not_matter(self) -> None:
         roots = [
             str(Path(package.__file__ or "").parents[2])

@@ -11,6 +11,7 @@ from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.lattice import Cell, Mode
+from support.tables import for_each
 
 REQUEST = PlanRequest(
     Grid(4, 3, [(0, 2)]),
@@ -62,7 +63,7 @@ BAD: list[tuple[tuple[int, ...], tuple[tuple[Cell, ...], ...], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("assignment", "paths", "text"), BAD)
+@for_each(("assignment", "paths", "text"), BAD)
 def test_problems_are_found(
     assignment: tuple[int, ...], paths: tuple[tuple[Cell, ...], ...], text: str
 ) -> None:

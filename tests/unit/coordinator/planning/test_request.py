@@ -16,6 +16,7 @@ from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import block_request
 from laneweave.protocol.errors import BadInputError
 from support.planning_oracles import requests
+from support.tables import for_each
 
 Document = dict[str, Any]
 
@@ -147,7 +148,7 @@ WRONG: list[tuple[Callable[[Document], None], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("change", "field"), WRONG)
+@for_each(("change", "field"), WRONG)
 def test_errors_name_the_wrong_field(change: Callable[[Document], None], field: str) -> None:
     wrong = document()
     change(wrong)

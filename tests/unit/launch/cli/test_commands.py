@@ -6,12 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-import pytest
 from typer.main import get_command
 
 from laneweave.launch.cli.commands import COMMANDS
 from laneweave.launch.cli.main import command_line
 from support.commands import Here, python
+from support.tables import for_each
 
 ROOT = Path(__file__).resolve().parents[4]
 CASE = ROOT / "docs" / "examples" / "case-study.json"
@@ -39,7 +39,7 @@ def commands_of(modules: set[str]) -> set[str]:
     return {name.rpartition(".")[2] for name in names & modules}
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@for_each("name", COMMANDS)
 def test_the_table_says_what_the_command_says(name: str) -> None:
     program: Any = get_command(command_line())
 

@@ -139,6 +139,7 @@ def test_without_a_plan_the_start_is_drawn(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_an_animation_has_a_frame_for_each_tick(tmp_path: Path) -> None:
     request = attrs.evolve(REQUEST, vehicles=REQUEST.vehicles[:2])
     paths = tuple(path[:2] for path in PLAN.paths[:2])

@@ -27,6 +27,7 @@ from laneweave.launch.fault_search.story import Story
 from laneweave.protocol.errors import BadInputError
 from support import commands
 from support.commands import LANEWEAVE, Here
+from support.variants import variants
 
 CALM = PROFILES["calm"]
 WELL_UNDER_WAY_S = 2.5
@@ -62,6 +63,7 @@ def test_several_processes_have_the_results_of_one(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_profiles_and_seeds_make_different_runs() -> None:
     digests = {
         run_tasks([(seed, name)], digest=True)[0].digest
@@ -136,7 +138,7 @@ def spent_s(pid: int) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("jobs", ["1", "2"])
+@pytest.mark.parametrize("jobs", variants(["2", "1"]))
 def test_interrupted(jobs: str) -> None:
     process = subprocess.Popen(
         [LANEWEAVE, "simulate", "--seeds", "0:100000", "--jobs", jobs],

@@ -51,11 +51,11 @@ def test_a_malformed_story_is_refused_in_one_line(
 @pytest.mark.slow
 def test_the_command_runs_a_story(tmp_path: Path) -> None:
     path = tmp_path / "story.json"
-    path.write_text(Story.drawn(1, PROFILES["calm"]).text(), "utf-8")
+    path.write_text(Story.drawn(1, PROFILES["small"]).text(), "utf-8")
     done = commands.laneweave("simulate", "--story", str(path), "--verbose")
     assert done.returncode == 0
     lines = done.stdout.splitlines()
-    assert lines[0] == "calm 1:"
+    assert lines[0] == "small 1:"
     assert lines[-1] == "passed"
 
 

@@ -219,6 +219,7 @@ def simulate(tmp_path: Path) -> Callable[[str, FaultSpec], Outcome]:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_a_simulated_run_with_all_faults_is_repeatable(
     simulate: Callable[[str, FaultSpec], Outcome], tmp_path: Path
 ) -> None:

@@ -11,6 +11,7 @@ import pytest
 from laneweave.launch.recordings.runs import single_run
 from laneweave.launch.report.report import report_run
 from support.chromium import Page, needs_chromium, new_page
+from support.variants import variants
 
 pytestmark = [pytest.mark.slow, needs_chromium]
 
@@ -52,7 +53,7 @@ def test_following_does_not_change_the_time(page: Page, address: str) -> None:
     assert page.console_errors() == []
 
 
-@pytest.mark.parametrize("width", [420, 1280])
+@pytest.mark.parametrize("width", variants([420, 1280]))
 def test_a_narrow_page_does_not_shrink_its_figures(page: Page, address: str, width: int) -> None:
     size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
     page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)

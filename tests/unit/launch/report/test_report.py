@@ -80,6 +80,7 @@ def check_page(page: Path, pictures: int) -> Reader:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_of_a_sweep(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     folder = tmp_path / "a <b> & 'c'"  # a name that needs escaping
     shutil.copytree(swept, folder)
@@ -108,6 +109,7 @@ def test_of_a_run(laneweave: Here, swept: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_of_a_run_without_formations(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(swept / "formation-1000-1", folder)

@@ -29,6 +29,7 @@ from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from support.bridge_bench import read_events, read_summary
 from support.commands import Here
+from support.variants import variants
 
 EXAMPLE = Path(__file__).resolve().parents[4] / "examples" / "method-plugin"
 METHODS = (RULE, LC2013)
@@ -228,7 +229,7 @@ def test_an_interrupted_run_leaves_its_summary(
 
 
 @pytest.mark.slow
-@each_method
+@pytest.mark.parametrize("method", variants(METHODS))
 def test_the_command_leaves_all_files(laneweave: Here, tmp_path: Path, method: str) -> None:
     out = tmp_path / "run"
     options = ("--duration", 5, "--volume", 600, "--out", out)

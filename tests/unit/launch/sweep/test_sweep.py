@@ -104,6 +104,7 @@ def running_points(sweep_pid: int) -> list[psutil.Process]:
     return wait_until(psutil.Process(sweep_pid).children, 120.0)
 
 
+@pytest.mark.more
 def test_a_run_whose_process_dies_is_a_failed_row_and_tried_again(
     scenario: Path, tmp_path: Path
 ) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario, to_tables
 from support.refusals import refusal
+from support.tables import for_each
 
 # --- fields that do not fit together ----------------------------------------------------------
 
@@ -105,12 +106,12 @@ def test_there_is_time_to_settle() -> None:
     parse_scenario({"vehicle": slow, "formation": {"settle_s": 28.2, "operation": "rolling"}})
 
 
-@pytest.mark.parametrize(("field", "data"), MISFITS)
+@for_each(("field", "data"), MISFITS)
 def test_fields_that_do_not_fit_are_refused_by_name(field: str, data: dict[str, Any]) -> None:
     assert refusal(parse_scenario, data).field == field
 
 
-@pytest.mark.parametrize(
+@for_each(
     "data",
     [
         {"demand": {"lane_shares": [1, 0, 0]}},

@@ -12,6 +12,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LONGEST_ROAD_M
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Restriction, SolidLine
+from support.tables import for_each
 
 ROLLING = {"operation": "rolling", "gap_m": 20.0}
 TYPES = [{"name": "truck", "share": 0.15, "length_m": 12.0}, {"name": "bus", "share": 0.05}]
@@ -75,7 +76,7 @@ share = 0.1
         load_scenario(path)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("rules", "message"),
     [
         (

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import pytest
-
 from laneweave.protocol.config.participants import demanded_vehicles, identities_of, members_of
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.deployment_fields import Shard, parse_shard
 from laneweave.sim_bridge.road.demand import arrivals
 from support.refusals import refusal
+from support.tables import for_each
 
 
 def test_the_identities_of_a_deployment() -> None:
@@ -23,8 +22,8 @@ def test_the_identities_of_a_deployment() -> None:
                      "vehicle.a", "observer.ping", "observer.status", "observer.watch"}  # fmt: skip
 
 
-@pytest.mark.parametrize("volume", [20.0, 400.0, 1600.0, 3600.0])
-@pytest.mark.parametrize("duration_s", [3.0, 40.0, 600.0])
+@for_each("volume", [20.0, 400.0, 1600.0, 3600.0])
+@for_each("duration_s", [3.0, 40.0, 600.0])
 def test_no_demand_has_more_vehicles_than_are_expected(volume: float, duration_s: float) -> None:
     for seed in range(15):
         scenario = parse_scenario(
@@ -39,7 +38,7 @@ def test_no_demand_has_more_vehicles_than_are_expected(volume: float, duration_s
         assert len(expected) <= 3 * volume * duration_s / 3600 * 1.4 + 60
 
 
-@pytest.mark.parametrize("text", ["", "1", "1/1", "2/2", "-1/2", "0/0", "0/1/2", "a/b", "0/10001",
+@for_each("text", ["", "1", "1/1", "2/2", "-1/2", "0/0", "0/1/2", "a/b", "0/10001",
                                   "1 / 2", "0/" + "9" * 30, "²/3"])  # fmt: skip
 def test_what_is_no_shard_is_refused(text: str) -> None:
     assert refusal(parse_shard, text, "--shard").field == "--shard"

@@ -12,6 +12,7 @@ import pytest
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, sections_for
+from support.tables import for_each
 
 Tables = dict[str, Any]
 WEAVING: Tables = {
@@ -60,9 +61,7 @@ def ends_at(end_m: float) -> Callable[[Tables], object]:
     return change
 
 
-@pytest.mark.parametrize(
-    ("change", "line"),
-    [
+@for_each(("change", "line"), [
         (entrance(lane=1), "entrance[0].lane: got 1"),
         (entrance(at_m=300.0), "entrance[0].at_m: got 300.0; allowed: 250"),
         (entrance(merge_m=300.0), "entrance[0].merge_m: got 300.0; allowed: from 400"),
@@ -128,8 +127,7 @@ def ends_at(end_m: float) -> Callable[[Tables], object]:
             lambda tables: tables.update(formation={"max_columns": 14}),
             "exit[0].at_m: got 700.0; allowed: at least 710: a formation that has passed",
         ),
-    ],
-)  # fmt: skip
+    ])  # fmt: skip
 def test_roads_that_are_not_possible_are_refused_in_one_line(
     change: Callable[[Tables], object], line: str
 ) -> None:

@@ -80,6 +80,7 @@ def test_lines_of_toml(end: str) -> None:
     assert not [keys for keys in found if "not a table" in keys or "ignored" in keys]
 
 
+@pytest.mark.more
 def test_lines_of_a_huge_array_are_searched_for_a_limited_time() -> None:
     text = "a = 1\nb = [\n" + "1,\n" * 20_000 + "]\nc = 2\n"
     assert toml_lines(text) == {("a",): 1}

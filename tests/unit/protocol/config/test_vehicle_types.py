@@ -16,6 +16,7 @@ from laneweave.protocol.lattice import displacements
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_types import VehicleType
 from laneweave.protocol.vehicle.lane_ends import drive_out, own_drive_out
+from support.tables import for_each
 
 ROLLING = {"operation": "rolling", "gap_m": 20.0}
 TRUCK: dict[str, Any] = {
@@ -161,7 +162,7 @@ def test_the_pitch_suits_every_pair_of_types() -> None:
     )
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("types", "tables", "line"),
     [
         ([{**TRUCK, "name": "car"}], {}, "vehicle_type[0].name: got 'car'"),

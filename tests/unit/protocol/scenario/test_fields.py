@@ -14,6 +14,7 @@ from laneweave.protocol.config.scenario_files import load_scenario, parse_scenar
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import FormationSettings
 from support.refusals import refusal
+from support.tables import for_each
 
 FOLDER = Path(__file__).parents[4] / "scenarios"
 TABLES = [
@@ -84,7 +85,7 @@ def test_the_file_of_the_paper_holds_the_defaults_but_for_its_formations() -> No
     assert load_scenario(FOLDER / "paper.toml") == attrs.evolve(default, formation=formation)
 
 
-@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.toml")), ids=lambda path: path.stem)
+@for_each("path", sorted(FOLDER.glob("*.toml")))
 def test_every_scenario_of_the_repository_loads(path: Path) -> None:
     assert load_scenario(path).schema == "laneweave.scenario/1"
 
@@ -134,20 +135,20 @@ TABLE_BY_NAME: type = type(attrs.Factory(dict))
 NOT_NUMBERS: tuple[Any, ...] = ("1", True, None, [], [1], {}, math.nan, math.inf, -math.inf)
 
 
-@pytest.mark.parametrize("table", ["", *(f"{table}." for table in TABLES)])
+@for_each("table", ["", *(f"{table}." for table in TABLES)])
 def test_an_unknown_key_is_refused_by_name(table: str) -> None:
     error = refusal(parse_scenario, nested(f"{table}speling", 1))
     assert error.field == f"{table}speling"
     assert "one of" in error.allowed
 
 
-@pytest.mark.parametrize("table", TABLES)
-@pytest.mark.parametrize("value", [5, "x", True, None, [], [{}], 1.5])
+@for_each("table", TABLES)
+@for_each("value", [5, "x", True, None, [], [{}], 1.5])
 def test_a_table_that_is_none_is_refused(table: str, value: object) -> None:
     assert refusal(parse_scenario, {table: value}).field == table
 
 
-@pytest.mark.parametrize(("field", "default"), LEAVES, ids=[field for field, _ in LEAVES])
+@for_each(("field", "default"), LEAVES)
 def test_every_wrong_type_of_every_field_is_refused_by_name(field: str, default: object) -> None:
     if isinstance(default, str):
         wrongs: tuple[Any, ...] = (1, True, None, [], {}, 1.5)
@@ -198,7 +199,7 @@ OUT_OF_RANGE = {
 }
 
 
-@pytest.mark.parametrize(("field", "values"), OUT_OF_RANGE.items(), ids=OUT_OF_RANGE)
+@for_each(("field", "values"), OUT_OF_RANGE.items())
 def test_values_out_of_range_are_refused_by_name(field: str, values: list[Any]) -> None:
     for value in values:
         assert refusal(parse_scenario, nested(field, value)).field == field, value

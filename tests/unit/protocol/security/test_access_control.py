@@ -24,6 +24,7 @@ from laneweave.protocol.security.connection import Credentials
 from laneweave.protocol.wire.identities import parse_identity
 from laneweave.protocol.wire.topics import TOPICS, Exchange, Keys, Party, matches
 from support.refusals import refusal
+from support.tables import for_each
 
 SCENARIO = parse_scenario(
     {
@@ -60,7 +61,7 @@ def may_read(who: str, key: str) -> bool:
     return subscribes
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("key", "senders", "readers"),
     [
         ("clock", "bridge", "c1 c2 watch"),
@@ -106,9 +107,9 @@ def test_tokens_and_the_service() -> None:
         assert not may(who, "ingress", "declare_queryable", "service/plan")
 
 
-@pytest.mark.parametrize("flow", list(Flow))
-@pytest.mark.parametrize("message", ["delete", "put", "query", "declare_subscriber", "reply"])
-@pytest.mark.parametrize("key", ["**", "*", "clock/**", "../other", "@/router", "state/*/*/x"])
+@for_each("flow", list(Flow))
+@for_each("message", ["delete", "put", "query", "declare_subscriber", "reply"])
+@for_each("key", ["**", "*", "clock/**", "../other", "@/router", "state/*/*/x"])
 def test_no_identity_has_rights_on_a_malformed_key(flow: Flow, message: str, key: str) -> None:
     for identity in identities_of(SCENARIO):
         assert not may(identity.common_name, flow, message, key)

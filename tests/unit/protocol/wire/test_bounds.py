@@ -29,6 +29,7 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 from support.states import A, changed, holding, sense_in
+from support.tables import for_each
 
 HUGE = 2**63 - 1
 ROAD_S = 100.0
@@ -56,7 +57,7 @@ def test_possible_numbers_pass(message: object) -> None:
     bounds().check(message, ROAD_S, 7.0)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("message", "changes"),
     [
         (CLOCK, {"t_s": 1e12, "tick": 10**13}),
@@ -86,7 +87,6 @@ def test_possible_numbers_pass(message: object) -> None:
         (COMMAND, {"accepted": BALLOT}),
         (COMMAND, {"transfer": PendingTransfer(BALLOT)}),
     ],
-    ids=lambda each: "-".join(each) if isinstance(each, dict) else type(each).__name__,
 )
 def test_impossible_numbers_are_refused(message: Any, changes: dict[str, Any]) -> None:  # noqa: ANN401
     change = changed if isinstance(message, VehicleState | Sense | Command) else replace

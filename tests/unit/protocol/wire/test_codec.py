@@ -28,6 +28,7 @@ from laneweave.protocol.wire.messages import (
     Sense,
 )
 from support.refusals import refusal
+from support.tables import for_each
 from support.wire_samples import HINTS, different, filled, is_struct
 
 SAMPLES: dict[type, Any] = {kind: filled(kind, different()) for kind in KINDS.values()}
@@ -213,7 +214,7 @@ WRONG_ENVELOPES: list[tuple[object, str]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("whole", "field"), WRONG_ENVELOPES)
+@for_each(("whole", "field"), WRONG_ENVELOPES)
 def test_a_wrong_envelope_is_refused_by_its_part(whole: object, field: str) -> None:
     assert VERSION == 2
     packed: bytes = msgpack.packb(whole)
@@ -328,7 +329,7 @@ def right_value(hint: Any) -> Any:  # noqa: ANN401
     return {int: 1, float: 1.0, bool: True, bytes: b"", Name: "v1", Ballot: [1, "c", 2, 3]}[hint]
 
 
-@pytest.mark.parametrize(("sample", "name"), FIELDS)
+@for_each(("sample", "name"), FIELDS)
 def test_every_wrong_value_of_a_field_is_refused_by_name(sample: object, name: str) -> None:
     wrongs = wrong_values(HINTS[type(sample)][name])
     assert len(wrongs) > 5
@@ -337,7 +338,7 @@ def test_every_wrong_value_of_a_field_is_refused_by_name(sample: object, name: s
         assert error.field.startswith(f"{type(sample).__name__}.{name}"), (wrong, error)
 
 
-@pytest.mark.parametrize(("sample", "name"), FIELDS)
+@for_each(("sample", "name"), FIELDS)
 def test_a_missing_field_is_refused_by_name(sample: object, name: str) -> None:
     """Fields are left out at the end of the array; those with a default may be missing."""
     version, kind, body = envelope(sample)
@@ -386,15 +387,15 @@ def test_the_path_leads_into_maps() -> None:
 # --- anything at all --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("opening", [b"\x91", b"\x81", b"\x81\xa1a", b"\x93\x02\xa4Plan\x91"])
-@pytest.mark.parametrize("depth", [100, 500, 1000, 5000, 100_000])
+@for_each("opening", [b"\x91", b"\x81", b"\x81\xa1a", b"\x93\x02\xa4Plan\x91"])
+@for_each("depth", [100, 500, 1000, 5000, 100_000])
 def test_deep_nesting_is_refused(opening: bytes, depth: int) -> None:
     refusal(decode, opening * depth)
     refusal(decode, opening * depth + b"\x01")
 
 
-@pytest.mark.parametrize(("sample", "name"), FIELDS)
-@pytest.mark.parametrize("depth", [50, 900, 1100])
+@for_each(("sample", "name"), FIELDS)
+@for_each("depth", [50, 900, 1100])
 def test_a_deeply_nested_field_is_refused(sample: object, name: str, depth: int) -> None:
     inner = b"\x91" * depth + b"\x01"
     payload = changed(sample, name, "HERE").replace(b"\xa4HERE", inner)

@@ -14,6 +14,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.wire.identities import Identity, Incarnations, above, parse_identity
 from laneweave.protocol.wire.topics import Party
 from support.refusals import refusal
+from support.tables import for_each
 
 STEP = 1 << 22
 NUMBERS = st.integers(0, 1 << 62)
@@ -102,11 +103,11 @@ def test_an_identity_is_read_back(text: str) -> None:
     assert parse_identity(text).common_name == text
 
 
-@pytest.mark.parametrize(
-    "text", ["", "router.", "router.x", "bridge.b", "coordinator", "coordinator.", "vehicle.a/b",
-             "Vehicle.a", "tram.a", "vehicle.a b", "vehicle.*", "observer." + "x" * 56, "vehicle.é",
-             "vehicle.a\n", " bridge"]
-)  # fmt: skip
+@for_each("text", ["", "router.", "router.x", "bridge.b", "coordinator", "coordinator.",
+             "vehicle.a/b", "Vehicle.a", "tram.a", "vehicle.a b", "vehicle.*",
+             "observer." + "x" * 56,
+             "vehicle.é",
+             "vehicle.a\n", " bridge"])  # fmt: skip
 def test_what_is_no_identity_is_refused(text: str) -> None:
     assert refusal(parse_identity, text).field == "identity"
 

@@ -12,6 +12,7 @@ from laneweave.protocol.names import NAME_PATTERN
 from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.codec import KINDS
 from support.refusals import refusal
+from support.tables import for_each
 
 KEYS = topics.Keys("r-1")
 NAMES = st.from_regex(NAME_PATTERN, fullmatch=True)
@@ -75,13 +76,13 @@ def test_every_message_kind_has_one_topic() -> None:
     assert sorted(kind.__name__ for kind in carried) == sorted(KINDS)
 
 
-@pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda topic: topic.name)
+@for_each("topic", topics.TOPICS)
 def test_the_grammar_has_no_reserved_characters(topic: topics.Topic) -> None:
     assert re.fullmatch(r"([a-z]+|{[a-z]+})(/([a-z]+|{[a-z]+}))*", topic.pattern)
     assert re.fullmatch(r"[a-z-]+", topic.name)
 
 
-@pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda topic: topic.name)
+@for_each("topic", topics.TOPICS)
 def test_a_foreign_realm_is_not_understood(topic: topics.Topic) -> None:
     key = KEYS.key(topic, **filled(topic))
     assert topics.Keys("r-2").read(key) is None
@@ -93,15 +94,12 @@ def test_a_foreign_realm_is_not_understood(topic: topics.Topic) -> None:
     assert KEYS.read(key.rpartition("/")[0]) is None
 
 
-@pytest.mark.parametrize(
-    "key",
-    ["", "/", "laneweave", "laneweave/r-1", "laneweave/r-1/", "laneweave/r-1/none",
+@for_each("key", ["", "/", "laneweave", "laneweave/r-1", "laneweave/r-1/", "laneweave/r-1/none",
      "laneweave/r-1/CLOCK", "laneweave/r-1/clock/x", "laneweave/r-1/state/1", "clock",
      "laneweave/r-1/state//v1", "laneweave/r-1/alive/tram/x", "laneweave//r-1/clock",
      "laneweave/r-1/command/*", "laneweave/r-1/command/**", "laneweave/r-1/**",
      "laneweave/*/clock", "laneweave/r-1/command/é", "laneweave/r-1/command/{vehicle}",
-     "laneweave/r-1/command/" + "x" * 65, "laneweave/r-1/command/a b"],
-)  # fmt: skip
+     "laneweave/r-1/command/" + "x" * 65, "laneweave/r-1/command/a b"])  # fmt: skip
 def test_a_malformed_key_is_not_understood(key: str) -> None:
     assert KEYS.read(key) is None
 
@@ -115,7 +113,7 @@ def test_any_text_is_read_or_refused(text: str) -> None:
             assert KEYS.key(topic, **parameters) == key
 
 
-@pytest.mark.parametrize("part", BAD_PARTS)
+@for_each("part", BAD_PARTS)
 def test_what_is_no_key_part_is_refused(part: str) -> None:
     assert refusal(KEYS.key, topics.COMMAND, vehicle=part).field == "vehicle"
     assert refusal(topics.Keys, part).field == "network.realm"
@@ -133,7 +131,7 @@ def test_a_missing_parameter_is_a_mistake_of_the_caller() -> None:
         KEYS.key(topics.COMMAND)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("expression", "key", "expected"),
     [
         ("a/b", "a/b", True),
@@ -155,7 +153,7 @@ def test_matching_follows_zenohs_rules(expression: str, key: str, *, expected: b
     assert topics.matches(expression, key) is expected
 
 
-@pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda topic: topic.name)
+@for_each("topic", topics.TOPICS)
 def test_declared_expressions_begin_with_a_wildcard_and_match_the_same_keys(
     topic: topics.Topic,
 ) -> None:

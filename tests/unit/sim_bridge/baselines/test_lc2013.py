@@ -23,6 +23,7 @@ from laneweave.sim_bridge.road.demand import arrivals, count_until
 from laneweave.sim_bridge.road.sized_bodies import bodies_of
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
 from support.closed_lanes import ramp_road
+from support.variants import variants
 
 LABELS = [name for name, one in METHODS.items() if one.method == LC2013]
 DROP = [{"lane": 0, "from_m": 800.0}]
@@ -92,7 +93,7 @@ def assert_continuous(before: Pose, after: Pose, scenario: Scenario) -> None:
         assert after[2] == pytest.approx(0.0, abs=1e-6)
 
 
-@pytest.mark.parametrize("label", LABELS)
+@pytest.mark.parametrize("label", variants(LABELS))
 @pytest.mark.parametrize("closures", [DROP, BLOCKED], ids=["drop", "blocked"])
 def test_vehicles_without_preferred_lanes_pass_closed_parts(
     label: str, closures: list[dict[str, float]], tmp_path: Path
@@ -113,7 +114,7 @@ def test_vehicles_without_preferred_lanes_pass_closed_parts(
     [(DROP, (0.0, 1.0, 1.0)), (BLOCKED, (1.0, 1.0, 1.0)), (BLOCKED_BETWEEN, (1.0, 1.0, 1.0))],
     ids=["drop", "blocked", "blocked-between"],
 )
-@pytest.mark.parametrize("label", ["lc2013", "lc2013-cooperative-4s"])
+@pytest.mark.parametrize("label", variants(["lc2013", "lc2013-cooperative-4s"]))
 def test_vehicles_leave_on_their_preferred_lanes(
     label: str, closures: list[dict[str, Any]], shares: tuple[float, ...], tmp_path: Path
 ) -> None:
@@ -124,7 +125,7 @@ def test_vehicles_leave_on_their_preferred_lanes(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("label", ["lc2013-human", "lc2013-cooperative-4s"])
+@pytest.mark.parametrize("label", variants(["lc2013-cooperative-4s", "lc2013-human"]))
 def test_a_queue_before_a_lane_drop_dissolves(label: str, tmp_path: Path) -> None:
     scenario = METHODS[label].settings(closed_road(DROP, volume=2400.0))
     assert max(drive(scenario, tmp_path).values()) > 70.0
@@ -140,15 +141,18 @@ PREFERENCES = evolve(WEAVING, demand=evolve(WEAVING.demand, lane_shares=(0.0, 1.
 
 @pytest.mark.parametrize(
     ("label", "scenario"),
-    [
-        ("lc2013", RAMP),
-        ("lc2013", WEAVING),
-        ("lc2013", PREFERENCES),
-        ("lc2013-human", RAMP),
-        ("lc2013-human", WEAVING),
-        ("lc2013-cooperative-4s", RAMP),
-        ("lc2013-cooperative-4s", WEAVING),
-    ],
+    variants(
+        [
+            ("lc2013", WEAVING),
+            ("lc2013-cooperative-4s", RAMP),
+            ("lc2013", RAMP),
+            ("lc2013", PREFERENCES),
+            ("lc2013-human", RAMP),
+            ("lc2013-human", WEAVING),
+            ("lc2013-cooperative-4s", WEAVING),
+        ],
+        2,
+    ),
 )
 def test_vehicles_enter_by_ramps_and_leave_by_their_exits(
     label: str, scenario: Scenario, tmp_path: Path

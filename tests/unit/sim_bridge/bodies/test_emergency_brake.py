@@ -19,6 +19,7 @@ from laneweave.sim_bridge.bodies.sensors import Sensors
 from support.paper import EXACT
 from support.road_vehicles import controller_in
 from support.states import command
+from support.tables import for_each
 
 SCENARIO = Scenario()
 LIMITS, TICK_S = SCENARIO.vehicle, SCENARIO.runtime.tick_s
@@ -51,9 +52,9 @@ def keepable(v_mps: float, a_mps2: float) -> bool:
     return needed <= pursued <= LIMITS.max_speed_mps - needed
 
 
-@pytest.mark.parametrize("v_mps", [0.5, 3.0, 15.0, 24.0])
-@pytest.mark.parametrize("a_mps2", [-4.0, 0.0, 3.0])
-@pytest.mark.parametrize("jerk", [-15.0, 0.0, 15.0])
+@for_each("v_mps", [0.5, 3.0, 15.0, 24.0])
+@for_each("a_mps2", [-4.0, 0.0, 3.0])
+@for_each("jerk", [-15.0, 0.0, 15.0])
 def test_what_is_to_spare_is_where_the_body_stops_that_brakes_one_tick_later(
     v_mps: float, a_mps2: float, jerk: float
 ) -> None:
@@ -118,9 +119,9 @@ def test_no_vehicle_hits_one_that_brakes_as_hard_as_it_can(
     assert other.state[1] == pytest.approx(0.0, abs=0.05)
 
 
-@pytest.mark.parametrize("lead_lag_s", [0.0, 0.2, 0.6])
-@pytest.mark.parametrize("lead_brake_mps2", [3.0, 5.0, 8.0, 12.0])
-@pytest.mark.parametrize(("v_mps", "other_mps"), [(15.0, 15.0), (25.0, 15.0), (8.0, 20.0)])
+@for_each("lead_lag_s", [0.0, 0.2, 0.6])
+@for_each("lead_brake_mps2", [3.0, 5.0, 8.0, 12.0])
+@for_each(("v_mps", "other_mps"), [(15.0, 15.0), (25.0, 15.0), (8.0, 20.0)])
 def test_no_vehicle_hits_one_with_other_brakes_than_its_own(
     v_mps: float, other_mps: float, lead_brake_mps2: float, lead_lag_s: float
 ) -> None:
@@ -185,7 +186,7 @@ def test_commanding_more_than_the_body_can_brake_does_not_count_as_braking(jerk:
     assert controller.rung_ticks[Rung.EMERGENCY] > 0
 
 
-@pytest.mark.parametrize("number", range(24))
+@for_each("number", range(24))
 def test_errors_of_measurement_do_not_make_it_too_late(number: int) -> None:
     """A faulty agent speeds up behind a vehicle that brakes sooner or later."""
     least_m, controller = drive_behind(SCENARIO, number, 4.0 + number, braking_tick=3 * number)

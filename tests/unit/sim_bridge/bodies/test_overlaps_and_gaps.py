@@ -144,7 +144,7 @@ def brute_gap(road: dict[str, Pose]) -> float:
 
 @pytest.mark.slow
 @given(st.lists(POSES, min_size=2, max_size=4), TRUCKS)
-@settings(max_examples=60)
+@settings(max_examples=25)
 def test_least_gap_agrees_with_slices(poses: list[Pose], trucks: list[bool]) -> None:
     poses = [(s, y, 0.0 if abs(heading) < 1e-3 else heading, v) for s, y, heading, v in poses]
     road = named(poses, trucks)

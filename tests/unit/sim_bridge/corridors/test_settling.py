@@ -29,7 +29,7 @@ ROAD = evolve(Scenario(), formation=evolve(Scenario().formation, speed_mps=SPEED
 TICK_S = ROAD.runtime.tick_s
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.floats(0.0, 150.0), st.floats(-3.0, 15.0), st.sampled_from([CAR, TRUCK]))
 def test_a_vehicle_settles_within_its_limits_and_not_behind_its_cell(
     ahead_m: float, slower_mps: float, limits: Vehicle

@@ -114,6 +114,7 @@ LATECOMER = (
 """Four of a formation, and one that comes when it is closed (paper, Fig. 2b)."""
 
 
+@pytest.mark.more
 def test_a_vehicle_joins_a_formation_that_has_room(tmp_path: Path) -> None:
     scenario = joining("room")
     events, cells = drive(scenario, tmp_path, LATECOMER)
@@ -129,6 +130,7 @@ def test_a_vehicle_joins_a_formation_that_has_room(tmp_path: Path) -> None:
     assert max(columns) - min(columns) < 4
 
 
+@pytest.mark.more
 def test_without_need_formations_stay_apart_unless_they_may_join(tmp_path: Path) -> None:
     events, _ = drive(joining("needed"), tmp_path, LATECOMER)
     assert of_kind(events, "formations-joined") == []

@@ -40,6 +40,7 @@ def run(road: LonelyRoad, *, owners_checked: bool = True) -> None:
                 owners[cell] = name
 
 
+@pytest.mark.more
 def test_ramp_vehicles_without_agents_stop_at_the_line_and_get_on() -> None:
     road = LonelyRoad(ON_RAMP)
     from_ramp = {Name(one.vehicle) for one in arrivals(ON_RAMP) if one.lane == 0}

@@ -130,6 +130,7 @@ class Entrance:
 @pytest.mark.slow
 @given(streams(), st.sampled_from([0.1, 0.3, 1.0, 2.5]))
 @settings(max_examples=60)
+@pytest.mark.more
 def test_every_cell_near_a_vehicle_has_an_owner(stream: list[Arrival], tick_s: float) -> None:
     entrance = Entrance(stream, tick_s=tick_s).run(120.0)
     assert len(entrance.vehicles) == len(stream)

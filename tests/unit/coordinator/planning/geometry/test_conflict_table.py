@@ -34,6 +34,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Mode, displacements, footprint
 from laneweave.protocol.scenario.fields import Scenario
 from oracles.moving_bodies import Bodies, least_gap_m
+from support.tables import for_each
 
 NEAR = range(-MAX_OFFSET, MAX_OFFSET + 1)
 STEPS = displacements(2)
@@ -96,8 +97,8 @@ def geometries(draw: st.DrawFn) -> BodyGeometry:
 # --------------------------------------------------------------------- the table at any delay
 
 
-@pytest.mark.parametrize("mode", [1, 2])
-@pytest.mark.parametrize("kind", PAPER_KINDS)
+@for_each("mode", [1, 2])
+@for_each("kind", PAPER_KINDS)
 def test_at_any_delay_it_contains_the_kinds_of_the_paper(mode: Mode, kind: str) -> None:
     model = ConflictModel([kind])
     named = {pair for pair in every_pair(mode) if model.kind(*moves(pair)) is not None}
@@ -192,6 +193,7 @@ def test_backwards_it_forbids_the_same_or_more(geometry: BodyGeometry) -> None:
 @pytest.mark.slow
 @settings(max_examples=15)
 @given(geometries(), st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 0.5))
+@pytest.mark.more
 def test_more_clearance_or_more_lateness_removes_nothing(
     geometry: BodyGeometry, along: float, across: float, late_s: float
 ) -> None:

@@ -15,6 +15,7 @@ from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from oracles.moving_bodies import Bodies, motion
+from support.tables import for_each
 
 
 def test_defaults_are_those_of_the_default_scenario() -> None:
@@ -63,7 +64,7 @@ WRONG: list[tuple[str, object]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "value"), WRONG)
+@for_each(("name", "value"), WRONG)
 def test_errors_name_the_field(name: str, value: object) -> None:
     with pytest.raises(BadInputError) as caught:
         geometry_from({name: value})
@@ -94,7 +95,7 @@ UNFIT: list[tuple[str, Mapping[str, float]]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "fields"), UNFIT)
+@for_each(("name", "fields"), UNFIT)
 def test_errors_name_inconsistent_fields(name: str, fields: dict[str, float]) -> None:
     with pytest.raises(BadInputError) as caught:
         geometry_from(fields)

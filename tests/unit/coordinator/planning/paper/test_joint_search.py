@@ -45,6 +45,7 @@ def test_path_set_is_optimal_and_legal_or_there_is_none(request: PlanRequest) ->
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_a_crowded_formation_is_solved_while_trees_do_not_end() -> None:
     request = traffic_request(_crowded_seed(), deadline_s=60.0)
     outcomes = []

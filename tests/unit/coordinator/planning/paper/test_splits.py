@@ -140,6 +140,7 @@ def _cost_of_child(
 @pytest.mark.slow
 @settings(max_examples=60, suppress_health_check=MANY_WITHOUT_CONFLICT)
 @given(conflicts())
+@pytest.mark.more
 def test_children_cost_more_as_predicted(drawn: tuple[Case, Conflict, tuple[int, int]]) -> None:
     (table, diagrams, _), conflict, moves = drawn
     children = disjoint_constraints(table, conflict, moves, diagrams)

@@ -11,6 +11,7 @@ from laneweave.launch.fault_search.checks.geometry import Geometry
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Name, Sense, VehicleRecord, VehicleState
 from support.states import holding, make_plan
+from support.tables import for_each
 
 GEOMETRY = Geometry(pitch_m=15.0, lane_width_m=3.5, length_m=5.0, width_m=1.8)
 A, B, C = Name("a"), Name("b"), Name("c")
@@ -84,7 +85,7 @@ LONG: Paths = {A: ((0, 0), (1, 0), (1, 1))}
 A_GOES: Motion = (1.0, A, 1, (0, 1))
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("kind", "plans", "motions"),
     [
         (None, [FOLLOWING], [(1.0, B, 1, (1, 1)), (1.9, A, 1, (1, 0))]),  # in order

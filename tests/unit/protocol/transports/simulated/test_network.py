@@ -30,6 +30,7 @@ from support.node_recorder import (
     send,
     token,
 )
+from support.tables import for_each
 
 KEY = Keys(REALM).key(HEARTBEAT, coordinator="a")
 BEAT = encode(beat(4).message)
@@ -364,7 +365,7 @@ def test_what_is_under_way_is_lost_when_the_link_breaks() -> None:
     assert receiver.tokens == ["+a", "-a"]
 
 
-@pytest.mark.parametrize("seed", range(20))
+@for_each("seed", range(20))
 def test_news_of_a_token_never_overtake_each_other(seed: int) -> None:
     watcher = listener()
     network = network_of(Conditions(jitter_s=0.05), seed=seed, a=watcher, v=Recorder())
@@ -572,8 +573,8 @@ def test_a_node_may_be_killed_or_end_while_the_router_is_lost() -> None:
     assert ("+c" in tokens) == ("-c" in tokens)
 
 
-@pytest.mark.parametrize("seed", range(8))
-@pytest.mark.parametrize("fault", ["disconnect", "kill"])
+@for_each("seed", range(8))
+@for_each("fault", ["disconnect", "kill"])
 def test_a_node_that_goes_while_it_looks_for_the_router_never_finds_it(
     fault: str, seed: int
 ) -> None:
