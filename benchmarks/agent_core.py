@@ -283,7 +283,7 @@ class Road:
         """Send PREPARE and PLAN to a formation, as its leader does."""
         plan = self._plan(block)
         members = [self.rigs[name] for name in plan.roster]
-        prepare = Prepare(plan.ballot, plan.formations, plan.roster)
+        prepare = Prepare(plan.ballot, plan.blocks, plan.roster)
         for topic, message in ((PREPARE, prepare), (PLAN, plan)):
             for rig in members:
                 name = rig.vehicle.name
@@ -315,7 +315,7 @@ class Road:
             raise RuntimeError("the road is too short for the plan")
         return Plan(
             ballot=Ballot(1, Name("c1"), 1, block),
-            formations=(block,),
+            blocks=(block,),
             roster=tuple(cells),
             incarnations={
                 name: each.controller.record.incarnation for name, each in members.items()

@@ -42,7 +42,7 @@ MESSAGES = (
         ahead=AROUND,
         behind=AROUND,
         setpoint=(0.11, 0.02),
-        formation=1,
+        block=1,
         bridge=NOW_NS,
     ),
     Command(VEHICLE, RECORD, 400, (-3, 1), 420, (-3, 0), bytes(8 * 60), 38),

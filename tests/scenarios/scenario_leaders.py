@@ -226,7 +226,7 @@ def written_plan(text: str, control: FormationLeader, ballot: messages.Ballot) -
     every_move = [move for each in moves.values() for move in each]
     return messages.Plan(
         ballot=ballot,
-        formations=tuple(map(int, blocks.split())) or control.formation.numbers,
+        blocks=tuple(map(int, blocks.split())) or control.formation.numbers,
         roster=tuple(cells),
         incarnations={name: control.incarnations[name] for name in cells},
         start_cells=cells,

@@ -358,16 +358,16 @@ class Street:
         """Give a vehicle a plan of its own, as a leader does: one move."""
         name, agent = Name(vehicle), self.agents[Name(vehicle)]
         start = self.bridge.vehicles[name].controller.hold_cell
-        formations = (self.scenario.lattice.block_of(start[0]),)
+        blocks = (self.scenario.lattice.block_of(start[0]),)
         plan = make_plan(
             {name: start},
             {name: ((0, start, target),)},
-            formations=formations,
+            blocks=blocks,
             incarnations={name: agent._incarnation},
             t0_s=t0_s,
             slot_s=self.scenario.timing.cycles_s[0],
         )
-        prepare = Prepare(plan.ballot, formations, (name,))
+        prepare = Prepare(plan.ballot, blocks, (name,))
         for topic, message in ((PREPARE, prepare), (PLAN, plan)):
             self.network.inject(KEYS.key(topic, vehicle=vehicle), encode(message))
             self.network.run(self.network.now_s + 0.02)  # nothing overtakes it

@@ -78,7 +78,7 @@ def keep_count(me: PlanExecution, _: object) -> None:
 
 
 def plans_for_some_of_its_blocks(me: PlanExecution, plan: Plan) -> bool:
-    return set(plan.formations) <= set(me.stored.joined)
+    return set(plan.blocks) <= set(me.stored.joined)
 
 
 def promise_without_joining(me: PlanExecution, prepare: Prepare) -> None:

@@ -63,7 +63,7 @@ class Convoy:
         yield Send(HEARTBEAT, Heartbeat(Name("c2"), 18, 3, False, 0), {"coordinator": "c2"})
         for number in range(self.count):
             state = self.state(number, tick)
-            yield Send(STATE, state, {"formation": 0, "vehicle": state.vehicle})
+            yield Send(STATE, state, {"block": 0, "vehicle": state.vehicle})
 
     def clock(self, tick: int, *, ended: bool = False) -> RoadClock:
         """Return the clock of a tick."""

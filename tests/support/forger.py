@@ -178,7 +178,7 @@ class Forger:
     def state(self, **changes: object) -> None:
         """Publish a state in the name of the victim."""
         state = evolve(self.known(VehicleState), **changes)
-        self.publish(STATE, state, formation=state.formation, vehicle=state.vehicle)
+        self.publish(STATE, state, block=state.block, vehicle=state.vehicle)
 
     def prepare(self, term: int) -> None:
         """Publish a PREPARE for the victim."""
@@ -188,7 +188,7 @@ class Forger:
 
     def heartbeat(self, term: int) -> None:
         """Publish a heartbeat in the name of a candidate that does not lead."""
-        forged = Heartbeat(Name("zz"), 1, term, leading=False, formations=0)
+        forged = Heartbeat(Name("zz"), 1, term, leading=False, plans=0)
         self.publish(HEARTBEAT, forged, coordinator="zz")
 
     def flip_token(self, incarnation: int) -> None:

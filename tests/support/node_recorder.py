@@ -59,7 +59,7 @@ class Recorder:
 
 
 def beat(number: int, sender: str = "a") -> node.Send:
-    message = Heartbeat(Name(sender), 1, number, leading=False, formations=0)
+    message = Heartbeat(Name(sender), 1, number, leading=False, plans=0)
     return node.Send(HEARTBEAT, message, {"coordinator": sender})
 
 

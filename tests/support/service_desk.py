@@ -133,13 +133,13 @@ def state(
     t_s: float = 0.0,
     joined: tuple[int, ...] | None = None,
 ) -> VehicleState:
-    formation = PAPER.lattice.block_of(cell[0]) if -8 < cell[0] <= 0 else 0
+    block = PAPER.lattice.block_of(cell[0]) if -8 < cell[0] <= 0 else 0
     return holding(
         name,
         promised,
         cell,
-        formation=formation,
-        joined=(formation,) if joined is None else joined,
+        block=block,
+        joined=(block,) if joined is None else joined,
         accepted=accepted,
         ready=accepted,
         t_s=t_s,

@@ -51,10 +51,10 @@ def set_record(store: RecordStore, **changes: object) -> None:
 def holding(
     vehicle: Name, promised: Ballot | None = None, hold_cell: Cell = (0, 0), **more: object
 ) -> VehicleState:
-    """Return the state of a vehicle of formation 0; `more` replaces or adds fields."""
+    """Return the state of a vehicle of block 0; `more` replaces or adds fields."""
     values: dict[str, Any] = {
         "vehicle": vehicle,
-        "formation": 0,
+        "block": 0,
         "record": VehicleRecord(incarnation=1, joined=(0,), promised=promised),
         "ready": False,
         "completed": 0,
@@ -88,7 +88,7 @@ def make_plan(
     steps = [move for each in all_moves.values() for move in each]
     values: dict[str, Any] = {
         "ballot": BALLOT,
-        "formations": (0,),
+        "blocks": (0,),
         "roster": tuple(cells),
         "incarnations": dict.fromkeys(cells, 1),
         "start_cells": dict(cells),
@@ -103,7 +103,7 @@ def make_plan(
 def sense_in(cell: Cell, tick: int = 0, **more: Any) -> Sense:  # noqa: ANN401 (fields)
     """Return what a vehicle senses that holds exactly in a cell; `more` replaces fields."""
     t_s = tick * PAPER.runtime.tick_s
-    formation = PAPER.lattice.block_of(cell[0])
+    block = PAPER.lattice.block_of(cell[0])
     values: dict[str, Any] = {
         "vehicle": Name("me"),
         "tick": tick,
@@ -113,9 +113,9 @@ def sense_in(cell: Cell, tick: int = 0, **more: Any) -> Sense:  # noqa: ANN401 (
         "motion_end_tick": 0,
         "motion_origin": cell,
         "preferred_lane": 0,
-        "record": VehicleRecord(joined=(formation,)),
+        "record": VehicleRecord(joined=(block,)),
         "ahead": (),
-        "formation": formation,
+        "block": block,
     }
     return changed(Sense(**values), **more)
 

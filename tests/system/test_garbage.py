@@ -70,10 +70,10 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
 
 def keys_of(topic: Topic, vehicle: str) -> Iterator[str]:
     """Return keys of a topic: of somebody who is there and of somebody who is not."""
-    there = {"vehicle": vehicle, "formation": 0, "stretch": 0, "coordinator": "c1"}
+    there = {"vehicle": vehicle, "block": 0, "stretch": 0, "coordinator": "c1"}
     there |= {"role": "agent", "name": vehicle, "incarnation": 1}
     there |= {"session": "s1", "client": "client"}
-    nobody = dict.fromkeys(topic.parameters, "ghost") | {"formation": 99, "stretch": 99}
+    nobody = dict.fromkeys(topic.parameters, "ghost") | {"block": 99, "stretch": 99}
     yield KEYS.key(topic, **there)
     yield KEYS.key(topic, **nobody)
 
@@ -166,7 +166,7 @@ def show_tokens(transport: ZenohTransport) -> None:
     keys += [f"{alive}/coordinator/c0/not-a-number", f"{alive}/vehicle/{'v' * 500}"]
     keys += [KEYS.key(VEHICLE_ALIVE, vehicle=GHOST), KEYS.key(BRIDGE_ALIVE, incarnation=GHOST)]
     keys += [KEYS.key(COORDINATOR_ALIVE, coordinator=GHOST, incarnation=7)]
-    keys += [KEYS.key(STATE, formation=0, vehicle=GHOST), f"{alive}/x", KEYS.key(SERVICE)]
+    keys += [KEYS.key(STATE, block=0, vehicle=GHOST), f"{alive}/x", KEYS.key(SERVICE)]
     for key in keys:
         transport.announce(key)
     for key in keys:

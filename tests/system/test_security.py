@@ -111,7 +111,7 @@ PUBLISHED: tuple[tuple[str, Topic, dict[str, object], str, tuple[str, ...]], ...
     ("coordinator.c1", EVENT, {"role": "coordinator", "name": "c1"}, "bridge", ()),
     (f"vehicle.{B}", COMMAND, {"vehicle": B}, "bridge", (FLEETS[B],)),
     # A vehicle's caretaker is a part of the bridge.
-    (f"vehicle.{B}", STATE, {"formation": 3, "vehicle": B}, f"vehicle.{A}", (FLEETS[B], "bridge")),
+    (f"vehicle.{B}", STATE, {"block": 3, "vehicle": B}, f"vehicle.{A}", (FLEETS[B], "bridge")),
     (f"vehicle.{B}", MOTION, {"stretch": -3, "vehicle": B}, f"vehicle.{A}", (FLEETS[B],)),
     (f"vehicle.{B}", REPORT, {"role": "agent", "name": B}, "observer.watch", (FLEETS[B],)),
 )
@@ -139,8 +139,8 @@ def test_nobody_publishes_what_is_somebody_elses(network: Network) -> None:
 
 def test_other_ways_of_naming_a_key_are_no_ways_around(network: Network) -> None:
     rightful, reader = network.join(f"vehicle.{A}"), network.join("coordinator.c2")
-    until_heard(rightful, reader, STATE, formation=1, vehicle=A)
-    key = KEYS.key(STATE, formation=1, vehicle=A)
+    until_heard(rightful, reader, STATE, block=1, vehicle=A)
+    key = KEYS.key(STATE, block=1, vehicle=A)
     for who in (f"vehicle.{B}", FLEETS[A], "coordinator.c1", "observer.watch"):
         session = network.join(who).transport._session
         for wild in ("laneweave/test/state/1/*", "laneweave/test/**", "laneweave/*/state/1/*"):
@@ -150,7 +150,7 @@ def test_other_ways_of_naming_a_key_are_no_ways_around(network: Network) -> None
             session.declare_publisher(key).put(b"by a publisher")
             session.delete(key)
     time.sleep(QUIET_S)
-    rightful.publish(STATE, b"last", formation=1, vehicle=A)
+    rightful.publish(STATE, b"last", block=1, vehicle=A)
     until(lambda: b"last" in reader.heard(STATE))
     assert {payload for _, payload in reader.received()} == {b"first", b"last"}
 
@@ -179,7 +179,7 @@ def test_nobody_reads_what_is_for_somebody_else(network: Network) -> None:
         (leader, vehicle, PREPARE, {"vehicle": B}),
         (bridge, vehicle, SENSE, {"vehicle": B}),
         (vehicle, bridge, COMMAND, {"vehicle": B}),
-        (vehicle, leader, STATE, {"formation": 1, "vehicle": B}),
+        (vehicle, leader, STATE, {"block": 1, "vehicle": B}),
         (bridge, leader, CENSUS, {}),
     )
     snoopers = {who: network.join(who) for who in MAY_READ if who != FLEETS[B]}

@@ -177,7 +177,7 @@ class AgentCore:
         if execution is None or execution.plan is None or sense is None or not self.in_charge:
             return
         if execution.needs_states(sense.t_s):
-            self.wanted_states = execution.plan.formations
+            self.wanted_states = execution.plan.blocks
 
     def on_motion(self, motion: Motion) -> None:
         """Handle the motion of a vehicle in one of the wanted stretches."""
@@ -400,7 +400,7 @@ class AgentCore:
         assert execution is not None  # noqa: S101 (there was a SENSE)
         assert sense is not None  # noqa: S101 (there was a SENSE)
         state = execution.state(sense, attended=True)
-        return Send(STATE, state, {"formation": state.formation, **self._own})
+        return Send(STATE, state, {"block": state.block, **self._own})
 
     def leave(self) -> list[Effect]:
         """Shut down: the vehicle has left the road."""

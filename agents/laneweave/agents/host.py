@@ -160,7 +160,7 @@ class AgentHost:
             effects, changed = [], False
             for agent in self._agents.values():
                 wanted = agent.wanted_states
-                if message.formation in wanted:
+                if message.block in wanted:
                     effects += agent.handle(event, now_s)
                     changed = changed or agent.wanted_states != wanted
             if changed:

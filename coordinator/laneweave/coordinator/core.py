@@ -332,7 +332,7 @@ class CoordinatorCore:
 
         A leader ignores vehicles that its census does not list, for example departed ones.
         """
-        if self.election.leading and self._formation_of.get(state.vehicle) == state.formation:
+        if self.election.leading and self._formation_of.get(state.vehicle) == state.block:
             return self.operation.on_state(state, now_s)
         return None
 

@@ -107,7 +107,7 @@ class Seat:
     def plan(self, *formations: int, incarnation: int = 1) -> list[Effect]:
         cells: dict[Name, Cell] = {ME: HOME, OTHER: (0, 0)}
         incarnations = {ME: incarnation, OTHER: 1}
-        plan = make_plan(cells, incarnations=incarnations, formations=formations or (0,))
+        plan = make_plan(cells, incarnations=incarnations, blocks=formations or (0,))
         return self.rig.hand(PLAN, plan)
 
 

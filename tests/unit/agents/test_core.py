@@ -43,16 +43,16 @@ def test_starts_with_its_own_topics_and_the_token_last() -> None:
 
 def test_the_state_contains_measurements_and_the_block_of_entry() -> None:
     rig = Rig()
-    sense = changed(rig.sense(), formation=5, joined=(5, 6))
+    sense = changed(rig.sense(), block=5, joined=(5, 6))
     rig.hand(topics.SENSE, sense)
     rig.coast(1)
-    sense = changed(rig.sense(), formation=5, joined=(5, 6), incarnation=1)
+    sense = changed(rig.sense(), block=5, joined=(5, 6), incarnation=1)
     command, state = (each for each in rig.hand(topics.SENSE, sense) if isinstance(each, node.Send))
     assert (command.topic, command.parameters) == (topics.COMMAND, {"vehicle": ME})
-    assert (state.topic, state.parameters) == (topics.STATE, {"formation": 5, "vehicle": ME})
+    assert (state.topic, state.parameters) == (topics.STATE, {"block": 5, "vehicle": ME})
     s_m, speed_mps, _, y_m, *_ = sense.state
     values = {"s_m": s_m, "y_m": y_m, "speed_mps": speed_mps, "t_s": TICK_S}
-    assert rig.shown == [holding(ME, None, HOME, formation=5, joined=(5, 6), **values)]
+    assert rig.shown == [holding(ME, None, HOME, block=5, joined=(5, 6), **values)]
 
 
 def test_left_reports_once_and_withdraws_its_token_last() -> None:

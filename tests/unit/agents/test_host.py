@@ -33,7 +33,7 @@ FRONT: Cell = (0, 0)
 """In formation 0; the next block begins at column -4."""
 SIDE: Cell = (-1, 1)
 """Likewise."""
-STATES_OF_0 = topics.STATE, {"formation": 0}
+STATES_OF_0 = topics.STATE, {"block": 0}
 
 
 def make_host(*vehicles: Name, shard: Shard | None = None) -> AgentHost:
@@ -64,7 +64,7 @@ def feel(
 
 def show(host: AgentHost, state: VehicleState) -> list[node.Effect]:
     """Bring the host a state of a vehicle, as the network does."""
-    key = {"formation": str(state.formation), "vehicle": state.vehicle}
+    key = {"block": str(state.block), "vehicle": state.vehicle}
     return give(host, node.Arrived(topics.STATE, key, state))
 
 
@@ -83,7 +83,7 @@ def accept(
     effects: list[node.Effect] = []
     for name in cells:
         effects += hand(host, topics.PREPARE, name, Prepare(BALLOT, formations, tuple(cells)))
-    plan = make_plan(cells, formations=formations)
+    plan = make_plan(cells, blocks=formations)
     for name, cell in cells.items():
         effects += hand(host, topics.PLAN, name, plan)
         effects += feel(host, name, cell, joined=formations, accepted=BALLOT)
@@ -110,7 +110,7 @@ def test_states_go_to_the_members_of_their_formation(formation: int) -> None:
         feel(host, name, cell)
     *_, last = sent(accept(host, {A: FRONT, B: SIDE}), VehicleState)
     assert (last.vehicle, last.ready) == (B, True)
-    show(host, replace(last, formation=formation))
+    show(host, replace(last, block=formation))
     (state,) = sent(feel(host, A, FRONT, 2), VehicleState)
     assert state.go is (formation == 0)  # A has heard B
     (state,) = sent(feel(host, B, SIDE, 2), VehicleState)
@@ -127,16 +127,16 @@ def test_host_subscribes_to_all_formations_of_a_plan_while_an_agent_waits(
         assert node.Listen(*STATES_OF_0) not in feel(host, name, cell, joined=formations)
     effects = accept(host, cells, formations)
     assert [effect for effect in effects if isinstance(effect, node.Listen)] == [
-        node.Listen(topics.STATE, {"formation": each}) for each in formations
+        node.Listen(topics.STATE, {"block": each}) for each in formations
     ]
     first, second = (state for state in sent(effects, VehicleState) if state.accepted)
-    assert (first.formation, second.formation) == (0, formations[-1])
+    assert (first.block, second.block) == (0, formations[-1])
     assert show(host, first) == show(host, second) == []
     (state,) = sent(feel(host, A, FRONT, 2, joined=formations), VehicleState)
     assert state.go
     effects = feel(host, B, rear, 2, joined=formations)
     assert [effect for effect in effects if isinstance(effect, node.Unlisten)] == [
-        node.Unlisten(topics.STATE, {"formation": each}) for each in formations
+        node.Unlisten(topics.STATE, {"block": each}) for each in formations
     ]
 
 

@@ -93,7 +93,7 @@ def refused(effects: list[Effect]) -> bool:
 
 
 def beat(term: int = 1, incarnation: int = 1, name: str = "c2") -> Heartbeat:
-    return Heartbeat(Name(name), incarnation, term, leading=False, formations=0)
+    return Heartbeat(Name(name), incarnation, term, leading=False, plans=0)
 
 
 @for_each(("topic", "make"), [

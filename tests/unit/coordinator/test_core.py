@@ -149,8 +149,8 @@ def test_states_of_vehicles_that_the_census_does_not_list_are_ignored() -> None:
     theirs = Ballot(4, Name("c9"), 3, 2)
     for stranger in (
         state(C, (0, 0), theirs, joined=(0, 1)),
-        changed(state(A, (0, 0), theirs, joined=(0, 1)), formation=1),
-        changed(state(B, (-5, 0), theirs, joined=(0, 1)), formation=0),
+        changed(state(A, (0, 0), theirs, joined=(0, 1)), block=1),
+        changed(state(B, (-5, 0), theirs, joined=(0, 1)), block=0),
     ):
         desk.tell(stranger)
     assert set(desk.leaders) == {0, 1}  # not joined
@@ -179,7 +179,7 @@ def test_leads_and_steps_down() -> None:
     assert logged(effects) == ["leader-elected"]
     desk.tell(census({A: (0, 0)}))
     assert set(desk.leaders) == {0}
-    better = Heartbeat(Name("c1"), 1, 1, leading=False, formations=0)
+    better = Heartbeat(Name("c1"), 1, 1, leading=False, plans=0)
     assert logged(desk.tell(better)) == []  # it waits until the newcomer leads
     effects = desk.tell(replace(better, leading=True))
     assert Unlisten(STATE) in effects
@@ -250,7 +250,7 @@ def test_prepare_promise_plan_acceptance() -> None:
     plans = messages(effects, Plan)
     assert [(s.topic, s.parameters["vehicle"]) for s in plans] == [(PLAN, A), (PLAN, B)]
     assert plans[0].message == plans[1].message
-    assert plans[0].message.formations == (0,)
+    assert plans[0].message.blocks == (0,)
     told = desk.accept(cells)
     assert desk.leaders[0].phase is BallotPhase.IN_FORCE
     assert desk.accept(cells, t_s=2.1) == []
@@ -344,7 +344,7 @@ def test_an_order_of_an_outbid_leader_is_not_computed() -> None:
 @pytest.mark.parametrize(
     "news",
     [
-        Heartbeat(Name("c1"), 1, 1, leading=True, formations=0),
+        Heartbeat(Name("c1"), 1, 1, leading=True, plans=0),
         state(A, promised=Ballot(9, Name("c1"), 1, 1), t_s=2.0),
     ],
     ids=["stepped down", "outbid"],
@@ -505,7 +505,7 @@ def test_ballots_never_repeat() -> None:
                 ballot = desk.leaders[number].ballot
                 assert ballot is not None
                 seen.append(ballot)
-            desk.tell(Heartbeat(Name("c1"), 1, 9, leading=True, formations=0))
+            desk.tell(Heartbeat(Name("c1"), 1, 9, leading=True, plans=0))
             desk.wait(2 * PAPER.network.election_s)
     assert len(set(seen)) == len(seen) == 24
 

@@ -24,7 +24,7 @@ def candidate(name: str = "b", started_s: float = 0.0) -> Election:
 
 
 def beat(name: str, incarnation: int = 1, term: int = 0, *, leading: bool = False) -> Heartbeat:
-    return Heartbeat(Name(name), incarnation, term, leading=leading, formations=0)
+    return Heartbeat(Name(name), incarnation, term, leading=leading, plans=0)
 
 
 @pytest.mark.parametrize("heard_s", [0.1, 0.3, 1.1, 7.7, 1e6 + 0.3])

@@ -107,7 +107,7 @@ def test_the_first_agent_is_in_charge_with_its_first_command(desk: Desk) -> None
     sense = sensed(desk, B)
     block = SCENARIO.lattice.block_of(sense.hold_cell[0])
     assert (sense.record.incarnation, sense.caretaker) == (AGENT, False)
-    assert (sense.formation, sense.record.joined) == (block, (block,))
+    assert (sense.block, sense.record.joined) == (block, (block,))
     assert read_events(desk.folder, "agent-took-over") == []
 
 
@@ -284,9 +284,9 @@ def test_there_are_no_caretakers_while_the_bridge_is_off_the_network(attended: D
 def ballot_for(desk: Desk) -> tuple[Prepare, Plan]:
     """Return a ballot for B alone, which only holds."""
     sense = desk.core.vehicles[B].sense(0, caretaker=True)
-    prepare = Prepare(BALLOT, (sense.formation,), (B,))
+    prepare = Prepare(BALLOT, (sense.block,), (B,))
     incarnations = {B: sense.record.incarnation}
-    plan = make_plan({B: sense.hold_cell}, formations=prepare.formations, incarnations=incarnations)
+    plan = make_plan({B: sense.hold_cell}, blocks=prepare.blocks, incarnations=incarnations)
     return prepare, plan
 
 
@@ -295,7 +295,7 @@ def test_a_caretaker_shows_its_vehicle_at_each_tick(cared_for: Desk) -> None:
         effects = next_tick(cared_for, A)
         (send,) = (e for e in effects if isinstance(e, Send) and e.topic is STATE)
         state, vehicle = send.message, cared_for.core.vehicles[B]
-        assert send.parameters == {"formation": vehicle.formation, "vehicle": B}
+        assert send.parameters == {"block": vehicle.block, "vehicle": B}
         assert (state.vehicle, state.attended, state.t_s) == (B, False, cared_for.core.t_s)
         assert (state.record.incarnation, state.s_m) == (
             vehicle.controller.record.incarnation,
@@ -373,8 +373,8 @@ def test_a_caretaker_that_has_ended_publishes_nothing(cared_for: Desk) -> None:
 
 def test_the_next_caretaker_remembers_the_joined_formations_only(cared_for: Desk) -> None:
     prepare, _ = ballot_for(cared_for)
-    both = (prepare.formations[0], prepare.formations[0] + 1)
-    cared_for.give(Arrived(PREPARE, OF_B, replace(prepare, formations=both)))
+    both = (prepare.blocks[0], prepare.blocks[0] + 1)
+    cared_for.give(Arrived(PREPARE, OF_B, replace(prepare, blocks=both)))
     first = cared_for.core.vehicles[B].controller.record.incarnation
     cared_for.up(B)
     next_tick(cared_for, A)

@@ -106,7 +106,7 @@ class BallotRound:
         cells, every_move = self.hold_cells, [move for each in moves.values() for move in each]
         return Plan(
             ballot=self.ballot,
-            formations=formations,
+            blocks=formations,
             roster=tuple(cells),
             incarnations=self.incarnations,
             start_cells=cells,

@@ -73,8 +73,8 @@ class FormationsOperation:
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry]:
         """Pass the state to the leader of its formation."""
         # Formations stay joined under any leader.
-        self._groups.join((state.formation, *state.record.joined))
-        group = self._groups.of(state.formation)
+        self._groups.join((state.block, *state.record.joined))
+        group = self._groups.of(state.block)
         leader = self.leaders.get(group[0])
         if leader is None or leader.formation.numbers != group:
             return []

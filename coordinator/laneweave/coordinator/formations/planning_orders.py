@@ -330,7 +330,7 @@ class FormationPlanner:
             return []
         return [
             neighbour.plan
-            for neighbour in self._neighbours(plan.formations)
+            for neighbour in self._neighbours(plan.blocks)
             # In other phases the plan has been outbid or aborted and is not executed.
             if neighbour.plan is not None
             and neighbour.plan.ballot == neighbour.ballot

@@ -96,7 +96,7 @@ class CellTransfer(BallotRound):
         after = {name: (cells - given) | needed.get(name, set()) for name, cells in before.items()}
         moves: dict[Name, tuple[PlannedMove, ...]] = dict.fromkeys(self.roster, ())
         moves |= {name: ((0, *move),) for name, move in self.moves.items()}
-        formations = tuple(sorted({promise.formation for promise in self.promises.values()}))
+        formations = tuple(sorted({promise.block for promise in self.promises.values()}))
         return replace(
             self.make_plan(formations, moves, self.t0_s, self.slot_s),
             before={name: tuple(sorted(before[name])) for name in self.roster},

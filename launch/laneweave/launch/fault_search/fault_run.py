@@ -538,7 +538,7 @@ class FaultRun:
             vehicles=len(self.setup.visits),
             motions=checker.motions,
             plans=len(plans),
-            joint_plans=sum(len(plan.formations) > 1 for plan in plans),
+            joint_plans=sum(len(plan.blocks) > 1 for plan in plans),
             takeovers=self._takeovers + self.road.takeovers,
             delivered=network.delivered,
             dropped=network.dropped,

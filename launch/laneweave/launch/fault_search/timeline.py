@@ -78,13 +78,13 @@ def _text_of(effect: Send) -> str | None:
             )
         case Prepare() as prepare:
             return (
-                f"PREPARE {short(prepare.ballot)} of {prepare.formations} "
+                f"PREPARE {short(prepare.ballot)} of {prepare.blocks} "
                 f"to {effect.parameters['vehicle']}, roster {' '.join(prepare.roster)}"
             )
         case Plan() as plan:
             moves = {name: list(each) for name, each in plan.moves.items() if each}
             return (
-                f"PLAN {short(plan.ballot)} of {plan.formations} to {effect.parameters['vehicle']}"
+                f"PLAN {short(plan.ballot)} of {plan.blocks} to {effect.parameters['vehicle']}"
                 f" t0={plan.t0_s:.1f} moves {moves}"
             )
         case LogEvent() as event:

@@ -192,7 +192,7 @@ class RoadView:
                     incarnation,
                     leading=heartbeat.leading and now_s - received_s < election_s,
                     term=heartbeat.term,
-                    plans_in_force=heartbeat.formations,
+                    plans_in_force=heartbeat.plans,
                     heard_s_ago=round(now_s - received_s, 3),
                     token=token,
                 )

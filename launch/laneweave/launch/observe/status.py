@@ -270,7 +270,7 @@ def _plans(view: RoadView, leader: Coordinator | None) -> Plans:
     if view.census is None:
         return Plans(in_force, "formations", None, None)
     closed = view.census.formations
-    accepted = {state.formation for state in states if state.accepted}
+    accepted = {state.block for state in states if state.accepted}
     planned = sum(
         any(one.first_block <= block <= one.last_block for block in accepted) for one in closed
     )

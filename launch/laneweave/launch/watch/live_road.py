@@ -190,7 +190,7 @@ class LiveRoad:
         if entry is not None:
             owner = formations.at(entry.cell[0])
         elif state is not None:
-            owner = formations.at(lattice.block_range(state.formation).start)
+            owner = formations.at(lattice.block_range(state.block).start)
         formation = -1 if owner is None else owner.number
         preferred = entry.preferred_lane if entry is not None else ANY_LANE
         vehicle_type = entry.vehicle_type if entry is not None else CAR

@@ -211,7 +211,7 @@ class PlanExecution:
         stored = sense.record
         return VehicleState(
             vehicle=self.vehicle,
-            formation=sense.formation,
+            block=sense.block,
             record=VehicleRecord(
                 incarnation=self.incarnation,
                 joined=self.stored.joined,
@@ -273,7 +273,7 @@ def is_in_roster(execution: PlanExecution, prepare: Prepare) -> bool:
     """The vehicle is in the roster, and in one of the formations."""
     # A vehicle that waited at the end of a lane belongs to another formation than before.
     return execution.vehicle in prepare.roster and (
-        execution.owns_cells or not {*prepare.formations}.isdisjoint(execution.stored.joined)
+        execution.owns_cells or not {*prepare.blocks}.isdisjoint(execution.stored.joined)
     )
 
 
@@ -286,7 +286,7 @@ def promise(execution: PlanExecution, prepare: Prepare) -> None:
     """Promise the ballot; request storage of its blocks as joined."""
     execution.promised, execution.promise_stored = prepare.ballot, False
     if not execution.owns_cells:
-        execution.wanted_joined = tuple(sorted({*execution.wanted_joined, *prepare.formations}))
+        execution.wanted_joined = tuple(sorted({*execution.wanted_joined, *prepare.blocks}))
 
 
 def drop_plan(execution: PlanExecution, _: object) -> None:
@@ -339,7 +339,7 @@ def stays_in_its_blocks(execution: PlanExecution, plan: Plan) -> bool:
     """The territory lies in the blocks of the plan."""
     if execution.owns_cells:
         return True
-    blocks = set(plan.formations)
+    blocks = set(plan.blocks)
     return all(
         execution.lattice.block_of(column) in blocks and 0 <= lane < execution.lattice.lanes
         for column, lane in plan.territory
@@ -348,7 +348,7 @@ def stays_in_its_blocks(execution: PlanExecution, plan: Plan) -> bool:
 
 def has_joined(execution: PlanExecution, plan: Plan) -> bool:
     """The blocks of the plan are exactly those that the controller has stored as joined."""
-    return execution.owns_cells or set(plan.formations) == set(execution.stored.joined)
+    return execution.owns_cells or set(plan.blocks) == set(execution.stored.joined)
 
 
 def transfers_only_owned_cells(execution: PlanExecution, plan: Plan) -> bool:

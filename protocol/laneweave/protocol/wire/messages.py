@@ -58,7 +58,7 @@ class Heartbeat(Message, frozen=True):
     """Highest term that the sender has seen; its own term while it leads."""
     leading: bool
     """Whether the sender leads."""
-    formations: Int64
+    plans: Int64
     """Number of plans in force, for observers."""
 
 
@@ -124,7 +124,7 @@ class Prepare(Message, frozen=True):
     """
 
     ballot: Ballot
-    formations: tuple[Int64, ...]
+    blocks: tuple[Int64, ...]
     """Blocks that the plan may use, ascending: the blocks of one formation or several joined."""
     roster: tuple[Name, ...]
     """All vehicles on the road that entered in these blocks; in the rolling operation, the vehicles
@@ -142,7 +142,7 @@ class Plan(Message, frozen=True):
     """
 
     ballot: Ballot
-    formations: tuple[Int64, ...]
+    blocks: tuple[Int64, ...]
     """Blocks of the ballot, which contain the territory."""
     roster: tuple[Name, ...]
     """Vehicles of the ballot."""
@@ -175,7 +175,7 @@ class VehicleState(Message, frozen=True):
 
     vehicle: Name
     """Vehicle that the state describes; a caretaker sends the state while there is no agent."""
-    formation: Int64
+    block: Int64
     """Number of the block in which the vehicle entered."""
     record: VehicleRecord
     """As stored; the promise as made by the process in charge, the acceptance only if it is one of
@@ -284,7 +284,7 @@ class Sense(Message, frozen=True):
     """Neighbours behind: at most one per lane that the body touches or is next to."""
     setpoint: tuple[Real, Real] = (0.0, 0.0)
     """Accelerations last commanded to the actuators, along and across the road [m/s2]."""
-    formation: Int64 = 0
+    block: Int64 = 0
     """Number of the block in which the vehicle entered."""
     motion_ticks: Int64 = 0
     """Duration of the current move [ticks]; 0: the vehicle settles in its cell, or holds."""

@@ -132,7 +132,7 @@ COMMAND = Topic(
 # Vehicles read the states of the vehicles that they wait for. For a vehicle without an agent, its
 # caretaker in the bridge sends the state.
 STATE = Topic(
-    "state", "state/{formation}/{vehicle}", messages.VehicleState, Party.VEHICLE, Quality.LATEST,
+    "state", "state/{block}/{vehicle}", messages.VehicleState, Party.VEHICLE, Quality.LATEST,
     readers=(Party.COORDINATOR, Party.VEHICLE, Party.OBSERVER), deputy=Party.BRIDGE,
     remark="coordinators: only the leader; vehicles: only while waiting for the formation",
 )  # fmt: skip

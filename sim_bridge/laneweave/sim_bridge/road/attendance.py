@@ -262,7 +262,7 @@ class Attendance:
 
 
 def _state_effect(state: VehicleState) -> Effect:
-    return Send(STATE, state, {"formation": state.formation, "vehicle": state.vehicle})
+    return Send(STATE, state, {"block": state.block, "vehicle": state.vehicle})
 
 
 def notify_left(vehicle: RoadVehicle, tick: int) -> Effect:

@@ -137,7 +137,7 @@ class RoadVehicle:
             ahead=neighbours.ahead,
             behind=neighbours.behind,
             setpoint=controller.plant.setpoint,
-            formation=self.block,
+            block=self.block,
             caretaker=caretaker,
             left=left,
             bridge=self.bridge,

@@ -101,7 +101,7 @@ def test_an_overfull_lane_is_sorted_by_a_joint_ballot_of_two_formations() -> Non
     effects = desk.give(run_job(job))
     plan = plan_of(effects)
     assert plan_problems(plan) == []
-    assert (plan.ballot, plan.formations, plan.roster) == (desk.ballot, (0, 1), tuple(members))
+    assert (plan.ballot, plan.blocks, plan.roster) == (desk.ballot, (0, 1), tuple(members))
     assert set(plan.territory) <= PAPER.lattice.block_cells(0) | PAPER.lattice.block_cells(1)
     for name, moves in plan.moves.items():
         assert (moves[-1][2] if moves else members[name])[1] == LANES[name]
@@ -130,7 +130,7 @@ def test_without_neighbours_a_formation_is_planned_alone() -> None:
     desk = Desk(scenario=JOINING)
     (job,) = jobs(desk.collect_promises(FULL, LANES))
     effects = desk.give(run_job(job))
-    assert plan_of(effects).formations == (0,)
+    assert plan_of(effects).blocks == (0,)
     assert len(notes(effects, "lane-out-of-reach")) == 1
 
 
@@ -160,7 +160,7 @@ def test_formations_are_not_joined_when_together_they_are_too_late() -> None:
     desk, job = overfull(short_road)
     effects = desk.give(run_job(job))
     assert notes(effects, "formations-joined") == []
-    assert plan_of(effects).formations == (0,)
+    assert plan_of(effects).blocks == (0,)
 
 
 def test_a_formation_that_has_given_up_is_not_joined() -> None:
@@ -168,7 +168,7 @@ def test_a_formation_that_has_given_up_is_not_joined() -> None:
     desk = Desk(scenario=JOINING)
     (job,) = jobs(behind_of_one(desk, 63.0))
     assert desk.leaders[0].phase is BallotPhase.ABORTED
-    assert plan_of(desk.give(run_job(job))).formations == (1,)
+    assert plan_of(desk.give(run_job(job))).blocks == (1,)
     assert sorted(desk.leaders) == [0, 1]
 
 
@@ -186,7 +186,7 @@ def test_no_more_formations_are_joined_than_the_scenario_allows() -> None:
     (job,) = jobs(desk.promise(cells, joined=(0, 1)))
     effects = desk.give(run_job(job))
     assert notes(effects, "formations-joined") == []
-    assert plan_of(effects).formations == (0, 1)
+    assert plan_of(effects).blocks == (0, 1)
 
 
 # --- groups that others have made -------------------------------------------------------------
@@ -229,7 +229,7 @@ def test_groups_that_overlap_become_one() -> None:
     desk = leading(cells)
     assert sorted(desk.leaders) == [0, 1, 2]
     desk.tell(state(A, cells[A], joined=(0, 1)))
-    desk.tell(changed(state(C, cells[C]), formation=2, joined=(1, 2)))
+    desk.tell(changed(state(C, cells[C]), block=2, joined=(1, 2)))
     assert {number: each.formation.numbers for number, each in desk.leaders.items()} == {
         0: (0, 1, 2)
     }
@@ -348,5 +348,5 @@ def test_a_lane_that_only_vehicles_without_agents_miss_joins_no_formations() -> 
     mine = {name: cells[name] for name in (A, B)}
     (job,) = jobs(desk.promise(mine, unattended=[A]))
     effects = desk.give(run_job(job))
-    assert plan_of(effects).formations == (0,)
+    assert plan_of(effects).blocks == (0,)
     assert notes(effects, "lane-out-of-reach") == [{"formation": 0, "vehicles": [A]}]

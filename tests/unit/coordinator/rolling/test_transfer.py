@@ -94,7 +94,7 @@ def test_the_plan_is_made_from_the_promises() -> None:
     transfer = issued()
     plan = transfer.plan
     assert plan == replace(
-        make_plan(), formations=plan.formations if plan else (), incarnations={A: 7, B: 7}
+        make_plan(), blocks=plan.blocks if plan else (), incarnations={A: 7, B: 7}
     )
     assert plan is not None
     assert plan_problems(plan) == ownership_problems(plan) == []

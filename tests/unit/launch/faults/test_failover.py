@@ -35,7 +35,7 @@ class History:
             self.look(START_S + index / 10)
 
     def leads(self, name: Name, term: int, now_s: float) -> None:
-        self.view.update(Heartbeat(name, 1, term, leading=True, formations=0), 0.0)
+        self.view.update(Heartbeat(name, 1, term, leading=True, plans=0), 0.0)
         self.look(now_s)
 
     def plan(self, name: Name, closed_s: float, now_s: float) -> None:

@@ -60,7 +60,7 @@ def on_road(*vehicles: str, leader: str | None = "c1", incarnation: int = 1) -> 
 
 
 def leads(view: RoadView, name: str, incarnation: int = 1) -> None:
-    heartbeat = Heartbeat(Name(name), incarnation, view.term, leading=True, formations=0)
+    heartbeat = Heartbeat(Name(name), incarnation, view.term, leading=True, plans=0)
     view.update(heartbeat, 0.0)
 
 

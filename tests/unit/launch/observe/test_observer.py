@@ -20,7 +20,7 @@ def clock(tick: int) -> RoadClock:
 
 
 def heartbeat(name: str, term: int, *, leading: bool = True) -> Heartbeat:
-    return Heartbeat(Name(name), 1, term, leading=leading, formations=0)
+    return Heartbeat(Name(name), 1, term, leading=leading, plans=0)
 
 
 def test_an_empty_view() -> None:

@@ -47,7 +47,7 @@ class Listener:
     def heartbeat(
         self, name: str, term: int, now_s: float, *, leading: bool = False, incarnation: int = 1
     ) -> None:
-        message = Heartbeat(Name(name), incarnation, term, leading=leading, formations=2)
+        message = Heartbeat(Name(name), incarnation, term, leading=leading, plans=2)
         self.view.update(Arrived(topics.HEARTBEAT, {"coordinator": name}, message), now_s)
 
     def coordinator(self, name: str, *, up: bool = True) -> None:
@@ -230,13 +230,13 @@ def test_formations_are_counted_by_their_number(healthy: Listener) -> None:
     healthy.census(112, closed, **vehicles)
     # Vehicles show the column in which they entered; the last one's formation is still open.
     for name, column in zip(vehicles, (0, 2, 5, 8), strict=True):
-        healthy.states(name, [112], formation=column)
+        healthy.states(name, [112], block=column)
     assert healthy.status().plans == Plans(2, "formations", 2, 0)
     promised = Ballot(1, Name("c"), 1, 1)
     for name, column in (("a", 0), ("b", 2), ("d", 8)):
-        healthy.states(name, [113], formation=column, accepted=True, promised=promised)
+        healthy.states(name, [113], block=column, accepted=True, promised=promised)
     assert healthy.status().plans == Plans(2, "formations", 2, 1)
-    healthy.states("c", [113], formation=5, accepted=True, promised=promised)
+    healthy.states("c", [113], block=5, accepted=True, promised=promised)
     assert healthy.status().plans == Plans(2, "formations", 2, 2)
 
 

@@ -194,7 +194,7 @@ def test_a_vehicle_that_is_not_listed_yet_is_in_the_formation_of_its_block() -> 
     road, _ = with_formations(FORMATIONS, 9, ClosedFormation(0, 2, 5.0))
     entering = Convoy(10, scenario=FORMATIONS).state(9, START + 22)
     for block, formation in ((2, 0), (3, -1)):
-        road.update(replace(entering, formation=block), 2.0)
+        road.update(replace(entering, block=block), 2.0)
         row = shown(road)["vehicles"][-1]
         assert (row[0], row[5]) == ("v0009", formation)
 

@@ -222,7 +222,7 @@ def test_no_more_messages_are_delayed_than_allowed(monkeypatch: pytest.MonkeyPat
 
 def test_effects_pass() -> None:
     core, listener = faulty()
-    heartbeat = Heartbeat(Name("c1"), 1, 1, leading=False, formations=0)
+    heartbeat = Heartbeat(Name("c1"), 1, 1, leading=False, plans=0)
     event = LogEvent(Name("agent"), Name("v1"), 0.0, Name("kind"))
     report = Report(Name("agent"), Name("v1"), solves=3)
     effects: list[node.Effect] = [

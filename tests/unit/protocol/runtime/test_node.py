@@ -57,7 +57,7 @@ from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report, 
 from support.node_recorder import Recorder, at_start
 
 KEYS = topics.Keys("r")
-BEAT = Heartbeat(Name("c1"), 7, 2, leading=True, formations=1)
+BEAT = Heartbeat(Name("c1"), 7, 2, leading=True, plans=1)
 BEAT_KEY = "laneweave/r/heartbeat/c1"
 
 
@@ -218,9 +218,9 @@ def test_a_message_on_a_topic_without_messages_is_counted(bench: Bench, key: str
 def test_effects_reach_the_transport(bench: Bench) -> None:
     work = Compute(1, lambda _: 2)
     calls = bench.carry_out(
-        Listen(topics.STATE, {"formation": 3}),
+        Listen(topics.STATE, {"block": 3}),
         Listen(topics.CENSUS),
-        Unlisten(topics.STATE, {"formation": 3}),
+        Unlisten(topics.STATE, {"block": 3}),
         Announce(topics.VEHICLE_ALIVE, {"vehicle": "v1"}),
         Withdraw(topics.VEHICLE_ALIVE, {"vehicle": "v1"}),
         Watch(topics.VEHICLE_ALIVE),

@@ -65,7 +65,7 @@ SETTLED = token_key("settled")
 
 
 def beat(number: int = 0) -> bytes:
-    return encode(Heartbeat(Name("c"), 1, number, leading=False, formations=0))
+    return encode(Heartbeat(Name("c"), 1, number, leading=False, plans=0))
 
 
 @define
@@ -760,7 +760,7 @@ class Errand:
                 self.wakeup_s = now_s + 0.05
             case node.Wakeup():
                 self.wakeup_s = None
-                message = Heartbeat(Name("c"), 1, 1, leading=False, formations=0)
+                message = Heartbeat(Name("c"), 1, 1, leading=False, plans=0)
                 yield node.Send(HEARTBEAT, message, {"coordinator": "errand"})
                 yield node.Compute(1, lambda _: "done")
             case node.Computed(1, "done"):

@@ -107,7 +107,7 @@ def test_cells_of_a_closed_transfer_may_be_owned() -> None:
 
 
 def test_neither_blocks_nor_joined_formations_matter() -> None:
-    plan = replace(make_plan(), formations=(17,))
+    plan = replace(make_plan(), blocks=(17,))
     execution = promised()
     assert execution.on_plan(plan)
     assert execution.wanted_joined == ()
@@ -183,5 +183,5 @@ def test_where_formations_own_blocks_there_are_no_transfers() -> None:
     assert execution.wanted.promised is None
     assert not execution.on_record(replace(stored, promised=HIGH))
     assert execution.promised == MID
-    assert execution.on_plan(replace(make_plan(), formations=(-1, 0), before={}, after={}))
+    assert execution.on_plan(replace(make_plan(), blocks=(-1, 0), before={}, after={}))
     assert execution.transfer is None

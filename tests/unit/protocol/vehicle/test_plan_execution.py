@@ -57,22 +57,22 @@ def note(execution: PlanExecution, ballot: Ballot | None) -> bool:
     return execution.on_record(replace(execution.stored, accepted=ballot))
 
 
-def prepare(ballot: Ballot, *roster: Name, formations: tuple[int, ...] = (0,)) -> Prepare:
-    return Prepare(ballot, formations, roster or (A, B))
+def prepare(ballot: Ballot, *roster: Name, blocks: tuple[int, ...] = (0,)) -> Prepare:
+    return Prepare(ballot, blocks, roster or (A, B))
 
 
 def make_plan(
     ballot: Ballot = MID,
     moves: dict[Name, tuple[PlannedMove, ...]] | None = None,
     cells: dict[Name, Cell] | None = None,
-    formations: tuple[int, ...] = (0,),
+    blocks: tuple[int, ...] = (0,),
 ) -> Plan:
     cells = cells or AT
     return plan_of(
         cells,
         moves or {A: ((0, (-4, 0), (-4, 1)),)},
         ballot=ballot,
-        formations=formations,
+        blocks=blocks,
         incarnations=dict.fromkeys(cells, 7),
         t0_s=T0_S,
         slot_s=SLOT_S,
@@ -143,7 +143,7 @@ def test_v2_promises_rising_ballots_only() -> None:
 
 def test_v2_not_in_the_roster() -> None:
     execution = vehicle()
-    assert not execution.on_prepare(prepare(HIGH, B, C, formations=(0, 1)))
+    assert not execution.on_prepare(prepare(HIGH, B, C, blocks=(0, 1)))
     assert (execution.promised, execution.phase) == (None, ExecutionPhase.FREE)
     assert execution.wanted_joined == (0,)
 
@@ -151,9 +151,9 @@ def test_v2_not_in_the_roster() -> None:
 def test_v2_ignores_formations_to_which_it_does_not_belong_any_more() -> None:
     """A late ballot may name a vehicle that has left the lattice and entered it elsewhere."""
     execution = vehicle(joined=(7, 8))
-    assert not execution.on_prepare(prepare(HIGH, formations=(0, 1)))
+    assert not execution.on_prepare(prepare(HIGH, blocks=(0, 1)))
     assert (execution.promised, execution.wanted_joined) == (None, (7, 8))
-    assert execution.on_prepare(prepare(LOW, formations=(6, 7)))
+    assert execution.on_prepare(prepare(LOW, blocks=(6, 7)))
     assert execution.promised == LOW
 
 
@@ -165,7 +165,7 @@ def test_v2_a_repeat_or_a_lower_ballot_changes_nothing(
     execution = reach()
     execution.on_state(shown())
     before = repr(execution)
-    assert execution.on_prepare(prepare(ballot, formations=(0, 1)))
+    assert execution.on_prepare(prepare(ballot, blocks=(0, 1)))
     assert repr(execution) == before
 
 
@@ -176,7 +176,7 @@ def test_v2_asks_for_the_formations_of_the_ballot_and_never_for_fewer() -> None:
         (MID, (0,), (0, 1, 2)),
         (HIGH, (5, 0), (0, 1, 2, 5)),
     ):
-        execution.on_prepare(prepare(ballot, formations=formations))
+        execution.on_prepare(prepare(ballot, blocks=formations))
         assert execution.wanted_joined == wanted
         assert execution.stored.joined == (0, 2)  # only the motion controller changes that
 
@@ -225,9 +225,9 @@ UNFIT = {
     "drives into B": make_plan(moves={A: ((0, (-4, 0), (-3, 0)),)}),
     "jumps": make_plan(moves={A: ((0, (-4, 0), (-4, 2)),)}),
     "no time": replace(make_plan(), slot_s=0.0),
-    "no block": replace(make_plan(), formations=()),
-    "another block": replace(make_plan(), formations=(1,)),
-    "a block that is not joined": make_plan(formations=(0, 1)),
+    "no block": replace(make_plan(), blocks=()),
+    "another block": replace(make_plan(), blocks=(1,)),
+    "a block that is not joined": make_plan(blocks=(0, 1)),
 }
 
 
@@ -253,9 +253,9 @@ def test_v3_the_territory_stays_within_the_blocks_of_the_plan(beyond: Cell) -> N
 
 def test_v3_a_joint_plan_waits_until_the_controller_has_confirmed_its_formations() -> None:
     execution = vehicle()
-    execution.on_prepare(prepare(MID, formations=(0, 1)))
+    execution.on_prepare(prepare(MID, blocks=(0, 1)))
     joint = make_plan(
-        moves={A: ((0, (-4, 0), (-4, 1)),)}, cells={A: (-4, 0), B: (-9, 0)}, formations=(0, 1)
+        moves={A: ((0, (-4, 0), (-4, 1)),)}, cells={A: (-4, 0), B: (-9, 0)}, blocks=(0, 1)
     )
     for joined in ((0,), (1,), (), (0, 2)):
         execution.stored = replace(execution.stored, joined=joined)
@@ -270,10 +270,10 @@ def test_v3_ignores_a_plan_for_some_of_the_blocks_that_are_joined(
 ) -> None:
     """Vehicles of the other blocks may be in any of them."""
     execution = vehicle(joined=(0, 1, 2))
-    execution.on_prepare(prepare(MID, formations=(0, 1, 2)))
+    execution.on_prepare(prepare(MID, blocks=(0, 1, 2)))
     cells: dict[Name, Cell] = {A: (-4, 0)}
-    assert not execution.on_plan(make_plan(cells=cells, formations=formations))
-    assert execution.on_plan(make_plan(cells=cells, formations=(0, 1, 2)))
+    assert not execution.on_plan(make_plan(cells=cells, blocks=formations))
+    assert execution.on_plan(make_plan(cells=cells, blocks=(0, 1, 2)))
 
 
 def waits(execution: PlanExecution) -> bool:
@@ -436,12 +436,12 @@ def test_how_long_a_move_may_be_due_follows_the_slots_of_its_plan(
 def test_the_state_says_what_the_vehicle_knows_and_senses(*, attended: bool) -> None:
     sense = Sense(
         A, 1001, 100.1, (7.0, 14.0, 0.5, 2.0, 0.1, 0.0), (-4, 1), 1038, (-4, 0), 2,
-        VehicleRecord(joined=(0,)), (), formation=3,
+        VehicleRecord(joined=(0,)), (), block=3,
     )  # fmt: skip
     execution = going()
     assert execution.tick(T0_S) is not None
     expected = holding(
-        A, MID, (-4, 1), incarnation=7, formation=3, accepted=True, ready=True, moving=True,
+        A, MID, (-4, 1), incarnation=7, block=3, accepted=True, ready=True, moving=True,
         go=True, attended=attended, s_m=7.0, y_m=2.0, speed_mps=14.0, t_s=100.1,
     )  # fmt: skip
     assert execution.state(sense, attended=attended) == expected

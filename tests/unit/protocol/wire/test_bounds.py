@@ -39,7 +39,7 @@ OWN = 10**18
 BALLOT = Ballot(HUGE, Name("c"), 1, 1)
 CLOCK = RoadClock(500, 50.0, 1, 1, 1, 0, ended=False, bridge=OWN)
 CENSUS = Census(50.0, (), (), bridge=OWN)
-BEAT = Heartbeat(Name("c2"), OWN, 3, leading=True, formations=1)
+BEAT = Heartbeat(Name("c2"), OWN, 3, leading=True, plans=1)
 STATE = holding(A, t_s=50.0, incarnation=OWN)
 SENSE = sense_in((0, 0), 500, incarnation=OWN, bridge=OWN)
 COMMAND = Command(A, VehicleRecord(OWN), 500, (0, 0), 0, (0, 0), b"")

@@ -40,9 +40,9 @@ def test_what_is_built_is_read_back(topic: topics.Topic) -> None:
 
 
 def test_numbers_become_text() -> None:
-    key = KEYS.key(topics.STATE, formation=-3, vehicle="v1")
+    key = KEYS.key(topics.STATE, block=-3, vehicle="v1")
     assert key == "laneweave/r-1/state/-3/v1"
-    assert KEYS.read(key) == (topics.STATE, {"formation": "-3", "vehicle": "v1"})
+    assert KEYS.read(key) == (topics.STATE, {"block": "-3", "vehicle": "v1"})
     # Equal numbers with different texts stay apart.
     keys = [KEYS.key(topics.COMMAND, vehicle=vehicle) for vehicle in (1, True, 1.0, "1")]
     assert [key.rpartition("/")[2] for key in keys] == ["1", "True", "1.0", "1"]
@@ -123,7 +123,7 @@ def test_what_is_no_key_part_is_refused(part: str) -> None:
 def test_expressions_leave_parameters_open() -> None:
     assert KEYS.all_of(topics.CLOCK) == "laneweave/r-1/clock"
     assert KEYS.all_of(topics.VEHICLE_ALIVE) == "laneweave/r-1/alive/vehicle/*"
-    assert KEYS.key(topics.STATE, formation=2, vehicle="*") == "laneweave/r-1/state/2/*"
+    assert KEYS.key(topics.STATE, block=2, vehicle="*") == "laneweave/r-1/state/2/*"
 
 
 def test_a_missing_parameter_is_a_mistake_of_the_caller() -> None:

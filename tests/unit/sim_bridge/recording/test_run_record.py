@@ -71,7 +71,7 @@ def test_the_first_ending_counts_and_nothing_follows_it(record: RunRecord, tmp_p
     record.close(15.0, Ending.INTERRUPTED)
     record.event(15.0, "leader")
     record.on_event(LogEvent(Name("agent"), Name("A"), 15.0, Name("late")))
-    record.on_heartbeat(Heartbeat(Name("c0"), 1, 1, leading=True, formations=0), 15.0, 1.0)
+    record.on_heartbeat(Heartbeat(Name("c0"), 1, 1, leading=True, plans=0), 15.0, 1.0)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -151,7 +151,7 @@ def test_recovery_is_the_time_without_a_heartbeat_of_a_leader(
     record: RunRecord, tmp_path: Path
 ) -> None:
     def beat(name: str, incarnation: int = 1, *, term: int = 1, leading: bool = True) -> Heartbeat:
-        return Heartbeat(Name(name), incarnation, term, leading=leading, formations=0)
+        return Heartbeat(Name(name), incarnation, term, leading=leading, plans=0)
 
     record.on_heartbeat(beat("c1", leading=False), 0.0, 1.0)
     record.on_heartbeat(beat("c0"), 0.1, 2.0)
@@ -171,11 +171,11 @@ def test_a_leader_that_does_not_know_its_successor_yet_is_no_change(
     """It was paused: it claims to lead until it receives a heartbeat of its successor."""
     beats = [("c0", 1), ("c1", 2), ("c0", 1), ("c1", 2), ("c0", 1), ("c0", 3)]
     for number, (name, term) in enumerate(beats):
-        beat = Heartbeat(Name(name), 1, term, leading=True, formations=0)
+        beat = Heartbeat(Name(name), 1, term, leading=True, plans=0)
         record.on_heartbeat(beat, 0.1 * number, 0.1 * number)
     late_s = 0.5 + SCENARIO.network.election_s
     # A partition ended that hid the newer leader; then that leader remains silent.
-    record.on_heartbeat(Heartbeat(Name("c2"), 1, 2, leading=True, formations=0), 1.0, late_s)
+    record.on_heartbeat(Heartbeat(Name("c2"), 1, 2, leading=True, plans=0), 1.0, late_s)
     record.close(2.0, Ending.COMPLETE)
     leaders = [(event["coordinator"], event["term"]) for event in read_events(tmp_path, "leader")]
     assert leaders == [("c0", 1), ("c1", 2), ("c0", 3), ("c2", 2)]

@@ -52,7 +52,7 @@ def plan(
 ) -> Plan:
     moves: dict[Name, tuple[PlannedMove, ...]] = {A: own_moves, B: ((0, OTHER, (-1, 2)),)}
     incarnations = {A: CARETAKER, B: 3}
-    fields = {"ballot": ballot, "formations": (FORMATION,), "incarnations": incarnations}
+    fields = {"ballot": ballot, "blocks": (FORMATION,), "incarnations": incarnations}
     return make_plan({A: start, B: OTHER}, moves, t0_s=1.0, **fields)
 
 
@@ -66,7 +66,7 @@ def test_shows_what_the_vehicle_does(caretaker: Caretaker, vehicle: RoadVehicle)
     drive(vehicle, range(10))
     s_m, speed_mps, _, y_m, *_ = vehicle.state
     state = holding(A, None, HOME, incarnation=CARETAKER, attended=False)
-    assert state.formation == FORMATION
+    assert state.block == FORMATION
     assert caretaker.state(10) == replace(state, s_m=s_m, y_m=y_m, speed_mps=speed_mps, t_s=1.0)
 
 
@@ -113,7 +113,7 @@ def test_what_the_agent_before_it_accepted_is_not_its_own(vehicle: RoadVehicle) 
         plan(SECOND),
         plan(start=NEXT),
         replace(plan(), incarnations={A: AGENT, B: 3}),
-        replace(plan(), formations=(FORMATION, FORMATION + 1)),
+        replace(plan(), blocks=(FORMATION, FORMATION + 1)),
         replace(plan(), territory=((-2, 0),)),
         replace(plan(), moves={B: ()}),
     ],
@@ -132,7 +132,7 @@ def test_joins_formations_for_the_vehicle(caretaker: Caretaker, vehicle: RoadVeh
     assert answer_of(caretaker, prepare(FIRST, *both)).record.joined == both
     assert vehicle.controller.record.joined == both
     assert answer_of(caretaker, prepare(SECOND)).record.joined == both
-    wide = replace(plan(SECOND), formations=both)
+    wide = replace(plan(SECOND), blocks=both)
     assert answer_of(caretaker, wide).accepted
 
 

@@ -88,7 +88,7 @@ class Claims:
         self._blocks[vehicle] = block
         for ballot, plan in self.plans.items():
             harmful = ballot in self.harmful
-            if block in plan.formations and not harmful and self._is_current(plan):
+            if block in plan.blocks and not harmful and self._is_current(plan):
                 self._tell("roster", t_s, vehicle, f"enters in a block of {short(ballot)}")
 
     def leave(self, vehicle: str) -> None:
@@ -222,10 +222,10 @@ class Claims:
             return
         for name in plan.roster:
             about = name, plan.incarnations[name], plan.ballot, plan.start_cells[name]
-            if (*about, () if plan.before else plan.formations) not in self._promises:
+            if (*about, () if plan.before else plan.blocks) not in self._promises:
                 text = f"{short(plan.ballot)} starts in {plan.start_cells[name]} without a promise"
                 self._tell("basis", t_s, name, text)
-        left_out = {name for name, block in self._blocks.items() if block in plan.formations}
+        left_out = {name for name, block in self._blocks.items() if block in plan.blocks}
         for missing in sorted(left_out - set(plan.roster)):
             self._tell("roster", t_s, missing, f"not in {short(plan.ballot)} of its block")
 

@@ -181,17 +181,17 @@ def _beyond_blocks(plan: Plan, rng: random.Random) -> tuple[Plan, Harm] | None:
 
 
 def _without_block(plan: Plan, rng: random.Random) -> tuple[Plan, Harm] | None:
-    if len(plan.formations) < 2:
+    if len(plan.blocks) < 2:
         return None
-    left_out = rng.choice(plan.formations)
-    blocks = tuple(block for block in plan.formations if block != left_out)
-    return replace(plan, formations=blocks), _all(plan, f"block {left_out} left out")
+    left_out = rng.choice(plan.blocks)
+    blocks = tuple(block for block in plan.blocks if block != left_out)
+    return replace(plan, blocks=blocks), _all(plan, f"block {left_out} left out")
 
 
 def _with_another_block(plan: Plan, rng: random.Random) -> tuple[Plan, Harm] | None:
-    block = rng.choice((min(plan.formations) - 1, max(plan.formations) + 1))
-    blocks = tuple(sorted((*plan.formations, block)))
-    return replace(plan, formations=blocks), _all(plan, f"block {block} claimed")
+    block = rng.choice((min(plan.blocks) - 1, max(plan.blocks) + 1))
+    blocks = tuple(sorted((*plan.blocks, block)))
+    return replace(plan, blocks=blocks), _all(plan, f"block {block} claimed")
 
 
 def _with_foreign_cell(plan: Plan, rng: random.Random) -> tuple[Plan, Harm] | None:

@@ -100,7 +100,7 @@ def test_a_plan_contains_all_vehicles_of_its_blocks(scene: Scene) -> None:
         scene.claims.record(holding(name, BALLOT, cell))
     scene.claims.on_plan(1.0, PLAN)
     assert scene.kinds == []
-    scene.claims.enter(2.0, "c", PLAN.formations[0])
+    scene.claims.enter(2.0, "c", PLAN.blocks[0])
     scene.claims.on_plan(3.0, PLAN)
     assert scene.kinds == ["roster", "roster"]
 

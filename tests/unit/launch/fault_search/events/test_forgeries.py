@@ -31,7 +31,7 @@ BALLOT = Ballot(1, Name("c1"), 1, 1)
 CELLS: dict[Name, Cell] = {A: (-1, 0), B: (0, 0)}
 LATTICE = RoadSetup(lanes=3).make_scenario().lattice
 BLOCKS = (LATTICE.block_of(0),)
-PLAN = make_plan(CELLS, {B: ((0, (0, 0), (0, 1)),)}, ballot=BALLOT, formations=BLOCKS)
+PLAN = make_plan(CELLS, {B: ((0, (0, 0), (0, 1)),)}, ballot=BALLOT, blocks=BLOCKS)
 OWNED: dict[Name, tuple[Cell, ...]] = {A: ((-1, 0),), B: ((0, 0), (0, 1))}
 ROLLING = replace(PLAN, before=OWNED, after=OWNED)
 
@@ -44,10 +44,10 @@ def accepts(name: Name, plan: Plan) -> bool:
         incarnation=PLAN.incarnations[name],
         hold_cell=CELLS[name],
         lattice=LATTICE,
-        stored=VehicleRecord(joined=PLAN.formations, owned=OWNED[name]),
+        stored=VehicleRecord(joined=PLAN.blocks, owned=OWNED[name]),
         owns_cells=rolling,
     )
-    execution.on_prepare(Prepare(BALLOT, PLAN.formations, PLAN.roster))
+    execution.on_prepare(Prepare(BALLOT, PLAN.blocks, PLAN.roster))
     return execution.on_plan(plan)
 
 
@@ -69,7 +69,7 @@ def test_a_changed_plan_is_refused_by_those_who_must(plan: Plan) -> None:
 def test_absurd_numbers_are_out_of_bounds() -> None:
     bounds = Bounds(incarnation=1000, tick_s=0.1, max_road_s=3600.0)
     messages = [
-        Heartbeat(Name("c1"), 1, 1, leading=True, formations=1),
+        Heartbeat(Name("c1"), 1, 1, leading=True, plans=1),
         RoadClock(10, 1.0, 1, 1, 1, 0, ended=False, bridge=1),
         Census(1.0, (), (), (), -1, 1),
         holding(A, BALLOT, (0, 0)),
