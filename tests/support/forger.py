@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from attrs import define, evolve, field
+from attrs import define, field
 
 from laneweave.protocol.runtime.transport import Delivery, Received
 from laneweave.protocol.security.connection import Access
@@ -39,6 +39,7 @@ from laneweave.protocol.wire.topics import (
     Quality,
     Topic,
 )
+from support.states import changed
 from support.waiting import wait_until
 
 OF_ROAD = (CLOCK, CENSUS, HEARTBEAT)
@@ -168,21 +169,21 @@ class Forger:
     def change(self, topic: Topic, **changes: object) -> None:
         """Publish a message of the road with some fields changed."""
         assert topic.kind is not None
-        self.publish(topic, evolve(self.known(topic.kind), **changes))
+        self.publish(topic, changed(self.known(topic.kind), **changes))
 
     def change_victims(self, topic: Topic, **changes: object) -> None:
         """Publish a message of the victim or for it with some fields changed."""
         assert topic.kind is not None
-        self.to_victim(topic, evolve(self.known(topic.kind), **changes))
+        self.to_victim(topic, changed(self.known(topic.kind), **changes))
 
     def state(self, **changes: object) -> None:
         """Publish a state in the name of the victim."""
-        state = evolve(self.known(VehicleState), **changes)
+        state = changed(self.known(VehicleState), **changes)
         self.publish(STATE, state, block=state.block, vehicle=state.vehicle)
 
     def prepare(self, term: int) -> None:
         """Publish a PREPARE for the victim."""
-        blocks = self.known(VehicleState).joined
+        blocks = self.known(VehicleState).record.joined
         ballot = HIGH._replace(term=term)
         self.to_victim(PREPARE, Prepare(ballot, blocks, (self.victim or Name("x"),)))
 

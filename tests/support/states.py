@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from laneweave.protocol.lattice import Cell, PlannedMove, territory
 from laneweave.protocol.runtime.node import Effect, Send
 from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.protocol.wire.field_types import Message
 from laneweave.protocol.wire.messages import (
     Ballot,
     Command,
@@ -24,17 +25,19 @@ from laneweave.sim_bridge.bodies.record_store import RecordStore
 from support.paper import PAPER
 
 T = TypeVar("T")
-Recorded = TypeVar("Recorded", VehicleState, Sense, Command)
+Changed = TypeVar("Changed", bound=Message)
 RECORD = frozenset(VehicleRecord.__struct_fields__)
 A, B, C, D, E, F = (Name(letter) for letter in "ABCDEF")
 BALLOT = Ballot(1, Name("c1"), 1, 1)
 
 
-def changed(message: Recorded, **changes: Any) -> Recorded:  # noqa: ANN401 (fields)
-    """Return a message with other fields, of its own or of its record.
+def changed(message: Changed, **changes: Any) -> Changed:  # noqa: ANN401 (fields)
+    """Return a message with other fields, of its own or of its record, if it has one.
 
     `accepted` of a state may be True: the plan of the promised ballot is accepted.
     """
+    if not isinstance(message, VehicleState | Sense | Command):
+        return replace(message, **changes)
     record = {name: changes.pop(name) for name in RECORD & changes.keys()}
     if isinstance(message, VehicleState):
         promised = record.get("promised", message.record.promised)
