@@ -111,6 +111,11 @@ class VehicleTypes(Mapping[str, VehicleType]):
         return all(one.changes_columns for one in self.values())
 
     @cached_property
+    def weakest_braking(self) -> Vehicle:
+        """Limits of the type with the least maximum deceleration."""
+        return max((one.limits for one in self.values()), key=lambda one: one.min_accel_mps2)
+
+    @cached_property
     def longest_body_m(self) -> float:
         """Length of the longest type of vehicle."""
         return max(one.limits.length_m for one in self.values())

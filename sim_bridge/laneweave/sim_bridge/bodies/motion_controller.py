@@ -136,8 +136,7 @@ class MotionController:
         self.motion_origin = self.hold_cell
         self.rung_ticks = dict.fromkeys(Rung, 0)
         self._jerks = array("f")
-        types, assumed = self._scenario.types.values(), self._scenario.braking
-        weakest = max((one.limits for one in types), key=lambda one: one.min_accel_mps2)
+        weakest, assumed = self._scenario.types.weakest_braking, self._scenario.braking
         self._brake = EmergencyBrake(self._limits, assumed, self.tick_s)
         self._weakest_brake = EmergencyBrake(weakest, assumed, self.tick_s)
         self._lane_ends = LaneEnds(self._scenario)

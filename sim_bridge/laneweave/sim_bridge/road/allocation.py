@@ -70,7 +70,7 @@ class BlockAllocation:
     def on_left(
         self, vehicle: RoadVehicle, vehicles: Mapping[Name, RoadVehicle], t_s: float
     ) -> None:
-        """Pass on no cells."""
+        """Do nothing: vehicles own no cells."""
 
 
 class CellAllocation:

@@ -31,8 +31,7 @@ class EntranceRoom:
     def __init__(self, scenario: Scenario) -> None:
         """Read the entrances of a road."""
         self._lattice = lattice = scenario.lattice
-        limits = [one.limits for one in scenario.types.values()]
-        weakest = min(limits, key=lambda one: -one.min_accel_mps2)
+        weakest = scenario.types.weakest_braking
         self._brake = EmergencyBrake(weakest, scenario.braking, scenario.runtime.tick_s)
         longest_m = scenario.types.longest_body_m
         stopping_m = lattice.speed_mps**2 / -weakest.min_accel_mps2

@@ -321,14 +321,14 @@ class Checker:
             self._report("two-plans", t_s, plan.roster, f"under ballot {short(plan.ballot)}")
 
     def _on_sense(self, t_s: float, sense: Sense) -> None:
-        attendant, joined = self._charge.get(sense.vehicle, (0, frozenset()))
-        if sense.record.incarnation < attendant:
-            text = f"{sense.record.incarnation} is in charge after {attendant}"
+        in_charge, joined = self._charge.get(sense.vehicle, (0, frozenset()))
+        if sense.record.incarnation < in_charge:
+            text = f"{sense.record.incarnation} is in charge after {in_charge}"
             self._report("monotone", t_s, [sense.vehicle], text)
         if not joined.issubset(sense.record.joined):
             text = f"its controller reports joined {sense.record.joined} after {sorted(joined)}"
             self._report("monotone", t_s, [sense.vehicle], text)
-        if sense.record.incarnation != attendant or len(joined) != len(sense.record.joined):
+        if sense.record.incarnation != in_charge or len(joined) != len(sense.record.joined):
             self._charge[sense.vehicle] = sense.record.incarnation, frozenset(sense.record.joined)
 
     def _on_state(self, t_s: float, state: VehicleState) -> None:
