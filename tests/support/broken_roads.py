@@ -9,7 +9,7 @@ import pytest
 from laneweave.agents import core
 from laneweave.agents.core import AgentCore
 from laneweave.protocol.road_layout import Exits
-from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_types import VehicleTypes
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.road.roadside import Roadside
@@ -80,4 +80,4 @@ def agents_insist(patch: pytest.MonkeyPatch) -> None:
 
 def types_are_ignored(patch: pytest.MonkeyPatch) -> None:
     """Leaders move trucks like cars, and their agents take such plans."""
-    patch.setattr(Scenario, "moves_of", lambda _self, _type: None)
+    patch.setattr(VehicleTypes, "moves_of", lambda _self, _type: None)

@@ -6,10 +6,12 @@ import json
 import re
 from pathlib import Path
 
+import attrs
 import pytest
 
+from laneweave.launch.fault_search.coverage import Rules
 from support.bug_register import EVERY_BUG
-from support.planted_bugs import BUGS
+from support.planted_bugs import BUGS, Bug, unchanged
 from support.unseen_bugs import UNSEEN
 
 ROOT = Path(__file__).parents[2]
@@ -47,3 +49,15 @@ def test_tests_that_are_named_are_run_by_make_test(request: pytest.FixtureReques
 
 def test_every_bug_says_what_it_breaks() -> None:
     assert [bug.name for bug in EVERY_BUG.values() if not bug.text.endswith(".")] == []
+
+
+@pytest.mark.parametrize("bug", EVERY_BUG.values(), ids=lambda bug: bug.name)
+def test_every_bug_can_be_planted(bug: Bug, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it replaces exists; most of the tests that plant it are not run by `make test`."""
+    with monkeypatch.context() as patch:
+        bug.plant(patch)
+        books = attrs.astuple(bug.rules, recurse=False)
+    intact = attrs.astuple(Rules(), recurse=False)
+    used = {rule for book in intact for rule in book.functions}
+    assert bug.replaced.keys() <= used
+    assert bug.plant is not unchanged or books != intact
