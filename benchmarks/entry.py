@@ -29,8 +29,6 @@ HEADINGS = ("veh/(lane h)", "wait s mean", "wait s p95", "columns", "vehicles")
 def enter(scenario: Scenario) -> tuple[list[float], list[int], list[int]]:
     """Return the wait [s] of each vehicle, and the columns and vehicles of each formation."""
     builder, lattice = formation_builder(scenario), scenario.lattice
-    if builder is None:
-        raise ValueError("the rolling operation has no formations")
     formation = scenario.formation
     meter = EntryMeter(lattice, formation.entry_spread_s, builder, interlaced=formation.interlaced)
     demand = arrivals(scenario)

@@ -39,7 +39,6 @@ def closed_blocks(
 ) -> tuple[tuple[ClosedFormation, ...], int]:
     """Return which formations of these vehicles the roadside has closed, and up to which block."""
     builder = formation_builder(scenario)
-    assert builder is not None, "the rolling operation has no formations"
     for entry in on_road:
         builder.try_add(entry.cell, entry.preferred_lane, entry.entered_s)
     formations = tuple(builder.closed(t_s))

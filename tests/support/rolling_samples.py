@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
+from laneweave.protocol.vehicle.territory import CellTerritory
 from laneweave.protocol.wire.messages import (
     Ballot,
     Name,
@@ -62,9 +63,7 @@ def pending(name: Name, ballot: Ballot = MID, roster: tuple[Name, ...] = (A, B))
 def vehicle(name: Name = A, rules: RuleBook = VEHICLE_RULES) -> PlanExecution:
     cell = make_plan().start_cells[name]
     stored = VehicleRecord(incarnation=INCARNATION, owned=BEFORE[name])
-    return PlanExecution(
-        name, INCARNATION, cell, ROLLING.lattice, stored, owns_cells=True, rules=rules
-    )
+    return PlanExecution(name, INCARNATION, cell, CellTerritory(), stored, rules=rules)
 
 
 def sense(

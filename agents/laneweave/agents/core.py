@@ -45,6 +45,7 @@ from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import displaced
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution, ends_in_time
+from laneweave.protocol.vehicle.territory import territory_of
 from laneweave.protocol.wire.bounds import check_ballot
 from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import (
@@ -109,7 +110,7 @@ class AgentCore:
         self._vehicle_type: str = CAR
         self._driver = make_driver(scenario, scenario.vehicle)
         self._drivable: frozenset[Cell] | None = None
-        self._lane_ends = LaneEnds(scenario)
+        self._lane_ends, self._territory = LaneEnds(scenario), territory_of(scenario)
         self._rules = rules
         self.wanted_motions: tuple[int, ...] = ()
         """Stretches of columns whose motions are needed now; empty while not in charge."""
@@ -361,9 +362,8 @@ class AgentCore:
             vehicle=self.vehicle,
             incarnation=self._incarnation,
             hold_cell=sense.hold_cell,
-            lattice=self._scenario.lattice,
+            territory=self._territory,
             stored=sense.record,
-            owns_cells=self._scenario.formation.rolling,
             moving=not self._driver.at_rest(sense),
             rules=self._rules,
             lane_ends=self._lane_ends,

@@ -153,15 +153,13 @@ class CoordinatorCore:
         plan: PlanFunction,
     ) -> Operation:
         scenario = self.scenario
-        if scenario.formation.rolling:
-            planner = make_planner(scenario)
-            return RollingOperation(
-                scenario, self._new_ballot, self._new_job, planner, transfer_rules
+        if scenario.formation.traits.has_formations:
+            rng = random.Random(f"{scenario.seed}/{self.name}/{self._incarnation}")  # noqa: S311
+            return FormationsOperation(
+                scenario, self._new_ballot, self._new_job, self._has_watched, rng, plan, rules
             )
-        rng = random.Random(f"{scenario.seed}/{self.name}/{self._incarnation}")  # noqa: S311
-        return FormationsOperation(
-            scenario, self._new_ballot, self._new_job, self._has_watched, rng, plan, rules
-        )
+        planner = make_planner(scenario)
+        return RollingOperation(scenario, self._new_ballot, self._new_job, planner, transfer_rules)
 
     @property
     def metrics(self) -> tuple[MetricsSnapshot, ...]:

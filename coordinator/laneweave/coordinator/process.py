@@ -70,7 +70,7 @@ def run_coordinator(
     """
     prepare(scenario.formation.solver, "formation.solver")
     with _exits_on_stop_signals():
-        if scenario.formation.rolling:
+        if scenario.formation.planner == ROLLING.name:
             ROLLING.load()
         BRANCHING.load_if_compiled()
     workers = scenario.service.workers or max(1, len(os.sched_getaffinity(0)) - 1)

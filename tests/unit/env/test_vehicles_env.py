@@ -329,7 +329,7 @@ def test_files_scenarios_and_tables_give_the_same_environment() -> None:
     path = ROOT / "scenarios" / "demo.toml"
     of_file, of_scenario = parallel_env(str(path)), parallel_env(load_scenario(path))
     assert of_file.scenario == of_scenario.scenario
-    assert of_file.scenario.formation.rolling
+    assert of_file.scenario.formation.operation == "rolling"
     assert same(of_file.reset(seed=1), of_scenario.reset(seed=1))
 
 

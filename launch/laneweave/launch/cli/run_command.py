@@ -153,7 +153,7 @@ def run(
     checked_method(method, "--method")
     live = {"watch": "given" if watch else None, "watch_listen": watch_listen}
     if method == FORMATION:
-        if settings.formation.rolling:
+        if settings.formation.planner != settings.formation.solver:
             reject_unused_options("with the rolling operation", solver=solver)
         if transport is Transport.simulated:
             reject_unused_options("with --transport simulated", pace=pace, endpoint=endpoint)

@@ -32,7 +32,7 @@ def read_events(folder: Path, *kinds: str) -> Iterator[Mapping[str, Any]]:
 
 def closed_formations(folder: Path, scenario: Scenario) -> Formations:
     """Return the formations of a recorded run; none in the rolling operation."""
-    if scenario.formation.rolling:
+    if not scenario.formation.traits.has_formations:
         return Formations()
     return recorded_formations(folder, scenario.lattice)
 

@@ -15,6 +15,7 @@ from laneweave.launch.run_methods import FORMATION, rank
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.operations import DEFAULT_OPERATION
 from laneweave.protocol.summary import SUMMARY_FILE, RunSummary, read_summary
 from laneweave.sim_bridge.recording.columns import SCENARIO_KEY
 
@@ -56,8 +57,9 @@ class Run:
     @property
     def title(self) -> str:
         """Label, operation if it is the rolling one, volume and seed."""
-        rolling = self.method == FORMATION == self.label and self.scenario.formation.rolling
-        label = f"{self.label} (rolling operation)" if rolling else self.label
+        operation, label = self.scenario.formation.operation, self.label
+        if self.method == FORMATION == label and operation != DEFAULT_OPERATION:
+            label = f"{label} ({operation} operation)"
         return f"{label}, {self.volume_veh_per_lane_h:g} veh/(lane·h), seed {self.scenario.seed}"
 
     @property

@@ -43,9 +43,8 @@ class DrivenMap:
     """The driven relative path map of a formation."""
 
     formation: int
-    rolling: bool
-    """Whether the run had no formations; the vehicles are then those that entered in some columns,
-    `columns`."""
+    is_formation: bool
+    """Whether the vehicles are a formation; otherwise they are those that entered in `columns`."""
     columns: tuple[int, int]
     """Rearmost and foremost column."""
     path_map: RelativePathMap
@@ -62,16 +61,16 @@ class DrivenMap:
     @property
     def name(self) -> str:
         """Name of the formation in figures."""
-        if self.rolling:
-            return f"columns {self.columns[0]} to {self.columns[1]}"
-        return f"formation {self.formation}"
+        if self.is_formation:
+            return f"formation {self.formation}"
+        return f"columns {self.columns[0]} to {self.columns[1]}"
 
     @property
     def vehicles(self) -> str:
         """Description of the vehicles."""
-        if self.rolling:
-            return f"the vehicles that entered in {self.name}"
-        return "a formation's vehicles"
+        if self.is_formation:
+            return "a formation's vehicles"
+        return f"the vehicles that entered in {self.name}"
 
     @property
     def colours(self) -> str:
@@ -141,7 +140,7 @@ def _map_of(
     order = sorted(range(len(cells)), key=lambda row: (-cells[row][0][0], cells[row][0][1]))
     return DrivenMap(
         formation.number,
-        run.scenario.formation.rolling,
+        run.scenario.formation.traits.has_formations,
         (formation.rear, formation.front),
         RelativePathMap(
             tuple(tracks.names[members[row][0]] for row in order),

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.scenario.formation_table import ROLLING_SOLVER
+from laneweave.protocol.scenario.operations import ROLLING_SOLVER
 from laneweave.protocol.scenario.timing import COMFORT_MPS2
 from laneweave.protocol.summary import HARD_BRAKE_MPS2, Planning, RunSummary, Safety
 
@@ -39,7 +39,7 @@ def _demand_rows(summary: RunSummary, scenario: Scenario | None) -> Iterator[Row
     if scenario is not None:
         yield "arrivals during", f"{scenario.demand.duration_s:g} s"
         if summary.method == FORMATION:
-            yield "operation", "rolling" if scenario.formation.rolling else "formations"
+            yield "operation", scenario.formation.operation
     yield "vehicles demanded", f"{summary.vehicles.demanded}"
     yield "seed", f"{summary.seed}"
 

@@ -130,9 +130,7 @@ class LocalRun:
         """
         check_temporary_folder()
         check_network(self.scenario, self.demand.vehicles)
-        formation = self.scenario.formation
-        needed = "rolling" if formation.rolling else formation.solver
-        context = fork_server({needed} & KERNELS.keys())
+        context = fork_server({self.scenario.formation.planner} & KERNELS.keys())
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
             stop_signals(self._request_stop),

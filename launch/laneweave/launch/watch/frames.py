@@ -16,7 +16,7 @@ depend on earlier frames, so any frame may be skipped.
 | `road`, `body_m`, `bodies_m`, `lattice`, `shade`, `colours`, `neutral` | parameters for drawing |
 | `preferences` | whether vehicles have preferred lanes |
 | `legend` | colours of vehicles: list of [colour, meaning] |
-| `rolling` | whether there are no formations: rolling operation or a reference method |
+| `has_formations` | whether there are formations: not in the rolling operation, nor with methods |
 | `losses` | recorded: message counts of the summary; live: null |
 
 **Frame**: live frames are pushed on changes, at most every `step_s`; recorded frames and earlier
@@ -248,7 +248,7 @@ def scene_of(scenario: Scenario, kind: str, title: str, step_s: float) -> dict[s
         "title": title,
         "step_s": step_s,
         **road_scene(scenario, recorded=kind == "recorded"),
-        "rolling": scenario.formation.rolling,
+        "has_formations": scenario.formation.traits.has_formations,
         "losses": None,
     }
 

@@ -166,9 +166,9 @@ class LiveRoad:
         }
 
     def _formations(self) -> Formations:
-        """Return the closed formations on the road; none in the rolling operation."""
+        """Return the closed formations on the road."""
         census = self.view.census
-        if census is None or self.scenario.formation.rolling:
+        if census is None:
             return Formations()
         return Formations.of_census(census.formations, self.scenario.lattice)
 

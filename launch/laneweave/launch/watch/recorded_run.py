@@ -78,8 +78,8 @@ class Recording:
         self._times_s = [moment.t_s for moment in self._moments]
         self.scene = scene_of(run.scenario, "recorded", run.title, self._step_s) | {
             "losses": _losses(run),
-            "rolling": run.scenario.formation.rolling or run.method != FORMATION,
         }
+        self.scene["has_formations"] &= run.method == FORMATION
 
     def frames(self, begin: int, end: int) -> list[str]:
         """Return the available frames from `begin` to `end`, both included."""

@@ -110,7 +110,7 @@ def _check_capacity(scenario: Scenario) -> None:
         for name, share in _shares(inflow)
     ]
     volume = scenario.demand.volume_veh_per_lane_h
-    if not formation.rolling:
+    if formation.traits.has_formations:
         columns = formation_columns(formation.max_vehicles, road.narrowest_lanes)
         require(
             not formation.closes_by_vehicles or columns <= formation.max_columns,
@@ -172,7 +172,7 @@ def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str)
     geometry = scenario.geometry
     own = min((one for one in geometry.sections if one.lane == lane), key=lambda one: one.from_m)
     from_m, room_m = max(own.from_m, own.moves_from_m, geometry.moves_from_m), 0.0
-    if scenario.road.closures and not scenario.formation.rolling:
+    if scenario.road.closures and scenario.formation.traits.has_formations:
         # At the volumes at which vehicles must cross lanes one after another, formations are full.
         formation = scenario.formation
         vehicles = formation.max_vehicles + scenario.flow.vehicles_from_ramps

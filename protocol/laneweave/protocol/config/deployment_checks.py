@@ -41,7 +41,8 @@ def check_sumo(scenario: Scenario) -> None:
     require(bool(first and last), "sumo.corridor", sumo.corridor, allowed)
     formation = scenario.formation
     allowed = '"rolling" with sumo.config'
-    require(formation.rolling, "formation.operation", formation.operation, allowed)
+    ok = "sumo.config" not in formation.traits.unused
+    require(ok, "formation.operation", formation.operation, allowed)
     allowed = "false with sumo.config: vehicles from SUMO settle in columns of their own"
     require(not formation.change_columns, "formation.change_columns", True, allowed)
 

@@ -38,7 +38,8 @@ def check_types(scenario: Scenario) -> None:
 
 def _check_types_of_structures(scenario: Scenario) -> None:
     """Check that all types drive all moves if structures are given: any vehicle gets any place."""
-    if scenario.formation.rolling or not scenario.formation.structures:
+    formation = scenario.formation
+    if not formation.structures or "formation.structures" in formation.traits.unused:
         return
     for name, own in scenario.types.items():
         for limit, needed in scenario.types.column_move_limits.items():
@@ -50,7 +51,7 @@ def _check_types_of_structures(scenario: Scenario) -> None:
                 value,
                 (f"at most {-shown:g}" if value < 0.0 else f"at least {shown:g}")
                 + " with formation.structures, where each vehicle moves by a column of "
-                f"{scenario.formation.gap_m:g} m in T_F (formation.cycle_s)",
+                f"{formation.gap_m:g} m in T_F (formation.cycle_s)",
             )
 
 

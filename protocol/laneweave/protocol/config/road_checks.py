@@ -82,7 +82,8 @@ def check_lane_rules(scenario: Scenario) -> None:
     if not rules:
         return
     allowed = '"rolling" with road.restrictions or road.solid_lines'
-    require(formation.rolling, "formation.operation", formation.operation, allowed)
+    ok = "road.restrictions" not in formation.traits.unused
+    require(ok, "formation.operation", formation.operation, allowed)
     for name, one in rules.items():
         allowed = f"a lane from 0 to {road.lanes - 1}"
         require(one.lane < road.lanes, f"{name}.lane", one.lane, allowed)
@@ -215,13 +216,13 @@ def check_exits(scenario: Scenario) -> None:
         used |= places
         for section in scenario.geometry.sections:
             begins_m = max(section.from_m, section.moves_from_m)
-            needed_m = _first_step_m(scenario, begins_m) + drive_out(scenario).room_m
+            first_m, first = _first_step(scenario, begins_m)
+            needed_m = first_m + drive_out(scenario).room_m
             require(
                 section.exit != exit_.name or exit_.at_m >= needed_m,
                 f"{name}.at_m",
                 exit_.at_m,
-                f"at least {needed_m:g}: {_FIRST_STEP[scenario.formation.rolling]}, in lane "
-                f"{section.lane}, and "
+                f"at least {needed_m:g}: {first}, in lane {section.lane}, and "
                 f"{drive_out(scenario).room_m:g} m for completing a change after stopping",
             )
 
@@ -243,12 +244,12 @@ def check_dead_ends(scenario: Scenario) -> None:
             for number, closure in enumerate(scenario.road.closures)
             if (closure.lane, closure.from_m) == (end.lane, end.end_m)
         )
-        first_m = _first_step_m(scenario, max(end.from_m, end.moves_from_m))
+        first_m, first = _first_step(scenario, max(end.from_m, end.moves_from_m))
         require(
             end.line_m >= first_m,
             name,
             end.end_m,
-            f"at least {first_m + needed.room_m:g}: {_FIRST_STEP[scenario.formation.rolling]}, and "
+            f"at least {first_m + needed.room_m:g}: {first}, and "
             f"{needed.room_m:g} m for driving on after stopping at the end of the lane",
         )
         require(
@@ -260,7 +261,7 @@ def check_dead_ends(scenario: Scenario) -> None:
         )
         before_m = end.line_m - scenario.formation.longest_m - scenario.types.step_m
         require(
-            scenario.formation.rolling
+            not scenario.formation.traits.has_formations
             or any(
                 max(one.from_m, one.moves_from_m) <= before_m and one.to_m > end.end_m
                 for one in scenario.geometry.sections
@@ -272,20 +273,16 @@ def check_dead_ends(scenario: Scenario) -> None:
         )
 
 
-_FIRST_STEP = {
-    True: "a step for changing lanes",
-    False: "a formation that has passed all entrances, and a step for changing lanes",
-}
-"""What must fit before the end of a lane, in the rolling operation and with formations."""
+def _first_step(scenario: Scenario, from_m: float) -> tuple[float, str]:
+    """Return where the first move ends in a section, and what has to fit before that.
 
-
-def _first_step_m(scenario: Scenario, from_m: float) -> float:
-    """Return where the first move ends in a section in which moves may begin at a position.
+    Moves may begin at a position, at the earliest.
 
     The vehicles of a formation are known once it has passed all entrances, and it moves once all of
     it is in the section.
     """
-    from_m = max(from_m, scenario.geometry.moves_from_m)
-    if not scenario.formation.rolling:
+    from_m, what = max(from_m, scenario.geometry.moves_from_m), "a step for changing lanes"
+    if scenario.formation.traits.has_formations:
         from_m = max(from_m, *scenario.geometry.entry_m) + scenario.formation.longest_m
-    return from_m + scenario.types.step_m
+        what = f"a formation that has passed all entrances, and {what}"
+    return from_m + scenario.types.step_m, what

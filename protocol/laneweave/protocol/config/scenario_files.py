@@ -40,23 +40,6 @@ _CHECKS = (
 )
 """Checks in the order in which they run. One may use what those before it in its group have
 established, so that a group reports its first error only; the groups are independent."""
-ROLLING_ONLY = ("sort_in_s2", "reward_drift", "change_columns")
-"""Fields of `formation` that only the rolling operation reads."""
-FORMATIONS_ONLY = (
-    "entry",
-    "close",
-    "max_vehicles",
-    "max_columns",
-    "max_joined",
-    "join",
-    "structures",
-    "solver",
-    "weight_straight",
-    "weight_oblique",
-    "planning_deadline_s",
-    "max_nodes",
-)
-"""Fields of `formation` that the rolling operation does not read."""
 
 
 def load_scenario(path: Path | None, **overrides: object) -> Scenario:
@@ -167,13 +150,14 @@ def effect_problems(data: Mapping[str, Any], scenario: Scenario) -> Iterator[Bad
     """Yield an error for each value in a file that has no effect in the resulting scenario."""
     formation, given = scenario.formation, data.get("formation", {})
     by_vehicles = formation.closes_by_vehicles
-    for fields, has_effect, allowed in (
-        (ROLLING_ONLY, formation.rolling, 'none, unless formation.operation is "rolling"'),
-        (FORMATIONS_ONLY, not formation.rolling, 'none where formation.operation is "rolling"'),
-        (("max_columns",), by_vehicles, 'none, unless formation.close is "vehicles"'),
-        (("join",), formation.max_joined > 1, "none, unless formation.max_joined is above 1"),
-        (("block_columns",), not by_vehicles, 'none, unless formation.close is "columns"'),
+    for name in given:
+        if f"formation.{name}" in formation.traits.unused:
+            allowed = f'none where formation.operation is "{formation.operation}"'
+            yield BadInputError(f"formation.{name}", given[name], allowed)
+    for name, has_effect, allowed in (
+        ("max_columns", by_vehicles, 'none, unless formation.close is "vehicles"'),
+        ("join", formation.max_joined > 1, "none, unless formation.max_joined is above 1"),
+        ("block_columns", not by_vehicles, 'none, unless formation.close is "columns"'),
     ):
-        if not has_effect:
-            for name in given.keys() & set(fields):
-                yield BadInputError(f"formation.{name}", given[name], allowed)
+        if name in given and not has_effect:
+            yield BadInputError(f"formation.{name}", given[name], allowed)

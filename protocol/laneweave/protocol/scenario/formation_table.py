@@ -14,6 +14,12 @@ from laneweave.protocol.errors import unknown_name
 from laneweave.protocol.field_validators import key_part, one_of, within, within_or_none
 from laneweave.protocol.names import NAME_PATTERN
 from laneweave.protocol.road_layout import LONGEST_ROAD_M
+from laneweave.protocol.scenario.operations import (
+    DEFAULT_OPERATION,
+    OPERATIONS,
+    ROLLING_SOLVER,
+    OperationTraits,
+)
 from laneweave.protocol.wire.events import STREAM_PLANNED
 
 BASE_CONFLICTS = ("node", "edge", "special-1")
@@ -48,8 +54,6 @@ SOLVERS: Final = ("tappa", "branching")
 """Built-in solvers. `tappa`: the paper's algorithm. `branching`: branch and bound, for large
 formations. Coordinators may have others (`laneweave.coordinator.planning.plug_ins`)."""
 DEFAULT_SOLVER: Final = "tappa"
-ROLLING_SOLVER: Final = "rolling"
-"""Name of the rolling operation's planner in counts of plans by solver."""
 
 
 def solver_of_event(kind: str, data: Mapping[str, Any]) -> str | None:
@@ -82,7 +86,7 @@ class DrivingStructure:
 class FormationSettings:
     """Formation control parameters d_F, T_F and v_F, and settings of the planner."""
 
-    operation: str = field(default="formations", validator=one_of("formations", "rolling"))
+    operation: str = field(default=DEFAULT_OPERATION, validator=one_of(*OPERATIONS))
     """`formations`: closed formations, each sorted by one plan, as in the paper. `rolling`: no
     formations; the whole stream is replanned in each slot."""
     entry: str = field(default="free", validator=one_of("free", "interlaced"))
@@ -141,19 +145,33 @@ class FormationSettings:
     """Maximum number of search nodes per plan, independent of the machine's speed."""
 
     @property
-    def rolling(self) -> bool:
-        """Whether the rolling operation is selected."""
-        return self.operation == "rolling"
+    def traits(self) -> OperationTraits:
+        """In what the selected operation differs from others."""
+        return OPERATIONS[self.operation]
+
+    def _has(self, field: str, value: object) -> bool:
+        """Return whether a field has a value, and the operation uses the field."""
+        return f"formation.{field}" not in self.traits.unused and getattr(self, field) == value
 
     @property
     def interlaced(self) -> bool:
         """Whether vehicles may enter only the cells of the interlaced structure."""
-        return not self.rolling and self.entry == "interlaced"
+        return self._has("entry", "interlaced")
 
     @property
     def closes_by_vehicles(self) -> bool:
         """Whether the length of formations depends on the traffic."""
-        return not self.rolling and self.close == "vehicles"
+        return self._has("close", "vehicles")
+
+    @property
+    def moves_in_s2(self) -> bool:
+        """Whether settled vehicles also change lanes in S2."""
+        return self._has("sort_in_s2", True)
+
+    @property
+    def planner(self) -> str:
+        """Name of the planner of the operation."""
+        return self.traits.planner or self.solver
 
     @property
     def block_width(self) -> int:
@@ -193,13 +211,8 @@ class FormationSettings:
 
     @property
     def entry_spread_s(self) -> float:
-        """Maximum time between a vehicle and its cell as they pass the start of the road.
-
-        With half of the time between two cells, a vehicle waits only if it is too close behind
-        another vehicle. Formations use three quarters: vehicles catch up with cells left empty, so
-        queues dissolve sooner.
-        """
-        return (0.5 if self.rolling else 0.75) * self.entry_spacing_s
+        """Maximum time between a vehicle and its cell as they pass the start of the road."""
+        return self.traits.entry_spread * self.entry_spacing_s
 
     @property
     def oblique_steps(self) -> int:

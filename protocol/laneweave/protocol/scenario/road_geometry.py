@@ -119,6 +119,6 @@ class RoadGeometry:
     def moves_from_m(self) -> float:
         """Position [m] from which vehicles may move between cells: in S2, or the start of S3."""
         start_m, formation = self._road.sorting_start_m, self._formation
-        if not (formation.rolling and formation.sort_in_s2):
+        if not formation.moves_in_s2:
             return start_m
         return min(start_m, max(self._road.s1_m, formation.speed_mps * (formation.settle_s + 4.0)))

@@ -27,9 +27,6 @@ traffic needs more steps on the same road: at 2400, 1 % of the vehicles miss the
 but less than 0.1 % with 4 s (`benchmarks/stream.py`)."""
 CYCLE_STEP_S = 0.2
 """Step between values of T_F; few values keep the number of planned trajectories low."""
-FORMATION_CLOSING_MPS = 8.0
-"""Speed at which a member of a formation may close up to another if T_F is not given; vehicles can
-brake from it in nearly all scenarios."""
 
 
 @frozen
@@ -52,7 +49,7 @@ class Timing:
         cycle_s = self._formation.cycle_s
         if cycle_s is not None:
             return cycle_s, cycle_s
-        if self._formation.rolling:
+        if self._formation.traits.common_slots:
             cycle_s = ROLLING_CYCLE_S
             if self._volume_veh_per_lane_h > COMFORTABLE_VOLUME_VEH_PER_LANE_H:
                 cycle_s = SHORTEST_CYCLE_S
@@ -68,21 +65,19 @@ class Timing:
         """Shortest T_F for which moves are likely to be possible, at least `SHORTEST_CYCLE_S`.
 
         A minimum-jerk move over d in T closes up with at most 15/8 d/T and accelerates with
-        10 / sqrt(3) d / T^2 at most. Moves are possible if these do not exceed v_F / 2 and 1.2
-        times the limit (which a trajectory within the limit can replace), in nearly all cases. For
-        formations, whose plans need short slots where many steps must fit, these are
-        `FORMATION_CLOSING_MPS` and 1.3 times the limit: the check of moves refuses a few scenarios
-        more, and asks for a longer T_F.
+        10 / sqrt(3) d / T^2 at most. Moves are possible if these do not exceed `closing_mps` and
+        `accel_ratio` times the limit (which a trajectory within the limit can replace), in nearly
+        all cases.
         """
         if not self._formation.change_columns:
             return SHORTEST_CYCLE_S
         # T_F is the same for all types; those that are weaker drive fewer moves.
         d_m, accel_mps2 = self._formation.gap_m, self._cars.max_accel_mps2
-        closing_mps, ratio = FORMATION_CLOSING_MPS, 1.3
-        if self._formation.rolling:
-            closing_mps, ratio = self._formation.speed_mps / 2.0, 1.2
+        traits, closing_mps = self._formation.traits, self._formation.traits.closing_mps
+        if closing_mps is None:
+            closing_mps = self._formation.speed_mps / 2.0
         by_speed_s = 15.0 / 8.0 * d_m / closing_mps
-        by_accel_s = math.sqrt(PEAK_ACCEL * d_m / (ratio * accel_mps2))
+        by_accel_s = math.sqrt(PEAK_ACCEL * d_m / (traits.accel_ratio * accel_mps2))
         slot_s = max(by_speed_s, by_accel_s) + self._formation.slack_s
         return max(SHORTEST_CYCLE_S, CYCLE_STEP_S * math.ceil(slot_s / CYCLE_STEP_S - 1e-9))
 

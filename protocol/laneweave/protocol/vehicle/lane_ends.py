@@ -119,9 +119,10 @@ class LaneEnds:
         for ends in self._dead_ends:
             yield from ends
 
-    def has_begun(self, lane: int, front_m: float) -> bool:
-        """Return whether moves into and out of a lane may begin at a position of the front."""
-        return bool(self._begun_m(lane, front_m))
+    def may_begin(self, origin: Cell, target: Cell, t_s: float) -> bool:
+        """Return whether a move is where moves may begin in both lanes."""
+        front_m, lanes = self._lattice.cell_s_m(origin[0], t_s), {origin[1], target[1]}
+        return len(lanes) == 1 or all(self._begun_m(lane, front_m) for lane in lanes)
 
     def _begun_m(self, lane: int, front_m: float) -> list[float]:
         """Return where the section begins in which moves may begin; empty: they may not."""

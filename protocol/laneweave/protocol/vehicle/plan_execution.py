@@ -18,10 +18,11 @@ from enum import Enum
 from attrs import define, field
 from msgspec.structs import replace
 
-from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.state_machine import RuleBook, Transition
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
-from laneweave.protocol.vehicle.plans import Needs, dependencies, ownership_problems, plan_problems
+from laneweave.protocol.vehicle.plans import Needs, dependencies, plan_problems
+from laneweave.protocol.vehicle.territory import Territory
 from laneweave.protocol.wire.messages import (
     Ballot,
     Name,
@@ -73,11 +74,9 @@ class PlanExecution:
     vehicle: Name
     incarnation: int
     hold_cell: Cell
-    lattice: Lattice
+    territory: Territory
     stored: VehicleRecord
     """Record of the vehicle, as last reported; joined blocks are never removed."""
-    owns_cells: bool = False
-    """Whether vehicles own cells (rolling operation); otherwise formations own blocks."""
     moving: bool = False
     phase: ExecutionPhase = ExecutionPhase.FREE
     promised: Ballot | None = None
@@ -132,7 +131,7 @@ class PlanExecution:
             self.wanted_joined = tuple(sorted({*joined, *self.wanted_joined}))
             self.stored = replace(self.stored, joined=joined)
         changed |= self.rules.take(self, STORED, record) is not None
-        if self.owns_cells:
+        if self.territory.stores_promises:
             promised, before = record.promised, self.promise_stored
             if promised is not None and promised != self.promised:
                 self.on_prepare(Prepare(promised, (), (self.vehicle,)))
@@ -170,11 +169,11 @@ class PlanExecution:
 
     @property
     def wanted(self) -> VehicleRecord:
-        """Record that the motion controller should store; formations do not store promises."""
+        """Record that the motion controller should store."""
         return VehicleRecord(
             incarnation=self.incarnation,
             joined=self.wanted_joined,
-            promised=self.promised if self.owns_cells else None,
+            promised=self.promised if self.territory.stores_promises else None,
             accepted=self.plan.ballot if self.plan is not None else None,
             transfer=self.transfer,
         )
@@ -271,9 +270,8 @@ class PlanExecution:
 
 def is_in_roster(execution: PlanExecution, prepare: Prepare) -> bool:
     """The vehicle is in the roster, and in one of the formations."""
-    # A vehicle that waited at the end of a lane belongs to another formation than before.
-    return execution.vehicle in prepare.roster and (
-        execution.owns_cells or not {*prepare.blocks}.isdisjoint(execution.stored.joined)
+    return execution.vehicle in prepare.roster and execution.territory.is_addressed(
+        execution.stored, prepare
     )
 
 
@@ -285,8 +283,7 @@ def is_above_promise(execution: PlanExecution, prepare: Prepare) -> bool:
 def promise(execution: PlanExecution, prepare: Prepare) -> None:
     """Promise the ballot; request storage of its blocks as joined."""
     execution.promised, execution.promise_stored = prepare.ballot, False
-    if not execution.owns_cells:
-        execution.wanted_joined = tuple(sorted({*execution.wanted_joined, *prepare.blocks}))
+    execution.wanted_joined = execution.territory.joined_by(execution.wanted_joined, prepare)
 
 
 def drop_plan(execution: PlanExecution, _: object) -> None:
@@ -337,38 +334,24 @@ def drives_its_moves(execution: PlanExecution, plan: Plan) -> bool:
 
 def stays_in_its_blocks(execution: PlanExecution, plan: Plan) -> bool:
     """The territory lies in the blocks of the plan."""
-    if execution.owns_cells:
-        return True
-    blocks = set(plan.blocks)
-    return all(
-        execution.lattice.block_of(column) in blocks and 0 <= lane < execution.lattice.lanes
-        for column, lane in plan.territory
-    )
+    return execution.territory.contains(plan)
 
 
 def has_joined(execution: PlanExecution, plan: Plan) -> bool:
     """The blocks of the plan are exactly those that the controller has stored as joined."""
-    return execution.owns_cells or set(plan.blocks) == set(execution.stored.joined)
+    return execution.territory.is_joined(execution.stored, plan)
 
 
 def transfers_only_owned_cells(execution: PlanExecution, plan: Plan) -> bool:
     """The cell transfers are valid, and the vehicle owns the cells attributed to it."""
-    if not execution.owns_cells:
-        return True
-    stored = execution.stored
-    owned = {*stored.owned, *(stored.transfer.after if stored.transfer is not None else ())}
-    return not ownership_problems(plan) and set(plan.before[execution.vehicle]) <= owned
+    return execution.territory.may_transfer(execution.stored, plan, execution.vehicle)
 
 
 def take_plan(execution: PlanExecution, plan: Plan) -> None:
     """Take the plan; derive its dependencies; request storage of the acceptance."""
     execution.plan = plan
     execution.needs = dependencies(plan, execution.vehicle)
-    if execution.owns_cells:
-        name = execution.vehicle
-        execution.transfer = PendingTransfer(
-            plan.ballot, plan.before[name], plan.after[name], plan.roster
-        )
+    execution.transfer = execution.territory.transfer_in(plan, execution.vehicle)
 
 
 def is_stored(execution: PlanExecution, record: VehicleRecord) -> bool:
@@ -454,10 +437,7 @@ def both_lanes_are_open(execution: PlanExecution, _: object) -> bool:
     """The cell is where moves may begin in both lanes."""
     # A move may be planned for later in its slot.
     move, ends = execution.next_move, execution.lane_ends
-    if move is None or ends is None or move[1][1] == move[2][1]:
-        return True
-    front_m = execution.lattice.cell_s_m(move[1][0], execution.t_s)
-    return all(ends.has_begun(lane, front_m) for _, lane in move[1:])
+    return move is None or ends is None or ends.may_begin(*move[1:], execution.t_s)
 
 
 def is_released(execution: PlanExecution, _: object) -> bool:

@@ -50,6 +50,7 @@ from laneweave.protocol.vehicle.motion import (
     keep_gap,
     limited_accel,
 )
+from laneweave.protocol.vehicle.territory import territory_of
 from laneweave.protocol.wire.messages import Command, Neighbour, VehicleRecord
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, Neighbours
 from laneweave.sim_bridge.bodies.plant import Plant
@@ -132,7 +133,7 @@ class MotionController:
         self.tick_s = self._scenario.runtime.tick_s
         # The other blocks of the formation are not known until it is closed.
         record = VehicleRecord(joined=(self.lattice.block_of(self.hold_cell[0]),))
-        self.store = RecordStore(record, owns_cells=self._scenario.formation.rolling)
+        self.store = RecordStore(record, territory_of(self._scenario))
         self.motion_origin = self.hold_cell
         self.rung_ticks = dict.fromkeys(Rung, 0)
         self._jerks = array("f")
@@ -166,15 +167,15 @@ class MotionController:
         """Return whether the hold cell has passed the stop line of the lane in which the body is.
 
         A body that is partly in the lane of its hold cell continues its move. One that has driven
-        out of another lane may come to a line, too, if it could not settle before. In formations a
-        body that drives partly in another lane keeps its cell, since the others of its formation
-        take up cells that are given up.
+        out of another lane may come to a line, too, if it could not settle before. A body that
+        drives partly in another lane keeps its cell if others would be led into it.
         """
         if self.off_lattice is OffLatticePhase.WAITING or not self._lane_ends:
             return False
         if self.off_lattice is OffLatticePhase.DRIVING_OUT and self._past_line:
             return False
-        if not self.store.owns_cells and self._straddles and self.measured[1] > STANDING_MPS:
+        stays_free = self.store.territory.given_up_cells_stay_free
+        if not stays_free and self._straddles and self.measured[1] > STANDING_MPS:
             return False
         # Behind an exit the lane may belong to a ramp, to whose end the body does not come.
         cell = self.hold_cell[0], self._body_lane
@@ -200,13 +201,13 @@ class MotionController:
         return lane != goal[1] and ends.too_late_to_move((goal[0], lane), goal, t_s)
 
     def return_to_origin(self, t_s: float) -> bool:
-        """Hold the cell in which the move began; return False if the vehicle does not own it.
+        """Hold the cell in which the move began; return False if the vehicle may not.
 
-        It owns the cell until a later plan takes it, which no vehicle that moves takes part in. In
-        a formation, no other vehicle is led into the cell before the move is complete. Commands
-        for earlier ticks, which may repeat the move, are no longer accepted.
+        It may until a later plan takes the cell, which no vehicle that moves takes part in. In a
+        formation, no other vehicle is led into the cell before the move is complete. Commands for
+        earlier ticks, which may repeat the move, are no longer accepted.
         """
-        if self.store.owns_cells and self.motion_origin not in self.record.owned:
+        if not self.store.territory.may_hold(self.record, self.motion_origin):
             return False
         if self.motion_origin[1] != self._body_lane:
             return False
@@ -288,8 +289,8 @@ class MotionController:
         """Accept a command from the process in charge, or from a newer one, which takes charge.
 
         A command is rejected if its incarnation is older than that of the process in charge, if its
-        tick is not later than that of the last command, if the vehicle does not own its hold cell
-        (rolling operation), or if it changes lanes in an emergency, beside another body, before one
+        tick is not later than that of the last command, if the vehicle may not hold its hold cell,
+        or if it changes lanes in an emergency, beside another body, before one
         that could not brake for it, or too late for an exit. A newer incarnation takes charge. Its
         first command must keep the hold cell: no plan can allow a process to move the vehicle
         before it is in charge. A rejected process may try again at the next tick.
@@ -316,7 +317,7 @@ class MotionController:
             self.store.put_in_charge(incarnation)
         self.command_tick = command.tick
         self.store_requests(command)
-        if self.store.owns_cells and leaves and command.hold_cell not in self.record.owned:
+        if leaves and not self.store.territory.may_hold(self.record, command.hold_cell):
             return False
         lane = command.hold_cell[1]
         if lane != self.hold_cell[1] and (

@@ -12,6 +12,7 @@ from attrs import define
 from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.vehicle.territory import Territory
 from laneweave.protocol.wire.messages import Ballot, PendingTransfer, VehicleRecord
 
 MAX_COLUMN = 2**31 - 1
@@ -23,8 +24,7 @@ class RecordStore:
     """The record of one vehicle, and the cells that only the roadside and the controller know."""
 
     record: VehicleRecord
-    owns_cells: bool
-    """Whether vehicles own cells (rolling operation); otherwise formations own blocks."""
+    territory: Territory
     _granted: frozenset[Cell] = frozenset()
     """Cells assigned by the roadside that are not part of any plan yet."""
     _given_up: frozenset[Cell] = frozenset()
@@ -70,15 +70,10 @@ class RecordStore:
         self.record = replace(self.record, promised=newest)
 
     def store_acceptance(self, ballot: Ballot) -> None:
-        """Store an acceptance by the process in charge unless a newer one is stored.
-
-        In the rolling operation the transfer of this ballot must be pending.
-        """
-        accepted, transfer = self.record.accepted, self.record.transfer
-        if self.owns_cells and (
-            transfer is None or transfer.ballot != ballot or transfer.withdrawn
-        ):
+        """Store an acceptance by the process in charge unless a newer one is stored."""
+        if not self.territory.may_accept(self.record, ballot):
             return
+        accepted = self.record.accepted
         newest = ballot if accepted is None else max(accepted, ballot)
         self.record = replace(self.record, accepted=newest)
 
@@ -111,24 +106,15 @@ class RecordStore:
         self.record = replace(self.record, owned=owned, transfer=transfer)
 
     def give_up_cells(self) -> None:
-        """Give up all cells, since the vehicle leaves the lattice.
-
-        The stored transfer tells leaders that the vehicle is gone for all ballots so far.
-        """
+        """Give up all cells, since the vehicle leaves the lattice."""
         self._given_up, self._granted = self.possible_cells, frozenset()
-        record = self.record
-        ballots = [ballot for ballot in (record.promised, record.accepted) if ballot is not None]
-        transfer = record.transfer
-        if transfer is not None:
-            ballots.append(transfer.ballot)
-        if ballots and self.owns_cells:
-            transfer = PendingTransfer(max(ballots))
-        self.record = replace(record, owned=(), accepted=None, transfer=transfer)
+        transfer = self.territory.transfer_of_departed(self.record)
+        self.record = replace(self.record, owned=(), accepted=None, transfer=transfer)
 
     def enter_block(self, block: int, cells: Iterable[Cell]) -> None:
         """Take cells in a block; in formations the vehicle leaves those to which it belonged."""
         self.record = replace(self.record, joined=(block,))
-        for cell in cells if self.owns_cells else ():
+        for cell in self.territory.owned_among(cells):
             self.assign_cell(cell)
 
     @property

@@ -1,8 +1,8 @@
-"""What vehicles get at the entrances besides their cells, depending on the operation.
+"""Allocation: how the roadside hands out the territory (`protocol.vehicle.territory`) at entrances.
 
-In formations, blocks of columns belong to a formation as soon as it is closed. In the rolling
-operation, every cell belongs to at most one vehicle. `allocation_of` selects one of them; no other
-part of the roadside depends on the operation.
+Blocks of columns belong to a formation as soon as it is closed. Cells belong to at most one vehicle
+each. `allocation_of` selects one of the two; no other part of the roadside depends on the
+operation.
 """
 
 from __future__ import annotations
@@ -29,8 +29,6 @@ begin near the entrance, since all cells must be assigned before a plan can tran
 
 class BlockAllocation:
     """Blocks of columns for formations; vehicles own no cells."""
-
-    gives_up_cells = False
 
     def __init__(self, builder: FormationBuilder) -> None:
         """Begin without formations."""
@@ -78,8 +76,6 @@ class CellAllocation:
 
     builder: FormationBuilder | None = None
     closed_to = -1
-    gives_up_cells = True
-    """Whether a vehicle that misses an exit, and cannot return to its lane, gives up its cells."""
 
     def __init__(self, scenario: Scenario, is_kept_free: Callable[[Cell], bool]) -> None:
         """Begin without vehicles.
@@ -295,7 +291,6 @@ Allocation = BlockAllocation | CellAllocation
 
 def allocation_of(scenario: Scenario, is_kept_free: Callable[[Cell], bool]) -> Allocation:
     """Return the allocation of a scenario's operation; see `CellAllocation`."""
-    builder = formation_builder(scenario)
-    if builder is None:
-        return CellAllocation(scenario, is_kept_free)
-    return BlockAllocation(builder)
+    if scenario.formation.traits.has_formations:
+        return BlockAllocation(formation_builder(scenario))
+    return CellAllocation(scenario, is_kept_free)

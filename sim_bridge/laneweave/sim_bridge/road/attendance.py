@@ -59,9 +59,8 @@ class Caretaker:
             vehicle=vehicle.name,
             incarnation=incarnation,
             hold_cell=controller.hold_cell,
-            lattice=controller.lattice,
+            territory=controller.store.territory,
             stored=controller.record,
-            owns_cells=controller.store.owns_cells,
             moving=controller.moving(tick),
         )
         self._execution.on_record(controller.record)

@@ -338,10 +338,8 @@ FormationBuilder = ColumnBlocks | GrowingFormations
 """Assigns entering vehicles to formations, in order of entry."""
 
 
-def formation_builder(scenario: Scenario) -> FormationBuilder | None:
-    """Return the builder of a scenario's formations; None in the rolling operation."""
-    if scenario.formation.rolling:
-        return None
+def formation_builder(scenario: Scenario) -> FormationBuilder:
+    """Return the builder of a scenario's formations."""
     formation, lattice, entrances = scenario.formation, scenario.lattice, Entrances.of(scenario)
     most, spread_s = formation.max_vehicles, formation.entry_spread_s
     if formation.closes_by_vehicles:

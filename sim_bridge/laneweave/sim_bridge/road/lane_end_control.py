@@ -27,6 +27,7 @@ from laneweave.protocol.vehicle.lane_ends import (
     lane_beside,
     own_drive_out,
 )
+from laneweave.protocol.vehicle.territory import territory_of
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
 from laneweave.protocol.wire.messages import Name, OffLattice
 from laneweave.sim_bridge.bodies.motion_controller import (
@@ -71,10 +72,10 @@ class LaneEndChange:
 class LaneEndControl:
     """Vehicles without cells, and the gaps that are kept free for them."""
 
-    def __init__(self, scenario: Scenario, meter: EntryMeter, *, gives_up_cells: bool) -> None:
-        """Begin without vehicles; see `CellAllocation.gives_up_cells`."""
+    def __init__(self, scenario: Scenario, meter: EntryMeter) -> None:
+        """Begin without vehicles."""
         self._meter = meter
-        self._gives_up_cells = gives_up_cells
+        self._cells_stay_free = territory_of(scenario).given_up_cells_stay_free
         self._scenario = scenario
         self._lattice = scenario.lattice
         ends = LaneEnds(scenario)
@@ -119,7 +120,7 @@ class LaneEndControl:
             missed = controller.has_missed_exit(t_s)
             if missed and controller.return_to_origin(t_s):
                 yield LaneEndChange(name, MISSED_EXIT, controller.hold_cell[1])
-            elif (missed and self._gives_up_cells) or controller.has_lost_cell(t_s):
+            elif (missed and self._cells_stay_free) or controller.has_lost_cell(t_s):
                 # While it drives out, a vehicle may come to another dead end.
                 self._forget(name)
                 yield self._take_off(name, vehicle)

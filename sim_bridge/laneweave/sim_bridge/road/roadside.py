@@ -110,9 +110,7 @@ class Roadside:
             shared_lanes=scenario.geometry.shared_exit_lanes,
             is_free=self._allocation.is_free,
         )
-        self._lane_ends = LaneEndControl(
-            scenario, self._meter, gives_up_cells=self._allocation.gives_up_cells
-        )
+        self._lane_ends = LaneEndControl(scenario, self._meter)
         self._room = EntranceRoom(scenario)
         self.demand = DemandQueue(scenario, stream, self._meter, outside_traffic)
         self.publisher = CensusPublisher(

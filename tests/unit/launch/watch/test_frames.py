@@ -60,5 +60,5 @@ def test_the_scene_contains_the_numbers_of_frames() -> None:
     source.scene |= scene_of(parse_scenario({}), "live", "here", 0.1)
     scene = json.loads(opening(source, "this server"))["scene"]
     assert (scene["first"], scene["last"], scene["session"]) == (15, 24, "this server")
-    assert (scene["kind"], scene["title"], scene["rolling"]) == ("live", "here", False)
+    assert (scene["kind"], scene["title"], scene["has_formations"]) == ("live", "here", True)
     assert len(scene["colours"]) == len(scene["legend"]) == scene["road"]["lanes"] == 3

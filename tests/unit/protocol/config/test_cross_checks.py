@@ -184,7 +184,7 @@ def test_values_with_an_effect_are_taken_and_those_of_options_and_recordings_too
     """An option may change what a file's values do; a recording holds all fields."""
     path = tmp_path / "x.toml"
     path.write_text("[formation]\nmax_vehicles = 5\nmax_columns = 6\n", encoding="utf-8")
-    assert load_scenario(path, formation__operation="rolling").formation.rolling
+    assert load_scenario(path, formation__operation="rolling").formation.planner == "rolling"
     path.write_text('[formation]\noperation = "rolling"\nsort_in_s2 = true\n', encoding="utf-8")
     assert load_scenario(path).formation.sort_in_s2
     path.write_text('[formation]\nclose = "columns"\nblock_columns = 6\n', encoding="utf-8")

@@ -160,7 +160,7 @@ def test_the_time_at_v_f_counts_from_the_entrance_to_the_destination() -> None:
 @pytest.mark.parametrize("name", ["on-ramp", "off-ramp", "weaving", "motorway"])
 def test_the_example_scenarios_are_valid(name: str) -> None:
     folder = Path(__file__).parents[4] / "scenarios"
-    assert load_scenario(folder / f"{name}.toml").formation.rolling
+    assert load_scenario(folder / f"{name}.toml").formation.operation == "rolling"
 
 
 @pytest.mark.parametrize(

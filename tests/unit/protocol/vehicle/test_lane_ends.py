@@ -114,7 +114,7 @@ def test_a_cell_is_in_a_lane_that_opens_again_as_soon_as_moves_into_it_may_begin
     begins_s = lattice.passing_time_s(-10, begins_m)
     assert ends.has_passed((-10, 1), begins_s - 0.01)
     assert not ends.has_passed((-10, 1), begins_s + 0.01)
-    assert ends.has_begun(1, begins_m + 0.01)
+    assert ends.may_begin((-10, 1), (-10, 0), begins_s + 0.01)
 
 
 def test_the_exit_before_does_not_end_moves_that_begin_before_the_lane_opens_again() -> None:

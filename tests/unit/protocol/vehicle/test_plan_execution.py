@@ -21,6 +21,7 @@ from laneweave.protocol.vehicle.plan_execution import (
     both_lanes_are_open,
     ends_in_time,
 )
+from laneweave.protocol.vehicle.territory import BlockTerritory
 from laneweave.protocol.wire.messages import (
     Ballot,
     Name,
@@ -49,7 +50,7 @@ AT: dict[Name, Cell] = {A: (-4, 0), B: (-3, 0)}
 
 def vehicle(name: Name = A, cell: Cell = (-4, 0), **more: Any) -> PlanExecution:  # noqa: ANN401
     stored = VehicleRecord(incarnation=7, joined=more.pop("joined", (0,)))
-    return PlanExecution(name, 7, cell, LATTICE, stored, **more)
+    return PlanExecution(name, 7, cell, BlockTerritory(LATTICE), stored, **more)
 
 
 def note(execution: PlanExecution, ballot: Ballot | None) -> bool:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.scenario.formation_table import FormationSettings, formation_columns
+from laneweave.protocol.scenario.formation_table import formation_columns
 from laneweave.protocol.wire.messages import ClosedFormation
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
@@ -420,7 +420,6 @@ def test_the_scenario_selects_the_builder() -> None:
     blocks = formation_builder(PAPER)
     assert isinstance(blocks, ColumnBlocks)
     assert (blocks.max_vehicles, blocks.lattice.block_columns, blocks.spread_s) == (6, 4, 1.5)
-    assert formation_builder(Scenario(formation=FormationSettings(operation="rolling"))) is None
 
 
 @pytest.mark.parametrize(("max_columns", "length"), [(7, 4), (3, 3)])

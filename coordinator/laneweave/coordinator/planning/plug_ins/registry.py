@@ -10,7 +10,7 @@ from attrs import frozen
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.plug_ins import PlugIns
-from laneweave.protocol.scenario.formation_table import ROLLING_SOLVER
+from laneweave.protocol.scenario.operations import ROLLING_SOLVER
 
 Paths = Sequence[Sequence[Cell]]
 """For each vehicle of a request, in its order: the cells (column, lane) from its start to a target.

@@ -89,7 +89,7 @@ class Watch {
     this.painter = new laneweaveRoad.Painter(part("road"), scene, this.theme());
     document.title = `${scene.title} · laneweave`;
     part("title").textContent = scene.title;
-    part("cells-name").textContent = this.live || !scene.rolling ? "cells" : "hold cells";
+    part("cells-name").textContent = this.live || scene.has_formations ? "cells" : "hold cells";
     part("sorted").parentElement.hidden = !scene.preferences;
     part("loss-name").textContent = scene.losses ? "Loss, whole run" : "Message loss";
     part("paces").hidden = this.live;
@@ -416,7 +416,7 @@ class Watch {
   }
 
   showLegend() {
-    const { legend, road, lattice, preferences, rolling } = this.store.scene;
+    const { legend, road, lattice, preferences, has_formations: hasFormations } = this.store.scene;
     const entry = (style, words) => {
       const span = document.createElement("span");
       if (style) {
@@ -432,9 +432,9 @@ class Watch {
     const rest = [
       ...(preferences ? [entry(null, "number: preferred lane, 0 is the rightmost")] : []),
       entry(null, `darker: slower than ${lattice.speed_mps} m/s; lighter: faster`),
-      entry({ kind: "cell" }, this.live && rolling ? "cells that a vehicle owns; framed: its hold cell" : "hold cell of a vehicle"),
+      entry({ kind: "cell" }, this.live && !hasFormations ? "cells that a vehicle owns; framed: its hold cell" : "hold cell of a vehicle"),
       entry({ kind: "target" }, "target of a vehicle"),
-      ...(rolling ? [] : [entry({ kind: "block" }, "columns of a formation, with its number")]),
+      ...(hasFormations ? [entry({ kind: "block" }, "columns of a formation, with its number")] : []),
     ];
     if (this.live) {
       rest.push(entry({ kind: "ghost" }, "not heard from: expected position"));

@@ -12,6 +12,7 @@ from laneweave.launch.fault_search.setup import RoadSetup
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
+from laneweave.protocol.vehicle.territory import BlockTerritory, CellTerritory
 from laneweave.protocol.wire.bounds import Bounds, check_ballot
 from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import (
@@ -38,14 +39,12 @@ ROLLING = replace(PLAN, before=OWNED, after=OWNED)
 
 def accepts(name: Name, plan: Plan) -> bool:
     """Return whether a vehicle that has promised the ballot takes a plan."""
-    rolling = bool(plan.before)
     execution = PlanExecution(
         vehicle=name,
         incarnation=PLAN.incarnations[name],
         hold_cell=CELLS[name],
-        lattice=LATTICE,
+        territory=CellTerritory() if plan.before else BlockTerritory(LATTICE),
         stored=VehicleRecord(joined=PLAN.blocks, owned=OWNED[name]),
-        owns_cells=rolling,
     )
     execution.on_prepare(Prepare(BALLOT, PLAN.blocks, PLAN.roster))
     return execution.on_plan(plan)
