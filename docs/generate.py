@@ -56,7 +56,8 @@ from laneweave.protocol.runtime.metrics import (
 from laneweave.protocol.security.access_control import READING, SENDING, Flow, rights_on
 from laneweave.protocol.state_machine import Function, RuleBook
 from laneweave.protocol.summary import described
-from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, ExecutionPhase
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
+from laneweave.protocol.vehicle.plan_execution import ExecutionPhase
 from laneweave.protocol.wire import events, messages
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import TOPICS, Exchange, Party, Topic

@@ -73,7 +73,7 @@ from attrs import frozen
 
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from scenarios.scenario_rolling import RollingRunner, is_rolling
 from scenarios.scenario_runner import Runner
 from scenarios.scenario_text import CollisionError, ScenarioError

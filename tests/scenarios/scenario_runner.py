@@ -13,7 +13,8 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import PeerDown, PeerUp, Started
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
+from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.wire.messages import Heartbeat, Plan, VehicleState
 from laneweave.protocol.wire.topics import COORDINATOR_ALIVE
 from scenarios.scenario_leaders import Candidate, Leader, Mail, formation_of

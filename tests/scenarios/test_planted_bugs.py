@@ -8,7 +8,7 @@ import pytest
 
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
-from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from scenarios.scenario_files import check_scenario, ends_in_collision, runner_of
 from scenarios.scenario_text import ScenarioError
 from support.bug_register import catches

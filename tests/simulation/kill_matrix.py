@@ -39,7 +39,7 @@ if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.tom
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.launch.fault_search.search import silence_logs
-from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from support.bug_register import EVERY_BUG
 from support.planted_bugs import Bug
 

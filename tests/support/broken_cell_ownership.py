@@ -11,7 +11,7 @@ from laneweave.coordinator.rolling import ownership, transfer
 from laneweave.coordinator.rolling.ownership import States
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.vehicle import plan_execution as vehicle_rules
+from laneweave.protocol.vehicle import territory
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.wire.messages import (
     Command,
@@ -134,7 +134,7 @@ def forget_motion(patch: Patch) -> None:
 
 
 def skip_ownership_checks(patch: Patch) -> None:
-    for module in (transfer, vehicle_rules):
+    for module in (transfer, territory):
         patch.setattr(module, "ownership_problems", lambda plan: [])  # noqa: ARG005
 
 

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import pytest
 
-from laneweave.agents import core
 from laneweave.agents.core import AgentCore
 from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.scenario.vehicle_types import VehicleTypes
+from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.road.roadside import Roadside
@@ -70,7 +70,7 @@ def late_commands_repeat_moves(patch: pytest.MonkeyPatch) -> None:
 
 def gates_stay_open(patch: pytest.MonkeyPatch) -> None:
     """An agent waits for ever with a move that can no longer begin."""
-    patch.setattr(core, "ends_in_time", lambda *_: True)
+    patch.setattr(PlanExecution, "stuck", False)
 
 
 def agents_insist(patch: pytest.MonkeyPatch) -> None:

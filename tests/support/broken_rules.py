@@ -21,7 +21,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import Transition
-from laneweave.protocol.vehicle import plan_execution as execution
+from laneweave.protocol.vehicle import execution_rules as execution
 from laneweave.protocol.vehicle.plan_execution import PLAN, ExecutionPhase, PlanExecution
 from laneweave.protocol.vehicle.plans import Needs, dependencies
 from laneweave.protocol.wire.messages import (

@@ -27,7 +27,7 @@ from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.runtime.node import Compute, Computed, Effect, Listen
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import Transition
-from laneweave.protocol.vehicle import plan_execution as execution
+from laneweave.protocol.vehicle import execution_rules as execution
 from laneweave.protocol.vehicle.plan_execution import GATE, PlanExecution
 from laneweave.protocol.vehicle.plans import Needs
 from laneweave.protocol.wire.messages import (

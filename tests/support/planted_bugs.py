@@ -17,7 +17,7 @@ from laneweave.coordinator.formations import leader
 from laneweave.coordinator.rolling import transfer
 from laneweave.launch.fault_search.coverage import Rules
 from laneweave.protocol.state_machine import Function, RuleBook, Transition
-from laneweave.protocol.vehicle import plan_execution as vehicle
+from laneweave.protocol.vehicle import execution_rules as vehicle
 from support import broken_cell_ownership as rolling
 from support import broken_rules as broken
 from support.rule_books import replacing

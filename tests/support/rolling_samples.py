@@ -6,7 +6,8 @@ from collections.abc import Iterable
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
+from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.vehicle.territory import CellTerritory
 from laneweave.protocol.wire.messages import (
     Ballot,
@@ -63,7 +64,7 @@ def pending(name: Name, ballot: Ballot = MID, roster: tuple[Name, ...] = (A, B))
 def vehicle(name: Name = A, rules: RuleBook = VEHICLE_RULES) -> PlanExecution:
     cell = make_plan().start_cells[name]
     stored = VehicleRecord(incarnation=INCARNATION, owned=BEFORE[name])
-    return PlanExecution(name, INCARNATION, cell, CellTerritory(), stored, rules=rules)
+    return PlanExecution(name, INCARNATION, cell, CellTerritory(), stored, rules)
 
 
 def sense(

@@ -8,7 +8,7 @@ rare. No scenario is written for them.
 from __future__ import annotations
 
 from laneweave.coordinator.ballots import ballot_round as ballot
-from laneweave.protocol.vehicle import plan_execution as vehicle
+from laneweave.protocol.vehicle import execution_rules as vehicle
 from support import broken_unseen as broken
 from support.planted_bugs import Bug
 

@@ -7,7 +7,7 @@ import pytest
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.protocol.state_machine import RuleBook, Transition
-from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from support.planted_bugs import BUGS, ROWS_OF_OTHERS, Bug, unchanged
 from support.tables import for_each
 from support.unseen_bugs import UNSEEN

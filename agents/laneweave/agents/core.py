@@ -42,9 +42,10 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import displaced
-from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution, ends_in_time
+from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.vehicle.territory import territory_of
 from laneweave.protocol.wire.bounds import check_ballot
 from laneweave.protocol.wire.identities import above
@@ -267,10 +268,10 @@ class AgentCore:
             return False
         if sense.hold_cell == execution.hold_cell:
             # An open gate for a move that can no longer begin would keep leaders waiting.
-            return execution.go and not execution.moving and not ends_in_time(execution, None)
+            return execution.stuck
         if move is None or sense.hold_cell != move[1]:
             return True
-        return self._lane_ends.too_late_to_move(move[1], move[2], sense.t_s)
+        return self._lane_ends.too_late(move[1], move[2], sense.t_s)
 
     def _wait(self, sense: Sense) -> list[Effect]:
         """Keep the claim on a vehicle without a cell, which its motion controller drives alone."""
@@ -303,7 +304,6 @@ class AgentCore:
         if in_charge:
             stretch = stretch_of(execution.hold_cell[0])
             self.wanted_motions = stretch - 1, stretch, stretch + 1
-            execution.on_record(sense.record)
             self._decide(sense, execution)
         drive = self._driver.drive(sense, moving=execution.moving)
         self._command = Command(
@@ -364,33 +364,28 @@ class AgentCore:
             hold_cell=sense.hold_cell,
             territory=self._territory,
             stored=sense.record,
-            moving=not self._driver.at_rest(sense),
             rules=self._rules,
+            moving=not self._driver.at_rest(sense),
             lane_ends=self._lane_ends,
             drivable=self._drivable,
         )
 
     def _decide(self, sense: Sense, execution: PlanExecution) -> None:
-        """Apply V5 to V7: end motions, open the gate, begin moves."""
+        """Advance plan execution by a tick, and begin the move that starts now."""
         if execution.moving and self._move is not None and sense.hold_cell != self._move[2]:
             # The COMMAND with the move was lost, so the body is still at its origin: a trajectory
             # that began earlier would be ahead of it. The plan may have been dropped since.
             self._driver.begin(self._move, sense.tick, self._move_ticks)
-        if execution.moving and self._driver.at_rest(sense):
-            execution.end_motion()
-        scenario = self._scenario
-        if displaced(
-            sense.state,
-            scenario.lattice,
-            execution.hold_cell,
-            sense.t_s,
-            scenario.types.room_ahead_m,
-        ):
-            execution.displace()
-        move = execution.tick(sense.t_s)
+        scenario, cell = self._scenario, execution.hold_cell
+        room_ahead_m = scenario.types.room_ahead_m
+        move = execution.on_sense(
+            sense,
+            arrived=execution.moving and self._driver.at_rest(sense),
+            displaced=displaced(sense.state, scenario.lattice, cell, sense.t_s, room_ahead_m),
+        )
         if move is not None and execution.plan is not None:
             self._move = move
-            self._move_ticks = self._scenario.timing.move_ticks(execution.plan.slot_s)
+            self._move_ticks = scenario.timing.move_ticks(execution.plan.slot_s)
             self._driver.begin(move, sense.tick, self._move_ticks)
 
     # --- messages to other processes -----------------------------------------------------------

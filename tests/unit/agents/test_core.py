@@ -14,9 +14,9 @@ from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.runtime import node
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle, VehicleTypeSettings
+from laneweave.protocol.vehicle.execution_rules import drives_its_moves
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import ARRIVED_ACROSS_M, ARRIVED_ALONG_M
-from laneweave.protocol.vehicle.plan_execution import drives_its_moves
 from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.messages import Command, Name, Neighbour, Prepare, Report
 from support.agent_rig import HOME, ME, MOVE_TICKS, OTHER, SCENARIO, TICK_S, Rig, up_and_running

@@ -16,7 +16,7 @@ from attrs import define, evolve, field, frozen
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.protocol.state_machine import Function, RuleBook, Transition
-from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 
 ADOPTION = "leader L2 STATE to in force"
 """Feature of a leader that adopts a plan."""

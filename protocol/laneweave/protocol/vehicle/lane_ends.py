@@ -12,7 +12,7 @@ complete it before the lanes part. docs/SAFETY.md derives the rules.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache, reduce
 
 from attrs import evolve, frozen
@@ -35,6 +35,9 @@ from laneweave.protocol.wire.messages import Neighbour
 
 BEFORE_TOUCHING = 0.6
 """Share of a move by which a body that changes lanes touches the other lane (by default 0.36)."""
+LATE_S = 0.2
+"""Delay with which a move that leads out of a lane may still begin; longer ones could end with the
+body partly in the lane at its stop line."""
 START_S = 0.3
 """Time after the front of a gap has passed in which a waiting vehicle may start into it."""
 _MAX_COLUMNS = 48
@@ -157,48 +160,61 @@ class LaneEnds:
         """Return the exit of the section in which a position is, or which it has passed."""
         return _end_ahead(self._exits, lane, s_m)
 
-    def has_passed(
-        self, cell: Cell, t_s: float, since_s: float | None = None, body_m: float | None = None
-    ) -> bool:
+    def has_passed(self, cell: Cell, t_s: float, body_m: float | None = None) -> bool:
         """Return whether a cell has passed the stop line of its section.
 
         Args:
             cell: the cell.
             t_s: road time.
-            since_s: road time at which the cell is in the section; None: `t_s`.
-            body_m: a position in the section, instead of that of the cell.
+            body_m: a position in the section; None: that of the cell.
         """
-        return self._has_passed_line(self.ahead, cell, t_s, since_s, body_m)
-
-    def ends_changes(
-        self, cell: Cell, t_s: float, since_s: float | None = None, body_m: float | None = None
-    ) -> bool:
-        """Return whether a cell is where lane changes have ended before an exit.
-
-        The arguments are those of `has_passed`.
-        """
-        return self._has_passed_line(self.exit_ahead, cell, t_s, since_s, body_m)
-
-    def _has_passed_line(
-        self,
-        find: Callable[[int, float], LaneEnd | None],
-        cell: Cell,
-        t_s: float,
-        since_s: float | None,
-        body_m: float | None,
-    ) -> bool:
-        """Return whether a cell has passed the line of the end that is found for its section."""
         if body_m is None:
-            # A move may begin before its lane opens: what ended before does not concern it.
-            body_m = self.in_section_m(cell, t_s if since_s is None else since_s)
-        end = find(cell[1], body_m)
-        return end is not None and self._lattice.cell_s_m(cell[0], t_s) > end.line_m
+            body_m = self.in_section_m(cell, t_s)
+        return self._is_beyond(self.ahead(cell[1], body_m), cell, t_s)
 
-    def too_late_to_move(self, origin: Cell, target: Cell, t_s: float) -> bool:
-        """Return whether a body in one lane can no longer begin to enter another, for an exit."""
-        return origin[1] != target[1] and any(
-            self.ends_changes(cell, t_s + self._touching_s, t_s) for cell in (origin, target)
-        )
+    def too_late(self, origin: Cell, target: Cell, t_s: float, slot_s: float | None = None) -> bool:
+        """Return whether it is too late for a move, because one of its lanes ends.
+
+        Everything that begins, continues or gives up moves on a road asks this; planners use the
+        same lines (`sections_to_lines`).
+
+        Args:
+            origin: cell in whose lane the body is.
+            target: cell into which it moves.
+            t_s: road time from which the move can begin.
+            slot_s: T_F. The whole move must end before the stop or exit lines of both lanes. None:
+                the vehicle moves already, but its body is not in the other lane; it must touch it
+                in time for an exit. Before a dead end it is stopped at the line.
+        """
+        lanes = origin[1], target[1]
+        if slot_s is None:
+            return lanes[0] != lanes[1] and any(
+                self._ends_changes(cell, t_s + self._touching_s, self.in_section_m(cell, t_s))
+                for cell in (origin, target)
+            )
+        front = max(origin[0], target[0])
+        if lanes[0] == lanes[1]:
+            cell = front, lanes[0]
+            return self.has_passed(cell, t_s + slot_s - LATE_S, self.in_section_m(cell, t_s))
+        # It may be planned for later in its slot, when both lanes are open (`may_begin`).
+        opens_s = max(self.opens_s((origin[0], lane), t_s) for lane in lanes)
+        begin_s = opens_s if opens_s < t_s + slot_s else t_s
+        end_s = begin_s + slot_s - LATE_S
+        for lane in lanes:
+            # A move may begin before its lane opens: what ended before does not concern it.
+            body_m = self.in_section_m((origin[0], lane), begin_s)
+            for is_beyond in (self.has_passed, self._ends_changes):
+                if is_beyond((front, lane), end_s, body_m):
+                    return True
+        return False
+
+    def _ends_changes(self, cell: Cell, t_s: float, body_m: float) -> bool:
+        """Return whether a cell is where lane changes have ended before the exit of a section."""
+        return self._is_beyond(self.exit_ahead(cell[1], body_m), cell, t_s)
+
+    def _is_beyond(self, end: LaneEnd | None, cell: Cell, t_s: float) -> bool:
+        """Return whether a cell has passed the line of an end, if there is one."""
+        return end is not None and self._lattice.cell_s_m(cell[0], t_s) > end.line_m
 
 
 def dead_ends(scenario: Scenario) -> tuple[LaneEnd, ...]:

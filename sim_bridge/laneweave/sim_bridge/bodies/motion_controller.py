@@ -198,7 +198,7 @@ class MotionController:
     def _misses_exit(self, goal: Cell, t_s: float) -> bool:
         """Return whether it is too late to begin to leave the lane of the body for a cell."""
         ends, lane = self._lane_ends, self._body_lane_for(goal[1])
-        return lane != goal[1] and ends.too_late_to_move((goal[0], lane), goal, t_s)
+        return lane != goal[1] and ends.too_late((goal[0], lane), goal, t_s)
 
     def return_to_origin(self, t_s: float) -> bool:
         """Hold the cell in which the move began; return False if the vehicle may not.

@@ -13,6 +13,7 @@ from enum import StrEnum
 from laneweave.protocol.runtime.node import Effect, Event, Listen, PeerDown, PeerUp, Send, Unlisten
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare, VehicleState
@@ -61,6 +62,7 @@ class Caretaker:
             hold_cell=controller.hold_cell,
             territory=controller.store.territory,
             stored=controller.record,
+            rules=VEHICLE_RULES,
             moving=controller.moving(tick),
         )
         self._execution.on_record(controller.record)
@@ -94,10 +96,7 @@ class Caretaker:
         """Return the state to publish; end the motion if the controller has completed it (V7)."""
         vehicle, execution = self._vehicle, self._execution
         controller = vehicle.controller
-        if execution.moving and not controller.moving(tick):
-            execution.end_motion()
-        if controller.displaced(tick):
-            execution.displace()
+        execution.on_body(arrived=not controller.moving(tick), displaced=controller.displaced(tick))
         return execution.state(vehicle.sense(tick, caretaker=True), attended=False)
 
 

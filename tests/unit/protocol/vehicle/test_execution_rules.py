@@ -9,11 +9,11 @@ from attrs import evolve
 from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.plan_execution import ExecutionPhase, PlanExecution
 from laneweave.protocol.vehicle.plans import ownership_problems, plan_problems
 from laneweave.protocol.vehicle.territory import BlockTerritory
 from laneweave.protocol.wire.messages import PendingTransfer, Plan, Prepare, VehicleRecord
+from support.convoy import ROLLING
 from support.rolling_samples import (
     AFTER,
     BEFORE,
@@ -180,7 +180,7 @@ def test_takes_ownership_with_the_open_gate(
 
 def test_where_formations_own_blocks_there_are_no_transfers() -> None:
     stored = VehicleRecord(incarnation=INCARNATION, joined=(-1, 0))
-    execution = evolve(vehicle(), territory=BlockTerritory(Scenario().lattice), stored=stored)
+    execution = evolve(vehicle(), territory=BlockTerritory(ROLLING.lattice), stored=stored)
     execution.on_prepare(Prepare(MID, (-1, 0), (A, B)))
     assert execution.wanted.promised is None
     assert not execution.on_record(replace(stored, promised=HIGH))

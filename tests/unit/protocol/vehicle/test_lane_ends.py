@@ -103,7 +103,7 @@ def test_cells_pass_the_line_with_the_lattice() -> None:
     assert not ends.has_passed((-10, 0), passing_s + 0.01)
     opens_s = lattice.passing_time_s(-10, 700.0)
     assert ends.has_passed((-10, 1), opens_s - 0.01)
-    assert ends.has_passed((-10, 1), opens_s + 0.01, passing_s)  # it was before the closed part
+    assert ends.has_passed((-10, 1), opens_s + 0.01, end.line_m)  # it was before the closed part
     assert not ends.has_passed((-10, 1), opens_s + 0.01)
 
 
@@ -126,8 +126,8 @@ def test_the_exit_before_does_not_end_moves_that_begin_before_the_lane_opens_aga
     begins_m = 700.0 + scenario.types.longest_body_m - early_start_m(scenario)
     assert begins_m < 700.0
     begins_s = lattice.passing_time_s(-10, begins_m)
-    assert ends.too_late_to_move((-10, 1), (-10, 0), begins_s - 0.01)
-    assert not ends.too_late_to_move((-10, 1), (-10, 0), begins_s + 0.01)
+    assert ends.too_late((-10, 1), (-10, 0), begins_s - 0.01)
+    assert not ends.too_late((-10, 1), (-10, 0), begins_s + 0.01)
 
 
 @pytest.mark.parametrize(

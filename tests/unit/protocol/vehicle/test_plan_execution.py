@@ -11,16 +11,9 @@ from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
 from laneweave.protocol.scenario.road_tables import Closure
-from laneweave.protocol.vehicle.lane_ends import LaneEnds, drive_out, early_start_m
-from laneweave.protocol.vehicle.plan_execution import (
-    LATE_S,
-    LISTEN_S,
-    VEHICLE_RULES,
-    ExecutionPhase,
-    PlanExecution,
-    both_lanes_are_open,
-    ends_in_time,
-)
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, both_lanes_are_open
+from laneweave.protocol.vehicle.lane_ends import LATE_S, LaneEnds, drive_out, early_start_m
+from laneweave.protocol.vehicle.plan_execution import LISTEN_S, ExecutionPhase, PlanExecution
 from laneweave.protocol.vehicle.territory import BlockTerritory
 from laneweave.protocol.wire.messages import (
     Ballot,
@@ -50,7 +43,9 @@ AT: dict[Name, Cell] = {A: (-4, 0), B: (-3, 0)}
 
 def vehicle(name: Name = A, cell: Cell = (-4, 0), **more: Any) -> PlanExecution:  # noqa: ANN401
     stored = VehicleRecord(incarnation=7, joined=more.pop("joined", (0,)))
-    return PlanExecution(name, 7, cell, BlockTerritory(LATTICE), stored, **more)
+    return PlanExecution(
+        name, 7, cell, BlockTerritory(LATTICE), stored, **{"rules": VEHICLE_RULES, **more}
+    )
 
 
 def note(execution: PlanExecution, ballot: Ballot | None) -> bool:
@@ -127,7 +122,7 @@ def test_v1_starts_with_nothing() -> None:
 def test_v1_takes_a_motion_over() -> None:
     execution = vehicle(cell=(-4, 1), moving=True)
     assert not execution.ready
-    execution.end_motion()
+    execution.on_body(arrived=True)
     assert (execution.moving, execution.completed, execution.hold_cell) == (False, 0, (-4, 1))
 
 
@@ -388,7 +383,7 @@ def test_v6_not_before_its_time() -> None:
 def test_v7_without_a_motion_nothing_ends(reach: Callable[[], PlanExecution]) -> None:
     execution = reach()
     before = repr(execution)
-    execution.end_motion()
+    execution.on_body(arrived=True)
     assert repr(execution) == before
 
 
@@ -418,7 +413,7 @@ def test_overdue_runs_from_the_moment_the_next_move_is_due() -> None:
     execution.on_state(shown())
     assert execution.tick(due_s + OVERDUE_S) is not None
     assert not execution.overdue(due_s + OVERDUE_S)  # on its way
-    execution.end_motion()
+    execution.on_body(arrived=True)
     assert not execution.overdue(due_s + 100.0)  # done
     execution.on_prepare(prepare(HIGH))
     assert not execution.overdue(due_s + 100.0)  # no plan
@@ -446,7 +441,7 @@ def test_the_state_says_what_the_vehicle_knows_and_senses(*, attended: bool) -> 
         go=True, attended=attended, s_m=7.0, y_m=2.0, speed_mps=14.0, t_s=100.1,
     )  # fmt: skip
     assert execution.state(sense, attended=attended) == expected
-    execution.end_motion()
+    execution.on_body(arrived=True)
     assert execution.state(sense, attended=attended) == replace(
         expected, moving=False, done=True, completed=1
     )
@@ -460,11 +455,11 @@ def test_the_state_says_what_the_vehicle_knows_and_senses(*, attended: bool) -> 
 def test_a_body_out_of_its_cell_is_not_ready_until_it_is_back() -> None:
     execution = accepted()
     execution.on_state(shown())
-    execution.displace()
+    execution.on_body(displaced=True)
     assert (execution.moving, execution.moving_in_plan, execution.ready) == (True, False, False)
     assert execution.tick(T0_S) is None
     assert not execution.go
-    execution.end_motion()
+    execution.on_body(arrived=True)
     assert (execution.ready, execution.completed) == (True, 0)
     assert execution.tick(T0_S) is not None
 
@@ -472,9 +467,9 @@ def test_a_body_out_of_its_cell_is_not_ready_until_it_is_back() -> None:
 def test_a_body_out_of_its_cell_does_not_interrupt_a_move() -> None:
     execution = going()
     assert execution.tick(T0_S) is not None
-    execution.displace()
+    execution.on_body(displaced=True)
     assert execution.moving_in_plan
-    execution.end_motion()
+    execution.on_body(arrived=True)
     assert execution.completed == 1
 
 
@@ -508,7 +503,7 @@ def test_a_move_begins_where_both_lanes_are_open(lane: int, closed_m: float) -> 
     execution = going()
     execution.lane_ends = LaneEnds(evolve(early, road=road))
     begins_s = T0_S + 20.0 / early.lattice.speed_mps
-    assert ends_in_time(evolve(execution, t_s=T0_S - 1.0), None)
+    assert not evolve(execution, t_s=T0_S - 1.0).too_late
     assert execution.tick(T0_S) is None
     assert execution.tick(begins_s - 0.01) is None
     assert execution.tick(begins_s) is not None
@@ -527,7 +522,7 @@ def test_a_lane_that_opens_again_does_not_excuse_a_move_beyond_the_stop_line(col
     execution.lane_ends = LaneEnds(evolve(ROLLING, road=road))
     execution.t_s = T0_S
     assert both_lanes_are_open(execution, None)
-    assert not ends_in_time(execution, None)
+    assert execution.too_late
 
 
 # --- the table as a whole ---------------------------------------------------------------------
@@ -538,7 +533,7 @@ def test_a_history_takes_every_row_of_the_table() -> None:
     book = RuleRecorder(VEHICLE_RULES)
     execution = evolve(vehicle(moving=True), rules=book)
     execution.on_plan(make_plan())
-    execution.end_motion()
+    execution.on_body(arrived=True)
     for _ in range(2):
         execution.on_prepare(prepare(MID))
     for _ in range(2):
@@ -549,14 +544,14 @@ def test_a_history_takes_every_row_of_the_table() -> None:
     for _ in range(2):
         execution.tick(T0_S)
     for _ in range(2):
-        execution.end_motion()
+        execution.on_body(arrived=True)
     execution.on_prepare(prepare(HIGH))
     assert execution.on_plan(make_plan(HIGH, {A: ()}, {A: (-4, 1), B: (-3, 0)}))
     assert note(execution, HIGH)
     for _ in range(2):
         execution.on_state(shown(ballot=HIGH, go=True))
     for _ in range(2):
-        execution.displace()
+        execution.on_body(displaced=True)
     rules = [f"{book.table[row].rule} row {row}" for row in book.taken]
     assert rules == [
         "V7 row 9", "V2 row 0", "V2 row 1", "V3 row 2", "V3 row 3", "V4 row 5", "V5 row 6",

@@ -11,6 +11,7 @@ from laneweave.launch.fault_search.events.forgeries import absurd, harmful, malf
 from laneweave.launch.fault_search.setup import RoadSetup
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.vehicle.territory import BlockTerritory, CellTerritory
 from laneweave.protocol.wire.bounds import Bounds, check_ballot
@@ -45,6 +46,7 @@ def accepts(name: Name, plan: Plan) -> bool:
         hold_cell=CELLS[name],
         territory=CellTerritory() if plan.before else BlockTerritory(LATTICE),
         stored=VehicleRecord(joined=PLAN.blocks, owned=OWNED[name]),
+        rules=VEHICLE_RULES,
     )
     execution.on_prepare(Prepare(BALLOT, PLAN.blocks, PLAN.roster))
     return execution.on_plan(plan)
