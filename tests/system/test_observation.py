@@ -88,8 +88,8 @@ def test_status_of_a_deployment(lab: Lab) -> None:
     assert ended.complaints == ["not healthy: no coordinator c3 found"]
 
     def flows(found: Status) -> bool:
-        """Tell whether c1 leads and the road advances, with few messages lost."""
-        rates, losses = found.messages_per_s, (found.loss.clock, found.loss.state)
+        """Tell whether c1 leads and the road advances."""
+        rates = found.messages_per_s
         return (
             (found.leader, found.claims) == ("c1", ("c1",))
             and {one.coordinator for one in found.candidates} == {"c1", "c2"}
@@ -97,7 +97,6 @@ def test_status_of_a_deployment(lab: Lab) -> None:
             and found.road is not None
             and found.road.advanced_s > 0.0
             and rates.get("state", 0.0) > rates.get("clock", 0.0) > 0.0
-            and all(loss is not None and loss < 0.5 for loss in losses)
         )
 
     lab.wait_until(lambda: flows(seen(config)), END_S)

@@ -130,7 +130,6 @@ def test_90_vehicles_are_shown(lab: Lab, page: Page) -> None:
     with traffic(endpoint).flowing():
         page.open(address)
         page.wait_until(lambda: page.text("count") == str(VEHICLES))
-        page.wait_until(lambda: page.text("loss") == "0.00 %")
 
         # Rates depend on the machine: benchmarks/watch.py measures them.
         before = page.run("laneweaveWatch.stats")
@@ -266,10 +265,6 @@ def test_a_deployment_is_shown_as_it_is(lab: Lab) -> None:
         -1, *(number for number, *_ in closed)
     }  # fmt: skip
     assert not any(frame["joined"] for frame in frames)
-    lost = [frame["loss"] for frame in frames if frame["loss"]]
-    assert lost
-    # A busy machine may lose some.
-    assert sum(loss[1] for loss in lost) <= 0.1 * sum(loss[0] for loss in lost)
     _check_places(frames, lab.folder / "out")
 
 

@@ -17,13 +17,12 @@ from rich.table import Table
 
 from laneweave.launch.cli.options import Config, Endpoint, load_deployment
 from laneweave.launch.observe.observer import Observer
-from laneweave.launch.observe.road_view import Coordinator, RoadView
+from laneweave.launch.observe.road_view import Coordinator
 from laneweave.launch.observe.status import (
     AGENT,
     BRIDGE,
     COORDINATOR,
     LISTENED,
-    LOSS_WINDOW_TICKS,
     TOKENS,
     RoleHealth,
     Status,
@@ -106,12 +105,7 @@ def listen(settings: Scenario, seconds: float, health: RoleHealth | None = None)
     from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 
     network = settings.network
-    observer = Observer(
-        Keys(network.realm),
-        view=RoadView(loss_window_ticks=LOSS_WINDOW_TICKS),
-        topics=LISTENED,
-        tokens=TOKENS,
-    )
+    observer = Observer(Keys(network.realm), topics=LISTENED, tokens=TOKENS)
     access, view = access_of(settings, "observer.status"), observer.view
 
     def problem() -> str | None:
@@ -162,9 +156,6 @@ def _rows(found: Status) -> Iterator[tuple[str, str]]:
     yield from _road_rows(found)
     for topic, rate in found.messages_per_s.items():
         yield f"{topic} messages", f"{rate:.1f}/s"
-    for topic, share in (("clock", found.loss.clock), ("state", found.loss.state)):
-        if share is not None:
-            yield f"{topic} messages lost", f"{100 * share:.1f} %"
 
 
 def _road_rows(found: Status) -> Iterator[tuple[str, str]]:

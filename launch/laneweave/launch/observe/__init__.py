@@ -1,4 +1,4 @@
-"""Observation of a deployment: observed state, health, message loss, metrics server.
+"""Observation of a deployment: observed state, health, metrics server.
 
 Entry points: `observer.Observer` with its `road_view.RoadView`, `status.status_of`,
 `metrics_server.serve_metrics`. An observer publishes nothing. Imported by `faults`, `run`, `watch`,

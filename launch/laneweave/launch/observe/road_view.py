@@ -12,7 +12,6 @@ from typing import Any
 
 from attrs import define, field, frozen
 
-from laneweave.launch.observe.message_loss import LossMeter
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import Arrived, PeerDown, PeerUp
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
@@ -90,11 +89,8 @@ class RoadView:
     incarnation: int = 0
     """Incarnation of the leader."""
     term: int = 0
-    loss_window_ticks: int = 0
-    """Number of ticks over which message loss is measured; 0: no measurement."""
     states: dict[Name, VehicleState] = field(factory=dict)
     """Newest state of each vehicle."""
-    loss: LossMeter = field(init=False)
     road: NewestRoad = field(factory=lambda: NewestRoad(HIGHEST_PACE))
     """The newest road, at any pace: observers do not know the scenario."""
     bounds: Bounds | None = None
@@ -119,10 +115,6 @@ class RoadView:
     bridge_tokens: set[int] = field(factory=set)
     """Incarnations of the bridges with tokens."""
     _events: deque[LogEvent] = field(factory=lambda: deque(maxlen=MAX_EVENTS))
-
-    @loss.default
-    def _new_meter(self) -> LossMeter:
-        return LossMeter(self.loss_window_ticks)
 
     @property
     def t_s(self) -> float:
@@ -149,7 +141,6 @@ class RoadView:
             case Census():
                 if self.census is None or event.t_s >= self.census.t_s:
                     self.census = event
-                    self.loss.on_census(event)
             case Heartbeat():
                 self._on_heartbeat(event, now_s)
             case LogEvent():
@@ -216,7 +207,7 @@ class RoadView:
         if self.roads == 0 or self.road.number != number:
             if self.roads:
                 self.clock = self.first_clock = self.census = None
-                self.states, self.loss = {}, self._new_meter()
+                self.states = {}
             self.roads += 1
         return is_newest
 
@@ -232,12 +223,10 @@ class RoadView:
             self.first_clock, self.first_clock_received_s = clock, now_s
         if self.clock is None or clock.tick >= self.clock.tick:
             self.clock, self.clock_received_s = clock, now_s
-        self.loss.on_clock(clock)
 
     def _on_state(self, state: VehicleState) -> None:
         if self.clock is not None and abs(state.t_s - self.clock.t_s) > FORGET_S:
             return
-        self.loss.on_state(state)
         known = self.states.get(state.vehicle)
         if known is None or state.t_s >= known.t_s:
             self.states[state.vehicle] = state

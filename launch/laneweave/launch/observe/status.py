@@ -24,8 +24,6 @@ LISTENED = tuple(
 )
 """Topics whose publishers do not wait for slow subscribers, so the observer cannot delay them."""
 TOKENS = (COORDINATOR_ALIVE, VEHICLE_ALIVE, BRIDGE_ALIVE)
-LOSS_WINDOW_TICKS = 10_000
-"""More ticks than `laneweave status` can observe."""
 
 COORDINATOR, BRIDGE, AGENT = "coordinator", "bridge", "agent"
 
@@ -75,14 +73,6 @@ class Vehicles:
 
 
 @frozen
-class Loss:
-    """Shares of expected messages that were not received; None: none were expected."""
-
-    clock: float | None
-    state: float | None
-
-
-@frozen
 class Status:
     """Observed state and health of a deployment."""
 
@@ -103,7 +93,6 @@ class Status:
     vehicles: Vehicles
     messages_per_s: dict[str, float]
     """Rate of received messages by topic."""
-    loss: Loss
 
     def to_dict(self) -> dict[str, Any]:
         """Return the status as a JSON object."""
@@ -154,7 +143,6 @@ def status_of(
             topic: round(count / listened_s, 2) if listened_s > 0 else 0.0
             for topic, count in sorted(view.message_counts.items())
         },
-        loss=Loss(_rounded(view.loss.clock_loss), _rounded(view.loss.state_loss)),
     )
 
 
@@ -304,7 +292,3 @@ def _vehicles(view: RoadView) -> Vehicles:
         unheard=sum(state is None for state in states),
         agents=len(view.agent_tokens),
     )
-
-
-def _rounded(share: float | None) -> float | None:
-    return None if share is None else round(share, 5)

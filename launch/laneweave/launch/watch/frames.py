@@ -17,7 +17,6 @@ depend on earlier frames, so any frame may be skipped.
 | `preferences` | whether vehicles have preferred lanes |
 | `legend` | colours of vehicles: list of [colour, meaning] |
 | `has_formations` | whether there are formations: not in the rolling operation, nor with methods |
-| `losses` | recorded: message counts of the summary; live: null |
 
 **Frame**: live frames are pushed on changes, at most every `step_s`; recorded frames and earlier
 live frames are sent on request.
@@ -32,7 +31,6 @@ live frames are sent on request.
 | `leader` | [name, term], or null |
 | `candidates` | list of [name, term, leading, silent] |
 | `counts` | [demanded, entered, on the road, left], or null |
-| `loss` | numbers of [expected, lost] states in the last 100 ticks, or null |
 | `plan` | newest plan: [t, vehicles, solve ms, solver or null, fallback], or null |
 | `news` | newest events, oldest first: list of [t, process, kind, details] |
 | `formations` | closed formations on the road: list of [number, rear column, front column] |
@@ -249,7 +247,6 @@ def scene_of(scenario: Scenario, kind: str, title: str, step_s: float) -> dict[s
         "step_s": step_s,
         **road_scene(scenario, recorded=kind == "recorded"),
         "has_formations": scenario.formation.traits.has_formations,
-        "losses": None,
     }
 
 

@@ -45,7 +45,6 @@ STILL_S = 2.0
 """Age (wall-clock time) of the newest clock message above which the clock counts as stopped."""
 MAX_PLANS = 500
 MAX_COORDINATORS = 32
-LOSS_WINDOW_TICKS = 100
 
 
 class LiveRoad:
@@ -55,7 +54,7 @@ class LiveRoad:
         """Start at a wall-clock time, connected to the router."""
         self.scenario = scenario
         self._lane_ends = LaneEnds(scenario)
-        self.view = RoadView(loss_window_ticks=LOSS_WINDOW_TICKS)
+        self.view = RoadView()
         self._targets: dict[Ballot, dict[Name, Cell]] = {}
         """Last cell of each moving vehicle, by plan."""
         self._events = EventFeed()
@@ -97,7 +96,7 @@ class LiveRoad:
         self._update_status(wall_s)
         view = self.view
         self._forget_departed()
-        clock, loss, formations = view.clock, view.loss, self._formations()
+        clock, formations = view.clock, self._formations()
         rows = self._rows(clock.t_s, formations) if clock is not None else ()
         return {
             "n": number,
@@ -108,7 +107,6 @@ class LiveRoad:
             "since": round(self._since_s, 3),
             **self._leadership(wall_s),
             "counts": [clock.demanded, clock.entered, clock.on_road, clock.left] if clock else None,
-            "loss": [loss.expected, loss.lost] if loss.expected else None,
             "plan": self._plan,
             "news": self._events.rows,
             "formations": [[one.number, one.rear, one.front] for one in formations.listed],

@@ -1,7 +1,7 @@
 """Frames of a recorded run, made on request.
 
-The files of a run contain only the current cell or move of each vehicle; owned cells, later moves
-and lost messages are not recorded. The scene contains the message counts of the summary.
+The files of a run contain only the current cell or move of each vehicle; owned cells and later
+moves are not recorded.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from laneweave.launch.drawing.colours import trip_lane
 from laneweave.launch.formation_columns import Formations
 from laneweave.launch.recordings.formations import closed_formations
-from laneweave.launch.recordings.runs import Run, not_a_run, single_run
+from laneweave.launch.recordings.runs import not_a_run, single_run
 from laneweave.launch.recordings.trajectories import NO_LATTICE, Tracks, read_tracks, read_trips
 from laneweave.launch.run_methods import FORMATION
 from laneweave.launch.watch.frames import MOVING, EventFeed, Row, compact, plan_row, scene_of
@@ -77,7 +77,6 @@ class Recording:
         self._demands_s = np.sort([float(trip["demanded_s"]) for trip in self._trips.values()])
         self._times_s = [moment.t_s for moment in self._moments]
         self.scene = scene_of(run.scenario, "recorded", run.title, self._step_s) | {
-            "losses": _losses(run),
         }
         self.scene["has_formations"] &= run.method == FORMATION
 
@@ -104,7 +103,6 @@ class Recording:
             "leader": moment.leader,
             "candidates": [],
             "counts": [demanded, moment.entered, len(rows), moment.left],
-            "loss": None,
             "plan": moment.plan,
             "news": moment.news,
             "formations": [[one.number, one.rear, one.front] for one in shown.listed],
@@ -180,9 +178,3 @@ def _moments(folder: Path) -> Iterator[_Moment]:
         entered, left = moment.entered + (kind == ENTERED), moment.left + (kind == LEFT)
         moment = _Moment(t_s, leader, plan, tuple(feed.rows), entered, left, joined)
         yield moment
-
-
-def _losses(run: Run) -> dict[str, int]:
-    """Return how many messages were published, and how many were dropped by injected faults."""
-    names = ("published", "dropped_by_faults")
-    return {name: getattr(run.summary.messages, name) if run.summary else 0 for name in names}

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from laneweave.launch.cli.status_command import show
 from laneweave.launch.observe.road_view import Coordinator, RoadView
-from laneweave.launch.observe.status import Loss, Plans, Road, Status, status_of
+from laneweave.launch.observe.status import Plans, Road, Status, status_of
 from laneweave.protocol.wire.messages import Name
 
 
@@ -49,7 +49,6 @@ def test_a_deployment() -> None:
         plans=Plans(3, "formations", 5, 3),
         road=road,
         messages_per_s={"clock": 39.5},
-        loss=Loss(0.0, None),
     )
     rows = shown(found)
     assert rows["claim to lead"] == "c1, c2"
@@ -57,8 +56,7 @@ def test_a_deployment() -> None:
     assert rows["candidate c2"] == "not heard from"
     assert rows["closed formations with a plan"] == "3 of 5"
     assert (rows["road"], rows["road time"], rows["pace"]) == ("advances", "28.1 s", "4.0")
-    assert (rows["clock messages"], rows["clock messages lost"]) == ("39.5/s", "0.0 %")
-    assert "state messages lost" not in rows
+    assert rows["clock messages"] == "39.5/s"
     ended = shown(evolve(found, road=evolve(road, ended=True)))
     assert ended["road"] == "ended"
     assert "pace" not in ended

@@ -1,4 +1,4 @@
-"""The status of a deployment: coordinators, road, vehicles, losses, health."""
+"""The status of a deployment: coordinators, road, vehicles, health."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from laneweave.launch.observe.status import (
     BRIDGE,
     COORDINATOR,
     LISTENED,
-    LOSS_WINDOW_TICKS,
     Plans,
     RoleHealth,
     Status,
@@ -42,7 +41,7 @@ ELECTION_S = 0.7
 class Listener:
     """Listens to a realm from second 0 on."""
 
-    view: RoadView = field(factory=lambda: RoadView(loss_window_ticks=LOSS_WINDOW_TICKS))
+    view: RoadView = field(factory=RoadView)
 
     def heartbeat(
         self, name: str, term: int, now_s: float, *, leading: bool = False, incarnation: int = 1
@@ -119,7 +118,6 @@ def test_a_healthy_deployment(healthy: Listener) -> None:
     assert found.road is not None
     assert (found.road.t_s, found.road.advanced_s, found.road.pace) == (12.0, 2.0, 1.0)
     assert (found.vehicles.attended, found.vehicles.agents) == (1, 1)
-    assert (found.loss.clock, found.loss.state) == (0.0, 0.0)
     assert found.messages_per_s["clock"] == 10.5
     found_json = json.loads(json.dumps(found.to_dict()))
     assert found_json["schema"] == "laneweave.status/1"
@@ -131,7 +129,7 @@ def test_a_healthy_deployment(healthy: Listener) -> None:
 def test_nothing_was_heard(listener: Listener) -> None:
     found = listener.status()
     assert found.problem == "there is no leader: no coordinators found"
-    assert (found.road, found.loss.clock, found.loss.state) == (None, None, None)
+    assert found.road is None
 
 
 def test_coordinators_without_a_leader(listener: Listener) -> None:
@@ -238,17 +236,6 @@ def test_formations_are_counted_by_their_number(healthy: Listener) -> None:
     assert healthy.status().plans == Plans(2, "formations", 2, 1)
     healthy.states("c", [113], block=5, accepted=True, promised=promised)
     assert healthy.status().plans == Plans(2, "formations", 2, 2)
-
-
-def test_loss_is_that_of_the_meter(healthy: Listener) -> None:
-    assert (healthy.status().loss.clock, healthy.status().loss.state) == (0.0, 0.0)
-    for tick in range(121, 141, 2):
-        healthy.clock(tick)
-        healthy.states("a", [tick])
-    loss = healthy.status().loss
-    assert loss.clock == pytest.approx(7 / 34, abs=1e-5)
-    # Ticks that were over before the census count no states.
-    assert loss.state == pytest.approx(7 / 29, abs=1e-5)
 
 
 # --- one role ------------------------------------------------------------------------------------

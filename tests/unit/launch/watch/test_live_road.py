@@ -55,14 +55,13 @@ def test_before_the_first_message() -> None:
     assert (frame["n"], frame["run"], frame["t"], frame["w"]) == (7, 0, None, 6.0)
     assert (frame["status"], frame["since"]) == ("waiting", 5.0)
     assert (frame["vehicles"], frame["leader"], frame["candidates"]) == ([], None, [])
-    assert (frame["loss"], frame["counts"], frame["plan"]) == (None, None, None)
+    assert (frame["counts"], frame["plan"]) == (None, None)
 
 
 def test_vehicles_are_shown_at_their_published_positions() -> None:
     frame = shown(watched())
     assert (frame["status"], frame["t"]) == ("live", round((START + 20) / 10, 3))
     assert frame["counts"] == [9, 9, 9, 0]
-    assert frame["loss"] == [15 * 9, 0]
     assert len(frame["vehicles"]) == 9
     for number, row in enumerate(frame["vehicles"]):
         state, (column, lane) = CONVOY.state(number, START + 20), CONVOY.cell(number)
@@ -229,7 +228,7 @@ def test_a_newer_bridge_begins_a_new_road() -> None:
     road.update(CONVOY.census(START + 21), 3.0)
     road.update(CONVOY.state(0, START + 100), 3.0)
     frame = shown(road, 3.0)
-    assert (frame["run"], frame["t"], frame["loss"]) == (2, 0.1, None)
+    assert (frame["run"], frame["t"]) == (2, 0.1)
     assert [row[0] for row in frame["vehicles"]] == later.names
     assert {row[8] for row in frame["vehicles"]} == {UNHEARD}
 

@@ -11,7 +11,6 @@ const CALM = matchMedia("(prefers-reduced-motion: reduce)");
 const NIGHT = matchMedia("(prefers-color-scheme: dark)");
 
 const part = (id) => document.getElementById(id);
-const count = (number) => number.toLocaleString("en").replaceAll(",", "\u202f"); // groups of three digits
 const clockTime = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour12: false });
 
 class Watch {
@@ -91,7 +90,6 @@ class Watch {
     part("title").textContent = scene.title;
     part("cells-name").textContent = this.live || scene.has_formations ? "cells" : "hold cells";
     part("sorted").parentElement.hidden = !scene.preferences;
-    part("loss-name").textContent = scene.losses ? "Loss, whole run" : "Message loss";
     part("paces").hidden = this.live;
     if (!this.live && this.place === null) {
       this.place = this.store.first;
@@ -312,7 +310,6 @@ class Watch {
     setText("leader", frame.leader ? `${frame.leader[0]}, term ${frame.leader[1]}` : noLeader);
     part("leader").classList.toggle("bad", !frame.leader && !ended);
     this.showCandidates(ended ? [] : frame.candidates);
-    this.showLoss(frame.loss, scene.losses, setText);
     const [plannedAt, planned, took, solver, fallback] = frame.plan ?? [];
     const by = solver ? ` by ${solver}${fallback ? " (fallback)" : ""}` : "";
     setText("plan", frame.plan ? `${took.toFixed(1)} ms` : "–");
@@ -334,18 +331,6 @@ class Watch {
       return chip;
     });
     part("candidates").replaceChildren(...chips);
-  }
-
-  showLoss(loss, losses, setText) {
-    if (losses) {
-      const { published, dropped_by_faults: dropped } = losses;
-      setText("loss", published ? `${((100 * dropped) / published).toFixed(2)} %` : "–");
-      setText("losses", published ? `${count(dropped)} of ${count(published)} messages dropped by faults` : "");
-      return;
-    }
-    setText("loss", loss ? `${((100 * loss[1]) / loss[0]).toFixed(2)} %` : "–");
-    setText("losses", loss ? `${count(loss[1])} of ${count(loss[0])} states` : "no states expected yet");
-    part("loss").classList.toggle("bad", loss !== null && loss[1] > 0.05 * loss[0]);
   }
 
   showNews(news) {
