@@ -80,8 +80,10 @@ def secured(
     with laboratory(folder) as lab:
         config = secured_deployment(lab, request.param.format(free_port()))
         init = ("certs", "init", "certs", "--config", config)
-        vehicles = ("--vehicle", A, "--vehicle", B, "--vehicle", "stranger")
-        assert lab.run(*init, *vehicles, "--client", "stranger").status == 0
+        assert lab.run(*init).status == 0
+        authority = load_authority(folder / "certs")
+        for name in (f"vehicle.{A}", f"vehicle.{B}", *STRANGERS):
+            issue(authority, folder / "certs", parse_identity(name), days=30.0)
         network = Network(folder / "certs", load_scenario(config))
         router = lab.start("router", "--config", config)
         lab.wait_until(

@@ -94,12 +94,12 @@ COMMANDS = {
         "List what can be a corridor in a SUMO simulation, or describe one.",
     ),
     "compile": CommandEntry(
-        "compile_command",
+        "plan_command",
         "compile_solvers",
         "Compile the solvers that need it, which otherwise happens when they are first used.",
     ),
-    "certs": CommandEntry("certs_commands", "app", "Make test certificates."),
-    "config": CommandEntry("config_commands", "app", "Check a configuration."),
+    "certs": CommandEntry("deployment_commands", "certs", "Make test certificates."),
+    "config": CommandEntry("deployment_commands", "config", "Check a configuration."),
 }
 """All commands in the order of the help page."""
 

@@ -1,4 +1,4 @@
-"""`laneweave plan`: answer a request."""
+"""`laneweave plan`: answer a request; `laneweave compile`: compile the solvers in advance."""
 
 from __future__ import annotations
 
@@ -105,6 +105,15 @@ def plan(
         scenario=settings,
         wait_s=wait,
     )
+
+
+def compile_solvers() -> None:
+    """Compile the solvers that need it, which otherwise happens when they are first used."""
+    from laneweave.coordinator.planning.kernels import KERNELS
+
+    for solver, kernels in KERNELS.items():
+        kernels.load()
+        typer.echo(f"{solver}: compiled")
 
 
 def _loaded(config: Path) -> Scenario:

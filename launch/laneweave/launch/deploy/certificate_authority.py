@@ -1,7 +1,8 @@
 """A certificate authority for tests: X.509 certificates with P-256 keys as PEM files.
 
 The authority's key can impersonate every process, so use this authority only in trials and test
-beds; elsewhere, use an existing authority with the same common names.
+beds; elsewhere, use an existing authority with the same common names. The package trustme is not
+enough: it would allow every certificate to act as a server, and so as the router.
 """
 
 from __future__ import annotations
@@ -44,19 +45,18 @@ class Authority:
     key: ec.EllipticCurvePrivateKey
 
 
-def make_authority(folder: Path, *, days: float = CA_DAYS, replace: bool = False) -> Authority:
+def make_authority(folder: Path, *, days: float = CA_DAYS) -> Authority:
     """Create an authority and write its files.
 
     Args:
         folder: folder for the files; created if necessary.
         days: validity of the certificate in days.
-        replace: whether to replace an existing authority, which invalidates all its certificates.
 
     Raises:
         BadInputError: an authority exists, or the files cannot be written.
     """
-    if not replace and (ca_path(folder).exists() or authority_key_path(folder).exists()):
-        raise BadInputError("DIR", str(folder), "a folder without an authority, or --force")
+    if ca_path(folder).exists() or authority_key_path(folder).exists():
+        raise BadInputError("DIR", str(folder), "a folder without an authority, or --keep")
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name(CA_NAME)
     certificate = (
@@ -101,7 +101,6 @@ def issue(
     *,
     days: float,
     hosts: Sequence[str] = (),
-    replace: bool = False,
     separate: bool = False,
 ) -> None:
     """Create a certificate and its key, and write their files.
@@ -115,7 +114,6 @@ def issue(
         identity: identity of the process.
         days: validity in days.
         hosts: names and addresses of the router; ignored for other processes.
-        replace: whether to replace an existing certificate.
         separate: whether to create the identity's sub-folder if it is missing.
 
     Raises:
@@ -125,10 +123,8 @@ def issue(
     if separate:
         _make_folder(folder / name)
     path = certificate_path(folder, name)
-    if path.exists() and not replace:
-        raise BadInputError(
-            "IDENTITY", name, f"an identity without a certificate in {folder}, or --force"
-        )
+    if path.exists():
+        raise BadInputError("IDENTITY", name, f"an identity without a certificate in {folder}")
     key = ec.generate_private_key(ec.SECP256R1())
     builder = _builder(_name(name), authority.certificate.subject, key.public_key(), days)
     # Only the router is a server.

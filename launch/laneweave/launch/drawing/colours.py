@@ -27,6 +27,8 @@ _MORE_LANES = (
 )
 NEUTRAL = "#8a8f96"
 """Colour of vehicles whose preferred lane is unknown; `web/road.js` uses the same."""
+CLOSED_FILL, CLOSED_HATCH = "#d3d7dc", "#9aa2ac"
+"""Colours of closed parts of lanes in figures."""
 SPEED_SPAN_MPS = 5.0
 """Difference from the lattice speed at which the shade is darkest or lightest."""
 SHADE_STRENGTH = 0.45

@@ -36,6 +36,13 @@ from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save
 from laneweave.launch.drawing.plan import short_name, team_colours
+from laneweave.launch.drawing.road_picture import (
+    ASPHALT,
+    draw_body,
+    draw_lanes,
+    draw_position_axis,
+    write_time,
+)
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import cell_state, commanded_state
@@ -52,10 +59,9 @@ _HELD_FRAMES: Final = 8
 _WIDTH_IN, _LANE_IN, _ROAD_GAP_IN, _TIMES_IN = 11.0, 0.24, 0.24, 2.3
 _MARGIN_M = 10.0
 _CAPTION = (
-    "front to the right, left lane on top, lanes drawn wider than they are; colours: vehicles with "
-    "the same targets"
+    "; front to the right, left lane on top, lanes drawn wider than they are; colours: vehicles "
+    "with the same targets"
 )
-_ROAD, _MARKING = "#e3e5e8", "#ffffff"
 
 
 @attrs.frozen(eq=False)
@@ -204,8 +210,9 @@ def road_figure(picture: _Picture) -> Figure:
     roads, times = figure.subfigures(2, 1, squeeze=False, height_ratios=heights_in)[:, 0]
     panels = list(roads.subplots(count, sharex=True, squeeze=False)[:, 0])
     for axes, tick in zip(panels, sorted(instants), strict=True):
-        _draw_empty_road(axes, picture, label_axis=axes is panels[-1])
+        _draw_road(axes, picture)
         _draw_instant(axes, picture, tick)
+    draw_position_axis(panels[-1], _CAPTION)
     along, across = times.subplots(1, 2)
     moved_m = drive.scenario.formation.speed_mps * drive.time_s(1) * np.arange(drive.ticks + 1)
     _draw_over_time(along, picture, drive.states[:, :, 0] - moved_m, "s $-$ v$_F$ t (m)")
@@ -219,32 +226,17 @@ def road_figure(picture: _Picture) -> Figure:
 
 def _draw_instant(axes: Axes, picture: _Picture, tick: int) -> None:
     """Draw the vehicles at a tick, with each vehicle's path since the start."""
-    _label_time(axes, picture.drive.time_s(tick))
+    write_time(axes, f"{picture.drive.time_s(tick):.1f} s")
     for number, colour in enumerate(picture.colours):
         along_m, _, _, across_m, _, _ = picture.drive.states[number, : tick + 1].T
         axes.plot(along_m, across_m, color=colour, linewidth=1.0, alpha=0.55, zorder=2)
         _Body.draw(axes, picture, number).move(picture.drive, number, tick)
 
 
-def _draw_empty_road(axes: Axes, picture: _Picture, *, label_axis: bool) -> None:
-    """Draw the lanes and, if `label_axis`, the axis label."""
-    width_m = picture.drive.scenario.road.lane_width_m
-    axes.set_xlim(*picture.extent_m)
-    axes.set_ylim(-0.3, picture.lanes * width_m + 0.3)
-    axes.axhspan(0, picture.lanes * width_m, color=_ROAD, zorder=0)
-    for lane in range(1, picture.lanes):
-        axes.axhline(lane * width_m, color=_MARKING, linewidth=1.4, dashes=(5, 5), zorder=1)
-    axes.set_yticks([])
-    axes.tick_params(
-        length=2, labelsize=7, labelcolor=FAINT_INK, bottom=label_axis, labelbottom=label_axis
-    )
-    axes.spines[:].set_visible(False)
-    if label_axis:
-        axes.set_xlabel(f"position on the road s (m); {_CAPTION}", fontsize=8, color=INK)
-
-
-def _label_time(axes: Axes, time_s: float) -> None:
-    axes.set_ylabel(f"{time_s:.1f} s", rotation=0, ha="right", va="center", fontsize=8, color=INK)
+def _draw_road(axes: Axes, picture: _Picture) -> None:
+    """Draw the lanes of the stretch that is driven."""
+    lane_width_m = picture.drive.scenario.road.lane_width_m
+    draw_lanes(axes, picture.lanes, lane_width_m, picture.extent_m)
 
 
 @attrs.frozen(eq=False)
@@ -256,8 +248,7 @@ class _Body:
 
     @classmethod
     def draw(cls, axes: Axes, picture: _Picture, number: int) -> _Body:
-        shape = Polygon(np.zeros((4, 2)), fc=picture.colours[number], ec=INK, lw=0.6, zorder=3)
-        axes.add_patch(shape)
+        shape = draw_body(axes, np.zeros((4, 2)), picture.colours[number])
         label = axes.annotate(
             picture.labels[number],
             (0.0, 0.0),
@@ -267,7 +258,7 @@ class _Body:
             color=INK,
             va="center_baseline",
             parse_math=False,
-            path_effects=[withStroke(linewidth=3.5, foreground=_ROAD)],
+            path_effects=[withStroke(linewidth=3.5, foreground=ASPHALT)],
             zorder=4,
         )
         return cls(shape, label)
@@ -286,7 +277,7 @@ def _draw_over_time(
     times_s = drive.scenario.runtime.tick_s * np.arange(drive.ticks + 1)
     ticks = range(0, drive.ticks + 1, drive.slot_ticks * math.ceil(max(1, drive.steps) / 10))
     axes.set_xticks([drive.time_s(tick) for tick in ticks])
-    axes.grid(axis="x", color=_ROAD, linewidth=0.8)
+    axes.grid(axis="x", color=ASPHALT, linewidth=0.8)
     axes.set_xlabel("time (s), a line for each step", fontsize=8, color=INK)
     axes.set_ylabel(meaning, fontsize=8, color=INK)
     axes.tick_params(length=2, labelsize=7, labelcolor=FAINT_INK)
@@ -358,7 +349,8 @@ def _write_gif(picture: _Picture, out: Path) -> None:
     figure = new_figure(_WIDTH_IN, 0.8 + 1.6 * picture.lanes * _LANE_IN)
     figure.suptitle(picture.title, fontsize=9, color=INK)
     axes = figure.subplots()
-    _draw_empty_road(axes, picture, label_axis=True)
+    _draw_road(axes, picture)
+    draw_position_axis(axes, _CAPTION)
     bodies = [_Body.draw(axes, picture, number) for number in range(len(picture.labels))]
     frame_ticks = max(1, math.ceil(drive.ticks / MAX_FRAMES))
     ticks = [*range(0, drive.ticks, frame_ticks), drive.ticks]
@@ -367,5 +359,5 @@ def _write_gif(picture: _Picture, out: Path) -> None:
         for tick in [0] * _HELD_FRAMES + ticks + [ticks[-1]] * _HELD_FRAMES:
             for number, body in enumerate(bodies):
                 body.move(drive, number, tick)
-            _label_time(axes, drive.time_s(tick))
+            write_time(axes, f"{drive.time_s(tick):.1f} s")
             writer.grab_frame()

@@ -12,8 +12,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from attrs import frozen
 
-from laneweave.launch.drawing.closed_parts import CLOSED_FILL, closed_parts
+from laneweave.launch.drawing.colours import CLOSED_FILL
 from laneweave.launch.drawing.figures import INK
+from laneweave.launch.drawing.road_scene import closed_parts
 from laneweave.launch.recordings.runs import Comparison, Run
 from laneweave.launch.recordings.trajectories import Floats, read_tracks
 from laneweave.launch.report.style import (

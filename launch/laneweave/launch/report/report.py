@@ -11,9 +11,9 @@ from pathlib import Path
 
 from attrs import define, field
 
-from laneweave.launch.drawing.closed_parts import describe_closed_parts
 from laneweave.launch.drawing.colours import has_preferences, sorting_start
 from laneweave.launch.drawing.figures import DPI, FigureFormat
+from laneweave.launch.drawing.road_scene import describe_closed_parts
 from laneweave.launch.recordings.runs import Comparison, Run, single_run
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.launch.report import distributions, figures

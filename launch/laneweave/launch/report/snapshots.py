@@ -8,12 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from laneweave.launch.drawing.closed_parts import (
-    CLOSED_FILL,
-    CLOSED_HATCH,
-    closed_parts,
-    ramp_edges,
-)
 from laneweave.launch.drawing.colours import (
     SHADE_STRENGTH,
     SPEED_SPAN_MPS,
@@ -26,6 +20,14 @@ from laneweave.launch.drawing.colours import (
     vehicle_legend,
 )
 from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK
+from laneweave.launch.drawing.road_picture import (
+    CLOSED,
+    draw_body,
+    draw_lanes,
+    draw_position_axis,
+    write_time,
+)
+from laneweave.launch.drawing.road_scene import closed_parts, ramp_edges
 from laneweave.launch.formation_columns import Formations
 from laneweave.launch.recordings.formations import closed_formations
 from laneweave.launch.recordings.runs import scenario_of
@@ -46,10 +48,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_ASPHALT, _PAINT = "#eeeff1", "#ffffff"
 _OWNED = ("#e2e4e8", "#d5d8dd")
 """Alternating colours for the columns of formations."""
-_CLOSED: Any = {"fc": CLOSED_FILL, "ec": CLOSED_HATCH, "hatch": "/////", "lw": 1.0}
 _ACROSS_SCALE, _LONG_ACROSS_SCALE = 1.8, 2.1
 """Scale across the road relative to the scale along it, because lanes would be too thin otherwise;
 the second one is for stretches longer than `_LONG_M`."""
@@ -112,7 +112,7 @@ def road_snapshots(
         for axes, t_s in zip(strips, times, strict=True):
             _draw_road(axes, scenario, stretch_m)
             shaded |= _draw_formations(axes, scenario, stretch_m, formations, t_s)
-            axes.set_ylabel(f"{t_s:g} s", rotation=0, ha="right", va="center", fontsize=10)
+            write_time(axes, f"{t_s:g} s")
             for number, name in enumerate(tracks.names):
                 pose = _pose(tracks, number, t_s)
                 if pose is not None and stretch_m[0] <= pose[0] <= stretch_m[1] + beyond_m:
@@ -121,8 +121,7 @@ def road_snapshots(
                     _draw_vehicle(
                         axes, pose, own.limits, trip_lane(scenario, trip), scenario, scale_pt_per_m
                     )
-        strips[-1].tick_params(axis="x", bottom=True, labelbottom=True)
-        strips[-1].set_xlabel("position on the road (m)")
+        draw_position_axis(strips[-1])
         starts = stretch_m[0] < scenario.geometry.moves_from_m < stretch_m[1]
         _draw_legend(figure, scenario, starts=starts, shaded=shaded)
 
@@ -189,29 +188,14 @@ def _below_m(scenario: Scenario) -> float:
 
 
 def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -> None:
-    """Draw asphalt and lane markings."""
-    road = scenario.road
+    """Draw the lanes with closed parts and the start of lane sorting."""
+    road, space = scenario.road, {"below_m": _below_m(scenario), "above_m": _ABOVE_M}
     width_m = road.lanes * road.lane_width_m
-    axes.set_xlim(*stretch_m)
-    axes.set_ylim(-_below_m(scenario), width_m + _ABOVE_M)
-    axes.fill_between(stretch_m, 0.0, width_m, color=_ASPHALT, linewidth=0.0, zorder=0)
-    for border in range(road.lanes + 1):
-        edge = border in (0, road.lanes)
-        axes.axhline(
-            border * road.lane_width_m,
-            color="#9aa0a8" if edge else _PAINT,
-            linewidth=1.2 if edge else 1.6,
-            linestyle="-" if edge else (0, (7, 6)),
-            zorder=1,
-        )
+    draw_lanes(axes, road.lanes, road.lane_width_m, stretch_m, **space)
     _draw_closed_parts(axes, scenario)
     if stretch_m[0] < scenario.geometry.moves_from_m < stretch_m[1]:
         place = ([scenario.geometry.moves_from_m] * 2, [0.0, width_m])
         axes.plot(*place, color=INK, linewidth=1.0, linestyle=":", zorder=2)
-    axes.set_yticks([])
-    axes.tick_params(axis="x", bottom=False, labelbottom=False)
-    axes.spines[:].set_visible(False)
-    axes.grid(visible=False)
 
 
 def _draw_closed_parts(axes: Axes, scenario: Scenario) -> None:
@@ -221,7 +205,7 @@ def _draw_closed_parts(axes: Axes, scenario: Scenario) -> None:
     width_m = scenario.road.lane_width_m
     for part in closed_parts(scenario):
         corner, length_m = (part.from_m, part.lane * width_m), part.to_m - part.from_m
-        axes.add_patch(Rectangle(corner, length_m, width_m, zorder=1.5, **_CLOSED))
+        axes.add_patch(Rectangle(corner, length_m, width_m, zorder=1.5, **CLOSED))
         if part.line_m is not None:
             lane_m = (corner[1], corner[1] + width_m)
             axes.plot([part.line_m] * 2, lane_m, color=INK, linewidth=1.6, zorder=2)
@@ -309,9 +293,7 @@ def _draw_vehicle(
 
     own_colour = vehicle_colour(scenario.road.lanes, lane)
     colour = _shade(own_colour, speed_mps - scenario.formation.speed_mps)
-    axes.add_patch(
-        Polygon(shape(-0.5, 0.5, 0.5), facecolor=colour, edgecolor=INK, linewidth=0.5, zorder=3)
-    )
+    draw_body(axes, shape(-0.5, 0.5, 0.5), colour)
     size_pt = min(_MAX_LANE_PT, 0.95 * width_m * scale_pt_per_m)
     if lane == ANY_LANE or not has_preferences(scenario) or size_pt < _MIN_LANE_PT:
         glass: dict[str, Any] = {"facecolor": "#ffffffb0", "linewidth": 0.0}
@@ -347,7 +329,7 @@ def _draw_legend(figure: Figure, scenario: Scenario, *, starts: bool, shaded: bo
     shades = f"darker: slower than {speed_mps:g} m/s; lighter: faster"
     handles.append(Line2D([], [], linewidth=0.0, label=shades))
     if scenario.road.closures:
-        handles.append(Patch(label="closed", **_CLOSED))
+        handles.append(Patch(label="closed", **CLOSED))
     if any(part.line_m is not None for part in closed_parts(scenario)):
         style: dict[str, Any] = {"marker": "|", "markersize": 9, "markeredgewidth": 1.6}
         handles.append(Line2D([], [], color=INK, linewidth=0.0, label="stop line", **style))

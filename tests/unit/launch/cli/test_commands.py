@@ -76,7 +76,7 @@ def test_the_help_page_imports_no_command() -> None:
 
 
 def test_the_help_of_a_command_imports_no_other() -> None:
-    assert commands_of(imported_by("certs", "init", "--help")) == {"certs_commands"}
+    assert commands_of(imported_by("certs", "init", "--help")) == {"deployment_commands"}
 
 
 def test_a_plan_imports_what_it_needs() -> None:

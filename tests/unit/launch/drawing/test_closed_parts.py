@@ -7,9 +7,14 @@ from typing import Any
 import pytest
 from attrs import evolve
 
-from laneweave.launch.drawing.closed_parts import ClosedPart, closed_parts, describe_closed_parts
 from laneweave.launch.drawing.colours import NEUTRAL, lane_colours, vehicle_colour, vehicle_legend
-from laneweave.launch.drawing.road_scene import closed_parts_script, road_scene
+from laneweave.launch.drawing.road_scene import (
+    ClosedPart,
+    closed_parts,
+    closed_parts_script,
+    describe_closed_parts,
+    road_scene,
+)
 from laneweave.launch.web import road_script
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario

@@ -13,8 +13,7 @@ import pytest
 from attrs import evolve
 from PIL import Image
 
-from laneweave.launch.drawing.closed_parts import CLOSED_FILL
-from laneweave.launch.drawing.colours import NEUTRAL, lane_colours
+from laneweave.launch.drawing.colours import CLOSED_FILL, NEUTRAL, lane_colours
 from laneweave.launch.drawing.figures import FigureFormat
 from laneweave.launch.recordings.runs import Comparison, Run, scenario_of
 from laneweave.launch.report.figures import (

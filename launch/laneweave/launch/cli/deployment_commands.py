@@ -1,4 +1,4 @@
-"""`laneweave certs`: a test authority and certificates for a secured deployment."""
+"""`laneweave certs` and `laneweave config`: certificates and checks for a deployment."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import load_scenario
@@ -16,7 +19,8 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.identities import Identity, parse_identity
 from laneweave.protocol.wire.topics import Party
 
-app = typer.Typer(help="Make test certificates.", add_completion=False)
+certs = typer.Typer(help="Make test certificates.", add_completion=False)
+config = typer.Typer(help="Check a configuration.", add_completion=False)
 
 DEFAULT_DAYS = 365.0
 MAX_DAYS = 3650.0
@@ -27,30 +31,21 @@ Hosts = Annotated[
     typer.Option("--host", metavar="NAME_OR_IP", help="Host of the router; repeatable."),
 ]
 Days = Annotated[float, typer.Option("--days", metavar="N", help="Validity in days.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 Separate = Annotated[
     bool,
     typer.Option("--separate", help="Give each identity a sub-folder, which also has ca.pem."),
 ]
 
 
-@app.command()
+@certs.command()
 def init(
     folder: Folder,
-    config: Annotated[
+    deployment: Annotated[
         Path | None,
         typer.Option("--config", metavar="DEPLOYMENT.toml", help="Deployment of the roles."),
     ] = None,
     host: Hosts = None,
     days: Days = DEFAULT_DAYS,
-    client: Annotated[
-        list[str] | None, typer.Option("--client", metavar="NAME", help="An additional client.")
-    ] = None,
-    vehicle: Annotated[
-        list[str] | None,
-        typer.Option("--vehicle", metavar="NAME", help="A vehicle with its own process."),
-    ] = None,
-    force: Force = False,
     keep: Annotated[
         bool, typer.Option("--keep", help="Keep existing files and make only missing ones.")
     ] = False,
@@ -69,10 +64,8 @@ def init(
     _check_days(days)
     if folder == Path():
         raise BadInputError("DIR", "", "the name of a folder")
-    if keep and force:
-        raise BadInputError("--keep", "true", "not with --force")
-    settings = load_scenario(config)
-    identities = list(dict.fromkeys(_wanted(settings, client or [], vehicle or [])))
+    settings = load_scenario(deployment)
+    identities = list(dict.fromkeys(_wanted(settings)))
     hosts = [*(host or ()), *_hosts(settings)]
     host_names(hosts)  # check before writing
     if keep and ca_path(folder).exists():
@@ -83,16 +76,16 @@ def init(
             if not certificate_path(folder, identity.common_name).exists()
         ]
     else:
-        authority = make_authority(folder, days=max(CA_DAYS, days), replace=force)
+        authority = make_authority(folder, days=max(CA_DAYS, days))
     for identity in identities:
-        issue(authority, folder, identity, days=days, hosts=hosts, replace=force, separate=separate)
+        issue(authority, folder, identity, days=days, hosts=hosts, separate=separate)
     typer.echo(f"{folder}: a test authority and {len(identities)} certificates:")
     for identity in identities:
         typer.echo(f"  {identity.common_name}")
     typer.echo(f"Keep {folder}/ca.key away from all hosts: it can impersonate all processes.")
 
 
-@app.command()
+@certs.command()
 def add(
     folder: Folder,
     identity: Annotated[
@@ -100,7 +93,6 @@ def add(
     ],
     host: Hosts = None,
     days: Days = DEFAULT_DAYS,
-    force: Force = False,
     separate: Separate = False,
 ) -> None:
     """Issue another certificate from the existing authority."""
@@ -111,7 +103,7 @@ def add(
     if host and wanted.party is not Party.ROUTER:
         raise BadInputError("--host", host[0], "only for the router")
     authority = load_authority(folder)
-    issue(authority, folder, wanted, days=days, hosts=host or (), replace=force, separate=separate)
+    issue(authority, folder, wanted, days=days, hosts=host or (), separate=separate)
     typer.echo(f"{folder}: a certificate for {wanted.common_name}")
 
 
@@ -120,16 +112,16 @@ def _check_days(days: float) -> None:
         raise BadInputError("--days", days, f"(0, {MAX_DAYS:g}]")
 
 
-def _wanted(settings: Scenario, clients: list[str], vehicles: list[str]) -> Iterator[Identity]:
+def _wanted(settings: Scenario) -> Iterator[Identity]:
     security = settings.security
     yield Identity(Party.ROUTER)
     yield Identity(Party.BRIDGE)
     for party, names in (
         (Party.COORDINATOR, coordinator_names(settings)),
         (Party.FLEET, security.fleets),
-        (Party.CLIENT, (*security.clients, *clients)),
+        (Party.CLIENT, security.clients),
         (Party.OBSERVER, security.observers),
-        (Party.VEHICLE, (*security.vehicles, *vehicles)),
+        (Party.VEHICLE, security.vehicles),
     ):
         for name in names:
             yield parse_identity(Identity(party, name).common_name, f"{party} NAME")
@@ -141,3 +133,38 @@ def _hosts(settings: Scenario) -> Iterator[str]:
         host = host_of(endpoint)
         if host:
             yield host
+
+
+@config.callback()
+def _group() -> None:
+    """Check a configuration."""
+
+
+@config.command()
+def check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A DEPLOYMENT.toml.")],
+    role: Annotated[
+        Party | None, typer.Option("--role", help="Also check the certificate of this role.")
+    ] = None,
+    name: Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the role.")] = "",
+) -> None:
+    """Check a configuration and, with --role, that role's certificate files on this host."""
+    from laneweave.launch.deploy.config_check import check_deployment
+    from laneweave.protocol.config.source_files import read_toml_source
+    from laneweave.protocol.errors import raise_all
+
+    settings = load_scenario(file)
+    if name and role is None:
+        raise BadInputError("--name", name, "only with --role")
+    identity = None
+    if role is not None:
+        identity = parse_identity(Identity(role, name).common_name, "--role and --name")
+    report = check_deployment(settings, identity)
+    for line in report.warnings:
+        typer.echo(f"warning: {line}", err=True)
+    with read_toml_source(file).located(given=("--name",)):
+        raise_all(report.problems)
+    table = Table("what", escape(str(file)), show_lines=False)
+    for what, value in report.facts:
+        table.add_row(what, escape(value))
+    Console().print(table)
