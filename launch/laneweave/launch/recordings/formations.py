@@ -16,7 +16,7 @@ from laneweave.protocol.wire.events import FORMATION_CLOSED
 
 
 def read_events(folder: Path, *kinds: str) -> Iterator[Mapping[str, Any]]:
-    """Yield the recorded events of the given kinds, in the order in which they were written.
+    """Yield the recorded events of the given kinds (none given: all), in the order of the file.
 
     Raises:
         OSError, ValueError, KeyError, TypeError: the events cannot be read.
@@ -26,7 +26,7 @@ def read_events(folder: Path, *kinds: str) -> Iterator[Mapping[str, Any]]:
         return
     for line in path.read_text(encoding="utf-8").splitlines():
         event = json.loads(line)
-        if event["kind"] in kinds:
+        if not kinds or event["kind"] in kinds:
             yield event
 
 

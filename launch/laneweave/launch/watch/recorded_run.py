@@ -6,9 +6,9 @@ moves are not recorded.
 
 from __future__ import annotations
 
-import json
 from bisect import bisect_right
 from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from laneweave.launch.drawing.colours import trip_lane
 from laneweave.launch.formation_columns import Formations
-from laneweave.launch.recordings.formations import closed_formations
+from laneweave.launch.recordings.formations import closed_formations, read_events
 from laneweave.launch.recordings.runs import not_a_run, single_run
 from laneweave.launch.recordings.trajectories import NO_LATTICE, Tracks, read_tracks, read_trips
 from laneweave.launch.run_methods import FORMATION
@@ -160,14 +160,11 @@ def _frames_of(
 
 def _moments(folder: Path) -> Iterator[_Moment]:
     """Yield the initial state and the state after each event, in chronological order."""
-    events = []
-    for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines():
-        event = json.loads(line)
-        events.append((float(event.pop("t_s")), str(event.pop("kind")), event))
     moment, feed = _Moment(float("-inf")), EventFeed()
     yield moment
-    for t_s, kind, data in sorted(events, key=lambda event: event[0]):
-        role = data.pop("role", "")
+    for event in sorted(read_events(folder), key=itemgetter("t_s")):
+        data = dict(event)
+        t_s, kind, role = float(data.pop("t_s")), str(data.pop("kind")), data.pop("role", "")
         feed.add(t_s, str(data.pop("name", role)), kind, data)
         leader, joined = moment.leader, moment.joined
         if kind == LEADER:
