@@ -12,6 +12,7 @@ from laneweave.launch.deploy.config_check import Report, check_deployment
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.wire.identities import parse_identity
 from support.commands import Here
+from support.tables import for_each
 
 DEPLOYMENT = """
 [network]
@@ -52,14 +53,6 @@ def test_certificates_for_a_deployment(laneweave: Here, config: Path) -> None:
         assert "valid until" in out
     report = check_deployment(load_scenario(config), parse_identity("router"), {})
     assert (report.problems, report.warnings) == ([], [])
-
-
-def test_an_authority_is_not_replaced(laneweave: Here, tmp_path: Path) -> None:
-    folder = tmp_path / "certs"
-    assert laneweave("certs", "init", folder)[0] == 0
-    before = (folder / "ca.pem").read_bytes()
-    laneweave.refused("certs", "init", folder)
-    assert (folder / "ca.pem").read_bytes() == before
 
 
 def test_what_is_missing_is_made_and_what_is_there_kept(laneweave: Here, config: Path) -> None:
@@ -104,31 +97,27 @@ def test_one_more_certificate(laneweave: Here, tmp_path: Path) -> None:
     assert laneweave("certs", "init", folder)[0] == 0
     assert laneweave("certs", "add", folder, "vehicle.x")[0] == 0
     assert (folder / "vehicle.x.pem").exists()
-    laneweave.refused("certs", "add", folder, "vehicle.x")
+    assert "certificate" in laneweave.refused("certs", "add", folder, "vehicle.x")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (("add", "FOLDER", "tram.x"), "IDENTITY"),
-        (("add", "FOLDER", "vehicle.../../x"), "IDENTITY"),
-        (("add", "FOLDER", "vehicle.x", "--host", "h"), "--host"),
-        (("add", "FOLDER", "vehicle.x", "--days", "0"), "--days"),
-        (("add", "FOLDER", "vehicle.x", "--days", "nan"), "--days"),
-        (("add", "FOLDER/none", "vehicle.x"), "DIR"),
-        (("init", "FOLDER/new", "--host", "é"), "--host"),
-        (("init", "FOLDER/ca.pem/below"), "DIR"),
-    ],
-)
-def test_what_cannot_be_certified(
-    laneweave: Here, tmp_path: Path, arguments: tuple[str, ...], named: str
-) -> None:
+def test_what_cannot_be_certified(laneweave: Here, tmp_path: Path) -> None:
     folder = tmp_path / "certs"
     assert laneweave("certs", "init", folder)[0] == 0
     there = set(folder.rglob("*"))
-    line = laneweave.refused("certs", *(one.replace("FOLDER", str(folder)) for one in arguments))
-    assert line.startswith(f"{named}: ")
-    assert set(folder.rglob("*")) == there
+    for words, named in (
+        ("add FOLDER tram.x", "IDENTITY"),
+        ("add FOLDER vehicle.../../x", "IDENTITY"),
+        ("add FOLDER vehicle.x --host h", "--host"),
+        ("add FOLDER vehicle.x --days 0", "--days"),
+        ("add FOLDER vehicle.x --days nan", "--days"),
+        ("add FOLDER/none vehicle.x", "DIR"),
+        ("init FOLDER", "DIR"),
+        ("init FOLDER/new --host é", "--host"),
+        ("init FOLDER/ca.pem/below", "DIR"),
+    ):
+        line = laneweave.refused("certs", *words.replace("FOLDER", str(folder)).split())
+        assert line.startswith(f"{named}: ")
+        assert set(folder.rglob("*")) == there
 
 
 def checked(text: str, identity: str | None, folder: Path) -> Report:
@@ -148,7 +137,7 @@ def test_all_problems_are_reported_at_once(laneweave: Here, tmp_path: Path) -> N
     assert [line[-len("toml:2)") :] for line in problems] == ["toml:2)", "toml:3)"]
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("endpoint", "listen", "fits"),
     [
         ("udp/127.0.0.1:1?rel=0", "udp/127.0.0.1:1?rel=0", True),
@@ -170,7 +159,7 @@ def test_a_file_that_does_not_load(laneweave: Here, tmp_path: Path) -> None:
     assert laneweave.refused("config", "check", path).startswith("network.endpiont")
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("identity", "problem"),
     [
         ("coordinator.c9", "an identity of this configuration"),

@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 
 from support.commands import Here
+from support.tables import for_each
 
 CASE_STUDY = Path(__file__).parents[4] / "docs" / "examples" / "case-study.json"
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("written", "option", "planned"),
     [
         (None, None, "tappa"),

@@ -7,13 +7,14 @@ import pytest
 from laneweave.launch.deploy.assigned_vehicles import AssignedVehicles, assigned_vehicles
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.deployment_fields import Security, Shard
+from support.tables import for_each
 
 FLEETS: dict[str, str | tuple[str, ...]] = {"even": "0/2", "odd": "1/2", "two": ("a", "b")}
 OPEN, SECURED = Security(fleets=FLEETS), Security(mode="mtls", fleets=FLEETS)
 
 
-@pytest.mark.parametrize("security", [OPEN, SECURED])
-@pytest.mark.parametrize(
+@for_each("security", [OPEN, SECURED])
+@for_each(
     ("vehicles", "shard", "fleet", "expected"),
     [
         ((), None, "odd", AssignedVehicles("fleet.odd", (), Shard(1, 2))),
@@ -39,7 +40,7 @@ def test_an_open_deployment_needs_no_fleets() -> None:
     assert assigned_vehicles(Security(), ["a", "b"], None, None).vehicles == ("a", "b")
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("security", "vehicles", "shard", "fleet", "field"),
     [
         (SECURED, (), None, None, "--shard"),

@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import pytest
 import yaml
 
 from laneweave.protocol.config.participants import identities_of
@@ -14,6 +13,7 @@ from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from support.commands import parameters
 from support.extras import EXTRA_OF_ROLE, PROJECT
+from support.tables import for_each
 
 ROOT = Path(__file__).resolve().parents[4]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
@@ -30,7 +30,7 @@ LARGE = {"plan", "sim"}
 WRITABLE = re.compile(r"^[\w.-]+:(?P<target>/[\w/.-]+)$")
 """A named volume that may be written to."""
 
-each_service = pytest.mark.parametrize("service", sorted(SERVICES))
+each_service = for_each("service", sorted(SERVICES))
 
 
 def role(service: str) -> str:

@@ -15,6 +15,7 @@ import yaml
 from laneweave.protocol.config.participants import identities_of
 from laneweave.protocol.config.scenario_files import load_scenario
 from support.commands import parameters
+from support.tables import for_each
 
 ROOT = Path(__file__).resolve().parents[4]
 BASE = ROOT / "deploy" / "kubernetes"
@@ -49,8 +50,8 @@ PODS = {
     **{("StatefulSet/coordinator", number): f"coordinator-{number}" for number in (1, 2, 3)},
     **{("StatefulSet/agents", number): f"agents-{number}" for number in (1, 2)},
 }
-each_pod = pytest.mark.parametrize(("workload", "ordinal"), sorted(PODS))
-each_resource = pytest.mark.parametrize("name", sorted(RESOURCES))
+each_pod = for_each(("workload", "ordinal"), sorted(PODS))
+each_resource = for_each("name", sorted(RESOURCES))
 
 
 def pod(workload: str) -> dict[str, Any]:
@@ -152,7 +153,7 @@ def test_a_container_sees_only_its_own_certificate_and_that_of_its_check(
     assert seen <= {identity.common_name for identity in identities_of(SCENARIO)}
 
 
-@pytest.mark.parametrize("workload", sorted(WORKLOADS))
+@for_each("workload", sorted(WORKLOADS))
 def test_containers_have_no_rights_to_misuse(workload: str) -> None:
     found = pod(workload)
     assert found["automountServiceAccountToken"] is False

@@ -22,6 +22,7 @@ from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.protocol.vehicle.lane_ends import drive_out
 from support.closed_lanes import BLOCKED, DROP, DROP_M
 from support.javascript import needs_node, printed_json
+from support.tables import for_each
 
 ROOM_M = drive_out(DROP).room_m
 
@@ -30,19 +31,16 @@ def five_lanes(*closures: Closure) -> Scenario:
     return evolve(DROP, road=evolve(DROP.road, lanes=5, closures=closures))
 
 
-def test_closed_parts_end_with_the_road() -> None:
+def test_closed_parts_are_sorted_and_end_with_the_road() -> None:
     assert closed_parts(DROP) == (ClosedPart(0, DROP_M, 1000.0, DROP_M - ROOM_M),)
     assert closed_parts(BLOCKED) == (ClosedPart(1, 600.0, 700.0, 600.0 - ROOM_M),)
     assert closed_parts(Scenario()) == ()
-
-
-def test_closed_parts_are_sorted() -> None:
     scenario = five_lanes(Closure(4, 700.0), Closure(0, 800.0), Closure(0, 300.0, 400.0))
     found = [(part.lane, part.from_m, part.to_m) for part in closed_parts(scenario)]
     assert found == [(0, 300.0, 400.0), (0, 800.0, 1000.0), (4, 700.0, 1000.0)]
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("scenario", "sentences"),
     [
         (Scenario(), ""),
@@ -159,7 +157,7 @@ def painted(width_px: int) -> list[list[Any]]:
 
 
 @needs_node
-@pytest.mark.parametrize("width_px", [320, 396, 420, 900, 1280])
+@for_each("width_px", [320, 396, 900])
 def test_labels_of_the_scale_do_not_touch(width_px: int) -> None:
     stretches: list[list[tuple[float, str]]] = []
     for name, *values in painted(width_px):

@@ -5,10 +5,10 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from laneweave.launch.drawing.colours import lane_colours, text_colour
+from support.tables import for_each
 
 DICHROMATS = {
     "none": np.eye(3),
@@ -39,8 +39,8 @@ def lab(colour: str, deficiency: str) -> NDArray[np.float64]:
     )
 
 
-@pytest.mark.parametrize("deficiency", DICHROMATS)
-@pytest.mark.parametrize("lanes", [2, 3])
+@for_each("deficiency", DICHROMATS)
+@for_each("lanes", [2, 3])
 def test_lanes_differ_for_all_readers(deficiency: str, lanes: int) -> None:
     for one, other in combinations(lane_colours(lanes), 2):
         distance = np.linalg.norm(lab(one, deficiency) - lab(other, deficiency))
@@ -54,7 +54,7 @@ def test_two_lanes_have_the_colours_of_the_outer_ones() -> None:
     assert len(set(lane_colours(8))) == 8
 
 
-@pytest.mark.parametrize("colour", [*lane_colours(3), *lane_colours(8)])
+@for_each("colour", [*lane_colours(3), *lane_colours(8)])
 def test_text_on_a_colour_is_legible(colour: str) -> None:
     lightness = lab(colour, "none")[0]
     assert abs(lightness - (0.0 if text_colour(colour) == "#000000" else 100.0)) > 38.0

@@ -16,7 +16,6 @@ from PIL import Image
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.cli import plan_answers
-from laneweave.launch.cli.plan_answers import answer_request
 from laneweave.launch.drawing import plan as plan_drawing
 from laneweave.launch.drawing.plan import check_drawing, plan_figure, write_gif, write_png
 from laneweave.protocol.errors import BadInputError
@@ -100,11 +99,6 @@ def test_a_target_of_two_teams_has_both_colours() -> None:
     vehicles = (attrs.evolve(REQUEST.vehicles[0], eligible=(0, 1)), *REQUEST.vehicles[1:])
     axes = plan_figure(attrs.evolve(REQUEST, vehicles=vehicles), NO_PLAN).axes[0]
     assert len(outlines(axes, "target")) == 5 + 2
-
-
-def test_there_are_colours_for_21_teams() -> None:
-    assert len({plan_drawing._colour(team) for team in range(21)}) == 21
-    assert plan_drawing._colour(21) == plan_drawing._colour(0)
 
 
 def test_without_a_plan_the_start_is_drawn() -> None:
@@ -227,11 +221,3 @@ def test_a_failed_drawing_is_reported(
     status, out, (line,) = laneweave("plan", CASE_STUDY, "--draw", tmp_path / "plan.png")
     assert (status, json.loads(out)["cost"]) == (1, 7)
     assert "cannot be drawn" in line
-
-
-def test_without_draw_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(plan_answers, "plan", lambda *_, **__: PLAN)
-    monkeypatch.setattr(plan_drawing, "draw_plan", None)
-    monkeypatch.chdir(tmp_path)
-    answer_request(CASE_STUDY, None, None, "tappa", as_table=True)
-    assert list(tmp_path.iterdir()) == []

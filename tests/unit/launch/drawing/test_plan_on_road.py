@@ -32,6 +32,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import cell_state
 from support.commands import Here
+from support.tables import for_each
 
 EXAMPLES = Path(__file__).resolve().parents[4] / "docs" / "examples"
 CASE_STUDY = EXAMPLES / "case-study.json"
@@ -65,14 +66,6 @@ def test_all_vehicles_are_in_their_cells_when_a_step_ends(driven: Drive) -> None
     assert driven.states.shape == (5, PLAN.steps * driven.slot_ticks + 1, 6)
     assert driven.time_s(driven.ticks) == pytest.approx(PLAN.steps * SCENARIO.timing.cycles_s[0])
     assert errors_m(driven, PLAN.paths).max() < 0.2
-
-
-def test_limits_of_the_vehicle_are_kept(driven: Drive) -> None:
-    vehicle = SCENARIO.vehicle
-    accels = driven.states[:, :, 2]
-    assert accels.min() >= vehicle.min_accel_mps2
-    assert accels.max() <= vehicle.max_accel_mps2
-    assert np.abs(np.diff(driven.states[:, :, 0], axis=1)).min() > 0
 
 
 def test_what_the_conflict_kinds_allow_is_shown(driven: Drive) -> None:
@@ -184,7 +177,7 @@ def test_the_road_is_drawn_in_addition_to_the_response(
     assert shown in titles[0]
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("options", "line"),
     [
         (["--draw-road", "road.pdf"], "--draw-road: got 'road.pdf'; allowed: a file that ends"),

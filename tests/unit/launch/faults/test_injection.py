@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
 from attrs import define, field
 
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.specification import FaultSpec, Kill, Pause
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.wire.messages import Census, CensusEntry, Heartbeat, Name
+from support.tables import for_each
 
 LEASE_S = 1.0
 
@@ -101,7 +101,7 @@ def test_targets_are_found_by_name() -> None:
     assert roles.done == [("kill", "c3"), ("kill", "router"), ("kill", "agent-v2")]
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("target", "names"),
     [("agent", ["agent-v1", "agent-v3", "agent-v4"]), ("coordinator", ["c1", "c2", "c3"])],
 )
@@ -159,7 +159,7 @@ def test_a_pause_ends_after_wall_clock_time_and_a_paused_role_is_no_target() -> 
 # --- recovery -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("fault", "heartbeats", "recovery_s"),
     [
         # What is in flight of the killed leader does not count, and nothing counts twice.

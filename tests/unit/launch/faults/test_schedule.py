@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from itertools import islice
 
-import pytest
-
 from laneweave.launch.faults.schedule import FaultEvent, FaultSchedule
 from laneweave.launch.faults.specification import FaultSpec, Kill, Partition, Pause
 from laneweave.protocol.runtime.message_faults import MessageRule
+from support.tables import for_each
 
 
 def events(faults: FaultSpec, seed: int = 1, until_s: float = 1e6) -> list[FaultEvent]:
@@ -62,16 +61,6 @@ def test_equal_seeds_draw_equal_times() -> None:
     assert events(own, 1) == events(faults, 2)
 
 
-def test_choices_are_drawn_from_the_seed() -> None:
-    faults = FaultSpec(kill=(Kill(at_s=1.0, every_s=1.0, times=20, target="agent"),))
-
-    def choices(seed: int) -> list[int]:
-        return [event.draw.randrange(1000) for event in events(faults, seed)]
-
-    assert choices(1) == choices(1)
-    assert choices(1) != choices(2)
-
-
 def test_another_fault_does_not_change_the_times_of_the_first() -> None:
     drawn = Kill(between_s=(0.0, 9.0), times=5)
     alone = times_s(FaultSpec(kill=(drawn,)))
@@ -92,7 +81,7 @@ def test_a_pause_lasts_as_long_as_drawn() -> None:
     assert (fixed.for_s, fixed.restart_after_s) == (2.0, None)
 
 
-@pytest.mark.parametrize(("share", "restarted"), [(0.0, 0), (0.29, 29), (0.5, 50), (1.0, 100)])
+@for_each(("share", "restarted"), [(0.0, 0), (0.29, 29), (0.5, 50), (1.0, 100)])
 def test_exactly_the_share_is_restarted(share: float, restarted: int) -> None:
     kill = Kill(
         target="agent", count=100, between_s=(0.0, 9.0), restart_after_s=2.0, restart_share=share

@@ -18,6 +18,7 @@ from laneweave.launch.faults.specification import (
 )
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.message_faults import MessageRule
+from support.tables import for_each
 
 COORDINATORS = ("c1", "c2")
 VEHICLES = ("v0001", "v0002")
@@ -114,7 +115,7 @@ def test_a_file_may_have_every_field(tmp_path: Path) -> None:
     assert found
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("text", "field"),
     [
         ('[[kill]]\ntarget = "c3"\nat_s = 1.0', "kill[0].target"),
@@ -225,12 +226,12 @@ def test_the_presets() -> None:
     assert preset_names() == PRESETS
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@for_each("name", PRESETS)
 def test_a_preset_loads_for_any_run(name: str) -> None:
     assert load_faults(name, ("c1",), ())
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("name", "rule"),
     [
         ("lossy10", MessageRule(loss=0.1)),

@@ -17,6 +17,7 @@ from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.scenario.fields import Scenario
 from support.commands import run
+from support.tables import for_each
 
 CASE_STUDY = Path(__file__).resolve().parents[4] / "docs" / "examples" / "case-study.json"
 SHORT: dict[str, Any] = {
@@ -38,7 +39,7 @@ def test_scenarios_come_from_tables_files_and_scenarios(tmp_path: Path) -> None:
         laneweave.load_scenario({"magic": 1})
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("arguments", "said"),
     [
         ({"method": "magic"}, "method: got 'magic'; allowed: one of formation, rule, lc2013"),

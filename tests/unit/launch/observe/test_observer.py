@@ -23,15 +23,6 @@ def heartbeat(name: str, term: int, *, leading: bool = True) -> Heartbeat:
     return Heartbeat(Name(name), 1, term, leading=leading, plans=0)
 
 
-def test_an_empty_view() -> None:
-    view = RoadView()
-    view.update(object(), 0.0)
-    Observer(Keys("here"), view=view).wait(0.001)
-    assert view == RoadView()
-    assert (view.clock, view.census, view.leader, view.term) == (None, None, None, 0)
-    assert view.t_s == 0.0
-
-
 def test_older_clocks_and_censuses_are_ignored() -> None:
     view = RoadView()
     for tick in (5, 7, 6, 7):
@@ -39,16 +30,6 @@ def test_older_clocks_and_censuses_are_ignored() -> None:
         view.update(Census(tick / 10, (), ()), 0.0)
     assert view.t_s == 0.7
     assert view.census == Census(0.7, (), ())
-
-
-def test_messages_of_an_earlier_bridge_are_ignored() -> None:
-    view = RoadView()
-    for bridge, tick in ((1, 50), (2, 3), (1, 51), (2, 4)):
-        view.update(replace(clock(tick), bridge=bridge), 0.0)
-        view.update(Census(tick / 10, (), (), bridge=bridge), 0.0)
-    assert (view.roads, view.bridge, view.t_s) == (2, 2, 0.4)
-    assert view.census is not None
-    assert view.census.t_s == 0.4
 
 
 def test_a_view_with_bounds_keeps_its_road_whatever_is_forged() -> None:

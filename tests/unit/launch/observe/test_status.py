@@ -126,12 +126,6 @@ def test_a_healthy_deployment(healthy: Listener) -> None:
     }  # fmt: skip
 
 
-def test_nothing_was_heard(listener: Listener) -> None:
-    found = listener.status()
-    assert found.problem == "there is no leader: no coordinators found"
-    assert found.road is None
-
-
 def test_coordinators_without_a_leader(listener: Listener) -> None:
     for name in ("c1", "c2"):
         listener.coordinator(name)
@@ -201,15 +195,6 @@ def test_a_road_that_has_ended_is_healthy(listener: Listener) -> None:
     listener.heartbeat("c1", 3, 1.9, leading=True)
     listener.clock(5, ended=True)
     assert listener.status().healthy
-
-
-def test_another_bridge_is_another_road(healthy: Listener) -> None:
-    for tick in (3, 4):
-        healthy.clock(tick, bridge=8)
-    found = healthy.status()
-    assert found.road is not None
-    assert found.road.t_s == 0.4
-    assert found.vehicles.attended == 0
 
 
 def test_attended_and_unattended_vehicles(healthy: Listener) -> None:

@@ -17,6 +17,7 @@ from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import Trip, metadata_of, trips_table
 from laneweave.sim_bridge.road.demand import Arrival
 from support.older_recordings import first_schema
+from support.tables import for_each
 
 SCENARIO = Scenario()
 LATTICE = SCENARIO.lattice
@@ -68,7 +69,7 @@ def test_an_earlier_recording_has_all_columns(newer: Path, older: Path) -> None:
     assert set(found["reserved_lane"].to_pylist()) == {1, None}
 
 
-@pytest.mark.parametrize("name", TRAJECTORIES.names)
+@for_each("name", TRAJECTORIES.names)
 def test_single_columns_are_read(newer: Path, older: Path, name: str) -> None:
     for folder in (newer, older):
         whole, alone = read_trajectories(folder), read_trajectories(folder, [name])

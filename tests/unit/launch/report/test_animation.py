@@ -172,32 +172,25 @@ def test_the_player_shows_the_whole_road_or_a_window_on_it(run: Run, tracks: Tra
 
 
 @needs_node
-def test_the_player_shades_as_the_pictures_do(run: Run, tracks: Tracks) -> None:
+def test_the_player_colours_as_the_pictures_do(run: Run, tracks: Tracks) -> None:
     data = animation_data(run, tracks)
-    for over_mps in (-9.0, -2.5, 0.0, 1.0, 7.0):
-        shade = data["shade"]
-        call = (
-            f"laneweaveRoad.shade('#2f6fc4', {over_mps}, {shade['span_mps']}, {shade['strength']})"
-        )
-        shown = in_node(call, data)
-        expected = ",".join(str(round(255 * part)) for part in _shade("#2f6fc4", over_mps))
-        assert shown == f"rgb({expected})"
+    speeds, shade = (-9.0, -2.5, 0.0, 1.0, 7.0), data["shade"]
+    colours = (*lane_colours(3), *lane_colours(8))
+    shades, texts, stretches = in_node(
+        f"[{json.dumps(speeds)}.map((over) => laneweaveRoad.shade("
+        f"'#2f6fc4', over, {shade['span_mps']}, {shade['strength']})),"
+        f" {json.dumps([rgb(colour) for colour in colours])}.map(laneweaveRoad.textColour),"
+        " [1200, 380, 60].map((width) => laneweaveRoad.wholeRoad(1000, width))]",
+        data,
+    )
+    for over_mps, shown in zip(speeds, shades, strict=True):
+        assert shown == f"rgb({','.join(str(round(255 * x)) for x in _shade('#2f6fc4', over_mps))})"
+    assert texts == list(map(text_colour, colours))
+    # Narrow pages show more stretches.
+    assert [len(one) for one in stretches] == [4, 8, 16]
+    for found in stretches:
+        assert [begin for begin, _ in found[1:]] == [end for _, end in found[:-1]]
 
 
-@needs_node
-def test_narrow_pages_show_more_stretches(run: Run, tracks: Tracks) -> None:
-    data = animation_data(run, tracks)
-    call = "[1200, 380, 60].map((width) => laneweaveRoad.wholeRoad(1000, width))"
-    wide, narrow, tiny = in_node(call, data)
-    assert [len(one) for one in (wide, narrow, tiny)] == [4, 8, 16]
-    for stretches in (wide, narrow, tiny):
-        assert [begin for begin, _ in stretches[1:]] == [end for _, end in stretches[:-1]]
-
-
-@needs_node
-def test_text_is_legible_on_all_colours(run: Run, tracks: Tracks) -> None:
-    data = animation_data(run, tracks)
-    for colour in (*lane_colours(3), *lane_colours(8)):
-        red, green, blue = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
-        shown = in_node(f"laneweaveRoad.textColour('rgb({red},{green},{blue})')", data)
-        assert shown == text_colour(colour)
+def rgb(colour: str) -> str:
+    return f"rgb({','.join(str(int(colour[place : place + 2], 16)) for place in (1, 3, 5))})"

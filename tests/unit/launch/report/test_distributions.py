@@ -249,24 +249,14 @@ def test_the_path_map_of_an_older_recording(swept: Path, tmp_path: Path) -> None
     assert shown.slot_s == 4.0
 
 
-def test_a_label_has_the_same_colour_beside_any_others() -> None:
-    alone = label_colours(["paper-12"])["paper-12"]
+def test_styles_of_labels_and_volumes() -> None:
     several = label_colours(["formation", "paper-12", "mine", "yours"])
-    assert several["paper-12"] == alone
+    assert several["paper-12"] == label_colours(["paper-12"])["paper-12"]
     assert len(set(several.values())) == 4
-
-
-def test_other_labels_are_neither_grey_nor_brown() -> None:
-    colours = label_colours([*METHODS, "mine", "yours"])
-    assert not {"#808890", "#7d3600"} & {colours["mine"], colours["yours"]}
-
-
-def test_later_lines_are_thinner() -> None:
+    others = label_colours([*METHODS, "mine", "yours"])
+    assert not {"#808890", "#7d3600"} & {others["mine"], others["yours"]}  # grey, brown
     widths = list(label_widths(["formation", "rolling", "rule"]).values())
     assert widths == sorted(set(widths), reverse=True)
-
-
-def test_volumes_that_fit_side_by_side() -> None:
     assert spread_evenly([1.0, 2.0]) == (1.0, 2.0)
     assert spread_evenly(list(map(float, range(11)))) == (0.0, 2.0, 4.0, 6.0, 8.0, 10.0)
 

@@ -45,6 +45,7 @@ from laneweave.sim_bridge.road.demand import Arrival
 from support.closed_lanes import DROP
 from support.commands import loads
 from support.summaries import make_summary
+from support.tables import for_each
 from support.tracks import make_tracks
 from support.variants import variants
 
@@ -145,7 +146,7 @@ def test_pictures_show_closed_parts_and_vehicles_without_preferences(tmp_path: P
     assert rgb(CLOSED_FILL) in colours_of(folder / "heat.png")
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("closures", "stretch_m"),
     [
         ((), (130.0, 450.0)),
@@ -330,7 +331,7 @@ def test_matplotlib_is_imported_only_to_draw() -> None:
         assert not loads(f"laneweave.launch.report.{module}", "matplotlib")
 
 
-@pytest.mark.parametrize("width_in", [3.0, 4.6, 9.2])
+@for_each("width_in", [3.0, 4.6, 9.2])
 def test_a_legend_is_not_wider_than_its_figure(tmp_path: Path, width_in: float) -> None:
     with picture(width_in, 3.7, tmp_path / "legend.png", 100) as figure:
         axes = figure.subplots()

@@ -22,6 +22,7 @@ from laneweave.launch.report.tables import Table, tables_of
 from laneweave.protocol.scenario.fields import Scenario
 from support.commands import Here
 from support.summaries import make_summary
+from support.tables import for_each
 
 ALWAYS = {"path_map.png", "spacing.png", "comfort.png"}
 FIGURES = ALWAYS | {"speeds.png", "road-formation.png"}
@@ -160,40 +161,29 @@ def test_runs_that_failed_are_listed_and_not_averaged(swept: Path, tmp_path: Pat
     assert {row[1] for row in traffic.rows} == {"1600"}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["missing"], "DIR: got 'missing'; allowed: the folder of a run"),
-        (["empty"], "DIR: got 'empty'; allowed: the folder of a run"),
-        (["torn"], "DIR: got 'torn'; allowed: the folder of a finished run"),
-        (["short"], "DIR: got 'short'; allowed: the folder of a finished run"),
-        (["unfinished"], "DIR: got 'unfinished'; allowed: the folder of a finished run"),
-        (["begun"], "DIR: got 'begun'; allowed: a sweep with a finished run"),
-        (["run", "--formation", "99"], "--formation: got 99; allowed: a formation of run: "),
-        (["run", "--out", "x"], "--out: got 'x'; allowed: only with several folders"),
-    ],
-)
 def test_one_line_says_what_is_wrong(
-    laneweave: Here,
-    swept: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: list[str],
-    said: str,
+    laneweave: Here, swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(swept / "formation-1000-1", "run")
-    shutil.copytree(swept / "formation-1000-1", "unfinished")
+    for name in ("run", "unfinished", "short"):
+        shutil.copytree(swept / "formation-1000-1", name)
     Path("unfinished", "summary.json").write_text('{"schema"')
-    shutil.copytree(swept / "formation-1000-1", "short")
-    whole = Path("short", "trajectories.parquet").read_bytes()
     Path("short", "trips.parquet").unlink()
-    Path("short", "trajectories.parquet").write_bytes(whole)
     for name in ("empty", "torn", "begun"):
         Path(name).mkdir()
     Path("torn", "trajectories.parquet").write_bytes(b"PAR1")
     Path("begun", "sweep.json").touch()
-    assert said in laneweave.refused("report", *arguments)
+    for words, said in (
+        ("missing", "DIR: got 'missing'; allowed: the folder of a run"),
+        ("empty", "DIR: got 'empty'; allowed: the folder of a run"),
+        ("torn", "DIR: got 'torn'; allowed: the folder of a finished run"),
+        ("short", "DIR: got 'short'; allowed: the folder of a finished run"),
+        ("unfinished", "DIR: got 'unfinished'; allowed: the folder of a finished run"),
+        ("begun", "DIR: got 'begun'; allowed: a sweep with a finished run"),
+        ("run --formation 99", "--formation: got 99; allowed: a formation of run: "),
+        ("run --out x", "--out: got 'x'; allowed: only with several folders"),
+    ):
+        assert said in laneweave.refused("report", *words.split())
 
 
 def test_an_error_of_the_report_is_not_reported_as_bad_input(
@@ -242,7 +232,7 @@ def test_planning_times_of_a_comparison(swept: Path) -> None:
     assert len(without.rows) == len(planning.rows) - 1
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("text", "kept"),
     [
         ("66.01 / 67.35 s", "66.01 / 67.35_s"),

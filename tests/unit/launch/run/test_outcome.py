@@ -20,6 +20,7 @@ from laneweave.sim_bridge.recording.trips import metadata_of, trips_table
 from support.closed_lanes import DROP
 from support.interchange import CORRIDOR, TRUCKS, stream, write_interchange
 from support.summaries import make_summary
+from support.tables import for_each
 
 MEASURED = ("min_gap_m", "min_headway_s", "max_accel_mps2", "min_accel_mps2", "max_jerk_mps3")
 
@@ -67,7 +68,7 @@ def test_a_run_without_problems(tmp_path: Path) -> None:
     assert (failover["recovery_s"], failover["plan_recovery_s"]) == ([0.25], [0.5])
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("found", "problem"),
     [
         (summary(overlaps=2), "2 pairs of vehicles overlapped"),
@@ -143,7 +144,7 @@ def printed(outcome: Outcome) -> str:
     return stream.getvalue()
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("found", "more", "row"),
     [
         (summary(), {}, ("processes", "9")),
@@ -232,7 +233,7 @@ def test_all_reasons_are_printed(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("more", "shown"),
     [
         ({"optimal": 0}, {"plans": "5", "plans proven optimal": "0 of 5"}),
@@ -248,7 +249,6 @@ def test_all_reasons_are_printed(tmp_path: Path) -> None:
         ),
         ({"plans": 0, "by_solver": {"tappa": 0, "branching": 0}, "fallbacks": 0}, {"plans": "0"}),
     ],
-    ids=["old", "rolling", "formations", "none"],
 )
 def test_the_table_says_which_solvers_planned(more: dict[str, Any], shown: dict[str, str]) -> None:
     found = make_summary(planning={"plans": 5} | more)
@@ -256,7 +256,7 @@ def test_the_table_says_which_solvers_planned(more: dict[str, Any], shown: dict[
     assert rows == {"plans": "5"} | shown
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("low", "high", "said"),
     [
         (-3.004, 3.0, ("-3.00 m/s²", "3.00 m/s²")),

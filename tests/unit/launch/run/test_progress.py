@@ -7,6 +7,7 @@ from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.progress import PaceMeter, RunProgress, duration
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Name, RoadClock
+from support.tables import for_each
 
 CLOCK = RoadClock(10, 1.0, demanded=4, entered=2, on_road=2, left=0, ended=False)
 VIEWS = (
@@ -47,7 +48,7 @@ def test_the_pace_is_that_of_the_last_seconds() -> None:
     assert measured(2.0, total_s=15.0).left_s == 0.0
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("paces", "wanted_pace", "said"),
     [
         (

@@ -57,6 +57,11 @@ def columns(folder: Path, name: str) -> dict[str, list[Any]]:
     return table
 
 
+def shape(value: Any) -> Any:  # noqa: ANN401 (JSON)
+    """Return the keys of a summary, nested."""
+    return {key: shape(inner) for key, inner in value.items()} if isinstance(value, dict) else ()
+
+
 @each_method
 @pytest.mark.parametrize("lane_change_s", [0.0, 4.0])
 def test_at_low_volume_all_vehicles_leave_on_their_preferred_lanes(
@@ -70,6 +75,11 @@ def test_at_low_volume_all_vehicles_leave_on_their_preferred_lanes(
     assert vehicles["demanded"] == vehicles["left"] == vehicles["on_preferred_lane"] > 5
     assert found["method"] == method
     assert found["safety"]["overlaps"] == 0
+    assert found["planning"]["plans"] == found["tracking"]["solves"] == 0
+    assert found["runtime"]["processes"] == 1
+    record = RunRecord(tmp_path / "formation", Scenario(), "formation", lambda: 0.0)
+    record.close(1.0, Ending.COMPLETE)
+    assert shape(found) == shape(read_summary(tmp_path / "formation"))
     assert found["safety"]["min_accel_mps2"] >= -10.0
     assert found["safety"]["max_accel_mps2"] <= 5.0
     trips = columns(tmp_path, "trips")
@@ -109,25 +119,8 @@ def test_a_lone_vehicle_takes_as_long_as_the_road_is(
     assert entered["t_s"] == pytest.approx(61.234)
 
 
-def shape(value: Any) -> Any:  # noqa: ANN401 (JSON)
-    """Return the keys of a summary, nested."""
-    return {key: shape(inner) for key, inner in value.items()} if isinstance(value, dict) else ()
-
-
-@each_method
-def test_the_summary_has_the_schema_of_formation_runs(tmp_path: Path, method: str) -> None:
-    record = RunRecord(tmp_path / "formation", Scenario(), "formation", lambda: 0.0)
-    record.close(1.0, Ending.COMPLETE)
-    finished(scenario(), tmp_path / method, method)
-    found = read_summary(tmp_path / method)
-    assert shape(found) == shape(read_summary(tmp_path / "formation"))
-    assert found["planning"]["plans"] == found["tracking"]["solves"] == 0
-    assert found["runtime"]["processes"] == 1
-
-
-@each_method
-def test_a_run_that_does_not_end_is_ended(tmp_path: Path, method: str) -> None:
-    outcome = finished(scenario(runtime={"max_road_s": 15.0}), tmp_path, method)
+def test_a_run_that_does_not_end_is_ended(tmp_path: Path) -> None:
+    outcome = finished(scenario(runtime={"max_road_s": 15.0}), tmp_path, RULE)
     assert outcome.exit_status == 1
     assert read_summary(tmp_path)["ending"] == Ending.LIMIT.value
 
@@ -202,26 +195,24 @@ def test_the_example_decides_on_lane_changes(
         assert not one.equals(other)
 
 
-@each_method
 def test_bodies_that_overlap_break_a_promise(
-    tmp_path: Path, method: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Bodies, "overlapping_pairs", lambda _: [("v0001", "v0002")])
-    outcome = finished(scenario(), tmp_path, method)
+    outcome = finished(scenario(), tmp_path, RULE)
     assert outcome.exit_status == 1
     assert "1 pairs of vehicles overlapped" in outcome.problems
 
 
-@each_method
 def test_an_interrupted_run_leaves_its_summary(
-    tmp_path: Path, method: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(road.ReferenceRoad, "advance", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        finished(scenario(), tmp_path, method)
+        finished(scenario(), tmp_path, LC2013)
     assert read_summary(tmp_path)["ending"] == Ending.INTERRUPTED.value
 
 

@@ -12,6 +12,7 @@ from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from support.commands import Here
+from support.tables import for_each
 
 ROOT = Path(__file__).resolve().parents[4]
 
@@ -36,10 +37,10 @@ def test_points_are_named_by_label_volume_and_seed() -> None:
         assert point.name.endswith(f"-{point.scenario.seed}")
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("label", "columns", "vehicles"), [("paper-6", 4, 6), ("paper-12", 8, 12), ("paper-18", 12, 18)]
 )
-@pytest.mark.parametrize(
+@for_each(
     "base",
     [
         load_scenario(None, formation__block_columns=6, formation__max_vehicles=4),
@@ -75,7 +76,7 @@ def test_labels_are_sorted_as_in_their_table() -> None:
     assert sorted(labels, key=rank) == ["formation", "paper-12", "a", "z"]
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("keep", "kept"),
     [
         (KeepTrajectories.none, [False, False]),
@@ -88,13 +89,13 @@ def test_kept_trajectories(keep: KeepTrajectories, kept: list[bool]) -> None:
     assert [point.keep_trajectories for point in points] == kept
 
 
-@pytest.mark.parametrize("text", ["", "magic", "formation,", "formation,formation"])
+@for_each("text", ["", "magic", "formation,", "formation,formation"])
 def test_bad_methods(text: str) -> None:
     with pytest.raises(BadInputError, match="--methods: got "):
         parse_methods(text)
 
 
-@pytest.mark.parametrize("text", ["", "a", "1000,", "0", "-5", "5000", "nan", "inf", "1e3,1000"])
+@for_each("text", ["", "a", "1000,", "0", "-5", "5000", "nan", "inf", "1e3,1000"])
 def test_bad_volumes(text: str) -> None:
     with pytest.raises(BadInputError, match="--volumes: got "):
         sweep_volumes(text, Scenario())
@@ -113,7 +114,7 @@ def test_too_many_points() -> None:
         plan_points(Scenario(), ["formation"], [1.0, 2.0], range(100_000), KeepTrajectories.none)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("arguments", "said"),
     [
         (["--methods", "magic"], "--methods: got 'magic'; allowed: one of formation"),

@@ -27,11 +27,6 @@ def numbers(source: FrameBuffer, begin: int, end: int) -> list[int]:
     return [json.loads(frame)["n"] for frame in source.frames(begin, end)]
 
 
-def test_an_empty_buffer() -> None:
-    empty = buffer(0)
-    assert (empty.first, empty.last, numbers(empty, 0, 5)) == (0, -1, [])
-
-
 def test_the_oldest_frames_are_forgotten() -> None:
     full = buffer(25)
     assert (full.first, full.last) == (15, 24)

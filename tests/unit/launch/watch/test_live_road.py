@@ -20,6 +20,7 @@ from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEven
 from support.closed_lanes import DROP
 from support.convoy import BALLOT, ROLLING, Convoy
 from support.states import changed
+from support.tables import for_each
 
 FORMATIONS: Scenario = parse_scenario({})
 BLOCKS: Scenario = parse_scenario({"formation": {"operation": "paper"}})
@@ -288,9 +289,7 @@ def test_events_and_plans() -> None:
     assert len(details) <= 90
 
 
-@pytest.mark.parametrize(
-    "value", ["a", None, [1], {"b": 2}, True, -(2**63), 10**400], ids=lambda value: str(value)[:20]
-)
+@for_each("value", ["a", None, [1], {"b": 2}, True, -(2**63), 10**400])
 def test_malformed_events_do_no_harm(value: object) -> None:
     road = watched()
     data = {"vehicles": value, "solve_ms": value, "solver": value, "fallback": value}

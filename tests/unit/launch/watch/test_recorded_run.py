@@ -20,6 +20,7 @@ from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from support.commands import Here
 from support.older_recordings import older_recording
+from support.tables import for_each
 
 pytestmark = pytest.mark.slow
 
@@ -151,7 +152,7 @@ def test_a_run_with_damaged_events_is_refused(recorded: Path, tmp_path: Path) ->
         Recording(folder)
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("arguments", "words"),
     [
         (["/nowhere"], "DIR"),

@@ -26,6 +26,7 @@ from laneweave.launch.watch.listening import open_socket
 from laneweave.launch.watch.recorded_run import Recording
 from laneweave.launch.watch.server import Browser, Browsers, make_app, request_of
 from laneweave.protocol.errors import BadInputError
+from support.tables import for_each
 from support.waiting import wait_until
 
 WAIT_S = 60.0
@@ -116,9 +117,7 @@ def site(shared_site: Site) -> Site:
     return shared_site
 
 
-@pytest.mark.parametrize(
-    "path", ["/", "/road.js", "/closed_parts.js", "/frames.js", "/layers.js", "/watch.js"]
-)
+@for_each("path", ["/", "/road.js", "/closed_parts.js", "/frames.js", "/layers.js", "/watch.js"])
 def test_the_page_needs_no_other_server(site: Site, path: str) -> None:
     status, kind, text = site.get(path)
     assert status == 200
@@ -185,7 +184,7 @@ def deaf_socket(site: Site) -> socket.socket:
     return deaf
 
 
-@pytest.mark.parametrize(
+@for_each(
     "message",
     [
         "",
