@@ -18,9 +18,9 @@ from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
-from laneweave.sim_bridge.corridors.corridor_reading import read_corridor, read_simulation
 from laneweave.sim_bridge.corridors.corridor_search import find_corridors
-from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
+from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
+from laneweave.sim_bridge.corridors.sumo_simulation import TimeWindow, read_simulation
 
 
 def driven(file: Path, name: str, window: TimeWindow) -> str:
@@ -53,7 +53,7 @@ def lines(file: Path, names: Sequence[str], window: TimeWindow) -> Iterator[str]
     """Yield a line for each corridor of a simulation, or why it cannot be read."""
     try:
         simulation = read_simulation(file, window)
-        candidates = find_corridors(simulation.network, simulation.demand)
+        candidates = find_corridors(simulation)
     except (BadInputError, CommandFailedError) as error:
         yield f"refused: {error}"
         return

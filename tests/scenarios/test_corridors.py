@@ -19,8 +19,8 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.sim_bridge.corridors import corridor_setup, sumo_statistics
-from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
-from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
+from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
+from laneweave.sim_bridge.corridors.sumo_simulation import TimeWindow
 from laneweave.sim_bridge.corridors.sumo_statistics import read_statistics
 from support.interchange import (
     CORRIDOR,
@@ -273,13 +273,13 @@ def test_a_queue_behind_the_exit_is_braked_for(
     rows, checked = read_rows(tmp_path / "run"), 0
     for one in read_statistics(tmp_path / "run").conflicts:
         tick = round(one.at_s / own.runtime.tick_s)
-        keys = [(names.get(name, ""), tick) for name in (one.vehicle, one.other)]
+        keys = [(names.get(name, ""), tick) for name in one.vehicles]
         if not rows.keys() >= {*keys}:
             continue  # SUMO drives one of them
         (rear_m, fast_mps), (front_m, slow_mps) = sorted(rows[key] for key in keys)
         gap_m = front_m - own.vehicle.length_m - rear_m
         # SUMO measures along its lanes, from which bodies are up to some decimetres away.
-        assert one.least_ttc_s == pytest.approx(gap_m / (fast_mps - slow_mps), rel=0.1)
+        assert one.min_ttc_s == pytest.approx(gap_m / (fast_mps - slow_mps), rel=0.1)
         checked += 1
     assert checked > 0
 

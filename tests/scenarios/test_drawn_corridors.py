@@ -10,7 +10,8 @@ from laneweave.launch.cli.corridor_command import corridor_tables
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.sim_bridge.corridors.corridor_reading import WHOLE, read_corridor
+from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
+from laneweave.sim_bridge.corridors.sumo_simulation import WHOLE
 from support.drawn_corridors import draw_corridor, problems
 
 IN_CI = 6

@@ -12,7 +12,8 @@ from laneweave.launch.cli.corridor_command import corridor_tables
 from laneweave.launch.recordings.trajectories import read_trajectories
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
-from laneweave.sim_bridge.corridors.corridor_reading import WHOLE, read_corridor
+from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
+from laneweave.sim_bridge.corridors.sumo_simulation import WHOLE
 from support import corridor_oracle
 from support.interchange import (
     CORRIDOR,

@@ -28,9 +28,10 @@ from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.corridors import sumo_network
-from laneweave.sim_bridge.corridors.corridor_reading import WHOLE, read_corridor
-from laneweave.sim_bridge.corridors.network_reading import read_network
 from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
+from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
+from laneweave.sim_bridge.corridors.sumo_network import read_network
+from laneweave.sim_bridge.corridors.sumo_simulation import WHOLE
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 from support.sharing import made_once
 
@@ -186,7 +187,7 @@ def interchange_network(folder: Path, state: str = "M") -> sumo_network.Network:
 def interchange_scenario(folder: Path) -> Scenario:
     """Return the scenario of the corridor with a stream of vehicles of a minute."""
     found = read_corridor(write_interchange(folder, stream(60), types=TRUCKS), CORRIDOR)
-    return parse_scenario(scenario_tables(found.corridor, found.demand))
+    return parse_scenario(scenario_tables(found))
 
 
 DRIVEN_S = 15

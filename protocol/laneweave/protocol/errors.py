@@ -50,6 +50,7 @@ class BadInputError(ValueError):
         *,
         choices: Collection[object] = (),
         place: str = "",
+        at_least: float | None = None,
     ) -> None:
         """Store the parts of the message, which shows a shortened `value`.
 
@@ -60,12 +61,14 @@ class BadInputError(ValueError):
             choices: the allowed values, of which the message suggests the most similar one; empty:
                 no suggestion.
             place: file and line of the value; empty: unknown, or not from a file.
+            at_least: lowest allowed value; None: there is none, or it is only in `allowed`.
         """
         self.field = field
         self.value = value
         self.allowed = allowed
         self.choices = choices
         self.place = place
+        self.at_least = at_least
         super().__init__(field, value, allowed)
 
     @property
@@ -119,6 +122,7 @@ class BadInputError(ValueError):
             self.allowed,
             choices=self.choices if choices is None else choices,
             place=self.place if place is None else place,
+            at_least=self.at_least,
         )
 
 
@@ -132,7 +136,12 @@ class SeveralBadInputsError(BadInputError):
         """Store the errors, at least one."""
         first = problems[0]
         super().__init__(
-            first.field, first.value, first.allowed, choices=first.choices, place=first.place
+            first.field,
+            first.value,
+            first.allowed,
+            choices=first.choices,
+            place=first.place,
+            at_least=first.at_least,
         )
         self._problems = tuple(problems)
 

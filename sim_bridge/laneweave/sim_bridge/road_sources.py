@@ -11,10 +11,10 @@ from attrs import field, frozen
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
-from laneweave.sim_bridge.corridors.corridor_setup import CorridorSetup, SumoCorridor
+from laneweave.sim_bridge.corridors.corridor_setup import CorridorSetup, setup_of
 from laneweave.sim_bridge.corridors.corridor_world import CorridorWorld
-from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
+from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
+from laneweave.sim_bridge.corridors.sumo_simulation import TimeWindow
 from laneweave.sim_bridge.corridors.take_over import TakeOver
 from laneweave.sim_bridge.road.demand import Arrival, arrivals
 from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, OutsideTraffic
@@ -53,7 +53,7 @@ def demand_of(scenario: Scenario) -> RunDemand:
     """
     if not scenario.sumo.config:
         return RunDemand(scenario, arrivals(scenario))
-    setup = sumo_corridor(scenario).setup(scenario)
+    setup = corridor_setup(scenario)
     return RunDemand(scenario, tuple(one.arrival for one in setup.arrivals), setup)
 
 
@@ -88,16 +88,17 @@ def open_road(demand: RunDemand, results: Path) -> Iterator[RoadSource]:
             if scenario.sumo.gui:
                 world_of_sumo.show(scenario.runtime.tick_s)
             ramps = TakeOver(scenario, world_of_sumo)
-            stream = tuple(one.arrival for one in setup.arrivals if one.departs_at_start)
-            yield RoadSource(world_of_sumo, stream, ramps, setup.found.demand.missing)
+            stream = tuple(one.arrival for one in setup.arrivals if one.origin.departs_at_start)
+            yield RoadSource(world_of_sumo, stream, ramps, setup.found.missing)
             world_of_sumo.drive_on()
 
 
-def sumo_corridor(scenario: Scenario) -> SumoCorridor:
+def corridor_setup(scenario: Scenario) -> CorridorSetup:
     """Return the corridor of a scenario, whose road must be that of the corridor.
 
     Raises:
-        BadInputError: the simulation cannot be read, or has another road.
+        BadInputError: the simulation cannot be read, has another road, or needs entrances, exits or
+            types of vehicles that the scenario lacks.
     """
     sumo = scenario.sumo
     window = TimeWindow(
@@ -113,4 +114,4 @@ def sumo_corridor(scenario: Scenario) -> SumoCorridor:
         if abs(value - expected) > TOLERANCE_M:
             allowed = f"{expected:g}, as the corridor {sumo.corridor} has"
             raise BadInputError(name, value, allowed)
-    return found
+    return setup_of(found, scenario)

@@ -14,10 +14,9 @@ from rich.table import Table
 from laneweave.protocol.errors import BadInputError
 
 if TYPE_CHECKING:
-    from laneweave.sim_bridge.corridors.corridor import Corridor
     from laneweave.sim_bridge.corridors.corridor_search import Candidate
-    from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor
-    from laneweave.sim_bridge.corridors.sumo_demand import TimeWindow
+    from laneweave.sim_bridge.corridors.sumo_corridor import SumoCorridor
+    from laneweave.sim_bridge.corridors.sumo_simulation import TimeWindow
 
 MAX_BEGIN_S = 1e9
 MAX_SCALE = 1e3
@@ -51,7 +50,7 @@ def corridor(
     """List what can be a corridor in a SUMO simulation, or describe one."""
     if toml and name is None:
         raise BadInputError("--corridor", "none", "FIRST_EDGE:LAST_EDGE with --toml")
-    from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
+    from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
 
     window = time_window(begin, end, scale)
     if name is None:
@@ -63,7 +62,7 @@ def corridor(
 
         typer.echo(tomli_w.dumps(corridor_tables(found, sumocfg, window)), nl=False)
         return
-    _describe(found, sumocfg)
+    _describe(found, sumocfg, window)
 
 
 def time_window(
@@ -74,7 +73,7 @@ def time_window(
     Raises:
         BadInputError: it is empty, or a number is negative.
     """
-    from laneweave.sim_bridge.corridors.sumo_demand import MAX_DEMAND_S, TimeWindow
+    from laneweave.sim_bridge.corridors.sumo_simulation import MAX_DEMAND_S, TimeWindow
 
     if begin_s is not None and not 0.0 <= begin_s <= MAX_BEGIN_S:
         raise BadInputError("--begin", begin_s, f"0 to {MAX_BEGIN_S:g}")
@@ -98,29 +97,22 @@ def corridor_tables(found: SumoCorridor, sumocfg: Path, window: TimeWindow) -> d
     """
     from laneweave.sim_bridge.corridors.scenario_tables import checked_tables
 
-    sumo = _sumo_table(sumocfg, found.corridor)
-    if window.begin_s is not None:
-        sumo["begin_s"] = window.begin_s
-    if window.scale is not None:
-        sumo["scale"] = window.scale
-    return checked_tables(found.corridor, found.demand, sumo)
-
-
-def _sumo_table(sumocfg: Path, corridor: Corridor) -> dict[str, Any]:
-    return {"config": str(sumocfg.resolve()), "corridor": corridor.name}
+    sumo = {"config": str(sumocfg.resolve()), "corridor": found.corridor.name}
+    options = {"begin_s": window.begin_s, "scale": window.scale}
+    given = {name: value for name, value in options.items() if value is not None}
+    return checked_tables(found, sumo | given)
 
 
 def _list(sumocfg: Path, window: TimeWindow) -> None:
-    from laneweave.sim_bridge.corridors.corridor_reading import read_simulation
     from laneweave.sim_bridge.corridors.corridor_search import (
         MIN_LANES,
         MIN_LENGTH_M,
         MIN_SPEED_MPS,
         find_corridors,
     )
+    from laneweave.sim_bridge.corridors.sumo_simulation import read_simulation
 
-    simulation = read_simulation(sumocfg, window)
-    found = find_corridors(simulation.network, simulation.demand)
+    found = find_corridors(read_simulation(sumocfg, window))
     if not found:
         raise BadInputError(
             "SUMOCFG",
@@ -139,15 +131,15 @@ def _list(sumocfg: Path, window: TimeWindow) -> None:
     console = Console()
     console.print(table)
     for one in found:
-        remark = _remark(one, sumocfg)
+        remark = _remark(one, sumocfg, window)
         if remark:
             console.print(f"{escape(one.name)}: {escape(remark)}", soft_wrap=True)
 
 
 def _numbers(one: Candidate) -> tuple[str, ...]:
-    corridor = one.corridor
-    if corridor is None:
+    if one.found is None:
         return ("",) * 7
+    corridor = one.found.corridor
     return (
         f"{len(corridor.edges)}",
         f"{corridor.lanes}",
@@ -159,25 +151,23 @@ def _numbers(one: Candidate) -> tuple[str, ...]:
     )
 
 
-def _remark(one: Candidate, sumocfg: Path) -> str:
+def _remark(one: Candidate, sumocfg: Path, window: TimeWindow) -> str:
     """Return why laneweave cannot drive a corridor, or what it does not use."""
-    corridor, demand = one.corridor, one.demand
-    if corridor is None or demand is None:
+    if one.found is None:
         return one.problem
-    from laneweave.sim_bridge.corridors.scenario_tables import checked_tables
-
     try:
-        checked_tables(corridor, demand, _sumo_table(sumocfg, corridor))
+        corridor_tables(one.found, sumocfg, window)
     except BadInputError as error:
         return str(error)
-    return f"{len(corridor.unused)} ways not used" if corridor.unused else ""
+    unused = len(one.found.corridor.unused)
+    return f"{unused} ways not used" if unused else ""
 
 
-def _describe(found: SumoCorridor, sumocfg: Path) -> None:
+def _describe(found: SumoCorridor, sumocfg: Path, window: TimeWindow) -> None:
     """Print what a corridor consists of."""
-    from laneweave.sim_bridge.corridors.scenario_tables import checked_tables, remarks
+    from laneweave.sim_bridge.corridors.scenario_tables import remarks
 
-    corridor, demand = found.corridor, found.demand
+    corridor, simulation = found.corridor, found.simulation
     console = Console(soft_wrap=True)
     table = Table(
         title=f"corridor {escape(corridor.name)}: {corridor.lanes} lanes, {corridor.length_m:.0f} m"
@@ -185,7 +175,7 @@ def _describe(found: SumoCorridor, sumocfg: Path) -> None:
     for column in ("edge", "from m", "to m", "lanes"):
         table.add_column(column, justify="left" if column == "edge" else "right")
     for edge in corridor.edges:
-        lanes = f"{edge.first_lane} to {edge.first_lane + edge.lanes - 1}"
+        lanes = f"{edge.lanes[0]} to {edge.lanes[-1]}"
         table.add_row(escape(edge.name), f"{edge.from_m:.0f}", f"{edge.to_m:.0f}", lanes)
     console.print(table)
     for ramp in corridor.ramps:
@@ -196,14 +186,13 @@ def _describe(found: SumoCorridor, sumocfg: Path) -> None:
         lanes = ", ".join(map(str, exit_.lanes))
         console.print(f"exit to {escape(exit_.edge)} from lane {lanes} at {exit_.at_m:.0f} m")
     try:
-        tables = checked_tables(corridor, demand, _sumo_table(sumocfg, corridor))
-        lines = remarks(corridor, demand, tables)
+        lines = remarks(found, corridor_tables(found, sumocfg, window))
     except BadInputError as error:
         lines = [f"laneweave cannot drive it: {error}"]
     for line in (*lines, *(f"not used: {remark}" for remark in corridor.unused)):
         console.print(escape(line))
-    console.print(f"{len(demand.passes)} vehicles in {demand.duration_s:.0f} s drive through it")
-    for reason, count in sorted(demand.missing.items()):
+    console.print(f"{len(found.passes)} vehicles in {simulation.duration_s:.0f} s drive through it")
+    for reason, count in sorted(found.missing.items()):
         console.print(f"left out: {count} vehicles that {escape(reason)}")
-    if found.simulation.demand.persons:
-        console.print(f"left out: {found.simulation.demand.persons} persons and containers")
+    if simulation.persons:
+        console.print(f"left out: {simulation.persons} persons and containers")

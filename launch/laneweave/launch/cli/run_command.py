@@ -305,13 +305,13 @@ def corridor_scenario(
         allowed = "none with --sumocfg: table sumo of the file names the simulation"
         raise BadInputError("SCENARIO.toml", str(scenario), allowed)
     from laneweave.launch.cli.corridor_command import corridor_tables, time_window
-    from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
     from laneweave.sim_bridge.corridors.scenario_tables import remarks
+    from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
 
     departures = time_window(**window, duration_s=duration_s)
     own_seed = Scenario().seed if seed is None else seed
     found = read_corridor(sumocfg, corridor, departures, own_seed)
     tables = corridor_tables(found, sumocfg, departures)
-    for remark in remarks(found.corridor, found.demand, tables):
+    for remark in remarks(found, tables):
         typer.echo(remark, err=True)
     return tables

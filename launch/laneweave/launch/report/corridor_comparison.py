@@ -18,13 +18,12 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.summary import HARD_BRAKE_MPS2, read_summary
 from laneweave.sim_bridge.corridors.corridor_setup import CorridorArrival
-from laneweave.sim_bridge.corridors.sumo_alone import drive_alone
 from laneweave.sim_bridge.corridors.sumo_statistics import (
     CONFLICT_S,
     SumoStatistics,
     read_statistics,
 )
-from laneweave.sim_bridge.road_sources import sumo_corridor
+from laneweave.sim_bridge.road_sources import corridor_setup
 
 ALONE_FOLDER = "sumo-alone"
 PAGE_FILE = "comparison.html"
@@ -60,8 +59,8 @@ def compare(
     alone = folder / ALONE_FOLDER
     alone.mkdir(exist_ok=True)
     with temporary_folder("sumo") as temporary:
-        setup = sumo_corridor(scenario).setup(scenario)
-        drive_alone(setup, temporary, alone, progress)
+        setup = corridor_setup(scenario)
+        setup.drive_alone(temporary, alone, progress)
     found = read_statistics(folder), read_statistics(alone)
     routes = _by_route(setup.arrivals, found)
     tables = [_times_table(routes), _events_table(found), _shortfalls_table(folder, routes)]

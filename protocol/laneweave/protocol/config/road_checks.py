@@ -222,8 +222,9 @@ def check_exits(scenario: Scenario) -> None:
                 section.exit != exit_.name or exit_.at_m >= needed_m,
                 f"{name}.at_m",
                 exit_.at_m,
-                f"at least {needed_m:g}: {first}, in lane {section.lane}, and "
+                f"{first}, in lane {section.lane}, and "
                 f"{drive_out(scenario).room_m:g} m for completing a change after stopping",
+                needed_m,
             )
 
 
@@ -249,8 +250,9 @@ def check_dead_ends(scenario: Scenario) -> None:
             end.line_m >= first_m,
             name,
             end.end_m,
-            f"at least {first_m + needed.room_m:g}: {first}, and "
-            f"{needed.room_m:g} m for driving on after stopping at the end of the lane",
+            f"{first}, and {needed.room_m:g} m for driving on "
+            "after stopping at the end of the lane",
+            first_m + needed.room_m,
         )
         require(
             lane_beside(scenario, end) is not None,

@@ -12,17 +12,25 @@ Comparison = tuple[str, str, float, str]
 """(field, relation, limit, description of the limit)."""
 
 
-def require(ok: bool, name: str, value: object, allowed: str) -> None:
-    """Raise an error unless a condition holds."""
+def require(
+    ok: bool, name: str, value: object, allowed: str, at_least: float | None = None
+) -> None:
+    """Raise an error unless a condition holds; `at_least` is named before what it is for."""
     if not ok:
-        raise BadInputError(name, value, allowed)
+        limit = "" if at_least is None else f"at least {at_least:g}: "
+        raise BadInputError(name, value, limit + allowed, at_least=at_least)
 
 
 def compare(tables: object, comparisons: Iterable[Comparison]) -> None:
     """Check each field against its limit."""
     values = [(one, attrgetter(one[0])(tables)) for one in comparisons]
     raise_all(
-        BadInputError(name, value, f"{relation} {limit:g}: {meaning}")
+        BadInputError(
+            name,
+            value,
+            f"{relation} {limit:g}: {meaning}",
+            at_least=limit if relation == "at least" else None,
+        )
         for (name, relation, limit, meaning), value in values
         if not _RELATIONS[relation](value, limit)
     )

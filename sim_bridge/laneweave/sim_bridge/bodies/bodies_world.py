@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from laneweave.protocol.vehicle.motion import State
@@ -10,7 +11,7 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_
 
 
 class BodiesWorld:
-    """Bodies of vehicles without SUMO; implements `World`.
+    """Bodies of vehicles without SUMO; implements `World`, and is the base of worlds with SUMO.
 
     A process may have any number of such worlds, but only one with SUMO.
     """
@@ -24,28 +25,30 @@ class BodiesWorld:
         """Add a vehicle to the road; its type does not matter here.
 
         Raises:
-            ValueError: the vehicle is on the road already.
+            ValueError: the vehicle is already on the road, or its state is not finite.
         """
         del vehicle_type
         if vehicle in self.states:
-            raise ValueError(f"{vehicle} is on the road already")
+            raise ValueError(f"{vehicle} is already on the road")
+        self._check(vehicle, state)
         self.states[vehicle] = state
 
     def place(self, vehicle: str, state: State) -> None:
-        """Set the state of a vehicle.
+        """Set the state of a vehicle at the end of the next step.
 
         Raises:
-            ValueError: the vehicle is not on the road.
+            ValueError: the vehicle is not on the road, or its state is not finite.
         """
         if vehicle not in self.states:
             raise ValueError(f"{vehicle} is not on the road")
+        self._check(vehicle, state)
         self.states[vehicle] = state
 
     def step(self) -> None:
         """Do nothing: only the bridge moves bodies."""
 
     def positions(self) -> dict[str, Pose]:
-        """Return the pose of each vehicle."""
+        """Return the pose of each vehicle, in the order of `add` calls."""
         return {vehicle: pose_of(state) for vehicle, state in self.states.items()}
 
     def collisions(self) -> list[tuple[str, str]]:
@@ -64,3 +67,8 @@ class BodiesWorld:
         """
         if self.states.pop(vehicle, None) is None:
             raise ValueError(f"{vehicle} is not on the road")
+
+    def _check(self, vehicle: str, state: State) -> None:
+        """Reject a state that cannot be displayed."""
+        if not math.isfinite(sum(state)):
+            raise ValueError(f"{vehicle} must have a finite state, not {state}")

@@ -16,7 +16,7 @@ from functools import cached_property
 from itertools import pairwise
 from statistics import median
 
-from attrs import field, frozen
+from attrs import evolve, field, frozen
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
@@ -48,13 +48,30 @@ OPTION = "--corridor"
 class CorridorEdge:
     """An edge of a corridor."""
 
-    name: str
+    edge: Edge
     from_m: float
     """Where it begins along the corridor."""
-    to_m: float
     first_lane: int
     """Corridor lane of its lane 0."""
-    lanes: int
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.edge.name
+
+    @property
+    def to_m(self) -> float:
+        """Where it ends along the corridor."""
+        return self.from_m + self.edge.length_m
+
+    @property
+    def lanes(self) -> range:
+        """The corridor lanes of its lanes."""
+        return range(self.first_lane, self.first_lane + len(self.edge.lanes))
+
+    def lane(self, number: int) -> Lane:
+        """Return the lane that is part of a corridor lane."""
+        return self.edge.lanes[number - self.first_lane]
 
 
 @frozen
@@ -96,6 +113,7 @@ class WayOut:
 class Corridor:
     """A road of lanes that are open from here to there, derived from consecutive edges."""
 
+    network: Network = field(repr=False)
     edges: tuple[CorridorEdge, ...]
     lanes: int
     length_m: float
@@ -106,8 +124,6 @@ class Corridor:
     closures: tuple[Closure, ...]
     ramps: tuple[Ramp, ...] = ()
     ways_out: tuple[WayOut, ...] = ()
-    parts: tuple[tuple[int, float, float, Lane], ...] = field(default=(), repr=False)
-    """(lane, from, to [m], SUMO's lane) of the lanes that it consists of."""
     unused: tuple[str, ...] = ()
     """Ways into the corridor and out of it that vehicles cannot use, in words."""
 
@@ -116,15 +132,19 @@ class Corridor:
         """Its first and its last edge, as in `--corridor`."""
         return f"{self.edges[0].name}:{self.edges[-1].name}"
 
+    def parts(self) -> Iterator[tuple[int, float, float, Lane]]:
+        """Yield (lane, from, to [m], SUMO's lane), each with the junction behind it."""
+        ends_m = [*(edge.from_m for edge in self.edges[1:]), self.edges[-1].to_m]
+        for one, end_m in zip(self.edges, ends_m, strict=True):
+            for lane in one.edge.car_lanes:
+                yield one.first_lane + lane.index, one.from_m, end_m, lane
+
     def lane_name(self, lane: int, at_m: float) -> str:
         """Return SUMO's name of the lane at a position, or before it."""
-        edges = [
-            edge
-            for edge in self.edges
-            if edge.from_m < at_m + HANDOVER_M
-            and edge.first_lane <= lane < edge.first_lane + edge.lanes
-        ]
-        edge = edges[-1] if edges else self.edges[0]
+        edge = self.edges[0]
+        for one in self.edges:
+            if one.from_m < at_m + HANDOVER_M and lane in one.lanes:
+                edge = one
         return f"{edge.name}_{lane - edge.first_lane}"
 
     def opens_m(self, lanes: Collection[int], before_m: float) -> float:
@@ -251,12 +271,20 @@ def _check_right_of_way(network: Network, before: Edge, after: Edge) -> None:
 
 @frozen
 class _OpenPart:
-    """A part of a corridor lane that is open without interruption, on some of the edges."""
+    """A part of a corridor lane that is open without interruption."""
 
     lane: int
-    first: int
-    last: int
-    """Numbers of its first and its last edge."""
+    edges: tuple[CorridorEdge, ...]
+
+    @property
+    def from_m(self) -> float:
+        """Where it begins."""
+        return self.edges[0].from_m
+
+    @property
+    def to_m(self) -> float:
+        """Where it ends."""
+        return self.edges[-1].to_m
 
 
 class _Derivation:
@@ -265,87 +293,62 @@ class _Derivation:
     def __init__(self, network: Network, way: tuple[Edge, ...], departing: Collection[str]) -> None:
         self._network = network
         self._departing = departing
-        self._way = way
         self._names = {edge.name for edge in way}
         self._limit_mps = min(lane.speed_mps for edge in way for lane in edge.car_lanes)
         self._links = [through_links(network, *pair) for pair in pairwise(way)]
-        first_lanes, at_m = [0], 0.0
-        places_m = []
-        for edge, links in zip(way, [*self._links, ()], strict=True):
-            places_m.append((at_m, at_m + edge.length_m))
-            if links:
-                first_lanes.append(first_lanes[-1] - _shift(links[0]))
-                at_m = places_m[-1][1] + median(link.length_m for link in links)
-        lowest = min(
-            first + lane.index
-            for first, edge in zip(first_lanes, way, strict=True)
-            for lane in edge.car_lanes
-        )
-        self._edges = tuple(
-            CorridorEdge(edge.name, from_m, to_m, first - lowest, len(edge.lanes))
-            for edge, first, (from_m, to_m) in zip(way, first_lanes, places_m, strict=True)
-        )
+        edges = [CorridorEdge(way[0], 0.0, 0)]
+        for edge, links in zip(way[1:], self._links, strict=True):
+            at_m = edges[-1].to_m + median(link.length_m for link in links)
+            edges.append(CorridorEdge(edge, at_m, edges[-1].first_lane - _shift(links[0])))
+        lowest = min(one.first_lane + lane.index for one in edges for lane in one.edge.car_lanes)
+        self._edges = tuple(evolve(one, first_lane=one.first_lane - lowest) for one in edges)
         self._unused: list[str] = []
         self._taken = [MAIN_ENTRANCE, END_OF_ROAD]
 
     def corridor(self) -> Corridor:
         """Return the corridor."""
-        parts = sorted(self._parts(), key=lambda part: (part.lane, part.first))
+        parts = sorted(self._parts(), key=lambda part: (part.lane, part.from_m))
         lanes = 1 + max(part.lane for part in parts)
         if lanes > MAX_LANES:
             raise BadInputError(OPTION, f"{lanes} lanes", f"at most {MAX_LANES} lanes")
-        ends_m = [(part.lane, self._edges[part.last].to_m) for part in parts]
-        ramps = tuple(
-            ramp
-            for number, part in enumerate(parts)
-            if (ramp := self._ramp(part, ends_m[:number])) is not None
-        )
+        found = (self._ramp(part, parts[:number]) for number, part in enumerate(parts))
+        ramps = tuple(ramp for ramp in found if ramp is not None)
+        first, last = self._edges[0].edge, self._edges[-1].edge
         for edge, count in Counter(ramp.edge for ramp in ramps).items():
             if count > 1:
-                allowed = (
-                    f"on-ramps of one lane, but {count} lanes of {edge} lead into the corridor"
-                )
-                name = f"{self._way[0].name}:{self._way[-1].name}"
-                raise BadInputError(OPTION, name, allowed)
+                allowed = f"on-ramps of one lane, but {count} lanes of {edge} lead into the"
+                raise BadInputError(OPTION, f"{first.name}:{last.name}", f"{allowed} corridor")
         ways_out = tuple(self._ways_out(parts))
+        links = [link for lane in last.car_lanes for link in self._network.links_from(lane)]
         return Corridor(
+            network=self._network,
             edges=self._edges,
             lanes=lanes,
-            length_m=self._given_back_m(
-                len(self._way) - 1,
-                [
-                    link
-                    for lane in self._way[-1].car_lanes
-                    for link in self._network.links_from(lane)
-                ],
-            ),
-            lane_width_m=min(lane.width_m for edge in self._way for lane in edge.car_lanes),
+            length_m=self._given_back_m(self._edges[-1], links),
+            lane_width_m=min(lane.width_m for one in self._edges for lane in one.edge.car_lanes),
             speed_mps=self._limit_mps,
             closures=tuple(self._closures(parts, lanes, ramps, ways_out)),
             ramps=ramps,
             ways_out=ways_out,
-            parts=tuple(self._lane_parts()),
             unused=tuple(self._unused),
         )
 
-    def _given_back_m(self, number: int, links: Sequence[Link]) -> float:
+    def _given_back_m(self, edge: CorridorEdge, links: Sequence[Link]) -> float:
         """Return where vehicles are given back on an edge, before links that lead out of it.
 
         Raises:
             BadInputError: the edge is too short for SUMO to brake there.
         """
-        edge = self._edges[number]
         brakes_m = braking_m(SPEED_SHARE * min(self._limit_mps, MAX_SPEED_MPS))
         nearest_m = min((self._gives_way_m(link, brakes_m) for link in links), default=math.inf)
         handover_m = max(HANDOVER_M, brakes_m - nearest_m)
-        if handover_m > edge.to_m - edge.from_m:
+        length_m = edge.to_m - edge.from_m
+        if handover_m > length_m:
             allowed = (
                 f"at least {handover_m:.0f} m, since vehicles have to give way behind it and brake "
                 "there: end the corridor before"
             )
-            raise BadInputError(
-                f"{OPTION}, length of {edge.name}", round(edge.to_m - edge.from_m, 1), allowed
-            )
+            raise BadInputError(f"{OPTION}, length of {edge.name}", round(length_m, 1), allowed)
         return edge.to_m - handover_m
 
     def _gives_way_m(self, link: Link, until_m: float) -> float:
@@ -360,55 +363,41 @@ class _Derivation:
             (self._gives_way_m(one, until_m - length_m) for one in following), default=math.inf
         )
 
-    def _lane(self, number: int, lane: int) -> Lane:
-        """Return the lane of an edge that is part of a corridor lane."""
-        return self._way[number].lanes[lane - self._edges[number].first_lane]
-
-    def _lane_parts(self) -> Iterator[tuple[int, float, float, Lane]]:
-        """Yield the lanes of all edges, each with the junction behind it."""
-        ends_m = [*(edge.from_m for edge in self._edges[1:]), self._edges[-1].to_m]
-        for edge, end_m, way in zip(self._edges, ends_m, self._way, strict=True):
-            for lane in way.car_lanes:
-                yield edge.first_lane + lane.index, edge.from_m, end_m, lane
-
     def _parts(self) -> Iterator[_OpenPart]:
         """Yield the open parts of all corridor lanes."""
         continued = {link.target.name for links in self._links for link in links}
         continuing = {link.origin.name for links in self._links for link in links}
-        for number, edge in enumerate(self._way):
-            for lane in edge.car_lanes:
+        for number, first in enumerate(self._edges):
+            for lane in first.edge.car_lanes:
                 if lane.name in continued:
                     continue
-                here, last = self._edges[number].first_lane + lane.index, number
-                while self._lane(last, here).name in continuing:
+                here, last = first.first_lane + lane.index, number
+                while self._edges[last].lane(here).name in continuing:
                     last += 1
-                yield _OpenPart(here, number, last)
+                yield _OpenPart(here, self._edges[number : last + 1])
 
-    def _ramp(self, part: _OpenPart, ends_m: Sequence[tuple[int, float]]) -> Ramp | None:
+    def _ramp(self, part: _OpenPart, before: Sequence[_OpenPart]) -> Ramp | None:
         """Return the ramp at the beginning of a part; note others that merge into it."""
-        feeding = list[Link]()
-        for number in range(part.first, part.last + 1):
-            for link in self._network.links_to(self._lane(number, part.lane)):
-                if link.origin.edge in self._names or number == 0:
+        first, feeding = part.edges[0], list[Link]()
+        for one in part.edges:
+            for link in self._network.links_to(one.lane(part.lane)):
+                if link.origin.edge in self._names or one is self._edges[0]:
                     continue
-                if number == part.first and not feeding:
+                if one is first and not feeding:
                     feeding.append(link)
                 else:
                     self._unused.append(
-                        f"{link.origin.edge} merges into lane {part.lane} at "
-                        f"{self._edges[number].from_m:.0f} m without an acceleration lane"
+                        f"{link.origin.edge} merges into lane {part.lane} at {one.from_m:.0f} m "
+                        "without an acceleration lane"
                     )
         if not feeding:
             return None
-        merge_m = self._edges[part.first].from_m
         length_m, speed_mps, path = self._before(feeding[0])
-        before_m = [to_m for lane, to_m in ends_m if lane == part.lane]
-        at_m = max(
-            MIN_AT_M, merge_m - min(length_m, MAX_RAMP_M), *(m + BEHIND_EXIT_M for m in before_m)
-        )
-        edge, to_edge = feeding[0].origin.edge, self._edges[part.first].name
+        ends_m = [one.to_m + BEHIND_EXIT_M for one in before if one.lane == part.lane]
+        at_m = max(MIN_AT_M, part.from_m - min(length_m, MAX_RAMP_M), *ends_m)
+        edge = feeding[0].origin.edge
         name = self._name(edge)
-        return Ramp(name, edge, to_edge, part.lane, at_m, merge_m, speed_mps, path)
+        return Ramp(name, edge, first.name, part.lane, at_m, part.from_m, speed_mps, path)
 
     def _name(self, edge: str) -> str:
         """Return a name for an entrance or exit that no other one has."""
@@ -438,25 +427,26 @@ class _Derivation:
 
     def _ways_out(self, parts: Sequence[_OpenPart]) -> Iterator[WayOut]:
         """Yield the exits; note ways out of lanes that go on."""
-        found: dict[tuple[str, int], list[tuple[int, Link]]] = {}
+        found: dict[tuple[str, str], list[tuple[int, Link]]] = {}
         for part in parts:
-            for number in range(part.first, min(part.last + 1, len(self._way) - 1)):
-                at_m = self._edges[number].to_m
-                for link in self._network.links_from(self._lane(number, part.lane)):
-                    if link.target.edge in self._names:
+            for one in part.edges:
+                for link in self._network.links_from(one.lane(part.lane)):
+                    if link.target.edge in self._names or one is self._edges[-1]:
                         continue
-                    if number == part.last:
-                        found.setdefault((link.target.edge, number), []).append((part.lane, link))
+                    if one is part.edges[-1]:
+                        own = found.setdefault((one.name, link.target.edge), [])
+                        own.append((part.lane, link))
                         break
                     self._unused.append(
-                        f"the way to {link.target.edge} leaves lane {part.lane} at {at_m:.0f} m "
-                        "without a lane of its own"
+                        f"the way to {link.target.edge} leaves lane {part.lane} at {one.to_m:.0f} "
+                        "m without a lane of its own"
                     )
-        for (edge, number), own in sorted(found.items(), key=lambda item: item[0][1]):
-            before = self._edges[number]
-            at_m = self._given_back_m(number, [link for _, link in own])
-            own_lanes = tuple(sorted({lane for lane, _ in own}))
-            yield WayOut(self._name(edge), edge, before.name, own_lanes, at_m)
+        for one in self._edges:
+            for (before, edge), own in found.items():
+                if before == one.name:
+                    at_m = self._given_back_m(one, [link for _, link in own])
+                    lanes = tuple(sorted({lane for lane, _ in own}))
+                    yield WayOut(self._name(edge), edge, before, lanes, at_m)
 
     def _closures(
         self,
@@ -466,18 +456,15 @@ class _Derivation:
         ways_out: Sequence[WayOut],
     ) -> Iterator[Closure]:
         """Yield the closed parts of all lanes."""
-        end_m = self._edges[-1].to_m
         exits_m = {(lane, one.from_edge): one.at_m for one in ways_out for lane in one.lanes}
         at_m = {(ramp.lane, ramp.merge_m): ramp.at_m for ramp in ramps}
         for lane in range(lanes):
             closed_m = 0.0
             for part in parts:
                 if part.lane == lane:
-                    begins_m = self._edges[part.first].from_m
-                    opens_m = at_m.get((lane, begins_m), begins_m)
+                    opens_m = at_m.get((lane, part.from_m), part.from_m)
                     if opens_m > closed_m:
                         yield Closure(lane, closed_m, opens_m)
-                    last = self._edges[part.last]
-                    closed_m = exits_m.get((lane, last.name), last.to_m)
-            if closed_m < end_m:
+                    closed_m = exits_m.get((lane, part.edges[-1].name), part.to_m)
+            if closed_m < self._edges[-1].to_m:
                 yield Closure(lane, closed_m)

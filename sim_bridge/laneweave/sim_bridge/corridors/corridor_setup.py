@@ -1,4 +1,4 @@
-"""A corridor of a SUMO simulation with all that a run on it needs, and its vehicles as arrivals.
+"""The vehicles of a corridor as arrivals on the road of a scenario, and SUMO's command lines.
 
 Vehicles get the names of all vehicles of laneweave, v0001 and so on in order of departure, since
 names in SUMO may contain characters that keys of messages must not. Those that depart on the
@@ -10,7 +10,7 @@ when SUMO has driven them there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -22,27 +22,19 @@ from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.wire.messages import CAR
-from laneweave.sim_bridge.corridors.corridor import Corridor
-from laneweave.sim_bridge.corridors.sumo_config import NO_OPTIONS, SumoConfig
-from laneweave.sim_bridge.corridors.sumo_demand import (
-    AT_START,
-    LIMITS,
-    Attributes,
-    CorridorDemand,
-    Pass,
-    SumoDemand,
-    SumoType,
-    type_names,
-)
-from laneweave.sim_bridge.corridors.sumo_network import Network
+from laneweave.sim_bridge.corridors.sumo_config import NO_OPTIONS
+from laneweave.sim_bridge.corridors.sumo_corridor import Pass, SumoCorridor
+from laneweave.sim_bridge.corridors.sumo_simulation import LIMITS, Attributes, SumoType
 from laneweave.sim_bridge.corridors.sumo_statistics import output_options
-from laneweave.sim_bridge.corridors.ways_in import WayIn, ways_to_ramp, ways_to_start
 from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 FIRST_ENTRY_S = 1.0
 """Road time before which no vehicle enters, so that agents can be announced."""
 MAX_WAIT_S = 600.0
 """Time after the last departure for which vehicles on their way to a ramp are awaited."""
+_AT_START = {"departLane": "best", "departPos": "base", "departSpeed": "max"}
+"""How vehicles depart at an entrance, whatever their files say: their trips are equally long."""
 _FIRST_SIMULATION = ("device.rerouting.", "end", "scale", "begin", "step-length")
 """Options that have determined the vehicles and their routes; they do not apply once more."""
 
@@ -54,52 +46,10 @@ class CorridorArrival:
     arrival: Arrival
     """At a ramp, its time is that of the departure from its first edge."""
     origin: Pass
-    on_ramp: bool = False
+    on_ramp: bool
     """Whether it departs on the ramp itself."""
-    near: bool = False
+    near: bool
     """Whether it departs near its entrance, on an edge on which vehicles are advised."""
-
-    @property
-    def departs_at_start(self) -> bool:
-        """Whether it departs on the first edge of the corridor; others come from outside."""
-        return self.origin.entrance == MAIN_ENTRANCE and not self.origin.upstream
-
-
-@frozen
-class SumoSimulation:
-    """A simulation of the user: its network, and its vehicles."""
-
-    config: SumoConfig
-    network: Network
-    demand: SumoDemand
-
-
-@frozen(slots=False)
-class SumoCorridor:
-    """A corridor of a SUMO simulation, and the vehicles that drive through it."""
-
-    simulation: SumoSimulation
-    corridor: Corridor
-    demand: CorridorDemand
-
-    @cached_property
-    def ways_to_start(self) -> Mapping[int, Mapping[str, WayIn]]:
-        """The lanes towards the start of the road, by lane of the road and name in SUMO."""
-        return ways_to_start(self.simulation.network, self.corridor)
-
-    @cached_property
-    def ways_to_ramps(self) -> Mapping[str, Mapping[str, WayIn]]:
-        """The lanes towards each ramp, by its name and by their names in SUMO."""
-        network, ramps = self.simulation.network, self.corridor.ramps
-        return {ramp.name: ways_to_ramp(network, self.corridor, ramp) for ramp in ramps}
-
-    def setup(self, scenario: Scenario) -> CorridorSetup:
-        """Return the setup of a run.
-
-        Raises:
-            BadInputError: the scenario lacks an entrance, exit or type of vehicle.
-        """
-        return CorridorSetup(self, scenario, _arrivals(self, scenario))
 
 
 @frozen(slots=False)
@@ -109,6 +59,7 @@ class CorridorSetup:
     found: SumoCorridor
     scenario: Scenario
     arrivals: tuple[CorridorArrival, ...]
+    """In order of departure."""
 
     @cached_property
     def by_name(self) -> Mapping[str, CorridorArrival]:
@@ -118,16 +69,39 @@ class CorridorSetup:
     @property
     def end_s(self) -> float:
         """SUMO's time until which vehicles are awaited."""
-        return self.found.simulation.demand.end_s + MAX_WAIT_S
+        return self.found.simulation.end_s + MAX_WAIT_S
 
-    def command_alone(self, folder: Path, results: Path) -> Sequence[str]:
-        """Return the command line with which SUMO drives all vehicles; see `command`."""
+    def drive_alone(
+        self, folder: Path, results: Path, progress: Callable[[float], None] = lambda _: None
+    ) -> None:
+        """Let SUMO drive the same vehicles itself, and write its statistics.
+
+        Those that depart on the corridor's first edge, or on a ramp, do so at its start, in the
+        lane that suits them best, whatever their files say: otherwise their trips would not be as
+        long as with laneweave.
+
+        Args:
+            folder: folder for temporary files.
+            results: folder for SUMO's statistics.
+            progress: called with the share of the simulated time that has passed.
+
+        Raises:
+            SumoUnavailableError: libsumo cannot be loaded.
+            SumoFailedError: SUMO rejects a file.
+        """
+        # After a run of laneweave, SUMO drives on for up to this time (`CorridorWorld.drive_on`).
+        begin_s, end_s = self.found.simulation.begin_s, self.end_s + MAX_WAIT_S
         departures = {
-            name: AT_START if one.on_ramp or one.departs_at_start else NO_OPTIONS
+            name: _AT_START if one.on_ramp or one.origin.departs_at_start else NO_OPTIONS
             for name, one in self.by_name.items()
         }
-        step_s = self.found.simulation.demand.step_s
-        return self._command(step_s, folder, results, departures, NO_OPTIONS)
+        step_s = self.found.simulation.step_s
+        awaited = {*self.by_name}
+        with SumoProcess(self._command(step_s, folder, results, departures, NO_OPTIONS)) as sumo:
+            while awaited and (now_s := sumo.simulation.getTime()) < end_s:
+                sumo.step()
+                awaited.difference_update(sumo.simulation.getArrivedIDList())
+                progress((now_s - begin_s) / (end_s - begin_s))
 
     def command(self, folder: Path, results: Path | None, more: Mapping[str, str]) -> Sequence[str]:
         """Write the files of a simulation of these vehicles, and return SUMO's command line.
@@ -140,7 +114,7 @@ class CorridorSetup:
             more: further options, by name.
         """
         departures = {
-            name: None if one.departs_at_start else self._departure(one)
+            name: None if one.origin.departs_at_start else self._departure(one)
             for name, one in self.by_name.items()
         }
         return self._command(self.scenario.runtime.tick_s, folder, results, departures, more)
@@ -148,8 +122,8 @@ class CorridorSetup:
     def _departure(self, one: CorridorArrival) -> Attributes:
         """Return how a vehicle departs outside of the corridor."""
         simulation, vehicle = self.found.simulation, one.origin.vehicle
-        depart_s = simulation.demand.begin_s + one.arrival.t_s
-        departure = {**(AT_START if one.on_ramp else NO_OPTIONS), "depart": f"{depart_s:.3f}"}
+        depart_s = simulation.begin_s + one.arrival.t_s
+        departure = {**(_AT_START if one.on_ramp else NO_OPTIONS), "depart": f"{depart_s:.3f}"}
         if one.near:
             # There is no room before the entrance to brake from a higher speed.
             lanes = simulation.network.edges[vehicle.route[0]].car_lanes
@@ -166,16 +140,16 @@ class CorridorSetup:
         departures: Mapping[str, Attributes | None],
         more: Mapping[str, str],
     ) -> Sequence[str]:
-        config, demand = self.found.simulation.config, self.found.simulation.demand
-        departures = {**dict.fromkeys(self.found.demand.left_out), **departures}
-        return config.command(
+        simulation = self.found.simulation
+        departures = {**dict.fromkeys(self.found.left_out), **departures}
+        return simulation.config.command(
             self.scenario.seed,
             {
-                "begin": f"{demand.begin_s:.10g}",
+                "begin": f"{simulation.begin_s:.10g}",
                 "step-length": f"{step_s:g}",
                 "collision.action": "warn",
-                **config.additional(folder, demand=False),
-                **demand.write(folder / "vehicles.rou.xml", departures),
+                **simulation.config.additional(folder, demand=False),
+                **simulation.write(folder / "vehicles.rou.xml", departures),
                 **more,
                 **output_options(results, folder, self.found.corridor.edge_numbers),
             },
@@ -183,30 +157,35 @@ class CorridorSetup:
         )
 
 
-def _arrivals(found: SumoCorridor, scenario: Scenario) -> tuple[CorridorArrival, ...]:
-    """Return the vehicles of a corridor in order of departure.
+def setup_of(found: SumoCorridor, scenario: Scenario) -> CorridorSetup:
+    """Return the setup of a run.
 
     Raises:
         BadInputError: the scenario lacks an entrance, exit or type of vehicle.
     """
-    types = _types_in(scenario, type_names(found.demand.passes))
+    return CorridorSetup(found, scenario, tuple(_arrivals(found, scenario)))
+
+
+def _arrivals(found: SumoCorridor, scenario: Scenario) -> Iterator[CorridorArrival]:
+    """Yield the vehicles of a corridor in order of departure."""
+    types = _types_in(scenario, found.type_names())
     lanes = {entrance.name: entrance.lane for entrance in scenario.entrance}
-    corridor, begin_s = found.corridor, found.simulation.demand.begin_s
+    corridor, begin_s = found.corridor, found.simulation.begin_s
     on_ramp = {ramp.name: {link.origin.edge for link in ramp.path} for ramp in corridor.ramps}
-    ways = (*found.ways_to_start.values(), *found.ways_to_ramps.values())
-    near = {lane.rpartition("_")[0] for way in ways for lane in way} - corridor.edge_numbers.keys()
+    near = {lane.rpartition("_")[0] for way in found.ways_in for lane in way.lanes}
+    near -= corridor.edge_numbers.keys()
     choose = _LaneChoice(scenario)
-    arrivals = []
-    for number, one in enumerate(found.demand.passes, start=1):
-        t_s = one.vehicle.depart_s - begin_s
+    for number, one in enumerate(found.passes, start=1):
+        vehicle, vehicle_type = one.vehicle, types[one.vehicle.vehicle_type]
+        t_s = vehicle.depart_s - begin_s
         if one.upstream:
             lane = scenario.road.first_lanes[0]  # which one it is depends on SUMO
         elif one.entrance == MAIN_ENTRANCE:
-            lane = choose.lane(t_s, one.destination, types[one.vehicle.vehicle_type])
+            lane = choose.lane(t_s, one.destination, vehicle_type)
         elif one.entrance in lanes:
             lane = lanes[one.entrance]
         else:
-            allowed = f"an entrance {one.entrance}: {one.vehicle.name} of the simulation needs it"
+            allowed = f"an entrance {one.entrance}: {vehicle.name} of the simulation needs it"
             raise BadInputError("entrance", [*lanes], allowed)
         arrival = Arrival(
             vehicle_name(number),
@@ -214,13 +193,12 @@ def _arrivals(found: SumoCorridor, scenario: Scenario) -> tuple[CorridorArrival,
             ANY_LANE,
             max(t_s, FIRST_ENTRY_S),
             one.destination,
-            types[one.vehicle.vehicle_type],
-            one.vehicle.name,
+            vehicle_type,
+            vehicle.name,
         )
-        first = one.vehicle.route[0]
+        first = vehicle.route[0]
         departs_on_ramp = first in on_ramp.get(one.entrance, ())
-        arrivals.append(CorridorArrival(arrival, one, departs_on_ramp, near=first in near))
-    return tuple(arrivals)
+        yield CorridorArrival(arrival, one, departs_on_ramp, near=first in near)
 
 
 def _types_in(scenario: Scenario, names: Mapping[SumoType, str]) -> Mapping[SumoType, str]:
@@ -238,10 +216,10 @@ def _types_in(scenario: Scenario, names: Mapping[SumoType, str]) -> Mapping[Sumo
     }
     found = {}
     for number, (kind, given) in enumerate(names.items()):
-        name, own = given if number else CAR, kind.limits
-        equal = [one for one in limits if limits[one] == own]
+        name = given if number else CAR
+        equal = [one for one in limits if limits[one] == kind.limits]
         if not equal and name not in limits:
-            allowed = f"a type with the limits of {name} in the simulation: {own}"
+            allowed = f"a type with the limits of {name} in the simulation: {kind.limits}"
             raise BadInputError("vehicle_type", [*limits], allowed)
         found[kind] = name if name in equal or not equal else equal[0]
     return found

@@ -16,8 +16,8 @@ from itertools import accumulate, pairwise
 
 from attrs import evolve, frozen
 
-from laneweave.sim_bridge.corridors.corridor import Corridor, Ramp, through_links
-from laneweave.sim_bridge.corridors.sumo_network import Lane, Link, Network, Point
+from laneweave.sim_bridge.corridors.corridor import Corridor, through_links
+from laneweave.sim_bridge.corridors.sumo_network import Lane, Link, Point
 
 WorldPose = tuple[float, float, float]
 """(x, y [m], direction [rad], anticlockwise from east)."""
@@ -28,6 +28,8 @@ class Piece:
     """A part of a corridor lane: a lane of an edge, or the way across a junction."""
 
     from_m: float
+    begins_m: float
+    """Where it begins to belong to the corridor; before, its lane belongs to SUMO."""
     to_m: float
     points: tuple[Point, ...]
     """Its centre line."""
@@ -37,13 +39,6 @@ class Piece:
     """Name of the edge; empty: inside a junction."""
     index: int = -1
     """Number of the lane in its edge."""
-    used_from_m: float = -math.inf
-    """Where it begins to belong to the corridor; before, its lane belongs to SUMO."""
-
-    @property
-    def begins_m(self) -> float:
-        """Where it is used from."""
-        return max(self.from_m, self.used_from_m)
 
     def at(self, s_m: float, left_m: float) -> WorldPose:
         """Return the point at a position, to the left of the centre line, and the direction.
@@ -64,30 +59,19 @@ class Piece:
             direction,
         )
 
-    def position_m(self, lane_m: float, lane_length_m: float) -> float:
-        """Return the position on the road of a position on SUMO's lane."""
-        return self.from_m + lane_m / lane_length_m * (self.to_m - self.from_m)
-
 
 class CorridorShape:
     """The centre lines of all corridor lanes."""
 
-    def __init__(self, network: Network, corridor: Corridor) -> None:
+    def __init__(self, corridor: Corridor) -> None:
         """Join the shapes of the lanes of a corridor."""
-        self.side = -1.0 if network.left_hand else 1.0
+        self.side = -1.0 if corridor.network.left_hand else 1.0
         """-1: the road is mirrored, since vehicles drive on the left."""
         self._lane_m = corridor.lane_width_m
         pieces: list[list[Piece]] = [[] for _ in range(corridor.lanes)]
-        for lane, piece in (*_main(network, corridor), *_ramps(corridor)):
+        for lane, piece in (*_main(corridor), *_ramps(corridor)):
             pieces[lane].append(piece)
         self._pieces = tuple(tuple(sorted(own, key=lambda one: one.begins_m)) for own in pieces)
-        self.by_lane = {
-            f"{piece.edge}_{piece.index}": (lane, piece)
-            for lane, own in enumerate(self._pieces)
-            for piece in own
-            if piece.edge
-        }
-        """Corridor lane and piece by the name of SUMO's lane."""
 
     def piece_at(self, lane: int, s_m: float) -> Piece:
         """Return the piece of a corridor lane at a position, or the nearest one."""
@@ -113,14 +97,13 @@ class CorridorShape:
         return any(one.begins_m <= s_m <= one.to_m for one in self._pieces[lane])
 
 
-def _main(network: Network, corridor: Corridor) -> Iterator[tuple[int, Piece]]:
+def _main(corridor: Corridor) -> Iterator[tuple[int, Piece]]:
     """Yield (lane, piece) of the edges of a corridor, and of the junctions between them."""
-    ways = [network.edges[edge.name] for edge in corridor.edges]
-    for edge, way in zip(corridor.edges, ways, strict=True):
-        for lane in way.car_lanes:
-            yield edge.first_lane + lane.index, _of_lane(lane, edge.from_m, edge.to_m)
-    for (before, way), (after, next_way) in pairwise(zip(corridor.edges, ways, strict=True)):
-        for link in through_links(network, way, next_way):
+    for one in corridor.edges:
+        for lane in one.edge.car_lanes:
+            yield one.first_lane + lane.index, _of_lane(lane, one.from_m, one.to_m)
+    for before, after in pairwise(corridor.edges):
+        for link in through_links(corridor.network, before.edge, after.edge):
             if after.from_m > before.to_m:
                 number = before.first_lane + link.origin.index
                 yield number, _of_link(link, before.to_m, after.from_m)
@@ -129,20 +112,17 @@ def _main(network: Network, corridor: Corridor) -> Iterator[tuple[int, Piece]]:
 def _ramps(corridor: Corridor) -> Iterator[tuple[int, Piece]]:
     """Yield (lane, piece) of the ways on which vehicles come to their acceleration lanes."""
     for ramp in corridor.ramps:
-        for piece in ramp_pieces(ramp):
+        to_m = ramp.merge_m
+        pieces = []
+        for link in ramp.path:
+            if link.length_m > 0.0:
+                pieces.append(_of_link(link, to_m - link.length_m, to_m))
+                to_m -= link.length_m
+            pieces.append(_of_lane(link.origin, to_m - link.origin.length_m, to_m))
+            to_m -= link.origin.length_m
+        for piece in pieces:
             if piece.to_m > ramp.at_m:
-                yield ramp.lane, evolve(piece, used_from_m=ramp.at_m)
-
-
-def ramp_pieces(ramp: Ramp) -> Iterator[Piece]:
-    """Yield the pieces of the way to an acceleration lane, the last one first."""
-    to_m = ramp.merge_m
-    for link in ramp.path:
-        if link.length_m > 0.0:
-            yield _of_link(link, to_m - link.length_m, to_m)
-            to_m -= link.length_m
-        yield _of_lane(link.origin, to_m - link.origin.length_m, to_m)
-        to_m -= link.origin.length_m
+                yield ramp.lane, evolve(piece, begins_m=max(piece.from_m, ramp.at_m))
 
 
 def _of_lane(lane: Lane, from_m: float, to_m: float) -> Piece:
@@ -162,4 +142,5 @@ def _piece(
     if len(points) < 2:
         points.append((points[0][0] + 1e-3, points[0][1]))
     steps_m = (math.dist(*pair) for pair in pairwise(points))
-    return Piece(from_m, to_m, tuple(points), tuple(accumulate(steps_m, initial=0.0)), edge, index)
+    lengths_m = tuple(accumulate(steps_m, initial=0.0))
+    return Piece(from_m, from_m, to_m, tuple(points), lengths_m, edge, index)

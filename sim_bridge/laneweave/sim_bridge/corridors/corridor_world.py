@@ -12,19 +12,22 @@ What SUMO drives near the corridor is seen by the sensors of vehicles inside (`o
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from attrs import evolve, frozen
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
+from laneweave.sim_bridge.bodies.bodies_world import BodiesWorld
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, pose_of
 from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor
-from laneweave.sim_bridge.corridors.corridor_setup import MAX_WAIT_S, CorridorSetup
+from laneweave.sim_bridge.corridors.corridor_setup import MAX_WAIT_S, CorridorArrival, CorridorSetup
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
-from laneweave.sim_bridge.corridors.sumo_network import Lane, Network
+from laneweave.sim_bridge.corridors.sumo_network import Lane
 from laneweave.sim_bridge.corridors.take_over import SEEN_BEYOND_M, Approaching
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
@@ -64,7 +67,7 @@ class _Slowing:
     """The headway of its type in SUMO."""
 
 
-class CorridorWorld(SumoProcess):
+class CorridorWorld(SumoProcess, BodiesWorld):
     """The corridor's vehicles in SUMO. Close it, or use it as a context manager."""
 
     def __init__(self, setup: CorridorSetup, folder: Path, results: Path | None = None) -> None:
@@ -80,43 +83,34 @@ class CorridorWorld(SumoProcess):
             SumoFailedError: SUMO rejects a file.
         """
         super().__init__(setup.command(folder, results, _PLANTS))
-        scenario, found = setup.scenario, setup.found
-        network, corridor = found.simulation.network, found.corridor
-        self._lane_m = scenario.road.lane_width_m
-        self._shape = CorridorShape(network, corridor)
+        BodiesWorld.__init__(self)
+        scenario, found, corridor = setup.scenario, setup.found, setup.found.corridor
+        self._shape = CorridorShape(corridor)
         self._sumo_name = {one.arrival.vehicle: one.origin.vehicle.name for one in setup.arrivals}
         self._coming = dict(setup.by_name)
-        self._setup, self._network = setup, network
-        self._states: dict[str, State] = {}
-        self._shown: dict[str, State] = {}
+        self._setup, self._network = setup, corridor.network
         self._returned: set[str] = set()
         """Names in SUMO of vehicles that have been given back and have not arrived."""
         self._elsewhere: list[Arrival] = []
         """Vehicles that have arrived without coming to their entrances."""
         self._slowing: dict[str, _Slowing] = {}
         """Vehicles that slow down since a lower limit is ahead, by name."""
-        self._taken: set[str] = set()
-        """Names in SUMO of vehicles that have been taken over."""
-        upstream = any(one.origin.upstream for one in setup.arrivals)
-        to_start = found.ways_to_start if upstream else {}
-        self.start_lanes = tuple(to_start)
-        """Lanes to whose beginning vehicles come from upstream."""
         entrances = {one.name for one in scenario.entrance}
-        to_ramps = {
-            ramp.lane: found.ways_to_ramps[ramp.name]
-            for ramp in corridor.ramps
-            if ramp.name in entrances
-        }
-        both = to_ramps.keys() & to_start.keys()
-        if both:
+        if any(one.origin.upstream for one in setup.arrivals):
+            entrances.add(MAIN_ENTRANCE)
+        ways = [one for one in found.ways_in if one.entrance in entrances]
+        self.start_lanes = tuple(one.lane for one in ways if one.entrance == MAIN_ENTRANCE)
+        """Lanes to whose beginning vehicles come from upstream."""
+        self._ways_in = {one.lane: one.lanes for one in ways}
+        ramps = {one.lane for one in ways if one.entrance != MAIN_ENTRANCE}
+        if both := ramps.intersection(self.start_lanes):
             allowed = f"one whose lane {min(both)} is either open at the start or that of a ramp"
             raise BadInputError(OPTION, corridor.name, allowed)
-        self._ways_in = {**to_start, **to_ramps}
         self.departing = tuple(
-            one.arrival for one in setup.arrivals if one.near and not one.departs_at_start
+            one.arrival for one in setup.arrivals if one.near and not one.origin.departs_at_start
         )
         """Vehicles that depart near an entrance, in order of departure."""
-        self._beyond = tuple(dict.fromkeys(_beyond(network, corridor)))
+        self._beyond = tuple(dict.fromkeys(_beyond(corridor, scenario)))
         self._approaching: dict[int, list[Approaching]] = {}
         """What SUMO has been asked since its last step, by lane."""
         self._others: list[OtherBody] | None = None
@@ -137,7 +131,7 @@ class CorridorWorld(SumoProcess):
                 coming = self._coming.get(vehicle)
                 if (
                     coming is not None
-                    and vehicle not in self._taken
+                    and coming.arrival.vehicle not in self.states
                     and (coming.arrival.lane == lane or coming.origin.upstream)
                 ):
                     s_m = way.from_m + api.getLanePosition(vehicle)
@@ -159,8 +153,10 @@ class CorridorWorld(SumoProcess):
     @property
     def outside(self) -> Sequence[Arrival]:
         """The vehicles that come from elsewhere and have not been taken over."""
-        coming = (one for name, one in self._coming.items() if name not in self._taken)
-        return [*self._elsewhere, *(one.arrival for one in coming if not one.departs_at_start)]
+        return [
+            *self._elsewhere,
+            *(one.arrival for one in self._coming.values() if self._is_outside(one)),
+        ]
 
     def others(self) -> Sequence[OtherBody]:
         """Return SUMO's own vehicles behind the exits and the end of the road."""
@@ -180,40 +176,31 @@ class CorridorWorld(SumoProcess):
                     speed_mps, accel_mps2 = api.getSpeed(vehicle), api.getAcceleration(vehicle)
                     yield OtherBody(vehicle, lane, exit_m, from_m + rear_m, speed_mps, accel_mps2)
 
-    def _is_driven(self, sumo_name: str) -> bool:
-        coming = self._coming.get(sumo_name)
-        return coming is not None and coming.arrival.vehicle in self._states
+    def _is_outside(self, coming: CorridorArrival) -> bool:
+        """Return whether SUMO drives a vehicle to its entrance."""
+        return not (coming.origin.departs_at_start or coming.arrival.vehicle in self.states)
 
     # --- the interface of worlds --------------------------------------------------------------
 
-    def add(self, vehicle: str, state: State, vehicle_type: str = CAR) -> None:  # noqa: ARG002 (SUMO has its own types)
+    def add(self, vehicle: str, state: State, vehicle_type: str = CAR) -> None:
         """Take a vehicle over: one that waits is added to SUMO, another one is driven by SUMO.
 
         Raises:
-            ValueError: the vehicle is already on the road.
+            ValueError: the vehicle is already on the road, or its state is not finite.
         """
-        if vehicle in self._states:
-            raise ValueError(f"{vehicle} is already on the road")
+        super().add(vehicle, state, vehicle_type)
         name = self._sumo_name[vehicle]
         coming, api = self._coming[name], self.vehicle
-        if coming.departs_at_start:
+        if coming.origin.departs_at_start:
             origin = coming.origin.vehicle
             route = f"laneweave.{name}"
             self.route.add(route, list(origin.route))
-            api.add(
-                name,
-                route,
-                typeID=origin.type_name,
-                depart="now",
-                departPos="0",
-                departSpeed="0",
-            )
+            kind = origin.type_name
+            api.add(name, route, typeID=kind, depart="now", departPos="0", departSpeed="0")
         api.setSpeed(name, -1.0)
         api.setSpeedMode(name, 0)
         api.setLaneChangeMode(name, 0)
-        self._taken.add(name)
         self._approaching.clear()
-        self._states[vehicle] = state
         self._move(vehicle, state)
 
     def place(self, vehicle: str, state: State) -> None:
@@ -222,11 +209,7 @@ class CorridorWorld(SumoProcess):
         Raises:
             ValueError: the vehicle is not on the road, or its state is not finite.
         """
-        if vehicle not in self._states:
-            raise ValueError(f"{vehicle} is not on the road")
-        if not math.isfinite(sum(state)):
-            raise ValueError(f"{vehicle} must have a finite state, not {state}")
-        self._states[vehicle] = state
+        super().place(vehicle, state)
         self._move(vehicle, state)
 
     def step(self) -> None:
@@ -240,10 +223,11 @@ class CorridorWorld(SumoProcess):
         self._approaching.clear()
         self._others = None
         for name in self.simulation.getArrivedIDList():
-            if name not in self._taken and self._is_ramp_vehicle(name):
+            coming = self._coming.get(name)
+            if coming is not None and self._is_outside(coming):
                 self._elsewhere.append(self._coming.pop(name).arrival)
         on_road = set(api.getIDList())
-        for vehicle, state in self._states.items():
+        for vehicle, state in self.states.items():
             name = self._sumo_name[vehicle]
             if name not in on_road:
                 raise RuntimeError(f"SUMO has lost {name} ({vehicle}) at s = {state[0]:.1f} m")
@@ -252,19 +236,11 @@ class CorridorWorld(SumoProcess):
             if error_m > MAX_DISPLAY_ERROR_M:
                 raise RuntimeError(f"SUMO displays {name} ({vehicle}) {error_m:.2f} m away")
             api.setPreviousSpeed(name, max(state[1], 0.0), state[2])
-        self._shown = dict(self._states)
-
-    def _is_ramp_vehicle(self, name: str) -> bool:
-        coming = self._coming.get(name)
-        return coming is not None and not coming.departs_at_start
-
-    def positions(self) -> dict[str, Pose]:
-        """Return the pose of each vehicle after the last step, in the order of `add` calls."""
-        return {vehicle: pose_of(state) for vehicle, state in self._shown.items()}
 
     def collisions(self) -> list[tuple[str, str]]:
         """Return the sorted pairs that SUMO reports, with a vehicle of the corridor in each."""
-        return [pair for pair in super().collisions() if any(map(self._is_driven, pair))]
+        driven = {self._sumo_name[vehicle] for vehicle in self.states}
+        return [pair for pair in super().collisions() if not driven.isdisjoint(pair)]
 
     def remove(self, vehicle: str) -> None:
         """Give a vehicle back to SUMO, with its speed.
@@ -272,10 +248,8 @@ class CorridorWorld(SumoProcess):
         Raises:
             ValueError: the vehicle is not on the road.
         """
-        state = self._states.pop(vehicle, None)
-        if state is None:
-            raise ValueError(f"{vehicle} is not on the road")
-        self._shown.pop(vehicle, None)
+        speed_mps = self.states.get(vehicle, (0.0, 0.0))[1]
+        super().remove(vehicle)
         name, api = self._sumo_name[vehicle], self.vehicle
         api.setSpeedMode(name, _OWN_SPEED_MODE)
         api.setLaneChangeMode(name, _OWN_LANE_CHANGES)
@@ -285,10 +259,9 @@ class CorridorWorld(SumoProcess):
         self._others = None
         self._correct_route(name)
         limit_mps = self._next_limit_mps(name)
-        if state[1] > limit_mps:
-            tau_s = api.getTau(name)
-            now_s = self.simulation.getTime()
-            self._slowing[name] = _Slowing(now_s, state[1], limit_mps, tau_s)
+        if speed_mps > limit_mps:
+            now_s, tau_s = self.simulation.getTime(), api.getTau(name)
+            self._slowing[name] = _Slowing(now_s, speed_mps, limit_mps, tau_s)
             api.setSpeedMode(name, _SLOWING_MODE)
             api.setTau(name, min(tau_s, SLOWING_TAU_S))
 
@@ -339,7 +312,7 @@ class CorridorWorld(SumoProcess):
 
     def drive_on(self) -> None:
         """Let SUMO drive on until the vehicles that it got back have arrived (statistics)."""
-        if self._states or not self.exhausted:
+        if self.states or not self.exhausted:
             return  # the run has been interrupted, or vehicles stand inside
         end_s = self.simulation.getTime() + MAX_WAIT_S
         while self._returned and self.simulation.getTime() < end_s:
@@ -354,45 +327,44 @@ class CorridorWorld(SumoProcess):
         self.vehicle.moveToXY(name, piece.edge, piece.index, x, y, degrees, 2)
 
 
-def _beyond(network: Network, corridor: Corridor) -> Iterator[tuple[str, tuple[int, float, float]]]:
+def _beyond(
+    corridor: Corridor, scenario: Scenario
+) -> Iterator[tuple[str, tuple[int, float, float]]]:
     """Yield SUMO's lanes before and behind the exits: (name, (lane, exit, beginning of the lane)).
 
-    Positions are distances [m] from the start of the road, along the lane of the corridor.
+    Positions are distances [m] from the start of the road, along the lane of the corridor. Those of
+    exits are the scenario's, which are rounded.
     """
-    last = corridor.edges[-1]
-    ends = [(one.from_edge, one.lanes, one.at_m) for one in corridor.ways_out]
-    every = tuple(range(last.first_lane, last.first_lane + last.lanes))
-    ends.append((last.name, every, corridor.length_m))
-    edges = {edge.name: edge for edge in corridor.edges}
-    for name, lanes, exit_m in ends:
-        end_m, first = edges[name].to_m, edges[name].first_lane
-        for lane in network.edges[name].car_lanes:
-            number = first + lane.index
-            if number in lanes:
-                yield lane.name, (number, exit_m, end_m - lane.length_m)
-                until_m, inside = exit_m + SEEN_BEYOND_M, corridor.edge_numbers
-                for ahead, from_m in _ahead(network, lane, end_m, until_m, inside):
+    last, at_m = corridor.edges[-1], {one.name: one.at_m for one in scenario.exit}
+    exits = {
+        (one.from_edge, lane): at_m.get(one.name, one.at_m)
+        for one in corridor.ways_out
+        for lane in one.lanes
+    }
+    exits |= {(last.name, lane): corridor.length_m for lane in last.lanes}
+    for one in corridor.edges:
+        for lane in one.edge.car_lanes:
+            number = one.first_lane + lane.index
+            exit_m = exits.get((one.name, number))
+            if exit_m is not None:
+                yield lane.name, (number, exit_m, one.to_m - lane.length_m)
+                for ahead, from_m in _ahead(corridor, lane, one.to_m, exit_m + SEEN_BEYOND_M):
                     yield ahead, (number, exit_m, from_m)
 
 
 def _ahead(
-    network: Network, lane: Lane, end_m: float, until_m: float, inside: Collection[str]
+    corridor: Corridor, lane: Lane, end_m: float, until_m: float
 ) -> Iterator[tuple[str, float]]:
     """Yield name and beginning of the lanes behind a lane that ends at a position.
 
-    Args:
-        network: the network.
-        lane: the lane.
-        end_m: its end.
-        until_m: where lanes begin at most.
-        inside: edges of the corridor, which are left out.
+    They begin before `until_m`, and are no lanes of the corridor.
     """
-    for link in network.links_from(lane) if end_m < until_m else ():
-        if link.target.edge in inside:
+    for link in corridor.network.links_from(lane) if end_m < until_m else ():
+        if link.target.edge in corridor.edge_numbers:
             continue
         from_m = end_m
         for across in link.across:
             yield across.name, from_m
             from_m += across.length_m
         yield link.target.name, from_m
-        yield from _ahead(network, link.target, from_m + link.target.length_m, until_m, inside)
+        yield from _ahead(corridor, link.target, from_m + link.target.length_m, until_m)

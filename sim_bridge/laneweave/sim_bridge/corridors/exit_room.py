@@ -18,7 +18,6 @@ from attrs import frozen
 from laneweave.protocol.road_layout import END_OF_ROAD, LaneSection
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
-from laneweave.sim_bridge.corridors.corridor import HANDOVER_M
 from laneweave.sim_bridge.road.demand import Arrival
 
 QUEUEING_MPS = 3.0
@@ -40,27 +39,22 @@ class _Way:
     inside_m: float
     """Length of the part before the exit in which vehicles may brake, after they changed lanes."""
 
+    def queue(self, others: Iterable[OtherBody]) -> tuple[float, int]:
+        """Return the distance of the queue's tail from the exit, and how many drive towards it.
 
-@frozen
-class _Queue:
-    """A queue behind an exit."""
-
-    tail_m: float
-    """Distance of its tail from the exit; infinite: there is none."""
-    before: int
-    """Number of bodies that drive towards it behind the exit."""
+        If there is no queue, the distance is infinite.
+        """
+        own = [one for one in others if (one.lane, one.exit_m) == (self.lane, self.exit_m)]
+        standing_m = (one.rear_m for one in own if one.speed_mps < QUEUEING_MPS)
+        tail_m = min(standing_m, default=math.inf)
+        return tail_m - self.exit_m, sum(one.rear_m < tail_m for one in own)
 
 
 class ExitRoom:
     """Holds vehicles at the start back while their exits have no room for them."""
 
     def __init__(self, scenario: Scenario, seen_m: float) -> None:
-        """Read the exits of a road.
-
-        Args:
-            scenario: road, types of vehicles.
-            seen_m: distance behind an exit up to which bodies are seen.
-        """
+        """Read the exits of a road, behind which bodies are seen up to `seen_m`."""
         self._seen_m = seen_m
         self._braking_m = scenario.formation.speed_mps**2 / (2.0 * QUEUE_DECEL_MPS2)
         self._place_m = scenario.types.longest_body_m + SPACE_M
@@ -68,12 +62,12 @@ class ExitRoom:
         """Vehicles whose exits have no room."""
         self._was_held = Counter[str]()
         """Their number by exit, at the last call."""
-        self._ways: dict[str, list[_Way]] = {}
-        names = {one.name for one in scenario.exit}
+        step_m = scenario.types.step_m
+        self._ways: dict[str, list[_Way]] = {one.name: [] for one in scenario.exit}
         for section in scenario.geometry.sections:
-            if section.exit in names:
-                way = _Way(section.lane, section.to_m, _inside_m(section, scenario.types.step_m))
-                self._ways.setdefault(section.exit, []).append(way)
+            if section.exit in self._ways:
+                way = _Way(section.lane, section.to_m, _inside_m(section, step_m))
+                self._ways[section.exit].append(way)
 
     def release(
         self,
@@ -123,36 +117,25 @@ class ExitRoom:
         """
         if destination == END_OF_ROAD:
             return True
-        queues = [(way, _queue(way, others)) for way in self._ways[destination]]
-        if not waiting and all(math.isinf(queue.tail_m) for _, queue in queues):
+        queues = [(way, *way.queue(others)) for way in self._ways[destination]]
+        if not waiting and all(math.isinf(tail_m) for _, tail_m, _ in queues):
             return True
-        if not going and any(queue.tail_m >= 2.0 * self._place_m for _, queue in queues):
+        if not going and any(tail_m >= 2.0 * self._place_m for _, tail_m, _ in queues):
             # A queue that always stands somewhere may still advance.
             return True
-        return going + 1 <= sum(self._places(way, queue) for way, queue in queues)
+        return going + 1 <= sum(self._places(*queue) for queue in queues)
 
-    def _places(self, way: _Way, queue: _Queue) -> float:
-        """Return the number of vehicles on the way that fit behind a queue."""
-        if math.isinf(queue.tail_m):
+    def _places(self, way: _Way, tail_m: float, before: int) -> float:
+        """Return the number of vehicles on the way that fit behind a queue; see `_Way.queue`."""
+        if math.isinf(tail_m):
             # The queue may be back before all vehicles that have waited are at the exit.
             room_m = self._seen_m
         else:
             # They may brake in the lane of the exit, but stand behind it. One place remains free,
             # since vehicles brake earlier than they have to.
             braking_m = max(0.0, self._braking_m - way.inside_m)
-            room_m = queue.tail_m - braking_m - self._place_m
-        return max(0.0, room_m / self._place_m - queue.before)
-
-
-def _queue(way: _Way, others: Sequence[OtherBody]) -> _Queue:
-    """Return the queue behind an exit in one of its lanes."""
-    ahead_m = [
-        (other.rear_m - way.exit_m, other.speed_mps < QUEUEING_MPS)
-        for other in others
-        if other.lane == way.lane and abs(other.exit_m - way.exit_m) <= 2.0 * HANDOVER_M
-    ]
-    tail_m = min((rear_m for rear_m, stands in ahead_m if stands), default=math.inf)
-    return _Queue(tail_m, sum(rear_m < tail_m for rear_m, _ in ahead_m))
+            room_m = tail_m - braking_m - self._place_m
+        return max(0.0, room_m / self._place_m - before)
 
 
 def _inside_m(section: LaneSection, step_m: float) -> float:

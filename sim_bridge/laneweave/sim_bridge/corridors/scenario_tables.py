@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -27,12 +26,8 @@ from laneweave.sim_bridge.corridors.corridor import (
     Corridor,
     Ramp,
 )
-from laneweave.sim_bridge.corridors.sumo_demand import (
-    CorridorDemand,
-    Pass,
-    SumoType,
-    type_names,
-)
+from laneweave.sim_bridge.corridors.sumo_corridor import Pass, SumoCorridor
+from laneweave.sim_bridge.corridors.sumo_simulation import SumoType
 
 MAX_VOLUME_VEH_PER_H = 3600.0
 MIN_SETTLE_S = 1.0
@@ -48,66 +43,61 @@ _WIDE_M = 100.0
 Tables = dict[str, Any]
 
 
-def checked_tables(corridor: Corridor, demand: CorridorDemand, sumo: Tables) -> Tables:
+def checked_tables(found: SumoCorridor, sumo: Tables) -> Tables:
     """Return the tables of a scenario file, which laneweave can drive.
 
     Args:
-        corridor: the corridor.
-        demand: its vehicles.
+        found: the corridor with its vehicles.
         sumo: the table `sumo`.
 
     Raises:
         BadInputError: it cannot; the error names the ramp, exit or edge.
     """
-    tables = scenario_tables(corridor, demand) | {"sumo": sumo}
+    corridor = found.corridor
+    tables = scenario_tables(found) | {"sumo": sumo}
     try:
         parse_scenario(tables)
     except BadInputError as error:
-        field, where = f"{error.field} of its scenario", _where(error.field, tables, corridor)
+        places = _places(tables, corridor)
+        where = next((text for field, text in places if error.field.startswith(field)), "")
+        field = f"{error.field} of its scenario"
         field = f"{OPTION} {corridor.name}, " + (f"{where} ({field})" if where else field)
-        raise BadInputError(field, error.value, _enough(error)) from error
-    return tables
-
-
-def _where(field: str, tables: Tables, corridor: Corridor) -> str:
-    """Return what a field of a scenario means in the network; empty: nothing special."""
-    found = re.match(r"(?:road\.)?(entrance|exit|closures)\[(\d+)\]", field)
-    if found is None:
-        return f"{corridor.length_m:.0f} m long" if field.startswith("road.s") else ""
-    kind, number = found[1], int(found[2])
-    if kind == "exit":
-        out = corridor.ways_out[number]
-        open_m = out.at_m - max(corridor.opens_m(out.lanes, out.at_m), 0.0)
-        lanes = " and ".join(corridor.lane_name(lane, out.at_m) for lane in out.lanes)
-        return f"exit to {out.edge} from lane {lanes}, open for {open_m:.0f} m"
-    if kind == "entrance":
-        names = {ramp.name: ramp for ramp in corridor.ramps}
-        ramp = names[tables["entrance"][number]["name"]]
-        ends_m = min(corridor.ends_m(ramp.lane, ramp.merge_m), corridor.length_m)
-        lane = corridor.lane_name(ramp.lane, ramp.merge_m)
-        used_m, open_m = ramp.merge_m - ramp.at_m, ends_m - ramp.merge_m
-        return f"on-ramp from {ramp.edge} of {used_m:.0f} m into lane {lane} of {open_m:.0f} m"
-    closure = tables["road"]["closures"][number]
-    if field.endswith("to_m"):
-        at_m = closure["to_m"]
-        return f"lane {corridor.lane_name(closure['lane'], at_m)}, which begins at {at_m:.0f} m"
-    return f"end of lane {corridor.lane_name(closure['lane'], closure.get('from_m', 0.0))}"
-
-
-def _enough(error: BadInputError) -> str:
-    """Return what is allowed, with the length that is missing."""
-    found = re.match(r"at least ([\d.]+)", error.allowed)
-    if found is None or not isinstance(error.value, float):
-        if error.field.endswith("].lane"):
-            return (
+        allowed = error.allowed
+        if error.at_least is not None and isinstance(error.value, float):
+            allowed += f"; {error.at_least - error.value:.0f} m longer are enough"
+        elif error.field.endswith("].lane"):
+            allowed = (
                 "a ramp in line with no lane that is open at the start of the corridor: begin the "
                 "corridor on a later edge"
             )
-        return error.allowed
-    return f"{error.allowed}; {float(found[1]) - error.value:.0f} m longer are enough"
+        raise BadInputError(field, error.value, allowed) from error
+    return tables
 
 
-def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
+def _places(tables: Tables, corridor: Corridor) -> Iterator[tuple[str, str]]:
+    """Yield beginnings of names of fields, and what is in the network there."""
+    yield "road.s", f"{corridor.length_m:.0f} m long"
+    for number, out in enumerate(corridor.ways_out):
+        open_m = out.at_m - max(corridor.opens_m(out.lanes, out.at_m), 0.0)
+        lanes = " and ".join(corridor.lane_name(lane, out.at_m) for lane in out.lanes)
+        yield f"exit[{number}]", f"exit to {out.edge} from lane {lanes}, open for {open_m:.0f} m"
+    ramps = {ramp.name: ramp for ramp in corridor.ramps}
+    for number, entrance in enumerate(tables.get("entrance", ())):
+        ramp = ramps[entrance["name"]]
+        lane = corridor.lane_name(ramp.lane, ramp.merge_m)
+        used_m = ramp.merge_m - ramp.at_m
+        open_m = min(corridor.ends_m(ramp.lane, ramp.merge_m), corridor.length_m) - ramp.merge_m
+        text = f"on-ramp from {ramp.edge} of {used_m:.0f} m into lane {lane} of {open_m:.0f} m"
+        yield f"entrance[{number}]", text
+    for number, closure in enumerate(tables["road"].get("closures", ())):
+        lane, to_m = closure["lane"], closure.get("to_m", math.inf)
+        opening = f"lane {corridor.lane_name(lane, to_m)}, which begins at {to_m:.0f} m"
+        yield f"road.closures[{number}].to_m", opening
+        end = corridor.lane_name(lane, closure.get("from_m", 0.0))
+        yield f"road.closures[{number}]", f"end of lane {end}"
+
+
+def scenario_tables(found: SumoCorridor) -> Tables:
     """Return the tables of a scenario file, not checked against each other.
 
     Vehicles arrive at random with the mean volumes of the simulation. No vehicle exceeds the lowest
@@ -117,18 +107,23 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
     Raises:
         BadInputError: no vehicle enters at the start of the corridor, or it is too short.
     """
-    main = _from(demand, MAIN_ENTRANCE)
+    corridor = found.corridor
+    by_entrance: dict[str, list[Pass]] = {}
+    for one in found.passes:
+        by_entrance.setdefault(one.entrance, []).append(one)
+    main = by_entrance.get(MAIN_ENTRANCE, [])
     if not main:
         allowed = f"a corridor that vehicles enter on {corridor.edges[0].name}"
-        left_out = " and ".join(f"{count} {reason}" for reason, count in demand.missing.items())
+        left_out = " and ".join(f"{count} {reason}" for reason, count in found.missing.items())
         allowed += f"; of those left out, {left_out}" if left_out else ""
         raise BadInputError(OPTION, corridor.name, allowed)
-    names = type_names(demand.passes)
+    names = found.type_names()
     car, *others = names
     own_names = {**names, car: CAR}
     fastest_mps = min(MAX_SPEED_MPS, corridor.speed_mps, *(one.max_speed_mps for one in names))
-    per_hour = 3600.0 / demand.duration_s
-    ramps = [ramp for ramp in corridor.ramps if _from(demand, ramp.name)]
+    duration_s = found.simulation.duration_s
+    ramps = [ramp for ramp in corridor.ramps if ramp.name in by_entrance]
+    first_lanes = corridor.lanes - sum(one.from_m <= 0.0 for one in corridor.closures)
     tables: Tables = {
         "road": {
             "lanes": corridor.lanes,
@@ -143,11 +138,11 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
                 "lane": ramp.lane,
                 "at_m": _m(ramp.at_m),
                 "merge_m": _m(ramp.merge_m),
-                "volume_veh_per_h": _volume(per_hour * len(_from(demand, ramp.name))),
-                "destinations": _destinations(_from(demand, ramp.name)),
+                "volume_veh_per_h": _volume(len(by_entrance[ramp.name]), duration_s),
+                "destinations": _destinations(by_entrance[ramp.name]),
                 "vehicle_types": [
                     {"type": names[one], "share": share}
-                    for one, share in _shares_of_types(_from(demand, ramp.name)).items()
+                    for one, share in _shares_of_types(by_entrance[ramp.name]).items()
                     if one != car
                 ],
             }
@@ -158,8 +153,8 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
             for one in corridor.ways_out
         ],
         "demand": {
-            "volume_veh_per_lane_h": _volume(per_hour * len(main) / _first_lanes(corridor)),
-            "duration_s": float(math.ceil(demand.duration_s)),
+            "volume_veh_per_lane_h": _volume(len(main), duration_s, first_lanes),
+            "duration_s": float(math.ceil(duration_s)),
             "destinations": _destinations(main),
         },
         "vehicle": {**car.limits, "max_speed_mps": round(fastest_mps, 2)},
@@ -169,12 +164,15 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
         ],
     }
     _check_widths(corridor, names)
-    tables["formation"] = _motion(
-        tables, corridor, math.floor(2.0 * SPEED_SHARE * fastest_mps) / 2.0
-    )
-    formation = tables["formation"]
-    _close_openings_at_the_end(tables, corridor.length_m, max(one.length_m for one in names))
-    settled_m = _m(formation["speed_mps"] * formation["settle_s"])
+    speed_mps = math.floor(2.0 * SPEED_SHARE * fastest_mps) / 2.0
+    formation = tables["formation"] = _motion(tables, corridor, speed_mps)
+    # Lanes that open so late that no vehicle can change into them are closed to the end.
+    body_m = max(one.length_m for one in names)
+    latest_m = corridor.length_m - body_m - speed_mps * formation["cycle_s"]
+    for closure in tables["road"]["closures"]:
+        if closure.get("to_m", 0.0) > latest_m:
+            del closure["to_m"]
+    settled_m = _m(speed_mps * formation["settle_s"])
     if settled_m >= corridor.length_m:
         raise BadInputError(OPTION, corridor.name, f"a corridor longer than {settled_m:g} m")
     tables["road"] |= {"s1_m": settled_m, "s2_m": 0.0, "s3_m": _m(corridor.length_m - settled_m)}
@@ -183,39 +181,29 @@ def scenario_tables(corridor: Corridor, demand: CorridorDemand) -> Tables:
     return {"schema": "laneweave.scenario/1", **filled}
 
 
-def remarks(corridor: Corridor, demand: CorridorDemand, tables: Tables) -> list[str]:
+def remarks(found: SumoCorridor, tables: Tables) -> list[str]:
     """Return what makes trips longer than the lanes require, in words.
 
     Args:
-        corridor: the corridor.
-        demand: its vehicles.
+        found: the corridor with its vehicles.
         tables: the tables of its scenario file.
     """
-    found = (_speed_remark(corridor, demand), _volume_remark(tables))
-    return [one for one in found if one]
-
-
-def _volume_remark(tables: Tables) -> str:
-    """Return which volume exceeds what the lanes carry; empty: none."""
+    remarks = []
+    allowed_mps = found.corridor.speed_mps
+    counts = Counter(one.vehicle.vehicle_type for one in found.passes)
+    slowest = min(counts, key=lambda kind: kind.max_speed_mps, default=None)
+    if slowest is not None and slowest.max_speed_mps < allowed_mps:
+        remarks.append(
+            f"v_F is 90 % of {slowest.max_speed_mps:.1f} m/s, the maximum speed of class "
+            f"{slowest.vehicle_class} ({counts[slowest]} of {len(found.passes)} vehicles); the "
+            f"lanes allow {allowed_mps:.1f} m/s"
+        )
     try:
         check_volumes(structure(tables, Scenario))
     except BadInputError as error:
-        allowed = f"without waiting {error.allowed}"
-        return f"vehicles wait at the entrances: {error.field} is {error.value:g}, {allowed}"
-    return ""
-
-
-def _speed_remark(corridor: Corridor, demand: CorridorDemand) -> str:
-    """Return which type of vehicle makes v_F lower than the lanes allow; empty: none."""
-    counts = Counter(one.vehicle.vehicle_type for one in demand.passes)
-    slowest = min(counts, key=lambda kind: kind.max_speed_mps, default=None)
-    if slowest is None or slowest.max_speed_mps >= corridor.speed_mps:
-        return ""
-    return (
-        f"v_F is 90 % of {slowest.max_speed_mps:.1f} m/s, the maximum speed of class "
-        f"{slowest.vehicle_class} ({counts[slowest]} of {len(demand.passes)} vehicles); the lanes "
-        f"allow {corridor.speed_mps:.1f} m/s"
-    )
+        what = f"{error.field} is {error.value:g}, without waiting {error.allowed}"
+        remarks.append(f"vehicles wait at the entrances: {what}")
+    return remarks
 
 
 def _check_widths(corridor: Corridor, names: Mapping[SumoType, str]) -> None:
@@ -234,31 +222,13 @@ def _check_widths(corridor: Corridor, names: Mapping[SumoType, str]) -> None:
         )
 
 
-def _from(demand: CorridorDemand, entrance: str) -> list[Pass]:
-    return [one for one in demand.passes if one.entrance == entrance]
-
-
-def _close_openings_at_the_end(tables: Tables, length_m: float, body_m: float) -> None:
-    """Close lanes to the end that open so late that no vehicle can change into them."""
-    formation = tables["formation"]
-    latest_m = length_m - body_m - formation["speed_mps"] * formation["cycle_s"]
-    for closure in tables["road"]["closures"]:
-        if closure.get("to_m", 0.0) > latest_m:
-            del closure["to_m"]
-
-
-def _volume(veh_per_h: float) -> float:
-    """Return a volume as scenarios allow it; it is that of a drawn demand only."""
-    return min(round(veh_per_h, 1), MAX_VOLUME_VEH_PER_H)
+def _volume(vehicles: int, duration_s: float, lanes: int = 1) -> float:
+    """Return a volume [veh/h] as scenarios allow it; it is that of a drawn demand only."""
+    return min(round(3600.0 / duration_s * vehicles / lanes, 1), MAX_VOLUME_VEH_PER_H)
 
 
 def _m(position_m: float) -> float:
     return round(position_m, 2)
-
-
-def _first_lanes(corridor: Corridor) -> int:
-    """Return the number of lanes that are open at the start."""
-    return corridor.lanes - sum(one.from_m <= 0.0 for one in corridor.closures)
 
 
 def _closure(closure: Closure, corridor: Corridor, ramps: Sequence[Ramp]) -> dict[str, Any]:
@@ -274,7 +244,7 @@ def _closure(closure: Closure, corridor: Corridor, ramps: Sequence[Ramp]) -> dic
 
 def _restrictions(corridor: Corridor, names: Mapping[SumoType, str]) -> Iterator[dict[str, Any]]:
     """Yield the tables of the parts of lanes in which some types may not drive."""
-    for number, from_m, to_m, lane in corridor.parts:
+    for number, from_m, to_m, lane in corridor.parts():
         banned = [name for kind, name in names.items() if not lane.allows(kind.vehicle_class)]
         if banned:
             yield _part(number, from_m, to_m) | {"vehicle_types": banned}
@@ -282,7 +252,7 @@ def _restrictions(corridor: Corridor, names: Mapping[SumoType, str]) -> Iterator
 
 def _solid_lines(corridor: Corridor, names: Mapping[SumoType, str]) -> Iterator[dict[str, Any]]:
     """Yield the tables of the lines that some types may not cross."""
-    for number, from_m, to_m, lane in corridor.parts:
+    for number, from_m, to_m, lane in corridor.parts():
         for side, beside in (("left", number + 1), ("right", number - 1)):
             kept = [
                 name

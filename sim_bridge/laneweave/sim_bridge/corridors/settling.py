@@ -43,8 +43,7 @@ def settling_s(
         speed_mps: v_F.
         limits: the vehicle's limits.
 
-    Returns:
-        None: it cannot without falling behind the cell, or takes longer than `LONGEST_S`.
+    None: it cannot without falling behind the cell, or takes longer than `LONGEST_S`.
     """
     if abs(ahead_m) <= _NEAR_M and abs(slower_mps) <= _NEAR_MPS:
         return _SHORTEST_S
@@ -68,9 +67,7 @@ def settling_s(
 def before_rest_s(room_ahead_m: float, limits: Vehicle) -> float:
     """Return how long before it is in its cell a vehicle is ready for plans, at least.
 
-    Args:
-        room_ahead_m: how far ahead of the cell it may be (`VehicleTypes.room_ahead_m`).
-        limits: its limits.
+    It may be ahead of the cell by `room_ahead_m` (`VehicleTypes.room_ahead_m`).
     """
     accel_mps2 = limits.max_accel_mps2
     return min(NEARLY_SETTLED_MPS / accel_mps2, math.sqrt(2.0 * room_ahead_m / accel_mps2))

@@ -58,12 +58,11 @@ class SumoConfig:
     options: Mapping[str, str] = field(hash=False)
     """All options that determine how vehicles drive, by SUMO's names; none with a default."""
 
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """All files that it consists of, as far as they exist."""
+    def changed_ns(self) -> tuple[int, ...]:
+        """Return when the files were changed that it consists of, as far as they exist."""
         named = [self.file, self.net_file, *self.additional_files]
         named += _paths(self.options.get("route-files", ""))
-        return tuple(file for file in named if file.is_file())
+        return tuple(file.stat().st_mtime_ns for file in named if file.is_file())
 
     def command(
         self, seed: int, more: Mapping[str, str], without: Sequence[str] = ()

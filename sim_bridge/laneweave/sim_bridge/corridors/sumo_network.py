@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 
 from attrs import define, field, frozen
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.sim_bridge.corridors.sumo_config import first_element
+from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 CARS = "passenger"
 """Class of vehicles that must be allowed in a lane of a corridor."""
@@ -14,6 +19,10 @@ IGNORING = "ignoring"
 """Class of vehicles that may drive anywhere."""
 _HAS_PRIORITY = "M"
 """State of a link whose vehicles give way to nobody."""
+_MOST_ACROSS = 8
+"""Most lanes one after another inside a junction; a loop of them is a broken file."""
+_SIDES = {"left": 1, "right": -1}
+"""SUMO's numbers for the sides to which vehicles change lanes."""
 Point = tuple[float, float]
 
 
@@ -35,11 +44,6 @@ class Lane:
     """Classes of vehicles that may not drive in it."""
     changing: Mapping[str, frozenset[str]] = field(factory=dict, eq=False)
     """Classes that may change lanes to a side; absent: all."""
-
-    @property
-    def allows_cars(self) -> bool:
-        """Whether cars may drive in it."""
-        return self.allows(CARS)
 
     def allows(self, vehicle_class: str) -> bool:
         """Return whether vehicles of a class may drive in it."""
@@ -66,7 +70,7 @@ class Edge:
     @property
     def car_lanes(self) -> tuple[Lane, ...]:
         """Lanes that cars may use."""
-        return tuple(lane for lane in self.lanes if lane.allows_cars)
+        return tuple(lane for lane in self.lanes if lane.allows(CARS))
 
 
 @frozen
@@ -108,18 +112,18 @@ class Network:
     """Whether vehicles drive on the left: lanes are numbered from the left."""
 
     @cached_property
-    def _from(self) -> Mapping[str, tuple[Link, ...]]:
+    def _from(self) -> Mapping[str, list[Link]]:
         return _grouped((link.origin.name, link) for link in self.links)
 
     @cached_property
-    def _to(self) -> Mapping[str, tuple[Link, ...]]:
+    def _to(self) -> Mapping[str, list[Link]]:
         return _grouped((link.target.name, link) for link in self.links)
 
-    def links_from(self, lane: Lane) -> tuple[Link, ...]:
+    def links_from(self, lane: Lane) -> Sequence[Link]:
         """Return the links that begin at the end of a lane."""
         return self._from.get(lane.name, ())
 
-    def links_to(self, lane: Lane) -> tuple[Link, ...]:
+    def links_to(self, lane: Lane) -> Sequence[Link]:
         """Return the links that end at the beginning of a lane."""
         return self._to.get(lane.name, ())
 
@@ -134,8 +138,67 @@ class Network:
         return tuple(self.edges[name] for name in names)
 
 
-def _grouped(pairs: Iterable[tuple[str, Link]]) -> Mapping[str, tuple[Link, ...]]:
+def _grouped(pairs: Iterable[tuple[str, Link]]) -> Mapping[str, list[Link]]:
     groups: dict[str, list[Link]] = {}
     for name, link in pairs:
         groups.setdefault(name, []).append(link)
-    return {name: tuple(links) for name, links in groups.items()}
+    return groups
+
+
+def read_network(sumo: SumoProcess) -> Network:
+    """Return the network of a simulation.
+
+    Raises:
+        BadInputError: it has no edges.
+    """
+    edges = {
+        name: Edge(
+            name, tuple(_lane(sumo, f"{name}_{n}") for n in range(sumo.edge.getLaneNumber(name)))
+        )
+        for name in sumo.edge.getIDList()
+        if not name.startswith(":")  # inside a junction
+    }
+    file = Path(sumo.simulation.getOption("net-file"))
+    if not edges:
+        raise BadInputError("net-file", str(file), "a network of SUMO with at least one edge")
+    # libsumo does not tell on which side vehicles drive.
+    left_hand = first_element("net-file", file).get("lefthand") == "true"
+    return Network(edges, tuple(_links(sumo, edges)), left_hand)
+
+
+def _lane(sumo: SumoProcess, name: str) -> Lane:
+    edge, _, index = name.rpartition("_")
+    api = sumo.lane
+    sizes = api.getLength(name), api.getWidth(name), api.getMaxSpeed(name)
+    shape, banned = tuple(api.getShape(name)), frozenset(api.getDisallowed(name))
+    changing = {
+        side: frozenset(api.getChangePermissions(name, number)) for side, number in _SIDES.items()
+    }
+    return Lane(name, edge, int(index), *sizes, shape, banned, changing)
+
+
+def _links(sumo: SumoProcess, edges: Mapping[str, Edge]) -> Iterator[Link]:
+    """Yield the links of all edges that cars may use."""
+    lights = {
+        (origin, target): light
+        for light in sumo.trafficlight.getIDList()
+        for links in sumo.trafficlight.getControlledLinks(light)
+        for origin, target, _ in links
+    }
+    for edge in edges.values():
+        for origin in edge.car_lanes:
+            for to, _, _, _, via, state, _, _ in sumo.lane.getLinks(origin.name):
+                name, _, index = to.rpartition("_")
+                if name in edges and edges[name].lanes[int(index)].allows(CARS):
+                    across = tuple(_across(sumo, via))
+                    light = lights.get((origin.name, to), "")
+                    yield Link(origin, edges[name].lanes[int(index)], across, state, light)
+
+
+def _across(sumo: SumoProcess, via: str) -> Iterator[Lane]:
+    """Yield the lanes inside a junction, from the first one on."""
+    for _ in range(_MOST_ACROSS):
+        if not via:
+            break
+        yield _lane(sumo, via)
+        via = next((after[4] for after in sumo.lane.getLinks(via)), "")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 from attrs import frozen
@@ -52,8 +53,6 @@ class SumoTrip:
     """The trip of a vehicle that has arrived."""
 
     depart_s: float
-    duration_s: float
-    """From its departure to its arrival."""
     arrival_s: float
     arrival_edge: str = ""
     """Edge on which it has arrived."""
@@ -61,16 +60,14 @@ class SumoTrip:
     """None: emissions were not computed."""
 
 
-@frozen
-class Conflict:
-    """Two vehicles with a short time to collision."""
+class Conflict(NamedTuple):
+    """Two vehicles with a short time to collision, their names sorted."""
 
-    vehicle: str
-    other: str
-    least_ttc_s: float
-    """Least time to collision."""
+    vehicles: tuple[str, ...]
     at_s: float
-    """When it was reached."""
+    """When the time was lowest."""
+    min_ttc_s: float
+    """Lowest time to collision."""
 
 
 @frozen
@@ -92,62 +89,45 @@ def read_statistics(folder: Path) -> SumoStatistics:
     Raises:
         OSError: a file cannot be read.
     """
-    trips = dict[str, SumoTrip]()
-    for _, element in ET.iterparse(folder / TRIPS_FILE):  # noqa: S314 (SUMO has written it)
-        if element.tag == "tripinfo":
-            trip = _trip(element)
-            if trip.arrival_s >= 0.0:
-                trips[element.get("id", "")] = trip
-            element.clear()
     found = ET.parse(folder / STATISTICS_FILE).getroot()  # noqa: S314 (SUMO has written it)
-    safety, teleports = found.find("safety"), found.find("teleports")
+    conflicts = (_conflict(one) for one in _elements(folder / CONFLICTS_FILE, "conflict"))
     return SumoStatistics(
-        trips,
-        collisions=_collisions(folder / COLLISIONS_FILE),
-        teleports=_count(teleports, "total"),
-        emergency_brakings=_count(safety, "emergencyBraking"),
-        conflicts=tuple(
-            {
-                (*sorted((one.vehicle, one.other)), one.at_s): one
-                for one in _conflicts(folder / CONFLICTS_FILE)
-            }.values()
-        ),
+        {
+            one.attrib["id"]: _trip(one)
+            for one in _elements(folder / TRIPS_FILE, "tripinfo")
+            if float(one.get("arrival", "-1")) >= 0.0
+        },
+        collisions=sum(1 for _ in _elements(folder / COLLISIONS_FILE, "collision")),
+        teleports=_count(found.find("teleports"), "total"),
+        emergency_brakings=_count(found.find("safety"), "emergencyBraking"),
+        conflicts=tuple({one[:2]: one for one in conflicts if one is not None}.values()),
     )
 
 
-def _collisions(file: Path) -> int:
-    found = ET.iterparse(file)  # noqa: S314 (SUMO has written it)
-    return sum(element.tag == "collision" for _, element in found)
+def _elements(file: Path, tag: str) -> Iterator[ET.Element]:
+    """Yield the elements with a tag; SUMO has written the file."""
+    for _, element in ET.iterparse(file):  # noqa: S314
+        if element.tag == tag:
+            yield element
+            element.clear()
 
 
-def _conflicts(file: Path) -> Iterator[Conflict]:
-    """Yield the conflicts in the output of SUMO's device."""
-    for _, element in ET.iterparse(file):  # noqa: S314 (SUMO has written it)
-        if element.tag != "conflict":
-            continue
-        least = element.find("minTTC")
-        if least is not None and least.get("value", "NA") != "NA":
-            yield Conflict(
-                element.get("ego", ""),
-                element.get("foe", ""),
-                float(least.get("value", "nan")),
-                float(least.get("time", "nan")),
-            )
-        element.clear()
+def _conflict(element: ET.Element) -> Conflict | None:
+    """Return a conflict in the output of SUMO's device; None: the two were never in conflict."""
+    least = element.find("minTTC")
+    if least is None or least.get("value", "NA") == "NA":
+        return None
+    vehicles = tuple(sorted((element.get("ego", ""), element.get("foe", ""))))
+    return Conflict(vehicles, float(least.get("time", "nan")), float(least.get("value", "nan")))
 
 
 def _trip(element: ET.Element) -> SumoTrip:
-    def number(name: str) -> float:
-        return float(element.get(name, "0"))
-
     emissions = element.find("emissions")
-    fuel_g = None if emissions is None else float(emissions.get("fuel_abs", "0")) / 1000.0
     return SumoTrip(
-        number("depart"),
-        number("duration"),
+        float(element.get("depart", "0")),
         float(element.get("arrival", "-1")),
         element.get("arrivalLane", "").rpartition("_")[0],
-        fuel_g,
+        None if emissions is None else float(emissions.get("fuel_abs", "0")) / 1000.0,
     )
 
 

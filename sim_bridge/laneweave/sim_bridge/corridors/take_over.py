@@ -20,7 +20,6 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
 from laneweave.protocol.vehicle.lane_ends import dead_ends
-from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.corridors.exit_room import ExitRoom
 from laneweave.sim_bridge.corridors.settling import LONGEST_S, before_rest_s, fall_back, settling_s
@@ -98,12 +97,7 @@ class TakeOver(OutsideTraffic):
     """Takes vehicles over from SUMO."""
 
     def __init__(self, scenario: Scenario, view: OutsideView) -> None:
-        """Begin without vehicles.
-
-        Args:
-            scenario: road, types of vehicles.
-            view: the vehicles on their way to the entrances.
-        """
+        """Begin without vehicles on their way to the entrances."""
         self._view = view
         self._lattice = scenario.lattice
         self._limits = {name: one.limits for name, one in scenario.types.items()}
@@ -127,11 +121,11 @@ class TakeOver(OutsideTraffic):
         self._exit_room = ExitRoom(scenario, SEEN_BEYOND_M)
         self._occupied = set[Cell]()
         """Cells in which vehicles are, or to which they move."""
-        self._known: dict[Name, Arrival] = {}
+        self._known: dict[str, Arrival] = {}
         """Approaching vehicles, each with the time at which it was expected first."""
         self._announce_s = scenario.runtime.announce_s
         self._departing = deque(view.departing)
-        self._due: dict[Name, Arrival] = {}
+        self._due: dict[str, Arrival] = {}
         """Announced vehicles that have not departed."""
         self._moved_s = 0.0
         """Road time at which a vehicle on the road moved the last time."""
@@ -141,11 +135,10 @@ class TakeOver(OutsideTraffic):
         new = []
         for lane, at_m in self._at_m.items():
             for one in self._view.approaching(lane):
-                name = Name(one.arrival.vehicle)
+                name = one.arrival.vehicle
                 if name not in self._known:
-                    expected_s = t_s + (at_m - one.s_m) / max(
-                        one.speed_mps, self._lattice.speed_mps
-                    )
+                    fastest_mps = max(one.speed_mps, self._lattice.speed_mps)
+                    expected_s = t_s + (at_m - one.s_m) / fastest_mps
                     self._known[name] = evolve(one.arrival, t_s=expected_s)
                     self._due.pop(name, None)
                     new.append(self._known[name])
@@ -155,7 +148,7 @@ class TakeOver(OutsideTraffic):
         """Return the vehicles that approach, or depart near an entrance within `announce_s`."""
         while self._departing and self._departing[0].t_s <= t_s + self._announce_s:
             first = self._departing.popleft()
-            self._due[Name(first.vehicle)] = first
+            self._due[first.vehicle] = first
         return [*self._known.values(), *self._due.values(), *self._exit_room.announced]
 
     @property
@@ -166,7 +159,7 @@ class TakeOver(OutsideTraffic):
     @property
     def never_came(self) -> Sequence[Arrival]:
         """The vehicles that were to come, and have not come near an entrance."""
-        return [one for one in self._view.outside if Name(one.vehicle) not in self._known]
+        return [one for one in self._view.outside if one.vehicle not in self._known]
 
     @property
     def start_lanes(self) -> Sequence[int]:
@@ -194,8 +187,7 @@ class TakeOver(OutsideTraffic):
         for lane, at_m in self._at_m.items():
             column = meter.next_open(lane, t_s)
             for one in self._view.approaching(lane):
-                name = Name(one.arrival.vehicle)
-                if name not in self._known:
+                if one.arrival.vehicle not in self._known:
                     continue  # it has come since `demanded`
                 if one.s_m < at_m:
                     column = self._advise(one, lane, column, t_s, meter)
@@ -203,7 +195,7 @@ class TakeOver(OutsideTraffic):
                 admissions.append(self._take(one, column, t_s, meter))
                 self._occupied.add(admissions[-1].cell)
                 column = admissions[-1].cell[0] - 1
-                del self._known[name]
+                del self._known[one.arrival.vehicle]
         return admissions
 
     def is_stuck(self, t_s: float, *, moving: bool) -> bool:
@@ -221,9 +213,11 @@ class TakeOver(OutsideTraffic):
         slower_mps = self._lattice.speed_mps - one.speed_mps
         limits = self._limits[arrival.vehicle_type]
 
+        def ahead_m(column: int) -> float:
+            return one.s_m - self._lattice.cell_s_m(column, t_s)
+
         def entry(column: int) -> tuple[float, float] | None:
-            ahead_m = one.s_m - self._lattice.cell_s_m(column, t_s)
-            time_s = settling_s(ahead_m, slower_mps, self._lattice.speed_mps, limits)
+            time_s = settling_s(ahead_m(column), slower_mps, self._lattice.speed_mps, limits)
             return None if time_s is None else (t_s, time_s)
 
         chosen = self._choose(arrival, first, meter, entry)
@@ -235,7 +229,6 @@ class TakeOver(OutsideTraffic):
                 column -= 1
         if not meter.take(arrival, column):
             raise RuntimeError(f"{arrival.vehicle} cannot have column {column}")
-        ahead_m = one.s_m - self._lattice.cell_s_m(column, t_s)
         ready_s = max(0.0, time_s - self._before_rest_s[arrival.vehicle_type])
         start = EntryState(one.s_m, one.speed_mps, time_s, ready_s)
         more = meter.exit_cells(arrival, column)
@@ -244,11 +237,11 @@ class TakeOver(OutsideTraffic):
             # one past the start is not assigned yet (`Roadside.assign_empty_cells`).
             last = first if (first + 1, arrival.lane) in self._occupied else first + 1
             more += tuple((ahead, arrival.lane) for ahead in range(column + 1, last + 1))
-        return Admission(arrival, (column, arrival.lane), t_s, ahead_m, more, start)
+        return Admission(arrival, (column, arrival.lane), t_s, ahead_m(column), more, start)
 
     def _arrival(self, one: Approaching) -> Arrival:
         """Return the arrival of a vehicle in the lane to which it comes."""
-        return evolve(self._known[Name(one.arrival.vehicle)], lane=one.arrival.lane)
+        return evolve(self._known[one.arrival.vehicle], lane=one.arrival.lane)
 
     def _choose(
         self,
@@ -259,12 +252,8 @@ class TakeOver(OutsideTraffic):
     ) -> tuple[int, float, float] | None:
         """Return the best column for a vehicle, its entry time and settling time; None: none.
 
-        Args:
-            arrival: the vehicle.
-            first: the first column that it can have.
-            meter: knows which columns are possible.
-            entry: returns when it would enter a column, and how long it would settle; None: it
-                cannot get there.
+        `first` is the first column that it can have. `entry` returns when it would enter a column,
+        and how long it would settle; None: it cannot get there.
         """
         found: list[tuple[bool, int, int, float, float]] = []
         for column in range(first, first - MAX_COLUMNS, -1):
@@ -288,11 +277,8 @@ class TakeOver(OutsideTraffic):
     ) -> bool:
         """Return whether a vehicle cannot change lanes in time.
 
-        Args:
-            arrival: the vehicle.
-            column: its column.
-            times: when it enters, and how long it settles.
-            beside: number of vehicles that make room before, one after another.
+        `times` says when it enters, and how long it settles; `beside` is the number of vehicles
+        that make room before, one after another.
         """
         entry_s, settle_s = times
         move_m = self._slot_s * self._lattice.speed_mps

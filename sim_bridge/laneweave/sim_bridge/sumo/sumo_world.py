@@ -13,7 +13,6 @@ replaces it with the plant's speed (setPreviousSpeed).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 
 from laneweave.protocol.road_layout import END_OF_ROAD
@@ -21,25 +20,26 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
+from laneweave.sim_bridge.bodies.bodies_world import BodiesWorld
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, pose_of
 from laneweave.sim_bridge.sumo.road_edges import ROAD, margin_m, route_name
 from laneweave.sim_bridge.sumo.session import SumoSession
 
 _ROUTE = route_name(MAIN_ENTRANCE, END_OF_ROAD)
 
 
-class SumoWorld(SumoSession):
+class SumoWorld(SumoSession, BodiesWorld):
     """One road with vehicles in SUMO. Close it, or use it as a context manager."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         """Start SUMO with an empty road; see `SumoSession`."""
         super().__init__(scenario, folder)
+        BodiesWorld.__init__(self)
         margin = margin_m(scenario)
         self._range_m = (-margin, scenario.road.length_m + margin)
         """Range of positions on SUMO's edge [m]."""
         self._lane_width_m = scenario.road.lane_width_m
         self._lanes = scenario.road.lanes
-        self._states: dict[str, State] = {}
         self._placed: set[str] = set()
         self._shown: list[str] = []
 
@@ -49,15 +49,12 @@ class SumoWorld(SumoSession):
         Raises:
             ValueError: the vehicle is already on the road, or `state` is not on the edge.
         """
-        if vehicle in self._states:
-            raise ValueError(f"{vehicle} is already on the road")
-        self._check(vehicle, state)  # before the vehicle is added to SUMO
+        super().add(vehicle, state, vehicle_type)  # raises before the vehicle is added to SUMO
         api = self.vehicle
         self.set_type(vehicle, vehicle_type)
         api.add(vehicle, _ROUTE, typeID=vehicle_type, depart="now", departPos="0", departSpeed="0")
         api.setSpeedMode(vehicle, 0)
         api.setLaneChangeMode(vehicle, 0)
-        self._states[vehicle] = state
         self._move(vehicle, state)
 
     def place(self, vehicle: str, state: State) -> None:
@@ -66,10 +63,7 @@ class SumoWorld(SumoSession):
         Raises:
             ValueError: the vehicle is not on the road, or `state` is not on the edge.
         """
-        if vehicle not in self._states:
-            raise ValueError(f"{vehicle} is not on the road")
-        self._check(vehicle, state)
-        self._states[vehicle] = state
+        super().place(vehicle, state)
         self._move(vehicle, state)
 
     def step(self) -> None:
@@ -78,27 +72,23 @@ class SumoWorld(SumoSession):
         Raises:
             RuntimeError: SUMO has a different number of vehicles (internal error).
         """
-        if len(self._placed) < len(self._states):
-            for vehicle, state in self._states.items():
+        if len(self._placed) < len(self.states):
+            for vehicle, state in self.states.items():
                 if vehicle not in self._placed:
                     self._move(vehicle, state)
         self._placed.clear()
         super().step()
         api = self.vehicle
-        if api.getIDCount() != len(self._states):
-            raise RuntimeError(f"SUMO shows {api.getIDCount()} of {len(self._states)} vehicles")
+        if api.getIDCount() != len(self.states):
+            raise RuntimeError(f"SUMO shows {api.getIDCount()} of {len(self.states)} vehicles")
         set_previous_speed = api.setPreviousSpeed
-        for vehicle, state in self._states.items():
+        for vehicle, state in self.states.items():
             set_previous_speed(vehicle, state[1], state[2])
-        self._shown = list(self._states)
+        self._shown = list(self.states)
 
     def positions(self) -> dict[str, Pose]:
         """Return the pose of each vehicle after the last step, in the order of `add` calls."""
         return self.poses(self._shown)
-
-    def others(self) -> Sequence[OtherBody]:
-        """Return no bodies: the bridge drives all."""
-        return ()
 
     def remove(self, vehicle: str) -> None:
         """Remove a vehicle from the road.
@@ -106,16 +96,14 @@ class SumoWorld(SumoSession):
         Raises:
             ValueError: the vehicle is not on the road.
         """
-        if self._states.pop(vehicle, None) is None:
-            raise ValueError(f"{vehicle} is not on the road")
+        super().remove(vehicle)
         self._placed.discard(vehicle)
         self._shown = [other for other in self._shown if other != vehicle]
         self.forget(vehicle)
 
     def _check(self, vehicle: str, state: State) -> None:
         """Reject a state that SUMO would display elsewhere."""
-        if not math.isfinite(sum(state)):
-            raise ValueError(f"{vehicle} must have a finite state, not {state}")
+        super()._check(vehicle, state)
         low_m, high_m = self._range_m
         if not low_m <= state[0] <= high_m:
             raise ValueError(

@@ -15,7 +15,8 @@ from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.run.outcome import Outcome, complete_summary, print_outcome
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
 from laneweave.protocol.summary import RunSummary, write_summary
-from laneweave.sim_bridge.corridors.corridor_reading import WHOLE, read_corridor
+from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
+from laneweave.sim_bridge.corridors.sumo_simulation import WHOLE
 from laneweave.sim_bridge.recording.trips import metadata_of, trips_table
 from support.closed_lanes import DROP
 from support.interchange import CORRIDOR, TRUCKS, stream, write_interchange

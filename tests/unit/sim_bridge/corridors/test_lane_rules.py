@@ -9,10 +9,10 @@ import pytest
 from attrs import evolve
 
 from laneweave.protocol.config.scenario_files import parse_scenario
-from laneweave.sim_bridge.corridors.corridor_reading import read_corridor
-from laneweave.sim_bridge.corridors.corridor_setup import SumoCorridor
+from laneweave.sim_bridge.corridors.corridor_setup import setup_of
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
 from laneweave.sim_bridge.corridors.scenario_tables import remarks, scenario_tables
+from laneweave.sim_bridge.corridors.sumo_corridor import SumoCorridor, read_corridor
 from support.interchange import CORRIDOR, LANE_M, TRUCKS, stream, vehicle, write_interchange
 
 KINDS = ("car", "truck")
@@ -31,14 +31,13 @@ def corridor_with(
 
 
 def remarks_on(found: SumoCorridor) -> list[str]:
-    tables = scenario_tables(found.corridor, found.demand)
-    return remarks(found.corridor, found.demand, tables)
+    return remarks(found, scenario_tables(found))
 
 
 def test_trucks_keep_out_of_lanes_that_ban_them(tmp_path: Path) -> None:
     banned = '<lane id="main3_2" disallow="truck"'
     found = corridor_with(tmp_path, '<lane id="main3_2"', banned)
-    tables = scenario_tables(found.corridor, found.demand)
+    tables = scenario_tables(found)
     (rule,) = tables["road"]["restrictions"]
     assert rule == {"lane": 3, "from_m": 950.0, "to_m": 1110.0, "vehicle_types": ["truck"]}
     scenario = parse_scenario(tables)
@@ -51,8 +50,8 @@ def test_vehicles_enter_in_lanes_that_allow_them(tmp_path: Path) -> None:
     trucks = [vehicle(f"t{n}", 3.0 * n, "main", "truck") for n in range(9)]
     cars = [vehicle(f"c{n}", 3.0 * n + 1.0, "main") for n in range(20)]
     found = corridor_with(tmp_path, '<lane id="main1_2"', banned, [*trucks, *cars])
-    scenario = parse_scenario(scenario_tables(found.corridor, found.demand))
-    arrivals = [one.arrival for one in found.setup(scenario).arrivals]
+    scenario = parse_scenario(scenario_tables(found))
+    arrivals = [one.arrival for one in setup_of(found, scenario).arrivals]
     lanes = {kind: {one.lane for one in arrivals if one.vehicle_type == kind} for kind in KINDS}
     assert lanes["truck"] == {2}  # the left lane would be the first one that is free
     assert 3 in lanes["car"]
@@ -62,9 +61,9 @@ def test_types_of_two_classes_with_equal_limits_are_two(tmp_path: Path) -> None:
     types = '<vType id="truck" vClass="taxi" sigma="0"/>'
     banned = '<lane id="main3_2" disallow="taxi"'
     found = corridor_with(tmp_path, '<lane id="main3_2"', banned, types=types)
-    tables = scenario_tables(found.corridor, found.demand)
+    tables = scenario_tables(found)
     assert tables["road"]["restrictions"][0]["vehicle_types"] == ["taxi"]
-    setup = found.setup(parse_scenario(tables))
+    setup = setup_of(found, parse_scenario(tables))
     kinds = {one.origin.vehicle.type_name: one.arrival.vehicle_type for one in setup.arrivals}
     assert kinds == {"car": "car", "truck": "taxi"}
 
@@ -81,7 +80,7 @@ def test_lines_that_may_not_be_crossed(
     tmp_path: Path, attribute: str, expected: dict[str, object] | None
 ) -> None:
     found = corridor_with(tmp_path, '<lane id="main3_1"', f'<lane id="main3_1" {attribute}')
-    tables = scenario_tables(found.corridor, found.demand)
+    tables = scenario_tables(found)
     lines = tables["road"].get("solid_lines")
     if expected is None:
         assert lines is None
@@ -93,7 +92,7 @@ def test_lines_that_may_not_be_crossed(
 def test_traffic_on_the_left_is_mirrored(tmp_path: Path) -> None:
     found = corridor_with(tmp_path, '<net version="1.20"', '<net version="1.20" lefthand="true"')
     assert found.simulation.network.left_hand
-    shape = CorridorShape(found.simulation.network, found.corridor)
+    shape = CorridorShape(found.corridor)
     (_, y_m, _), piece = shape.at(300.0, 1.5 * LANE_M + 0.4)
     # A body left of the middle of its lane on the mirrored road is right of it in the world.
     assert (piece.edge, piece.index) == ("main1", 0)
@@ -110,6 +109,5 @@ def test_a_slow_type_that_lowers_the_speed_of_all_is_named(tmp_path: Path) -> No
 
 def test_it_is_said_that_vehicles_wait_where_lanes_carry_fewer(tmp_path: Path) -> None:
     found = corridor_with(tmp_path, "<net", "<net")
-    most = evolve(found.demand, duration_s=20.0)
-    (remark,) = remarks(found.corridor, most, scenario_tables(found.corridor, most))
+    (remark,) = remarks_on(evolve(found, simulation=evolve(found.simulation, end_s=20.0)))
     assert "vehicles wait at the entrances: demand.volume_veh_per_lane_h is 3600, with" in remark

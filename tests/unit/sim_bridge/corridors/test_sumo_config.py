@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.sim_bridge.corridors.corridor_reading import read_simulation
 from laneweave.sim_bridge.corridors.sumo_config import read_config
+from laneweave.sim_bridge.corridors.sumo_simulation import read_simulation
 from support.interchange import vehicle, write_interchange
 
 FILES = '<net-file value="small.net.xml"/><route-files value="small.rou.xml"/>'
@@ -59,7 +59,7 @@ def test_options_mean_what_they_mean_to_sumo(
     for name in ("more.xml", "other file.xml"):
         (tmp_path / name).write_text("<additional/>", encoding="utf-8")
     found = read_simulation(write_config(tmp_path, text))
-    assert len(found.demand.vehicles) == count
+    assert len(found.vehicles) == count
 
 
 BUS = (
@@ -106,9 +106,9 @@ def test_additional_files_are_read(
         tmp_path, f"<input>{FILES}<additional-files value='{name}'/></input>", [vehicles]
     )
     found = read_simulation(config)
-    assert len(found.demand.vehicles) == count
+    assert len(found.vehicles) == count
     if "rerouter" in additional:
-        assert found.demand.vehicles[0].route[-1] == "off"
+        assert found.vehicles[0].route[-1] == "off"
 
 
 def test_no_output_of_the_configuration_is_written(tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_no_output_of_the_configuration_is_written(tmp_path: Path) -> None:
     )
     config = write_config(tmp_path, text)
     before = {*tmp_path.iterdir()}
-    assert read_simulation(config).demand.vehicles
+    assert read_simulation(config).vehicles
     assert {*tmp_path.iterdir()} == before
 
 

@@ -1,4 +1,4 @@
-"""The vehicles of a SUMO simulation, as SUMO itself draws them, and those of a corridor.
+"""A SUMO simulation: its network, and its vehicles as SUMO itself draws them.
 
 SUMO drives the simulation once, with the user's own configuration, and reports each vehicle with
 its type, route, stops and departure (`--vehroute-output`). Whatever the configuration describes
@@ -9,8 +9,7 @@ laneweave and SUMO alone drive afterwards.
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -18,18 +17,15 @@ from xml.etree import ElementTree as ET
 from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError, Described
-from laneweave.protocol.road_layout import END_OF_ROAD
-from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
-from laneweave.sim_bridge.corridors.corridor import Corridor, unique_name
-from laneweave.sim_bridge.corridors.sumo_config import SumoConfig
+from laneweave.protocol.runtime.temporary_folders import temporary_folder
+from laneweave.sim_bridge.corridors.sumo_config import SumoConfig, read_config
+from laneweave.sim_bridge.corridors.sumo_network import Network, read_network
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
 MAX_DEMAND_S = 7200.0
 """Default length of the time window."""
 LATEST_S = 7.0 * 86400.0
 """Time up to which the first departure is looked for."""
-AT_START = {"departLane": "best", "departPos": "base", "departSpeed": "max"}
-"""How vehicles depart at an entrance, whatever their files say: their trips are equally long."""
 LIMITS = ("length_m", "width_m", "max_accel_mps2", "min_accel_mps2")
 Attributes = Mapping[str, str]
 _NOT_KEPT = frozenset({"id", "type", "depart", "arrival", "fromTaz", "toTaz", "reroute"})
@@ -39,8 +35,6 @@ _STOP_NOT_KEPT = frozenset(
     | {"started", "ended", "join", "split", "parkingBadges"}
 )
 """Attributes of stops that depend on passengers or other vehicles, or say what has happened."""
-_ROUTES_FILE = "vehicles.xml"
-"""SUMO's report of the vehicles."""
 _PARKING = 1
 """Flag of stops beside the road."""
 _DEFAULT_TYPE = "DEFAULT_VEHTYPE"
@@ -57,6 +51,10 @@ class TimeWindow:
     """Time at which it ends, if the duration does not end before."""
     scale: float | None = None
     """SUMO's factor for the demand; None: as the configuration says."""
+
+
+WHOLE = TimeWindow()
+"""The default time window."""
 
 
 @frozen
@@ -111,9 +109,11 @@ class SumoVehicle:
 
 
 @frozen
-class SumoDemand:
-    """All vehicles of a simulation that depart in a time window."""
+class SumoSimulation:
+    """A simulation of the user: its network, and all vehicles that depart in a time window."""
 
+    config: SumoConfig
+    network: Network = field(repr=False)
     vehicles: tuple[SumoVehicle, ...]
     """In order of departure."""
     begin_s: float
@@ -124,6 +124,11 @@ class SumoDemand:
     """XML elements of the types."""
     persons: int = 0
     """Number of persons and containers, which are in no run."""
+
+    @property
+    def duration_s(self) -> float:
+        """Time within which its vehicles depart."""
+        return max(self.end_s - self.begin_s, 1.0)
 
     @property
     def departing(self) -> frozenset[str]:
@@ -148,90 +153,70 @@ class SumoDemand:
         return {"route-files": str(file)}
 
 
-@frozen
-class Pass:
-    """A vehicle's way through a corridor."""
-
-    vehicle: SumoVehicle
-    entrance: str
-    """`MAIN_ENTRANCE`, or the name of a ramp."""
-    destination: str
-    """`END_OF_ROAD`, or the name of an exit."""
-    upstream: str = ""
-    """Edge from which it comes to the start; empty: it departs on the first edge, or by a ramp."""
+_MAX_KEPT = 2
+_kept: dict[tuple[Path, TimeWindow, int], tuple[tuple[int, ...], SumoSimulation]] = {}
+"""The last simulations, with the times at which their files changed: a command reads one often."""
 
 
-@frozen
-class CorridorDemand:
-    """The vehicles that drive through a corridor."""
-
-    passes: tuple[Pass, ...]
-    """In order of departure."""
-    duration_s: float
-    """Time within which they depart."""
-    missing: Mapping[str, int]
-    """Number of vehicles that a corridor cannot serve, by reason."""
-    left_out: frozenset[str] = frozenset()
-    """Their names in SUMO."""
-
-
-def first_simulation(
-    config: SumoConfig, folder: Path, window: TimeWindow, seed: int = 1
-) -> SumoProcess:
-    """Start the simulation in which SUMO draws the vehicles.
+def read_simulation(file: Path, window: TimeWindow = WHOLE, seed: int = 1) -> SumoSimulation:
+    """Read the files of a simulation, and let SUMO draw its vehicles.
 
     Args:
-        config: the simulation.
-        folder: folder for temporary files.
+        file: SUMO's configuration file.
         window: when the vehicles depart.
-        seed: SUMO's seed, unless the configuration has one.
+        seed: seed from which SUMO draws flows and types, unless the configuration has one.
 
     Raises:
+        BadInputError: a file cannot be read, or no vehicle departs in the time window.
         CommandFailedError: libsumo is missing, or SUMO rejects a file.
     """
+    key = file.resolve(), window, seed
+    changed_ns, simulation = _kept.pop(key, ((), None))
+    if simulation is None or simulation.config.changed_ns() != changed_ns:
+        with temporary_folder("sumo") as folder:
+            config = read_config(file, folder)
+            changed_ns, simulation = config.changed_ns(), _draw(config, folder, window, seed)
+    _kept[key] = changed_ns, simulation
+    for oldest in [*_kept][:-_MAX_KEPT]:
+        del _kept[oldest]
+    return simulation
+
+
+def _draw(config: SumoConfig, folder: Path, window: TimeWindow, seed: int) -> SumoSimulation:
+    """Let SUMO drive a simulation for the time window, and return it with its vehicles.
+
+    Raises:
+        BadInputError: no vehicle departs in the time window.
+        CommandFailedError: libsumo is missing, or SUMO rejects a file.
+    """
+    routes, state = folder / "vehicles.xml", folder / "state.xml"
     options = {
         **config.additional(folder, demand=True),
-        "vehroute-output": str(folder / _ROUTES_FILE),
+        "vehroute-output": str(routes),
         "vehroute-output.write-unfinished": "true",
         "vehroute-output.intended-depart": "true",
         "vehroute-output.last-route": "true",
     }
-    if window.begin_s is not None:
-        options["begin"] = f"{window.begin_s:g}"
-    if window.scale is not None:
-        options["scale"] = f"{window.scale:g}"
-    return SumoProcess(config.command(seed, options))
-
-
-def read_demand(
-    sumo: SumoProcess, config: SumoConfig, folder: Path, window: TimeWindow
-) -> SumoDemand:
-    """Let SUMO drive a simulation, close it, and return its vehicles.
-
-    Args:
-        sumo: the simulation, which `first_simulation` has started.
-        config: its configuration.
-        folder: folder for temporary files.
-        window: when the vehicles depart.
-
-    Raises:
-        BadInputError: no vehicle departs in the time window.
-        CommandFailedError: SUMO rejects a file.
-    """
-    state = folder / "state.xml"
-    begin_s, until_s = sumo.simulation.getTime(), sumo.simulation.getEndTime()
-    until_s = until_s if until_s > begin_s else math.inf
-    end_s = min(begin_s + window.duration_s, window.end_s, until_s)
-    # One step more: a vehicle departs in the first step after its time.
-    step_s = sumo.simulation.getDeltaT()
-    waiting = _drive(sumo, end_s + step_s, min(LATEST_S, until_s))
-    sumo.simulation.saveState(str(state))
-    types = {name: _type(sumo, name) for name in sumo.vehicletype.getIDList()}
-    found = [*_not_departed(sumo, waiting, types)]
-    ahead = {name: stops for name in sumo.vehicle.getIDList() if (stops := _stops(sumo, name))}
-    sumo.close()  # SUMO completes its output
-    departed, persons = _departed(folder / _ROUTES_FILE, types, begin_s, ahead)
-    found += departed
+    for name, value in (("begin", window.begin_s), ("scale", window.scale)):
+        options |= {} if value is None else {name: f"{value:g}"}
+    with SumoProcess(config.command(seed, options)) as sumo:
+        network = read_network(sumo)
+        begin_s, until_s = sumo.simulation.getTime(), sumo.simulation.getEndTime()
+        until_s = until_s if until_s > begin_s else math.inf
+        end_s = min(begin_s + window.duration_s, window.end_s, until_s)
+        # One step more: a vehicle departs in the first step after its time.
+        step_s = sumo.simulation.getDeltaT()
+        waiting = _drive(sumo, end_s + step_s, min(LATEST_S, until_s))
+        sumo.simulation.saveState(str(state))
+        types = {name: _type(sumo, name) for name in sumo.vehicletype.getIDList()}
+        found = [*_not_departed(sumo, waiting, types)]
+        ahead = {name: stops for name in sumo.vehicle.getIDList() if (stops := _stops(sumo, name))}
+    persons = 0
+    for _, element in ET.iterparse(routes):  # noqa: S314 (SUMO has written it, and closed it)
+        persons += element.tag in {"person", "container"}
+        if element.tag == "vehicle":
+            found.append(_departed(element, types, begin_s, ahead))
+            element.clear()
     inside = sorted(
         (one for one in found if one.depart_s < end_s or math.isinf(one.depart_s)),
         key=lambda one: one.depart_s,
@@ -245,14 +230,9 @@ def read_demand(
             Described(f"{begin_s:g} s to {end_s:g} s"),
             "a time in which vehicles depart" + (f"; {hint}" if math.isfinite(first_s) else ""),
         )
-    return SumoDemand(
-        tuple(inside),
-        begin_s,
-        min(end_s, math.floor(departures_s[-1]) + 1.0),
-        step_s,
-        _type_elements(state),
-        persons,
-    )
+    end_s = min(end_s, math.floor(departures_s[-1]) + 1.0)
+    elements = _type_elements(state)
+    return SumoSimulation(config, network, tuple(inside), begin_s, end_s, step_s, elements, persons)
 
 
 def _drive(sumo: SumoProcess, end_s: float, latest_s: float) -> Mapping[str, float]:
@@ -276,11 +256,10 @@ def _drive(sumo: SumoProcess, end_s: float, latest_s: float) -> Mapping[str, flo
 
 def _due_s(sumo: SumoProcess) -> dict[str, float]:
     """Return when the vehicles that have been loaded in the last step are to depart."""
-    now_s = sumo.simulation.getTime()
-    return {
-        name: now_s - sumo.vehicle.getDepartDelay(name)
-        for name in sumo.simulation.getLoadedIDList()
-    }
+    now_s, loaded = sumo.simulation.getTime(), sumo.simulation.getLoadedIDList()
+    # A scale below 1 leaves some of them out at once.
+    present = {*sumo.vehicle.getLoadedIDList()} if loaded else ()
+    return {name: now_s - sumo.vehicle.getDepartDelay(name) for name in loaded if name in present}
 
 
 def _type(sumo: SumoProcess, name: str) -> SumoType:
@@ -347,43 +326,29 @@ def _route(sumo: SumoProcess, name: str) -> tuple[str, ...]:
 
 
 def _departed(
-    file: Path,
-    types: Mapping[str, SumoType],
-    begin_s: float,
-    ahead: Mapping[str, tuple[Attributes, ...]],
-) -> tuple[list[SumoVehicle], int]:
-    """Return the vehicles of SUMO's output, and the number of persons and containers.
-
-    Args:
-        file: the output.
-        types: the types, by name.
-        begin_s: when the simulation has begun.
-        ahead: stops that vehicles have not reached.
-    """
-    vehicles, persons = list[SumoVehicle](), 0
-    for _, element in ET.iterparse(file):  # noqa: S314 (SUMO has written it)
-        persons += element.tag in {"person", "container"}
-        if element.tag == "vehicle":
-            vehicles.append(_reported(element, types, begin_s, ahead))
-            element.clear()
-    return vehicles, persons
-
-
-def _reported(
     element: ET.Element,
     types: Mapping[str, SumoType],
     begin_s: float,
     ahead: Mapping[str, tuple[Attributes, ...]],
 ) -> SumoVehicle:
+    """Return a vehicle of SUMO's output.
+
+    Args:
+        element: its element.
+        types: the types, by name.
+        begin_s: when the simulation has begun.
+        ahead: stops that vehicles have not reached.
+    """
     attributes = {name: value for name, value in element.attrib.items() if name not in _NOT_KEPT}
     if float(attributes.get("departSpeed", "0")) > 0.0:
         # What SUMO has reported is a speed, which may be too high beside other vehicles.
         attributes["departSpeed"] = "max"
+    *_, route = element.iter("route")
     name, type_name = element.get("id", ""), element.get("type", _DEFAULT_TYPE)
     return SumoVehicle(
         name,
         _departure_s(element.get("depart", ""), begin_s),
-        tuple(_edges(element)),
+        tuple(route.get("edges", "").split()),
         types[type_name],
         type_name,
         attributes,
@@ -399,11 +364,6 @@ def _departure_s(text: str, begin_s: float) -> float:
         return float(text)
     except ValueError:
         return math.inf
-
-
-def _edges(vehicle: ET.Element) -> Sequence[str]:
-    *_, route = vehicle.iter("route")
-    return route.get("edges", "").split()
 
 
 def _stop(element: ET.Element) -> Attributes:
@@ -424,62 +384,3 @@ def _type_elements(state: Path) -> str:
             if parameter.get("key", "").startswith("has.rerouting"):
                 kind.remove(parameter)  # routes are those of the first simulation
     return "".join(ET.tostring(kind, encoding="unicode") for kind in found)
-
-
-def demand_on(corridor: Corridor, demand: SumoDemand) -> CorridorDemand:
-    """Return the vehicles whose routes lead through a corridor."""
-    passes, missing, left_out = list[Pass](), Counter[str](), set[str]()
-    for vehicle in demand.vehicles:
-        found = _pass_of(vehicle, corridor)
-        if isinstance(found, Pass):
-            passes.append(found)
-        elif found:
-            missing[found] += 1
-            left_out.add(vehicle.name)
-    duration_s = max(demand.end_s - demand.begin_s, 1.0)
-    return CorridorDemand(tuple(passes), duration_s, missing, frozenset(left_out))
-
-
-def _pass_of(vehicle: SumoVehicle, corridor: Corridor) -> Pass | str:
-    """Return a vehicle's way through the corridor, or why it is left out; empty: no contact."""
-    route, numbers = vehicle.route, corridor.edge_numbers
-    inside = [place for place, edge in enumerate(route) if edge in numbers]
-    if not inside:
-        return ""
-    first, last = inside[0], inside[-1]
-    if [numbers[route[place]] for place in inside] != [
-        *range(numbers[route[first]], numbers[route[first]] + last - first + 1)
-    ]:
-        return "drive through it twice"
-    if math.isinf(vehicle.depart_s):
-        return "wait for passengers"
-    if vehicle.stops:
-        return "stop on their way"
-    before = route[first - 1] if first else ""
-    after = route[last + 1] if last + 1 < len(route) else ""
-    entrance, destination, upstream = MAIN_ENTRANCE, END_OF_ROAD, ""
-    if numbers[route[first]] == 0:
-        upstream = before
-    else:
-        ramps = {(one.edge, one.to_edge): one.name for one in corridor.ramps}
-        if (before, route[first]) not in ramps:
-            return f"enter from {before}" if before else f"start on {route[first]}"
-        entrance = ramps[before, route[first]]
-    if numbers[route[last]] < len(numbers) - 1:
-        exits = {(one.from_edge, one.edge): one.name for one in corridor.ways_out}
-        if (route[last], after) not in exits:
-            return f"leave to {after}" if after else f"end on {route[last]}"
-        destination = exits[route[last], after]
-    return Pass(vehicle, entrance, destination, upstream)
-
-
-def type_names(passes: Sequence[Pass]) -> dict[SumoType, str]:
-    """Return the types with their names, the most frequent first; that is the car.
-
-    Types with equal limits and classes are one. Their names are those of SUMO's classes.
-    """
-    counts = Counter(one.vehicle.vehicle_type for one in passes)
-    names: dict[SumoType, str] = {}
-    for kind, _ in counts.most_common():
-        names[kind] = unique_name(kind.vehicle_class, names.values())
-    return names

@@ -1,0 +1,159 @@
+"""A corridor of a SUMO simulation, and the vehicles whose routes lead through it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+
+from attrs import frozen
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.road_layout import END_OF_ROAD
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
+from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor, corridor_of, unique_name
+from laneweave.sim_bridge.corridors.sumo_network import Network
+from laneweave.sim_bridge.corridors.sumo_simulation import (
+    WHOLE,
+    SumoSimulation,
+    SumoType,
+    SumoVehicle,
+    TimeWindow,
+    read_simulation,
+)
+from laneweave.sim_bridge.corridors.ways_in import WayIn, ways_in
+
+
+@frozen
+class Pass:
+    """A vehicle's way through a corridor."""
+
+    vehicle: SumoVehicle
+    entrance: str
+    """`MAIN_ENTRANCE`, or the name of a ramp."""
+    destination: str
+    """`END_OF_ROAD`, or the name of an exit."""
+    upstream: str = ""
+    """Edge from which it comes to the start; empty: it departs on the first edge, or by a ramp."""
+
+    @property
+    def departs_at_start(self) -> bool:
+        """Whether it departs on the first edge of the corridor; others come from outside."""
+        return self.entrance == MAIN_ENTRANCE and not self.upstream
+
+
+@frozen(slots=False)
+class SumoCorridor:
+    """A corridor of a SUMO simulation, and the vehicles that drive through it."""
+
+    simulation: SumoSimulation
+    corridor: Corridor
+    passes: tuple[Pass, ...]
+    """In order of departure."""
+    left_out: Mapping[str, str]
+    """Why it cannot serve vehicles whose routes touch it, by their names in SUMO."""
+
+    @property
+    def missing(self) -> Mapping[str, int]:
+        """Number of vehicles that it cannot serve, by reason."""
+        return Counter(self.left_out.values())
+
+    @property
+    def volume_veh_per_h(self) -> float:
+        """Number of vehicles per hour that drive through a part of it."""
+        return 3600.0 * len(self.passes) / self.simulation.duration_s
+
+    @cached_property
+    def ways_in(self) -> tuple[WayIn, ...]:
+        """The lanes towards the entrances."""
+        return tuple(ways_in(self.corridor))
+
+    def type_names(self) -> dict[SumoType, str]:
+        """Return the types with their names, the most frequent first; that is the car.
+
+        Types with equal limits and classes are one. Their names are those of SUMO's classes.
+        """
+        counts = Counter(one.vehicle.vehicle_type for one in self.passes)
+        names: dict[SumoType, str] = {}
+        for kind, _ in counts.most_common():
+            names[kind] = unique_name(kind.vehicle_class, names.values())
+        return names
+
+
+def read_corridor(file: Path, name: str, window: TimeWindow = WHOLE, seed: int = 1) -> SumoCorridor:
+    """Read the files of a simulation, and derive a corridor; see `read_simulation`.
+
+    `name` consists of the first and the last edge, FIRST_EDGE:LAST_EDGE.
+
+    Raises:
+        BadInputError: a file cannot be read, the edges are not a corridor, or no vehicle departs in
+            the time window.
+        CommandFailedError: libsumo is missing, or SUMO rejects a file.
+    """
+    simulation = read_simulation(file, window, seed)
+    return corridor_in(simulation, *_edges_of(name, simulation.network))
+
+
+def corridor_in(simulation: SumoSimulation, first: str, last: str) -> SumoCorridor:
+    """Return the corridor from one edge to another, with its vehicles; see `corridor_of`."""
+    corridor = corridor_of(simulation.network, first, last, simulation.departing)
+    passes, left_out = list[Pass](), dict[str, str]()
+    for vehicle in simulation.vehicles:
+        found = _pass_of(vehicle, corridor)
+        if isinstance(found, Pass):
+            passes.append(found)
+        elif found:
+            left_out[vehicle.name] = found
+    return SumoCorridor(simulation, corridor, tuple(passes), left_out)
+
+
+def _edges_of(name: str, network: Network) -> tuple[str, str]:
+    """Return the first and the last edge that a name of a corridor consists of.
+
+    Names of edges may contain colons.
+
+    Raises:
+        BadInputError: it does not consist of two names.
+    """
+    colons = [place for place, letter in enumerate(name) if letter == ":"]
+    pairs = [(name[:place], name[place + 1 :]) for place in colons]
+    pairs = [pair for pair in pairs if all(pair)]
+    for pair in pairs:
+        if all(edge in network.edges for edge in pair):
+            return pair
+    if len(pairs) != 1:
+        raise BadInputError(OPTION, name, "FIRST_EDGE:LAST_EDGE, two edges of the network")
+    return pairs[0]
+
+
+def _pass_of(vehicle: SumoVehicle, corridor: Corridor) -> Pass | str:
+    """Return a vehicle's way through the corridor, or why it is left out; empty: no contact."""
+    route, numbers = vehicle.route, corridor.edge_numbers
+    inside = [place for place, edge in enumerate(route) if edge in numbers]
+    if not inside:
+        return ""
+    first, last = inside[0], inside[-1]
+    begin, end = numbers[route[first]], numbers[route[last]]
+    if [numbers[route[place]] for place in inside] != [*range(begin, begin + last - first + 1)]:
+        return "drive through it twice"
+    if math.isinf(vehicle.depart_s):
+        return "wait for passengers"
+    if vehicle.stops:
+        return "stop on their way"
+    before, after = ("", *route)[first], (*route, "")[last + 1]
+    entrance, destination, upstream = MAIN_ENTRANCE, END_OF_ROAD, ""
+    if begin == 0:
+        upstream = before
+    else:
+        ramps = {(one.edge, one.to_edge): one.name for one in corridor.ramps}
+        if (before, route[first]) not in ramps:
+            return f"enter from {before}" if before else f"start on {route[first]}"
+        entrance = ramps[before, route[first]]
+    if end < len(numbers) - 1:
+        exits = {(one.from_edge, one.edge): one.name for one in corridor.ways_out}
+        if (route[last], after) not in exits:
+            return f"leave to {after}" if after else f"end on {route[last]}"
+        destination = exits[route[last], after]
+    return Pass(vehicle, entrance, destination, upstream)
