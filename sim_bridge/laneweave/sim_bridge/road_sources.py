@@ -84,13 +84,13 @@ def open_road(demand: RunDemand, results: Path) -> Iterator[RoadSource]:
                     world.show(scenario.runtime.tick_s)
                 yield RoadSource(world, demand.arrivals)
             return
-        with CorridorWorld(setup, folder, results) as world_of_sumo:
+        with CorridorWorld(setup, folder, results) as corridor:
             if scenario.sumo.gui:
-                world_of_sumo.show(scenario.runtime.tick_s)
-            ramps = TakeOver(scenario, world_of_sumo)
+                corridor.show(scenario.runtime.tick_s)
             stream = tuple(one.arrival for one in setup.arrivals if one.origin.departs_at_start)
-            yield RoadSource(world_of_sumo, stream, ramps, setup.found.missing)
-            world_of_sumo.drive_on()
+            taken_over = TakeOver(scenario, corridor)
+            yield RoadSource(corridor, stream, taken_over, setup.found.missing)
+            corridor.drive_on()
 
 
 def corridor_setup(scenario: Scenario) -> CorridorSetup:

@@ -12,15 +12,18 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from typing import Protocol
 
-from attrs import evolve, frozen
+from attrs import evolve
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
 from laneweave.protocol.vehicle.lane_ends import dead_ends
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
+from laneweave.sim_bridge.corridors.corridor_world import (
+    SEEN_BEYOND_M,
+    Approaching,
+    CorridorWorld,
+)
 from laneweave.sim_bridge.corridors.exit_room import ExitRoom
 from laneweave.sim_bridge.corridors.settling import LONGEST_S, before_rest_s, fall_back, settling_s
 from laneweave.sim_bridge.road.demand import Arrival
@@ -41,69 +44,23 @@ CENSUS_S = 0.7
 """Time after its entry in which coordinators know a vehicle."""
 BESIDE_COLUMNS = 1
 """Number of columns by which a vehicle rather falls back than entering beside another vehicle."""
-SEEN_BEYOND_M = 200.0
-"""Distance behind an exit up to which SUMO's vehicles are seen."""
 STANDING_S = 120.0
 """Time for which all vehicles stand in queues behind exits when a run ends, after all entries."""
 MAX_COLUMNS = 40
 """Maximum number of columns that are tried."""
 
 
-@frozen
-class Approaching:
-    """A vehicle that SUMO drives towards an entrance."""
-
-    arrival: Arrival
-    """With the lane to which it comes."""
-    s_m: float
-    """Position of its front on the road; it is negative before the start."""
-    speed_mps: float
-    limits: tuple[tuple[float, float], ...]
-    """Where each lane on its way ends [m], from its own on, and how fast it drives there [m/s]."""
-    upstream: bool = False
-    """Whether it still has to pass a junction where ways join, so that others may come before."""
-
-
-class OutsideView(Protocol):
-    """What SUMO drives to the entrances."""
-
-    @property
-    def start_lanes(self) -> Sequence[int]:
-        """Lanes to whose beginning vehicles come from upstream."""
-
-    @property
-    def departing(self) -> Sequence[Arrival]:
-        """Vehicles that depart near an entrance, in order of departure."""
-
-    def approaching(self, lane: int) -> Sequence[Approaching]:
-        """Return the vehicles that come to the entrance of a lane, the foremost first."""
-
-    def advise(self, vehicle: str, speed_mps: float | None) -> None:
-        """Set the speed at which a vehicle is driven, if it can drive at it; None: its own."""
-
-    def others(self) -> Sequence[OtherBody]:
-        """Return the bodies up to `SEEN_BEYOND_M` behind the exits."""
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether no vehicles come to an entrance any more."""
-
-    @property
-    def outside(self) -> Sequence[Arrival]:
-        """The vehicles that have not been taken over."""
-
-
 class TakeOver(OutsideTraffic):
     """Takes vehicles over from SUMO."""
 
-    def __init__(self, scenario: Scenario, view: OutsideView) -> None:
+    def __init__(self, scenario: Scenario, world: CorridorWorld) -> None:
         """Begin without vehicles on their way to the entrances."""
-        self._view = view
+        self._world = world
         self._lattice = scenario.lattice
         self._limits = {name: one.limits for name, one in scenario.types.items()}
         self._at_m = {one.lane: one.at_m for one in scenario.entrance}
         """Positions of the entrances, by lane."""
-        self._at_m |= dict.fromkeys(view.start_lanes, 0.0)
+        self._at_m |= dict.fromkeys(world.start_lanes, 0.0)
         self._before_rest_s = {
             name: before_rest_s(scenario.types.room_ahead_m, one.limits)
             for name, one in scenario.types.items()
@@ -124,7 +81,7 @@ class TakeOver(OutsideTraffic):
         self._known: dict[str, Arrival] = {}
         """Approaching vehicles, each with the time at which it was expected first."""
         self._announce_s = scenario.runtime.announce_s
-        self._departing = deque(view.departing)
+        self._departing = deque(world.departing)
         self._due: dict[str, Arrival] = {}
         """Announced vehicles that have not departed."""
         self._moved_s = 0.0
@@ -134,7 +91,7 @@ class TakeOver(OutsideTraffic):
         """Return the vehicles that have come near an entrance since the last call."""
         new = []
         for lane, at_m in self._at_m.items():
-            for one in self._view.approaching(lane):
+            for one in self._world.approaching(lane):
                 name = one.arrival.vehicle
                 if name not in self._known:
                     fastest_mps = max(one.speed_mps, self._lattice.speed_mps)
@@ -154,21 +111,21 @@ class TakeOver(OutsideTraffic):
     @property
     def exhausted(self) -> bool:
         """Whether no more vehicles will come."""
-        return self._view.exhausted
+        return self._world.exhausted
 
     @property
     def never_came(self) -> Sequence[Arrival]:
         """The vehicles that were to come, and have not come near an entrance."""
-        return [one for one in self._view.outside if one.vehicle not in self._known]
+        return [one for one in self._world.outside if one.vehicle not in self._known]
 
     @property
     def start_lanes(self) -> Sequence[int]:
         """Lanes to whose beginning vehicles come from upstream."""
-        return self._view.start_lanes
+        return self._world.start_lanes
 
     def release(self, coming: Sequence[Arrival], ahead: Iterable[Arrival]) -> Sequence[Arrival]:
         """Return which of the vehicles at the start may enter; see `ExitRoom`."""
-        return self._exit_room.release(coming, ahead, self._view.others)
+        return self._exit_room.release(coming, ahead, self._world.others)
 
     def full_lanes(self) -> set[int]:
         """Return the lanes to whose start a vehicle is too close for another to enter before it."""
@@ -176,7 +133,7 @@ class TakeOver(OutsideTraffic):
             lane
             for lane, at_m in self._at_m.items()
             if at_m <= 0.0
-            for one in self._view.approaching(lane)[:1]
+            for one in self._world.approaching(lane)[:1]
             if one.s_m > -NEAR_S * max(one.speed_mps, self._lattice.speed_mps)
         }
 
@@ -186,7 +143,7 @@ class TakeOver(OutsideTraffic):
         self._occupied = set(occupied)
         for lane, at_m in self._at_m.items():
             column = meter.next_open(lane, t_s)
-            for one in self._view.approaching(lane):
+            for one in self._world.approaching(lane):
                 if one.arrival.vehicle not in self._known:
                     continue  # it has come since `demanded`
                 if one.s_m < at_m:
@@ -321,7 +278,7 @@ class TakeOver(OutsideTraffic):
                 advice = _slow_mps(distance_m, wanted_s - t_s, comes_mps, accel_mps2) or advice
                 if advice is not None and one.upstream:
                     advice = max(advice, UPSTREAM_SHARE * own_mps)
-        self._view.advise(arrival.vehicle, advice)
+        self._world.advise(arrival.vehicle, advice)
         return first
 
 

@@ -4,37 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from attrs import define, evolve, field
+from attrs import evolve
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
-from laneweave.sim_bridge.corridors.take_over import Approaching, TakeOver
+from laneweave.sim_bridge.corridors.corridor_world import Approaching
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
 from support.interchange import interchange_scenario
-
-
-@define
-class View:
-    """Vehicles on the ramp, and the advice for them."""
-
-    coming: list[Approaching]
-    advice: dict[str, float | None] = field(factory=dict)
-    exhausted: bool = False
-    start_lanes: tuple[int, ...] = ()
-    departing: tuple[Arrival, ...] = ()
-    outside: tuple[Arrival, ...] = ()
-
-    def approaching(self, lane: int) -> list[Approaching]:
-        return [one for one in self.coming if one.arrival.lane == lane]
-
-    def others(self) -> list[OtherBody]:
-        return []
-
-    def advise(self, vehicle: str, speed_mps: float | None) -> None:
-        self.advice[vehicle] = speed_mps
+from support.outside import Outside
 
 
 def meter_of(scenario: Scenario, taken: frozenset[Cell] = frozenset()) -> EntryMeter:
@@ -53,11 +32,11 @@ def admit(
     taken: frozenset[Cell] = frozenset(),
     occupied: frozenset[Cell] = frozenset(),
     t_s: float = 50.0,
-) -> tuple[list[Admission], View]:
-    view = View([*coming])
-    ramps = TakeOver(scenario, view)
+) -> tuple[list[Admission], Outside]:
+    outside = Outside([*coming])
+    ramps = outside.take_over(scenario)
     ramps.demanded(t_s)
-    return ramps.admit(t_s, meter_of(scenario, taken), occupied), view
+    return ramps.admit(t_s, meter_of(scenario, taken), occupied), outside
 
 
 def on_ramp(name: str, s_m: float, speed_mps: float, kind: str = "car") -> Approaching:
@@ -120,8 +99,8 @@ def test_a_vehicle_that_would_be_too_early_is_slowed_down_on_its_way(tmp_path: P
     at_m = scenario.entrance[0].at_m
     ahead = on_ramp("a", at_m - 150.0, 20.0)
     close = evolve(on_ramp("b", at_m - 158.0, 20.0), s_m=at_m - 158.0)
-    admissions, view = admit(scenario, ahead, close)
+    admissions, outside = admit(scenario, ahead, close)
     assert admissions == []
-    slowed = view.advice["b"]
+    slowed = outside.advice["b"]
     assert slowed is not None
     assert 3.0 <= slowed < 20.0

@@ -18,11 +18,12 @@ from laneweave.protocol.wire.messages import Census, ClosedFormation, Name, Road
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.corridors.exit_room import HELD_ANNOUNCED
-from laneweave.sim_bridge.corridors.take_over import STANDING_S, Approaching, TakeOver
+from laneweave.sim_bridge.corridors.take_over import STANDING_S
 from laneweave.sim_bridge.road.demand import Arrival, arrivals
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.outside import Outside
 from support.paper import closing_time_s, paper
 from support.road_vehicles import vehicle_in
 
@@ -316,24 +317,8 @@ OFF_RAMP = {
 }
 
 
-@define
-class Outside:
-    """No traffic outside but a queue, which leaves no room behind the exit."""
-
-    full: bool = True
-    exhausted: bool = False
-    start_lanes: tuple[int, ...] = ()
-    departing: tuple[Arrival, ...] = ()
-    outside: tuple[Arrival, ...] = ()
-
-    def approaching(self, _: int) -> list[Approaching]:
-        return []
-
-    def advise(self, *_: object) -> None:
-        """Do nothing."""
-
-    def others(self) -> list[OtherBody]:
-        return [OtherBody("queue", 0, 800.0, 801.0, 0.0, 0.0)] if self.full else []
+QUEUE = OtherBody("queue", 0, 800.0, 801.0, 0.0, 0.0)
+"""It leaves no room behind the exit."""
 
 
 def held_roadside(outside: Outside, exits: int) -> tuple[Roadside, Scenario]:
@@ -342,7 +327,7 @@ def held_roadside(outside: Outside, exits: int) -> tuple[Roadside, Scenario]:
         Arrival(f"v{n:04}", 1, ANY_LANE, 2.0 + 2.0 * n, "off" if n <= exits else END_OF_ROAD)
         for n in range(1, 9)
     )
-    return Roadside(scenario, stream, outside_traffic=TakeOver(scenario, outside)), scenario
+    return Roadside(scenario, stream, outside_traffic=outside.take_over(scenario)), scenario
 
 
 def admitted(roadside: Roadside, scenario: Scenario, from_s: float, to_s: float) -> list[Admission]:
@@ -356,14 +341,14 @@ def admitted(roadside: Roadside, scenario: Scenario, from_s: float, to_s: float)
 
 
 def test_a_vehicle_that_is_held_back_is_announced_and_enters_when_it_is_released() -> None:
-    outside = Outside()
+    outside = Outside(bodies=[QUEUE])
     roadside, scenario = held_roadside(outside, exits=1)
     before = admitted(roadside, scenario, 0.0, 60.0)
     # It does not keep those behind it back.
     assert [one.arrival.vehicle for one in before] == [f"v{n:04}" for n in range(2, 9)]
     assert [one.vehicle for one in roadside.publisher.census(60.0, ()).announced] == ["v0001"]
     assert not roadside.demand.exhausted(60.0)
-    outside.full = False
+    outside.bodies.clear()
     (late,) = admitted(roadside, scenario, 60.0, 65.0)
     assert late.arrival.vehicle == "v0001"
     # It does not enter in the past, where its body would be on the road already.
@@ -371,13 +356,13 @@ def test_a_vehicle_that_is_held_back_is_announced_and_enters_when_it_is_released
 
 
 def test_few_vehicles_of_those_that_are_held_back_are_announced() -> None:
-    roadside, scenario = held_roadside(Outside(), exits=7)
+    roadside, scenario = held_roadside(Outside(bodies=[QUEUE]), exits=7)
     assert len(admitted(roadside, scenario, 0.0, 60.0)) == 1
     assert len(roadside.publisher.census(60.0, ()).announced) == HELD_ANNOUNCED
 
 
 def test_a_road_on_which_all_stand_is_over_when_no_more_vehicles_come() -> None:
-    outside = Outside()
+    outside = Outside(bodies=[QUEUE])
     roadside, scenario = held_roadside(outside, exits=7)
     (one,) = admitted(roadside, scenario, 0.0, 60.0)
     vehicle = RoadVehicle.entering(one, 20.0, scenario, 0)
