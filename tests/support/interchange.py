@@ -27,12 +27,8 @@ from laneweave.launch.cli.corridor_command import corridor_tables
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.corridors import sumo_network
-from laneweave.sim_bridge.corridors.scenario_tables import scenario_tables
 from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
-from laneweave.sim_bridge.corridors.sumo_network import read_network
 from laneweave.sim_bridge.corridors.sumo_simulation import WHOLE
-from laneweave.sim_bridge.sumo.simulation import SumoProcess
 from support.sharing import made_once
 
 LANE_M = 3.2
@@ -116,7 +112,6 @@ def write_interchange(
     vehicles: Sequence[str] = (),
     *,
     types: str = "",
-    state: str = "M",
     network: Network = EXIT_FIRST,
 ) -> Path:
     """Write the files of the simulation, and return its configuration.
@@ -125,10 +120,9 @@ def write_interchange(
         folder: their folder.
         vehicles: XML elements of vehicles, in order of departure.
         types: XML elements of types; the type `car` always exists.
-        state: right of way of the link from main4 to main5.
         network: the road.
     """
-    (folder / "small.net.xml").write_text("\n".join(_network(network, state)), encoding="utf-8")
+    (folder / "small.net.xml").write_text("\n".join(_network(network)), encoding="utf-8")
     routes = ["<routes>", '<vType id="car" sigma="0"/>', types, *vehicles, "</routes>"]
     (folder / "small.rou.xml").write_text("\n".join(routes), encoding="utf-8")
     config = folder / "small.sumocfg"
@@ -178,18 +172,6 @@ def stream(duration_s: int) -> list[str]:
 TRUCKS = '<vType id="truck" vClass="truck" length="7.1" accel="1.3" decel="4" sigma="0"/>'
 
 
-def interchange_network(folder: Path, state: str = "M") -> sumo_network.Network:
-    """Return the network of the corridor's simulation; `state`: right of way of its main road."""
-    with SumoProcess(("sumo", "-c", str(write_interchange(folder, state=state)))) as sumo:
-        return read_network(sumo)
-
-
-def interchange_scenario(folder: Path) -> Scenario:
-    """Return the scenario of the corridor with a stream of vehicles of a minute."""
-    found = read_corridor(write_interchange(folder, stream(60), types=TRUCKS), CORRIDOR)
-    return parse_scenario(scenario_tables(found))
-
-
 DRIVEN_S = 15
 """Duration of the stream of `driven_interchange`."""
 
@@ -212,7 +194,7 @@ def driven_interchange(factory: pytest.TempPathFactory) -> tuple[Scenario, Path]
     return scenario_of(folder / "files" / "small.sumocfg"), folder / "run"
 
 
-def _network(network: Network, state: str) -> Iterator[str]:
+def _network(network: Network) -> Iterator[str]:
     edges, links = network.edges, network.links
     yield '<net version="1.20">'
     bounds = f"{min(edge.from_m for edge in edges)},-60,{max(edge.to_m for edge in edges)},20"
@@ -244,9 +226,8 @@ def _network(network: Network, state: str) -> Iterator[str]:
             yield f'<request index="{number}" response="{none}" foes="{none}" cont="0"/>'
         yield "</junction>"
     for before, from_lane, after, to_lane in links:
-        right = state if after == "main5" else "M"
         yield (
             f'<connection from="{before}" to="{after}" fromLane="{from_lane}" toLane="{to_lane}"'
-            f' dir="s" state="{right}"/>'
+            ' dir="s" state="M"/>'
         )
     yield "</net>"

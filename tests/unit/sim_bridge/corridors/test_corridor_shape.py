@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 
-from laneweave.sim_bridge.corridors.corridor import corridor_of
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape, _piece
-from support.interchange import LANE_M, interchange_network
+from laneweave.sim_bridge.corridors.sumo_corridor import SumoCorridor
+from support.interchange import LANE_M
+from support.tables import for_each
 
 
 @pytest.fixture
-def shape(tmp_path: Path) -> CorridorShape:
-    return CorridorShape(corridor_of(interchange_network(tmp_path), "main1", "main5"))
+def shape(interchange: SumoCorridor) -> CorridorShape:
+    return CorridorShape(interchange.corridor)
 
 
-@pytest.mark.parametrize("s_m", [0.0, 5.0, 699.0, 700.0, 701.0, 1000.0, 1360.5, 1950.0])
-@pytest.mark.parametrize("lane", [1, 2, 3])
+@for_each("s_m", [0.0, 5.0, 699.0, 700.0, 701.0, 1000.0, 1360.5, 1950.0])
+@for_each("lane", [1, 2, 3])
 def test_the_main_road_of_the_interchange_is_straight(
     shape: CorridorShape, s_m: float, lane: int
 ) -> None:

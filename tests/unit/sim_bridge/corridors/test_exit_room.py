@@ -4,21 +4,14 @@ from __future__ import annotations
 
 import math
 
-import pytest
 from attrs import evolve
 
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.corridors.exit_room import QUEUE_DECEL_MPS2, SPACE_M, ExitRoom
-from support.interchange import interchange_scenario
 
 SEEN_M = 200.0
-
-
-@pytest.fixture(scope="module")
-def scenario(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
-    return interchange_scenario(tmp_path_factory.mktemp("interchange"))
 
 
 def body(scenario: Scenario, rear_m: float, speed_mps: float = 0.0, lane: int = 0) -> OtherBody:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import pytest
 from attrs import evolve
 
 from laneweave.protocol.config.scenario_files import parse_scenario
@@ -19,14 +18,16 @@ KINDS = ("car", "truck")
 
 
 def corridor_with(
-    folder: Path, old: str, new: str, vehicles: Sequence[str] = (), types: str = TRUCKS
+    folder: Path, new: Mapping[str, str], vehicles: Sequence[str] = (), types: str = TRUCKS
 ) -> SumoCorridor:
-    """Return the corridor of the interchange with a part of its network file replaced."""
+    """Return the corridor of the interchange with parts of its network file replaced."""
     config = write_interchange(folder, vehicles or stream(60), types=types)
     file = folder / "small.net.xml"
     text = file.read_text(encoding="utf-8")
-    assert old in text
-    file.write_text(text.replace(old, new), encoding="utf-8")
+    for old, part in new.items():
+        assert old in text
+        text = text.replace(old, part)
+    file.write_text(text, encoding="utf-8")
     return read_corridor(config, CORRIDOR)
 
 
@@ -35,8 +36,8 @@ def remarks_on(found: SumoCorridor) -> list[str]:
 
 
 def test_trucks_keep_out_of_lanes_that_ban_them(tmp_path: Path) -> None:
-    banned = '<lane id="main3_2" disallow="truck"'
-    found = corridor_with(tmp_path, '<lane id="main3_2"', banned)
+    banned = {'<lane id="main3_2"': '<lane id="main3_2" disallow="truck"'}
+    found = corridor_with(tmp_path, banned)
     tables = scenario_tables(found)
     (rule,) = tables["road"]["restrictions"]
     assert rule == {"lane": 3, "from_m": 950.0, "to_m": 1110.0, "vehicle_types": ["truck"]}
@@ -46,10 +47,10 @@ def test_trucks_keep_out_of_lanes_that_ban_them(tmp_path: Path) -> None:
 
 
 def test_vehicles_enter_in_lanes_that_allow_them(tmp_path: Path) -> None:
-    banned = '<lane id="main1_2" disallow="truck"'
+    banned = {'<lane id="main1_2"': '<lane id="main1_2" disallow="truck"'}
     trucks = [vehicle(f"t{n}", 3.0 * n, "main", "truck") for n in range(9)]
     cars = [vehicle(f"c{n}", 3.0 * n + 1.0, "main") for n in range(20)]
-    found = corridor_with(tmp_path, '<lane id="main1_2"', banned, [*trucks, *cars])
+    found = corridor_with(tmp_path, banned, [*trucks, *cars])
     scenario = parse_scenario(scenario_tables(found))
     arrivals = [one.arrival for one in setup_of(found, scenario).arrivals]
     lanes = {kind: {one.lane for one in arrivals if one.vehicle_type == kind} for kind in KINDS}
@@ -59,8 +60,8 @@ def test_vehicles_enter_in_lanes_that_allow_them(tmp_path: Path) -> None:
 
 def test_types_of_two_classes_with_equal_limits_are_two(tmp_path: Path) -> None:
     types = '<vType id="truck" vClass="taxi" sigma="0"/>'
-    banned = '<lane id="main3_2" disallow="taxi"'
-    found = corridor_with(tmp_path, '<lane id="main3_2"', banned, types=types)
+    banned = {'<lane id="main3_2"': '<lane id="main3_2" disallow="taxi"'}
+    found = corridor_with(tmp_path, banned, types=types)
     tables = scenario_tables(found)
     assert tables["road"]["restrictions"][0]["vehicle_types"] == ["taxi"]
     setup = setup_of(found, parse_scenario(tables))
@@ -68,29 +69,26 @@ def test_types_of_two_classes_with_equal_limits_are_two(tmp_path: Path) -> None:
     assert kinds == {"car": "car", "truck": "taxi"}
 
 
-@pytest.mark.parametrize(
-    ("attribute", "expected"),
-    [
-        ('changeLeft="emergency"', {"to": "left"}),
-        ('changeRight="truck"', {"to": "right", "vehicle_types": ["car"]}),
-        ('changeLeft="all"', None),
-    ],
-)
-def test_lines_that_may_not_be_crossed(
-    tmp_path: Path, attribute: str, expected: dict[str, object] | None
-) -> None:
-    found = corridor_with(tmp_path, '<lane id="main3_1"', f'<lane id="main3_1" {attribute}')
+def test_lines_that_may_not_be_crossed(tmp_path: Path) -> None:
+    old = '<lane id="main3_{}"'
+    found = corridor_with(
+        tmp_path,
+        {
+            old.format(0): '<lane id="main3_0" changeLeft="all"',
+            old.format(1): '<lane id="main3_1" changeLeft="emergency" changeRight="truck"',
+        },
+    )
     tables = scenario_tables(found)
-    lines = tables["road"].get("solid_lines")
-    if expected is None:
-        assert lines is None
-        return
-    assert lines == [{"lane": 2, "from_m": 950.0, "to_m": 1110.0, **expected}]
+    part = {"lane": 2, "from_m": 950.0, "to_m": 1110.0}
+    assert tables["road"]["solid_lines"] == [
+        {**part, "to": "left"},
+        {**part, "to": "right", "vehicle_types": ["car"]},
+    ]
     assert parse_scenario(tables)
 
 
 def test_traffic_on_the_left_is_mirrored(tmp_path: Path) -> None:
-    found = corridor_with(tmp_path, '<net version="1.20"', '<net version="1.20" lefthand="true"')
+    found = corridor_with(tmp_path, {"<net": '<net lefthand="true"'})
     assert found.simulation.network.left_hand
     shape = CorridorShape(found.corridor)
     (_, y_m, _), piece = shape.at(300.0, 1.5 * LANE_M + 0.4)
@@ -99,15 +97,17 @@ def test_traffic_on_the_left_is_mirrored(tmp_path: Path) -> None:
     assert y_m == pytest.approx(1.5 * LANE_M - 0.4)
 
 
-def test_a_slow_type_that_lowers_the_speed_of_all_is_named(tmp_path: Path) -> None:
+def test_a_slow_type_that_lowers_the_speed_of_all_is_named(
+    interchange: SumoCorridor, tmp_path: Path
+) -> None:
     types = '<vType id="truck" vClass="moped" maxSpeed="12.5" sigma="0"/>'
-    found = corridor_with(tmp_path, "<net", "<net", types=types)
+    found = corridor_with(tmp_path, {}, types=types)
     (remark,) = remarks_on(found)
     assert "12.5 m/s, the maximum speed of class moped (9 of 70" in remark
-    assert not remarks_on(corridor_with(tmp_path, "<net", "<net"))
+    assert not remarks_on(interchange)
 
 
-def test_it_is_said_that_vehicles_wait_where_lanes_carry_fewer(tmp_path: Path) -> None:
-    found = corridor_with(tmp_path, "<net", "<net")
-    (remark,) = remarks_on(evolve(found, simulation=evolve(found.simulation, end_s=20.0)))
+def test_it_is_said_that_vehicles_wait_where_lanes_carry_fewer(interchange: SumoCorridor) -> None:
+    shorter = evolve(interchange.simulation, end_s=20.0)
+    (remark,) = remarks_on(evolve(interchange, simulation=shorter))
     assert "vehicles wait at the entrances: demand.volume_veh_per_lane_h is 3600, with" in remark

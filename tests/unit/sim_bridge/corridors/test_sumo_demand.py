@@ -56,7 +56,9 @@ def test_vehicles_have_their_entrance_destination_and_departure(tmp_path: Path) 
 
 
 def test_vehicles_that_start_inside_are_left_out_and_listed(tmp_path: Path) -> None:
-    found = corridor(tmp_path, vehicle("a", 0.0, "main"), vehicle("b", 1.0, "inside"))
+    after_the_end = vehicle("c", 300.5, "main")
+    inside = vehicle("b", 1.0, "inside")
+    found = corridor(tmp_path, vehicle("a", 299.0, "main"), inside, after_the_end)
     assert [one.vehicle.name for one in found.passes] == ["a"]
     assert found.missing == {"start on main3": 1}
     setup = setup_of(found, parse_scenario(scenario_tables(found)))
@@ -79,11 +81,6 @@ def test_vehicles_come_from_upstream_but_not_twice(tmp_path: Path) -> None:
     assert missing == {"drive through it twice": 1}
 
 
-def test_vehicles_that_depart_after_the_end_are_left_out(tmp_path: Path) -> None:
-    found = corridor(tmp_path, vehicle("a", 299.0, "main"), vehicle("b", 300.5, "main"))
-    assert [one.vehicle.name for one in found.passes] == ["a"]
-
-
 def test_flows_are_vehicles_as_sumo_makes_them(tmp_path: Path) -> None:
     flow = (
         '<flow id="f" type="car" begin="10" period="20" number="4" departSpeed="max">'
@@ -94,10 +91,10 @@ def test_flows_are_vehicles_as_sumo_makes_them(tmp_path: Path) -> None:
     assert departures == {f"f.{number}": 10.0 + 20.0 * number for number in range(4)}
 
 
-def test_arrivals_have_names_of_laneweave_and_lanes_that_suit_them(tmp_path: Path) -> None:
-    found = corridor(tmp_path, *stream(60))
-    scenario = parse_scenario(scenario_tables(found))
-    arrivals = arrivals_of(found, scenario)
+def test_arrivals_have_names_of_laneweave_and_lanes_that_suit_them(
+    interchange: SumoCorridor, scenario: Scenario
+) -> None:
+    arrivals = arrivals_of(interchange, scenario)
     assert [one.arrival.vehicle for one in arrivals[:2]] == ["v0001", "v0002"]
     assert {one.arrival.lane for one in arrivals if one.origin.entrance == "on"} == {0}
     # The lane next to the exit for those that leave, and all lanes for the others.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from attrs import evolve
 
 from laneweave.protocol.lattice import Cell
@@ -12,7 +10,6 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.corridors.corridor_world import Approaching
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
-from support.interchange import interchange_scenario
 from support.outside import Outside
 
 
@@ -45,8 +42,7 @@ def on_ramp(name: str, s_m: float, speed_mps: float, kind: str = "car") -> Appro
     )
 
 
-def test_a_slow_vehicle_gets_a_cell_to_which_it_can_fall_back(tmp_path: Path) -> None:
-    scenario = interchange_scenario(tmp_path)
+def test_a_slow_vehicle_gets_a_cell_to_which_it_can_fall_back(scenario: Scenario) -> None:
     at_m = scenario.entrance[0].at_m
     (fast,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 22.0))
     (slow,), _ = admit(scenario, on_ramp("b", at_m + 1.0, 15.0))
@@ -60,17 +56,15 @@ def test_a_slow_vehicle_gets_a_cell_to_which_it_can_fall_back(tmp_path: Path) ->
     assert slow.start.settle_s > fast.start.settle_s
 
 
-def test_one_behind_another_gets_a_column_behind_it(tmp_path: Path) -> None:
-    scenario = interchange_scenario(tmp_path)
+def test_one_behind_another_gets_a_column_behind_it(scenario: Scenario) -> None:
     at_m = scenario.entrance[0].at_m
     coming = on_ramp("a", at_m + 30.0, 20.0), on_ramp("b", at_m + 1.0, 20.0)
     first, second = admit(scenario, *coming)[0]
     assert second.cell[0] < first.cell[0]
 
 
-def test_a_vehicle_never_gets_a_cell_that_it_cannot_have(tmp_path: Path) -> None:
+def test_a_vehicle_never_gets_a_cell_that_it_cannot_have(scenario: Scenario) -> None:
     """Not even where none of the columns that it would reach in time is free."""
-    scenario = interchange_scenario(tmp_path)
     at_m = scenario.entrance[0].at_m
     (alone,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 20.0))
     taken = frozenset((alone.cell[0] + 3 - number, 0) for number in range(25))
@@ -81,8 +75,7 @@ def test_a_vehicle_never_gets_a_cell_that_it_cannot_have(tmp_path: Path) -> None
     assert second.cell[0] < first.cell[0]
 
 
-def test_a_vehicle_rather_enters_where_nobody_has_to_make_room(tmp_path: Path) -> None:
-    scenario = interchange_scenario(tmp_path)
+def test_a_vehicle_rather_enters_where_nobody_has_to_make_room(scenario: Scenario) -> None:
     at_m = scenario.entrance[0].at_m
     (alone,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 20.0))
     column = alone.cell[0]
@@ -94,8 +87,7 @@ def test_a_vehicle_rather_enters_where_nobody_has_to_make_room(tmp_path: Path) -
     assert same.cell[0] == column
 
 
-def test_a_vehicle_that_would_be_too_early_is_slowed_down_on_its_way(tmp_path: Path) -> None:
-    scenario = interchange_scenario(tmp_path)
+def test_a_vehicle_that_would_be_too_early_is_slowed_down_on_its_way(scenario: Scenario) -> None:
     at_m = scenario.entrance[0].at_m
     ahead = on_ramp("a", at_m - 150.0, 20.0)
     close = evolve(on_ramp("b", at_m - 158.0, 20.0), s_m=at_m - 158.0)

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
-from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
-from support.interchange import CORRIDOR, RAMP_SPEED_MPS, TRUCKS, stream, write_interchange
+from laneweave.sim_bridge.corridors.sumo_corridor import SumoCorridor
+from support.interchange import RAMP_SPEED_MPS
 
 
-def test_the_ways_to_the_ramp_and_parallel_ones_to_the_start(tmp_path: Path) -> None:
-    found = read_corridor(write_interchange(tmp_path, stream(10), types=TRUCKS), CORRIDOR)
-    *to_start, to_ramp = found.ways_in
-    (ramp,) = found.corridor.ramps
+def test_the_ways_to_the_ramp_and_parallel_ones_to_the_start(interchange: SumoCorridor) -> None:
+    *to_start, to_ramp = interchange.ways_in
+    (ramp,) = interchange.corridor.ramps
     assert (to_ramp.entrance, to_ramp.lane) == (ramp.name, ramp.lane)
     lanes = to_ramp.lanes
     assert [*lanes] == ["on_0", "before_0"]
