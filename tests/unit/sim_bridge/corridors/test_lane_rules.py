@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import pytest
 from attrs import evolve
 
 from laneweave.protocol.config.scenario_files import parse_scenario

@@ -58,7 +58,7 @@ def test_vehicles_have_their_entrance_destination_and_departure(tmp_path: Path) 
 def test_vehicles_that_start_inside_are_left_out_and_listed(tmp_path: Path) -> None:
     after_the_end = vehicle("c", 300.5, "main")
     inside = vehicle("b", 1.0, "inside")
-    found = corridor(tmp_path, vehicle("a", 299.0, "main"), inside, after_the_end)
+    found = corridor(tmp_path, inside, vehicle("a", 299.0, "main"), after_the_end)
     assert [one.vehicle.name for one in found.passes] == ["a"]
     assert found.missing == {"start on main3": 1}
     setup = setup_of(found, parse_scenario(scenario_tables(found)))
