@@ -64,8 +64,9 @@ from laneweave.protocol.wire.topics import TOPICS, Exchange, Party, Topic
 from laneweave.sim_bridge.core import BridgeMetrics
 from laneweave.sim_bridge.recording.columns import TICKS, TRAJECTORIES, TRIPS, Table
 from scenario_reference import meanings_in, scenario_table
-from support.bug_register import ROAD_BUGS
-from support.planted_bugs import BUGS, Bug
+from support.bugs import Bug
+from support.planted_bugs import BUGS
+from support.road_bugs import ROAD_BUGS
 from support.unseen_bugs import UNSEEN
 
 DOCS = Path(__file__).resolve().parent

@@ -40,8 +40,8 @@ from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.launch.fault_search.search import silence_logs
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
-from support.bug_register import EVERY_BUG
-from support.planted_bugs import Bug
+from support.bugs import Bug
+from support.planted_bugs import EVERY_BUG
 
 ROOT = Path(__file__).parents[2]
 EVIDENCE = ROOT / "docs" / "evidence" / "kill_matrix.json"

@@ -28,8 +28,8 @@ from laneweave.launch.fault_search.coverage import Coverage
 from laneweave.launch.fault_search.profiles import GUIDED, PROFILES, profiles_named
 from laneweave.launch.fault_search.search import rounds, run_story, shrunk, silence_logs
 from laneweave.launch.fault_search.story import Story
-from support.bug_register import EVERY_BUG
-from support.planted_bugs import BUGS, Bug
+from support.bugs import Bug
+from support.planted_bugs import BUGS, EVERY_BUG
 from support.unseen_bugs import UNSEEN
 
 SEEDS = 2000

@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from simulation.search_bugs import first_catch
-from support.bug_register import EVERY_BUG
-from support.planted_bugs import BUGS
+from support.planted_bugs import BUGS, EVERY_BUG
 from support.unseen_bugs import UNSEEN
 
 EVIDENCE = Path(__file__).parents[2] / "docs" / "evidence" / "planted-bugs-found.json"

@@ -13,7 +13,7 @@ import pytest
 from laneweave.launch.fault_search.search import run_story
 from laneweave.launch.fault_search.story import Story
 from simulation.search_bugs import STORIES
-from support.bug_register import EVERY_BUG
+from support.planted_bugs import EVERY_BUG
 
 PATHS = sorted(STORIES.glob("*.json"))
 LONG = {"superseded-command-played"}

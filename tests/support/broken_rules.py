@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
 import pytest
 from attrs import evolve
@@ -13,15 +12,19 @@ from laneweave.agents.core import AgentCore
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.election import Election
-from laneweave.coordinator.formations import operation, roster
+from laneweave.coordinator.formations import operation
 from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.roster import Formation, Groups
+from laneweave.coordinator.rolling import transfer
+from laneweave.coordinator.rolling.ownership import States
+from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.launch.fault_search.road.drawn_entrance import DrawnEntrance
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import Transition
 from laneweave.protocol.vehicle import execution_rules as execution
+from laneweave.protocol.vehicle import territory
 from laneweave.protocol.vehicle.plan_execution import PLAN, ExecutionPhase, PlanExecution
 from laneweave.protocol.vehicle.plans import Needs, dependencies
 from laneweave.protocol.wire.messages import (
@@ -31,14 +34,25 @@ from laneweave.protocol.wire.messages import (
     Command,
     Heartbeat,
     Name,
+    PendingTransfer,
     Plan,
     Prepare,
+    Sense,
     VehicleState,
 )
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
-from laneweave.sim_bridge.road.attendance import Caretaker
+from laneweave.sim_bridge.bodies.record_store import RecordStore
+from laneweave.sim_bridge.road.attendance import Attendance, Caretaker
 from laneweave.sim_bridge.road.formation_building import ColumnBlocks
-from support.states import changed
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.bugs import Plant, instead_of
+from support.states import changed, set_record
+
+Patch = pytest.MonkeyPatch
+Call = Callable[..., None]
+"""A method that is replaced."""
+Dependencies = Callable[..., tuple[Needs, ...]]
+OwnedCells = Callable[..., frozenset[Cell] | None]
 
 LEASE_S = 2.0
 FAR_BEHIND = 2**31
@@ -121,7 +135,7 @@ def hear_moves_under_way(me: PlanExecution, state: VehicleState) -> None:
         me.progress[state.vehicle] = max(me.progress.get(state.vehicle, -1), shown)
 
 
-def ready_with_plan(patch: pytest.MonkeyPatch) -> None:
+def ready_with_plan(patch: Patch) -> None:
     patch.setattr(PlanExecution, "ready", property(lambda me: me.plan is not None))
 
 
@@ -137,22 +151,15 @@ def is_released_after_a_while(me: PlanExecution, _: object) -> bool:
     return heard or me.is_due(me.t_s - LEASE_S)
 
 
-def one_less(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
+@instead_of(execution, "dependencies")
+def need_one_less(needs_of: Dependencies, plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
     return tuple(
-        {other: count - 1 for other, count in needs.items()}
-        for needs in dependencies(plan, vehicle)
+        {other: count - 1 for other, count in needs.items()} for needs in needs_of(plan, vehicle)
     )
 
 
-def need_one_less(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(execution, "dependencies", one_less)
-
-
-def forget_corners(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(execution, "dependencies", without_corners)
-
-
-def without_corners(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
+@instead_of(execution, "dependencies")
+def forget_corners(_: object, plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
     def needs_of(step: int, cells: set[Cell]) -> Needs:
         return {
             other: index + 1
@@ -174,37 +181,37 @@ def start_and_count(me: PlanExecution, _: object) -> None:
 # --- a leader ---------------------------------------------------------------------------------
 
 
-def replace_roster(
-    patch: pytest.MonkeyPatch, roster: Callable[[FormationLeader], Iterable[Name]]
-) -> None:
-    patch.setattr(FormationLeader, "roster", property(lambda me: tuple(roster(me))))
+def as_roster(roster: Callable[[FormationLeader], Iterable[Name]]) -> Plant:
+    def plant(patch: Patch) -> None:
+        patch.setattr(FormationLeader, "roster", property(lambda me: tuple(roster(me))))
+
+    return plant
 
 
-def roster_of_heard(patch: pytest.MonkeyPatch) -> None:
-    replace_roster(patch, lambda me: (name for name in me.formation.roster if name in me.states))
+@as_roster
+def roster_of_heard(me: FormationLeader) -> Iterable[Name]:
+    return (name for name in me.formation.roster if name in me.states)
 
 
-def roster_of_majority(patch: pytest.MonkeyPatch) -> None:
-    def mutant(me: FormationLeader) -> Iterable[Name]:
-        members = me.formation.roster
-        promised = [name for name in members if name in me.promises]
-        return promised if 2 * len(promised) > len(members) else members
-
-    replace_roster(patch, mutant)
+@as_roster
+def roster_of_majority(me: FormationLeader) -> Iterable[Name]:
+    members = me.formation.roster
+    promised = [name for name in members if name in me.promises]
+    return promised if 2 * len(promised) > len(members) else members
 
 
-def roster_of_promised(patch: pytest.MonkeyPatch) -> None:
-    replace_roster(patch, lambda me: me.promises or me.formation.roster)
+@as_roster
+def roster_of_promised(me: FormationLeader) -> Iterable[Name]:
+    return me.promises or me.formation.roster
 
 
 def any_has_promised(me: FormationLeader, _: object) -> bool:
     return bool(me.promises)
 
 
-def take_old_states(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(
-        FormationLeader, "_is_news", lambda me, state, _: state.vehicle in me.formation.roster
-    )
+@instead_of(FormationLeader, "_is_news")
+def take_old_states(_: object, me: FormationLeader, state: VehicleState, *__: object) -> bool:
+    return state.vehicle in me.formation.roster
 
 
 def heard_have_accepted(me: FormationLeader, _: object) -> bool:
@@ -267,44 +274,35 @@ def promised_b(me: FormationLeader, state: VehicleState) -> bool:
 # --- outside the rule books -------------------------------------------------------------------
 
 
-def revive(patch: pytest.MonkeyPatch) -> None:
-    hear = Election.on_heartbeat
-
-    def mutant(self: Election, heartbeat: Heartbeat, now_s: float) -> None:
-        self._dead.clear()
-        hear(self, heartbeat, now_s)
-
-    patch.setattr(Election, "on_heartbeat", mutant)
+@instead_of(Election, "on_heartbeat")
+def revive(hear: Call, self: Election, heartbeat: Heartbeat, now_s: float) -> None:
+    self._dead.clear()
+    hear(self, heartbeat, now_s)
 
 
-def ignore_link_loss(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Election, "on_link", skip)
+ignore_link_loss = instead_of(Election, "on_link")(skip)
 
 
-def forget_incarnation(patch: pytest.MonkeyPatch) -> None:
-    new_ballot = CoordinatorCore._new_ballot
-
-    def mutant(self: CoordinatorCore, above: Ballot | None) -> Ballot:
-        return new_ballot(self, above)._replace(incarnation=1)
-
-    patch.setattr(CoordinatorCore, "_new_ballot", mutant)
+@instead_of(CoordinatorCore, "_new_ballot")
+def forget_incarnation(new_ballot: Callable[..., Ballot], *given: object) -> Ballot:
+    return new_ballot(*given)._replace(incarnation=1)
 
 
-def close_at_once(patch: pytest.MonkeyPatch) -> None:
-    closed_formations = roster.closed_formations
+@instead_of(operation, "closed_formations")
+def close_at_once(
+    closed_formations: Callable[..., dict[int, Formation]],
+    census: Census,
+    t_s: float,
+    scenario: Scenario,
+    groups: Groups,
+) -> dict[int, Formation]:
+    blocks = sorted({scenario.lattice.block_of(entry.cell[0]) for entry in census.on_road})
+    closed = tuple(ClosedFormation(block, block, 0.0) for block in blocks)
+    early = replace(census, formations=closed, closed_to=FAR_BEHIND)
+    return closed_formations(early, t_s, scenario, groups)
 
-    def mutant(
-        census: Census, t_s: float, scenario: Scenario, groups: Groups
-    ) -> dict[int, Formation]:
-        blocks = sorted({scenario.lattice.block_of(entry.cell[0]) for entry in census.on_road})
-        closed = tuple(ClosedFormation(block, block, 0.0) for block in blocks)
-        early = replace(census, formations=closed, closed_to=FAR_BEHIND)
-        return closed_formations(early, t_s, scenario, groups)
 
-    patch.setattr(operation, "closed_formations", mutant)
-
-
-def close_early(patch: pytest.MonkeyPatch) -> None:
+def close_early(patch: Patch) -> None:
     closing_s, close_formations = ColumnBlocks._closing_s, DrawnEntrance.close_formations
 
     def block_mutant(self: ColumnBlocks, block: int) -> float:
@@ -317,64 +315,151 @@ def close_early(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(DrawnEntrance, "close_formations", drawn_mutant)
 
 
-def join_nothing(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Groups, "join", never)
+join_nothing = instead_of(Groups, "join")(never)
+never_moving = instead_of(MotionController, "moving", "displaced")(never)
 
 
-def play_any_command(patch: pytest.MonkeyPatch) -> None:
-    accept_command = MotionController.accept_command
-
-    def mutant(self: MotionController, command: Command) -> bool:
-        return accept_command(
-            self,
-            changed(command, incarnation=max(command.record.incarnation, self.record.incarnation)),
-        )
-
-    patch.setattr(MotionController, "accept_command", mutant)
+@instead_of(MotionController, "accept_command")
+def play_any_command(accept: Callable[..., bool], self: MotionController, command: Command) -> bool:
+    incarnation = max(command.record.incarnation, self.record.incarnation)
+    return accept(self, changed(command, incarnation=incarnation))
 
 
-def always_in_charge(patch: pytest.MonkeyPatch) -> None:
+def always_in_charge(patch: Patch) -> None:
     def mutant(self: AgentCore) -> bool:
         return self.execution is not None and not self.ended
 
     patch.setattr(AgentCore, "in_charge", property(mutant))
 
 
-def note_by_itself(patch: pytest.MonkeyPatch) -> None:
-    ask = AgentCore._request_storage
-
-    def mutant(self: AgentCore, execution: PlanExecution) -> Iterator[Effect]:
-        yield from ask(self, execution)
-        if execution.plan is not None:
-            noted = replace(execution.stored, accepted=execution.plan.ballot)
-            if execution.on_record(noted):
-                yield self._state()
-
-    patch.setattr(AgentCore, "_request_storage", mutant)
+@instead_of(AgentCore, "_request_storage")
+def note_by_itself(
+    ask: Callable[..., Iterator[Effect]], self: AgentCore, execution: PlanExecution
+) -> Iterator[Effect]:
+    yield from ask(self, execution)
+    if execution.plan is not None:
+        noted = replace(execution.stored, accepted=execution.plan.ballot)
+        if execution.on_record(noted):
+            yield self._state()
 
 
-def keep_incarnation(patch: pytest.MonkeyPatch) -> None:
-    sense = AgentCore._on_sense
-
-    def mutant(self: AgentCore, message: Any, now_s: float) -> Any:  # noqa: ANN401
-        # As if there had been no caretaker: earlier promises still count.
-        as_before = changed(message, incarnation=self._incarnation, caretaker=False)
-        return sense(self, as_before, now_s)
-
-    patch.setattr(AgentCore, "_on_sense", mutant)
+@instead_of(AgentCore, "_on_sense")
+def keep_incarnation(
+    on_sense: Callable[..., object], self: AgentCore, message: Sense, now_s: float
+) -> object:
+    # As if there had been no caretaker: earlier promises still count.
+    return on_sense(self, changed(message, incarnation=self._incarnation, caretaker=False), now_s)
 
 
-def accept_moves(patch: pytest.MonkeyPatch) -> None:
-    on_message = Caretaker.on_message
+@instead_of(Caretaker, "on_message")
+def accept_moves(
+    on_message: Callable[..., VehicleState | None],
+    self: Caretaker,
+    message: Prepare | Plan,
+    tick: int,
+) -> VehicleState | None:
+    if isinstance(message, Plan):
+        return self.state(tick) if self._execution.on_plan(message) else None
+    return on_message(self, message, tick)
 
-    def mutant(self: Caretaker, message: Prepare | Plan, tick: int) -> VehicleState | None:
-        if isinstance(message, Plan):
-            return self.state(tick) if self._execution.on_plan(message) else None
-        return on_message(self, message, tick)
 
-    patch.setattr(Caretaker, "on_message", mutant)
+# --- the rolling operation --------------------------------------------------------------------
 
 
-def never_moving(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(MotionController, "moving", never)
-    patch.setattr(MotionController, "displaced", never)
+@instead_of(MotionController, "accept_command")
+def obey(accept_command: Callable[..., bool], self: MotionController, command: Command) -> bool:
+    owned = self.record.owned
+    set_record(self.store, owned=tuple(sorted({*owned, command.hold_cell})))
+    taken = accept_command(self, command)
+    set_record(self.store, owned=owned)
+    return taken
+
+
+@instead_of(RecordStore, "begin_transfer")
+def own_at_once(begin_transfer: Call, self: RecordStore, transfer: PendingTransfer) -> None:
+    begin_transfer(self, transfer)
+    self.complete_transfer(transfer.ballot)
+
+
+@instead_of(RecordStore, "begin_transfer")
+def note_any_transfer(_: object, self: RecordStore, transfer: PendingTransfer) -> None:
+    if transfer != self.record.transfer:
+        set_record(self, transfer=transfer, owned=transfer.before)
+
+
+@instead_of(RecordStore, "put_in_charge")
+def forget_promise(put_in_charge: Call, self: RecordStore, incarnation: int) -> None:
+    put_in_charge(self, incarnation)
+    set_record(self, promised=None)
+
+
+def forget_owned_cells(patch: Patch) -> None:
+    accept_command, take_charge = MotionController.accept_command, Attendance._put_caretaker
+
+    def forget(controller: MotionController, before: int) -> None:
+        if before not in (0, controller.record.incarnation):
+            set_record(controller.store, owned=(controller.hold_cell,))
+
+    def claimed(self: MotionController, command: Command) -> bool:
+        before = self.record.incarnation
+        taken = accept_command(self, command)
+        forget(self, before)
+        return taken
+
+    def cared_for(self: Attendance, vehicle: RoadVehicle, tick: int) -> None:
+        before = vehicle.controller.record.incarnation
+        take_charge(self, vehicle, tick)
+        forget(vehicle.controller, before)
+
+    patch.setattr(MotionController, "accept_command", claimed)
+    patch.setattr(Attendance, "_put_caretaker", cared_for)
+
+
+@instead_of(PlanExecution, "state")
+def show_owned_cells_at_once(
+    state: Callable[..., VehicleState], self: PlanExecution, sense: Sense, **more: bool
+) -> VehicleState:
+    return state(self, changed(sense, promised=self.promised), **more)
+
+
+@instead_of(transfer, "owned_cells")
+def cancel_closed_transfers(_: object, state: VehicleState, *__: object) -> frozenset[Cell]:
+    return frozenset(state.record.owned)
+
+
+@instead_of(transfer, "owned_cells")
+def cancel_on_common_promise(
+    owned_cells: OwnedCells, state: VehicleState, states: States, gone: Collection[Name]
+) -> frozenset[Cell] | None:
+    pending, promised = state.record.transfer, state.record.promised
+    if pending is not None and not pending.open:
+        common = {states[name].record.promised for name in pending.roster if name in states}
+        if common == {promised} and promised != pending.ballot:
+            return frozenset(pending.before)
+    return owned_cells(state, states, gone)
+
+
+@instead_of(transfer, "owned_cells")
+def forget_motion(
+    owned_cells: OwnedCells, state: VehicleState, *more: object
+) -> frozenset[Cell] | None:
+    return owned_cells(replace(state, moving=False), *more)
+
+
+def skip_ownership_checks(patch: Patch) -> None:
+    for module in (transfer, territory):
+        patch.setattr(module, "ownership_problems", lambda plan: [])  # noqa: ARG005
+
+
+def keep_what_is_given(patch: Patch) -> None:
+    make = CellTransfer._plan
+
+    def mutant(self: CellTransfer, before: Mapping[Name, frozenset[Cell]]) -> Plan:
+        plan = make(self, before)
+        after = {
+            name: tuple(sorted({*cells, *plan.before[name]})) for name, cells in plan.after.items()
+        }
+        return replace(plan, after=after)
+
+    patch.setattr(CellTransfer, "_plan", mutant)
+    skip_ownership_checks(patch)

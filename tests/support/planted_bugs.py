@@ -7,20 +7,17 @@ them and what else catches them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-
-import pytest
-from attrs import field, frozen
+from collections.abc import Mapping
 
 from laneweave.coordinator.ballots import ballot_round as ballot
 from laneweave.coordinator.formations import leader
 from laneweave.coordinator.rolling import transfer
-from laneweave.launch.fault_search.coverage import Rules
-from laneweave.protocol.state_machine import Function, RuleBook, Transition
+from laneweave.protocol.state_machine import Function
 from laneweave.protocol.vehicle import execution_rules as vehicle
-from support import broken_cell_ownership as rolling
 from support import broken_rules as broken
-from support.rule_books import replacing
+from support.bugs import Bug
+from support.road_bugs import ROAD_BUGS
+from support.unseen_bugs import UNSEEN
 
 ROWS_OF_OTHERS = {
     "L1": "election: coordinator.election",
@@ -33,52 +30,6 @@ ROWS_OF_OTHERS = {
     "transfer": "how a leader transfers cells: coordinator.rolling.transfer",
 }
 """Rules that are not, or not only, in the rule books, and where they are."""
-
-
-def unchanged(_: pytest.MonkeyPatch) -> None:
-    """Change nothing outside the rule books."""
-
-
-@frozen(eq=False)
-class Bug:
-    """One broken rule."""
-
-    name: str
-    rule: str
-    """Of docs/PROTOCOL.md, or one of `ROWS_OF_OTHERS`."""
-    text: str
-    """What is broken."""
-    scenario: str = ""
-    """A scenario of tests/scenarios that it makes fail; empty: none is written for it."""
-    collides: bool = True
-    """That scenario ends with two vehicles in one cell (in the rolling operation also: with two
-    owners of one, or with a body in a cell that is not its own)."""
-    replaced: Mapping[Function, Function] = field(factory=dict)
-    """Guards and actions of a vehicle or a leader, and their replacements."""
-    vehicle_row: Callable[[Transition], Transition] | None = None
-    """Changes rows of a vehicle's table."""
-    plant: Callable[[pytest.MonkeyPatch], None] = unchanged
-    """Changes what is in no rule book."""
-
-    @property
-    def vehicle_rules(self) -> RuleBook:
-        """A vehicle's rules with this bug."""
-        book = self._broken(vehicle.VEHICLE_RULES)
-        return book if self.vehicle_row is None else RuleBook(map(self.vehicle_row, book.table))
-
-    @property
-    def leader_rules(self) -> RuleBook:
-        """A leader's rules with this bug."""
-        return self._broken(leader.LEADER_RULES)
-
-    @property
-    def rules(self) -> Rules:
-        """All rule books with this bug, for the fault search."""
-        return Rules(self.vehicle_rules, self.leader_rules, self._broken(transfer.TRANSFER_RULES))
-
-    def _broken(self, book: RuleBook) -> RuleBook:
-        used = book.functions
-        return replacing(book, {rule: bug for rule, bug in self.replaced.items() if rule in used})
 
 
 BUGS: tuple[Bug, ...] = (
@@ -268,32 +219,32 @@ BUGS: tuple[Bug, ...] = (
     Bug("moves-outside-owned-cells", "V5",
         "The same, and the controller accepts cells that are not owned.",
         "rolling_cell_transfer",
-        replaced={vehicle.open_transfer: broken.skip}, plant=rolling.obey),
+        replaced={vehicle.open_transfer: broken.skip}, plant=broken.obey),
     Bug("ownership-without-gate", "ownership",
         "A vehicle owns its new cells as soon as it accepts.",
-        "rolling_gate", plant=rolling.own_at_once),
+        "rolling_gate", plant=broken.own_at_once),
     Bug("transfer-after-promise", "ownership", "An old transfer is stored after a higher promise.",
-        "rolling_late_command", plant=rolling.note_any_transfer),
+        "rolling_late_command", plant=broken.note_any_transfer),
     Bug("promise-lost-with-process", "ownership",
         "A new process may promise a lower ballot than the last one.",
-        "rolling_agent_restarts", collides=False, plant=rolling.forget_promise),
+        "rolling_agent_restarts", collides=False, plant=broken.forget_promise),
     Bug("ownership-lost-with-process", "ownership", "The owned cells are lost with the agent.",
-        "rolling_agent_restarts", collides=False, plant=rolling.forget_owned_cells),
+        "rolling_agent_restarts", collides=False, plant=broken.forget_owned_cells),
     Bug("promise-not-noted", "transfer", "A promise counts before the controller has stored it.",
-        "rolling_promise_not_noted", collides=False, plant=rolling.show_owned_cells_at_once),
+        "rolling_promise_not_noted", collides=False, plant=broken.show_owned_cells_at_once),
     Bug("closed-transfers-ignored", "transfer", "Leaders treat every closed transfer as cancelled.",
-        "rolling_cell_passed_on", plant=rolling.cancel_closed_transfers),
+        "rolling_cell_passed_on", plant=broken.cancel_closed_transfers),
     Bug("common-promise-cancels-transfers", "transfer",
         "A common newer promise cancels closed transfers.",
-        "rolling_cell_passed_on", plant=rolling.cancel_on_common_promise),
+        "rolling_cell_passed_on", plant=broken.cancel_on_common_promise),
     Bug("body-left-out", "transfer", "A moving vehicle does not need the cell that it leaves.",
-        "rolling_under_way", plant=rolling.forget_motion),
+        "rolling_under_way", plant=broken.forget_motion),
     Bug("owner-left-out", "transfer", "A cell is taken from an owner that is not in the roster.",
         "rolling_owner_left_out", replaced={vehicle.transfers_only_owned_cells: broken.always},
-        plant=rolling.skip_ownership_checks),
+        plant=broken.skip_ownership_checks),
     Bug("cell-kept-by-both", "transfer", "A vehicle that gives a cell away also keeps it.",
         "rolling_cell_transfer", replaced={vehicle.transfers_only_owned_cells: broken.always},
-        plant=rolling.keep_what_is_given),
+        plant=broken.keep_what_is_given),
 )  # fmt: skip
 
 NOT_A_SAFETY_MATTER: Mapping[Function, str] = {
@@ -317,3 +268,6 @@ NOT_A_SAFETY_MATTER: Mapping[Function, str] = {
     transfer.record_reason: "likewise",
 }
 """Guards and actions that no bug is planted in, and why."""
+
+EVERY_BUG: dict[str, Bug] = {bug.name: bug for bug in (*BUGS, *UNSEEN, *ROAD_BUGS)}
+"""All planted bugs by name."""

@@ -15,21 +15,8 @@ from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LAT
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.road.entry import EntryMeter
-from support.broken_lane_end_control import (
-    drives_on,
-    full_lanes_are_entered,
-    gap_is_entered,
-    gap_too_short,
-    keeps_its_cells,
-    last_first,
-    line_at_the_end,
-    line_forgotten_when_driving_out,
-    no_stop_line,
-    starts_without_a_gap,
-    waits_forever,
-)
-from support.broken_lane_ends import gaps_are_given_away
-from support.bug_register import Plant, catches, name_of
+from support import road_bugs
+from support.bugs import Bug, catches
 from support.closed_lanes import LonelyRoad, road_with
 from support.variants import variants
 
@@ -137,7 +124,7 @@ def test_the_census_tells_where_they_stand() -> None:
     "blind",
     [
         pytest.param(False, id=""),
-        pytest.param(True, id="planted bug", marks=catches(full_lanes_are_entered)),
+        pytest.param(True, id="planted bug", marks=catches(road_bugs.full_lanes_are_entered)),
     ],
 )
 @pytest.mark.more
@@ -145,7 +132,7 @@ def test_a_queue_that_reaches_the_entrance_keeps_vehicles_from_entering(
     monkeypatch: pytest.MonkeyPatch, *, blind: bool
 ) -> None:
     if blind:
-        full_lanes_are_entered(monkeypatch)
+        road_bugs.full_lanes_are_entered.plant(monkeypatch)
     road = lonely_road(road_with(Closure(0, 300.0), s3_m=350.0), 2200.0, 80.0)
     longest = 0
     while not road.overlaps and (road.vehicles or not road.roadside.demand.exhausted(road.t_s)):
@@ -200,31 +187,30 @@ CROWD: tuple[float, float] = (1500.0, 50.0)
 """Volume [veh/(lane h)] and duration [s] of the traffic that shows the bugs."""
 ENOUGH_S = 260.0
 """Without a bug all vehicles have left the road before."""
-BUGS: tuple[Plant, ...] = (
-    no_stop_line, line_at_the_end, keeps_its_cells, starts_without_a_gap, waits_forever,
-    last_first, drives_on, line_forgotten_when_driving_out,
+BUGS: tuple[Bug, ...] = (
+    road_bugs.no_stop_line, road_bugs.line_at_the_end, road_bugs.keeps_its_cells,
+    road_bugs.starts_without_a_gap, road_bugs.waits_forever, road_bugs.last_first,
+    road_bugs.drives_on, road_bugs.line_forgotten_when_driving_out,
     # Only traffic notices these.
-    gaps_are_given_away, gap_is_entered, gap_too_short,
+    road_bugs.gaps_are_given_away, road_bugs.gap_is_entered, road_bugs.gap_too_short,
 )  # fmt: skip
 
 
-LATE = {waits_forever, drives_on, line_forgotten_when_driving_out}
+LATE = {"waits-forever", "drives-on", "line-forgotten-when-driving-out"}
 """Bugs that are noticed only because vehicles are still on the road at `ENOUGH_S`."""
 
 
 @pytest.mark.parametrize(
-    "plant",
+    "bug",
     [
         pytest.param(
-            bug,
-            marks=[catches(bug), *([pytest.mark.more] if bug in LATE else [])],
-            id=name_of(bug),
+            bug, marks=[catches(bug), *[pytest.mark.more] * (bug.name in LATE)], id=bug.name
         )
         for bug in BUGS
     ],
 )
-def test_planted_bugs_are_noticed(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
-    plant(monkeypatch)
+def test_planted_bugs_are_noticed(bug: Bug, monkeypatch: pytest.MonkeyPatch) -> None:
+    bug.plant(monkeypatch)
     with pytest.raises(AssertionError):
         check(lonely_road(DROP, *CROWD), ENOUGH_S)
 

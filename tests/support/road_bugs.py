@@ -1,0 +1,303 @@
+"""Planted bugs of roads whose lanes end, and of ramps and exits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping
+
+import pytest
+from attrs import evolve
+from msgspec.structs import replace
+
+from laneweave.agents.core import AgentCore
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import Exits
+from laneweave.protocol.scenario.vehicle_types import VehicleTypes
+from laneweave.protocol.vehicle.lane_ends import DriveOut, LaneEnd, LaneEnds
+from laneweave.protocol.vehicle.plan_execution import PlanExecution
+from laneweave.protocol.wire.messages import Census, CensusEntry, Command, Name, Sense
+from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase
+from laneweave.sim_bridge.road import lane_end_control
+from laneweave.sim_bridge.road.entry import EntryMeter
+from laneweave.sim_bridge.road.formation_building import (
+    ColumnBlocks,
+    Entrances,
+    GrowingFormations,
+)
+from laneweave.sim_bridge.road.lane_end_control import LaneEndControl
+from laneweave.sim_bridge.road.roadside import EntranceRoom, Roadside
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.bugs import Bug, breaks
+from support.states import set_record
+
+Patch = pytest.MonkeyPatch
+Call = Callable[..., None]
+"""A method that is replaced."""
+Vehicles = Mapping[Name, RoadVehicle]
+LANE_ENDS, RAMPS, FORMATIONS = "lane ends", "ramps, exits", "formations on roads"
+"""What the bugs are about."""
+
+# --- leaving the lattice, and entering it again -----------------------------------------------
+
+
+@breaks(LANE_ENDS, LaneEnds, "has_passed")
+def never_leaves(*_: object, **__: object) -> bool:
+    """A vehicle whose cell has passed the stop line stays in it."""
+    return False
+
+
+@breaks(LANE_ENDS)
+def agents_move_vehicles_without_cells(patch: Patch) -> None:
+    """The motion controller of a vehicle without cells executes commands."""
+    accept_command = MotionController.accept_command
+
+    def accept(self: MotionController, command: Command) -> bool:
+        off_lattice, self.off_lattice = self.off_lattice, None
+        try:
+            return accept_command(self, command)
+        finally:
+            self.off_lattice = off_lattice
+
+    patch.setattr(MotionController, "accept_command", accept)
+    agent_remembers.plant(patch)
+
+
+@breaks(LANE_ENDS, AgentCore, "_act")
+def agent_remembers(
+    act: Callable[..., list[object]], self: AgentCore, sense: Sense, **more: bool
+) -> list[object]:
+    """An agent does not notice that its vehicle has left the lattice."""
+    self._sense = blind = replace(sense, off_lattice=False)
+    return act(self, blind, **more)
+
+
+@breaks(LANE_ENDS, LaneEndControl, "is_kept_free")
+def gaps_are_given_away(*_: object) -> bool:
+    """The roadside assigns the cells of a gap to vehicles near them."""
+    return False
+
+
+@breaks(LANE_ENDS)
+def still_listed(patch: Patch) -> None:
+    """Leaders plan for vehicles that have left the lattice."""
+
+    def on_lattice(census: Census) -> tuple[CensusEntry, ...]:
+        return census.on_road
+
+    patch.setattr(Census, "on_lattice", property(on_lattice))
+
+
+@breaks(LANE_ENDS, LaneEndControl, "update")
+def gap_taken_too_early(
+    update: Callable[..., Collection[object]], self: LaneEndControl, vehicles: Vehicles, t_s: float
+) -> Collection[object]:
+    """A vehicle gets its cells when it begins to drive out, from another gap."""
+    changes = list(update(self, vehicles, t_s))
+    for gaps in self._gaps.values():
+        for gap in gaps:
+            if gap.vehicle is not None and gap.columns[0] > -(10**6):
+                gap.columns = range(gap.columns[0] - 2, gap.columns[-1] - 1)
+    return changes
+
+
+# --- stop lines, queues, and gaps for driving out ---------------------------------------------
+
+
+@breaks(LANE_ENDS, MotionController, "_lines_ahead")
+def no_stop_line(*_: object) -> list[object]:
+    """Vehicles do not stop before the end of their lane."""
+    return []
+
+
+@breaks(LANE_ENDS)
+def line_at_the_end(patch: Patch) -> None:
+    """There is no room to accelerate before the end of the lane."""
+    ahead, ends_of = LaneEnds.ahead, LaneEnds.__iter__
+
+    def at_the_end(end: LaneEnd) -> LaneEnd:
+        return evolve(end, line_m=end.end_m)
+
+    def ahead_of(self: LaneEnds, lane: int, s_m: float) -> LaneEnd | None:
+        end = ahead(self, lane, s_m)
+        return None if end is None else at_the_end(end)
+
+    patch.setattr(LaneEnds, "ahead", ahead_of)
+    patch.setattr(LaneEnds, "__iter__", lambda self: map(at_the_end, ends_of(self)))
+
+
+@breaks(LANE_ENDS, MotionController, "leave_lattice")
+def keeps_its_cells(leave_lattice: Call, self: MotionController) -> None:
+    """A vehicle that leaves the lattice keeps its cells."""
+    owned = self.record.owned
+    leave_lattice(self)
+    set_record(self.store, owned=owned)
+
+
+@breaks(LANE_ENDS)
+def gap_is_entered(patch: Patch) -> None:
+    """The entry meter only says that it keeps columns free, and sensors are not asked."""
+
+    def keep_free(self: EntryMeter, lane: int, count: int, _: object) -> range:
+        return range(self._columns[lane] - count + 1, self._columns[lane] + 1)
+
+    patch.setattr(LaneEndControl, "_is_free", lambda *_: True)
+    patch.setattr(EntryMeter, "keep_free", keep_free)
+
+
+@breaks(LANE_ENDS, lane_end_control, "drive_out", "own_drive_out")
+def gap_too_short(needed: Callable[..., DriveOut], *given: object) -> DriveOut:
+    """A gap has room for the vehicle, but not for driving out."""
+    return evolve(needed(*given), columns=1)
+
+
+@breaks(LANE_ENDS)
+def starts_without_a_gap(patch: Patch) -> None:
+    """Vehicles drive out long before their gap passes."""
+    start: Callable[..., object] = LaneEndControl._start
+
+    def mutant(self: LaneEndControl, vehicle: object, gaps: object, t_s: float) -> object:
+        return start(self, vehicle, gaps, t_s + 30.0)
+
+    patch.setattr(lane_end_control, "START_S", 1e9)
+    patch.setattr(LaneEndControl, "_is_free", lambda *_: True)
+    patch.setattr(LaneEndControl, "_start", mutant)
+
+
+@breaks(LANE_ENDS)
+def waits_forever(patch: Patch) -> None:
+    """Only the first gap is asked for."""
+    patch.setattr(lane_end_control, "OPEN_GAPS", 10_000)
+
+
+@breaks(LANE_ENDS, LaneEndControl, "_waiting")
+def last_first(waiting: Callable[..., list[object]], *given: object) -> list[object]:
+    """The rearmost vehicle of a queue drives out through the others."""
+    return waiting(*given)[::-1]
+
+
+@breaks(LANE_ENDS, MotionController, "leave_lattice")
+def drives_on(leave_lattice: Call, self: MotionController) -> None:
+    """A vehicle off the lattice aims at its cell, which is beyond the end of the lane."""
+    leave_lattice(self)
+    self.off_lattice, self._past_line = OffLatticePhase.DRIVING_OUT, True
+
+
+@breaks(LANE_ENDS)
+def line_forgotten_when_driving_out(patch: Patch) -> None:
+    """The way out is blocked by the line at which the vehicle stands."""
+    drive_out = MotionController.drive_out
+
+    def mutant(self: MotionController, cell: Cell) -> None:
+        drive_out(self, cell)
+        self._past_line = False
+
+    patch.setattr(MotionController, "drive_out", mutant)
+    patch.setattr("laneweave.sim_bridge.bodies.motion_controller.STANDING_MPS", -1.0)
+
+
+@breaks(LANE_ENDS, EntranceRoom, "full_lanes")
+def full_lanes_are_entered(*_: object) -> set[int]:
+    """Vehicles enter a lane whose queue reaches the entrance."""
+    return set()
+
+
+# --- ramps and exits --------------------------------------------------------------------------
+
+
+@breaks(RAMPS, Roadside, "assign_empty_cells")
+def ramps_are_issued_at_the_start(assign: Call, self: Roadside, vehicles: Vehicles) -> None:
+    """The cells of a ramp are also assigned as they pass the start of the road."""
+    assign(self, vehicles)
+    for one in list(vehicles.values()):
+        for lane, entry_m in enumerate(self._meter._entry_m):
+            if entry_m > 0.0 and one.arrival.lane != lane:
+                one.controller.store.assign_cell((one.admission.cell[0], lane))
+
+
+@breaks(RAMPS, Roadside, "on_left")
+def cells_are_passed_on_twice(
+    on_left: Call, self: Roadside, vehicle: RoadVehicle, vehicles: Vehicles, t_s: float
+) -> None:
+    """Two vehicles get each cell of a vehicle that leaves."""
+    on_left(self, vehicle, vehicles, t_s)
+    for one in list(vehicles.values())[:1]:
+        for cell in vehicle.controller.store.certain_cells:
+            one.controller.store.assign_cell(cell)
+
+
+@breaks(RAMPS, Exits, "left_by")
+def exits_are_closed(left_by: Callable[..., object], self: Exits, lane: int, s_m: float) -> object:
+    """Vehicles in the lane of an exit drive on."""
+    return left_by(self, lane, s_m) if s_m >= self._length_m else None
+
+
+@breaks(RAMPS, MotionController, "return_to_origin")
+def late_commands_repeat_moves(
+    back: Callable[..., bool], self: MotionController, t_s: float
+) -> bool:
+    """A vehicle that holds its cell again executes a late command for the move."""
+    tick = self.command_tick
+    done = back(self, t_s)
+    self.command_tick = tick
+    return done
+
+
+@breaks(RAMPS)
+def gates_stay_open(patch: pytest.MonkeyPatch) -> None:
+    """An agent waits for ever with a move that can no longer begin."""
+    patch.setattr(PlanExecution, "stuck", False)
+
+
+@breaks(RAMPS, AgentCore, "_has_lost_track")
+def agents_insist(*_: object) -> bool:
+    """An agent does not notice that its move was taken back."""
+    return False
+
+
+@breaks(RAMPS, VehicleTypes, "moves_of")
+def types_are_ignored(*_: object) -> None:
+    """Leaders move trucks like cars, and their agents take such plans."""
+
+
+# --- formations -------------------------------------------------------------------------------
+
+
+@breaks(FORMATIONS)
+def columns_are_not_reserved(patch: Patch) -> None:
+    """Vehicles enter the columns that are kept free."""
+    reserve = GrowingFormations.reserve
+
+    def growing(self: GrowingFormations, column: int, count: int, t_s: float) -> range:
+        reserved = reserve(self, column, count, t_s)
+        self.first_open_column = reserved[-1]
+        return reserved
+
+    def blocks(self: ColumnBlocks, column: int, count: int, _: float) -> range:
+        front = self.lattice.block_range(self.lattice.block_of(column) + 1)[-1]
+        return range(front - count + 1, front + 1)
+
+    patch.setattr(GrowingFormations, "reserve", growing)
+    patch.setattr(ColumnBlocks, "reserve", blocks)
+
+
+@breaks(FORMATIONS)
+def ramps_are_forgotten(patch: Patch) -> None:
+    """Formations are closed before their columns have passed the ramp."""
+
+    def pass_ramps(self: GrowingFormations, _: float) -> None:
+        self._ramp_column = -math.inf
+
+    def closing_s(self: ColumnBlocks, block: int) -> float:
+        return self.lattice.passing_time_s(self.lattice.block_range(block)[0]) + self.spread_s
+
+    patch.setattr(GrowingFormations, "_pass_ramps", pass_ramps)
+    patch.setattr(ColumnBlocks, "_closing_s", closing_s)
+
+
+@breaks(FORMATIONS, Entrances, "first_column")
+def columns_ahead_are_closed(*_: object) -> int:
+    """Columns that pass only the ramp, since they were ahead of the road's start, are closed."""
+    return 0
+
+
+ROAD_BUGS: tuple[Bug, ...] = tuple(one for one in [*vars().values()] if isinstance(one, Bug))
