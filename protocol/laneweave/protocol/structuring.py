@@ -11,7 +11,7 @@ import copy
 import re
 import sys
 from collections import abc
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import cycle
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -79,9 +79,9 @@ def _text_or_texts(value: object, _: type) -> TextOrTexts:
     raise BadInputError("", value, "a string or a list of strings")
 
 
-def strict_converter(*, detailed: bool) -> Converter:
-    """Return a converter without coercion; `detailed`: errors name the path of the field."""
-    converter = Converter(forbid_extra_keys=True, detailed_validation=detailed)
+def _strict_converter() -> Converter:
+    """Return a converter without coercion, whose errors name the path of the field."""
+    converter = Converter(forbid_extra_keys=True)
     converter.register_structure_hook(int, _exactly(int, "an integer"))
     converter.register_structure_hook(str, _exactly(str, "a string"))
     converter.register_structure_hook(bool, _exactly(bool, "true or false"))
@@ -123,30 +123,17 @@ def _origin(kind: Any) -> object:  # noqa: ANN401 (any annotation)
 
 def _tuple_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a generic alias)
     kinds = get_args(kind)
-    endless = kinds[-1] is Ellipsis
     hooks = [(converter.get_structure_hook(part), part) for part in kinds if part is not Ellipsis]
-    first_hook, first_part = hooks[0]
-    count = None if endless else len(hooks)
+    endless = kinds[-1] is Ellipsis
 
-    def parts(value: object) -> Sequence[Any]:
+    def hook_of_tuple(value: object, _: type) -> tuple[Any, ...]:
         if not isinstance(value, (list, tuple)):
             raise BadInputError("", value, "a list")
-        if count is not None and len(value) != count:
-            raise BadInputError("", value, f"a list of {count}")
-        return value
-
-    def fast_uniform(value: object, _: type) -> tuple[Any, ...]:
-        return tuple([first_hook(item, first_part) for item in parts(value)])
-
-    def fast_mixed(value: object, _: type) -> tuple[Any, ...]:
-        return tuple(
-            [hook(item, part) for item, (hook, part) in zip(parts(value), hooks, strict=True)]
-        )
-
-    def detailed(value: object, _: type) -> tuple[Any, ...]:
+        if not endless and len(value) != len(hooks):
+            raise BadInputError("", value, f"a list of {len(hooks)}")
         done: list[Any] = []
         problems: list[BadInputError] = []
-        for number, (item, (hook, part)) in enumerate(zip(parts(value), cycle(hooks))):
+        for number, (item, (hook, part)) in enumerate(zip(value, cycle(hooks))):
             try:
                 done.append(hook(item, part))
             except Exception as error:  # noqa: BLE001 (hooks and validators may raise anything)
@@ -156,10 +143,7 @@ def _tuple_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a gen
         raise_all(problems)
         return tuple(done)
 
-    if converter.detailed_validation:
-        return detailed
-    # Vehicles mostly receive lists of one kind (states, cells).
-    return fast_uniform if all(part is first_part for _, part in hooks) else fast_mixed
+    return hook_of_tuple
 
 
 def _dict_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a generic alias)
@@ -186,14 +170,9 @@ def _dict_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a gene
 
 
 def _class_hook(kind: type, converter: Converter) -> Hook:
-    fields_hook: Hook = make_dict_structure_fn(
-        kind,
-        converter,
-        _cattrs_forbid_extra_keys=True,
-        _cattrs_detailed_validation=converter.detailed_validation,
-    )
+    fields_hook: Hook = make_dict_structure_fn(kind, converter, _cattrs_forbid_extra_keys=True)
 
-    def detailed(value: object, _: type) -> object:
+    def hook(value: object, _: type) -> object:
         if not isinstance(value, Mapping):
             raise BadInputError("", value, "a table")
         for key in value:
@@ -205,11 +184,10 @@ def _class_hook(kind: type, converter: Converter) -> Hook:
             problems = [*problems_of(error), *_invalid_values(value, kind, converter)]
         raise combined(problems)
 
-    # The fast hook rejects the same values, but its errors do not name the field.
-    return detailed if converter.detailed_validation else fields_hook
+    return hook
 
 
-_CONVERTER = strict_converter(detailed=True)
+_CONVERTER = _strict_converter()
 
 
 def structure(data: Mapping[str, Any], kind: type[T]) -> T:
@@ -223,6 +201,12 @@ def structure(data: Mapping[str, Any], kind: type[T]) -> T:
     except Exception as error:  # noqa: BLE001 (hooks and validators may raise anything)
         problems = problems_of(error)
     raise combined(_with_other_tables(problems, kind))
+
+
+def unstructure(instance: attrs.AttrsInstance) -> dict[str, Any]:
+    """Return the nested maps from which `structure` builds an instance."""
+    tables: dict[str, Any] = _CONVERTER.unstructure(instance)
+    return tables
 
 
 def _with_other_tables(problems: Iterable[BadInputError], kind: type) -> Iterator[BadInputError]:

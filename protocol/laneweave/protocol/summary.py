@@ -27,57 +27,50 @@ HARD_BRAKE_MPS2 = 5.0
 """Deceleration beyond which vehicles are counted as braking hard."""
 
 
-def about(meaning: str, unit: str = "") -> dict[str, str]:
-    """Return the metadata of a field of the summary: what it means, and its unit.
+def figure(meaning: str, unit: str = "", default: object = attrs.NOTHING) -> Any:  # noqa: ANN401
+    """Return a field of the summary: what it means, and its unit.
 
     docs/RESULT_FILES.md and the columns of a sweep's results.parquet are described with them.
     """
-    return {"meaning": meaning, "unit": unit}
+    return field(default=default, metadata={"meaning": meaning, "unit": unit})
+
+
+def optional(meaning: str, unit: str = "") -> Any:  # noqa: ANN401 (as `attrs.field`)
+    """Return a `figure` that not every summary has."""
+    return figure(meaning, unit, default=None)
 
 
 @frozen(kw_only=True)
 class VehicleCounts:
     """Vehicle counts."""
 
-    demanded: int = field(metadata=about("vehicles that have arrived at an entrance"))
-    entered: int = field(metadata=about("vehicles that have entered the road"))
-    left: int = field(metadata=about("vehicles that have left it"))
-    on_preferred_lane: int = field(
-        metadata=about(
-            "vehicles that left by their destination, and in their preferred lane if any"
-        )
+    demanded: int = figure("vehicles that have arrived at an entrance")
+    entered: int = figure("vehicles that have entered the road")
+    left: int = figure("vehicles that have left it")
+    on_preferred_lane: int = figure(
+        "vehicles that left by their destination, and in their preferred lane if any"
     )
-    peak: int = field(metadata=about("maximum number of vehicles on the road at once"))
-    at_destination: int | None = field(
-        default=None, metadata=about("the same as on_preferred_lane")
+    peak: int = figure("maximum number of vehicles on the road at once")
+    at_destination: int | None = optional("the same as on_preferred_lane")
+    left_off_lane: int | None = optional("vehicles that left elsewhere or in another lane")
+    missed_exits: int | None = optional("vehicles that left by another exit than their destination")
+    stopped_at_lane_end: int | None = optional(
+        "vehicles that left the lattice, to stop at the end of their lane"
     )
-    left_off_lane: int | None = field(
-        default=None, metadata=about("vehicles that left elsewhere or in another lane")
+    left_out: dict[str, int] | None = optional(
+        "vehicles of a SUMO simulation that its corridor cannot serve, by reason"
     )
-    missed_exits: int | None = field(
-        default=None, metadata=about("vehicles that left by another exit than their destination")
-    )
-    stopped_at_lane_end: int | None = field(
-        default=None,
-        metadata=about("vehicles that left the lattice, to stop at the end of their lane"),
-    )
-    left_out: dict[str, int] | None = field(
-        default=None,
-        metadata=about("vehicles of a SUMO simulation that its corridor cannot serve, by reason"),
-    )
-    left_unattended: int | None = field(
-        default=None, metadata=about("vehicles that left with a caretaker in charge")
-    )
+    left_unattended: int | None = optional("vehicles that left with a caretaker in charge")
 
 
 @frozen(kw_only=True)
 class TripTimes:
     """Means of the counted vehicles of one entrance or one destination [s]."""
 
-    n: int = field(metadata=about("number of counted vehicles"))
-    mean: float = field(metadata=about("mean travel time", "s"))
-    delay: float = field(
-        metadata=about("mean excess over the time at v_F from the entrance to the destination", "s")
+    n: int = figure("number of counted vehicles")
+    mean: float = figure("mean travel time", "s")
+    delay: float = figure(
+        "mean excess over the time at v_F from the entrance to the destination", "s"
     )
 
 
@@ -85,20 +78,17 @@ class TripTimes:
 class TravelTime:
     """Travel times of the counted vehicles [s]; None: no vehicle was counted."""
 
-    mean: float | None = field(metadata=about("mean travel time of the counted vehicles", "s"))
-    p50: float | None = field(metadata=about("median", "s"))
-    p95: float | None = field(metadata=about("95th percentile", "s"))
-    max: float | None = field(metadata=about("longest travel time", "s"))
-    n: int | None = field(default=None, metadata=about("number of counted vehicles"))
-    by_destination: dict[str, TripTimes] | None = field(
-        default=None,
-        metadata=about("by the exit by which they want to leave (end: the end of the road)"),
+    mean: float | None = figure("mean travel time of the counted vehicles", "s")
+    p50: float | None = figure("median", "s")
+    p95: float | None = figure("95th percentile", "s")
+    max: float | None = figure("longest travel time", "s")
+    n: int | None = optional("number of counted vehicles")
+    by_destination: dict[str, TripTimes] | None = optional(
+        "by the exit by which they want to leave (end: the end of the road)"
     )
-    by_entrance: dict[str, TripTimes] | None = field(
-        default=None, metadata=about("by entrance (main: the start of the road)")
-    )
-    by_type: dict[str, TripTimes] | None = field(
-        default=None, metadata=about("by type of vehicle (car: the scenario's table vehicle)")
+    by_entrance: dict[str, TripTimes] | None = optional("by entrance (main: the start of the road)")
+    by_type: dict[str, TripTimes] | None = optional(
+        "by type of vehicle (car: the scenario's table vehicle)"
     )
 
 
@@ -106,37 +96,24 @@ class TravelTime:
 class Safety:
     """Counts and extremes over all vehicles and ticks; None: nothing was measured."""
 
-    overlaps: int = field(
-        metadata=about(
-            "pairs of bodies that intersected at some tick; closed parts of lanes count as bodies"
-        )
+    overlaps: int = figure(
+        "pairs of bodies that intersected at some tick; closed parts of lanes count as bodies"
     )
-    sumo_collisions: int = field(
-        metadata=about("pairs of vehicles for which SUMO reported a collision")
+    sumo_collisions: int = figure("pairs of vehicles for which SUMO reported a collision")
+    min_gap_m: float | None = figure(
+        "minimum bumper-to-bumper gap of two vehicles whose bodies overlap laterally", "m"
     )
-    min_gap_m: float | None = field(
-        metadata=about(
-            "minimum bumper-to-bumper gap of two vehicles whose bodies overlap laterally", "m"
-        )
+    min_headway_s: float | None = figure(
+        "minimum of such a gap over the speed of the vehicle behind", "s"
     )
-    min_headway_s: float | None = field(
-        metadata=about("minimum of such a gap over the speed of the vehicle behind", "s")
+    emergency_brakes: int = figure("episodes of braking with more than 90 % of the limit")
+    hard_brakes: int | None = optional(
+        f"vehicles that braked with more than {HARD_BRAKE_MPS2:g} m/s2"
     )
-    emergency_brakes: int = field(
-        metadata=about("episodes of braking with more than 90 % of the limit")
-    )
-    hard_brakes: int | None = field(
-        default=None,
-        metadata=about(f"vehicles that braked with more than {HARD_BRAKE_MPS2:g} m/s2"),
-    )
-    max_accel_mps2: float | None = field(metadata=about("maximum acceleration", "m/s2"))
-    min_accel_mps2: float | None = field(
-        metadata=about("minimum acceleration: hardest braking", "m/s2")
-    )
-    max_jerk_mps3: float | None = field(
-        metadata=about(
-            "maximum of the change of acceleration between two ticks over their distance", "m/s3"
-        )
+    max_accel_mps2: float | None = figure("maximum acceleration", "m/s2")
+    min_accel_mps2: float | None = figure("minimum acceleration: hardest braking", "m/s2")
+    max_jerk_mps3: float | None = figure(
+        "maximum of the change of acceleration between two ticks over their distance", "m/s3"
     )
 
 
@@ -144,104 +121,90 @@ class Safety:
 class PlanningMs:
     """Planning times [ms]."""
 
-    p50: float | None = field(metadata=about("median", "ms"))
-    p95: float | None = field(metadata=about("95th percentile", "ms"))
-    max: float | None = field(metadata=about("longest time", "ms"))
+    p50: float | None = figure("median", "ms")
+    p95: float | None = figure("95th percentile", "ms")
+    max: float | None = figure("longest time", "ms")
 
 
 @frozen(kw_only=True)
 class DurationMs:
     """Durations [ms]."""
 
-    p50: float | None = field(metadata=about("median", "ms"))
-    p99: float | None = field(metadata=about("99th percentile", "ms"))
+    p50: float | None = figure("median", "ms")
+    p99: float | None = figure("99th percentile", "ms")
 
 
 @frozen(kw_only=True)
 class Planning:
     """Plan counts over all coordinators."""
 
-    plans: int = field(metadata=about("plans that were made"))
-    optimal: int = field(metadata=about("plans whose cost is proven optimal"))
-    largest_formation: int = field(metadata=about("maximum number of vehicles in a plan"))
-    by_solver: dict[str, int] | None = field(default=None, metadata=about("plans by solver"))
-    fallbacks: int | None = field(
-        default=None,
-        metadata=about(
-            "plans that another solver made, because the chosen one found none in its share of "
-            "nodes or time, or, as a plug-in, none that was valid"
-        ),
+    plans: int = figure("plans that were made")
+    optimal: int = figure("plans whose cost is proven optimal")
+    largest_formation: int = figure("maximum number of vehicles in a plan")
+    by_solver: dict[str, int] | None = optional("plans by solver")
+    fallbacks: int | None = optional(
+        "plans that another solver made, because the chosen one found none in its share of "
+        "nodes or time, or, as a plug-in, none that was valid"
     )
-    solve_ms: PlanningMs = field(metadata=about("time to make a plan", "ms"))
+    solve_ms: PlanningMs = figure("time to make a plan", "ms")
 
 
 @frozen(kw_only=True)
 class Tracking:
     """Solve counts of agents, and counts of fallbacks."""
 
-    solves: int = field(metadata=about("ticks at which an agent tracked a reference"))
-    osqp_solves: int | None = field(default=None, metadata=about("solves with OSQP"))
-    unconstrained_steps: int | None = field(
-        default=None, metadata=about("solves whose unconstrained optimum met all constraints")
+    solves: int = figure("ticks at which an agent tracked a reference")
+    osqp_solves: int | None = optional("solves with OSQP")
+    unconstrained_steps: int | None = optional(
+        "solves whose unconstrained optimum met all constraints"
     )
-    unusable: int = field(metadata=about("solves without a usable solution"))
-    hold_law_ticks: int | None = field(
-        default=None, metadata=about("ticks in which the hold law drove a body, without a command")
+    unusable: int = figure("solves without a usable solution")
+    hold_law_ticks: int | None = optional(
+        "ticks in which the hold law drove a body, without a command"
     )
-    emergency_ticks: int | None = field(default=None, metadata=about("ticks of emergency braking"))
-    missed_ticks: int | None = field(
-        default=None,
-        metadata=about("answers of agents that were missing at the deadline of their tick"),
+    emergency_ticks: int | None = optional("ticks of emergency braking")
+    missed_ticks: int | None = optional(
+        "answers of agents that were missing at the deadline of their tick"
     )
-    caretaker_takeovers: int | None = field(
-        default=None, metadata=about("times that a caretaker took charge of a vehicle")
+    caretaker_takeovers: int | None = optional("times that a caretaker took charge of a vehicle")
+    agent_takeovers: int | None = optional(
+        "times that an agent took charge from a caretaker or an earlier agent"
     )
-    agent_takeovers: int | None = field(
-        default=None,
-        metadata=about("times that an agent took charge from a caretaker or an earlier agent"),
-    )
-    solve_ms: DurationMs = field(metadata=about("CPU time of a solve", "ms"))
+    solve_ms: DurationMs = figure("CPU time of a solve", "ms")
 
 
 @frozen(kw_only=True)
 class RuntimeFigures:
     """Process counts, and the speed of the run."""
 
-    real_time_factor: float = field(metadata=about("road time over wall time"))
-    wall_s: float = field(metadata=about("wall time of the run", "s"))
-    processes: int | None = field(
-        metadata=about("maximum number of processes at once; null: unknown")
-    )
-    vehicles_per_process: int = field(metadata=about("vehicles per agent process"))
-    tick_ms: DurationMs = field(metadata=about("wall time of a tick", "ms"))
+    real_time_factor: float = figure("road time over wall time")
+    wall_s: float = figure("wall time of the run", "s")
+    processes: int | None = figure("maximum number of processes at once; null: unknown")
+    vehicles_per_process: int = figure("vehicles per agent process")
+    tick_ms: DurationMs = figure("wall time of a tick", "ms")
 
 
 @frozen(kw_only=True)
 class Messages:
     """Message counts over all processes."""
 
-    published: int = field(metadata=about("messages published by all processes"))
-    dropped_by_faults: int = field(metadata=about("messages dropped by injected faults"))
-    rejected: int | None = field(
-        default=None, metadata=about("malformed messages that were received")
-    )
+    published: int = figure("messages published by all processes")
+    dropped_by_faults: int = figure("messages dropped by injected faults")
+    rejected: int | None = optional("malformed messages that were received")
 
 
 @frozen(kw_only=True)
 class LeaderChanges:
     """Leadership changes."""
 
-    leader_changes: int = field(metadata=about("times that another candidate became leader"))
-    recovery_s: list[float] = field(
-        metadata=about(
-            "periods without a leader; with injected faults: from each fault of a leader until "
-            "another candidate led",
-            "s",
-        )
+    leader_changes: int = figure("times that another candidate became leader")
+    recovery_s: list[float] = figure(
+        "periods without a leader; with injected faults: from each fault of a leader until "
+        "another candidate led",
+        "s",
     )
-    plan_recovery_s: list[float] | None = field(
-        default=None,
-        metadata=about("times from each leader fault until the next plan was in force", "s"),
+    plan_recovery_s: list[float] | None = optional(
+        "times from each leader fault until the next plan was in force", "s"
     )
 
 
@@ -249,42 +212,34 @@ class LeaderChanges:
 class RunSummary:
     """The content of `summary.json`."""
 
-    schema: str = field(metadata=about("name and number of the schema"))
-    method: str = field(metadata=about("value of laneweave run --method"))
-    seed: int = field(metadata=about("seed of the scenario"))
-    volume_veh_per_lane_h: float = field(metadata=about("demand per lane", "veh/(lane h)"))
-    lanes: int = field(metadata=about("number of lanes"))
-    road_m: float = field(metadata=about("length of the road", "m"))
-    simulated_s: float = field(metadata=about("road time at the end", "s"))
+    schema: str = figure("name and number of the schema")
+    method: str = figure("value of laneweave run --method")
+    seed: int = figure("seed of the scenario")
+    volume_veh_per_lane_h: float = figure("demand per lane", "veh/(lane h)")
+    lanes: int = figure("number of lanes")
+    road_m: float = figure("length of the road", "m")
+    simulated_s: float = figure("road time at the end", "s")
     vehicles: VehicleCounts
     travel_time_s: TravelTime
-    throughput_veh_per_lane_h: float | None = field(
-        metadata=about(
-            "vehicles that leave between the first and the last counted one; null: undefined",
-            "veh/(lane h)",
-        )
+    throughput_veh_per_lane_h: float | None = figure(
+        "vehicles that leave between the first and the last counted one; null: undefined",
+        "veh/(lane h)",
     )
     safety: Safety
-    ending: str | None = field(
-        default=None,
-        metadata=about(
-            "complete: all demanded vehicles have left; limit: runtime.max_road_s was reached; "
-            "interrupted: the run was stopped, or something failed"
-        ),
+    ending: str | None = optional(
+        "complete: all demanded vehicles have left; limit: runtime.max_road_s was reached; "
+        "interrupted: the run was stopped, or something failed"
     )
     planning: Planning
     tracking: Tracking
     runtime: RuntimeFigures
     messages: Messages
     failover: LeaderChanges
-    faults: dict[str, Any] | None = field(
-        default=None, metadata=about("injected faults, by kind; absent without a fault file")
+    faults: dict[str, Any] | None = optional(
+        "injected faults, by kind; absent without a fault file"
     )
-    plug_ins: list[str] | None = field(
-        default=None,
-        metadata=about(
-            "name and version of the distributions whose plug-ins made plans or drove vehicles"
-        ),
+    plug_ins: list[str] | None = optional(
+        "name and version of the distributions whose plug-ins made plans or drove vehicles"
     )
     folder: Path | None = field(default=None, eq=False, metadata={IN_FILE: False})
     """Folder of the run, which is not part of the file."""

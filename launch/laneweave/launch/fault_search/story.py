@@ -19,7 +19,7 @@ from laneweave.protocol.config.source_files import (
     unique_keys,
 )
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.structuring import strict_converter, structure
+from laneweave.protocol.structuring import structure, unstructure
 from laneweave.protocol.wire.messages import Name
 
 SCHEMA = "laneweave.story/1"
@@ -87,7 +87,7 @@ class Story:
 
     def text(self) -> str:
         """Return the story as JSON."""
-        table = {"schema": SCHEMA, **strict_converter(detailed=False).unstructure(self)}
+        table = {"schema": SCHEMA, **unstructure(self)}
         return json.dumps(table, indent=1) + "\n"
 
 

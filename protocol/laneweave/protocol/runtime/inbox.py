@@ -1,4 +1,4 @@
-"""Input queue of a node, with fair scheduling of queries and bounded waiting of messages."""
+"""Input queue of a node, with fair scheduling, and bounds on what waits or is not answered."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from typing import Generic, TypeVar
 
 from laneweave.protocol.runtime.metrics import SnapshotRequest
 from laneweave.protocol.runtime.node import Computed, Stopping
@@ -32,6 +33,12 @@ OVERFLOW_S = 0.1
 QUERY_SHARE = 0.1
 """Maximum fraction of time spent on queries while other work is queued."""
 
+MAX_OPEN_QUERIES = 4096
+"""Maximum number of open queries; further ones are declined."""
+MAX_OPEN_PER_SENDER = 1024
+"""Maximum number of open queries of one sender; further ones are declined."""
+
+T = TypeVar("T")
 Item = Delivery | Computed | SnapshotRequest | Stopping
 """Input of a node."""
 
@@ -108,3 +115,36 @@ class Inbox:
             self._waiting[name] -= 1
             if not self._waiting[name]:
                 del self._waiting[name]
+
+
+class OpenQueries(Generic[T]):
+    """Queries that have not been answered or declined yet, by token; safe in any thread."""
+
+    def __init__(self) -> None:
+        """Create an empty table."""
+        self._queries: dict[int, tuple[str, T]] = {}
+        """Sender and query by token."""
+        self._by_sender: Counter[str] = Counter()
+        self._lock = threading.Lock()
+        self._last_token = 0
+
+    def add(self, sender: str, query: T) -> int | None:
+        """Register a query and return its token; None if there are too many."""
+        with self._lock:
+            full = len(self._queries) >= MAX_OPEN_QUERIES
+            if full or self._by_sender[sender] >= MAX_OPEN_PER_SENDER:
+                return None
+            self._last_token += 1
+            self._queries[self._last_token] = sender, query
+            self._by_sender[sender] += 1
+            return self._last_token
+
+    def pop(self, token: int) -> T | None:
+        """Remove and return a query; None if the token is unknown."""
+        with self._lock:
+            sender, query = self._queries.pop(token, (None, None))
+            if sender is not None:
+                self._by_sender[sender] -= 1
+                if not self._by_sender[sender]:
+                    del self._by_sender[sender]
+            return query

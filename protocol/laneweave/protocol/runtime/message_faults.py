@@ -19,7 +19,7 @@ import attrs
 from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.field_validators import one_of, within
+from laneweave.protocol.field_validators import one_of, within, within_or_none
 from laneweave.protocol.runtime.metrics import MetricsSnapshot
 from laneweave.protocol.runtime.node import (
     Arrived,
@@ -37,6 +37,7 @@ SENDER_OF_ROLE = {role: str(party) for party, role in ROLES.items()}
 """Kind of sender in message rules, by role."""
 SENDERS = tuple(SENDER_OF_ROLE.values())
 MESSAGE_TOPICS = tuple(topic.name for topic in TOPICS if topic.kind is not None)
+_SENDER = attrs.validators.optional(one_of(*SENDERS))
 CoreWrapper = Callable[[Core], Core]
 """Wraps a core, or returns it unchanged."""
 MAX_HELD = 10_000
@@ -69,15 +70,11 @@ class MessageRule:
     """Maximum additional delay of each copy, drawn uniformly; reorders frequent messages."""
     from_s: float = field(default=0.0, validator=within(0.0, 1e6))
     """Road time at which the rule starts; 0: also before the road's clock starts."""
-    until_s: float | None = field(
-        default=None, validator=attrs.validators.optional(within(0.0, 1e6))
-    )
+    until_s: float | None = field(default=None, validator=within_or_none(0.0, 1e6))
     """Road time at which the rule ends; None: when the run ends."""
-    sender: str | None = field(default=None, validator=attrs.validators.optional(one_of(*SENDERS)))
+    sender: str | None = field(default=None, validator=_SENDER)
     """Kind of sender; None: any."""
-    receiver: str | None = field(
-        default=None, validator=attrs.validators.optional(one_of(*SENDERS))
-    )
+    receiver: str | None = field(default=None, validator=_SENDER)
     """Kind of receiver; None: any."""
 
     def __attrs_post_init__(self) -> None:

@@ -23,8 +23,8 @@ import zenoh
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import check_endpoint
+from laneweave.protocol.runtime.inbox import OpenQueries
 from laneweave.protocol.runtime.metrics import Observe, RouterMetrics, unobserved
-from laneweave.protocol.runtime.open_queries import OpenQueries
 from laneweave.protocol.runtime.processes import stop_signals
 from laneweave.protocol.runtime.transport import (
     Answer,
