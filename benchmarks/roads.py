@@ -35,7 +35,7 @@ from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.launch.run_methods import FORMATION, METHODS
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import load_scenario
-from laneweave.protocol.config.source_files import read_toml
+from laneweave.protocol.config.source_files import read_toml_source
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
@@ -119,7 +119,7 @@ def _leaving(share: float) -> dict[str, object]:
 
 def _weaving(ramp_veh_per_h: float, volume: int) -> dict[str, object]:
     """Return the overrides for equal flows from the on-ramp and to the off-ramp of weaving.toml."""
-    (ramp,) = read_toml(SCENARIOS / "weaving.toml")["entrance"]
+    (ramp,) = read_toml_source(SCENARIOS / "weaving.toml").tables["entrance"]
     return {
         "entrance": [ramp | {"volume_veh_per_h": ramp_veh_per_h}],
         **_leaving(ramp_veh_per_h / (3 * volume)),

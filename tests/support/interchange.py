@@ -47,7 +47,6 @@ class _Edge:
     lanes: Sequence[float]
     """Centre lines of its lanes, from the right [m]."""
     speed_mps: float = MAIN_SPEED_MPS
-    right_of_way: str = "M"
 
 
 def _centres(first: int, count: int, shift_m: float = 0.0) -> tuple[float, ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -87,9 +86,16 @@ CASE_STUDY = "docs/examples/case-study.json"
 ROUTER = "router --endpoint tcp/127.0.0.1:1"
 
 
-def run_with(extras: str, command: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | only_extras(*extras.split())
-    return run(LANEWEAVE, *command.split(), cwd=ROOT, env=environment)
+REFUSED_IN_TURN = """
+import contextlib, io, sys
+from laneweave.launch.cli.main import _status
+for command in sys.argv[1:]:
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        status = _status(command.split())
+    print(status, repr(out.getvalue()), err.getvalue(), end="")
+"""
+"""Runs commands in one process, since starting one takes longer; prints a line for each."""
 
 
 @pytest.mark.slow
@@ -122,15 +128,15 @@ def test_commands_need_only_their_extra(
     extras: str, command: str, says: str, tmp_path: Path
 ) -> None:
     # `test_roles_by_hand` runs all other roles like this.
-    done = run_with(extras, command.format(folder=tmp_path))
+    environment = os.environ | only_extras(*extras.split())
+    words = command.format(folder=tmp_path).split()
+    done = run(LANEWEAVE, *words, cwd=ROOT, env=environment)
     assert "not installed" not in done.stderr
     assert says in done.stdout + done.stderr
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("command", "begins", "names"),
-    [
+MISSING: dict[str, list[tuple[str, str, str]]] = {
+    "": [
         ("run --duration 5", "", "not installed"),
         (f"plan {CASE_STUDY} --solver branching", "", "[plan]"),
         ("coordinator --endpoint tcp/127.0.0.1:1", "", "[plan]"),
@@ -140,33 +146,26 @@ def test_commands_need_only_their_extra(
         ("certs init new-folder", "", "laneweave[certs]"),
         ("watch --endpoint tcp/127.0.0.1:1", "", "laneweave[watch]"),
     ],
-)
-def test_base_install_names_the_missing_extra(command: str, begins: str, names: str) -> None:
-    assert_refused(run_with("", command), begins, names)
-    assert not (ROOT / "new-folder").exists()
+    "plan": [
+        (f"plan {CASE_STUDY} --draw plan.png", "", "not installed"),
+        (f"plan {CASE_STUDY} --draw-road road.png", "--draw-road: got 'road.png'",
+         "laneweave[agent] and laneweave[sim]"),
+    ],
+}  # fmt: skip
+"""By installed extra: commands, and how the line begins with which they are refused, and a part."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("command", "begins", "names"),
-    [
-        (f"plan {CASE_STUDY} --draw plan.png", "", "not installed"),
-        (
-            f"plan {CASE_STUDY} --draw-road road.png",
-            "--draw-road: got 'road.png'",
-            "laneweave[agent] and laneweave[sim]",
-        ),
-    ],
-)
-def test_drawing_a_plan_names_the_missing_extra(command: str, begins: str, names: str) -> None:
-    assert_refused(run_with("plan", command), begins, names)
-
-
-def assert_refused(done: subprocess.CompletedProcess[str], begins: str, names: str) -> None:
-    assert (done.returncode, done.stdout) == (2, "")
-    (line,) = done.stderr.splitlines()
-    assert line.startswith(begins)
-    assert names in line
+@pytest.mark.parametrize("extra", MISSING)
+def test_commands_name_the_missing_extra(extra: str) -> None:
+    commands = [command for command, _, _ in MISSING[extra]]
+    environment = os.environ | only_extras(*extra.split())
+    done = python(REFUSED_IN_TURN, *commands, cwd=ROOT, env=environment)
+    assert (done.returncode, done.stderr) == (0, "")
+    for line, (_, begins, names) in zip(done.stdout.splitlines(), MISSING[extra], strict=True):
+        assert line.startswith(f"2 '' {begins}")
+        assert names in line
+    assert not (ROOT / "new-folder").exists()
 
 
 @pytest.mark.slow

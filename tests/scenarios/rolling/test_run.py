@@ -1,20 +1,15 @@
-"""Whole runs in the rolling operation: real roles on the simulated network, and no SUMO."""
+"""A whole run in the rolling operation: real roles on a bad simulated network, and no SUMO."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
-import pytest
-
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.core import TickPhase
 from laneweave.sim_bridge.road.demand import Arrival
-from support import bridge_bench as bench
 from support.bridge_bench import Street, make_scenario, read_summary
 
 SCENARIO = make_scenario(
@@ -51,40 +46,12 @@ def watched(street: Street) -> Callable[[], bool]:
     return look
 
 
-def run(folder: Path, conditions: Conditions) -> Street:
-    street = Street(SCENARIO, folder, DEMAND, conditions)
+def test_on_a_bad_network_vehicles_are_late_at_worst(tmp_path: Path) -> None:
+    street = Street(SCENARIO, tmp_path, DEMAND, BAD)
     street.start_coordinators(2)
     street.start_shard()
     street.run(watched(street))
-    return street
-
-
-@pytest.mark.more
-def test_all_vehicles_reach_their_lanes(tmp_path: Path) -> None:
-    run(tmp_path, Conditions())
-    summary = read_summary(tmp_path)
-    assert summary["ending"] == "complete"
-    assert summary["vehicles"]["on_preferred_lane"] == len(DEMAND)
-    assert summary["safety"]["overlaps"] == summary["safety"]["emergency_brakes"] == 0
-    assert summary["tracking"]["hold_law_ticks"] == 0
-
-
-def test_on_a_bad_network_vehicles_are_late_at_worst(tmp_path: Path) -> None:
-    run(tmp_path, BAD)
     summary = read_summary(tmp_path)
     assert summary["ending"] == "complete"
     assert summary["vehicles"]["left"] == len(DEMAND)
     assert summary["safety"]["overlaps"] == 0
-
-
-@pytest.mark.parametrize("conditions", [Conditions(), BAD], ids=["good", "bad"])
-@pytest.mark.more
-def test_messages_in_kind_make_the_same_run(
-    tmp_path: Path, conditions: Conditions, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    as_bytes = run(tmp_path / "bytes", conditions)
-    monkeypatch.setattr(bench, "SimulatedNetwork", partial(SimulatedNetwork, skip_codec=True))
-    skip_codec = run(tmp_path / "kind", conditions)
-    assert as_bytes.world.shown == skip_codec.world.shown
-    assert len(as_bytes.world.shown) > 300
-    assert as_bytes.network.delivered == skip_codec.network.delivered

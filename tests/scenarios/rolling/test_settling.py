@@ -11,7 +11,7 @@ from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.agents.driving.reference import Reference
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.motion import State, cell_state, integrate
+from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import Name, Sense, VehicleRecord
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.demand import Arrival
@@ -67,28 +67,6 @@ def test_no_limit_is_approached_and_no_vehicle_overshoots(offset_m: float) -> No
     assert np.abs(reference.window(BEGIN_TICK).jerks).max() < 0.5 * LIMITS.max_jerk_mps3
     assert (np.diff(rows[:, 0]) * np.sign(offset_m) <= 1e-9).all()
     assert rows[:, 3:] == pytest.approx(0.0)
-
-
-def test_is_what_the_jerks_make_of_it() -> None:
-    reference = settling(beside(7.5))
-    for tick in (BEGIN_TICK, BEGIN_TICK + 17, END_TICK - 5):
-        window = reference.window(tick)
-        for row, jerk, following in zip(
-            window.states, window.jerks, window.states[1:], strict=False
-        ):
-            exact = integrate(tuple(row.tolist()), (jerk[0], jerk[1]), TICK_S)
-            np.testing.assert_allclose(following, exact, atol=1e-6)
-
-
-def test_takes_all_the_time_there_is() -> None:
-    """To be there earlier takes more jerk."""
-
-    def cost(end_tick: int) -> float:
-        reference = Reference.settling(SCENARIO, LIMITS, CELL, beside(7.5), BEGIN_TICK, end_tick)
-        ticks = range(BEGIN_TICK, END_TICK)
-        return sum(float((reference.window(tick).jerks[0] ** 2).sum()) for tick in ticks)
-
-    assert 0.0 < cost(END_TICK) < cost(END_TICK - 1) < cost(END_TICK - 40)
 
 
 @pytest.mark.parametrize("offset_m", [7.5, 0.0, -7.5])

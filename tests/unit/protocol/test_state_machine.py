@@ -117,18 +117,6 @@ def test_actions_see_the_phase_before_and_guards_stop_at_the_first_that_fails() 
 # --- other functions in the places of some ----------------------------------------------------
 
 
-def test_a_function_is_replaced_in_a_copy_only() -> None:
-    book = replacing(BOOK, {is_powered: lambda machine, message: True})  # noqa: ARG005
-    machine = Machine(powered=False)
-    taken = book.take(machine, "switch", "softly")
-    assert taken is book.table[1]
-    assert [row.rule for row in book.table] == [row.rule for row in TABLE]
-    assert book.functions - BOOK.functions != set()
-    assert BOOK.table == TABLE
-    machine = Machine(powered=False)
-    assert BOOK.take(machine, "switch", "softly") is TABLE[3]
-
-
 def test_a_function_that_no_rule_uses_cannot_be_replaced() -> None:
     with pytest.raises(ValueError, match="no rule uses unused"):
         replacing(BOOK, {unused: click})

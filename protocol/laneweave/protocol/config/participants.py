@@ -55,11 +55,6 @@ def coordinator_names(scenario: Scenario) -> tuple[str, ...]:
     return tuple(f"c{index + 1}" for index in range(scenario.runtime.coordinators))
 
 
-def single_vehicles(scenario: Scenario) -> tuple[str, ...]:
-    """Return the vehicles that may have their own process."""
-    return scenario.security.vehicles or demanded_vehicles(scenario)
-
-
 def identities_of(scenario: Scenario) -> Iterator[Identity]:
     """Yield all identities of a deployment."""
     security = scenario.security
@@ -70,7 +65,7 @@ def identities_of(scenario: Scenario) -> Iterator[Identity]:
         (Party.FLEET, tuple(security.fleets)),
         (Party.CLIENT, security.clients),
         (Party.OBSERVER, security.observers),
-        (Party.VEHICLE, single_vehicles(scenario)),
+        (Party.VEHICLE, security.vehicles or demanded_vehicles(scenario)),
     ):
         for name in names:
             yield Identity(party, name)

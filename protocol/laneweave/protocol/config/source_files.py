@@ -96,17 +96,12 @@ def shown_name(path: Path) -> str:
     return "stdin" if path == STDIN else str(path)
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Return the tables of a TOML file.
+def read_toml_source(path: Path) -> SourceFile:
+    """Read a TOML file.
 
     Raises:
         BadInputError: the file cannot be read or is not TOML.
     """
-    return read_toml_source(path).tables
-
-
-def read_toml_source(path: Path) -> SourceFile:
-    """Read a TOML file; raises as `read_toml`."""
     text = read_text(path, "file", "TOML", MAX_TOML_BYTES)
     try:
         return SourceFile(str(path), text, tomllib.loads(text), toml_lines)

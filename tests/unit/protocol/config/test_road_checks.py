@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, sections_for
 from support.tables import for_each
@@ -155,12 +154,6 @@ def test_the_time_at_v_f_counts_from_the_entrance_to_the_destination() -> None:
     assert scenario.geometry.free_flow_trip_s(0) == pytest.approx(50.0)
     assert scenario.geometry.free_flow_trip_s(1, "off") == pytest.approx(700.0 / 15.0)
     assert [scenario.geometry.entrance_of(lane) for lane in (0, 1)] == ["on", "main"]
-
-
-@pytest.mark.parametrize("name", ["on-ramp", "off-ramp", "weaving", "motorway"])
-def test_the_example_scenarios_are_valid(name: str) -> None:
-    folder = Path(__file__).parents[4] / "scenarios"
-    assert load_scenario(folder / f"{name}.toml").formation.operation == "rolling"
 
 
 @pytest.mark.parametrize(

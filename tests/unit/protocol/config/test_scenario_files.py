@@ -26,28 +26,6 @@ def test_a_missing_file_or_a_folder_is_refused(tmp_path: Path) -> None:
         assert refusal(load_scenario, path).field == "file"
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"seed = ",
-        b"seed 1",
-        b"\xff\xfe",
-        b"seed = 1\nseed = 2",
-        b"[road\nlanes = 3",
-        b"\x00",
-        b"{}",
-        b"seed = " + b"9" * 5000,
-        b"seed = " + b"[" * 5000,
-        b"road.lanes = 3\nroad = 1",
-    ],
-    ids=range(10),
-)
-def test_what_is_no_toml_is_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "x.toml"
-    path.write_bytes(content)
-    assert refusal(load_scenario, path).field == "file"
-
-
 def test_values_that_toml_allows_are_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "x.toml"
     for line, field in (

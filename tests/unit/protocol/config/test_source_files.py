@@ -17,12 +17,13 @@ from laneweave.protocol.config.source_files import (
     SourceFile,
     json_lines,
     read_text,
-    read_toml,
+    read_toml_source,
     toml_lines,
     unique_keys,
 )
 from laneweave.protocol.errors import BadInputError, SeveralBadInputsError
 from support.refusals import refusal
+from support.tables import for_each
 
 TOML = '''\
 seed = 1
@@ -147,25 +148,29 @@ def test_errors_are_sorted_by_line_and_those_of_options_have_none() -> None:
     assert places == ("", "x.toml:6", "x.toml:19")
 
 
-@pytest.mark.parametrize(
+@for_each(
     ("content", "said"),
     [
         (b"\xff\xfea\x00", "valid TOML in UTF-8 (it is UTF-16)"),
         (b"a = '\xe4'", "valid TOML in UTF-8 (byte 5 is not)"),
         (b"a = 1\n" * MAX_TOML_BYTES, f"at most {MAX_TOML_BYTES} bytes"),
         (b"a = 1\na = 2\n", "valid TOML (Cannot overwrite a value (at line 2, column 6))"),
+        (b"a = " + b"9" * 5000, "valid TOML (Exceeds the limit"),
+        (b"a = " + b"[" * 5000, "valid TOML (maximum recursion depth"),
+        (b"\x00", "valid TOML (Invalid statement"),
     ],
 )
 def test_text_that_cannot_be_read(tmp_path: Path, content: bytes, said: str) -> None:
     path = tmp_path / "x.toml"
     path.write_bytes(content)
-    assert refusal(read_toml, path).allowed == said
+    error = refusal(read_toml_source, path)
+    assert (error.field, error.allowed[: len(said)]) == ("file", said)
 
 
 def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
     path = tmp_path / "x.toml"
     path.write_bytes(b"\xef\xbb\xbfseed = 1\r\n")
-    assert read_toml(path) == {"seed": 1}
+    assert read_toml_source(path).tables == {"seed": 1}
 
 
 def test_standard_input_has_the_same_limit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -85,11 +85,6 @@ def test_the_file_of_the_paper_holds_the_defaults_but_for_its_formations() -> No
     assert load_scenario(FOLDER / "paper.toml") == attrs.evolve(default, formation=formation)
 
 
-@for_each("path", sorted(FOLDER.glob("*.toml")))
-def test_every_scenario_of_the_repository_loads(path: Path) -> None:
-    assert load_scenario(path).schema == "laneweave.scenario/1"
-
-
 def test_the_lattice_is_that_of_the_tables() -> None:
     formation = {"close": "columns", "block_columns": 6}
     lattice = parse_scenario({"road": {"lanes": 2}, "formation": formation}).lattice

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from functools import cache
 
 import pytest
 
@@ -41,11 +41,16 @@ SCENARIO = parse_scenario(
 PREFIX = "laneweave/r/"
 
 
+@cache
+def rules(who: str) -> tuple[Rule, ...]:
+    return rules_of(parse_identity(who), SCENARIO)
+
+
 def may(who: str, flow: str, message: str, key: str) -> bool:
     """Return whether an identity may send or get a kind of Zenoh's messages on a key."""
     return any(
         rule.flow == flow and rule.message == message and matches(expression, PREFIX + key)
-        for rule in rules_of(parse_identity(who), SCENARIO)
+        for rule in rules(who)
         for expression in rule.keys
     )
 
@@ -115,15 +120,10 @@ def test_no_identity_has_rights_on_a_malformed_key(flow: Flow, message: str, key
         assert not may(identity.common_name, flow, message, key)
 
 
-def _all_rules(scenario: Scenario) -> Iterator[Rule]:
-    for identity in identities_of(scenario):
-        yield from rules_of(identity, scenario)
-
-
 def test_all_keys_are_of_topics_of_the_realm() -> None:
     keys = Keys("r")
     concrete = [keys.key(topic, **dict.fromkeys(topic.parameters, "x")) for topic in TOPICS]
-    for rule in _all_rules(SCENARIO):
+    for rule in (rule for who in identities_of(SCENARIO) for rule in rules(who.common_name)):
         assert rule.message != "delete"
         for expression in rule.keys:
             assert "**" not in expression
@@ -143,11 +143,7 @@ def test_every_topic_has_senders_and_readers() -> None:
 
 def test_the_rights_of_a_fleet_are_those_of_its_vehicles_and_the_census() -> None:
     def rights(who: str) -> set[tuple[Flow, str, str]]:
-        return {
-            (rule.flow, rule.message, key)
-            for rule in rules_of(parse_identity(who), SCENARIO)
-            for key in rule.keys
-        }
+        return {(rule.flow, rule.message, key) for rule in rules(who) for key in rule.keys}
 
     more = rights("fleet.two") - rights("vehicle.a") - rights("vehicle.b")
     assert {key for _, _, key in more} == {PREFIX + "census"}
