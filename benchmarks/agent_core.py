@@ -30,7 +30,7 @@ from attrs import define, field
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import Drive, TrackingDriver
 from laneweave.agents.host import AgentHost
-from laneweave.coordinator.formations.planning_orders import LONGEST_DEADLINE_S
+from laneweave.coordinator.formations.formation_planner import LONGEST_DEADLINE_S
 from laneweave.coordinator.formations.roster import start_time_s, steps_left
 from laneweave.coordinator.formations.sorting import SortingTask, sort_lanes
 from laneweave.coordinator.planning.solve import plan

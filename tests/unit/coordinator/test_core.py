@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
-from laneweave.coordinator.formations import planning_orders as formation_planner
-from laneweave.coordinator.formations.planning_orders import START_MARGIN_S
+from laneweave.coordinator.formations import formation_planner
+from laneweave.coordinator.formations.formation_planner import START_MARGIN_S
 from laneweave.coordinator.formations.roster import start_time_s
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
 from laneweave.coordinator.planning.budget import Clock

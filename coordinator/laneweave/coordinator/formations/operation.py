@@ -6,8 +6,8 @@ import random
 from collections.abc import Callable, Iterator
 
 from laneweave.coordinator.ballots.ballot_round import PROMISED, TIME, BallotPhase
+from laneweave.coordinator.formations.formation_planner import FormationPlanner
 from laneweave.coordinator.formations.leader import FormationLeader
-from laneweave.coordinator.formations.planning_orders import FormationPlanner
 from laneweave.coordinator.formations.roster import Formation, Groups, closed_formations, joinable
 from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.response import PlanFunction

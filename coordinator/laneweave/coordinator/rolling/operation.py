@@ -17,18 +17,17 @@ from typing import Any
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.conflict_kinds import Move
-from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import StreamPlan
 from laneweave.coordinator.rolling.checked_planner import Planner
-from laneweave.coordinator.rolling.observed import ObservedRoad, Snapshot
+from laneweave.coordinator.rolling.known_road import KnownRoad
+from laneweave.coordinator.rolling.observed import ObservedRoad
 from laneweave.coordinator.rolling.ownership import certain_cells, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
-from laneweave.protocol.lattice import Cell, footprint
-from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
+from laneweave.protocol.lattice import footprint
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
+from laneweave.protocol.scenario.formation_table import SNAPSHOT_S
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.vehicle.motion import DISPLACED_ALONG_M
 from laneweave.protocol.wire.events import (
     PLAN_IN_FORCE,
     PLANNING_FAILED,
@@ -39,7 +38,6 @@ from laneweave.protocol.wire.events import (
 from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
-    CensusEntry,
     Name,
     Plan,
     Prepare,
@@ -51,11 +49,6 @@ LISTEN_S = 0.5
 heartbeats it has missed."""
 MAX_DELAY_S = 1.0
 """Time into its slot after which a plan that is not in force is dropped."""
-LOOKAHEAD_M = 600.0
-"""Distance before the first moves at which planning for a vehicle begins: the length of S3, so that
-all vehicles that can interact there are included in time."""
-MARGIN_COLUMNS = 10
-"""Columns ahead of the foremost and behind the rearmost vehicle that plans may use."""
 
 
 class RollingOperation:
@@ -84,7 +77,6 @@ class RollingOperation:
         self._new_job = new_job
         self._planner = planner
         self._slot_s = scenario.timing.cycles_s[0]
-        self._sections = scenario.geometry.sections
         self.observed = ObservedRoad()
         self.transfers: list[CellTransfer] = []
         self._transfer_of: dict[Name, CellTransfer] = {}
@@ -174,133 +166,17 @@ class RollingOperation:
             return
         if max(self._since[0], t_s - 1.5 * self._scenario.runtime.tick_s) > snapshot_s:
             snapshot_s = t_s  # too late for that snapshot: use the newest states
-        vehicles, blocked, ends_m = self._observed_at(snapshot_s, slot + 1)
+        known = KnownRoad(
+            self._scenario, self.observed.at(snapshot_s), snapshot_s, slot + 1, self._since[0]
+        )
+        vehicles, blocked = known.vehicles_and_blocked_cells(self.transfers)
         self._newest_slot = slot + 1
         job = self._new_job()
         self._ordered = (job, slot + 1)
-        plan = partial(self._planner, slot + 1, vehicles, self._last_plan, blocked, ends_m)
+        plan = partial(
+            self._planner, slot + 1, vehicles, self._last_plan, blocked, known.section_ends_m()
+        )
         yield Compute(job, lambda _: plan())
-
-    def _observed_at(
-        self, snapshot_s: float, slot: int
-    ) -> tuple[tuple[StreamVehicle, ...], frozenset[Cell], dict[int, float]]:
-        """Return what the planner needs: vehicles, blocked cells, and earlier ends of sections."""
-        vehicles: dict[Cell, StreamVehicle] = {}
-        owned, reserved = set[Cell](), set[Cell]()
-        # States from an earlier term of this leader do not report current positions.
-        since_s = self._since[0] - 1e-6 if self._since is not None else 0.0
-        far_m = self._scenario.geometry.moves_from_m - LOOKAHEAD_M
-        snapshot = self.observed.at(snapshot_s)
-        gated = self._gated(snapshot, slot - 1)
-        # Vehicles without a state come last: they may have moved, and others may hold their cells.
-        for entry in sorted(
-            snapshot.census.on_lattice, key=lambda entry: entry.vehicle not in snapshot.states
-        ):
-            state = snapshot.states.get(entry.vehicle)
-            column = entry.cell[0] if state is None else state.hold_cell[0]
-            s_m = self._scenario.lattice.cell_s_m(column, (slot - 1) * self._slot_s)
-            if s_m < far_m:
-                continue
-            targets = self._targets(entry, s_m)
-            moves = self._scenario.types.moves_of(entry.vehicle_type)
-            if state is None:
-                unknown = StreamVehicle(
-                    entry.vehicle, entry.cell, targets, True, vehicle_type=entry.vehicle_type
-                )
-                vehicles.setdefault(entry.cell, unknown)
-                continue
-            # With an open gate the move may begin at any time. With a closed gate it never begins
-            # once the vehicle promises the newer ballot.
-            late = state.go and not state.done and not state.moving
-            owned |= certain_cells(state, snapshot.states, snapshot.gone)
-            if late or entry.vehicle in gated:
-                reserved |= {*state.record.owned} - {state.hold_cell}
-            elif entry.ready_s > slot * self._slot_s:
-                # It may still be beside these cells.
-                column, lane = state.hold_cell
-                reserved |= {
-                    cell for cell in state.record.owned if cell[1] == lane and cell[0] > column
-                }
-            settles = entry.ready_s > (slot - 1) * self._slot_s
-            held = late or not state.attended or state.t_s < since_s
-            held = held or (self._is_displaced(state) and not settles)
-            ready_s = entry.ready_s - READY_LATE_S
-            waits = max(0, math.ceil(ready_s / self._slot_s - slot - 1e-9))
-            if entry.vehicle in gated:
-                waits = max(waits, 1)
-            cell, own = state.hold_cell, entry.vehicle_type
-            known = StreamVehicle(entry.vehicle, cell, targets, held, moves, waits, own)
-            vehicles.setdefault(cell, known)
-        columns = [column for column, _ in vehicles] or [0]
-        window = range(min(columns) - MARGIN_COLUMNS, max(columns) + MARGIN_COLUMNS + 1)
-        blocked = frozenset(
-            (column, lane)
-            for lane in range(self._scenario.road.lanes)
-            for column in self._assigned_columns(lane, window, snapshot_s)
-            if (column, lane) not in owned or (column, lane) in reserved
-        )
-        return tuple(vehicles.values()), blocked, self._ends_m(snapshot.census)
-
-    def _gated(self, snapshot: Snapshot, slot: int) -> frozenset[Name]:
-        """Return the members of ballots for a slot whose start gates wait for a settling vehicle.
-
-        If one of them promised the next ballot, the gate would stay closed.
-        """
-        t0_s, states = slot * self._slot_s, snapshot.states
-        settling = {one.vehicle for one in snapshot.census.on_lattice if one.ready_s > t0_s}
-        return frozenset(
-            name
-            for transfer in self.transfers
-            if transfer.phase is BallotPhase.IN_FORCE
-            and transfer.t0_s >= t0_s - 1e-6
-            and not settling.isdisjoint(transfer.roster)
-            and not any(states[one].go for one in transfer.roster if one in states)
-            for name in transfer.roster
-        )
-
-    def _assigned_columns(self, lane: int, columns: range, t_s: float) -> range:
-        """Return the columns whose cells may have been assigned to vehicles at a road time.
-
-        On a ramp, plans count on cells behind it: they will be assigned before moves begin there.
-        """
-        lattice, entry_m = self._scenario.lattice, self._scenario.geometry.entry_m[lane]
-        if entry_m <= 0.0:
-            return columns
-        first = math.ceil((entry_m - lattice.cell_s_m(0, t_s)) / lattice.pitch_m)
-        return range(max(columns.start, first), columns.stop)
-
-    def _targets(self, entry: CensusEntry, s_m: float) -> frozenset[int]:
-        """Return the sections by whose ends a vehicle at a position may leave the road.
-
-        A vehicle that has passed its exit drives to the end of the road.
-        """
-        goals, own = self._scenario.geometry.goal_sections, entry.vehicle_type
-        wanted = goals(entry.preferred_lane, entry.destination, own)
-        ahead = frozenset(number for number in wanted if self._sections[number].to_m > s_m)
-        return ahead or goals(ANY_LANE, END_OF_ROAD, own)
-
-    def _is_displaced(self, state: VehicleState) -> bool:
-        """Return whether a body is farther from its cell than any move of one cell takes it.
-
-        Its plans would not come into force, since it is not ready for them.
-        """
-        lattice = self._scenario.lattice
-        cell_s_m = lattice.cell_s_m(state.hold_cell[0], state.t_s)
-        return abs(state.s_m - cell_s_m) > lattice.pitch_m + DISPLACED_ALONG_M
-
-    def _ends_m(self, census: Census) -> dict[int, float]:
-        """Return where sections end before vehicles without cells [m], by index."""
-        ends_m: dict[int, float] = {}
-        bodies = [entry.off_lattice for entry in census.on_road if entry.off_lattice is not None]
-        for number, section in enumerate(self._sections):
-            inside = [
-                body.rear_m
-                for body in bodies
-                if body.lane == section.lane and section.from_m <= body.rear_m < section.to_m
-            ]
-            if inside:
-                ends_m[number] = min(inside)
-        return ends_m
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[LogEntry]:
         """Begin ballots for the first moves of the plan requested last; ignore other results."""

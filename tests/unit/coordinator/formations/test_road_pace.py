@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from laneweave.coordinator.formations.planning_orders import MIN_PACE, PACE_WINDOW_S, RoadPace
+from laneweave.coordinator.formations.formation_planner import MIN_PACE, PACE_WINDOW_S, RoadPace
 
 
 def heard(pace: float, ticks: int = 100, t_s: float = 0.0) -> RoadPace:

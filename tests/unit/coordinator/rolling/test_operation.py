@@ -16,10 +16,9 @@ from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.rolling.problem import NO_ENDS, StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import checked, stream_planner, stream_road
+from laneweave.coordinator.rolling.known_road import LOOKAHEAD_M, MARGIN_COLUMNS
 from laneweave.coordinator.rolling.operation import (
     LISTEN_S,
-    LOOKAHEAD_M,
-    MARGIN_COLUMNS,
     MAX_DELAY_S,
     RollingOperation,
     _clusters,
