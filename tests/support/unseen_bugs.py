@@ -20,8 +20,8 @@ from laneweave.coordinator.ballots import ballot_round as ballots
 from laneweave.coordinator.ballots.ballot_round import BallotRound
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.formations import operation as formations
-from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.formation_planner import FormationPlanner
+from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.roster import Formation, Groups
 from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.rolling.problem import StreamPlan
