@@ -394,17 +394,13 @@ def test_scenario_files_load(path: Path) -> None:
         load_scenario(path)
 
 
-@each_document
-def test_requests_in_documents_are_valid(path: Path) -> None:
-    for body in fences(path.read_text(encoding="utf-8"), "json"):
-        data = json.loads(body)
+def test_requests_in_documents_and_examples_are_valid() -> None:
+    texts = [path.read_text(encoding="utf-8") for path in (DOCS / "examples").rglob("*.json")]
+    assert texts
+    texts += [body for path in MARKDOWN for body in fences(path.read_text("utf-8"), "json")]
+    for data in map(json.loads, texts):
         if data.get("schema") == "laneweave.plan.request/1":
             PlanRequest.from_dict(data)
-
-
-@pytest.mark.parametrize("path", sorted((DOCS / "examples").rglob("*.json")), ids=str)
-def test_example_requests_are_valid(path: Path) -> None:
-    PlanRequest.from_dict(json.loads(path.read_text(encoding="utf-8")))
 
 
 def test_answer_to_the_case_study_is_as_shown(capsys: pytest.CaptureFixture[str]) -> None:

@@ -138,7 +138,6 @@ def test_moves_of_types() -> None:
     [
         ({}, 4.0),
         ({"formation": {"gap_m": 16.0, "speed_mps": 12.0}}, 4.0),
-        ({"formation": {"speed_mps": 8.0}}, 4.0),
         ({"formation": {"gap_m": 20.0}, "vehicle_type": [TRUCK]}, 5.0),
         ({"vehicle": {"max_accel_mps2": 3.0}}, 5.0),
     ],

@@ -23,20 +23,15 @@ def filled(topic: topics.Topic, text: str = "x") -> dict[str, str]:
     return {name: f"{text}{index}" for index, name in enumerate(topic.parameters)}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda topic: topic.name)
-def test_what_is_built_is_read_back(topic: topics.Topic) -> None:
-    @given(st.tuples(*(NAMES for _ in topic.parameters)), NAMES)
-    @example(tuple("y" * 64 for _ in topic.parameters), "x" * 64)
-    def check(texts: tuple[str, ...], realm: str) -> None:
-        keys = topics.Keys(realm)
-        parameters = dict(zip(topic.parameters, texts, strict=True))
-        key = keys.key(topic, **parameters)
-        assert keys.read(key) == (topic, parameters)
-        assert topics.matches(keys.all_of(topic), key)
-        assert not re.search(r"[*$?#\s{}]|//|^/|/$", key)
-
-    check()
+@given(st.sampled_from(topics.TOPICS), st.lists(NAMES, min_size=3, max_size=3), NAMES)
+@example(topics.STATE, ["y" * 64] * 3, "x" * 64)
+def test_what_is_built_is_read_back(topic: topics.Topic, texts: list[str], realm: str) -> None:
+    keys = topics.Keys(realm)
+    parameters = dict(zip(topic.parameters, texts, strict=False))
+    key = keys.key(topic, **parameters)
+    assert keys.read(key) == (topic, parameters)
+    assert topics.matches(keys.all_of(topic), key)
+    assert not re.search(r"[*$?#\s{}]|//|^/|/$", key)
 
 
 def test_numbers_become_text() -> None:
@@ -57,8 +52,11 @@ def test_the_parameters_of_a_key_cannot_be_changed() -> None:
     assert KEYS.read(key) == (topics.COMMAND, {"vehicle": "v1"})
 
 
-def test_topics_are_distinct() -> None:
+def test_topics_are_distinct_and_have_no_reserved_characters() -> None:
     assert len({topic.name for topic in topics.TOPICS}) == len(topics.TOPICS)
+    for topic in topics.TOPICS:
+        assert re.fullmatch(r"([a-z]+|{[a-z]+})(/([a-z]+|{[a-z]+}))*", topic.pattern)
+        assert re.fullmatch(r"[a-z-]+", topic.name)
     shapes = {re.sub(r"{\w+}", "*", topic.pattern) for topic in topics.TOPICS}
     assert len(shapes) == len(topics.TOPICS)
     keys = [KEYS.key(topic, **filled(topic)) for topic in topics.TOPICS]
@@ -74,12 +72,6 @@ def test_only_short_messages_that_the_next_one_replaces_may_be_lost_by_a_link() 
 def test_every_message_kind_has_one_topic() -> None:
     carried = [topic.kind for topic in topics.TOPICS if topic.kind is not None]
     assert sorted(kind.__name__ for kind in carried) == sorted(KINDS)
-
-
-@for_each("topic", topics.TOPICS)
-def test_the_grammar_has_no_reserved_characters(topic: topics.Topic) -> None:
-    assert re.fullmatch(r"([a-z]+|{[a-z]+})(/([a-z]+|{[a-z]+}))*", topic.pattern)
-    assert re.fullmatch(r"[a-z-]+", topic.name)
 
 
 @for_each("topic", topics.TOPICS)
