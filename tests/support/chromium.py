@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,8 @@ import pytest
 from attrs import frozen
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
+
+from support.waiting import wait_until
 
 NO_BROWSER = "no browser: chromium and chromium-driver are not installed"
 PROGRAM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
@@ -47,10 +48,7 @@ class Page:
 
     def wait_until(self, condition: Callable[[], object]) -> None:
         """Wait until a condition holds; fail with the page's text after `WAIT_S`."""
-        give_up = time.monotonic() + WAIT_S
-        while not condition():
-            assert time.monotonic() < give_up, self.run("document.body.innerText")
-            time.sleep(0.05)
+        wait_until(condition, WAIT_S, lambda: self.run("document.body.innerText"))
 
     def console_errors(self) -> list[str]:
         """Return what the page has written to the console since the last call."""

@@ -16,7 +16,6 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -208,10 +207,7 @@ class Lab:
 
     def check_nothing_left(self) -> None:
         """Check that no process of this test runs any more, and no temporary file is there."""
-        give_up = time.monotonic() + END_S
-        while left := self.processes():
-            assert time.monotonic() < give_up, f"left running: {left}"
-            time.sleep(0.05)
+        wait_until(lambda: not self.processes(), END_S, self.processes)
         assert list(self.sockets.iterdir()) == []
 
     def kill_rest(self) -> list[str]:

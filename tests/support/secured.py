@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -26,6 +24,7 @@ from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import Keys, Quality, Topic
 from support.deployments import REALM, deployment
 from support.harness import Lab
+from support.waiting import wait_until
 
 KEYS = Keys(REALM)
 SECURITY = """
@@ -145,22 +144,15 @@ def opens(access: Access) -> bool:
     return True
 
 
-def until(condition: Callable[[], object], what: str = "") -> None:
-    """Wait until something holds."""
-    give_up = time.monotonic() + COME_S
-    while not condition():
-        assert time.monotonic() < give_up, f"not within {COME_S:g} s: {what}"
-        time.sleep(0.005)
-
-
 def until_heard(sender: Member, reader: Member, topic: Topic, **parameters: object) -> None:
     """Have a reader subscribe, and send `first` until it is heard: that takes a moment."""
     reader.transport.subscribe(KEYS.key(topic, **parameters))
-    give_up = time.monotonic() + COME_S
-    while not reader.heard(topic):
-        assert time.monotonic() < give_up, f"{topic.name} is not heard"
+
+    def heard() -> set[bytes]:
         sender.publish(topic, b"first", **parameters)
-        time.sleep(0.01)
+        return reader.heard(topic)
+
+    wait_until(heard, COME_S, lambda: topic.name)
 
 
 def connects(endpoint: str, **tls: object) -> bool:

@@ -8,7 +8,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Self
 
 import psutil
@@ -25,6 +25,7 @@ from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import COORDINATOR_ALIVE, Keys
 from support.deployments import free_tcp
 from support.harness import END_S, Ended, Lab
+from support.waiting import wait_until
 
 REALM = "default"
 LEASE_S = 1.0
@@ -84,7 +85,7 @@ workers = 1
 {self.limits}"""
         self.lab.path("deployment.toml", config)
         router = self.lab.start("router", "--config", "deployment.toml")
-        watcher = self._watcher()
+        watcher = wait_until(self._connected, END_S)
         keys = Keys(REALM)
         watcher.watch(keys.all_of(COORDINATOR_ALIVE))
         try:
@@ -99,14 +100,10 @@ workers = 1
         assert (ended.status, ended.out, ended.complaints) == (0, "", []), ended
         self.lab.check_nothing_left()
 
-    def _watcher(self) -> ZenohTransport:
-        give_up = time.monotonic() + END_S
-        while True:
-            try:
-                return ZenohTransport(self.access, self._news.put)
-            except ValueError:
-                assert time.monotonic() < give_up
-                time.sleep(0.05)
+    def _connected(self) -> ZenohTransport | None:
+        with suppress(ValueError):
+            return ZenohTransport(self.access, self._news.put)
+        return None
 
     @property
     def access(self) -> Access:
@@ -221,10 +218,8 @@ class Load:
 
     def wait_answers(self, more: int) -> None:
         """Wait until so many more requests have been answered, or one has failed."""
-        enough, give_up = len(self.outcomes) + more, time.monotonic() + END_S
-        while len(self.outcomes) < enough and not self.failures:
-            assert time.monotonic() < give_up, f"{len(self.outcomes)} of {enough} answers"
-            time.sleep(0.02)
+        enough = len(self.outcomes) + more
+        wait_until(lambda: len(self.outcomes) >= enough or self.failures, END_S)
 
     def _ask_in_turn(self) -> None:
         while not self.over.is_set():

@@ -47,6 +47,7 @@ from laneweave.protocol.wire.topics import (
 from support.deployments import ask, free_port, start_router, stop
 from support.harness import END_S, RUN_S, Lab, check_safe_and_complete, laboratory, trips
 from support.secured import (
+    COME_S,
     KEYS,
     LINKS,
     ONE_LINK,
@@ -58,9 +59,9 @@ from support.secured import (
     opens,
     secured_deployment,
     shown_by,
-    until,
     until_heard,
 )
+from support.waiting import wait_until
 
 A, B = "v0001", "v0002"
 FLEETS = {one: f"fleet.agents-{1 if Shard(0, 2).contains(one) else 2}" for one in (A, B)}
@@ -135,7 +136,7 @@ def test_nobody_publishes_what_is_somebody_elses(network: Network) -> None:
     for owner, topic, parameters, reader, others in PUBLISHED:
         rightful[owner].publish(topic, b"last", **parameters)
         allowed = {who.encode() for who in (owner, *others)} | {b"last"}
-        until(lambda r=reader, t=topic: b"last" in readers[r].heard(t), topic.name)  # type: ignore[misc]
+        wait_until(lambda r=reader, t=topic: b"last" in readers[r].heard(t), COME_S)  # type: ignore[misc]
         assert readers[reader].heard(topic, b"first") == allowed, topic.name
 
 
@@ -153,7 +154,7 @@ def test_other_ways_of_naming_a_key_are_no_ways_around(network: Network) -> None
             session.delete(key)
     time.sleep(QUIET_S)
     rightful.publish(STATE, b"last", block=1, vehicle=A)
-    until(lambda: b"last" in reader.heard(STATE))
+    wait_until(lambda: b"last" in reader.heard(STATE), COME_S)
     assert {payload for _, payload in reader.received()} == {b"first", b"last"}
 
 
@@ -196,7 +197,7 @@ def test_nobody_reads_what_is_for_somebody_else(network: Network) -> None:
 
     for sender, reader, topic, parameters in sent:
         sender.publish(topic, b"last", **parameters)
-        until(lambda r=reader, t=topic: b"last" in r.heard(t), topic.name)  # type: ignore[misc]
+        wait_until(lambda r=reader, t=topic: b"last" in r.heard(t), COME_S)  # type: ignore[misc]
     time.sleep(QUIET_S)
     for who, snooper in snoopers.items():
         read = {key.removeprefix("laneweave/test/") for key, _ in snooper.received()}
@@ -243,7 +244,7 @@ def test_nobody_shows_somebody_elses_token(network: Network) -> None:
 
     for key, owner in shown.items():
         network.join(owner).transport.announce(key)
-    until(lambda: bridge.tokens() | leader.tokens() == set(shown))
+    wait_until(lambda: bridge.tokens() | leader.tokens() == set(shown), COME_S)
     assert snooper.tokens() == set()
 
 
@@ -261,7 +262,7 @@ def test_only_coordinators_serve_and_only_clients_ask(network: Network) -> None:
     assert answer_to(client, key) == b""
 
     network.serve("coordinator.c1", key)
-    until(lambda: answer_to(client, key) == b"coordinator.c1")
+    wait_until(lambda: answer_to(client, key) == b"coordinator.c1", COME_S)
     for who in ("bridge", f"vehicle.{A}", "fleet.agents-1", "observer.watch", *STRANGERS):
         assert answer_to(network.join(who), key, timeout_s=0.1) == b""
     assert answer_to(client, key) == b"coordinator.c1"
@@ -276,7 +277,7 @@ def test_a_query_has_the_name_of_its_clients_certificate(network: Network) -> No
     forged = KEYS.key(CLIENT_ALIVE, session="s", client="plan")
     for token in (own, forged):
         client.transport.announce(token)
-    until(lambda: coordinator.tokens() == {own})
+    wait_until(lambda: coordinator.tokens() == {own}, COME_S)
     declined = [client.transport.query(key, b"forged", 5.0, sender=s) for s in (forged, "x" * 2000)]
     for number, sender in enumerate((own, "")):
         client.transport.query(key, b"%d" % number, 5.0, sender=sender)
@@ -284,7 +285,7 @@ def test_a_query_has_the_name_of_its_clients_certificate(network: Network) -> No
     def queries() -> list[tuple[bytes, str]]:
         return [(q.payload, q.sender) for q in list(coordinator.got) if isinstance(q, Query)]
 
-    until(lambda: len(queries()) == 2)
+    wait_until(lambda: len(queries()) == 2, COME_S)
     assert queries() == [(b"0", own), (b"1", "")]
     assert [query.result(END_S) for query in declined] == [None, None]
 
@@ -293,7 +294,7 @@ def test_what_is_too_long_does_not_come_in(network: Network) -> None:
     key, most_bytes = KEYS.key(SERVICE), network.scenario.service.max_request_bytes
     client = network.join("client.plan")
     network.serve("coordinator.c1", key)
-    until(lambda: answer_to(client, key, bytes(most_bytes)))
+    wait_until(lambda: answer_to(client, key, bytes(most_bytes)), COME_S)
     assert answer_to(client, key, bytes(REQUEST_MARGIN * most_bytes + 1), 0.2) == b""
     assert answer_to(client, key, bytes(most_bytes))
 
@@ -301,7 +302,7 @@ def test_what_is_too_long_does_not_come_in(network: Network) -> None:
     until_heard(bridge, reader, CENSUS)
     for size in (MAX_BYTES + 1, MAX_BYTES):
         bridge.publish(CENSUS, bytes(size))
-    until(lambda: reader.heard(CENSUS, b"first"))
+    wait_until(lambda: reader.heard(CENSUS, b"first"), COME_S)
     assert reader.heard(CENSUS) == {b"first", bytes(MAX_BYTES)}
 
 
