@@ -65,7 +65,7 @@ class ScenarioDriver(LightDriver):
     """Driver without dynamics: a motion ends when the scenario puts the body at its target."""
 
     def at_rest(self, sense: Sense) -> bool:
-        return at_rest_in_cell(sense.state, self._lattice, self._goal, sense.t_s)
+        return at_rest_in_cell(sense.measured, self._lattice, self._goal, sense.t_s)
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         return Drive(sense.tick + 1 if moving else 0, self._origin, self._ticks, b"")

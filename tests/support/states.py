@@ -111,7 +111,7 @@ def sense_in(cell: Cell, tick: int = 0, **more: Any) -> Sense:  # noqa: ANN401 (
         "vehicle": Name("me"),
         "tick": tick,
         "t_s": t_s,
-        "state": cell_state(PAPER.lattice, cell, t_s),
+        "measured": cell_state(PAPER.lattice, cell, t_s),
         "hold_cell": cell,
         "motion_end_tick": 0,
         "motion_origin": cell,

@@ -233,17 +233,17 @@ class AgentCore:
         drove = self.in_charge and self._sense is not None and not self._sense.off_lattice
         self._sense = sense
         # Clocks of different machines may give a caretaker the same incarnation.
-        in_charge = sense.record.incarnation
-        taken = sense.caretaker and in_charge == self._incarnation
-        if taken or in_charge > self._incarnation:
+        incarnation = sense.record.incarnation
+        taken = sense.caretaker and incarnation == self._incarnation
+        if taken or incarnation > self._incarnation:
             self._command, self.wanted_motions = None, ()
             if not sense.caretaker:
                 return []  # another agent is in charge
-            self._claim_above(in_charge)
-        elif in_charge < self._incarnation and self._raised:
+            self._claim_above(incarnation)
+        elif incarnation < self._incarnation and self._raised:
             # The incarnation in an earlier SENSE may have been wrong, and the claim too high.
-            self._claim_above(in_charge)
-        return self._act(sense, in_charge=self.in_charge, drove=drove)
+            self._claim_above(incarnation)
+        return self._act(sense, drove=drove)
 
     def _set_type(self, vehicle_type: str) -> None:
         """Drive a vehicle of a type; it is known from the first SENSE of a road on."""
@@ -286,12 +286,12 @@ class AgentCore:
         )
         return [Send(COMMAND, self._command, self._own)]
 
-    def _act(self, sense: Sense, *, in_charge: bool, drove: bool) -> list[Effect]:
+    def _act(self, sense: Sense, *, drove: bool) -> list[Effect]:
         """Answer a tick; `drove`: whether this process has driven the vehicle until now."""
         if drove and (sense.off_lattice or self._has_lost_track(sense)):
             # What it has promised and accepted is void: it begins anew, like another process.
             self._claim_above(self._incarnation)
-            in_charge = False
+        in_charge = self.in_charge
         if not (drove and in_charge) or sense.off_lattice:
             # Repeated while a claim is pending, since another process may still begin a move.
             self._take_over(sense)
@@ -329,8 +329,8 @@ class AgentCore:
     def _on_confirmation(self, sense: Sense) -> list[Effect]:
         """Handle a repeated SENSE: the controller may have stored something within the tick."""
         execution = self.execution
-        in_charge = sense.record.incarnation
-        if execution is None or not self.in_charge or in_charge != self._incarnation:
+        stale = sense.record.incarnation != self._incarnation
+        if execution is None or not self.in_charge or stale:
             return []
         self._sense = sense
         return [self._state()] if execution.on_record(sense.record) else []
@@ -348,10 +348,10 @@ class AgentCore:
         self._sense = self._command = self._move = self.execution = None
         self.wanted_motions, self.wanted_states = (), ()
 
-    def _claim_above(self, in_charge: int) -> None:
+    def _claim_above(self, incarnation: int) -> None:
         """Take a new incarnation, above that of the process in charge."""
         number = self._new_incarnation()
-        self._incarnation = above(number, in_charge)
+        self._incarnation = above(number, incarnation)
         self._raised = self._incarnation != number
 
     def _take_over(self, sense: Sense) -> None:
@@ -381,7 +381,7 @@ class AgentCore:
         move = execution.on_sense(
             sense,
             arrived=execution.moving and self._driver.at_rest(sense),
-            displaced=displaced(sense.state, scenario.lattice, cell, sense.t_s, room_ahead_m),
+            displaced=displaced(sense.measured, scenario.lattice, cell, sense.t_s, room_ahead_m),
         )
         if move is not None and execution.plan is not None:
             self._move = move

@@ -31,7 +31,7 @@ def warm_up(scenario: Scenario) -> None:
         vehicle=Name("warm-up"),
         tick=0,
         t_s=0.0,
-        state=cell_state(scenario.lattice, cell, 0.0),
+        measured=cell_state(scenario.lattice, cell, 0.0),
         hold_cell=cell,
         motion_end_tick=0,
         motion_origin=cell,

@@ -50,7 +50,7 @@ def test_the_state_contains_measurements_and_the_block_of_entry() -> None:
     command, state = (each for each in rig.hand(topics.SENSE, sense) if isinstance(each, node.Send))
     assert (command.topic, command.parameters) == (topics.COMMAND, {"vehicle": ME})
     assert (state.topic, state.parameters) == (topics.STATE, {"block": 5, "vehicle": ME})
-    s_m, speed_mps, _, y_m, *_ = sense.state
+    s_m, speed_mps, _, y_m, *_ = sense.measured
     values = {"s_m": s_m, "y_m": y_m, "speed_mps": speed_mps, "t_s": TICK_S}
     assert rig.shown == [holding(ME, None, HOME, block=5, joined=(5, 6), **values)]
 

@@ -98,7 +98,7 @@ def test_a_tick_ends_when_all_have_answered(desk: Desk) -> None:
     assert asked(effects) == [A, B]
     for sense in sent(effects, Sense):
         assert sense.tick == tick + 1
-        assert sense.state == desk.world.states[sense.vehicle]
+        assert sense.measured == desk.world.states[sense.vehicle]
 
 
 def test_the_answers_are_played_from_this_tick_on(desk: Desk) -> None:
@@ -147,10 +147,10 @@ def test_measurement_errors_are_the_same_in_repeated_senses(tmp_path: Path) -> N
     senses = {sense.vehicle: sense for sense in sent(desk.wake(), Sense)}
     for name, sense in senses.items():
         true = desk.core.vehicles[name].state
-        assert sense.state != true
-        assert sense.state == pytest.approx(true, abs=0.4)
+        assert sense.measured != true
+        assert sense.measured == pytest.approx(true, abs=0.4)
         controller = desk.core.vehicles[name].controller
-        assert (sense.state, sense.ahead) == (controller.measured, controller.neighbours.ahead)
+        assert (sense.measured, sense.ahead) == (controller.measured, controller.neighbours.ahead)
         assert sense.behind == controller.neighbours.behind
     assert senses[A].ahead == senses[B].behind == ()
     for (other,) in (senses[B].ahead, senses[A].behind):

@@ -25,6 +25,7 @@ from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import (
+    State,
     at_rest_in_cell,
     cell_state,
     commanded_state,
@@ -132,9 +133,9 @@ class TrackingDriver:
         """Continue the motion controller's current motion."""
         self._goal, self._settling = sense.hold_cell, None
         if sense.motion_origin == sense.hold_cell and sense.motion_end_tick > sense.tick + 3:
-            state = commanded_state(sense.state, sense.setpoint, self._limits, self._speed_mps)
+            commanded = self._commanded(sense)
             self._reference = self._settling = Reference.settling(
-                *self._own, sense.hold_cell, state, sense.tick, sense.motion_end_tick
+                *self._own, sense.hold_cell, commanded, sense.tick, sense.motion_end_tick
             )
         elif sense.motion_end_tick > sense.tick and sense.motion_ticks in self._durations:
             begin_tick = sense.motion_end_tick - sense.motion_ticks
@@ -156,27 +157,26 @@ class TrackingDriver:
         One that settles may still fall back to its cell if others have the room.
         """
         reference, room_ahead_m = self._current, self._room_ahead_m
-        if room_ahead_m > 0.0 and reference.origin == self._goal:
-            return nearly_settled(sense.state, self._lattice, self._goal, sense.t_s, room_ahead_m)
-        return sense.tick >= reference.rest_tick and at_rest_in_cell(
-            sense.state, self._lattice, self._goal, sense.t_s
-        )
+        measured, lattice, goal, t_s = sense.measured, self._lattice, self._goal, sense.t_s
+        if room_ahead_m > 0.0 and reference.origin == goal:
+            return nearly_settled(measured, lattice, goal, t_s, room_ahead_m)
+        return sense.tick >= reference.rest_tick and at_rest_in_cell(measured, lattice, goal, t_s)
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         """Track the reference; return the motion and the jerks from this tick on."""
         reference, tick = self._current, sense.tick
-        state = commanded_state(sense.state, sense.setpoint, self._limits, self._speed_mps)
-        gaps = self._surroundings.gaps(sense, state, self._goal[1])
+        commanded = self._commanded(sense)
+        gaps = self._surroundings.gaps(sense, commanded, self._goal[1])
         window = None
         if self._stop_lines:
             window = reference.window(tick)
-            gaps = self._stop_lines.limit(gaps, window.states, sense.state[0])
+            gaps = self._stop_lines.limit(gaps, window.states, sense.measured[0])
         result = None
         if gaps is NO_GAPS and tick >= reference.end_tick:
             goal = cell_state(self._lattice, self._goal, sense.t_s)
-            result = self._tracker.rest(state, goal)
+            result = self._tracker.rest(commanded, goal)
         if result is None:
-            result = self._tracker.solve(state, window or reference.window(tick), gaps)
+            result = self._tracker.solve(commanded, window or reference.window(tick), gaps)
         self._solve_ms.append(result.solve_ms)
         self._unusable += not result.usable
         self._osqp_solves += result.iterations > 0
@@ -203,6 +203,9 @@ class TrackingDriver:
     def on_motion(self, motion: Motion) -> None:
         """Handle another vehicle's announced motion."""
         self._surroundings.on_motion(motion)
+
+    def _commanded(self, sense: Sense) -> State:
+        return commanded_state(sense.measured, sense.setpoint, self._limits, self._speed_mps)
 
     @property
     def _current(self) -> Reference:

@@ -122,7 +122,7 @@ class Reference:
         scenario: Scenario,
         limits: Vehicle,
         cell: Cell,
-        state: State,
+        commanded: State,
         tick: int,
         end_tick: int,
     ) -> Reference:
@@ -131,7 +131,8 @@ class Reference:
         The motion must last at least three ticks; see `settling_trajectory`.
         """
         goal = cell_state(scenario.lattice, cell, tick * scenario.runtime.tick_s)
-        trajectory = settling_trajectory(scenario, limits, np.array(state) - goal, end_tick - tick)
+        error = np.array(commanded) - goal
+        trajectory = settling_trajectory(scenario, limits, error, end_tick - tick)
         return cls(scenario, limits, cell, trajectory, tick)
 
     def settle_meanwhile(self, before: Reference) -> None:
@@ -168,7 +169,7 @@ class Reference:
 
 
 def yield_behind(
-    state: State, states: Array, jerks: Array, latest_m: Array, tick_s: float, limits: Vehicle
+    commanded: State, states: Array, jerks: Array, latest_m: Array, tick_s: float, limits: Vehicle
 ) -> None:
     """Replace the part of a reference that is beyond the yielding path, in place.
 
@@ -185,21 +186,21 @@ def yield_behind(
     ends.
 
     Args:
-        state: (s, v, a, y, v_y, a_y) of the vehicle now.
+        commanded: commanded state of the vehicle.
         states: states of the reference (N + 1, 6).
         jerks: jerks of the reference (N, 2).
         latest_m: upper bounds (N + 1,) on the front bumper; +inf for none.
         tick_s: length of the tick [s].
         limits: the vehicle's limits.
     """
-    s, v = state[0], max(state[1], 0.0)
+    s, v = commanded[0], max(commanded[1], 0.0)
     first = min(round(_REACT_S / tick_s), len(jerks))
     t = tick_s * np.arange(first, len(states))
     needed = 2.0 * (s + v * t - latest_m[first:] + _BUFFER_M) / (t * t)
     decel = float(needed.max())
     decel = min(decel, -_BRAKE_SHARE * limits.min_accel_mps2)
     decel = max(decel, -_ACCEL_SHARE * limits.max_accel_mps2)
-    now, path, inputs = state, [state], []
+    now, path, inputs = commanded, [commanded], []
     p_y, p_v, p_a = _LATERAL_GAINS
     for (_, _, _, y, v_y, a_y), (_, j_y) in zip(states[:-1].tolist(), jerks.tolist(), strict=True):
         back = p_y * (y - now[3]) + p_v * (v_y - now[4]) + p_a * (a_y - now[5])

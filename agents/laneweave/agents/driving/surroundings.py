@@ -21,7 +21,7 @@ from laneweave.agents.driving.tracking_problem import NO_GAPS, Gaps
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State
-from laneweave.protocol.wire.messages import Motion, Neighbour, Sense
+from laneweave.protocol.wire.messages import Motion, Sense
 
 Array = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ class Surroundings:
         self._speed_mps = scenario.formation.speed_mps
         self._min_gap_m = scenario.tracking.min_gap_m
         self._slow_mps = SLOW_SHARE * scenario.formation.speed_mps
-        # Accelerations with which this vehicle can approach its neighbours.
+        # Accelerations with which this vehicle can approach neighbours ahead and behind.
         self._gain_mps2, self._loss_mps2 = limits.max_accel_mps2, limits.min_accel_mps2
         self._times_s = np.arange(scenario.timing.horizon_ticks + 1) * scenario.runtime.tick_s
         self._beyond = self._times_s > SENSED_S + 1e-9
@@ -76,21 +76,21 @@ class Surroundings:
         """Handle another vehicle's announced motion."""
         self._motions.add(motion)
 
-    def gaps(self, sense: Sense, state: State, lane: int) -> Gaps:
+    def gaps(self, sense: Sense, commanded: State, lane: int) -> Gaps:
         """Return the gaps between neighbours, ignoring neighbours out of reach.
 
         Args:
             sense: sensor measurements.
-            state: commanded state of this vehicle.
+            commanded: commanded state of this vehicle.
             lane: lane that this vehicle is in or enters.
         """
-        first, last = self._lattice.lanes_touched(sense.state[3], self._width_m)
+        first, last = self._lattice.lanes_touched(sense.measured[3], self._width_m)
         touched = first, last, lane
         latest = earliest = None
-        ahead, near = self._relevant(sense, state, sense.ahead, touched, _AHEAD, self._gain_mps2)
+        ahead, near = self._relevant(sense, commanded, touched, _AHEAD)
         if near:
             latest = self._at_constant_speed(near, _AHEAD)
-        behind, near = self._relevant(sense, state, sense.behind, touched, _BEHIND, self._loss_mps2)
+        behind, near = self._relevant(sense, commanded, touched, _BEHIND)
         if near:
             earliest = self._at_constant_speed(near, _BEHIND)
         if self._motions.known:
@@ -105,11 +105,9 @@ class Surroundings:
     def _relevant(
         self,
         sense: Sense,
-        state: State,
-        others: tuple[Neighbour, ...],
+        commanded: State,
         touched: tuple[int, int, int],
         side: _Side,
-        accel_mps2: float,
     ) -> tuple[list[_Sensed], list[_Sensed]]:
         """Return neighbours in relevant lanes (if motions are known) and the ones within reach.
 
@@ -117,13 +115,13 @@ class Surroundings:
 
         Args:
             sense: sensor measurements.
-            state: commanded state of this vehicle.
-            others: the neighbours in one direction.
+            commanded: commanded state of this vehicle.
             touched: the first and the last lane that the body touches; the lane that it enters.
             side: the direction.
-            accel_mps2: acceleration that brings the vehicle closer to its neighbours; negative
-                behind.
         """
+        others, accel_mps2 = sense.ahead, self._gain_mps2
+        if side is _BEHIND:
+            others, accel_mps2 = sense.behind, self._loss_mps2
         first, last, lane = touched
         motions_known, lag_s, sign = self._motions.known, self._lag_s, side.sign
         relevant: list[_Sensed] = []
@@ -132,16 +130,16 @@ class Surroundings:
             if first <= other.lane <= last or other.lane == lane:
                 # Difference between position and commanded position.
                 lag_m = lag_s * (other.speed_mps - self._speed_mps)
-                front_m = sense.state[0] + sign * (other.gap_m - self._min_gap_m) + lag_m
+                front_m = sense.measured[0] + sign * (other.gap_m - self._min_gap_m) + lag_m
                 other_mps = max(other.speed_mps + lag_s * other.accel_mps2, 0.0)
                 if motions_known:
                     relevant.append((other.lane, front_m, other_mps))
                 # The maximum is now or at the end of the prediction, by convexity in time.
                 lasts_s = SLOW_S if sign > 0.0 and other_mps < self._slow_mps else SENSED_S
-                closer_m = (state[1] - other_mps + 0.5 * accel_mps2 * lasts_s) * lasts_s
+                closer_m = (commanded[1] - other_mps + 0.5 * accel_mps2 * lasts_s) * lasts_s
                 if sign * closer_m < 0.0:
                     closer_m = 0.0
-                if sign * (state[0] + closer_m) > sign * front_m:
+                if sign * (commanded[0] + closer_m) > sign * front_m:
                     near.append((other.lane, front_m, other_mps))
         return relevant, near
 

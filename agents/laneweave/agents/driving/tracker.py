@@ -98,7 +98,7 @@ class Tracker:
                 limits, scenario.formation.speed_mps
             )
 
-    def solve(self, state: State, window: Window, gaps: Gaps = NO_GAPS) -> TrackResult:
+    def solve(self, commanded: State, window: Window, gaps: Gaps = NO_GAPS) -> TrackResult:
         """Return the jerks that take a vehicle from its commanded state to its reference.
 
         Raises:
@@ -109,14 +109,14 @@ class Tracker:
         if shapes != self._shapes:
             raise ValueError(f"window has shapes {shapes}, not {self._n} ticks")
         # A finite sum implies finite numbers, which is the usual case.
-        if not math.isfinite(sum(state)) and not all(map(math.isfinite, state)):
-            raise ValueError(f"state is not finite: {state}")
+        if not math.isfinite(sum(commanded)) and not all(map(math.isfinite, commanded)):
+            raise ValueError(f"state is not finite: {commanded}")
         if gaps is not NO_GAPS:
             gaps.check(self._n)
         program = self.program
-        target = self._yielding(state, window, gaps.latest)
+        target = self._yielding(commanded, window, gaps.latest)
         iterations = 0
-        error = _error(state, target)
+        error = _error(commanded, target)
         usable = _is_near(error)
         if usable:
             jerk = self._regulated(error, target, gaps)
@@ -128,20 +128,21 @@ class Tracker:
             result = program.solve()
             usable, iterations = result.usable, result.iterations
         if not usable:
-            target = self._yielding(state, self._path_back(state, window.states), gaps.latest)
-            error = _error(state, target)
+            back = self._path_back(commanded, window.states)
+            target = self._yielding(commanded, back, gaps.latest)
+            error = _error(commanded, target)
             program.write_bounds(error, target.states, target.jerks, target.defect, gaps)
             program.admit_zero()
             result = program.solve()
             usable, iterations = result.usable, iterations + result.iterations
         if usable:
-            jerk = self._limited(state, target.jerks + program.jerks(result))
+            jerk = self._limited(commanded, target.jerks + program.jerks(result))
         else:
             jerk = np.zeros((self._n, 2))
         elapsed_ms = (self._stopwatch() - start) * 1e3
         return TrackResult(jerk, usable, iterations, elapsed_ms, result.violation)
 
-    def rest(self, state: State, goal: State) -> TrackResult | None:
+    def rest(self, commanded: State, goal: State) -> TrackResult | None:
         """Return the jerks that keep a vehicle in its cell while no other vehicle is near.
 
         Near `goal`, the state at rest in the cell, no constraint can bind, and `solve` would return
@@ -152,22 +153,22 @@ class Tracker:
         start = self._stopwatch()
         # Unrolled, since it runs every tick for every vehicle.
         max_s, max_v, max_a, max_y, max_vy, max_ay = self.unconstrained_errors
-        s = state[0] - goal[0]
+        s = commanded[0] - goal[0]
         if not -max_s <= s <= max_s:
             return None
-        v = state[1] - goal[1]
+        v = commanded[1] - goal[1]
         if not -max_v <= v <= max_v:
             return None
-        a = state[2] - goal[2]
+        a = commanded[2] - goal[2]
         if not -max_a <= a <= max_a:
             return None
-        y = state[3] - goal[3]
+        y = commanded[3] - goal[3]
         if not -max_y <= y <= max_y:
             return None
-        v_y = state[4] - goal[4]
+        v_y = commanded[4] - goal[4]
         if not -max_vy <= v_y <= max_vy:
             return None
-        a_y = state[5] - goal[5]
+        a_y = commanded[5] - goal[5]
         if not -max_ay <= a_y <= max_ay:
             return None
         self.program.discard_solution()
@@ -197,49 +198,49 @@ class Tracker:
         answer: Array = target.jerks + free_jerk
         return answer
 
-    def _yielding(self, state: State, window: Window, latest: Array | None) -> Window:
+    def _yielding(self, commanded: State, window: Window, latest: Array | None) -> Window:
         """Return the reference, with a yielding path if it violates a gap."""
         if latest is None or not (window.states[:, 0] > latest).any():
             return window
         states, jerks = window.states.copy(), window.jerks.copy()
-        yield_behind(state, states, jerks, latest, self._tick_s, self._limits)
+        yield_behind(commanded, states, jerks, latest, self._tick_s, self._limits)
         transition, effect = self._axis
         along = states[:, :3]
         defect = along[:-1] @ transition.T + jerks[:, :1] * effect[:, 0] - along[1:]
         return Window(states, jerks, None, defect)
 
-    def _path_back(self, state: State, states: Array) -> Window:
+    def _path_back(self, commanded: State, states: Array) -> Window:
         """Return the hold law's path from a state to a reference."""
-        path, inputs = [state], []
+        path, inputs = [commanded], []
         for row in states[:-1].tolist():
             jerk = hold_law(path[-1], tuple(row), self._limits, self._tick_s)
             path.append(integrate(path[-1], jerk, self._tick_s))
             inputs.append(jerk)
         return Window(np.array(path), np.array(inputs))
 
-    def _limited(self, state: State, jerk: Array) -> Array:
+    def _limited(self, commanded: State, jerk: Array) -> Array:
         """Return jerks (N, 2) that keep the limits exactly, if the state allows this."""
         max_jerk = self.program.jerk_limits
         clipped = np.clip(jerk, -max_jerk, max_jerk)
-        if self._excess(state, clipped) <= _LIMIT_TOLERANCE:
+        if self._excess(commanded, clipped) <= _LIMIT_TOLERANCE:
             return clipped
-        now = state
+        now = commanded
         for k, (along, across) in enumerate(jerk.tolist()):
             allowed = limited_jerk(now, (along, across), self._limits, self._tick_s)
             jerk[k] = allowed
             now = integrate(now, allowed, self._tick_s)
         return jerk
 
-    def _excess(self, state: State, jerk: Array) -> float:
+    def _excess(self, commanded: State, jerk: Array) -> float:
         """Return the maximum excess over a limit of the states that result from jerks (N, 2)."""
         limits, h = self._limits, self._tick_s
         rate = np.cumsum(jerk, axis=0)
         rate *= h
-        rate += (state[2], state[5])
+        rate += (commanded[2], commanded[5])
         change = rate - jerk * (h / 2.0)
         speed = np.cumsum(change, axis=0)
         speed *= h
-        speed += (state[1], state[4])
+        speed += (commanded[1], commanded[4])
         v, a, a_y = speed[:, 0], rate[:, 0], rate[:, 1]
         return max(
             float(a.max()) - limits.max_accel_mps2,
@@ -251,15 +252,15 @@ class Tracker:
         )
 
 
-def _error(state: State, target: Window) -> State:
+def _error(commanded: State, target: Window) -> State:
     s, v, a, y, v_y, a_y = target.states[0].tolist()
     return (
-        state[0] - s,
-        state[1] - v,
-        state[2] - a,
-        state[3] - y,
-        state[4] - v_y,
-        state[5] - a_y,
+        commanded[0] - s,
+        commanded[1] - v,
+        commanded[2] - a,
+        commanded[3] - y,
+        commanded[4] - v_y,
+        commanded[5] - a_y,
     )
 
 

@@ -114,29 +114,28 @@ def cell_state(lattice: Lattice, cell: Cell, t_s: float) -> State:
     return (lattice.cell_s_m(column, t_s), lattice.speed_mps, 0.0, lattice.cell_y_m(lane), 0.0, 0.0)
 
 
-def at_rest_in_cell(state: State, lattice: Lattice, cell: Cell, t_s: float) -> bool:
+def at_rest_in_cell(measured: State, lattice: Lattice, cell: Cell, t_s: float) -> bool:
     """Return whether a body has arrived in `cell` at road time `t_s` [s]."""
     goal = cell_state(lattice, cell, t_s)
-    return (
-        abs(state[0] - goal[0]) <= ARRIVED_ALONG_M and abs(state[3] - goal[3]) <= ARRIVED_ACROSS_M
-    )
+    along_m, across_m = abs(measured[0] - goal[0]), abs(measured[3] - goal[3])
+    return along_m <= ARRIVED_ALONG_M and across_m <= ARRIVED_ACROSS_M
 
 
-def has_settled(state: State, lattice: Lattice, cell: Cell, t_s: float) -> bool:
+def has_settled(measured: State, lattice: Lattice, cell: Cell, t_s: float) -> bool:
     """Return whether a body is in `cell` at road time `t_s` [s], and about as fast as the cell."""
     return (
-        at_rest_in_cell(state, lattice, cell, t_s)
-        and abs(state[1] - lattice.speed_mps) <= SETTLED_MPS
+        at_rest_in_cell(measured, lattice, cell, t_s)
+        and abs(measured[1] - lattice.speed_mps) <= SETTLED_MPS
     )
 
 
 def nearly_settled(
-    state: State, lattice: Lattice, cell: Cell, t_s: float, room_ahead_m: float
+    measured: State, lattice: Lattice, cell: Cell, t_s: float, room_ahead_m: float
 ) -> bool:
     """Return whether a body that settles in `cell` is near enough to take part in plans.
 
     Args:
-        state: state of the body.
+        measured: measured state of the body.
         lattice: the lattice.
         cell: the cell.
         t_s: road time.
@@ -144,24 +143,24 @@ def nearly_settled(
     """
     goal = cell_state(lattice, cell, t_s)
     return (
-        -ARRIVED_ALONG_M <= state[0] - goal[0] <= room_ahead_m
-        and abs(state[3] - goal[3]) <= ARRIVED_ACROSS_M
-        and -NEARLY_SETTLED_MPS <= state[1] - goal[1] <= SETTLED_MPS
+        -ARRIVED_ALONG_M <= measured[0] - goal[0] <= room_ahead_m
+        and abs(measured[3] - goal[3]) <= ARRIVED_ACROSS_M
+        and -NEARLY_SETTLED_MPS <= measured[1] - goal[1] <= SETTLED_MPS
     )
 
 
 def displaced(
-    state: State, lattice: Lattice, cell: Cell, t_s: float, room_ahead_m: float = 0.0
+    measured: State, lattice: Lattice, cell: Cell, t_s: float, room_ahead_m: float = 0.0
 ) -> bool:
     """Return whether a body is too far from `cell` to hold it at road time `t_s` [s].
 
     It may be as far ahead of its cell as behind it, and `room_ahead_m` if that is farther.
     """
     goal = cell_state(lattice, cell, t_s)
-    ahead_m = state[0] - goal[0]
+    ahead_m = measured[0] - goal[0]
     return (
         not -DISPLACED_ALONG_M <= ahead_m <= max(DISPLACED_ALONG_M, room_ahead_m)
-        or abs(state[3] - goal[3]) > DISPLACED_ACROSS_M
+        or abs(measured[3] - goal[3]) > DISPLACED_ACROSS_M
     )
 
 

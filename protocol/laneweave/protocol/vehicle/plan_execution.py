@@ -235,9 +235,9 @@ class PlanExecution:
             done=self.done,
             overdue=self.overdue(sense.t_s),
             attended=attended,
-            s_m=sense.state[0],
-            y_m=sense.state[3],
-            speed_mps=sense.state[1],
+            s_m=sense.measured[0],
+            y_m=sense.measured[3],
+            speed_mps=sense.measured[1],
             t_s=sense.t_s,
         )
 

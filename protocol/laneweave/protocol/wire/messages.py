@@ -266,9 +266,9 @@ class Sense(Message, frozen=True):
     tick: Int64
     t_s: Real
     """Road time of the tick [s]."""
-    state: tuple[Real, Real, Real, Real, Real, Real]
-    """Measured (s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2]); s is the front bumper
-    along the road, y the body centre from the right edge."""
+    measured: tuple[Real, Real, Real, Real, Real, Real]
+    """State (s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2]); s is the front bumper along
+    the road, y the body centre from the right edge."""
     hold_cell: Cell
     """Cell in which the motion controller will hold unless it receives a new command."""
     motion_end_tick: Int64

@@ -127,7 +127,7 @@ class RoadVehicle:
             vehicle=self.name,
             tick=tick,
             t_s=tick * controller.tick_s,
-            state=controller.measured,
+            measured=controller.measured,
             hold_cell=controller.hold_cell,
             motion_end_tick=controller.motion_end_tick,
             motion_origin=controller.motion_origin,

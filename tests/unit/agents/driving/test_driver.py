@@ -70,7 +70,7 @@ def sense(
 ) -> Sense:
     """Return what a vehicle senses that is `off` metres from its cell, along and across."""
     s, v, a, y, v_y, a_y = cell_state(LATTICE, cell, tick * TICK_S)
-    return sense_in(cell, tick, **{"state": (s + off[0], v, a, y + off[1], v_y, a_y), **more})
+    return sense_in(cell, tick, **{"measured": (s + off[0], v, a, y + off[1], v_y, a_y), **more})
 
 
 def driver() -> TrackingDriver:
@@ -93,12 +93,12 @@ def probed() -> tuple[TrackingDriver, Probe]:
 
 def follow(made: TrackingDriver, scenario: Scenario, ticks: int) -> tuple[Drive, dict[str, Any]]:
     """Let a driver begin its move at tick 10 and drive a body; return how far both have come."""
-    plant = Plant(sense().state, scenario.vehicle, TICK_S)
+    plant = Plant(sense().measured, scenario.vehicle, TICK_S)
     for tick in range(10, 10 + ticks):
-        felt = sense(tick, state=plant.state, setpoint=plant.setpoint)
+        felt = sense(tick, measured=plant.state, setpoint=plant.setpoint)
         drive = made.drive(felt, moving=True)
         plant.step(*jerks(drive)[0].tolist())
-    return drive, {"state": plant.state, "setpoint": plant.setpoint}
+    return drive, {"measured": plant.state, "setpoint": plant.setpoint}
 
 
 def jerks(drive: Drive) -> NDArray[np.float64]:
@@ -128,7 +128,7 @@ def test_a_move_ends_after_its_time_and_its_horizon_ends_in_the_target() -> None
     made.begin(MOVE, 10, MOVE_TICKS)
     drive = made.drive(sense(), moving=True)
     assert (drive.motion_end_tick, drive.motion_origin) == (10 + MOVE_TICKS, HOME)
-    end = play(sense().state, drive)
+    end = play(sense().measured, drive)
     assert end == pytest.approx(cell_state(LATTICE, MOVE[2], (10 + N) * TICK_S), abs=0.02)
 
 
@@ -212,8 +212,10 @@ def test_a_late_motion_has_an_end_in_the_future() -> None:
 def test_the_commanded_state_is_tracked_and_not_the_bodys() -> None:
     """What the set-point is about to do needs no correction."""
     made, probe = probed()
-    s, v, a, y, v_y, a_y = sense().state
-    made.drive(sense(state=(s, v + 0.4, a - 0.5, y, v_y, a_y), setpoint=(0.7, 0.2)), moving=False)
+    s, v, a, y, v_y, a_y = sense().measured
+    made.drive(
+        sense(measured=(s, v + 0.4, a - 0.5, y, v_y, a_y), setpoint=(0.7, 0.2)), moving=False
+    )
     lag_s = SCENARIO.vehicle.actuator_lag_s
     expected = (s + lag_s * 0.4, v + 0.4 - lag_s * 0.5, 0.7, y, v_y, 0.2)
     assert probe.state == pytest.approx(expected)
@@ -232,7 +234,7 @@ def test_gaps_are_kept_on_the_own_lane_and_from_the_start_of_a_move_on_the_targe
     felt = sense(ahead=(Neighbour(0, 3.0, 15.0), Neighbour(1, 4.5, 15.0), Neighbour(2, 4.0, 15.0)))
     made.drive(felt, moving=moving)
     assert probe.gaps.latest is not None
-    assert probe.gaps.latest[0] == pytest.approx(felt.state[0] + gap_m - LEAST_M)
+    assert probe.gaps.latest[0] == pytest.approx(felt.measured[0] + gap_m - LEAST_M)
 
 
 # --- when tracking fails ----------------------------------------------------------------------

@@ -199,7 +199,7 @@ def gaps(
 ) -> Gaps:
     """Return what others leave a vehicle in the home cell."""
     felt = sense_in(HOME, tick, ahead=ahead, behind=behind)
-    return around.gaps(felt, felt.state, lane)
+    return around.gaps(felt, felt.measured, lane)
 
 
 def hearing(*motions: Motion) -> Surroundings:

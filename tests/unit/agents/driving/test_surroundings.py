@@ -43,7 +43,7 @@ def gaps_of(felt: Sense, lane: int = HOME[1], *, all_of_them: bool = False) -> G
     surroundings = Surroundings(SCENARIO, LIMITS)
     if all_of_them:
         surroundings._gain_mps2, surroundings._loss_mps2 = 1e6, -1e6
-    state = commanded_state(felt.state, felt.setpoint, LIMITS, V_F)
+    state = commanded_state(felt.measured, felt.setpoint, LIMITS, V_F)
     return surroundings.gaps(felt, state, lane)
 
 

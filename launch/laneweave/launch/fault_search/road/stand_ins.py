@@ -162,9 +162,9 @@ class LightVehicle(RoadVehicle):
         self.latest_s = max(self.latest_s, sense.t_s + ahead_s)
         if ahead_s == 0.0:
             return sense
-        s, v, a, y, v_y, a_y = sense.state
+        s, v, a, y, v_y, a_y = sense.measured
         state = (s + self._speed_mps * ahead_s, v, a, y, v_y, a_y)
-        return replace(sense, t_s=sense.t_s + ahead_s, state=state)
+        return replace(sense, t_s=sense.t_s + ahead_s, measured=state)
 
 
 class LightDriver:
@@ -200,7 +200,7 @@ class LightDriver:
     def at_rest(self, sense: Sense) -> bool:
         """Return whether the time of the motion is over and the body is in its target cell."""
         return sense.tick >= self._end_tick and at_rest_in_cell(
-            sense.state, self._lattice, self._goal, sense.t_s
+            sense.measured, self._lattice, self._goal, sense.t_s
         )
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:

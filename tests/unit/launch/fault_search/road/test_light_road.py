@@ -97,7 +97,7 @@ def test_the_process_in_charge_moves_the_body(bench: Bench) -> None:
         (0.0, "*** a enters in (4, 1)"),
         (0.1, "*** a moves from (4, 1) to (4, 2) in 0.80 s"),
     ]
-    lateral = [bench.sense().state[3] for _ in range(9)]
+    lateral = [bench.sense().measured[3] for _ in range(9)]
     assert lateral[3] == pytest.approx(1.5 * 3.5 + 3.5 * 0.5)
     assert lateral[7] == lateral[8] == 2.5 * 3.5
 
@@ -162,7 +162,7 @@ def test_a_wrong_clock_shifts_no_cell() -> None:
     assert {round(sense.t_s - sense.tick * 0.1, 4) for sense in senses} != {0.0}
     for sense in senses:
         assert abs(sense.t_s - sense.tick * 0.1) <= 0.1
-        assert at_rest_in_cell(sense.state, SCENARIO.lattice, (4, 1), sense.t_s)
+        assert at_rest_in_cell(sense.measured, SCENARIO.lattice, (4, 1), sense.t_s)
     assert all(one.t_s < other.t_s for one, other in pairwise(senses))
 
 
