@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from laneweave.sim_bridge.baselines.reference_road import ReferenceVehicle
 from laneweave.sim_bridge.baselines.rules import Lanes, Rules
 from support.rule_road import PAPER, rule_scenario, vehicle
+from support.tables import for_each
 
 NEEDED_M = 5.0 + 15.0 * 0.66
 
@@ -43,8 +44,8 @@ def test_one_lane_at_a_time_towards_the_preferred_one() -> None:
 # --- rule 2 -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("side", [-1, 1])
-@pytest.mark.parametrize("distance_m", [0.0, 1.0, NEEDED_M - 0.1, NEEDED_M + 0.1])
+@for_each("side", [-1, 1])
+@for_each("distance_m", [0.0, 1.0, NEEDED_M - 0.1, NEEDED_M + 0.1])
 def test_a_gap_is_accepted_if_it_is_large_enough(distance_m: float, side: int) -> None:
     one, accepted = vehicle("a", 500.0, 0, 1), distance_m > NEEDED_M
     slowing = sort(one, vehicle("b", 500.0 + side * distance_m, 1))

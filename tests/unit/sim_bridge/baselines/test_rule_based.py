@@ -14,6 +14,7 @@ from laneweave.sim_bridge.baselines.rule_based import check_rule
 from laneweave.sim_bridge.road.demand import arrivals
 from support.bridge_bench import arrival
 from support.rule_road import PAPER, RuleRoad, rule_scenario, vehicle
+from support.tables import for_each
 
 METHODS: list[dict[str, Any]] = [
     {"gap": gap, "yielding": yielding, "lane_change_s": lane_change_s}
@@ -56,8 +57,8 @@ def test_no_vehicle_enters_close_behind_a_standing_one() -> None:
 # --- moving -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rule", METHODS, ids=str)
-@pytest.mark.parametrize("s_m", [700.0, 860.0, 930.0])
+@for_each("rule", METHODS)
+@for_each("s_m", [700.0, 860.0, 930.0])
 def test_three_abreast_that_want_to_change_round_all_do(rule: dict[str, Any], s_m: float) -> None:
     """The knot that a rule without a tie-break never unties."""
     speed_mps = 15.0 if s_m < 800.0 else 5.0
@@ -117,7 +118,7 @@ def test_a_jam_clears_up(gap: str, lane_change_s: float) -> None:
     assert all((one.lane, one.previous_lane) == (one.preferred_lane, None) for one in road.left)
 
 
-@pytest.mark.parametrize("yielding", ["unsorted", "all"])
+@for_each("yielding", ["unsorted", "all"])
 def test_a_vehicle_blocked_in_its_lane_change_yields(yielding: str) -> None:
     """`v1` cannot finish before `v0` is gone, and `v0` cannot change while `v1` is so near."""
     waiting = vehicle("v0", 860.0, 1, 0, speed_mps=0.0)
@@ -166,8 +167,8 @@ def test_no_vehicle_slides_sideways() -> None:
 # --- scenarios that do not fit ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("tables", "field"),
+@for_each(
+    "tables, field",
     [
         ({"rule": {"stop_distance_m": 600.0}}, "rule.stop_distance_m"),
         ({"rule": {"stop_distance_m": 20.0}}, "rule.stop_distance_m"),

@@ -13,6 +13,7 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, Exits
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.sim_bridge.baselines.reference_road import ReferenceVehicle
 from laneweave.sim_bridge.baselines.rule_based import check_rule
 from laneweave.sim_bridge.baselines.rules import Lanes, Rules
 from laneweave.sim_bridge.baselines.wanted_lanes import WantedLane, WantedLanes
@@ -20,6 +21,7 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies
 from laneweave.sim_bridge.road.demand import arrivals
 from support.closed_lanes import ramp_road
 from support.rule_road import RuleRoad, vehicle
+from support.tables import for_each
 
 
 def closed_road(
@@ -65,11 +67,30 @@ def step(road: RuleRoad) -> None:
     assert bodies.in_closed_lanes(road.scenario) == []
 
 
+def drive(scenario: Scenario) -> dict[ReferenceVehicle, float]:
+    """Drive all vehicles of a demand, and return their travel times [s]."""
+    check_rule(scenario)
+    road, exits = RuleRoad(scenario), Exits(scenario.geometry.sections, scenario.road.length_m)
+    demand = arrivals(scenario)
+    waiting, left_s = list(demand), dict[ReferenceVehicle, float]()
+    while len(left_s) < len(demand):
+        assert road.t_s < 200.0
+        while waiting and waiting[0].t_s <= road.t_s + scenario.runtime.tick_s:
+            road.entrance.queue(waiting.pop(0))
+        step(road)
+        for one in road.left[len(left_s) :]:
+            section = exits.left_by(one.lane, one.s_m)
+            assert section is not None
+            assert section.serves(one.preferred_lane, one.destination)
+            left_s[one] = road.t_s - one.arrival.t_s
+    return left_s
+
+
 # --- wanted lanes -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("scenario", "s_m", "lane", "preferred", "wanted"),
+@for_each(
+    "scenario, s_m, lane, preferred, wanted",
     [
         (DROP, 200.0, 1, ANY_LANE, 1),
         (DROP, 200.0, 0, ANY_LANE, 1),
@@ -92,17 +113,6 @@ def test_a_vehicle_wants_a_lane_that_is_open_beyond_the_next_dead_end(
     scenario: Scenario, s_m: float, lane: int, preferred: int, wanted: int
 ) -> None:
     assert WantedLanes(scenario).of(vehicle("a", s_m, lane, preferred)).lane == wanted
-
-
-@pytest.mark.parametrize(
-    ("s_m", "changes"),
-    [(200.0, False), (599.0, False), (650.0, False), (704.0, False), (705.0, True)],
-)
-def test_no_vehicle_changes_into_a_closed_part_or_before_it(s_m: float, *, changes: bool) -> None:
-    one, lanes = vehicle("a", s_m, 1, 0), Lanes(3)
-    lanes.enter(one, 1)
-    assert Rules(BLOCKED).sort(lanes) == {}
-    assert one.lane == (0 if changes else 1)
 
 
 # --- speeds before a dead end -----------------------------------------------------------------
@@ -166,16 +176,7 @@ def test_all_vehicles_pass_closed_parts(
     closure: tuple[int, float, float], shares: tuple[float, ...], rule: dict[str, Any]
 ) -> None:
     scenario = closed_road(closure, shares=shares, **rule)
-    check_rule(scenario)
-    road, demand = RuleRoad(scenario), arrivals(scenario)
-    waiting, left_s = list(demand), list[float]()
-    while len(left_s) < len(demand):
-        assert road.t_s < 200.0
-        while waiting and waiting[0].t_s <= road.t_s + scenario.runtime.tick_s:
-            road.entrance.queue(waiting.pop(0))
-        step(road)
-        left_s += [road.t_s - one.arrival.t_s for one in road.left[len(left_s) :]]
-    assert all(one.arrival.preferred_lane in (one.lane, ANY_LANE) for one in road.left)
+    left_s = drive(scenario).values()
     assert sum(left_s) / len(left_s) < 1.1 * scenario.geometry.free_flow_s
 
 
@@ -185,8 +186,8 @@ ON_RAMP = ramp_road()
 WEAVING = ramp_road(ends_m=700.0, exit_name="off")
 
 
-@pytest.mark.parametrize(
-    ("s_m", "lane", "destination", "wanted"),
+@for_each(
+    "s_m, lane, destination, wanted",
     [
         (100.0, 3, "off", WantedLane(0, 700.0, stops=True)),
         (300.0, 1, "off", WantedLane(0, 700.0, stops=True)),
@@ -222,23 +223,28 @@ def test_a_vehicle_wants_the_nearest_lane_of_its_exit() -> None:
     assert WantedLanes(scenario).of(vehicle("a", 300.0, 0, ANY_LANE)).lane == 2
 
 
-@pytest.mark.parametrize(
-    ("lane", "destination", "s_m", "changes"),
+@for_each(
+    "scenario, lane, preferred, destination, s_m, changes",
     [
-        (0, END_OF_ROAD, 204.0, False),
-        (0, END_OF_ROAD, 205.0, True),
-        (1, "off", 204.0, False),
-        (1, "off", 205.0, True),
-        (1, "off", 699.0, True),
-        (1, END_OF_ROAD, 300.0, False),
+        # Into a closed part, before it, and behind it as soon as a body has room.
+        *((BLOCKED, 1, 0, END_OF_ROAD, s_m, False) for s_m in (200.0, 599.0, 650.0, 704.0)),
+        (BLOCKED, 1, 0, END_OF_ROAD, 705.0, True),
+        # Beside a ramp.
+        (WEAVING, 0, ANY_LANE, END_OF_ROAD, 204.0, False),
+        (WEAVING, 0, ANY_LANE, END_OF_ROAD, 205.0, True),
+        (WEAVING, 1, ANY_LANE, "off", 204.0, False),
+        (WEAVING, 1, ANY_LANE, "off", 205.0, True),
+        (WEAVING, 1, ANY_LANE, "off", 699.0, True),
+        (WEAVING, 1, ANY_LANE, END_OF_ROAD, 300.0, False),
     ],
 )
-def test_no_vehicle_changes_lanes_beside_a_ramp(
-    lane: int, destination: str, s_m: float, *, changes: bool
+def test_no_vehicle_changes_into_a_closed_part_or_beside_a_ramp(
+    scenario: Scenario, lane: int, preferred: int, destination: str, s_m: float, *, changes: bool
 ) -> None:
-    one, lanes = vehicle("a", s_m, lane, ANY_LANE, destination=destination), Lanes(4)
+    one = vehicle("a", s_m, lane, preferred, destination=destination)
+    lanes = Lanes(scenario.road.lanes)
     lanes.enter(one, lane)
-    assert Rules(WEAVING).sort(lanes) == {}
+    assert Rules(scenario).sort(lanes) == {}
     assert (one.lane != lane) == changes
 
 
@@ -276,23 +282,13 @@ def test_a_vehicle_enters_a_ramp_behind_those_in_its_lane_ahead_of_it() -> None:
 def test_all_vehicles_leave_at_their_destinations(scenario: Scenario, rule: dict[str, Any]) -> None:
     demand = evolve(scenario.demand, duration_s=30.0, volume_veh_per_lane_h=1000.0)
     scenario = evolve(scenario, rule=evolve(scenario.rule, **rule), demand=demand)
-    check_rule(scenario)
-    road, exits = RuleRoad(scenario), Exits(scenario.geometry.sections, scenario.road.length_m)
-    waiting = list(arrivals(scenario))
-    count, delays_s = len(waiting), list[float]()
-    while len(delays_s) < count:
-        assert road.t_s < 200.0
-        while waiting and waiting[0].t_s <= road.t_s + scenario.runtime.tick_s:
-            road.entrance.queue(waiting.pop(0))
-        step(road)
-        for one in road.left[len(delays_s) :]:
-            section = exits.left_by(one.lane, one.s_m)
-            assert section is not None
-            assert section.serves(one.preferred_lane, one.destination)
-            free_s = scenario.geometry.free_flow_trip_s(one.arrival.lane, one.destination)
-            delays_s.append(road.t_s - one.arrival.t_s - free_s)
+    free_s = scenario.geometry.free_flow_trip_s
+    delays_s = [
+        travel_s - free_s(one.arrival.lane, one.destination)
+        for one, travel_s in drive(scenario).items()
+    ]
     assert min(delays_s) > -0.2
-    assert sum(delays_s) / count < 7.0
+    assert sum(delays_s) / len(delays_s) < 7.0
 
 
 # --- crowds -----------------------------------------------------------------------------------

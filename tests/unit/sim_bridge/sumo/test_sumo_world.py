@@ -87,14 +87,6 @@ def test_random_motion_and_traffic_are_exact(world: SumoWorld) -> None:
     assert number > 80
 
 
-def test_moving_across_all_lanes_at_standstill_speed_is_exact(world: SumoWorld) -> None:
-    world.add("v1", (500.0, 0.0, 0.0, 0.9, 0.0, 0.0))
-    for y_m in np.linspace(0.9, 9.6, 100):
-        world.place("v1", (500.0, 0.0, 0.0, float(y_m), 0.0, 0.0))
-        world.step()
-        assert world.positions()["v1"] == pytest.approx((500.0, y_m, 0.0, 0.0), abs=1e-6)
-
-
 def test_a_vehicle_that_is_not_placed_stays(world: SumoWorld) -> None:
     world.add("v1", cruising(100.0, 1.75))
     for _ in range(5):

@@ -15,17 +15,15 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.lc2013 import check_lc2013
 from laneweave.sim_bridge.sumo.network import write_network
-from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
 from support.bridge_bench import arrival
 from support.closed_lanes import ramp_road
+from support.tables import for_each
 
 
-def written(
-    folder: Path, **tables: dict[str, Any]
-) -> tuple[tuple[str, ...], ET.Element, ET.Element]:
+def files_of(scenario: Scenario, folder: Path) -> tuple[tuple[str, ...], ET.Element, ET.Element]:
     """Return SUMO's options, the network and the routes."""
-    options = write_network(parse_scenario(tables), folder, sumo_drives=True)
+    options = write_network(scenario, folder, sumo_drives=True)
     network, routes = (
         ET.parse(folder / name).getroot()  # noqa: S314 (our own)
         for name in ("road.net.xml", "road.rou.xml")
@@ -38,33 +36,28 @@ def written(
 
 @pytest.mark.parametrize("lanes", [1, 3, 8])
 def test_each_lane_leads_to_an_exit_of_its_own(tmp_path: Path, lanes: int) -> None:
-    _, network, routes = written(tmp_path, road={"lanes": lanes})
+    tables = {"road": {"lanes": lanes}, "formation": {"speed_mps": 12.0}}
+    _, network, routes = files_of(parse_scenario(tables), tmp_path)
     connections = {(one.attrib["fromLane"], one.attrib["to"]) for one in network.iter("connection")}
     assert connections == {(str(lane), f"exit{lane}") for lane in range(lanes)}
     edges = {one.attrib["id"]: one.attrib["edges"] for one in routes.iter("route")}
     assert edges == {f"main/lane-{lane}": f"road exit{lane}" for lane in range(lanes)}
-
-
-def test_lanes_go_on_where_they_were_and_the_road_ends_where_it_should(tmp_path: Path) -> None:
-    _, network, _ = written(tmp_path, formation={"speed_mps": 12.0})
     shapes = {one.attrib["id"]: one.attrib["shape"] for one in network.iter("lane")}
-    for lane in range(3):
+    for lane in range(lanes):
         end = f"1000.000000,{(lane + 0.5) * 3.5:.6f}"
         assert shapes[f"road_{lane}"].endswith(end)
         assert shapes[f"exit{lane}_0"].startswith(end)
     assert {float(one.attrib["speed"]) for one in network.iter("lane")} == {12.0}
 
 
-def test_the_parameters_are_those_of_the_scenario(tmp_path: Path) -> None:
-    table = {"headway_s": 0.8, "min_gap_m": 0.5, "lane_change_s": 4.0}
-    files, _, routes = written(tmp_path, lc2013=table)
+def test_drivers_are_as_the_scenario_says(tmp_path: Path) -> None:
+    table: dict[str, Any] = {"headway_s": 0.8, "min_gap_m": 0.5, "lane_change_s": 4.0}
+    options, _, routes = files_of(parse_scenario({"lc2013": table}), tmp_path)
     kind = next(routes.iter("vType")).attrib
     assert (kind["carFollowModel"], kind["laneChangeModel"]) == ("Krauss", "LC2013")
     assert [float(kind[name]) for name in ("tau", "minGap", "accel", "decel")] == [0.8, 0.5, 5, 10]
-    assert files[-2:] == ("--lanechange.duration", "4.000000")
-
-
-def test_drivers_are_as_the_scenario_says(tmp_path: Path) -> None:
+    assert options[-2:] == ("--lanechange.duration", "4.000000")
+    assert "--lateral-resolution" not in options
     table = {
         "model": "SL2015",
         "imperfection": 0.5,
@@ -74,10 +67,10 @@ def test_drivers_are_as_the_scenario_says(tmp_path: Path) -> None:
         "cooperative": 0.5,
         "assertive": 2.0,
     }
-    options, _, routes = written(tmp_path, lc2013=table)
+    options, _, routes = files_of(parse_scenario({"lc2013": table}), tmp_path)
     kind = next(routes.iter("vType")).attrib
     assert kind["laneChangeModel"] == "SL2015"
-    names = (
+    names = [
         "sigma",
         "accel",
         "decel",
@@ -85,11 +78,10 @@ def test_drivers_are_as_the_scenario_says(tmp_path: Path) -> None:
         "lcStrategic",
         "lcCooperative",
         "lcAssertive",
-    )
+    ]
     assert [float(kind[name]) for name in names] == [0.5, 2.6, 4.5, 10.0, 10.0, 0.5, 2.0]
     assert "--lateral-resolution" in options
     assert "--lanechange.duration" not in options
-    assert "--lateral-resolution" not in written(tmp_path)[0]
 
 
 @pytest.mark.parametrize("label", [name for name, one in METHODS.items() if one.method == LC2013])
@@ -106,17 +98,6 @@ def test_sumo_drives_every_named_set_of_parameters(tmp_path: Path, label: str) -
     assert y_m < scenario.road.lane_width_m
 
 
-def test_a_headway_within_a_tick_is_refused() -> None:
-    with pytest.raises(BadInputError, match=r"lc2013\.headway_s"):
-        check_lc2013(parse_scenario({"lc2013": {"headway_s": 0.05}}))
-
-
-@pytest.mark.parametrize(("name", "value"), [("accel_mps2", 5.1), ("decel_mps2", 10.1)])
-def test_drivers_do_not_exceed_the_limits_of_their_vehicles(name: str, value: float) -> None:
-    with pytest.raises(BadInputError, match=rf"lc2013\.{name}.*at most"):
-        check_lc2013(parse_scenario({"lc2013": {name: value}}))
-
-
 # --- closed parts of lanes --------------------------------------------------------------------
 
 SHORT = {"s1_m": 50.0, "s2_m": 100.0, "s3_m": 850.0}
@@ -130,14 +111,13 @@ def closed_road(
     lc2013: dict[str, Any] | None = None,
 ) -> tuple[ET.Element, ET.Element]:
     """Return the network and the routes of a road with closed parts of lanes."""
-    _, network, routes = written(
-        folder,
-        road={**SHORT, "closures": list(closures)},
-        demand={"lane_shares": list(shares)},
-        formation={"operation": "rolling"},
-        lc2013=lc2013 or {},
-    )
-    return network, routes
+    tables = {
+        "road": {**SHORT, "closures": list(closures)},
+        "demand": {"lane_shares": list(shares)},
+        "formation": {"operation": "rolling"},
+        "lc2013": lc2013 or {},
+    }
+    return files_of(parse_scenario(tables), folder)[1:]
 
 
 def lanes_by_edge(network: ET.Element) -> dict[str, tuple[float, float, dict[float, bool]]]:
@@ -227,40 +207,34 @@ def test_lane_changes_that_take_time_end_before_the_closed_part(
     assert lanes_by_edge(network)["road"][1] == pytest.approx(end_m)
 
 
-@pytest.mark.parametrize(
-    ("closure", "field"),
-    [
-        ({"lane": 0, "from_m": 300.0}, "from_m"),
-        ({"lane": 0, "from_m": 800.0, "to_m": 997.0}, "to_m"),
-    ],
-)
-def test_a_closed_part_that_leaves_no_room_is_refused(
-    closure: dict[str, float], field: str
-) -> None:
-    tables = {
-        "road": {**SHORT, "closures": [closure]},
+def closed(**closure: float) -> dict[str, Any]:
+    return {
+        "road": {**SHORT, "closures": [{"lane": 0, **closure}]},
         "formation": {"operation": "rolling"},
         "lc2013": {"lane_change_s": 20.0},
     }
-    with pytest.raises(BadInputError, match=rf"road\.closures\[0\]\.{field}"):
+
+
+@for_each(
+    "tables, expected",
+    [
+        ({"lc2013": {"headway_s": 0.05}}, r"lc2013\.headway_s"),
+        ({"lc2013": {"accel_mps2": 5.1}}, r"lc2013\.accel_mps2.*at most"),
+        ({"lc2013": {"decel_mps2": 10.1}}, r"lc2013\.decel_mps2.*at most"),
+        (closed(from_m=300.0), r"road\.closures\[0\]\.from_m"),
+        (closed(from_m=800.0, to_m=997.0), r"road\.closures\[0\]\.to_m"),
+    ],
+)
+def test_what_sumo_cannot_drive_is_refused(tables: dict[str, Any], expected: str) -> None:
+    with pytest.raises(BadInputError, match=expected):
         check_lc2013(parse_scenario(tables))
 
 
 # --- ramps and exits --------------------------------------------------------------------------
 
 
-def ramp_files(folder: Path, scenario: Scenario) -> tuple[ET.Element, ET.Element]:
-    """Return the network and the routes of a road with ramps and exits."""
-    write_network(scenario, folder, sumo_drives=True)
-    network, routes = (
-        ET.parse(folder / name).getroot()  # noqa: S314 (our own)
-        for name in ("road.net.xml", "road.rou.xml")
-    )
-    return network, routes
-
-
 def test_a_ramp_is_an_edge_beside_the_road_until_it_joins(tmp_path: Path) -> None:
-    network, routes = ramp_files(tmp_path, ramp_road())
+    _, network, routes = files_of(ramp_road(), tmp_path)
     assert lanes_by_edge(network) == {
         "road": (-30.0, 200.0, {5.25: OPEN, 8.75: OPEN, 12.25: OPEN}),
         "road1": (200.0, 205.0, {1.75: OPEN, 5.25: OPEN, 8.75: OPEN, 12.25: OPEN}),
@@ -290,7 +264,7 @@ def test_a_ramp_is_an_edge_beside_the_road_until_it_joins(tmp_path: Path) -> Non
 def test_an_exit_is_an_edge_behind_the_lane_that_it_ends(tmp_path: Path) -> None:
     # A lane change that takes time does not shorten the lane of an exit.
     scenario = ramp_road(ends_m=700.0, exit_name="off", lc2013={"lane_change_s": 4.0})
-    network, routes = ramp_files(tmp_path, scenario)
+    _, network, routes = files_of(scenario, tmp_path)
     edges = lanes_by_edge(network)
     assert edges["road2"][:2] == (205.0, 700.0)
     assert edges["exit-off"] == (700.0, 730.0, {1.75: OPEN})
@@ -308,7 +282,7 @@ def test_an_exit_is_an_edge_behind_the_lane_that_it_ends(tmp_path: Path) -> None
 
 
 def test_each_junction_knows_all_lanes_that_lead_to_it(tmp_path: Path) -> None:
-    network, _ = ramp_files(tmp_path, ramp_road(ends_m=700.0, exit_name="off"))
+    _, network, _ = files_of(ramp_road(ends_m=700.0, exit_name="off"), tmp_path)
     names = [one.attrib["id"] for one in network.iter("junction")]
     assert len(names) == len(set(names))
     for junction in network.iter("junction"):
@@ -332,7 +306,7 @@ def test_a_lane_between_two_lanes_of_an_exit_does_not_lead_there(tmp_path: Path)
             "formation": {"operation": "rolling"},
         }
     )
-    network, _ = ramp_files(tmp_path, scenario)
+    _, network, _ = files_of(scenario, tmp_path)
     leading = {one for one in connected_positions(network) if one[1] == "exit-off"}
     assert leading == {("road", "exit-off", 1.75), ("road", "exit-off", 8.75)}
 
@@ -378,9 +352,3 @@ def test_a_vehicle_that_may_not_change_lanes_waits_at_the_end(traffic: SumoTraff
         traffic.advance()
         s_m, y_m, _, _ = traffic.positions()["v1"]
     assert y_m == pytest.approx(5.25)
-
-
-def test_there_is_one_simulation_per_process(traffic: SumoTraffic, tmp_path: Path) -> None:
-    assert traffic.positions() == {}
-    with pytest.raises(RuntimeError, match="one simulation per process"):
-        SumoWorld(Scenario(), tmp_path / "other")
