@@ -95,16 +95,7 @@ class Lc2013Traffic:
 
     def _entered(self, name: str, t_s: float, entrance: Entrance) -> ReferenceVehicle:
         s_m, y_m, _, speed_mps = self._poses[name]
-        lane = self._offered.pop(name)
-        arrival = entrance.take(lane)
-        vehicle = ReferenceVehicle(
-            arrival=arrival,
-            entered_s=entrance.entered_s(arrival, s_m, t_s),
-            s_m=s_m,
-            speed_mps=speed_mps,
-            y_m=y_m,
-            lane=lane,
-        )
+        vehicle = entrance.enter(self._offered.pop(name), t_s, s_m, y_m, speed_mps)
         self._vehicles[name] = vehicle
         if not self._everywhere:
             self._kept_in_lane.add(vehicle)

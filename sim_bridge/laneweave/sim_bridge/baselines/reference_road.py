@@ -105,6 +105,15 @@ class Entrance:
         """Return when a vehicle that is at `s_m` at `t_s` passed its entrance at v_F."""
         return t_s - (s_m - self._entry_m[arrival.lane]) / self._speed_mps
 
+    def enter(
+        self, lane: int, t_s: float, s_m: float, y_m: float, speed_mps: float
+    ) -> ReferenceVehicle:
+        """Remove the next vehicle from the queue of a lane, and return it on the road at `t_s`."""
+        arrival = self.take(lane)
+        return ReferenceVehicle(
+            arrival, self.entered_s(arrival, s_m, t_s), s_m, speed_mps, y_m, lane
+        )
+
     def take(self, lane: int) -> Arrival:
         """Remove and return the next vehicle in the queue of a lane."""
         return self._queues[lane].popleft()

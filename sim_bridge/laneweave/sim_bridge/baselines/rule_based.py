@@ -145,15 +145,8 @@ class RuleTraffic:
                 s_m = self._room_m(arrival, entrance.max_entry_m(arrival, t_s))
                 if s_m is None:
                     break
-                entrance.take(lane)
-                vehicle = ReferenceVehicle(
-                    arrival=arrival,
-                    entered_s=entrance.entered_s(arrival, s_m, t_s),
-                    s_m=s_m,
-                    speed_mps=self._speed_mps,
-                    y_m=self._centre_m(lane),
-                    lane=lane,
-                )
+                y_m = self._centre_m(lane)
+                vehicle = entrance.enter(lane, t_s, s_m, y_m, self._speed_mps)
                 self._vehicles[vehicle.name] = vehicle
                 self._lanes.enter(vehicle, lane)
                 self._world.add(vehicle.name, vehicle.state)

@@ -233,14 +233,15 @@ class Rules:
 
         Every lane change is decided here. Methods with another criterion override this.
         """
-        is_safe = self.following.is_safe
         ahead, behind = lanes.neighbours(vehicle, lane)
-        if ahead is not None and not is_safe(
-            vehicle.s_m, vehicle.speed_mps, ahead.s_m, ahead.speed_mps
-        ):
-            return False
-        return behind is None or is_safe(
-            behind.s_m, behind.speed_mps, vehicle.s_m, vehicle.speed_mps
+        return self._suits(vehicle, ahead) and self._suits(behind, vehicle)
+
+    def _suits(self, behind: ReferenceVehicle | None, ahead: ReferenceVehicle | None) -> bool:
+        """Return whether a vehicle may follow another; either may be missing."""
+        return (
+            behind is None
+            or ahead is None
+            or self.following.is_safe(behind.s_m, behind.speed_mps, ahead.s_m, ahead.speed_mps)
         )
 
     def yielding(
@@ -250,15 +251,10 @@ class Rules:
 
         These are vehicles with too small a gap ahead, also if `accepts` has another criterion.
         """
-        is_safe = self.following.is_safe
         ahead, behind = lanes.neighbours(vehicle, lane)
-        if ahead is not None and not is_safe(
-            vehicle.s_m, vehicle.speed_mps, ahead.s_m, ahead.speed_mps
-        ):
+        if not self._suits(vehicle, ahead):
             yield vehicle
-        if behind is not None and not is_safe(
-            behind.s_m, behind.speed_mps, vehicle.s_m, vehicle.speed_mps
-        ):
+        if behind is not None and not self._suits(behind, vehicle):
             # By rule 1, a vehicle that has finished continues at v_F, and the other one waits. A
             # vehicle that is still changing may be blocked by the other one in its old lane.
             yields = self._all_yield or not self.has_finished(behind)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -35,10 +36,8 @@ class Ticks:
 
     def close(self) -> None:
         """Write the buffered rows, and close the file."""
-        try:
+        with closing(self._file):
             self._write_rows()
-        finally:
-            self._file.close()
 
     def durations(self) -> DurationMs:
         """Return statistics of all ticks, read from the file."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -156,10 +157,8 @@ class Trajectories:
 
     def close(self) -> None:
         """Write the buffered rows, and close the file."""
-        try:
+        with closing(self._file):
             self._write_rows()
-        finally:
-            self._file.close()
 
     def _write_rows(self) -> None:
         """Write the buffered rows as one row group."""

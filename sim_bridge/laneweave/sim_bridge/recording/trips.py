@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable
+from contextlib import closing
 from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any
@@ -120,10 +121,8 @@ class Trips:
 
     def close(self) -> None:
         """Write the remaining trips, and close the file."""
-        try:
+        with closing(self._file):
             self._write(list(self._trips.values()))
-        finally:
-            self._file.close()
 
     def table(self) -> pa.Table:
         """Return all trips, read from the file."""
