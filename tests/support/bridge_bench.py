@@ -151,7 +151,7 @@ class Desk:
     def start(self, *up: str) -> list[Effect]:
         """Start the bridge, with agents that are there already."""
         for vehicle in up:
-            self.core._answers.up.add(Name(vehicle))
+            self.core.road.answers.up.add(Name(vehicle))
         return self.give(Started())
 
     def up(self, vehicle: str) -> list[Effect]:
@@ -176,7 +176,7 @@ class Desk:
         """
         name = Name(vehicle)
         controller = self.core.vehicles[name].controller
-        cared_for = name in self.core._attendance
+        cared_for = name in self.core.road.attendance
         unchanged: dict[str, Any] = {
             "vehicle": name,
             "record": VehicleRecord(max(controller.record.incarnation + cared_for, 1)),
@@ -204,7 +204,7 @@ class Desk:
         for _ in range(20_000):
             if until():
                 return
-            awaited = sorted(self.core._answers.awaited - set(deaf))
+            awaited = sorted(self.core.road.answers.awaited - set(deaf))
             if self.core.phase is TickPhase.ANSWERS and awaited:
                 self.answer(awaited[0])
             else:
@@ -217,7 +217,7 @@ class Desk:
 
     def drive_to_silence(self, *silent: str) -> None:
         """Go on without answers of some agents until they count as silent."""
-        answers = self.core._answers
+        answers = self.core.road.answers
         self.drive(
             lambda: answers.silent >= set(silent) and self.core.phase is TickPhase.ANSWERS, *silent
         )

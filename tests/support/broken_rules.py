@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
 import pytest
 from attrs import evolve
@@ -18,7 +18,7 @@ from laneweave.coordinator.formations.roster import Formation, Groups
 from laneweave.coordinator.rolling import transfer
 from laneweave.coordinator.rolling.ownership import States
 from laneweave.coordinator.rolling.transfer import CellTransfer
-from laneweave.launch.fault_search.road.drawn_entrance import DrawnEntrance
+from laneweave.launch.fault_search.road.drawn_entrance import DrawnBlocks
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect
 from laneweave.protocol.scenario.fields import Scenario
@@ -303,16 +303,16 @@ def close_at_once(
 
 
 def close_early(patch: Patch) -> None:
-    closing_s, close_formations = ColumnBlocks._closing_s, DrawnEntrance.close_formations
+    closing_s, close_formations = ColumnBlocks._closing_s, DrawnBlocks.close_formations
 
     def block_mutant(self: ColumnBlocks, block: int) -> float:
         return closing_s(self, block) - EARLY_S
 
-    def drawn_mutant(self: DrawnEntrance, t_s: float) -> list[ClosedFormation]:
-        return close_formations(self, t_s + EARLY_S)
+    def drawn_mutant(self: DrawnBlocks, t_s: float, gaps: Sequence[range]) -> list[ClosedFormation]:
+        return close_formations(self, t_s + EARLY_S, gaps)
 
     patch.setattr(ColumnBlocks, "_closing_s", block_mutant)
-    patch.setattr(DrawnEntrance, "close_formations", drawn_mutant)
+    patch.setattr(DrawnBlocks, "close_formations", drawn_mutant)
 
 
 join_nothing = instead_of(Groups, "join")(never)

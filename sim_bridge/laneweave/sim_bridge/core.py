@@ -1,7 +1,7 @@
 """The bridge's core: lockstep ticks between the simulated world and the vehicles' agents.
 
-In each tick the roadside admits vehicles, every vehicle on the road receives a SENSE, its agent
-answers with a trajectory, all bodies move by one tick, the world displays them, and gaps and
+In each tick (`simulated_road`) vehicles enter, every vehicle on the road receives a SENSE, its
+agent answers with a trajectory, all bodies move by one tick, the world displays them, and gaps and
 overlaps are measured. SENSE is repeated to agents that have not answered (`tick_answers`); after
 the deadline their motion controllers continue their trajectories. A vehicle whose agent is absent,
 silent or always late gets a caretaker (`attendance`).
@@ -16,14 +16,11 @@ from enum import Enum
 from itertools import groupby
 from typing import ClassVar
 
-import structlog
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.runtime.metrics import MetricsSnapshot, metric
 from laneweave.protocol.runtime.node import (
-    Announce,
     Arrived,
     Effect,
     End,
@@ -35,11 +32,10 @@ from laneweave.protocol.runtime.node import (
     Started,
     Stopping,
     Wakeup,
-    Watch,
 )
+from laneweave.protocol.scenario.deployment_fields import Runtime
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.wire.bounds import check_ballot
-from laneweave.protocol.wire.events import AGENT_MISSING, AGENT_SILENT
+from laneweave.protocol.wire.events import AGENT_MISSING
 from laneweave.protocol.wire.messages import (
     Command,
     Heartbeat,
@@ -50,24 +46,20 @@ from laneweave.protocol.wire.messages import (
     Report,
 )
 from laneweave.protocol.wire.topics import (
-    BRIDGE_ALIVE,
-    COMMAND,
     EVENT,
     HEARTBEAT,
     REPORT,
-    SENSE,
     VEHICLE_ALIVE,
 )
 from laneweave.sim_bridge.recording.record_interface import Record
 from laneweave.sim_bridge.recording.run_record import Ending
-from laneweave.sim_bridge.road.attendance import Attendance, notify_left
+from laneweave.sim_bridge.road.attendance import notify_left
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, OutsideTraffic
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from laneweave.sim_bridge.simulated_road import SimulatedRoad
 from laneweave.sim_bridge.world_interface import World, show_bodies
-
-log = structlog.get_logger(__name__)
 
 BRIDGE = Name("bridge")
 CATCH_UP_S = 1.0
@@ -109,6 +101,76 @@ class TickPhase(Enum):
     ENDED = "ended"
 
 
+class TickPace:
+    """When ticks open, if answers arrive in time.
+
+    The road keeps a pace on average: after long ticks it is faster, up to the scenario's
+    `max_pace`. On a link that loses packets, few ticks are long.
+    """
+
+    def __init__(self, runtime: Runtime, pace: float | None) -> None:
+        """Begin at any time; `pace` as in `BridgeCore`."""
+        self._tick_s = runtime.tick_s
+        self._duration_s = runtime.tick_s / (pace or runtime.max_pace)
+        self._min_duration_s = min(self._duration_s, runtime.tick_s / runtime.max_pace)
+        self._opened_s = 0.0
+        self._due_s = 0.0
+        """Time at which the current tick was due."""
+
+    def start(self, now_s: float) -> None:
+        """Make the first tick due now."""
+        self._due_s = now_s
+
+    def open_tick(self, now_s: float) -> None:
+        """Register that a tick opens."""
+        self._opened_s = now_s
+
+    def next_s(self, now_s: float, *, answering: bool) -> float:
+        """Return when the next tick opens; `answering`: whether any agent can answer."""
+        if answering:
+            self._due_s = max(self._due_s + self._duration_s, now_s - CATCH_UP_S)
+        else:
+            # Run no faster than real time during a network failure.
+            self._due_s = self._opened_s + max(self._duration_s, self._tick_s)
+        return max(now_s, self._due_s, self._opened_s + self._min_duration_s)
+
+
+class FinalReports:
+    """The processes whose final report is awaited."""
+
+    def __init__(self) -> None:
+        """Await the report of the bridge."""
+        self._awaited: set[str] = {BRIDGE}
+        self._departures: deque[tuple[int, Name]] = deque()
+        """Tick and name of each vehicle that has left in the last `REPORT_TICKS`."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether all reports have arrived."""
+        return not self._awaited
+
+    def expect(self, name: str) -> None:
+        """Await the report of an agent."""
+        self._awaited.add(name)
+
+    def take(self, report: Report) -> bool:
+        """Return whether a report is news: not from an earlier run, and no duplicate."""
+        if report.role not in ("agent", "bridge"):
+            return True
+        known = report.name in self._awaited
+        self._awaited.discard(report.name)
+        return known
+
+    def on_left(self, tick: int, vehicle: Name) -> None:
+        """Register that a vehicle has left."""
+        self._departures.append((tick, vehicle))
+
+    def forget(self, tick: int) -> None:
+        """Give up reports of vehicles that left long ago: lost, or their agents were killed."""
+        while self._departures and self._departures[0][0] < tick - REPORT_TICKS:
+            self._awaited.discard(self._departures.popleft()[1])
+
+
 class BridgeCore:
     """State machine of the bridge; a `Core`."""
 
@@ -139,34 +201,22 @@ class BridgeCore:
             stopwatch: clock [s] that measures how long ticks take.
             outside_traffic: further vehicles, which a simulator drives to entrances.
         """
-        self.scenario = scenario
-        self.tick = 0
         self.phase = TickPhase.STARTING
-        self.vehicles: dict[Name, RoadVehicle] = {}
+        self._scenario = scenario
         self._world = world
         self._record = record
         self._roadside = Roadside(scenario, stream, incarnation, outside_traffic)
-        self._exits = Exits(scenario.geometry.sections, scenario.road.length_m)
-        runtime = scenario.runtime
-        self._tick_duration_s = runtime.tick_s / (pace or runtime.max_pace)
-        self._min_tick_duration_s = min(self._tick_duration_s, runtime.tick_s / runtime.max_pace)
-        self._incarnation = incarnation
+        self.road = SimulatedRoad(
+            scenario, self._roadside, record, new_incarnation, RoadVehicle.entering, incarnation
+        )
+        self._answers = self.road.answers
+        self._pace = TickPace(scenario.runtime, pace)
+        self._reports = FinalReports()
         self._stopwatch = stopwatch
-        self._bounds = runtime.bounds(incarnation)
-        self._attendance = Attendance(scenario, new_incarnation)
-        self._answers = self._attendance.answers
-        self._at_entrance: list[RoadVehicle] = []
-        self._unreported: set[str] = {BRIDGE}
-        """Processes whose final report is awaited."""
-        self._departures: deque[tuple[int, Name]] = deque()
-        """Tick and name of each vehicle that has left in the last `REPORT_TICKS`."""
+        self._tick_began = 0.0
         self._agent_wait_s = scenario.runtime.agent_start_s
         """Maximum wait for agents at the entrance."""
         self._ending = Ending.COMPLETE
-        self._tick_began = 0.0
-        self._opened_s = 0.0
-        self._due_s = 0.0
-        """Time at which the current tick was due."""
         self._until_s = 0.0
         """Deadline for all phases except ANSWERS."""
 
@@ -185,14 +235,24 @@ class BridgeCore:
                 vehicles_entered_total=clock.entered,
                 vehicles_left_total=clock.left,
                 vehicles_on_road=clock.on_road,
-                vehicles_unattended=self._attendance.caretaker_count,
+                vehicles_unattended=self.road.attendance.caretaker_count,
             ),
         )
 
     @property
+    def vehicles(self) -> Mapping[Name, RoadVehicle]:
+        """The vehicles on the road, by name, in the order in which they entered."""
+        return self.road.vehicles
+
+    @property
+    def tick(self) -> int:
+        """Number of completed ticks."""
+        return self.road.tick
+
+    @property
     def t_s(self) -> float:
         """Road time."""
-        return self.tick * self.scenario.runtime.tick_s
+        return self.road.t_s
 
     @property
     def wakeup_s(self) -> float | None:
@@ -219,24 +279,23 @@ class BridgeCore:
         return effects
 
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
-        self._attendance.on_network(event, now_s)
+        self.road.attendance.on_network(event, now_s)
         match event:
             case Started():
-                for subscribed in (COMMAND, EVENT, REPORT, HEARTBEAT):
+                for subscribed in (EVENT, REPORT, HEARTBEAT):
                     yield Listen(subscribed)
-                yield Watch(VEHICLE_ALIVE)
-                yield Announce(BRIDGE_ALIVE, {"incarnation": self._incarnation})
-                self._due_s = now_s
+                yield from self.road.connect()
+                self._pace.start(now_s)
                 self._open_tick(now_s)
             case Arrived(_, parameters, message):
                 yield from self._on_message(message, parameters, now_s)
             case PeerUp(topic, parameters) if topic is VEHICLE_ALIVE:
-                self._agent_wait_s = self.scenario.runtime.agent_start_s
+                self._agent_wait_s = self._scenario.runtime.agent_start_s
                 if parameters["vehicle"] in self.vehicles:
-                    self._unreported.add(parameters["vehicle"])
+                    self._reports.expect(parameters["vehicle"])
             case Wakeup() if self.phase is TickPhase.ANSWERS:
                 for name, copies in groupby(self._answers.due_resends(now_s)):
-                    sense = self._sense_of(self.vehicles[name])  # encoded once
+                    sense = self.road.sense_of(self.vehicles[name])  # encoded once
                     yield from (sense for _ in copies)
             case Stopping():
                 # While the bridge waits for final reports, the run itself has ended.
@@ -250,56 +309,21 @@ class BridgeCore:
     ) -> Iterator[Effect]:
         match message:
             case Prepare() | Plan():
-                vehicle = Name(parameters["vehicle"])
-                check_ballot(message.ballot, self.t_s)
-                yield from self._attendance.on_message(vehicle, message, self.tick)
-            case Report():
-                self._on_report(message)
+                yield from self.road.on_ballot(Name(parameters["vehicle"]), message)
+            case Report() if self._reports.take(message):
+                self._record.on_report(message)
             case LogEvent():
                 self._record.on_event(message)
             case Heartbeat():
-                self._bounds.check(message, self.t_s, now_s)
+                self.road.bounds.check(message, self.t_s, now_s)
                 self._record.on_heartbeat(message, self.t_s, now_s)
             case _:
                 pass
 
     def _on_command(self, command: Command, now_s: float) -> list[Effect]:
-        effects: list[Effect] = []
-        name = command.vehicle
-        vehicle = self.vehicles.get(name)
-        if vehicle is None:
-            return effects
-        in_charge, incarnation = vehicle.controller.record.incarnation, command.record.incarnation
-        self._bounds.check(command, self.t_s, now_s)
-        self._bounds.check_claim(incarnation, in_charge, now_s)
-        current = command.tick == self.tick and self.phase is TickPhase.ANSWERS
-        if incarnation >= in_charge:
-            self._answers.received(name, now_s, current=current)
-        had_caretaker = name in self._attendance
-        if self._attendance.register_command(vehicle, command):
-            effects.append(self._sense_of(vehicle))
-        if not current:
-            # A late answer was computed for a past state and would lead to a wrong position.
-            if command.tick < self.tick and incarnation == in_charge:
-                self._answers.late(name)
-            return effects
-        try:
-            effects += self._attendance.accept_command(vehicle, command)
-        except BadInputError as error:
-            log.warning("command ignored", vehicle=name, reason=str(error))
-            return effects
-        # Only an accepted command can change the process in charge.
-        if in_charge not in (0, vehicle.controller.record.incarnation):
-            previous = "caretaker" if had_caretaker else "agent"
-            self._record.on_agent_took_over(self.t_s, name, previous)
-        return effects
-
-    def _on_report(self, report: Report) -> None:
-        if report.role in ("agent", "bridge"):
-            if report.name not in self._unreported:
-                return  # from an earlier run, or a duplicate
-            self._unreported.discard(report.name)
-        self._record.on_report(report)
+        # A late answer was computed for a past state and would lead to a wrong position.
+        in_time = command.tick == self.tick and self.phase is TickPhase.ANSWERS
+        return self.road.on_command(command, now_s, in_time=in_time)
 
     # --- the tick -----------------------------------------------------------------------------
 
@@ -308,126 +332,60 @@ class BridgeCore:
         if self.phase is TickPhase.PACE and now_s >= self._until_s:
             self._open_tick(now_s)
         if self.phase is TickPhase.AGENTS:
-            missing = any(each.name not in self._answers.up for each in self._at_entrance)
+            missing = any(each.name not in self._answers.up for each in self.road.at_entrance)
             if not missing or now_s >= self._until_s:
-                yield from self._begin_tick(now_s)
+                self._enter()
+                yield from self.road.begin_tick(now_s)
+                self.phase = TickPhase.ANSWERS
         if self.phase is TickPhase.ANSWERS and self._answers.complete(now_s):
             yield from self._end_tick(now_s)
         if self.phase is TickPhase.SHUTTING_DOWN and (
-            now_s >= self._until_s or not self._unreported
+            now_s >= self._until_s or self._reports.complete
         ):
             self._finish(self._ending)
             yield End()
 
     def _open_tick(self, now_s: float) -> None:
         """Admit vehicles at the entrance and start waiting for their agents."""
-        self._opened_s = now_s
+        self._pace.open_tick(now_s)
         self._tick_began = self._stopwatch()
-        for arrival in self._roadside.demand.newly_demanded(self.t_s):
-            self._record.on_demanded(arrival)
-        for admission in self._roadside.admit(self.t_s, self.vehicles):
-            self._at_entrance.append(
-                RoadVehicle.entering(admission, self.t_s, self.scenario, self._incarnation)
-            )
+        self.road.admit()
         self.phase = TickPhase.AGENTS
         self._until_s = now_s + self._agent_wait_s
 
-    def _begin_tick(self, now_s: float) -> Iterator[Effect]:
-        self._enter()
-        for change in self._roadside.control_lane_ends(self.vehicles, self.t_s):
-            self._attendance.begin_anew(self.vehicles[change.vehicle], self.tick)
-            self._record.on_lane_end(self.t_s, change.vehicle, change.lane, change.kind)
-        self._close_formations()
-        self._roadside.assign_empty_cells(self.vehicles)
-        yield from self._roadside.publish(self.tick, self.t_s, self.vehicles.values())
-        yield from self._start_caretakers(now_s)
-        for vehicle in self.vehicles.values():
-            yield self._sense_of(vehicle)
-        yield from self._attendance.states(self.tick)
-        yield from self._attendance.notify_departed(self.tick)
-        self._attendance.start_tick(self.vehicles, now_s)
-        self.phase = TickPhase.ANSWERS
-
     def _enter(self) -> None:
-        for vehicle in self._at_entrance:
-            self.vehicles[vehicle.name] = vehicle
+        for vehicle in self.road.enter():
             self._world.add(vehicle.name, vehicle.state, vehicle.arrival.vehicle_type)
-            self._record.on_entered(vehicle)
             if vehicle.name in self._answers.up:
-                self._unreported.add(vehicle.name)
+                self._reports.expect(vehicle.name)
             else:
                 self._record.event(self.t_s, AGENT_MISSING, vehicle=vehicle.name)
                 # After a missing agent, wait only briefly for others until one appears.
-                self._agent_wait_s = self.scenario.network.resend_s
-        self._at_entrance.clear()
-
-    def _close_formations(self) -> None:
-        for closed in self._roadside.close_formations(self.t_s):
-            blocks = closed.blocks
-            members = [vehicle for vehicle in self.vehicles.values() if vehicle.block in blocks]
-            for vehicle in members:
-                vehicle.join(closed)
-            self._record.on_closed(closed, [vehicle.name for vehicle in members])
-
-    def _start_caretakers(self, now_s: float) -> Iterator[Effect]:
-        """Put caretakers in charge of vehicles whose agents are absent, silent or always late."""
-        for name in self._answers.update_durations(now_s):
-            self._record.event(self.t_s, AGENT_SILENT, vehicle=name)
-        for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
-            self._record.on_caretaker_took_over(self.t_s, vehicle.name, absence)
-            yield from self._attendance.take_charge(vehicle, self.tick)
-
-    def _sense_of(self, vehicle: RoadVehicle) -> Effect:
-        caretaker = vehicle.name in self._attendance
-        sense = vehicle.sense(self.tick, caretaker=caretaker)
-        return Send(SENSE, sense, {"vehicle": vehicle.name})
+                self._agent_wait_s = self._scenario.network.resend_s
 
     def _end_tick(self, now_s: float) -> Iterator[Effect]:
+        road = self.road
         self._record.on_missed(self._answers.close())
-        tick = self.tick
-        for vehicle in self.vehicles.values():
-            vehicle.step(tick)
-        self.tick += 1
-        show_bodies(self._world, self.vehicles, self.scenario, self._record, self.t_s)
-        yield from self._remove_departed()
+        road.step()
+        show_bodies(self._world, road.vehicles, self._scenario, self._record, road.t_s)
+        for vehicle in road.departed():
+            self._world.remove(vehicle.name)
+            self._reports.on_left(road.tick, vehicle.name)
+            yield from road.remove(vehicle)
+        self._reports.forget(road.tick)
         duration_s = self._stopwatch() - self._tick_began
-        self._record.on_tick(self.t_s, len(self.vehicles), duration_s)
+        self._record.on_tick(road.t_s, len(road.vehicles), duration_s)
         if self._is_over():
             yield from self._shut_down(now_s)
             return
-        self._until_s = self._schedule_tick(now_s)
+        answering = not self._answers.all_silent and road.attendance.link_up
+        self._until_s = self._pace.next_s(now_s, answering=answering)
         self.phase = TickPhase.PACE
-
-    def _schedule_tick(self, now_s: float) -> float:
-        """Schedule the next tick, and return when it opens.
-
-        The road keeps `pace` on average: after long ticks it is faster, up to the scenario's
-        `max_pace`. On a link that loses packets, few ticks are long.
-        """
-        if self._answers.all_silent or not self._attendance.link_up:
-            # No agent can answer: run no faster than real time during a network failure.
-            self._due_s = self._opened_s + max(self._tick_duration_s, self.scenario.runtime.tick_s)
-        else:
-            self._due_s = max(self._due_s + self._tick_duration_s, now_s - CATCH_UP_S)
-        return max(now_s, self._due_s, self._opened_s + self._min_tick_duration_s)
-
-    def _remove_departed(self) -> Iterator[Effect]:
-        for name, vehicle in list(self.vehicles.items()):
-            if self._exits.left_by(vehicle.body_lane, vehicle.state[0]) is not None:
-                del self.vehicles[name]
-                self._world.remove(name)
-                self._roadside.on_left(vehicle, self.vehicles, self.t_s)
-                self._departures.append((self.tick, name))
-                self._record.on_left(vehicle, self.t_s, attended=name not in self._attendance)
-                yield from self._attendance.leave(vehicle)
-        while self._departures and self._departures[0][0] < self.tick - REPORT_TICKS:
-            # The agent was killed, or its report was lost.
-            self._unreported.discard(self._departures.popleft()[1])
 
     def _is_over(self) -> bool:
         if self._roadside.is_over(self.t_s, self.vehicles):
             return True
-        if self.t_s >= self.scenario.runtime.max_road_s:
+        if self.t_s >= self._scenario.runtime.max_road_s:
             self._ending = Ending.LIMIT
             return True
         return False
@@ -437,8 +395,8 @@ class BridgeCore:
     def _shut_down(self, now_s: float) -> Iterator[Effect]:
         on_road = self.vehicles.values()
         yield from self._roadside.publish(self.tick, self.t_s, on_road, ended=True)
-        yield from self._attendance.notify_departed(self.tick)
-        for vehicle in self.vehicles.values():
+        yield from self.road.attendance.notify_departed(self.tick)
+        for vehicle in on_road:
             yield notify_left(vehicle, self.tick)
         # Sent last, through the network like the other reports: the node adds its counters.
         yield Send(REPORT, Report(role=BRIDGE, name=BRIDGE), {"role": BRIDGE, "name": BRIDGE})

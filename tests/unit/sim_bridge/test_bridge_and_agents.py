@@ -122,7 +122,7 @@ def test_an_agent_that_slept_until_its_vehicle_was_taken_care_of_does_not_move(
 ) -> None:
     """The caretaker may have promised its cell to others: it is back in charge, without a plan."""
     sleep(street, agent, target, MOVE_TICK - 2, asleep_ticks)
-    assert A in street.bridge._attendance
+    assert A in street.bridge.road.attendance
     agent.asleep = False
     street.run_to(MOVE_TICK + asleep_ticks + 100)
     assert seen_in_cell(street)[-1] == pytest.approx((0.0, 0.0), abs=0.1)
@@ -132,7 +132,7 @@ def test_an_agent_that_slept_until_its_vehicle_was_taken_care_of_does_not_move(
 
 def check_in_charge_without_plan(street: Street, cell: Cell) -> None:
     agent = street.agents[A]
-    assert A not in street.bridge._attendance
+    assert A not in street.bridge.road.attendance
     assert agent.in_charge
     execution = agent.execution
     assert execution is not None
@@ -174,7 +174,7 @@ def test_ticks_do_not_wait_long_for_an_agent_that_sleeps(street: Street, agent: 
     )
     agent.asleep = False
     street.run_to(200)
-    assert street.bridge._answers.silent == set()
+    assert street.bridge.road.answers.silent == set()
 
 
 # --- an agent that dies -----------------------------------------------------------------------
@@ -235,9 +235,9 @@ def check_complete(street: Street, folder: Path) -> None:
     bridge = street.bridge
     for left_over in (
         bridge.vehicles,
-        bridge._answers.silent,
-        bridge._answers.awaited,
-        bridge._at_entrance,
+        bridge.road.answers.silent,
+        bridge.road.answers.awaited,
+        bridge.road.at_entrance,
     ):
         assert not left_over
 
@@ -246,8 +246,8 @@ def check_all_gone(street: Street) -> None:
     """Check that nothing is kept of vehicles that are no more."""
     bridge = street.bridge
     # The last one's token may vanish after its report, with which the run is over.
-    assert set(bridge._attendance.departed) <= bridge._answers.up <= {MANY[-1].vehicle}
-    assert not bridge._unreported
+    assert set(bridge.road.attendance.departed) <= bridge.road.answers.up <= {MANY[-1].vehicle}
+    assert not bridge._reports._awaited
     for node in street.nodes:
         assert not getattr(node.core, "_agents", None)
 
@@ -268,7 +268,7 @@ def test_a_whole_run_counts_every_message_once_and_keeps_little_of_vehicles_that
 
     def look() -> bool:
         nonlocal most
-        most = max(most, len(bridge._attendance.departed))
+        most = max(most, len(bridge.road.attendance.departed))
         if bridge.phase is TickPhase.SHUTTING_DOWN and not ended_s:
             ended_s.append(street.network.now_s)
         return bridge.phase is TickPhase.ENDED
@@ -325,7 +325,7 @@ def test_messages_that_are_not_lost_are_waited_for(tmp_path: Path, delay_s: floa
     for one in MANY:
         street.start_agents(one.vehicle)
     street.run_to(250)
-    assert not street.bridge._answers.lossy
+    assert not street.bridge.road.answers.lossy
     assert missed_ticks(street) == 0
 
 
@@ -337,7 +337,7 @@ def missed_ticks(street: Street) -> int:
 
 def test_the_clock_does_not_race_while_the_bridge_is_off_the_network(tmp_path: Path) -> None:
     street = Street(SHORT_ROAD, tmp_path, MANY)
-    street.bridge._tick_duration_s = 1e-3  # as fast as agents answer
+    street.bridge._pace._duration_s = 1e-3  # as fast as agents answer
     street.start_shard()
     street.run_to(60)
     street.network.disconnect("bridge")

@@ -119,7 +119,7 @@ def test_an_agent_that_restarts_takes_charge_and_its_zombie_does_not(attended: D
     next_tick(attended, A)
     attended.answer(B, incarnation=AGENT, jerks=jerks((9.0, 0.0)))
     assert attended.known(B) == before
-    assert attended.core._answers.awaited == {A, B}  # it is not the zombie's answer that counts
+    assert attended.core.road.answers.awaited == {A, B}  # it is not the zombie's answer that counts
     (event,) = read_events(attended.folder, "agent-took-over")
     assert (event["vehicle"], event["previous"]) == (B, "agent")
 
@@ -130,7 +130,7 @@ def test_the_answers_of_a_zombie_are_no_sign_of_life(attended: Desk) -> None:
     for _ in range(MISSES):
         attended.answer(B, incarnation=AGENT)
         next_tick(attended, A)
-    assert attended.core._answers.silent == {B}
+    assert attended.core.road.answers.silent == {B}
     assert sensed(attended, B).caretaker
 
 
@@ -217,7 +217,7 @@ def test_the_caretaker_takes_charge_when_no_answer_comes_in_time(attended: Desk)
             break
     assert tick > 2
     check_cared_for(attended, "late")
-    assert attended.core._answers.silent == set()
+    assert attended.core.road.answers.silent == set()
     for _ in range(3):  # as long as it is late it stays so
         late_answer(attended)
         next_tick(attended, A)
@@ -227,24 +227,24 @@ def test_the_caretaker_takes_charge_when_no_answer_comes_in_time(attended: Desk)
 
 def test_an_agent_that_claims_its_vehicle_is_present_without_a_token(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, TWO)
-    desk.core._attendance._new_incarnation = lambda: 10**9
+    desk.core.road.attendance._new_incarnation = lambda: 10**9
     desk.start(A)
     desk.drive_to_entry(A, B)
     check_cared_for(desk, "absent")  # its agent never came
     care = sensed(desk, B).record.incarnation
     assert care == 10**9  # as for any process
     assert desk.answer(B, incarnation=care + 1) == CARE_OF_B_ENDS
-    assert B in desk.core._answers.up
+    assert B in desk.core.road.answers.up
     for _ in range(3):
         next_tick(desk, A, B)
         assert not sensed(desk, B).caretaker
-        assert desk.core._answers.awaited == {A, B}
+        assert desk.core.road.answers.awaited == {A, B}
 
 
 def test_a_refused_claim_is_no_presence(desk: Desk) -> None:
     desk.down(B)
     desk.answer(B, incarnation=AGENT, hold_cell=(-1, 1))  # a move is no claim
-    assert B not in desk.core._answers.up
+    assert B not in desk.core.road.answers.up
 
 
 def test_an_agent_that_is_back_at_once_needs_no_caretaker(attended: Desk) -> None:
@@ -255,7 +255,7 @@ def test_an_agent_that_is_back_at_once_needs_no_caretaker(attended: Desk) -> Non
 
 
 def test_caretakers_have_greater_incarnations_than_all_before(desk: Desk) -> None:
-    desk.core._attendance._new_incarnation = lambda: 5
+    desk.core.road.attendance._new_incarnation = lambda: 5
     desk.answer(B, incarnation=10**13)
     desk.down(B)
     next_tick(desk, A)
@@ -272,10 +272,10 @@ def test_there_are_no_caretakers_while_the_bridge_is_off_the_network(attended: D
     assert read_events(attended.folder, "caretaker-took-over") == []
     attended.give(LinkUp())
     came_s, lease_s = attended.now_s, SCENARIO.network.lease_s
-    attended.drive(lambda: B in attended.core._attendance, B)
+    attended.drive(lambda: B in attended.core.road.attendance, B)
     # The others reconnect about now, too: only later is B's silence evidence.
     assert came_s + lease_s <= attended.now_s <= came_s + lease_s + 2 * TICK_S
-    assert A not in attended.core._attendance
+    assert A not in attended.core.road.attendance
 
 
 # --- messages of caretakers -------------------------------------------------------------------
@@ -324,7 +324,7 @@ def test_the_bridge_publishes_no_state_of_a_vehicle_with_an_agent(attended: Desk
 def test_an_agent_that_was_gone_takes_its_vehicle_back(cared_for: Desk) -> None:
     cared_for.up(B)
     next_tick(cared_for, A)
-    assert cared_for.core._answers.awaited == {A, B}
+    assert cared_for.core.road.answers.awaited == {A, B}
     check_takes_back(cared_for)
 
 
@@ -333,7 +333,7 @@ def test_an_agent_that_was_silent_takes_its_vehicle_back(attended: Desk) -> None
     late = attended.command(B, tick=attended.core.tick - 1, incarnation=AGENT)
     attended.give(Arrived(COMMAND, OF_B, late))
     next_tick(attended, A)
-    assert attended.core._answers.awaited == {A, B}
+    assert attended.core.road.answers.awaited == {A, B}
     check_takes_back(attended)
 
 
@@ -359,7 +359,7 @@ def test_an_agent_cannot_move_its_vehicle_with_the_claim(cared_for: Desk) -> Non
     before = cared_for.known(B)
     assert cared_for.answer(B, hold_cell=(-1, 1)) == []
     assert cared_for.known(B) == before
-    assert cared_for.core._answers.awaited == {A, B}
+    assert cared_for.core.road.answers.awaited == {A, B}
 
 
 def test_a_caretaker_that_has_ended_publishes_nothing(cared_for: Desk) -> None:
@@ -394,7 +394,7 @@ def test_caretakers_end_with_their_vehicles(tmp_path: Path) -> None:
     desk.drive_to_entry(A, B)
     desk.drive(lambda: B not in desk.core.vehicles)
     assert listening(desk.effects)[-4:] == CARE_OF_B + CARE_OF_B_ENDS
-    assert B not in desk.core._attendance
+    assert B not in desk.core.road.attendance
 
 
 def test_vehicles_that_leave_off_their_lane_are_reported(tmp_path: Path) -> None:
@@ -442,9 +442,9 @@ def test_a_command_with_an_impossible_number_is_refused(
     effects = attended.answer(B, **({"incarnation": AGENT} | changes))
     assert [type(effect) for effect in effects] == [Refuse]
     assert attended.known(B) == before
-    assert B in attended.core._answers.awaited
+    assert B in attended.core.road.answers.awaited
     attended.answer(B, incarnation=AGENT)
-    assert B not in attended.core._answers.awaited
+    assert B not in attended.core.road.answers.awaited
 
 
 def test_a_claim_near_the_limit_leaves_room_for_successors(attended: Desk) -> None:
@@ -452,12 +452,12 @@ def test_a_claim_near_the_limit_leaves_room_for_successors(attended: Desk) -> No
     limit = DAY_NS
     attended.answer(B, incarnation=limit)
     assert attended.core.vehicles[B].controller.record.incarnation == limit
-    attended.drive(lambda: B in attended.core._attendance, B)
+    attended.drive(lambda: B in attended.core.road.attendance, B)
     caretaker = attended.core.vehicles[B].controller.record.incarnation
     assert caretaker > limit
     attended.drive_to(attended.core.tick + 1, B)
     attended.answer(B, incarnation=above(5, caretaker))
-    assert B not in attended.core._attendance
+    assert B not in attended.core.road.attendance
 
 
 def test_a_caretaker_promises_no_ballot_of_an_impossible_term(cared_for: Desk) -> None:

@@ -182,15 +182,15 @@ def test_an_agent_without_answers_is_awaited_to_each_deadline_until_it_is_silent
 ) -> None:
     for _ in range(MISSES):
         assert read_events(desk.folder, "agent-silent") == []
-        assert B not in desk.core._attendance
-        assert desk.core._answers.awaited == {A, B}
+        assert B not in desk.core.road.attendance
+        assert desk.core.road.answers.awaited == {A, B}
         began_s, tick = desk.now_s, desk.core.tick
         desk.answer(A)
         while desk.core.tick == tick:
             desk.wake()
         assert desk.now_s == pytest.approx(began_s + DEADLINE_S)
         desk.drive_to(desk.core.tick)
-    assert desk.core._answers.silent == {B}
+    assert desk.core.road.answers.silent == {B}
     (event,) = read_events(desk.folder, "agent-silent")
     assert (event["vehicle"], event["t_s"]) == (B, pytest.approx(desk.core.t_s))
     # All agents are still asked, but the tick does not wait for the silent one.
@@ -211,10 +211,10 @@ def test_a_late_answer_ends_the_silence_and_does_nothing_else(desk: Desk) -> Non
     known = desk.known(B)
     assert desk.give(Arrived(topics.COMMAND, {"vehicle": B}, late)) == []
     assert desk.known(B) == known
-    assert B in desk.core._attendance  # until it claims its vehicle
+    assert B in desk.core.road.attendance  # until it claims its vehicle
     desk.answer(A)  # this tick had not asked it to be waited for
     desk.wake()
-    assert desk.core._answers.awaited == {A, B}
+    assert desk.core.road.answers.awaited == {A, B}
 
 
 @pytest.mark.parametrize(
@@ -234,7 +234,7 @@ def test_an_answer_to_another_tick_or_that_makes_no_sense_changes_nothing(
     answer = {"tick": tick + apart, "jerks": jerks((9.0, 9.0), ticks=9), **moving}
     desk.answer(A, **(answer | changes))
     assert desk.known(A) == known
-    assert desk.core._answers.awaited == {A, B}
+    assert desk.core.road.answers.awaited == {A, B}
 
 
 def test_an_answer_between_two_ticks_changes_nothing(desk: Desk) -> None:
@@ -247,7 +247,7 @@ def test_an_answer_between_two_ticks_changes_nothing(desk: Desk) -> None:
     desk.give(Arrived(topics.COMMAND, {"vehicle": A}, early))
     assert desk.known(A) == known
     desk.wake()
-    assert desk.core._answers.awaited == {A, B}
+    assert desk.core.road.answers.awaited == {A, B}
 
 
 def test_the_first_answer_of_a_known_vehicle_counts(desk: Desk) -> None:
@@ -265,11 +265,11 @@ def test_a_dead_agent_is_not_waited_for(desk: Desk) -> None:
     desk.down(B)
     assert desk.core.tick == tick + 1
     desk.wake()
-    assert desk.core._answers.awaited == {A}
+    assert desk.core.road.answers.awaited == {A}
     desk.up(B)  # another one: from the next tick on
     desk.answer(A)
     desk.wake()
-    assert desk.core._answers.awaited == {A, B}
+    assert desk.core.road.answers.awaited == {A, B}
     assert read_events(desk.folder, "agent-silent") == []
 
 
@@ -351,7 +351,7 @@ def test_departures_are_notified_until_the_agent_is_gone(tmp_path: Path) -> None
     desk.effects.clear()
     desk.drive_to(desk.core.tick + 2)
     assert not any(sense.left for sense in sent(desk.effects, Sense))
-    assert len(desk.core._attendance.departed) == 0
+    assert len(desk.core.road.attendance.departed) == 0
 
 
 def test_departures_are_notified_a_limited_number_of_times(tmp_path: Path) -> None:
@@ -361,7 +361,7 @@ def test_departures_are_notified_a_limited_number_of_times(tmp_path: Path) -> No
     notified = [sense.vehicle for sense in sent(desk.effects, Sense) if sense.left]
     assert notified.count(A) == LEFT_REPEATS
     assert notified.count(B) == 1  # it was the last one
-    assert A not in desk.core._attendance.departed
+    assert A not in desk.core.road.attendance.departed
 
 
 # --- the end ----------------------------------------------------------------------------------
@@ -467,7 +467,7 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, [*TWO, arrival("C", 3.0)])
     desk.start(A, B, "C")
     desk.drive(lambda: desk.core.tick > 60, B)
-    assert desk.core._answers.silent == {B}
+    assert desk.core.road.answers.silent == {B}
     desk.drive(lambda: desk.core.phase is TickPhase.SHUTTING_DOWN, B)
     for name in (A, B, "C"):
         desk.report("agent", name)
@@ -476,10 +476,10 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
     core = desk.core
     assert core.phase is TickPhase.ENDED
     for left_over in (
-        *(core.vehicles, core._attendance.departed, core._attendance._caretakers),
-        *(core._answers._without_message, core._answers._silence_s),
-        *(core._answers.silent, core._answers.awaited, core._answers.up),
-        *(core._at_entrance, core._unreported, desk.world.states),
+        *(core.vehicles, core.road.attendance.departed, core.road.attendance._caretakers),
+        *(core.road.answers._without_message, core.road.answers._silence_s),
+        *(core.road.answers.silent, core.road.answers.awaited, core.road.answers.up),
+        *(core.road.at_entrance, core._reports._awaited, desk.world.states),
     ):
         assert not left_over
 
@@ -513,7 +513,7 @@ def test_the_clock_does_not_race_while_the_network_is_away(tmp_path: Path, first
         desk.up(name)
     tick = desk.core.tick
     desk.drive_to(tick + 3)
-    assert desk.core._answers.awaited == {A, B}
+    assert desk.core.road.answers.awaited == {A, B}
     began_s = desk.now_s
     desk.drive_to(tick + 10)
     assert desk.now_s < began_s + 0.1  # as fast as it may
@@ -522,10 +522,10 @@ def test_the_clock_does_not_race_while_the_network_is_away(tmp_path: Path, first
 def test_tokens_that_vanish_with_the_link_are_not_believed(desk: Desk) -> None:
     desk.give(LinkDown())
     desk.down(A)
-    assert desk.core._answers.awaited == {A, B}
+    assert desk.core.road.answers.awaited == {A, B}
     desk.give(LinkUp())
     desk.give(
         PeerDown(topics.COORDINATOR_ALIVE, {"coordinator": B, "incarnation": "1"})
     )  # no agent's
     desk.down(A)
-    assert desk.core._answers.awaited == {B}
+    assert desk.core.road.answers.awaited == {B}

@@ -297,7 +297,7 @@ class FaultRun:
         bridge = next(self._incarnations)
         road = LightRoad(
             self.setup.scenario,
-            self.setup.make_entrance(self.story.preferences[0].lanes, bridge),
+            self.setup.make_roadside(self.story.preferences[0].lanes, bridge),
             self.setup.visit_of,
             self.checker,
             self._incarnations.__next__,

@@ -21,14 +21,14 @@ from laneweave.launch.fault_search.events.lasting_faults import (
     LastingFaults,
 )
 from laneweave.launch.fault_search.profiles import Profile
-from laneweave.launch.fault_search.road.drawn_entrance import DrawnEntrance, Entrance, Grant
+from laneweave.launch.fault_search.road.drawn_entrance import DrawnTraffic, Grant, drawn_roadside
 from laneweave.launch.fault_search.road.drawn_roads import (
     EXIT,
     STRAIGHT_ROAD,
     DrawnRoad,
     draw_road,
 )
-from laneweave.launch.fault_search.road.stand_ins import Visit
+from laneweave.launch.fault_search.road.light_vehicle import Visit
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.deployment_fields import Network, Runtime
@@ -287,10 +287,11 @@ class Setup:
             leaving=leaving,
         )
 
-    def make_entrance(self, preferred_lanes: Mapping[Name, int], bridge: int) -> Entrance:
-        """Return the entrance of a road with preferred lanes and the incarnation of its bridge."""
+    def make_roadside(self, preferred_lanes: Mapping[Name, int], bridge: int) -> Roadside:
+        """Return the roadside of a road with preferred lanes and the incarnation of its bridge."""
         if not self.road.roadside:
-            return DrawnEntrance(self.visits, preferred_lanes, self.formations, self.grants, bridge)
+            traffic = DrawnTraffic(self.visits, preferred_lanes)
+            return drawn_roadside(self.scenario, traffic, self.formations, self.grants, bridge)
         stream = tuple(
             Arrival(
                 visit.vehicle,

@@ -1,4 +1,4 @@
-"""Interface through which the bridge reports what happens on its road."""
+"""Interfaces through which the bridge reports what happens on its road."""
 
 from __future__ import annotations
 
@@ -11,12 +11,8 @@ from laneweave.sim_bridge.recording.run_record import Ending, RecordedVehicle
 from laneweave.sim_bridge.road.demand import Arrival
 
 
-class Record(Protocol):
-    """Receiver of a road's measurements: `RunRecord`, which writes files, or a substitute."""
-
-    @property
-    def missed_ticks(self) -> int:
-        """Number of answers that were missing at their tick's deadline."""
+class RoadRecord(Protocol):
+    """Receiver of what happens to vehicles on a road."""
 
     def event(self, t_s: float, kind: str, /, **data: object) -> None:
         """Record an event from the bridge."""
@@ -36,17 +32,25 @@ class Record(Protocol):
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Record that a vehicle has left the lattice at a dead end, or comes back."""
 
-    def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
-        """Record a vehicle that is still on the road at the end."""
-
-    def on_missed(self, agents: int) -> None:
-        """Record the number of answers that were missing at a tick's deadline."""
-
     def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
         """Record that a caretaker has taken charge of a vehicle."""
 
     def on_agent_took_over(self, t_s: float, vehicle: Name, previous: str) -> None:
         """Record that an agent has taken charge of a vehicle."""
+
+
+class Record(RoadRecord, Protocol):
+    """Receiver of a road's measurements: `RunRecord`, which writes files, or a substitute."""
+
+    @property
+    def missed_ticks(self) -> int:
+        """Number of answers that were missing at their tick's deadline."""
+
+    def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
+        """Record a vehicle that is still on the road at the end."""
+
+    def on_missed(self, agents: int) -> None:
+        """Record the number of answers that were missing at a tick's deadline."""
 
     def on_positions(
         self,

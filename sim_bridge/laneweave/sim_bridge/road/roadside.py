@@ -11,7 +11,7 @@ from laneweave.protocol.runtime.node import Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
 from laneweave.protocol.wire.messages import ClosedFormation, Name, Neighbour
-from laneweave.sim_bridge.road.allocation import NO_VEHICLES, allocation_of
+from laneweave.sim_bridge.road.allocation import NO_VEHICLES, Allocation, allocation_of
 from laneweave.sim_bridge.road.census import CensusPublisher
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, DemandQueue, OutsideTraffic
@@ -87,6 +87,7 @@ class Roadside:
         stream: Sequence[Arrival],
         bridge: int = 0,
         outside_traffic: OutsideTraffic = NO_OUTSIDE_TRAFFIC,
+        allocation: Allocation | None = None,
     ) -> None:
         """Begin without vehicles.
 
@@ -95,10 +96,11 @@ class Roadside:
             stream: the arrivals, by time.
             bridge: incarnation of the bridge.
             outside_traffic: further vehicles, which a simulator drives to entrances.
+            allocation: what vehicles get besides their cells; None: that of the operation.
         """
         self.outside = outside_traffic
         self._lanes = range(scenario.road.lanes)
-        self._allocation = allocation_of(scenario, self._is_kept_free)
+        self._allocation = allocation or allocation_of(scenario, self._is_kept_free)
         self._meter = EntryMeter(
             scenario.lattice,
             scenario.formation.entry_spread_s,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Self
 
 from attrs import define, evolve
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import ClosedFormation, Name, Sense
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
@@ -40,8 +42,13 @@ class RoadVehicle:
 
     @classmethod
     def entering(
-        cls, admission: Admission, t_s: float, scenario: Scenario, bridge: int = 0
-    ) -> RoadVehicle:
+        cls,
+        admission: Admission,
+        t_s: float,
+        scenario: Scenario,
+        bridge: int = 0,
+        make_body: Callable[[State, Vehicle, float], Plant] = Plant,
+    ) -> Self:
         """Return an admitted vehicle at road time `t_s`; it has driven at v_F since admission.
 
         The vehicle settles in its cell within `formation.settle_s`.
@@ -58,9 +65,8 @@ class RoadVehicle:
             settle_s, ready_s = start.settle_s, start.ready_s
         name = Name(admission.arrival.vehicle)
         limits = scenario.types[admission.arrival.vehicle_type].limits
-        controller = MotionController(
-            Plant((s_m, speed_mps, *rest[2:]), limits, tick_s), scenario, admission.cell
-        )
+        body = make_body((s_m, speed_mps, *rest[2:]), limits, tick_s)
+        controller = MotionController(body, scenario, admission.cell)
         if settle_s > 0.0:
             controller.motion_end_tick = round((t_s + settle_s) / tick_s)
         controller.enter_lattice((admission.cell, *admission.more_cells))

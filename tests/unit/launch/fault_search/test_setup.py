@@ -8,7 +8,7 @@ import pytest
 from attrs import evolve
 
 from laneweave.launch.fault_search.profiles import PROFILES, profiles_named
-from laneweave.launch.fault_search.road.stand_ins import Visit
+from laneweave.launch.fault_search.road.light_vehicle import Visit
 from laneweave.launch.fault_search.setup import BLOCK_COLUMNS, Setup
 from laneweave.protocol.config.scenario_files import check_scenario
 from laneweave.protocol.errors import BadInputError
@@ -135,8 +135,8 @@ def test_the_roadside_admits_all_vehicles_in_turn(name: str) -> None:
             # The volume has no effect: arrivals are drawn elsewhere.
             check_scenario(evolve(setup.scenario, demand=Demand(100.0)))
         lanes = setup.preferences(rng, last=False)
-        entrance = setup.make_entrance(lanes, bridge=1)
-        entered = [each for tick in range(1000) for each in entrance.admit(tick * 0.1)]
+        roadside = setup.make_roadside(lanes, bridge=1)
+        entered = [each for tick in range(1000) for each in roadside.admit(tick * 0.1)]
         assert {each.arrival.vehicle for each in entered} == set(lanes)
         for each in entered:
             assert each.arrival.preferred_lane == lanes[Name(each.arrival.vehicle)]

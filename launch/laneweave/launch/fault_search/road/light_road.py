@@ -1,46 +1,34 @@
-"""The simplified road: a bridge without SUMO that does not wait for agents.
+"""The road of the fault search: the bridge's simulated road with light vehicles, at a fixed rate.
 
-Every vehicle gets a SENSE in each tick, COMMANDs are executed on arrival, and bodies move in
-straight lines to the hold cells of their motion controllers. The real `MotionController`,
-`Answers` and `Attendance` decide which process may command a vehicle, which agents are silent, and
-what caretakers publish. Vehicles enter through an `Entrance`, which may be the real roadside.
+`LightRoad` waits for no agent, unlike the bridge: a tick begins every `tick_s`, and COMMANDs are
+executed when they arrive, also those for earlier ticks. `CheckedRoad` informs the checker about
+what happens on the road.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
 
 from laneweave.launch.fault_search.checks.checker import Checker
-from laneweave.launch.fault_search.road.drawn_entrance import Entrance
-from laneweave.launch.fault_search.road.stand_ins import LightVehicle, Visit
+from laneweave.launch.fault_search.road.light_vehicle import LightVehicle, Visit
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.road_layout import Exits
-from laneweave.protocol.runtime.node import (
-    Announce,
-    Arrived,
-    Effect,
-    Event,
-    Listen,
-    Refuse,
-    Send,
-    Started,
-    Wakeup,
-    Watch,
-)
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.runtime.node import Arrived, Effect, Event, Refuse, Send, Started, Wakeup
+from laneweave.protocol.runtime.transport import LinkUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
-from laneweave.protocol.wire.bounds import check_ballot
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
-from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare
-from laneweave.protocol.wire.topics import BRIDGE_ALIVE, COMMAND, SENSE, VEHICLE_ALIVE
-from laneweave.sim_bridge.road.attendance import Absence, Attendance
+from laneweave.protocol.wire.messages import ClosedFormation, Command, Name, Plan, Prepare, Sense
+from laneweave.sim_bridge.recording.run_record import RecordedVehicle
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.roadside import Roadside
+from laneweave.sim_bridge.simulated_road import SimulatedRoad
 
 DRIVE_OUT_S = 8.0
 """Time in which a vehicle drives from standing into its cell."""
-AGENT_START_S = 1.0
-"""Time after which a caretaker takes charge of a vehicle that entered without an agent."""
 
 
 class Reception(Enum):
@@ -52,13 +40,116 @@ class Reception(Enum):
     IN_TIME = "in time"
 
 
+class CheckedRoad:
+    """Tells the checker what happens on a road, and moves bodies accordingly.
+
+    For the checker, a vehicle without cells has left the road. Implements `RoadRecord`.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        roadside: Roadside,
+        checker: Checker,
+        new_incarnation: Callable[[], int],
+        new_vehicle: Callable[[Admission, float, Scenario, int], LightVehicle],
+        bridge: int,
+        began_s: float,
+    ) -> None:
+        """Begin with an empty road; arguments as those of `SimulatedRoad` and `LightRoad`."""
+        self.road = SimulatedRoad(scenario, roadside, self, new_incarnation, new_vehicle, bridge)
+        self.takeovers = 0
+        """Number of takeovers by caretakers."""
+        self._scenario = scenario
+        self._vehicles = self.road.vehicles
+        self._checker = checker
+        self._began_s = began_s
+        self._lane_ends = LaneEnds(scenario)
+        self._tick_m = 1.5 * scenario.lattice.speed_mps * scenario.runtime.tick_s
+        """Distance beyond an exit at which a vehicle has left the road."""
+
+    def event(self, t_s: float, kind: str, /, **data: object) -> None:
+        """Do nothing."""
+
+    def on_demanded(self, arrival: Arrival) -> None:
+        """Do nothing."""
+
+    def on_closed(self, closed: ClosedFormation, members: Sequence[Name]) -> None:
+        """Do nothing."""
+
+    def on_agent_took_over(self, t_s: float, vehicle: Name, previous: str) -> None:
+        """Do nothing."""
+
+    def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
+        """Count a takeover."""
+        del t_s, vehicle, reason
+        self.takeovers += 1
+
+    def on_entered(self, vehicle: RecordedVehicle) -> None:
+        """Let a vehicle enter."""
+        one = self._vehicles[Name(vehicle.name)]
+        self._checker.enter(self._began_s + one.body.t_s, one.name, one.cell, one.block)
+
+    def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
+        """Let a vehicle leave the road."""
+        del attended
+        if self._vehicles[Name(vehicle.name)].controller.off_lattice is None:
+            self._checker.leave(self._began_s + t_s, vehicle.name)
+
+    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
+        """Let a body stop before the end of its lane, and come back; see `LaneEndControl`."""
+        one, now_s = self._vehicles[vehicle], self._began_s + t_s
+        body, cell = one.body, one.cell
+        if kind == MISSED_EXIT:
+            self._checker.give_up_move(now_s, vehicle, cell)
+            body.go(cell, t_s, self._scenario.runtime.tick_s)
+        elif kind == LEFT_LATTICE:
+            self._checker.leave(now_s, vehicle)
+            end = self._lane_ends.ahead(lane, body.state[0])
+            body.stop_at(math.inf if end is None else end.line_m)
+        elif kind == DRIVES_OUT:
+            body.drive_out(cell, t_s, DRIVE_OUT_S)
+        elif kind == ENTERED_LATTICE:
+            self._checker.enter(now_s, vehicle, cell, one.block)
+
+    def begin_move(self, vehicle: LightVehicle, held: Cell, now_s: float, lasts_s: float) -> None:
+        """Begin the motion from the cell that a vehicle held to the cell that it holds now."""
+        name, cell, in_charge = vehicle.name, vehicle.cell, vehicle.controller.record.incarnation
+        move = (held, cell)
+        self._checker.begin(now_s, name, in_charge, move, lasts_s, vehicle.latest_s)
+        along, across = cell[0] - held[0], cell[1] - held[1]
+        if (along, across) not in self._scenario.types[vehicle.arrival.vehicle_type].moves:
+            self._checker.undrivable(now_s, name, move)
+        vehicle.body.go(cell, now_s - self._began_s, lasts_s)
+
+    def report_stored(self, now_s: float, vehicle: LightVehicle) -> None:
+        """Report the record of a vehicle on the lattice."""
+        if vehicle.controller.off_lattice is None:
+            self._checker.store(now_s, vehicle.name, vehicle.controller.record)
+
+    def check_lanes(self, now_s: float) -> None:
+        """Report bodies in lanes that have ended, also partly at an exit."""
+        for name, vehicle in self._vehicles.items():
+            s_m, _, _, y_m, _, _ = vehicle.state
+            touched = self._scenario.lattice.lanes_touched(y_m, vehicle.size[1])
+            for lane in {*touched}:
+                exit_lane = self._lane_ends.exit_ahead(lane, s_m)
+                if exit_lane is not None and s_m > exit_lane.end_m + self._tick_m:
+                    text = f"in lanes {touched} at {s_m:.1f} m, exit at {exit_lane.end_m:g} m"
+                    self._checker.beyond_end(now_s, name, text)
+            end = self._lane_ends.ahead(vehicle.body_lane, s_m)
+            if end is not None and s_m > end.end_m:
+                text = f"at {s_m:.1f} m, its lane ends at {end.end_m:g} m"
+                self._checker.beyond_end(now_s, name, text)
+
+
 class LightRoad:
     """Core of the road."""
 
     def __init__(
         self,
         scenario: Scenario,
-        entrance: Entrance,
+        roadside: Roadside,
         visits: Mapping[Name, Visit],
         checker: Checker,
         new_incarnation: Callable[[], int],
@@ -72,7 +163,7 @@ class LightRoad:
 
         Args:
             scenario: lattice and timing.
-            entrance: admits vehicles, publishes clock and census.
+            roadside: admits vehicles, publishes clock and census.
             visits: clock errors and time of exit of each vehicle.
             checker: checker to inform about events on the road.
             new_incarnation: returns the incarnation number for a caretaker.
@@ -82,66 +173,38 @@ class LightRoad:
             bridge: incarnation of this road's bridge.
             began_s: virtual time at road time 0.
         """
-        self.tick = -1
-        self.vehicles: dict[Name, LightVehicle] = {}
-        self.takeovers = 0
-        """Number of takeovers by caretakers."""
-        self.refused = 0
-        """Number of COMMANDs rejected by motion controllers."""
-        self._scenario = scenario
-        self._tick_s = scenario.runtime.tick_s
-        self._entrance = entrance
-        self._visits = visits
+        self.began_s = began_s
         self._checker = checker
+        self._checked = CheckedRoad(
+            scenario, roadside, checker, new_incarnation, self._new_vehicle, bridge, began_s
+        )
+        self._road = self._checked.road
+        self.vehicles = self._road.vehicles
+        self._visits = visits
         self._move_lasts_s = move_lasts_s
         self._reception = reception
-        self.bridge = bridge
-        self.began_s = began_s
         self._preferred_lanes: Mapping[Name, int] = {}
         """Newest preferred lanes; empty: those at the entrance."""
-        self._attendance = Attendance(scenario, new_incarnation)
-        self._bounds = scenario.runtime.bounds(bridge)
-        self._lane_ends = LaneEnds(scenario)
-        self._exits = Exits(scenario.geometry.sections, scenario.road.length_m)
-        self._tick_m = 1.5 * scenario.lattice.speed_mps * self._tick_s
-        """Distance beyond an exit at which a vehicle has left the road."""
 
     @property
-    def wakeup_s(self) -> float:
-        """Time of the next tick."""
-        return self.began_s + (self.tick + 1) * self._tick_s
+    def takeovers(self) -> int:
+        """Number of takeovers by caretakers."""
+        return self._checked.takeovers
+
+    @property
+    def tick(self) -> int:
+        """Number of completed ticks."""
+        return self._road.tick
 
     @property
     def t_s(self) -> float:
         """Road time of the newest tick."""
-        return self.tick * self._tick_s
+        return self._road.t_s
 
-    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
-        """Handle an event; see `Core`."""
-        try:
-            yield from self._on_event(event, now_s)
-        except BadInputError as error:
-            yield Refuse(error)
-
-    def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
-        self._attendance.on_network(event, now_s)
-        match event:
-            case Arrived(_, _, Command() as command):
-                yield from self._on_command(command, now_s)
-            case Arrived(_, parameters, (Prepare() | Plan()) as message):
-                name = Name(parameters["vehicle"])
-                check_ballot(message.ballot, self.t_s)
-                yield from self._attendance.on_message(name, message, self.tick)
-                if name in self.vehicles:
-                    self._report_stored(name, now_s)
-            case Wakeup() if now_s >= self.wakeup_s:
-                yield from self._on_tick(now_s)
-            case Started():
-                yield Listen(COMMAND)
-                yield Watch(VEHICLE_ALIVE)
-                yield Announce(BRIDGE_ALIVE, {"incarnation": self.bridge})
-            case _:
-                pass
+    @property
+    def wakeup_s(self) -> float:
+        """Time of the next tick."""
+        return self.began_s + (self.tick + 1) * self._road.scenario.runtime.tick_s
 
     def prefer(self, preferred_lanes: Mapping[Name, int]) -> None:
         """Change the preferred lanes of all vehicles, also of those that enter later."""
@@ -149,144 +212,72 @@ class LightRoad:
         for name, vehicle in self.vehicles.items():
             vehicle.prefer(preferred_lanes[name])
 
+    def _new_vehicle(
+        self, admission: Admission, t_s: float, scenario: Scenario, bridge: int
+    ) -> LightVehicle:
+        name = Name(admission.arrival.vehicle)
+        vehicle = LightVehicle.visiting(self._visits[name], admission, t_s, scenario, bridge)
+        if name in self._preferred_lanes:
+            vehicle.prefer(self._preferred_lanes[name])
+        return vehicle
+
+    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
+        """Handle an event; see `Core`."""
+        try:
+            for effect in self._on_event(event, now_s):
+                if not (isinstance(effect, Send) and self._loses(effect)):
+                    yield effect
+        except BadInputError as error:
+            yield Refuse(error)
+
+    def _loses(self, effect: Send) -> bool:
+        message = effect.message
+        return isinstance(message, Sense) and self._reception(message.vehicle) is Reception.LOST
+
+    def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
+        road = self._road
+        road.attendance.on_network(event, now_s)
+        match event:
+            case Arrived(_, _, Command() as command):
+                yield from self._on_command(command, now_s)
+            case Arrived(_, parameters, (Prepare() | Plan()) as message):
+                name = Name(parameters["vehicle"])
+                yield from road.on_ballot(name, message)
+                if name in self.vehicles:
+                    self._checked.report_stored(now_s, self.vehicles[name])
+            case Wakeup() if now_s >= self.wakeup_s:
+                yield from self._end_tick()
+                yield from self._begin_tick(now_s)
+            case Started():
+                # The agents start at the same time.
+                road.attendance.on_network(LinkUp(), now_s)
+                yield from road.connect()
+                yield from self._begin_tick(now_s)
+            case _:
+                pass
+
     def _on_command(self, command: Command, now_s: float) -> Iterator[Effect]:
         vehicle = self.vehicles.get(command.vehicle)
         reception = self._reception(command.vehicle)
         if vehicle is None or reception is Reception.LOST or command.tick > self.tick:
             return
-        controller = vehicle.controller
-        held, name = controller.hold_cell, command.vehicle
-        self._bounds.check(command, self.t_s, now_s)
-        self._bounds.check_claim(command.record.incarnation, controller.record.incarnation, now_s)
-        if self._attendance.register_command(vehicle, command):
-            self._report_stored(name, now_s)
-            if self._reception(name) is not Reception.LOST:
-                yield self._sense_of(name, vehicle)
-        if reception is Reception.LATE:
-            return
-        try:
-            taken = yield from self._attendance.accept_command(vehicle, command)
-        except BadInputError:
-            taken = False
-        self.refused += not taken
-        self._report_stored(name, now_s)
-        if controller.hold_cell != held:
-            lasts_s = self._move_lasts_s()
-            move = (held, controller.hold_cell)
-            self._checker.begin(
-                now_s, name, command.record.incarnation, move, lasts_s, vehicle.latest_s
-            )
-            (column, lane), (to_column, to_lane) = move
-            if (to_column - column, to_lane - lane) not in vehicle.drivable:
-                self._checker.undrivable(now_s, name, move)
-            vehicle.body.go(controller.hold_cell, now_s - self.began_s, lasts_s)
+        held = vehicle.cell
+        in_time = reception is Reception.IN_TIME
+        yield from self._road.on_command(command, now_s, in_time=in_time)
+        self._checked.report_stored(now_s, vehicle)
+        if vehicle.cell != held:
+            self._checked.begin_move(vehicle, held, now_s, self._move_lasts_s())
 
-    # --- the tick -----------------------------------------------------------------------------
-
-    def _on_tick(self, now_s: float) -> Iterator[Effect]:
-        self.tick += 1
-        t_s = self.t_s
+    def _begin_tick(self, now_s: float) -> Iterator[Effect]:
         self._checker.advance(now_s)
-        self._let_enter(now_s)
-        self._control_lane_ends(now_s)
-        self._close_formations()
-        self._entrance.assign_empty_cells(self.vehicles)
-        yield from self._let_leave(now_s)
-        for name, vehicle in self.vehicles.items():
-            self._report_stored(name, now_s)
-            vehicle.body.t_s = t_s
-            self._check_lane(name, vehicle, now_s)
-        yield from self._attend(now_s)
-        self._attendance.start_tick(self.vehicles, now_s)
-        for name, vehicle in self.vehicles.items():
-            if self._reception(name) is not Reception.LOST:
-                yield self._sense_of(name, vehicle)
-        yield from self._attendance.states(self.tick)
-        yield from self._entrance.publish(self.tick, t_s, self.vehicles.values())
+        self._road.admit()
+        self._road.enter()
+        yield from self._road.begin_tick(now_s)
+        self._checked.check_lanes(now_s)
+        for vehicle in self.vehicles.values():
+            self._checked.report_stored(now_s, vehicle)
 
-    def _sense_of(self, name: Name, vehicle: LightVehicle) -> Effect:
-        sense = vehicle.sense(self.tick, caretaker=name in self._attendance)
-        return Send(SENSE, sense, {"vehicle": name})
-
-    def _let_enter(self, now_s: float) -> None:
-        for admission in self._entrance.admit(self.t_s):
-            name = Name(admission.arrival.vehicle)
-            vehicle = LightVehicle(self._visits[name], admission, self._scenario, self.bridge)
-            self.vehicles[name] = vehicle
-            if name in self._preferred_lanes:
-                vehicle.prefer(self._preferred_lanes[name])
-            self._checker.enter(now_s, name, admission.cell, vehicle.block)
-
-    def _close_formations(self) -> None:
-        for closed in self._entrance.close_formations(self.t_s):
-            for vehicle in self.vehicles.values():
-                if vehicle.block in closed.blocks:
-                    vehicle.join(closed)
-
-    def _control_lane_ends(self, now_s: float) -> None:
-        """Let vehicles stop before the end of their lane, and come back; see `LaneEndControl`.
-
-        For the checker, a vehicle without cells has left the road.
-        """
-        for change in self._entrance.control_lane_ends(self.vehicles, self.t_s):
-            vehicle = self.vehicles[change.vehicle]
-            self._attendance.begin_anew(vehicle, self.tick)
-            cell = vehicle.controller.hold_cell
-            if change.kind == MISSED_EXIT:
-                self._checker.give_up_move(now_s, change.vehicle, cell)
-                vehicle.body.go(cell, self.t_s, self._tick_s)
-            elif change.kind == LEFT_LATTICE:
-                self._checker.leave(now_s, change.vehicle)
-                end = self._lane_ends.ahead(change.lane, vehicle.body.state[0])
-                vehicle.body.stop_at(math.inf if end is None else end.line_m)
-            elif change.kind == DRIVES_OUT:
-                vehicle.body.drive_out(cell, self.t_s, DRIVE_OUT_S)
-            elif change.kind == ENTERED_LATTICE:
-                self._checker.enter(now_s, change.vehicle, cell, vehicle.block)
-
-    def _check_lane(self, name: Name, vehicle: LightVehicle, now_s: float) -> None:
-        """Report a body in a lane that has ended, also partly at an exit."""
-        s_m, _, _, y_m, _, _ = vehicle.body.state
-        touched = self._scenario.lattice.lanes_touched(y_m, self._scenario.vehicle.width_m)
-        for lane in {*touched}:
-            exit_lane = self._lane_ends.exit_ahead(lane, s_m)
-            if exit_lane is not None and s_m > exit_lane.end_m + self._tick_m:
-                self._checker.beyond_end(
-                    now_s, name, f"in lanes {touched} at {s_m:.1f} m, exit at {exit_lane.end_m:g} m"
-                )
-        end = self._lane_ends.ahead(int(y_m // self._scenario.road.lane_width_m), s_m)
-        if end is not None and s_m > end.end_m:
-            self._checker.beyond_end(
-                now_s, name, f"at {s_m:.1f} m, its lane ends at {end.end_m:g} m"
-            )
-
-    def _report_stored(self, name: Name, now_s: float) -> None:
-        controller = self.vehicles[name].controller
-        if controller.off_lattice is not None:
-            return
-        self._checker.store(now_s, name, controller.record)
-
-    def _let_leave(self, now_s: float) -> Iterator[Effect]:
-        leaving = [
-            name
-            for name, each in self.vehicles.items()
-            if each.leaves_by(self.t_s)
-            or self._exits.left_by(each.body_lane, each.body.state[0]) is not None
-        ]
-        for name in leaving:
-            vehicle = self.vehicles.pop(name)
-            yield from self._attendance.leave(vehicle)
-            if vehicle.controller.off_lattice is None:
-                self._checker.leave(now_s, name)
-            self._entrance.on_left(vehicle, self.vehicles, self.t_s)
-        yield from self._attendance.notify_departed(self.tick)
-
-    def _attend(self, now_s: float) -> Iterator[Effect]:
-        """Let caretakers take charge of vehicles with absent or silent agents."""
-        self._attendance.answers.update_durations(now_s)
-        for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
-            if absence is Absence.ABSENT and self.t_s < vehicle.admission.t_s + AGENT_START_S:
-                continue
-            self.takeovers += 1
-            yield from self._attendance.take_charge(vehicle, self.tick)
-            self._report_stored(vehicle.name, now_s)
+    def _end_tick(self) -> Iterator[Effect]:
+        self._road.step()
+        for vehicle in self._road.departed():
+            yield from self._road.remove(vehicle)

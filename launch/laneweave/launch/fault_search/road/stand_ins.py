@@ -1,6 +1,6 @@
-"""Fast stand-ins for the costly parts of a run: bodies, trajectory drivers, the rolling planner.
+"""Fast stand-ins for the costly parts of agents and coordinators: trajectories, rolling planner.
 
-Safety does not depend on any of them.
+Safety does not depend on either of them.
 """
 
 from __future__ import annotations
@@ -8,10 +8,6 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Collection, Mapping, Sequence
-
-import attrs
-from attrs import frozen
-from msgspec.structs import replace
 
 from laneweave.agents.driving.driver import Drive, SolverStats
 from laneweave.coordinator.planning.rolling.problem import (
@@ -24,147 +20,11 @@ from laneweave.coordinator.rolling.checked_planner import stream_road
 from laneweave.protocol.lattice import Cell, PlannedMove, displacements, footprint
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
-from laneweave.protocol.vehicle.motion import State, at_rest_in_cell
-from laneweave.protocol.wire.messages import CAR, Motion, Name, Sense
-from laneweave.sim_bridge.bodies.motion_controller import MotionController
-from laneweave.sim_bridge.bodies.plant import Plant
-from laneweave.sim_bridge.road.entry import Admission
-from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from laneweave.protocol.vehicle.motion import at_rest_in_cell
+from laneweave.protocol.wire.messages import Motion, Sense
 
 UNNEEDED_MOVES = 0.4
 """Probability with which the planner moves a vehicle that is in its preferred lane."""
-SYNC_S = 1.0
-"""Interval at which a vehicle's clock is synchronized; it drifts in between."""
-
-
-@frozen
-class Visit:
-    """A vehicle's entry cell, entry and exit times, and clock errors."""
-
-    vehicle: Name
-    cell: Cell
-    """Cell in which the vehicle enters; at the real roadside, only its lane counts."""
-    enters_s: float
-    """Time of entry, or of arrival at the real roadside."""
-    leaves_s: float | None
-    """Exit time; None: the vehicle stays until the end of the road."""
-    clock_offset_s: float = 0.0
-    clock_drift: float = 0.0
-    """Error of the clock rate: seconds gained per second."""
-    vehicle_type: str = CAR
-
-
-class LightBody(Plant):
-    """Body that moves straight from cell to cell in given times."""
-
-    def __init__(self, scenario: Scenario, limits: Vehicle, cell: Cell) -> None:
-        """Start at rest in a cell."""
-        super().__init__((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), limits, scenario.runtime.tick_s)
-        self.t_s = 0.0
-        """Time of the newest tick."""
-        self._lattice = scenario.lattice
-        self._origin: tuple[float, float] = cell
-        self._goal: Cell = cell
-        self._begin_s = self._end_s = 0.0
-        self._stop_m = math.inf
-        """Position at which the body waits; infinite while it is on the lattice."""
-
-    @property
-    def state(self) -> State:
-        """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2) at the newest tick."""
-        column, lane = self._place(self.t_s)
-        lattice = self._lattice
-        s_m = lattice.speed_mps * self.t_s + column * lattice.pitch_m
-        y_m = (lane + 0.5) * lattice.lane_width_m
-        if s_m >= self._stop_m:
-            return (self._stop_m, 0.0, 0.0, y_m, 0.0, 0.0)
-        return (s_m, lattice.speed_mps, 0.0, y_m, 0.0, 0.0)
-
-    def go(self, cell: Cell, now_s: float, lasts_s: float) -> None:
-        """Begin a motion to a cell from the current position."""
-        self._origin, self._goal = self._place(now_s), cell
-        self._begin_s, self._end_s = now_s, now_s + lasts_s
-
-    def stop_at(self, s_m: float) -> None:
-        """Drive on to a position, and wait there."""
-        self._stop_m = s_m
-
-    def drive_out(self, cell: Cell, now_s: float, lasts_s: float) -> None:
-        """Begin a motion from the place where the body waits to a cell."""
-        column = (self._stop_m - self._lattice.speed_mps * now_s) / self._lattice.pitch_m
-        self._origin, self._goal = (column, self._goal[1]), cell
-        self._begin_s, self._end_s = now_s, now_s + lasts_s
-        self._stop_m = math.inf
-
-    def has_arrived(self, now_s: float) -> bool:
-        """Return whether the body is in the centre of its target cell."""
-        return now_s >= self._end_s
-
-    def _place(self, t_s: float) -> tuple[float, float]:
-        if t_s >= self._end_s:
-            return self._goal
-        share = (t_s - self._begin_s) / (self._end_s - self._begin_s)
-        (column, lane), (to_column, to_lane) = self._origin, self._goal
-        return (column + share * (to_column - column), lane + share * (to_lane - lane))
-
-
-class LightVehicle(RoadVehicle):
-    """Vehicle with a simplified body, its own clock and a variable preferred lane."""
-
-    def __init__(
-        self, visit: Visit, admission: Admission, scenario: Scenario, bridge: int = 0
-    ) -> None:
-        """Start at rest in the cell of the admission."""
-        own = scenario.types[admission.arrival.vehicle_type]
-        self.drivable = own.moves
-        """Moves (columns, lanes) that the type of the vehicle drives."""
-        self.body = LightBody(scenario, own.limits, admission.cell)
-        super().__init__(
-            visit.vehicle,
-            admission,
-            MotionController(self.body, scenario, admission.cell),
-            bridge=bridge,
-        )
-        self.controller.enter_lattice((admission.cell,))
-        if not scenario.formation.closes_by_vehicles:
-            self.formation = self.controller.record.joined[0]
-        self.clock_jump_s = 0.0
-        """Error of the vehicle's clock by jumps, in addition to that of the visit."""
-        self.latest_s = 0.0
-        """Latest road time that the vehicle's clock has shown."""
-        self._visit = visit
-        self._speed_mps = scenario.lattice.speed_mps
-
-    @property
-    def preferred_lane(self) -> int:
-        """Preferred lane."""
-        return self.admission.arrival.preferred_lane
-
-    def leaves_by(self, t_s: float) -> bool:
-        """Return whether the vehicle leaves the road by a given time."""
-        return self._visit.leaves_s is not None and t_s >= self._visit.leaves_s
-
-    def prefer(self, lane: int) -> None:
-        """Change the preferred lane."""
-        arrival = attrs.evolve(self.admission.arrival, preferred_lane=lane)
-        self.admission = attrs.evolve(self.admission, arrival=arrival)
-
-    def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
-        """Return the SENSE message as seen by the vehicle's own clock.
-
-        The vehicle knows its position in the lattice from its neighbours: a wrong clock makes it
-        act early or late, but does not shift its cell.
-        """
-        sense = super().sense(tick, caretaker=caretaker, left=left)
-        visit = self._visit
-        drifted_s = visit.clock_offset_s + visit.clock_drift * (sense.t_s % SYNC_S)
-        ahead_s = max(drifted_s + self.clock_jump_s, -sense.t_s)
-        self.latest_s = max(self.latest_s, sense.t_s + ahead_s)
-        if ahead_s == 0.0:
-            return sense
-        s, v, a, y, v_y, a_y = sense.measured
-        state = (s + self._speed_mps * ahead_s, v, a, y, v_y, a_y)
-        return replace(sense, t_s=sense.t_s + ahead_s, measured=state)
 
 
 class LightDriver:
