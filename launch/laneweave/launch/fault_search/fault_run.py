@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import count
 from typing import Any
@@ -20,8 +20,8 @@ from attrs import field, frozen
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
-from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
+from laneweave.launch.fault_search.arrivals import Arrivals
 from laneweave.launch.fault_search.checks.checker import Checker
 from laneweave.launch.fault_search.checks.geometry import Geometry
 from laneweave.launch.fault_search.checks.violations import Violation
@@ -34,7 +34,6 @@ from laneweave.launch.fault_search.road.stand_ins import LightDriver, LightPlann
 from laneweave.launch.fault_search.story import Story
 from laneweave.launch.fault_search.timeline import Timeline
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Compute, Core, Effect, Event, Send
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
@@ -49,16 +48,6 @@ INCARNATIONS_PER_S = 10_000
 """Lead of incarnations per second by which a clock is ahead."""
 MAX_MOTION_SLOTS = 3.0
 """Maximum duration of a slow motion, in slots."""
-PATIENCE_S = 90.0
-"""Time limit for all vehicles to arrive after the fault phase."""
-MAX_FUTILE_PLANS = 5
-"""Number of plans after which a vehicle that has not moved counts as stuck."""
-MIN_ROAD_S = 10.0
-"""Time after its beginning at which slots of a road must have been planned."""
-HEALTHY_SLOTS = 8
-"""Number of slots after the fault phase (rolling operation)."""
-STANDING_S = 120.0
-"""Time after these slots in which vehicles that stand before the end of a lane must drive on."""
 NOTICE_S = 0.1
 """Time after which a candidate must have noticed that it is disconnected."""
 ELECTED_S = 5.0
@@ -171,7 +160,7 @@ class FaultRun:
                 scenario.formation.gap_m, scenario.road.lane_width_m, size.length_m, size.width_m
             ),
             timeline.add if timeline is not None else None,
-            rolling=self._rolling,
+            rolling=self.setup.road.rolling,
         )
         self._features: set[str] = set()
         """Rules and guards reached so far."""
@@ -186,14 +175,7 @@ class FaultRun:
             self.checker.claims.harmful,
             self._log,
         )
-        self._proposed: Counter[str] = Counter()
-        """Number of plans after the fault phase that move or hold each vehicle."""
-        self._planned_slots = 0
-        """Number of plans after the fault phase (rolling operation)."""
-        self._first_cells: dict[Name, Cell] = {}
-        """First cell of each vehicle after the fault phase (rolling operation)."""
-        self._moved: set[Name] = set()
-        """Vehicles that have moved since the fault phase."""
+        self._arrivals = Arrivals(self.setup, story.fault_s)
         self._preferences = story.preferences[0].lanes
         self._takeovers = 0
         """Number of takeovers by caretakers on earlier roads."""
@@ -210,9 +192,8 @@ class FaultRun:
         self.faults.plan(story.events)
         for change in story.preferences[1:]:
             network.at(change.t_s, self._change_preferences, change.lanes)
-        network.at(story.fault_s, self.faults.heal)
-        end_s = story.fault_s + self._patience_s
-        while network.now_s < end_s and not self._is_over():
+        network.at(story.fault_s, self._heal)
+        while network.now_s < self._arrivals.limit_s and not self._is_over():
             network.run(network.now_s + CHECK_S)
             while network.failed_jobs:
                 failed = network.failed_jobs.pop()
@@ -223,14 +204,7 @@ class FaultRun:
             if self.faults.healed:
                 self._restart_agents()
         self.checker.advance(network.now_s)
-        for name in self._not_arrived():
-            vehicle = self.road.vehicles[name]
-            text = f"in {vehicle.controller.hold_cell}, prefers lane {vehicle.preferred_lane}"
-            self.checker.stuck(network.now_s, name, text)
-        if self._rolling and not self.checker.violations:
-            for name in self._standing:
-                self.checker.stuck(network.now_s, name, "it stands before the end of its lane")
-            self._check_planning()
+        self._arrivals.check(network.now_s, self.road, self.checker)
         return self._result(time.process_time() - began_s)
 
     # --- processes ----------------------------------------------------------------------------
@@ -239,11 +213,7 @@ class FaultRun:
     def agents(self) -> tuple[str, ...]:
         """Agents of the vehicles that have not left the road."""
         road_s = self.network.now_s - self.road.began_s
-        return tuple(
-            visit.vehicle
-            for visit in self.setup.visits
-            if visit.leaves_s is None or road_s < visit.leaves_s
-        )
+        return tuple(visit.vehicle for visit in self.setup.visits if road_s < visit.until_s)
 
     @property
     def leaders(self) -> tuple[str, ...]:
@@ -310,28 +280,9 @@ class FaultRun:
         return road
 
     def _make_planner(self, scenario: Scenario) -> Planner:
-        """Return a planner that, after the fault phase, counts its plans for each vehicle."""
         exact = self.setup.road.stream_planner
         planner = stream_planner(scenario) if exact else LightPlanner(scenario).plan
-
-        def plan(
-            slot: int,
-            vehicles: Sequence[StreamVehicle],
-            before: StreamPlan | None,
-            blocked: Collection[Cell],
-            ends_m: Mapping[int, float],
-        ) -> StreamPlan:
-            table = planner(slot, vehicles, before, blocked, ends_m)
-            if self.faults.healed:
-                self._planned_slots += 1
-                paths = table.paths.items()
-                self._proposed.update(vehicle.vehicle for vehicle in vehicles if vehicle.held)
-                self._proposed.update(
-                    name for name, path in paths if len(path) > 1 and path[0] != path[1]
-                )
-            return table
-
-        return plan
+        return self._arrivals.counted(planner)
 
     def _leads(self, name: str) -> bool:
         if name not in self.network:
@@ -431,102 +382,13 @@ class FaultRun:
 
     # --- outcome ------------------------------------------------------------------------------
 
+    def _heal(self) -> None:
+        self.faults.heal()
+        self._arrivals.healed = True
+
     def _is_over(self) -> bool:
-        self._record_moves()
-        if self.checker.violations:
-            return True
-        if self._rolling:
-            healthy_s = self.network.now_s - self.story.fault_s
-            return healthy_s >= self._healthy_s and not self._standing
-        return self.faults.healed and not self._under_way and not self._not_arrived()
-
-    @property
-    def _rolling(self) -> bool:
-        return self.setup.road.rolling
-
-    @property
-    def _patience_s(self) -> float:
-        if self._rolling:
-            return self._healthy_s + STANDING_S
-        return PATIENCE_S + STANDING_S if self._last_change_m else PATIENCE_S
-
-    @property
-    def _healthy_s(self) -> float:
-        """Time after the fault phase for which slots are planned (rolling operation)."""
-        return HEALTHY_SLOTS * self.setup.scenario.timing.cycles_s[0]
-
-    @property
-    def _standing(self) -> list[Name]:
-        """Vehicles that have stopped before the end of their lane."""
-        vehicles = self.road.vehicles.items()
-        return [name for name, one in vehicles if one.controller.off_lattice is not None]
-
-    @property
-    def _last_change_m(self) -> float:
-        """Position behind which the lanes of the road do not change any more; 0: they never do."""
-        scenario = self.setup.scenario
-        changes_m = {
-            position_m
-            for section in scenario.geometry.sections
-            for position_m in (section.from_m, section.to_m)
-            if 0.0 < position_m < scenario.road.length_m
-        }
-        return max(changes_m, default=0.0)
-
-    @property
-    def _under_way(self) -> bool:
-        """Whether vehicles have not passed all places where lanes change (formations)."""
-        last_m = self._last_change_m
-        return any(each.body.state[0] < last_m for each in self.road.vehicles.values())
-
-    @property
-    def _free(self) -> Collection[Name]:
-        """Vehicles without a preferred lane: they have missed their exit (formations)."""
-        return () if self._rolling else self.setup.leaving
-
-    def _record_moves(self) -> None:
-        """Record which vehicles have moved since the fault phase (rolling operation)."""
-        if self._rolling and self.faults.healed:
-            for name, vehicle in self.road.vehicles.items():
-                cell = vehicle.controller.hold_cell
-                if self._first_cells.setdefault(name, cell) != cell:
-                    self._moved.add(name)
-
-    def _check_planning(self) -> None:
-        """Check that slots have been planned since the fault phase (rolling operation)."""
-        vehicles = self.road.vehicles
-        if vehicles and self.road.t_s > MIN_ROAD_S and not self._planned_slots:
-            name = next(iter(vehicles))
-            self.checker.stuck(self.network.now_s, name, "no slot is planned")
-
-    def _not_arrived(self) -> list[Name]:
-        """Return the vehicles that should be at rest in their preferred lanes, but are not.
-
-        In the rolling operation, these are vehicles that have not moved although plans move them:
-        one that has moved need not be in its preferred lane, which may be full.
-        """
-        if self.checker.violations or not self.faults.healed:
-            return []
-        road_s = self.network.now_s - self.road.began_s
-        not_arrived = [
-            name
-            for name, vehicle in self.road.vehicles.items()
-            if vehicle.controller.off_lattice is None
-            and (
-                (
-                    vehicle.controller.hold_cell[1] != vehicle.preferred_lane
-                    and name not in self._free
-                )
-                or not vehicle.body.has_arrived(road_s)
-            )
-        ]
-        if not self._rolling:
-            return not_arrived
-        return [
-            name
-            for name in not_arrived
-            if name not in self._moved and self._proposed[name] >= MAX_FUTILE_PLANS
-        ]
+        complete = self._arrivals.complete(self.network.now_s, self.road)
+        return complete or bool(self.checker.violations)
 
     def _result(self, cpu_s: float) -> SeedResult:
         network, checker = self.network, self.checker

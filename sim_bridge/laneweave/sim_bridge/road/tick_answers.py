@@ -8,10 +8,8 @@ Answers after the deadline indicate a slow machine rather than lost messages. Ti
 time, and SENSE is repeated less often, so that the road slows down and agents keep up. When answers
 arrive in time again, the extra time slowly shrinks.
 
-An agent answers every SENSE, also a repeated one. If agents answer fewer than they were sent,
-messages are lost. While they are, SENSE is repeated as soon as no more answers arrive, in several
-copies, and a tick lasts no longer than in real time. An agent that answers no SENSE at all, because
-it hangs, is not evidence of loss.
+While messages are lost (`message_loss`), SENSE is repeated as soon as no more answers arrive, in
+several copies, and a tick lasts no longer than in real time.
 
 Times are on the node's clock. Each tick counts for at most its deadline; other waits of the road
 (pace, starting agents) do not count as silence.
@@ -20,13 +18,13 @@ Times are on the node's clock. Each tick counts for at most its deadline; other 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable
 
 from attrs import define, field
 
 from laneweave.protocol.scenario.deployment_fields import Runtime
 from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.road.message_loss import MessageLoss
 
 MAX_STRETCH = 8.0
 """Maximum factor of `tick_deadline_s`."""
@@ -39,8 +37,6 @@ _LATE_AGENTS_LOSSY = 1.0 / 3.0
 so some agents are late on a fast machine, too."""
 LATE_SHARE = 2.0
 """Multiple of `agent_silent_s` after which an agent that always answers late is replaced."""
-LOSSY_SHARE = 0.9
-"""Share of answered SENSE messages below which messages count as lost."""
 LOSSY_TICK = 0.6
 """Deadline of a tick while messages are lost, as a multiple of `tick_s`."""
 LOSSY_ROUNDS = 6
@@ -53,8 +49,6 @@ _FLOOR = 0.1
 """Minimum wait for further answers, as a multiple of `tick_resend_s`."""
 _ROUND_TRIPS = 1.5
 """The same, as a multiple of the shortest round trip."""
-_MEMORY = 0.95
-"""Multiplier of the numbers of earlier SENSE messages and answers at each tick."""
 _FORGET = 1.1
 """Multiplier of the round-trip time at each tick, to detect that it has increased."""
 _ROUNDING_S = 1e-6
@@ -92,17 +86,7 @@ class Answers:
     """Total duration of ticks since the last message from any agent."""
     _missing: set[Name] = field(factory=set)
     """Agents whose answers the last tick awaited in vain."""
-    _asked: Counter[Name] = field(factory=Counter)
-    """SENSE messages to each awaited agent since the current tick started."""
-    _received: Counter[Name] = field(factory=Counter)
-    """Answers to any tick from each agent since the current tick started."""
-    _asked_last: int = 0
-    """SENSE messages in the last tick to agents that answered any."""
-    _asked_before: float = 0.0
-    """Weighted number of such messages in the ticks before: their answers have arrived or are
-    lost."""
-    _received_before: float = 0.0
-    """Weighted number of answers until the last tick."""
+    _loss: MessageLoss = field(factory=MessageLoss)
     _round_s: float | None = None
     """Time at which the last round of SENSE was sent; None: it is being sent."""
     _first_round_s: float | None = None
@@ -117,8 +101,8 @@ class Answers:
 
     @property
     def lossy(self) -> bool:
-        """Whether messages are lost: agents answer fewer SENSE messages than they are sent."""
-        return self._received_before < LOSSY_SHARE * self._asked_before
+        """Whether messages are lost."""
+        return self._loss.lossy
 
     def agent_up(self, name: Name) -> None:
         """Register an agent's token and reset its counters."""
@@ -149,8 +133,8 @@ class Answers:
             now_s: the node's clock.
             current: whether it answers the current tick.
         """
-        first = not self._received
-        self._received[name] += 1
+        first = not self._loss.received
+        self._loss.received[name] += 1
         if self._first_round_s is not None and current and first:
             self._round_trip_s = min(self._round_trip_s, now_s - self._first_round_s)
         if self.lossy and self._round_s is not None:
@@ -205,24 +189,15 @@ class Answers:
         self._stretch *= _STRETCH if slow else _RELAX
         self._stretch = min(max(self._stretch, 1.0), MAX_STRETCH)
         self._late.clear()
-        self._estimate_loss()
+        self._loss.start_tick()
+        self._round_trip_s *= _FORGET
         self._sent_s, self._first_round_s = now_s, None
         self._begin_round(now_s, self.awaited)
         self.deadline_s = now_s + self._stretch * self._patience_s
 
-    def _estimate_loss(self) -> None:
-        """Compare the answers with the SENSE messages of one tick before: some arrive late."""
-        received = sum(count for name, count in self._received.items() if name in self._asked)
-        self._asked_before = _MEMORY * self._asked_before + self._asked_last
-        self._received_before = _MEMORY * self._received_before + received
-        self._asked_last = sum(self._asked[name] for name in self._received)
-        self._asked.clear()
-        self._received.clear()
-        self._round_trip_s *= _FORGET
-
     def _begin_round(self, now_s: float, names: Iterable[Name]) -> None:
         """Register that a SENSE is being sent to agents."""
-        self._asked.update(names)
+        self._loss.on_sent(names)
         if self.lossy:
             # Sending takes time: the wait for answers begins with the next event.
             self._round_s, self.resend_s = None, now_s
@@ -267,7 +242,7 @@ class Answers:
         copies = 1
         if self.lossy:
             # Many messages keep the processors busy, but few rounds of few messages save time.
-            budget = max(FEW, len(self._asked))
+            budget = max(FEW, len(self._loss.asked))
             copies = min(COPIES, max(1, budget // max(1, len(self.awaited))))
         again = [name for name in sorted(self.awaited) for _ in range(copies)]
         self._begin_round(now_s, again)

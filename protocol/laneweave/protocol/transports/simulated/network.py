@@ -17,20 +17,12 @@ import heapq
 import math
 from bisect import insort
 from collections.abc import Callable, Iterable
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import count
 
 from attrs import frozen
 
-from laneweave.protocol.runtime.node import (
-    Arrived,
-    Core,
-    Node,
-    Started,
-    Stopping,
-    known_key,
-    read_message,
-)
+from laneweave.protocol.runtime.node import Core, Node, Started, Stopping
 from laneweave.protocol.runtime.transport import (
     Answer,
     Delivery,
@@ -42,6 +34,7 @@ from laneweave.protocol.runtime.transport import (
     TokenUp,
 )
 from laneweave.protocol.transports.simulated.member import Member, Tokens
+from laneweave.protocol.transports.simulated.parcels import CACHE_SIZE, Parcel, Reader
 from laneweave.protocol.transports.simulated.virtual_time import Clock, Conditions, Simulation
 from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import Name
@@ -51,43 +44,6 @@ KILL_SEEN_S = 0.005
 """Time until others detect a killed process (measured on Zenoh: 2 to 9 ms)."""
 REJOIN_S = (0.2, 0.9)
 """Range of the time that nodes take to reconnect to a restored router (measured on Zenoh)."""
-_CACHE_SIZE = 4096
-"""Size of the shared caches of decoded messages and of keys."""
-
-
-class Parcel(bytes):
-    """A message object that is sent in place of its bytes."""
-
-    message: object
-    arrived: Arrived | None
-    """The event of its newest arrival, which receivers on one key share."""
-    key: str
-    """Key of the newest arrival."""
-
-    def __new__(cls, message: object) -> Parcel:
-        """Wrap a message."""
-        parcel = super().__new__(cls)
-        parcel.message, parcel.arrived, parcel.key = message, None, ""
-        return parcel
-
-
-class _Reader:
-    """Decoder of a realm's messages, which are bytes or objects."""
-
-    def __init__(self, keys: Keys, read_payload: Callable[[bytes, type], object]) -> None:
-        self._known = lru_cache(maxsize=_CACHE_SIZE)(partial(known_key, keys))
-        # A plan has several receivers with different keys, but is decoded only once.
-        read = partial(read_message, keys, decode=read_payload)
-        self._read = lru_cache(maxsize=_CACHE_SIZE)(read)
-
-    def __call__(self, key: str, payload: bytes) -> Arrived:
-        if not isinstance(payload, Parcel):
-            return self._read(key, payload)
-        arrived = payload.arrived
-        if arrived is None or payload.key != key:
-            payload.key = key
-            payload.arrived = arrived = Arrived(*self._known(key), payload.message)
-        return arrived
 
 
 @frozen
@@ -177,8 +133,8 @@ class SimulatedNetwork(Simulation):
         self._token_count = count(1)
         self._label_count = count(1)
         self._member_count = count()
-        self._readers: dict[str, _Reader] = {}
-        self._decode = lru_cache(maxsize=_CACHE_SIZE)(decode)
+        self._readers: dict[str, Reader] = {}
+        self._decode = lru_cache(maxsize=CACHE_SIZE)(decode)
 
     # --- nodes ------------------------------------------------------------------------------
 
@@ -409,10 +365,10 @@ class SimulatedNetwork(Simulation):
 
     # --- internals --------------------------------------------------------------------------
 
-    def _reader(self, realm: str) -> _Reader:
+    def _reader(self, realm: str) -> Reader:
         """Return the reader that all nodes of a realm share."""
         if realm not in self._readers:
-            self._readers[realm] = _Reader(Keys(realm), self._decode)
+            self._readers[realm] = Reader(Keys(realm), self._decode)
         return self._readers[realm]
 
     def _vanish(self, name: str, seen_after_s: float) -> None:

@@ -12,9 +12,9 @@ from laneweave.protocol.runtime.transport import Answer, LinkDown, LinkUp
 from laneweave.protocol.transports.simulated.network import (
     KILL_SEEN_S,
     REJOIN_S,
-    Parcel,
     SimulatedNetwork,
 )
+from laneweave.protocol.transports.simulated.parcels import Parcel
 from laneweave.protocol.transports.simulated.virtual_time import Clock, Conditions
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.topics import COMMAND, HEARTBEAT, SERVICE, VEHICLE_ALIVE, Keys
