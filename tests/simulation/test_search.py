@@ -18,8 +18,8 @@ import pytest
 
 from laneweave.launch.fault_search.fault_run import SeedResult, Totals
 from laneweave.launch.fault_search.profiles import PROFILES
+from laneweave.launch.fault_search.road_setup import SLOT_S
 from laneweave.launch.fault_search.search import replay_command, run_story, run_tasks
-from laneweave.launch.fault_search.setup import SLOT_S
 from laneweave.launch.fault_search.story import Story
 from support.variants import variants
 

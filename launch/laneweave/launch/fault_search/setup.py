@@ -1,8 +1,7 @@
 """Setup of a run: road, vehicles, lasting faults, and preferred lanes.
 
-In the rolling operation the road is short, because plans extend to its end. On a drawn entrance,
-some vehicles are in S3 at the start, and the others enter behind them. At the real roadside, all
-vehicles enter one after another.
+On a drawn entrance, some vehicles are in S3 at the start (rolling operation), and the others enter
+behind them. At the real roadside, all vehicles enter one after another.
 """
 
 from __future__ import annotations
@@ -17,59 +16,50 @@ from attrs import evolve, frozen
 from laneweave.launch.fault_search.events.lasting_faults import (
     CLOCK_DRIFT,
     CLOCK_OFFSET_S,
-    LEASE_S,
     LastingFaults,
 )
 from laneweave.launch.fault_search.profiles import Profile
 from laneweave.launch.fault_search.road.drawn_entrance import DrawnTraffic, Grant, drawn_roadside
 from laneweave.launch.fault_search.road.drawn_roads import (
     EXIT,
-    STRAIGHT_ROAD,
     DrawnRoad,
     draw_road,
 )
 from laneweave.launch.fault_search.road.light_vehicle import Visit
+from laneweave.launch.fault_search.road_setup import (
+    BLOCK_COLUMNS,
+    MAX_SIZE,
+    MODES,
+    TRUCK,
+    RoadSetup,
+    draw_rolling_road,
+    rng_of_types,
+)
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import END_OF_ROAD
-from laneweave.protocol.scenario.deployment_fields import Network, Runtime
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import FormationSettings
-from laneweave.protocol.scenario.road_tables import Closure, Road
-from laneweave.protocol.scenario.vehicle_tables import VehicleTypeSettings
+from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.protocol.wire.messages import CAR, ClosedFormation, Name
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.roadside import Roadside
 
-TICK_S = 0.1
 LEAVES_S = (2.0, 9.0)
 """Range of times that vehicles spend on the road if they leave during the fault phase."""
 
 MEAN_HEADWAYS_S = (0.3, 3.0)
 """Range of the mean headway, beyond the minimum of 1 s, between arrivals at the real roadside."""
 
-# Operation in formations
-SLOT_S, MOVE_S = 1.0, 0.8
-MODES = (1, 1, 2)
 LAST_COLUMNS = (1, 1, -3, -7)
 """Rear columns of the rearmost formation to draw from. Vehicles in columns >= 0 are on the road at
 the start; the others enter later, and the formation closes when its rear column enters."""
-BLOCK_COLUMNS = 4
 LENGTHS = (2, 7)
 """Range of formation lengths if they differ, in columns."""
 GAPS = (0, 0, 1)
 """Gaps to draw from, between formations of different lengths, in columns."""
-MAX_SIZE = 6
-"""Maximum number of vehicles in a formation."""
 MAX_JOINED_SIZE = 10
 """Maximum number of vehicles in two formations that may join, to limit planning time."""
 
-# Rolling operation
-SLOTS_S = (1.0, 1.0, 1.0, 2.0)
-"""Slot lengths to draw from. Ballots often abort with the shortest."""
-MOVE_SHARE = 0.8
-"""Duration of a move as a share of the slot."""
-SLOTS_ON_ROAD = 45
-"""Length of the road, as the number of slots that a column takes to pass it."""
 MAX_BEHIND = 3
 """Number of empty cells that the last vehicle in a lane owns behind itself."""
 BEFORE_COLUMNS = (3, 4, 6)
@@ -78,78 +68,8 @@ LANE_ENDS_M = (150.0, 300.0)
 """Range of distances between the first position of moves and the end of lane 0."""
 WITH_TRUCKS = 0.3
 """Share of drawn roads with trucks."""
-TRUCK = VehicleTypeSettings("truck", 0.3, max_accel_mps2=4.0)
-"""A type that cannot change columns in the short slots of the fault search. It has the size of
-cars, since sizes and brakes do not matter to light bodies."""
 LEAVING = 0.4
 """Share of vehicles that leave by the exit of a drawn road."""
-STREAM_PLANNER = 0.05
-"""Share of runs with the stream planner, which takes ten times as long as the rest of a run."""
-
-
-@frozen(kw_only=True)
-class RoadSetup:
-    """Road and operation of a run."""
-
-    lanes: int
-    rolling: bool = False
-    roadside: bool = False
-    """Whether vehicles enter at the real roadside."""
-    growing: bool = False
-    """Whether formations have different lengths."""
-    max_joined: int = 1
-    max_vehicles: int = MAX_SIZE
-    """Maximum number of vehicles in a formation at the real roadside."""
-    slot_s: float = SLOT_S
-    move_s: float = MOVE_S
-    mode: int = 1
-    before_m: float = 0.0
-    """Length of the road before S3."""
-    seed: int = 0
-    stream_planner: bool = False
-    """Whether the stream planner replaces `LightPlanner` (rolling operation)."""
-    trucks: bool = False
-    """Whether there are vehicles that do not change columns (at the roadside)."""
-    drawn: DrawnRoad = STRAIGHT_ROAD
-    """Closed parts, ramps and exits (at the real roadside)."""
-
-    def make_scenario(self) -> Scenario:
-        """Return the scenario of the road."""
-        if self.rolling:
-            formation = FormationSettings(
-                operation="rolling",
-                cycle_s=self.slot_s,
-                move_s=self.move_s,
-                mode=self.mode,
-                sort_in_s2=False,
-            )
-            s3_m = SLOTS_ON_ROAD * self.slot_s * formation.speed_mps
-        else:
-            formation = FormationSettings(
-                operation="formations",
-                close="vehicles" if self.growing else "columns",
-                block_columns=BLOCK_COLUMNS,
-                max_vehicles=self.max_vehicles,
-                cycle_s=self.slot_s,
-                move_s=self.move_s,
-                max_joined=self.max_joined,
-                mode=self.mode,
-                # Limit planning by nodes: a deadline would make plans depend on the machine.
-                planning_deadline_s=3600.0,
-                max_nodes=500,
-            )
-            s3_m = 20_000.0
-        drawn = self.drawn
-        return Scenario(
-            road=Road(self.lanes, s1_m=0.0, s2_m=self.before_m, s3_m=s3_m, closures=drawn.closures),
-            entrance=drawn.entrance,
-            exit=drawn.exit,
-            vehicle_type=(TRUCK,) if self.trucks else (),
-            formation=formation,
-            network=Network(heartbeat_s=0.2, election_s=0.6, lease_s=LEASE_S),
-            runtime=Runtime(tick_s=TICK_S, agent_silent_s=1.5),
-            seed=self.seed,
-        )
 
 
 @frozen
@@ -211,7 +131,7 @@ class Setup:
 
     @classmethod
     def _drawn_rolling(cls, profile: Profile, lanes: int, rng: random.Random) -> Setup:
-        road = _draw_rolling_road(lanes, rng)
+        road = draw_rolling_road(lanes, rng)
         scenario = road.make_scenario()
         lasting = LastingFaults.drawn(profile, rng)
         # At least the foremost column is in S3 at the start.
@@ -235,7 +155,7 @@ class Setup:
     @classmethod
     def _drawn_at_roadside(cls, profile: Profile, lanes: int, rng: random.Random) -> Setup:
         if profile.rolling:
-            road = _draw_rolling_road(lanes, rng, before_columns=rng.choice(BEFORE_COLUMNS))
+            road = draw_rolling_road(lanes, rng, before_columns=rng.choice(BEFORE_COLUMNS))
             if profile.lane_ends:
                 ends_m = road.before_m + rng.uniform(*LANE_ENDS_M)
                 road = evolve(road, drawn=DrawnRoad((Closure(0, ends_m),)))
@@ -259,13 +179,13 @@ class Setup:
                 seed = rng.randrange(2**31)
                 road = evolve(road, before_m=before_m, drawn=drawn, seed=seed)
         if profile.roads:
-            road = evolve(road, trucks=_types_rng(road, "road").random() < WITH_TRUCKS)
+            road = evolve(road, trucks=rng_of_types(road, "road").random() < WITH_TRUCKS)
         scenario = road.make_scenario()
         lasting = LastingFaults.drawn(profile, rng)
         mean_s = rng.uniform(*MEAN_HEADWAYS_S)
         entered = [*scenario.flow.inflows]
         next_s = {lane: rng.uniform(0.0, mean_s) for lane in entered}
-        visits, types_rng = [], _types_rng(road, "vehicles")
+        visits, types_rng = [], rng_of_types(road, "vehicles")
         for number in range(1, rng.randint(*profile.vehicles) + 1):
             arrival_s, lane = min((t_s, lane) for lane, t_s in next_s.items())
             next_s[lane] += 1.0 + rng.expovariate(1.0 / mean_s)
@@ -339,26 +259,6 @@ class Setup:
             ]
             preferences |= _draw_lanes(members, [length] * lanes, [1.0] * lanes, rng)
         return preferences
-
-
-def _draw_rolling_road(lanes: int, rng: random.Random, before_columns: int = 0) -> RoadSetup:
-    slot_s = rng.choice(SLOTS_S)
-    road = RoadSetup(
-        lanes=lanes,
-        rolling=True,
-        roadside=before_columns > 0,
-        slot_s=slot_s,
-        move_s=round(MOVE_SHARE * slot_s / TICK_S) * TICK_S,
-        mode=rng.choice(MODES),
-        seed=rng.randrange(2**31),
-        stream_planner=rng.random() < STREAM_PLANNER,
-    )
-    return evolve(road, before_m=before_columns * road.make_scenario().lattice.pitch_m)
-
-
-def _types_rng(road: RoadSetup, purpose: str) -> random.Random:
-    """Return a random generator for types alone: no other draw depends on them."""
-    return random.Random(f"types/{purpose}/{road.seed}")  # noqa: S311 (simulation, no secrets)
 
 
 def _draw_lanes(

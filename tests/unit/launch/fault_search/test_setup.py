@@ -9,7 +9,8 @@ from attrs import evolve
 
 from laneweave.launch.fault_search.profiles import PROFILES, profiles_named
 from laneweave.launch.fault_search.road.light_vehicle import Visit
-from laneweave.launch.fault_search.setup import BLOCK_COLUMNS, Setup
+from laneweave.launch.fault_search.road_setup import BLOCK_COLUMNS
+from laneweave.launch.fault_search.setup import Setup
 from laneweave.protocol.config.scenario_files import check_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.road_tables import Demand

@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from laneweave.launch.fault_search.events.forgeries import absurd, harmful, malformed
-from laneweave.launch.fault_search.setup import RoadSetup
+from laneweave.launch.fault_search.road_setup import RoadSetup
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES

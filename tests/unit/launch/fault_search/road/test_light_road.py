@@ -12,7 +12,7 @@ from laneweave.launch.fault_search.checks.geometry import Geometry
 from laneweave.launch.fault_search.road.drawn_entrance import DrawnTraffic, drawn_roadside
 from laneweave.launch.fault_search.road.light_road import LightRoad, Reception
 from laneweave.launch.fault_search.road.light_vehicle import Visit
-from laneweave.launch.fault_search.setup import RoadSetup
+from laneweave.launch.fault_search.road_setup import RoadSetup
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Arrived, Effect, PeerDown, PeerUp, Send, Started, Wakeup
 from laneweave.protocol.vehicle.motion import at_rest_in_cell
