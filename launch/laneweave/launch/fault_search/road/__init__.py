@@ -1,1 +1,1 @@
-"""The simplified road of the fault search: `light_road.LightRoad`, its entrances and vehicles."""
+"""The road of the fault search: `light_road.LightRoad`, its entrances and vehicles."""
