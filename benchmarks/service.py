@@ -241,7 +241,6 @@ def load(workers: int, solver_rate_per_s: float) -> dict[str, Any]:
         "rate_per_s": rate,
         "of_solvers_rate": rate / (workers * solver_rate_per_s),
         "of_workers_time": sum(one.response.solve_ms for one in first) / (1e3 * workers * took_s),
-        "repeated_ms_p50": 1e3 * statistics.median(one.latency_s for one in again),
     }
 
 

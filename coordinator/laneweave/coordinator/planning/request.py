@@ -85,7 +85,7 @@ class PlanRequest:
     geometry: defines the conflict kind `geometric`; None: footprints.
     solver: name of a solver, built in or a plug-in where the request is answered; None: the
         default there.
-    id: a service answers a repeated id with the same response; empty: no id.
+    id: a service plans pending requests with the same id once; empty: no id.
     """
 
     grid: Grid

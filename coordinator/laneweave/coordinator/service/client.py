@@ -106,9 +106,9 @@ class PlanningFailedError(PlanError):
 class PendingRequest:
     """One plan request over all attempts: decides what to do after each; pure, without a clock.
 
-    A request may be sent repeatedly: coordinators recognise it by its id, and answering it twice is
-    harmless. It is sent again if there is no answer (its coordinator has exited or is disconnected,
-    and the others have not noticed yet), or if its coordinator is overloaded.
+    A request may be sent repeatedly: planning it twice is harmless. It is sent again if there is no
+    answer (its coordinator has exited or is disconnected, and the others have not noticed yet), or
+    if its coordinator is overloaded.
     """
 
     request: PlanRequest

@@ -4,7 +4,7 @@ Every coordinator receives every request and accepts those that are assigned to 
 so any number of coordinators can share the load without exchanging messages. A request waits for a
 free worker until its deadline at the latest, and is answered in the remaining time. Clients are
 served in turn. A request that its client cancels, or whose client is gone, is dropped, and its
-worker stops. A repeated request with the same id gets the same answer.
+worker stops. A request that is repeated under the same id while it is pending is planned once.
 """
 
 from __future__ import annotations
@@ -19,13 +19,11 @@ from attrs import frozen
 from laneweave.coordinator.planning.plug_ins.registry import checked_solver
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
-from laneweave.coordinator.service.answers import CachedAnswer, CachedAnswers
 from laneweave.coordinator.service.format import (
     CANCELLED,
     FAILED,
     INVALID,
     LATE,
-    MSGPACK,
     Format,
     Refusal,
     format_of,
@@ -71,7 +69,7 @@ class ServiceMetrics:
     left_total: int = metric("Requests assigned to other coordinators", default=0)
     answered_total: int = metric("Requests answered", default=0)
     repeated_total: int = metric(
-        "Repeated requests (same id) that got the earlier answer", default=0
+        "Requests repeated (same id) while they were pending, and planned once", default=0
     )
     invalid_total: int = metric("Requests refused because they are not valid", default=0)
     overloaded_total: int = metric("Requests refused because of overload", default=0)
@@ -122,7 +120,6 @@ class PlanningService:
         """Live sessions; that of unknown clients is never closed."""
         self._mean_s = FIRST_MEAN_S
         """Mean time of recent plans."""
-        self._answers = CachedAnswers(settings)
         self._refusals = PacedRefusals()
         self._metrics = ServiceMetrics()
 
@@ -187,8 +184,7 @@ class PlanningService:
         form = query.form
         try:
             request = self._read(form, payload)
-            self._answers.expire(now_s)
-            entry, cached = self._known(request)
+            entry = self._pending_under_id(request)
         except BadInputError as error:
             self._count("invalid_total")
             yield form.reply(query.token, Refusal(INVALID, str(error), error.field))
@@ -196,11 +192,6 @@ class PlanningService:
         if entry is not None:
             self._count("repeated_total")
             entry.queries.append(query)
-            return
-        if cached is not None:
-            self._count("repeated_total")
-            answer = form.write(MSGPACK.read(cached.packed))
-            yield Reply(query.token, answer, encoding=form.encoding)
             return
         client = query.session.client
         count = len(self._pending)
@@ -232,15 +223,12 @@ class PlanningService:
             raise BadInputError("deadline_s", request.deadline_s, allowed)
         return request
 
-    def _known(self, request: PlanRequest) -> tuple[PendingPlan | None, CachedAnswer | None]:
-        """Return the entry or the cached answer of a repeated request."""
-        entry, cached = self._by_id.get(request.id), self._answers.get(request.id)
-        another = (entry is not None and entry.request != request) or (
-            cached is not None and not cached.is_for(request)
-        )
-        if another:
-            raise BadInputError("id", request.id, "an id that no other recent request has")
-        return entry, cached
+    def _pending_under_id(self, request: PlanRequest) -> PendingPlan | None:
+        """Return the entry of a repeated request that is pending."""
+        entry = self._by_id.get(request.id)
+        if entry is not None and entry.request != request:
+            raise BadInputError("id", request.id, "an id that no other pending request has")
+        return entry
 
     # --- overload -----------------------------------------------------------------------------
 
@@ -315,9 +303,9 @@ class PlanningService:
             if self._pending.drop(entry):
                 yield StopJob(entry.job)
 
-    def _forget(self, entry: PendingPlan) -> bool:
-        """Remove a request from those known by id; return whether it was one of them."""
-        return self._by_id.pop(entry.request.id, None) is not None
+    def _forget(self, entry: PendingPlan) -> None:
+        """Remove a request from those known by id."""
+        self._by_id.pop(entry.request.id, None)
 
     # --- planning -----------------------------------------------------------------------------
 
@@ -377,7 +365,7 @@ class PlanningService:
     def _end(
         self, entry: PendingPlan, answer: PlanResponse | Refusal, now_s: float
     ) -> Iterator[Effect]:
-        """Answer all queries for a request; if the answer is a plan, cache it."""
+        """Answer all queries for a request."""
         if isinstance(answer, PlanResponse):
             self._count("answered_total")
             planned_s = answer.solve_ms / 1e3
@@ -386,8 +374,7 @@ class PlanningService:
             self._count("service_seconds_total", max(0.0, now_s - entry.arrived_s - planned_s))
         for query in entry.queries:
             yield query.form.reply(query.token, answer)
-        if self._forget(entry) and isinstance(answer, PlanResponse):
-            self._answers.add(entry.request, answer, now_s)
+        self._forget(entry)
 
     def _count(self, name: str, by: float = 1) -> None:
         counted = getattr(self._metrics, name) + by

@@ -12,7 +12,7 @@ import attrs
 from laneweave.protocol.config import demand_checks, deployment_checks, motion_checks, road_checks
 from laneweave.protocol.config.source_files import read_toml_source
 from laneweave.protocol.errors import BadInputError, raise_all
-from laneweave.protocol.scenario.deployment_fields import Security
+from laneweave.protocol.scenario.deployment_fields import FORMER_SERVICE_FIELDS, Security
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import PAPERS_FORMATIONS
 from laneweave.protocol.structuring import structure
@@ -115,11 +115,17 @@ def _structured(data: Mapping[str, Any]) -> Scenario:
 
 
 def _with_current_names(data: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the tables with the former value `operation = "paper"` replaced by current fields."""
-    formation = data.get("formation") if isinstance(data, Mapping) else None
-    if not isinstance(formation, Mapping) or formation.get("operation") != "paper":
+    """Return the tables without former fields, and with current ones for `operation = "paper"`."""
+    if not isinstance(data, Mapping):
         return data
-    return {**data, "formation": {**PAPERS_FORMATIONS, **formation, "operation": "formations"}}
+    formation, service = data.get("formation"), data.get("service")
+    if isinstance(formation, Mapping) and formation.get("operation") == "paper":
+        current = {**PAPERS_FORMATIONS, **formation, "operation": "formations"}
+        data = {**data, "formation": current}
+    if isinstance(service, Mapping) and not FORMER_SERVICE_FIELDS.isdisjoint(service):
+        kept = {name: value for name, value in service.items() if name not in FORMER_SERVICE_FIELDS}
+        data = {**data, "service": kept}
+    return data
 
 
 def to_tables(scenario: Scenario) -> dict[str, Any]:

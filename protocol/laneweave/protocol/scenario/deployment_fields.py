@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 import attrs
 from attrs import field, frozen
@@ -117,6 +117,10 @@ class Security:
     """Processes that may only subscribe."""
 
 
+FORMER_SERVICE_FIELDS: Final = frozenset({"cache_entries", "cache_s"})
+"""Fields of the table `service` in earlier files, which are ignored."""
+
+
 @frozen
 class Service:
     """The planning service of every coordinator."""
@@ -134,10 +138,6 @@ class Service:
     """Maximum size of a request; longer ones are rejected."""
     max_deadline_s: float = field(default=600.0, validator=within(0.001, 3600.0))
     """Maximum deadline of a request; longer ones are rejected."""
-    cache_entries: int = field(default=1024, validator=within(0, 1_000_000))
-    """Number of cached answers to requests with an id."""
-    cache_s: float = field(default=60.0, validator=within(0.0, 86_400.0))
-    """Time for which answers are cached."""
 
 
 @frozen
