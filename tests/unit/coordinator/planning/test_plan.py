@@ -128,7 +128,7 @@ class TestInfeasible:
 
 @functools.cache
 def _optimum_of_block(seed: int) -> float:
-    optimum = plan(block_request(seed, deadline_s=3600.0)).cost
+    optimum = plan(block_request(seed, deadline_s=3600.0), solver="branching").cost
     assert optimum is not None
     return optimum
 

@@ -31,6 +31,7 @@ from oracles.moving_bodies import Bodies, Profile, drive, least_gap_of_plan_m
 from oracles.path_rules import check_paths
 from oracles.proven import Oracle, by_oracle
 from support.planning_oracles import assert_agreement
+from support.variants import variants
 from unit.coordinator.planning.test_against_milp import chunks
 
 ON_TIME = {"lateness_s": 0.0}
@@ -85,7 +86,7 @@ CROWDED = ((3, 2, 2), (4, 1, 2), (3, 2, 3), (2, 2, 3), (2, 2, 4))
 
 @pytest.mark.slow
 @pytest.mark.parametrize("geometry", [*GEOMETRIES, TIGHT], ids=str)
-@pytest.mark.parametrize("mode", [1, 2])
+@pytest.mark.parametrize("mode", variants([2, 1]))
 def test_planner_agrees_with_joint_search_on_crowded_grids(
     geometry: dict[str, float], mode: Mode
 ) -> None:

@@ -35,6 +35,7 @@ from laneweave.protocol.lattice import Cell, Mode, displacements, footprint
 from laneweave.protocol.scenario.fields import Scenario
 from oracles.moving_bodies import Bodies, least_gap_m
 from support.tables import for_each
+from support.variants import variants
 
 NEAR = range(-MAX_OFFSET, MAX_OFFSET + 1)
 STEPS = displacements(2)
@@ -160,23 +161,13 @@ def test_waiting_in_a_crossed_cell_is_a_conflict(mode: Mode, lateness_s: float) 
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
-@given(geometries())
-def test_disjoint_footprints_are_never_too_close(geometry: BodyGeometry) -> None:
-    """They are separated by a column or by a lane, so the table forbids none of them."""
-    table = conflict_table(geometry)
-    for pair in table:
-        assert footprints_meet(pair), pair
-
-
-@pytest.mark.slow
 @settings(max_examples=20)
 @given(geometries())
-def test_the_table_is_symmetric(
-    geometry: BodyGeometry,
-) -> None:
+def test_the_table_is_symmetric_and_has_no_disjoint_footprints(geometry: BodyGeometry) -> None:
+    """Those are separated by a column or by a lane."""
     table = conflict_table(geometry)
     for (column, lane), a, b in table:
+        assert footprints_meet(((column, lane), a, b))
         assert ((-column, -lane), b, a) in table
         assert ((column, -lane), (a[0], -a[1]), (b[0], -b[1])) in table
 
@@ -231,8 +222,10 @@ def test_it_contains_what_simulated_bodies_do(geometry: BodyGeometry, seed: int)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("parts", [3, 8, clearances.PARTS])
-@pytest.mark.parametrize("lateness_s", [None, 0.0, 0.3, 0.7])
+@pytest.mark.parametrize(
+    ("lateness_s", "parts"),
+    variants(product((0.3, None, 0.0, 0.7), (clearances.PARTS, 3, 8)), count=2),
+)
 def test_clearances_are_never_overestimated(
     parts: int, lateness_s: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
