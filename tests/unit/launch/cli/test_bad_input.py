@@ -71,6 +71,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["report"], "DIR"),
         (["certs", "init", LONG], "file: got 'xxx"),
         (["run", "--out", LONG], "--out: got 'xxx"),
+        (["run", "--faults", LONG], "--faults: got 'xxx"),
         (["run", "a\0b"], "SCENARIO.toml"),
         (["run", "--seed", "1e3"], "--seed: got '1e3'; allowed: an integer"),
         (["run", "--volume", "x"], "--volume: got 'x'; allowed: a number"),

@@ -86,6 +86,7 @@ def test_results_and_files_of_others_are_never_removed(tmp_path: Path) -> None:
     write_summary(complete, make_summary(ending="complete"))
     (foreign / "notes.txt").touch()
     (broken / "summary.json").touch()
+    assert refusal(foreign / "notes.txt").endswith("a new or empty folder")
     for folder in (recorded, complete, foreign, broken):
         before = sorted(folder.iterdir())
         assert refusal(folder).endswith("a new or empty folder")
