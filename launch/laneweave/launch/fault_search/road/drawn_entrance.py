@@ -118,6 +118,6 @@ def drawn_roadside(
     bridge: int = 0,
 ) -> Roadside:
     """Return a roadside with drawn traffic, formations, and owners of empty cells."""
-    if scenario.formation.rolling:
-        return Roadside(scenario, (), bridge, traffic, DrawnCells(scenario, grants, traffic))
-    return Roadside(scenario, (), bridge, traffic, DrawnBlocks(scenario, formations))
+    if scenario.formation.traits.has_formations:
+        return Roadside(scenario, (), bridge, traffic, DrawnBlocks(scenario, formations))
+    return Roadside(scenario, (), bridge, traffic, DrawnCells(scenario, grants, traffic))

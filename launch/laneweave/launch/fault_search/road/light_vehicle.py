@@ -153,6 +153,6 @@ class LightVehicle(RoadVehicle):
         self.latest_s = max(self.latest_s, sense.t_s + ahead_s)
         if ahead_s == 0.0:
             return sense
-        s, v, a, y, v_y, a_y = sense.state
-        state = (s + self.controller.lattice.speed_mps * ahead_s, v, a, y, v_y, a_y)
-        return replace(sense, t_s=sense.t_s + ahead_s, state=state)
+        s, v, a, y, v_y, a_y = sense.measured
+        measured = (s + self.controller.lattice.speed_mps * ahead_s, v, a, y, v_y, a_y)
+        return replace(sense, t_s=sense.t_s + ahead_s, measured=measured)
