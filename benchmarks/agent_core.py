@@ -253,7 +253,7 @@ class Road:
             ]
             self.states.call(_deliver, [rig.node] * len(received), received)
         for rig in self.rigs.values():
-            self.moving += rig.vehicle.controller.motion_end_tick > tick
+            self.moving += rig.vehicle.controller.motion.end_tick > tick
             rig.vehicle.step(tick)
         self.tick = tick + 1
         self._update_sensors()

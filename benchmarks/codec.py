@@ -14,6 +14,7 @@ from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import (
     Ballot,
     Command,
+    CurrentMotion,
     Name,
     Neighbour,
     Sense,
@@ -26,6 +27,7 @@ NOW_NS = 1_790_000_000_000_000_000
 """A time at which processes start: incarnations take 9 bytes."""
 VEHICLE, BALLOT = Name("v0012"), Ballot(3, Name("c1"), NOW_NS, 7)
 RECORD = VehicleRecord(NOW_NS, (1,), BALLOT, BALLOT)
+MOTION = CurrentMotion((-3, 0), 420, 38)
 AROUND = tuple(Neighbour(lane, 20.3, 15.21, 0.11) for lane in range(2))
 MESSAGES = (
     Sense(
@@ -34,9 +36,7 @@ MESSAGES = (
         t_s=40.0,
         measured=(512.31, 15.01, 0.12, 5.63, 0.01, 0.02),
         hold_cell=(-3, 1),
-        motion_end_tick=420,
-        motion_origin=(-3, 0),
-        motion_ticks=38,
+        motion=MOTION,
         preferred_lane=1,
         record=RECORD,
         ahead=AROUND,
@@ -45,7 +45,7 @@ MESSAGES = (
         block=1,
         bridge=NOW_NS,
     ),
-    Command(VEHICLE, RECORD, 400, (-3, 1), 420, (-3, 0), bytes(8 * 60), 38),
+    Command(VEHICLE, RECORD, 400, (-3, 1), MOTION, bytes(8 * 60)),
     VehicleState(
         VEHICLE,
         1,

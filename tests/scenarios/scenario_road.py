@@ -25,6 +25,7 @@ from laneweave.protocol.vehicle.motion import at_rest_in_cell, cell_state
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.wire.messages import (
     Command,
+    CurrentMotion,
     Name,
     Plan,
     Prepare,
@@ -68,7 +69,8 @@ class ScenarioDriver(LightDriver):
         return at_rest_in_cell(sense.measured, self._lattice, self._goal, sense.t_s)
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
-        return Drive(sense.tick + 1 if moving else 0, self._origin, self._ticks, b"")
+        end_tick = sense.tick + 1 if moving else 0
+        return Drive(CurrentMotion(self._origin, end_tick, self._ticks), b"")
 
 
 @define(eq=False)

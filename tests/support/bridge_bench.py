@@ -33,7 +33,15 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.codec import encode
-from laneweave.protocol.wire.messages import Command, Name, Prepare, Report, Sense, VehicleRecord
+from laneweave.protocol.wire.messages import (
+    Command,
+    CurrentMotion,
+    Name,
+    Prepare,
+    Report,
+    Sense,
+    VehicleRecord,
+)
 from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, REPORT, VEHICLE_ALIVE, Keys
 from laneweave.sim_bridge.bodies.bodies_world import BodiesWorld
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
@@ -182,8 +190,7 @@ class Desk:
             "record": VehicleRecord(max(controller.record.incarnation + cared_for, 1)),
             "tick": self.core.tick,
             "hold_cell": controller.hold_cell,
-            "motion_end_tick": 0,
-            "motion_origin": controller.hold_cell,
+            "motion": CurrentMotion(controller.hold_cell),
             "jerks": jerks((0.0, 0.0), ticks=self.scenario.timing.horizon_ticks),
         }
         return changed(Command(**unchanged), **changes)

@@ -119,15 +119,15 @@ class Ideal:
 
     def at(self, controller: MotionController, tick: int) -> State:
         """Return its state at a tick, given what the motion controller knows of the motion."""
-        scenario, motion = self.scenario, (controller.motion_origin, controller.hold_cell)
+        scenario, motion = self.scenario, (controller.motion.origin, controller.hold_cell)
         tick_s = scenario.runtime.tick_s
         if motion != self._motion:
             self._motion, (origin, target) = motion, motion
             self._tick = tick
             self._reference = Reference.hold(scenario, scenario.vehicle, target)
             if origin != target:
-                ticks = controller.motion_ticks
-                self._tick = controller.motion_end_tick - ticks
+                ticks = controller.motion.ticks
+                self._tick = controller.motion.end_tick - ticks
                 self._reference = Reference.move(
                     scenario, scenario.vehicle, origin, target, self._tick, ticks
                 )
@@ -216,7 +216,7 @@ class _Run:
                 self.begin_tick = self._tick + round(HOLDING_S / tick_s)
             return
         for name, vehicle in bridge.vehicles.items():
-            origin, target = vehicle.controller.motion_origin, vehicle.controller.hold_cell
+            origin, target = vehicle.controller.motion.origin, vehicle.controller.hold_cell
             if origin[0] == target[0] and origin[1] != target[1]:
                 self.disturbed, self.begin_tick = name, self._tick + round(IN_MOVE_S / tick_s)
                 return
@@ -229,9 +229,9 @@ class _Run:
         self.overlaps += len(bodies.overlapping_pairs())
         self.braked += sum(one.controller.rung is Rung.EMERGENCY for one in vehicles.values())
         self.motions |= {
-            (name, one.controller.motion_origin, one.controller.hold_cell)
+            (name, one.controller.motion.origin, one.controller.hold_cell)
             for name, one in vehicles.items()
-            if one.controller.motion_origin != one.controller.hold_cell
+            if one.controller.motion.origin != one.controller.hold_cell
         }
 
     def response(self) -> Response:

@@ -154,9 +154,7 @@ class Road:
             record=VehicleRecord(incarnation=1),
             tick=self.tick,
             hold_cell=one.hold_cell,
-            motion_end_tick=drive.motion_end_tick,
-            motion_origin=drive.motion_origin,
-            motion_ticks=drive.motion_ticks,
+            motion=drive.motion,
             jerks=drive.jerks,
         )
         if not one.vehicle.controller.accept_command(command):

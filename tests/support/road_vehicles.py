@@ -40,8 +40,7 @@ def known(controller: MotionController) -> tuple[object, ...]:
         controller.record.accepted,
         controller.command_tick,
         controller.hold_cell,
-        controller.motion_origin,
-        controller.motion_end_tick,
+        controller.motion,
         controller._jerks.tobytes(),
     )
 

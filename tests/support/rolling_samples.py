@@ -11,6 +11,7 @@ from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.vehicle.territory import CellTerritory
 from laneweave.protocol.wire.messages import (
     Ballot,
+    CurrentMotion,
     Name,
     PendingTransfer,
     Plan,
@@ -75,7 +76,7 @@ def sense(
     owned: tuple[Cell, ...] | None = None,
 ) -> Sense:
     return Sense(
-        name, 1, 1.0, (0.0,) * 6, HOME, 0, HOME, 0,
+        name, 1, 1.0, (0.0,) * 6, HOME, CurrentMotion(HOME), 0,
         VehicleRecord(
             incarnation=INCARNATION, promised=promised, transfer=transfer, accepted=accepted,
             owned=BEFORE[name] if owned is None else owned,

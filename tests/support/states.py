@@ -15,6 +15,7 @@ from laneweave.protocol.wire.field_types import Message
 from laneweave.protocol.wire.messages import (
     Ballot,
     Command,
+    CurrentMotion,
     Name,
     Plan,
     Sense,
@@ -113,8 +114,7 @@ def sense_in(cell: Cell, tick: int = 0, **more: Any) -> Sense:  # noqa: ANN401 (
         "t_s": t_s,
         "measured": cell_state(PAPER.lattice, cell, t_s),
         "hold_cell": cell,
-        "motion_end_tick": 0,
-        "motion_origin": cell,
+        "motion": CurrentMotion(cell),
         "preferred_lane": 0,
         "record": VehicleRecord(joined=(block,)),
         "ahead": (),
@@ -132,8 +132,7 @@ def command(
         "record": VehicleRecord(incarnation=1),
         "tick": tick,
         "hold_cell": hold_cell,
-        "motion_end_tick": tick + len(pairs),
-        "motion_origin": (0, 1),
+        "motion": CurrentMotion((0, 1), tick + len(pairs)),
         "jerks": jerks(*pairs),
     }
     return changed(Command(**values), **more)

@@ -52,6 +52,7 @@ from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import (
     CAR,
     Command,
+    CurrentMotion,
     Motion,
     Name,
     Plan,
@@ -280,8 +281,7 @@ class AgentCore:
             record=VehicleRecord(incarnation=self._incarnation),
             tick=sense.tick,
             hold_cell=sense.hold_cell,
-            motion_end_tick=sense.motion_end_tick,
-            motion_origin=sense.motion_origin,
+            motion=CurrentMotion(sense.motion.origin, sense.motion.end_tick),
             jerks=b"",
         )
         return [Send(COMMAND, self._command, self._own)]
@@ -311,9 +311,7 @@ class AgentCore:
             record=execution.wanted,
             tick=sense.tick,
             hold_cell=execution.hold_cell,
-            motion_end_tick=drive.motion_end_tick,
-            motion_origin=drive.motion_origin,
-            motion_ticks=drive.motion_ticks,
+            motion=drive.motion,
             jerks=drive.jerks,
         )
         effects: list[Effect] = [Send(COMMAND, self._command, self._own)]

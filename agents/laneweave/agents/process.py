@@ -17,7 +17,7 @@ from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.identities import Incarnations
-from laneweave.protocol.wire.messages import Name, Sense, VehicleRecord
+from laneweave.protocol.wire.messages import CurrentMotion, Name, Sense, VehicleRecord
 
 
 def warm_up(scenario: Scenario) -> None:
@@ -33,8 +33,7 @@ def warm_up(scenario: Scenario) -> None:
         t_s=0.0,
         measured=cell_state(scenario.lattice, cell, 0.0),
         hold_cell=cell,
-        motion_end_tick=0,
-        motion_origin=cell,
+        motion=CurrentMotion(cell),
         preferred_lane=lane,
         record=VehicleRecord(),
         ahead=(),

@@ -180,6 +180,6 @@ class Observer:
             (v_mps - lattice.speed_mps) / lattice.speed_mps,
             along_m / lattice.pitch_m,
             (y_m - lattice.cell_y_m(lane)) / lattice.lane_width_m,
-            float(controller.motion_end_tick > round(t_s / controller.tick_s)),
+            float(controller.motion.end_tick > round(t_s / controller.tick_s)),
             float(refused),
         )

@@ -12,7 +12,7 @@ from laneweave.agents.driving.reference import Reference
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state
-from laneweave.protocol.wire.messages import Name, Sense, VehicleRecord
+from laneweave.protocol.wire.messages import CurrentMotion, Name, Sense, VehicleRecord
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
@@ -95,8 +95,8 @@ def test_a_vehicle_that_enters_beside_its_cell_moves(offset_m: float) -> None:
     vehicle = entering(offset_m)
     controller = vehicle.controller
     assert vehicle.state == pytest.approx(beside(offset_m))
-    assert (controller.hold_cell, controller.motion_origin) == (CELL, CELL)
-    assert controller.motion_end_tick == (END_TICK if offset_m else 0)
+    assert (controller.hold_cell, controller.motion.origin) == (CELL, CELL)
+    assert controller.motion.end_tick == (END_TICK if offset_m else 0)
     assert controller.moving(BEGIN_TICK) is bool(offset_m)
 
 
@@ -108,7 +108,7 @@ def drive(driver: TrackingDriver, plant: Plant, ticks: range) -> list[State]:
         along, across = np.frombuffer(drive.jerks, "<f4").reshape(-1, 2)[0].tolist()
         plant.step(along, across)
         states.append(plant.state)
-        assert (drive.motion_origin, drive.motion_end_tick) == (CELL, max(END_TICK, tick + 1))
+        assert (drive.motion.origin, drive.motion.end_tick) == (CELL, max(END_TICK, tick + 1))
     return states
 
 
@@ -118,8 +118,8 @@ def body(offset_m: float, tick: int = BEGIN_TICK) -> Plant:
 
 def sense(plant: Plant, tick: int) -> Sense:
     return Sense(
-        Name("A"), tick, tick * TICK_S, plant.state, CELL, END_TICK, CELL, 0, VehicleRecord(), (),
-        setpoint=plant.setpoint,
+        Name("A"), tick, tick * TICK_S, plant.state, CELL, CurrentMotion(CELL, END_TICK), 0,
+        VehicleRecord(), (), setpoint=plant.setpoint,
     )  # fmt: skip
 
 

@@ -81,7 +81,7 @@ def test_answers_each_tick_once_and_repeats_are_the_same_bytes() -> None:
     effects = rig.hand(topics.SENSE, sense)
     assert [e.topic for e in effects if isinstance(e, node.Send)] == [topics.COMMAND, topics.STATE]
     (command,) = sent(effects, Command)
-    assert (command.tick, command.hold_cell, command.motion_end_tick) == (2, HOME, 0)
+    assert (command.tick, command.hold_cell, command.motion.end_tick) == (2, HOME, 0)
     assert (command.record.incarnation, command.record.joined) == (1, (0,))
     for _ in range(3):
         assert rig.hand(topics.SENSE, replace(sense, setpoint=(9.0, 9.0))) == [
@@ -146,8 +146,8 @@ def test_a_move_ends_in_its_cell_on_time(target: Cell) -> None:
     rig.accept((0, HOME, target))
     state = rig.run()
     assert (state.moving, state.ready, state.hold_cell, state.completed) == (True, True, target, 0)
-    assert rig.controller.motion_end_tick == rig.tick - 1 + MOVE_TICKS
-    assert rig.controller.motion_origin == HOME
+    assert rig.controller.motion.end_tick == rig.tick - 1 + MOVE_TICKS
+    assert rig.controller.motion.origin == HOME
     state = rig.run(MOVE_TICKS)
     assert (state.moving, state.completed, state.done) == (False, 1, True)
     assert rig.off(target) < 0.12  # what the lag of its actuators leaves
@@ -163,10 +163,10 @@ def test_a_move_whose_first_commands_are_lost_begins_when_one_arrives() -> None:
     lost = 8
     for _ in range(lost):
         (command,) = sent(rig.hand(topics.SENSE, rig.sense()), Command)
-        assert (command.hold_cell, command.motion_end_tick) == (target, rig.tick + MOVE_TICKS)
+        assert (command.hold_cell, command.motion.end_tick) == (target, rig.tick + MOVE_TICKS)
         rig.coast(1)
     rig.run()
-    assert rig.controller.motion_end_tick == rig.tick - 1 + MOVE_TICKS
+    assert rig.controller.motion.end_tick == rig.tick - 1 + MOVE_TICKS
     assert rig.run(MOVE_TICKS).done
     assert rig.off(target) < 0.12
 
@@ -176,7 +176,7 @@ def test_v7_only_when_the_body_is_there() -> None:
     rig = kept_back()
     state = rig.shown[-1]
     assert (state.moving, state.completed) == (True, 0)
-    assert rig.controller.motion_end_tick == rig.tick
+    assert rig.controller.motion.end_tick == rig.tick
     rig.ahead = ()
     while rig.run().moving:
         assert rig.tick < 400
@@ -207,12 +207,12 @@ def test_restart_takes_the_motion_over(silent_ticks: int) -> None:
     rig.coast(silent_ticks)
     under_way = silent_ticks < MOVE_TICKS - 12
     command = rig.claim()
-    assert (command.hold_cell, command.motion_end_tick > rig.tick) == ((0, 2), under_way)
+    assert (command.hold_cell, command.motion.end_tick > rig.tick) == ((0, 2), under_way)
     state = rig.run()
     assert (state.record.incarnation, state.record.promised, state.hold_cell) == (2, None, (0, 2))
     assert state.moving == under_way
     if under_way:
-        assert rig.controller.motion_origin == HOME
+        assert rig.controller.motion.origin == HOME
     state = rig.run(MOVE_TICKS)
     assert (state.moving, state.completed) == (False, 0)
     assert rig.off((0, 2)) < 0.1

@@ -21,7 +21,7 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire import topics
-from laneweave.protocol.wire.messages import Census, Name, Report, RoadClock, Sense
+from laneweave.protocol.wire.messages import Census, CurrentMotion, Name, Report, RoadClock, Sense
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import pose_of
 from laneweave.sim_bridge.core import CATCH_UP_S, SHUT_DOWN_S, TickPhase
 from laneweave.sim_bridge.road.attendance import LEFT_REPEATS
@@ -230,7 +230,7 @@ def test_an_answer_to_another_tick_or_that_makes_no_sense_changes_nothing(
     desk: Desk, apart: int, changes: dict[str, object]
 ) -> None:
     known, tick = desk.known(A), desk.core.tick
-    moving = {"hold_cell": (-1, 0), "motion_end_tick": tick + 9, "motion_origin": (-1, 0)}
+    moving = {"hold_cell": (-1, 0), "motion": CurrentMotion((-1, 0), tick + 9)}
     answer = {"tick": tick + apart, "jerks": jerks((9.0, 9.0), ticks=9), **moving}
     desk.answer(A, **(answer | changes))
     assert desk.known(A) == known

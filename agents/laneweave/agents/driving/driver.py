@@ -31,7 +31,7 @@ from laneweave.protocol.vehicle.motion import (
     commanded_state,
     nearly_settled,
 )
-from laneweave.protocol.wire.messages import Motion, Sense
+from laneweave.protocol.wire.messages import CurrentMotion, Motion, Sense
 
 _FLOAT32 = np.dtype("<f4")
 Course = tuple[Cell, Cell, int, int]
@@ -42,11 +42,8 @@ Course = tuple[Cell, Cell, int, int]
 class Drive:
     """Output to the motion controller at one tick."""
 
-    motion_end_tick: int
-    """End of the current motion; 0 if the vehicle holds."""
-    motion_origin: Cell
-    motion_ticks: int
-    """Duration of the move; 0: the vehicle settles in its cell, or holds."""
+    motion: CurrentMotion
+    """Its end is 0 if the vehicle holds."""
     jerks: bytes
     """Little-endian float32 pairs (along, across) [m/s3], one per tick of the horizon; empty if no
     solution is usable."""
@@ -131,15 +128,15 @@ class TrackingDriver:
 
     def take_over(self, sense: Sense) -> None:
         """Continue the motion controller's current motion."""
-        self._goal, self._settling = sense.hold_cell, None
-        if sense.motion_origin == sense.hold_cell and sense.motion_end_tick > sense.tick + 3:
+        self._goal, self._settling, motion = sense.hold_cell, None, sense.motion
+        if motion.origin == sense.hold_cell and motion.end_tick > sense.tick + 3:
             commanded = self._commanded(sense)
             self._reference = self._settling = Reference.settling(
-                *self._own, sense.hold_cell, commanded, sense.tick, sense.motion_end_tick
+                *self._own, sense.hold_cell, commanded, sense.tick, motion.end_tick
             )
-        elif sense.motion_end_tick > sense.tick and sense.motion_ticks in self._durations:
-            begin_tick = sense.motion_end_tick - sense.motion_ticks
-            self.begin((0, sense.motion_origin, sense.hold_cell), begin_tick, sense.motion_ticks)
+        elif motion.end_tick > sense.tick and motion.ticks in self._durations:
+            begin_tick = motion.end_tick - motion.ticks
+            self.begin((0, motion.origin, sense.hold_cell), begin_tick, motion.ticks)
         else:
             self._reference = Reference.hold(*self._own, sense.hold_cell)
 
@@ -183,11 +180,10 @@ class TrackingDriver:
         end_tick = max(reference.end_tick, tick + 1) if moving else 0
         if reference is self._settling and tick < reference.end_tick:
             end_tick = reference.end_tick  # ready for plans, but still settling
+        # A late body is still moving; an agent that takes over must know this.
+        ticks = self._ticks if reference.origin != self._goal else 0
         return Drive(
-            # A late body is still moving; an agent that takes over must know this.
-            motion_end_tick=end_tick,
-            motion_origin=reference.origin,
-            motion_ticks=self._ticks if reference.origin != self._goal else 0,
+            motion=CurrentMotion(reference.origin, end_tick, ticks),
             jerks=result.jerk.astype(_FLOAT32).tobytes() if result.usable else b"",
         )
 

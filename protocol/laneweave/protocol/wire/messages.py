@@ -115,6 +115,20 @@ class VehicleRecord(Message, frozen=True):
     """Rolling operation: newest transfer of its cells."""
 
 
+class CurrentMotion(Message, frozen=True):
+    """Motion of a vehicle, from which another process in charge of it can continue.
+
+    Part of other messages; like the record, it is stored by the motion controller.
+    """
+
+    origin: Cell
+    """Cell in which the motion began; the hold cell if the vehicle holds."""
+    end_tick: Int64 = 0
+    """Tick at which the motion ends."""
+    ticks: Int64 = 0
+    """Duration of a move [ticks]; 0: the vehicle settles in its cell, or holds."""
+
+
 class Prepare(Message, frozen=True):
     """Leader to each vehicle of the roster that has not promised, every `network.resend_s`.
 
@@ -271,10 +285,8 @@ class Sense(Message, frozen=True):
     the road, y the body centre from the right edge."""
     hold_cell: Cell
     """Cell in which the motion controller will hold unless it receives a new command."""
-    motion_end_tick: Int64
-    """Tick at which the current motion ends; at most `tick` if the vehicle holds."""
-    motion_origin: Cell
-    """Cell in which the current motion began; `hold_cell` if the vehicle holds."""
+    motion: CurrentMotion
+    """As stored by the motion controller; its end is at most `tick` if the vehicle holds."""
     preferred_lane: Int64
     record: VehicleRecord
     """As stored by the motion controller."""
@@ -286,8 +298,6 @@ class Sense(Message, frozen=True):
     """Accelerations last commanded to the actuators, along and across the road [m/s2]."""
     block: Int64 = 0
     """Number of the block in which the vehicle entered."""
-    motion_ticks: Int64 = 0
-    """Duration of the current move [ticks]; 0: the vehicle settles in its cell, or holds."""
     caretaker: bool = False
     """Whether the caretaker is in charge because the agent is absent or does not answer in time."""
     left: bool = False
@@ -322,14 +332,10 @@ class Command(Message, frozen=True):
     """Tick of the SENSE that it answers."""
     hold_cell: Cell
     """Cell in which the controller holds after the last jerk."""
-    motion_end_tick: Int64
-    """Tick at which the current motion ends; 0 if the vehicle holds."""
-    motion_origin: Cell
-    """Cell in which the motion began."""
+    motion: CurrentMotion
+    """To be stored; its end is 0 if the vehicle holds."""
     jerks: bytes
     """Little-endian float32 pairs (along, across) [m/s3], one per tick, from `tick` on."""
-    motion_ticks: Int64 = 0
-    """Duration of the current move [ticks]; 0: the vehicle settles in its cell, or holds."""
 
 
 class OffLattice(Message, frozen=True):

@@ -51,7 +51,7 @@ from laneweave.protocol.vehicle.motion import (
     limited_accel,
 )
 from laneweave.protocol.vehicle.territory import territory_of
-from laneweave.protocol.wire.messages import Command, Neighbour, VehicleRecord
+from laneweave.protocol.wire.messages import Command, CurrentMotion, Neighbour, VehicleRecord
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, Neighbours
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.record_store import MAX_COLUMN, RecordStore, blocks_in_range
@@ -99,10 +99,7 @@ class MotionController:
     _scenario: Scenario
     hold_cell: Cell
     store: RecordStore = field(init=False)
-    motion_origin: Cell = field(init=False)
-    motion_end_tick: int = 0
-    motion_ticks: int = 0
-    """Planned duration of the current move; 0 while settling or holding."""
+    motion: CurrentMotion = field(init=False)
     command_tick: int = -1
     """Tick of the newest command; -1: none."""
     rung: Rung = Rung.HOLD
@@ -134,7 +131,7 @@ class MotionController:
         # The other blocks of the formation are not known until it is closed.
         record = VehicleRecord(joined=(self.lattice.block_of(self.hold_cell[0]),))
         self.store = RecordStore(record, territory_of(self._scenario))
-        self.motion_origin = self.hold_cell
+        self.motion = CurrentMotion(self.hold_cell)
         self.rung_ticks = dict.fromkeys(Rung, 0)
         self._jerks = array("f")
         weakest, assumed = self._scenario.types.weakest_braking, self._scenario.braking
@@ -207,11 +204,11 @@ class MotionController:
         formation, no other vehicle is led into the cell before the move is complete. Commands for
         earlier ticks, which may repeat the move, are no longer accepted.
         """
-        if not self.store.territory.may_hold(self.record, self.motion_origin):
+        if not self.store.territory.may_hold(self.record, self.motion.origin):
             return False
-        if self.motion_origin[1] != self._body_lane:
+        if self.motion.origin[1] != self._body_lane:
             return False
-        self.hold_cell = self.motion_origin
+        self.hold_cell = self.motion.origin
         self.command_tick = max(self.command_tick, round(t_s / self.tick_s) - 1)
         self._stop_motion()
         return True
@@ -252,7 +249,7 @@ class MotionController:
 
     def _stop_motion(self) -> None:
         self._jerks = self._jerks[:0]
-        self.motion_origin, self.motion_end_tick, self.motion_ticks = self.hold_cell, 0, 0
+        self.motion = CurrentMotion(self.hold_cell)
 
     def _lines_ahead(self, measured: State, tick: int) -> list[Neighbour]:
         """Return the stop lines of the lanes that the body touches or enters, as vehicles.
@@ -330,9 +327,7 @@ class MotionController:
         if len(jerks) > 0 or leaves:
             self._jerks, self._jerks_tick = jerks, command.tick
             self.hold_cell = command.hold_cell
-            self.motion_origin = command.motion_origin
-            self.motion_end_tick = command.motion_end_tick
-            self.motion_ticks = command.motion_ticks
+            self.motion = command.motion
         return True
 
     def store_requests(self, command: Command) -> bool:
@@ -347,7 +342,7 @@ class MotionController:
 
         A late body continues to move after the planned end of its motion.
         """
-        return tick < self.motion_end_tick or not at_rest_in_cell(
+        return tick < self.motion.end_tick or not at_rest_in_cell(
             self.measured, self.lattice, self.hold_cell, tick * self.tick_s
         )
 
@@ -409,7 +404,7 @@ class MotionController:
         return False
 
     def _checked_jerks(self, command: Command) -> array[float]:
-        for cell in (command.hold_cell, command.motion_origin):
+        for cell in (command.hold_cell, command.motion.origin):
             if not (0 <= cell[1] < self.lattice.lanes and abs(cell[0]) <= MAX_COLUMN):
                 raise BadInputError("Command", cell, f"cells in {self.lattice.lanes} lanes")
         joined = command.record.joined
@@ -464,7 +459,7 @@ class MotionController:
         if self._body_lane == self.hold_cell[1] or self.off_lattice is not None:
             return False
         s_m, speed_mps = self.measured[:2]
-        columns = self.motion_origin[0], self.hold_cell[0]
+        columns = self.motion.origin[0], self.hold_cell[0]
         t_s = tick * self.tick_s
         if self._lane_ends.has_passed(self.hold_cell, t_s):
             return True  # the other lane has ended meanwhile

@@ -11,7 +11,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State, cell_state
-from laneweave.protocol.wire.messages import ClosedFormation, Name, Sense
+from laneweave.protocol.wire.messages import ClosedFormation, CurrentMotion, Name, Sense
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import ExactNeighbours, Size
 from laneweave.sim_bridge.bodies.plant import Plant
@@ -68,7 +68,8 @@ class RoadVehicle:
         body = make_body((s_m, speed_mps, *rest[2:]), limits, tick_s)
         controller = MotionController(body, scenario, admission.cell)
         if settle_s > 0.0:
-            controller.motion_end_tick = round((t_s + settle_s) / tick_s)
+            end_tick = round((t_s + settle_s) / tick_s)
+            controller.motion = CurrentMotion(admission.cell, end_tick)
         controller.enter_lattice((admission.cell, *admission.more_cells))
         formation = None if scenario.formation.closes_by_vehicles else controller.record.joined[0]
         sensors = Sensors(scenario, name)
@@ -135,9 +136,7 @@ class RoadVehicle:
             t_s=tick * controller.tick_s,
             measured=controller.measured,
             hold_cell=controller.hold_cell,
-            motion_end_tick=controller.motion_end_tick,
-            motion_origin=controller.motion_origin,
-            motion_ticks=controller.motion_ticks,
+            motion=controller.motion,
             preferred_lane=self.admission.arrival.preferred_lane,
             record=controller.record,
             ahead=neighbours.ahead,

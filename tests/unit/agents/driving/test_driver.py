@@ -25,7 +25,7 @@ from laneweave.protocol.vehicle.motion import (
     integrate,
     limited_jerk,
 )
-from laneweave.protocol.wire.messages import Neighbour, Report, Sense
+from laneweave.protocol.wire.messages import CurrentMotion, Neighbour, Report, Sense
 from laneweave.protocol.wire.topics import SENSE
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.plant import Plant
@@ -119,7 +119,7 @@ def play(state: State, drive: Drive) -> State:
 
 def test_holding_has_no_end_and_jerks_for_a_whole_horizon() -> None:
     drive = driver().drive(sense(), moving=False)
-    assert (drive.motion_end_tick, drive.motion_origin) == (0, HOME)
+    assert drive.motion == CurrentMotion(HOME)
     assert jerks(drive) == pytest.approx(np.zeros((N, 2)), abs=1e-4)
 
 
@@ -127,7 +127,7 @@ def test_a_move_ends_after_its_time_and_its_horizon_ends_in_the_target() -> None
     made = driver()
     made.begin(MOVE, 10, MOVE_TICKS)
     drive = made.drive(sense(), moving=True)
-    assert (drive.motion_end_tick, drive.motion_origin) == (10 + MOVE_TICKS, HOME)
+    assert drive.motion == CurrentMotion(HOME, 10 + MOVE_TICKS, MOVE_TICKS)
     end = play(sense().measured, drive)
     assert end == pytest.approx(cell_state(LATTICE, MOVE[2], (10 + N) * TICK_S), abs=0.02)
 
@@ -141,18 +141,13 @@ def test_a_motion_under_way_is_taken_over_where_it_is(scenario: Scenario, ticks:
     made.take_over(sense())
     made.begin(MOVE, 10, ticks)
     drive, body = follow(made, scenario, 20)
-    motion: dict[str, Any] = {
-        "motion_end_tick": 10 + ticks,
-        "motion_origin": HOME,
-        "motion_ticks": ticks,
-    }
-    assert {name: getattr(drive, name) for name in motion} == motion
-    felt = sense(30, MOVE[2], **motion, **body)
+    assert drive.motion == CurrentMotion(HOME, 10 + ticks, ticks)
+    felt = sense(30, MOVE[2], motion=drive.motion, **body)
     heir = TrackingDriver(scenario, scenario.vehicle)
     heir.take_over(felt)
     assert not heir.at_rest(felt)
     theirs, mine = made.drive(felt, moving=True), heir.drive(felt, moving=True)
-    assert {name: getattr(mine, name) for name in motion} == motion
+    assert mine.motion == drive.motion
     assert jerks(mine) == pytest.approx(jerks(theirs), abs=1e-3)
     assert heir.motion(10 + 2 * REPEAT_TICKS) == (HOME, MOVE[2], 10, ticks)
 
@@ -166,10 +161,10 @@ def test_a_motion_that_is_over_or_of_an_impossible_duration_is_taken_over_as_a_h
     end_tick: int, ticks: int
 ) -> None:
     made, felt = TrackingDriver(SCENARIO, SCENARIO.vehicle), sense(25, MOVE[2])
-    made.take_over(replace(felt, motion_end_tick=end_tick, motion_origin=HOME, motion_ticks=ticks))
+    made.take_over(replace(felt, motion=CurrentMotion(HOME, end_tick, ticks)))
     assert made.at_rest(felt)
     drive = made.drive(felt, moving=False)
-    assert (drive.motion_origin, drive.motion_ticks) == (MOVE[2], 0)
+    assert drive.motion == CurrentMotion(MOVE[2])
 
 
 # --- the end of a motion ----------------------------------------------------------------------
@@ -202,8 +197,8 @@ def test_a_late_motion_has_an_end_in_the_future() -> None:
     made.begin(MOVE, 10, MOVE_TICKS)
     tick = 10 + MOVE_TICKS + 5
     late = sense(tick, MOVE[2], off=(-2.0, 0.0))
-    assert made.drive(late, moving=True).motion_end_tick == tick + 1
-    assert made.drive(late, moving=False).motion_end_tick == 0
+    assert made.drive(late, moving=True).motion.end_tick == tick + 1
+    assert made.drive(late, moving=False).motion.end_tick == 0
 
 
 # --- what is tracked --------------------------------------------------------------------------
@@ -247,7 +242,7 @@ def test_an_unusable_answer_leaves_what_is_being_played() -> None:
     probe.broken = True
     for ticks in (3, 4, 20):
         drive = made.drive(sense(10 + ticks), moving=True)
-        assert drive == Drive(10 + MOVE_TICKS, HOME, MOVE_TICKS, b"")
+        assert drive == Drive(CurrentMotion(HOME, 10 + MOVE_TICKS, MOVE_TICKS), b"")
 
 
 def test_a_usable_answer_ends_the_silence() -> None:

@@ -13,7 +13,7 @@ from laneweave.agents.driving.tracking_problem import NO_GAPS, Gaps
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state, commanded_state
-from laneweave.protocol.wire.messages import Name, Neighbour, Sense, VehicleRecord
+from laneweave.protocol.wire.messages import CurrentMotion, Name, Neighbour, Sense, VehicleRecord
 from laneweave.sim_bridge.bodies.plant import Plant
 
 SCENARIO = Scenario()
@@ -34,7 +34,17 @@ def sense(
     setpoint: tuple[float, float] = (0.0, 0.0),
 ) -> Sense:
     return Sense(
-        Name("me"), 0, 0.0, state, HOME, 0, HOME, 0, VehicleRecord(), ahead, behind, setpoint
+        Name("me"),
+        0,
+        0.0,
+        state,
+        HOME,
+        CurrentMotion(HOME),
+        0,
+        VehicleRecord(),
+        ahead,
+        behind,
+        setpoint,
     )
 
 

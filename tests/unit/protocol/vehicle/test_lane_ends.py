@@ -26,6 +26,7 @@ from laneweave.protocol.vehicle.lane_ends import (
     sections_to_lines,
 )
 from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.protocol.wire.messages import CurrentMotion
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from support.closed_lanes import BLOCKED, DROP
 from support.convoy import ROLLING
@@ -271,7 +272,9 @@ def test_no_line_counts_in_a_lane_that_opens_again_for_a_move_behind_its_end(
     reference = Reference.move(KEEPING, KEEPING.vehicle, (-10, 0), (-10, 1), begin_tick, ticks)
     window = reference.window(begin_tick)
     move = command(begin_tick, *window.jerks.tolist(), hold_cell=(-10, 1), incarnation=7)
-    assert controller.accept_command(replace(move, motion_origin=(-10, 0)))
+    assert controller.accept_command(
+        replace(move, motion=CurrentMotion((-10, 0), move.motion.end_tick))
+    )
     for tick in range(begin_tick, begin_tick + len(window.jerks)):
         s, v, a, y, v_y, a_y = controller.plant.state
         controller.perceive((s + error_m, v, a, y, v_y, a_y), controller.neighbours)
@@ -285,7 +288,7 @@ def test_a_body_that_must_stay_in_its_lane_does_not_stop_at_the_line_of_another(
     lattice = DROP.lattice
     state = (500.0, 5.0, 0.0, lattice.cell_y_m(1), 0.0, 0.0)
     controller = controller_in((0, 1), DROP, state=state)
-    controller.motion_origin, controller.hold_cell = (8, 1), (8, 0)
+    controller.motion, controller.hold_cell = CurrentMotion((8, 1)), (8, 0)
     for tick in range(333, 700):
         controller.step(tick)
         assert controller.plant.state[3] - 0.5 * DROP.vehicle.width_m > lattice.lane_width_m

@@ -17,6 +17,7 @@ from laneweave.protocol.vehicle.plan_execution import LISTEN_S, ExecutionPhase, 
 from laneweave.protocol.vehicle.territory import BlockTerritory
 from laneweave.protocol.wire.messages import (
     Ballot,
+    CurrentMotion,
     Name,
     Plan,
     Prepare,
@@ -431,8 +432,8 @@ def test_how_long_a_move_may_be_due_follows_the_slots_of_its_plan(
 @pytest.mark.parametrize("attended", [True, False])
 def test_the_state_says_what_the_vehicle_knows_and_senses(*, attended: bool) -> None:
     sense = Sense(
-        A, 1001, 100.1, (7.0, 14.0, 0.5, 2.0, 0.1, 0.0), (-4, 1), 1038, (-4, 0), 2,
-        VehicleRecord(joined=(0,)), (), block=3,
+        A, 1001, 100.1, (7.0, 14.0, 0.5, 2.0, 0.1, 0.0), (-4, 1),
+        CurrentMotion((-4, 0), 1038), 2, VehicleRecord(joined=(0,)), (), block=3,
     )  # fmt: skip
     execution = going()
     assert execution.tick(T0_S) is not None

@@ -20,6 +20,7 @@ from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
     Command,
+    CurrentMotion,
     Heartbeat,
     Name,
     PendingTransfer,
@@ -40,7 +41,7 @@ CENSUS = Census(50.0, (), (), bridge=OWN)
 BEAT = Heartbeat(Name("c2"), OWN, 3, leading=True, plans=1)
 STATE = holding(A, t_s=50.0, incarnation=OWN)
 SENSE = sense_in((0, 0), 500, incarnation=OWN, bridge=OWN)
-COMMAND = Command(A, VehicleRecord(OWN), 500, (0, 0), 0, (0, 0), b"")
+COMMAND = Command(A, VehicleRecord(OWN), 500, (0, 0), CurrentMotion((0, 0)), b"")
 POSSIBLE = (CLOCK, CENSUS, BEAT, STATE, SENSE, COMMAND)
 
 

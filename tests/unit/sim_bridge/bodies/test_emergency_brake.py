@@ -11,7 +11,7 @@ from msgspec.structs import astuple
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake, last_tick_m
 from laneweave.protocol.vehicle.motion import Jerk, commanded_state, limited_jerk
-from laneweave.protocol.wire.messages import Name, Neighbour
+from laneweave.protocol.wire.messages import CurrentMotion, Name, Neighbour
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Neighbours
 from laneweave.sim_bridge.bodies.plant import Plant
@@ -159,7 +159,7 @@ def drive_behind(
     least_m = gap_m
     for tick in range(braking_tick + 60):
         controller.accept_command(
-            command(tick, (15.0, 0.0), hold_cell=(0, 0), motion_origin=(0, 0))
+            command(tick, (15.0, 0.0), hold_cell=(0, 0), motion=CurrentMotion((0, 0), tick + 1))
         )
         around = sensors.measure_neighbours(([astuple(seen(own, other))], []))
         controller.perceive(sensors.measure(own.state), around)
@@ -178,7 +178,7 @@ def test_commanding_more_than_the_body_can_brake_does_not_count_as_braking(jerk:
     own, wall = controller.plant, plant_at(24.0, 0.0)
     for tick in range(40):
         controller.accept_command(
-            command(tick, (jerk, 0.0), hold_cell=(0, 0), motion_origin=(0, 0))
+            command(tick, (jerk, 0.0), hold_cell=(0, 0), motion=CurrentMotion((0, 0), tick + 1))
         )
         controller.perceive(own.state, Neighbours((seen(own, wall),), ()))
         controller.step(tick)

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.motion import Jerk, cell_state
-from laneweave.protocol.wire.messages import Ballot, Command, Name, Neighbour
+from laneweave.protocol.wire.messages import Ballot, Command, CurrentMotion, Name, Neighbour
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Neighbours
 from laneweave.sim_bridge.bodies.record_store import MAX_COLUMN
@@ -54,7 +54,7 @@ def test_without_a_command_it_holds_its_cell(controller: MotionController) -> No
         controller.step(tick)
     assert controller.plant.state == pytest.approx(cell_state(LATTICE, HOME, 50 * TICK_S))
     assert driven(controller) == {Rung.HOLD: 50}
-    assert (controller.motion_origin, controller.motion_end_tick) == (HOME, 0)
+    assert controller.motion == CurrentMotion(HOME)
 
 
 def test_plays_jerk_by_jerk_and_from_the_middle_when_ticks_were_missed(
@@ -86,7 +86,7 @@ def test_the_newest_command_counts(controller: MotionController) -> None:
     assert (controller.command_tick, controller.hold_cell) == (5, HOME)
     assert controller.accept_command(command(6, (2.0, 0.0), hold_cell=(1, 1)))
     assert (controller.command_tick, controller.hold_cell) == (6, (1, 1))
-    assert (controller.motion_origin, controller.motion_end_tick) == (HOME, 7)
+    assert controller.motion == CurrentMotion(HOME, 7)
 
 
 def test_a_command_without_jerks_leaves_the_motion_as_it_is_unless_it_names_another_cell(
@@ -95,7 +95,7 @@ def test_a_command_without_jerks_leaves_the_motion_as_it_is_unless_it_names_anot
     controller.accept_command(command(5, *[(1.0, 0.0)] * 3, hold_cell=(1, 1)))
     controller.step(5)
     assert controller.accept_command(command(6, hold_cell=(1, 1)))
-    assert (controller.command_tick, controller.motion_end_tick) == (6, 8)
+    assert (controller.command_tick, controller.motion.end_tick) == (6, 8)
     controller.step(6)
     assert controller.plant.setpoint[0] == pytest.approx(2.0 * TICK_S)
     assert driven(controller) == {Rung.EXECUTE: 2}
@@ -265,8 +265,8 @@ def test_an_acceptance_is_forgotten_when_another_takes_charge(
         {"hold_cell": (0, -1)},
         {"hold_cell": (0, LATTICE.lanes)},
         {"hold_cell": (MAX_COLUMN + 1, 0)},
-        {"motion_origin": (-MAX_COLUMN - 1, 0)},
-        {"motion_origin": (0, 2**62)},
+        {"motion": CurrentMotion((-MAX_COLUMN - 1, 0))},
+        {"motion": CurrentMotion((0, 2**62))},
         {"joined": (0, MAX_COLUMN + 1)},
     ],
 )
@@ -396,7 +396,8 @@ def test_a_body_that_had_to_brake_stays_in_its_lane(
     there: Cell = (HOME[0], HOME[1] + 1)
     # The agent wants to move over, too.
     jerks = [(0.0, 2.0)] * 6 + [(0.0, 0.0)] * 20
-    move = replace(command(0, *jerks, hold_cell=there), motion_origin=origin)
+    move = command(0, *jerks, hold_cell=there)
+    move = replace(move, motion=replace(move.motion, origin=origin))
     assert controller.accept_command(move)
     touched = False
     for tick in range(8):

@@ -8,7 +8,14 @@ import pytest
 from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, VehicleState
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    CurrentMotion,
+    Name,
+    Plan,
+    Prepare,
+    VehicleState,
+)
 from laneweave.sim_bridge.road.attendance import Caretaker
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.paper import PAPER
@@ -151,9 +158,7 @@ def test_never_moves_whatever_it_has_promised_and_accepted(
 
 def test_the_move_of_the_agent_before_it_counts_until_its_end(vehicle: RoadVehicle) -> None:
     # By the hold law, which takes longer than the 38 ticks of the command.
-    move = command(
-        0, (0.0, 0.0), hold_cell=NEXT, incarnation=AGENT, motion_end_tick=38, motion_origin=HOME
-    )
+    move = command(0, (0.0, 0.0), hold_cell=NEXT, incarnation=AGENT, motion=CurrentMotion(HOME, 38))
     assert vehicle.controller.accept_command(move)
     drive(vehicle, range(5))
     caretaker = Caretaker(vehicle, CARETAKER, 5)

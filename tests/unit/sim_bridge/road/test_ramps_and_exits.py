@@ -10,7 +10,14 @@ from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.vehicle.lane_ends import dead_ends
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.events import DRIVES_OUT, LEFT_LATTICE, MISSED_EXIT
-from laneweave.protocol.wire.messages import Ballot, Command, Name, PendingTransfer, VehicleRecord
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Command,
+    CurrentMotion,
+    Name,
+    PendingTransfer,
+    VehicleRecord,
+)
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase, Rung
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.demand import arrivals
@@ -197,7 +204,7 @@ def change_at(moves: float) -> Command:
     tick = round(time_before_line(moves) / WEAVING.runtime.tick_s)
     return Command(
         vehicle=Name("A"), record=VehicleRecord(incarnation=1), tick=tick, hold_cell=(0, 0),
-        motion_end_tick=tick + 58, motion_origin=(0, 1), jerks=b"", motion_ticks=58,
+        motion=CurrentMotion((0, 1), tick + 58, 58), jerks=b"",
     )  # fmt: skip
 
 
@@ -241,7 +248,8 @@ def test_the_roadside_takes_it_back_and_the_vehicle_drives_past_the_exit() -> No
     while road.t_s < line_s - 0.3 * WEAVING.timing.move_s:
         road.step()
     controller.store.assign_cell((column, 0))
-    controller.motion_origin, controller.hold_cell = controller.hold_cell, (column, 0)
+    controller.motion = CurrentMotion(controller.hold_cell)
+    controller.hold_cell = (column, 0)
     road.step()
     assert (MISSED_EXIT, vehicle.name) in [(kind, name) for _, kind, name in road.events]
     run(road, owners_checked=False)

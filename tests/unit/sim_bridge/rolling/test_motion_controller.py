@@ -12,6 +12,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import (
     Ballot,
     Command,
+    CurrentMotion,
     Name,
     PendingTransfer,
     Prepare,
@@ -63,8 +64,7 @@ def order(
         ),
         0,
         HOME,
-        0,
-        HOME,
+        CurrentMotion(HOME),
         b"",
     )
 

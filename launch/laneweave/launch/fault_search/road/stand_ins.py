@@ -21,7 +21,7 @@ from laneweave.protocol.lattice import Cell, PlannedMove, displacements, footpri
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import at_rest_in_cell
-from laneweave.protocol.wire.messages import Motion, Sense
+from laneweave.protocol.wire.messages import CurrentMotion, Motion, Sense
 
 UNNEEDED_MOVES = 0.4
 """Probability with which the planner moves a vehicle that is in its preferred lane."""
@@ -49,8 +49,8 @@ class LightDriver:
 
     def take_over(self, sense: Sense) -> None:
         """Continue the current motion of the motion controller."""
-        self._origin, self._goal = sense.motion_origin, sense.hold_cell
-        self._end_tick, self._ticks = sense.motion_end_tick, sense.motion_ticks
+        motion, self._goal = sense.motion, sense.hold_cell
+        self._origin, self._end_tick, self._ticks = motion.origin, motion.end_tick, motion.ticks
 
     def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
         """Begin a move of `ticks` ticks at a tick."""
@@ -66,7 +66,7 @@ class LightDriver:
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         """Return a command with the end of the current motion, and without jerks."""
         end_tick = max(self._end_tick, sense.tick + 1) if moving else 0
-        return Drive(end_tick, self._origin, self._ticks, b"")
+        return Drive(CurrentMotion(self._origin, end_tick, self._ticks), b"")
 
     def motion(self, tick: int) -> None:
         """Publish no motion; motions would only slow down the search."""

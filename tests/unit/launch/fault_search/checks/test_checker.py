@@ -9,7 +9,14 @@ import pytest
 from laneweave.launch.fault_search.checks.checker import MAX_VIOLATIONS, Checker
 from laneweave.launch.fault_search.checks.geometry import Geometry
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.wire.messages import Ballot, Name, Sense, VehicleRecord, VehicleState
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    CurrentMotion,
+    Name,
+    Sense,
+    VehicleRecord,
+    VehicleState,
+)
 from support.states import holding, make_plan
 from support.tables import for_each
 
@@ -32,8 +39,9 @@ def state(vehicle: Name, seq: int | None, hold_cell: Cell = (0, 0), **more: obje
     return holding(vehicle, None if seq is None else ballot(seq), hold_cell, **more)
 
 
-def sense(attendant: int, joined: tuple[int, ...] = (0,)) -> Sense:
-    return Sense(A, 1, 0.1, (0.0,) * 6, (0, 0), 0, (0, 0), 0, VehicleRecord(attendant, joined), ())
+def sense(in_charge: int, joined: tuple[int, ...] = (0,)) -> Sense:
+    record = VehicleRecord(in_charge, joined)
+    return Sense(A, 1, 0.1, (0.0,) * 6, (0, 0), CurrentMotion((0, 0)), 0, record, ())
 
 
 class Scene:

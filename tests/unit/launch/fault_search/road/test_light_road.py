@@ -20,6 +20,7 @@ from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
     Command,
+    CurrentMotion,
     Name,
     Prepare,
     Sense,
@@ -68,7 +69,7 @@ class Bench:
     ) -> list[object]:
         tick = self.road.tick if tick is None else tick
         record = VehicleRecord(incarnation=incarnation, accepted=accepted)
-        command = Command(A, record, tick, cell, tick + 8, (4, 1), b"")
+        command = Command(A, record, tick, cell, CurrentMotion((4, 1), tick + 8), b"")
         return messages(self.road.handle(Arrived(COMMAND, OWN, command), self.now_s))
 
     def agent(self, *, up: bool) -> None:
