@@ -54,10 +54,10 @@ def test_start(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, TWO)
     effects = desk.start()
     assert effects[:6] == [
-        Listen(topics.COMMAND),
         Listen(topics.EVENT),
         Listen(topics.REPORT),
         Listen(topics.HEARTBEAT),
+        Listen(topics.COMMAND),
         Watch(topics.VEHICLE_ALIVE),
         Announce(topics.BRIDGE_ALIVE, {"incarnation": 0}),
     ]

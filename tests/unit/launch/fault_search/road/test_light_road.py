@@ -22,12 +22,10 @@ from laneweave.protocol.wire.messages import (
     Command,
     CurrentMotion,
     Name,
-    Prepare,
     Sense,
     VehicleRecord,
-    VehicleState,
 )
-from laneweave.protocol.wire.topics import COMMAND, PREPARE, VEHICLE_ALIVE
+from laneweave.protocol.wire.topics import COMMAND, VEHICLE_ALIVE
 
 SCENARIO = RoadSetup(lanes=3).make_scenario()
 A = Name("a")
@@ -125,31 +123,6 @@ def test_a_late_command_counts_unless_a_newer_one_was_there(bench: Bench) -> Non
     bench.command(7, (4, 1), tick=1)
     bench.command(6, (4, 1))  # an earlier process
     assert len(bench.log) == 2
-
-
-def test_a_vehicle_without_agent_gets_a_caretaker_that_gives_way(bench: Bench) -> None:
-    for _ in range(5):  # time that an agent may take to connect
-        bench.tick()
-    bench.agent(up=False)
-    sent = bench.tick()
-    assert [message.attended for message in sent if isinstance(message, VehicleState)] == [False]
-    sense = next(message for message in sent if isinstance(message, Sense))
-    assert sense.caretaker
-    assert sense.record.incarnation == 100
-    prepare = Prepare(Ballot(1, Name("c1"), 1, 1), (-1,), (A,))
-    (state,) = messages(bench.road.handle(Arrived(PREPARE, OWN, prepare), bench.now_s))
-    assert isinstance(state, VehicleState)
-    assert state.record.promised == prepare.ballot
-    bench.agent(up=True)
-    bench.command(101, (4, 1))
-    assert not bench.sense().caretaker
-    assert bench.road.takeovers == 1
-
-
-def test_a_silent_agent_is_replaced(bench: Bench) -> None:
-    ticks = round(SCENARIO.runtime.agent_silent_s / SCENARIO.runtime.tick_s)
-    assert not any(bench.sense().caretaker for _ in range(ticks - 1))
-    assert any(bench.sense().caretaker for _ in range(3))
 
 
 def test_a_wrong_clock_shifts_no_cell() -> None:
