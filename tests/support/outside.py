@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 from attrs import define, field
 
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
-from laneweave.sim_bridge.corridors.corridor_world import Approaching, CorridorWorld
-from laneweave.sim_bridge.corridors.take_over import TakeOver
+from laneweave.sim_bridge.corridors.take_over import Approaching, TakeOver
 from laneweave.sim_bridge.road.demand import Arrival
 
 
@@ -27,7 +24,7 @@ class Outside:
 
     def take_over(self, scenario: Scenario) -> TakeOver:
         """Return the traffic from outside of a road."""
-        return TakeOver(scenario, cast("CorridorWorld", self))
+        return TakeOver(scenario, self)
 
     def approaching(self, lane: int) -> list[Approaching]:
         return [one for one in self.coming if one.arrival.lane == lane]

@@ -219,7 +219,7 @@ def _check_sumo_options(settings: Scenario, volume: float | None, *, compare: bo
         CommandFailedError: there is no screen for the window.
     """
     if settings.sumo.gui:
-        from laneweave.sim_bridge.sumo.sumo_gui import check_screen
+        from laneweave.sim_bridge.sumo.simulation import check_screen
 
         check_screen()
     if volume is not None and settings.sumo.config:

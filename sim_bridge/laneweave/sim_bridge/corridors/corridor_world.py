@@ -27,7 +27,9 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, pose_of
 from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor
 from laneweave.sim_bridge.corridors.corridor_setup import MAX_WAIT_S, CorridorArrival, CorridorSetup
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
+from laneweave.sim_bridge.corridors.exit_room import SEEN_BEYOND_M
 from laneweave.sim_bridge.corridors.sumo_network import Lane
+from laneweave.sim_bridge.corridors.take_over import Approaching
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.sumo.simulation import SumoProcess
 
@@ -48,25 +50,8 @@ would brake in an emergency."""
 SLOWING_TAU_S = 0.5
 """Headway that SUMO keeps meanwhile. That of the lattice may be shorter than SUMO's default, 1 s,
 and SUMO would brake to lengthen it."""
-SEEN_BEYOND_M = 200.0
-"""Distance behind an exit up to which SUMO's vehicles are seen."""
 MAX_DISPLAY_ERROR_M = 0.1
 """Maximum distance between a body and where SUMO displays it."""
-
-
-@frozen
-class Approaching:
-    """A vehicle that SUMO drives towards an entrance."""
-
-    arrival: Arrival
-    """With the lane to which it comes."""
-    s_m: float
-    """Position of its front on the road; it is negative before the start."""
-    speed_mps: float
-    limits: tuple[tuple[float, float], ...]
-    """Where each lane on its way ends [m], from its own on, and how fast it drives there [m/s]."""
-    upstream: bool = False
-    """Whether it still has to pass a junction where ways join, so that others may come before."""
 
 
 @frozen

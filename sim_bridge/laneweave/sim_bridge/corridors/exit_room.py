@@ -20,6 +20,8 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.road.demand import Arrival
 
+SEEN_BEYOND_M = 200.0
+"""Distance behind an exit up to which SUMO's vehicles are seen."""
 QUEUEING_MPS = 3.0
 """Speed below which vehicles are in a queue."""
 QUEUE_DECEL_MPS2 = 3.0
@@ -53,9 +55,8 @@ class _Way:
 class ExitRoom:
     """Holds vehicles at the start back while their exits have no room for them."""
 
-    def __init__(self, scenario: Scenario, seen_m: float) -> None:
-        """Read the exits of a road, behind which bodies are seen up to `seen_m`."""
-        self._seen_m = seen_m
+    def __init__(self, scenario: Scenario) -> None:
+        """Read the exits of a road."""
         self._braking_m = scenario.formation.speed_mps**2 / (2.0 * QUEUE_DECEL_MPS2)
         self._place_m = scenario.types.longest_body_m + SPACE_M
         self._held: list[Arrival] = []
@@ -129,7 +130,7 @@ class ExitRoom:
         """Return the number of vehicles on the way that fit behind a queue; see `_Way.queue`."""
         if math.isinf(tail_m):
             # The queue may be back before all vehicles that have waited are at the exit.
-            room_m = self._seen_m
+            room_m = SEEN_BEYOND_M
         else:
             # They may brake in the lane of the exit, but stand behind it. One place remains free,
             # since vehicles brake earlier than they have to.

@@ -19,7 +19,7 @@ from xml.etree import ElementTree as ET
 from attrs import field, frozen
 
 from laneweave.protocol.errors import NO_VALUE, BadInputError, Described
-from laneweave.sim_bridge.sumo.simulation import SumoFailedError, SumoProcess
+from laneweave.sim_bridge.sumo.simulation import SumoFailedError, SumoProcess, first_element
 
 _WITHOUT_EFFECT = frozenset({"output", "report", "traci_server", "gui_only"})
 """Sections of options that do not determine how vehicles drive."""
@@ -174,27 +174,6 @@ def _check_kind(file: Path) -> None:
     if kind in kinds:
         allowed = f"a configuration (.sumocfg) that names it; the file is {kinds[kind]}"
         raise BadInputError("SUMOCFG", str(file), allowed)
-
-
-def first_element(field: str, file: Path) -> ET.Element:
-    """Return the outermost element of an XML file with its attributes, not its content.
-
-    Args:
-        field: what the file is, for errors.
-        file: the file, compressed if its name ends with `.gz`.
-
-    Raises:
-        BadInputError: it cannot be read, or is no XML.
-    """
-    try:
-        with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as stream:
-            found: ET.Element = next(ET.iterparse(stream, events=("start",)))[1]  # noqa: S314
-    except (ET.ParseError, StopIteration, EOFError, gzip.BadGzipFile) as error:
-        raise BadInputError(field, str(file), f"XML ({error})") from error
-    except OSError as error:
-        allowed = f"a readable file ({error.strerror or error})"
-        raise BadInputError(field, str(file), allowed) from error
-    return found
 
 
 def _paths(value: str) -> tuple[Path, ...]:

@@ -10,8 +10,7 @@ from pathlib import Path
 from attrs import define, field, frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.sim_bridge.corridors.sumo_config import first_element
-from laneweave.sim_bridge.sumo.simulation import SumoProcess
+from laneweave.sim_bridge.sumo.simulation import SumoProcess, first_element
 
 CARS = "passenger"
 """Class of vehicles that must be allowed in a lane of a corridor."""

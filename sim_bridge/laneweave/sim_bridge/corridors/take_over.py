@@ -12,18 +12,15 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from typing import Protocol
 
-from attrs import evolve
+from attrs import evolve, frozen
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
 from laneweave.protocol.vehicle.lane_ends import dead_ends
-from laneweave.sim_bridge.corridors.corridor_world import (
-    SEEN_BEYOND_M,
-    Approaching,
-    CorridorWorld,
-)
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.corridors.exit_room import ExitRoom
 from laneweave.sim_bridge.corridors.settling import LONGEST_S, before_rest_s, fall_back, settling_s
 from laneweave.sim_bridge.road.demand import Arrival
@@ -50,10 +47,54 @@ MAX_COLUMNS = 40
 """Maximum number of columns that are tried."""
 
 
+@frozen
+class Approaching:
+    """A vehicle that SUMO drives towards an entrance."""
+
+    arrival: Arrival
+    """With the lane to which it comes."""
+    s_m: float
+    """Position of its front on the road; it is negative before the start."""
+    speed_mps: float
+    limits: tuple[tuple[float, float], ...]
+    """Where each lane on its way ends [m], from its own on, and how fast it drives there [m/s]."""
+    upstream: bool = False
+    """Whether it still has to pass a junction where ways join, so that others may come before."""
+
+
+class SumoTraffic(Protocol):
+    """What take-over sees of the vehicles that SUMO drives, and what it asks of them."""
+
+    @property
+    def start_lanes(self) -> tuple[int, ...]:
+        """Lanes of the road into which lanes lead at its start."""
+
+    @property
+    def departing(self) -> Sequence[Arrival]:
+        """Vehicles that depart near their entrances, by time."""
+
+    @property
+    def outside(self) -> Sequence[Arrival]:
+        """All vehicles that come from outside."""
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether no more vehicles will come."""
+
+    def approaching(self, lane: int) -> Sequence[Approaching]:
+        """Return the vehicles that approach the entrance of a lane, the first one first."""
+
+    def others(self) -> Sequence[OtherBody]:
+        """Return the bodies of SUMO's vehicles near the road."""
+
+    def advise(self, vehicle: str, speed_mps: float | None) -> None:
+        """Advise a vehicle's speed; None: its driver decides."""
+
+
 class TakeOver(OutsideTraffic):
     """Takes vehicles over from SUMO."""
 
-    def __init__(self, scenario: Scenario, world: CorridorWorld) -> None:
+    def __init__(self, scenario: Scenario, world: SumoTraffic) -> None:
         """Begin without vehicles on their way to the entrances."""
         self._world = world
         self._lattice = scenario.lattice
@@ -75,7 +116,7 @@ class TakeOver(OutsideTraffic):
             for lane, at_m in self._at_m.items()
         }
         """Where moves out of each of these lanes have ended."""
-        self._exit_room = ExitRoom(scenario, SEEN_BEYOND_M)
+        self._exit_room = ExitRoom(scenario)
         self._occupied = set[Cell]()
         """Cells in which vehicles are, or to which they move."""
         self._known: dict[str, Arrival] = {}

@@ -1,19 +1,25 @@
-"""SUMO in this process; the only module that imports libsumo.
+"""SUMO in this process, and its window; the only module that imports libsumo and traci.
 
 libsumo stores its simulation in global variables, so a process can have only one `SumoProcess` at a
 time. libsumo is imported when one opens, so that other code works without it.
+
+libsumo has no window. So sumo-gui runs beside it as a second simulation of the same network without
+traffic of its own, and shows the vehicles of the first, tick by tick, over TraCI.
 """
 
 from __future__ import annotations
 
 import ctypes
+import gzip
+import importlib.util
 import os
+import sys
+import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from laneweave.protocol.errors import CommandFailedError
-from laneweave.sim_bridge.sumo.sumo_gui import SumoGui, load_traci
+from laneweave.protocol.errors import BadInputError, CommandFailedError
 
 DEBIAN_PACKAGES = {
     "libX11.so.6": "libx11-6",
@@ -24,6 +30,11 @@ DEBIAN_PACKAGES = {
 }
 """System libraries that libsumo loads, and their Debian packages; slim containers lack them."""
 
+MISSING = "sumo-gui is not installed: pip install 'laneweave[gui]'"
+NO_DISPLAY = "sumo-gui needs a screen, and DISPLAY is not set: run without --gui, or with xvfb-run"
+_ROUTE, _LABEL = "laneweave", "laneweave-gui"
+_EXACT = 2
+"""moveToXY puts a vehicle exactly at a position, whatever its route."""
 _IMPORT_SWITCH = "LIBSUMO_AS_TRACI"
 
 
@@ -125,13 +136,143 @@ class SumoProcess:
         self.close()
 
 
+def check_screen() -> None:
+    """Check that there is a screen for a window.
+
+    Raises:
+        CommandFailedError: there is none.
+    """
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        raise CommandFailedError(NO_DISPLAY)
+
+
+class SumoGui:
+    """A window of sumo-gui, to be closed."""
+
+    def __init__(self, network: Path, tick_s: float, program: str = "sumo-gui") -> None:
+        """Start sumo-gui, and wait until it has loaded the network.
+
+        Args:
+            network: network file of the simulation.
+            tick_s: length of a tick.
+            program: `sumo-gui`, or `sumo`, which shows nothing (tests).
+
+        Raises:
+            CommandFailedError: sumo-gui is not installed, or cannot start.
+        """
+        if program == "sumo-gui":
+            check_screen()
+        package, traci = importlib.util.find_spec("sumo"), _load_traci()
+        if package is None or package.origin is None or traci is None:
+            raise CommandFailedError(MISSING)
+        suffix = ".exe" if sys.platform == "win32" else ""
+        binary = Path(package.origin).parent / "bin" / f"{program}{suffix}"
+        command = [str(binary), "--net-file", str(network), "--step-length", f"{tick_s:g}"]
+        command += [
+            "--collision.action",
+            "none",
+            "--time-to-teleport",
+            "-1",
+            "--no-warnings",
+            "true",
+        ]
+        command += ["--no-step-log", "true", "--xml-validation", "never"]
+        if program == "sumo-gui":
+            command += ["--start", "true", "--quit-on-end", "true", "--delay", "0"]
+        self._lost = (traci.exceptions.FatalTraCIError, OSError)
+        self._refused = traci.exceptions.TraCIException
+        try:
+            traci.start(command, label=_LABEL)
+            self._gui: Any = traci.getConnection(_LABEL)
+            lanes = (lane for lane in self._gui.lane.getIDList() if not lane.startswith(":"))
+            for_cars = (
+                one for one in lanes if "passenger" not in self._gui.lane.getDisallowed(one)
+            )
+            self._gui.route.add(_ROUTE, [self._gui.lane.getEdgeID(next(for_cars))])
+        except (*self._lost, self._refused) as error:
+            raise CommandFailedError(f"sumo-gui does not start ({error})") from error
+        self._shown = set[str]()
+
+    def show(self, vehicles: Any, names: list[str] | tuple[str, ...]) -> bool:  # noqa: ANN401
+        """Show vehicles where they are; return whether the window is still open.
+
+        Args:
+            vehicles: libsumo's interface to vehicles.
+            names: the vehicles on the network.
+        """
+        try:
+            for name in self._shown.difference(names):
+                self._gui.vehicle.remove(name)
+            for name in names:
+                if name not in self._shown:
+                    self._add(vehicles, name)
+                x_m, y_m = vehicles.getPosition(name)
+                lane = vehicles.getLaneID(name)
+                edge, _, index = lane.rpartition("_")
+                self._gui.vehicle.moveToXY(
+                    name, edge, int(index or 0), x_m, y_m, vehicles.getAngle(name), _EXACT
+                )
+            self._shown = set(names)
+            self._gui.simulationStep()
+        except (*self._lost, self._refused):
+            return False  # the user has closed the window, or sumo-gui cannot show a vehicle
+        return True
+
+    def _add(self, vehicles: Any, name: str) -> None:  # noqa: ANN401
+        api = self._gui.vehicle
+        api.add(name, _ROUTE)
+        api.setSpeedMode(name, 0)
+        api.setLaneChangeMode(name, 0)
+        api.setLength(name, vehicles.getLength(name))
+        api.setWidth(name, vehicles.getWidth(name))
+        api.setVehicleClass(name, vehicles.getVehicleClass(name))
+        api.setColor(name, vehicles.getColor(name))
+
+    def close(self) -> None:
+        """Close the window, unless the user has done so."""
+        try:
+            self._gui.close()
+        except self._lost:
+            return
+
+
+def first_element(field: str, file: Path) -> ET.Element:
+    """Return the outermost element of an XML file with its attributes, not its content.
+
+    Args:
+        field: what the file is, for errors.
+        file: the file, compressed if its name ends with `.gz`.
+
+    Raises:
+        BadInputError: it cannot be read, or is no XML.
+    """
+    try:
+        with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as stream:
+            found: ET.Element = next(ET.iterparse(stream, events=("start",)))[1]  # noqa: S314
+    except (ET.ParseError, StopIteration, EOFError, gzip.BadGzipFile) as error:
+        raise BadInputError(field, str(file), f"XML ({error})") from error
+    except OSError as error:
+        allowed = f"a readable file ({error.strerror or error})"
+        raise BadInputError(field, str(file), allowed) from error
+    return found
+
+
+def _load_traci() -> Any:  # noqa: ANN401 - optional
+    """Return the module traci; None: it is not installed."""
+    try:
+        import traci  # noqa: PLC0415 (optional)
+    except ImportError:
+        return None
+    return traci
+
+
 def _load_libsumo() -> Any:  # noqa: ANN401 - libsumo has no types
     """Import libsumo without its warning about the version of pyarrow.
 
     The warning concerns SUMO's Parquet output, which is not used. libsumo and pyarrow were tested
     together, imported in either order.
     """
-    load_traci()  # before the switch, which also makes traci an alias of libsumo
+    _load_traci()  # before the switch, which also makes traci an alias of libsumo
     previous = os.environ.get(_IMPORT_SWITCH)
     os.environ[_IMPORT_SWITCH] = "quiet"
     try:

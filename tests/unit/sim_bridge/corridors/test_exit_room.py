@@ -11,8 +11,6 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.corridors.exit_room import QUEUE_DECEL_MPS2, SPACE_M, ExitRoom
 
-SEEN_M = 200.0
-
 
 def body(scenario: Scenario, rear_m: float, speed_mps: float = 0.0, lane: int = 0) -> OtherBody:
     """Return a body behind the end of the exit's edge, 4 m after vehicles are given back."""
@@ -22,7 +20,7 @@ def body(scenario: Scenario, rear_m: float, speed_mps: float = 0.0, lane: int = 
 
 def places(scenario: Scenario, *others: OtherBody, waiting: int = 0) -> int:
     """Return how many vehicles may be on their way to the exit."""
-    room = ExitRoom(scenario, SEEN_M)
+    room = ExitRoom(scenario)
     count = 0
     while count < 1000 and room.has_room("off", count, waiting, others):
         count += 1
@@ -70,7 +68,7 @@ def test_those_who_have_waited_do_not_come_all_at_once(scenario: Scenario) -> No
 
 def test_other_lanes_and_the_end_of_the_road_do_not_matter(scenario: Scenario) -> None:
     assert places(scenario, body(scenario, 5.0, lane=1)) == 1000
-    assert ExitRoom(scenario, SEEN_M).has_room(END_OF_ROAD, 500, 9, [body(scenario, 5.0)])
+    assert ExitRoom(scenario).has_room(END_OF_ROAD, 500, 9, [body(scenario, 5.0)])
 
 
 def test_a_queue_does_not_keep_the_exit_unused(scenario: Scenario) -> None:

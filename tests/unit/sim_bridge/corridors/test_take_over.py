@@ -7,7 +7,7 @@ from attrs import evolve
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.corridors.corridor_world import Approaching
+from laneweave.sim_bridge.corridors.take_over import Approaching
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
 from support.outside import Outside

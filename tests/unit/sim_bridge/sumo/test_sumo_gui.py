@@ -12,7 +12,7 @@ import traci
 from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.sumo import simulation
-from laneweave.sim_bridge.sumo.sumo_gui import SumoGui
+from laneweave.sim_bridge.sumo.simulation import SumoGui
 from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 
 SCENARIO = Scenario()
