@@ -217,7 +217,6 @@ class VehicleState(Message, frozen=True):
     speed_mps: Real
     """Speed along the road [m/s]."""
     t_s: Real
-    """Road time of the tick [s]."""
 
     @property
     def accepted(self) -> bool:
@@ -279,7 +278,6 @@ class Sense(Message, frozen=True):
     """Receiver."""
     tick: Int64
     t_s: Real
-    """Road time of the tick [s]."""
     measured: tuple[Real, Real, Real, Real, Real, Real]
     """State (s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2]); s is the front bumper along
     the road, y the body centre from the right edge."""
@@ -416,7 +414,6 @@ class Census(Message, frozen=True):
     """
 
     t_s: Real
-    """Road time [s]."""
     on_road: tuple[CensusEntry, ...]
     """All vehicles on the road."""
     announced: tuple[Announcement, ...]
@@ -446,13 +443,11 @@ class RoadClock(Message, frozen=True):
 
     tick: Int64
     t_s: Real
-    """Road time of the tick [s]."""
     demanded: Int64
     """Number of vehicles that have arrived so far."""
     entered: Int64
     """Number of vehicles that have entered so far."""
     on_road: Int64
-    """Number of vehicles on the road."""
     left: Int64
     """Number of vehicles that have left so far."""
     ended: bool
@@ -499,7 +494,6 @@ class LogEvent(Message, frozen=True):
     role: Name
     name: Name
     t_s: Real
-    """Road time [s]."""
     kind: Name
     """One of the names in `wire.events`."""
     data: dict[str, Any] = field(default_factory=dict)
