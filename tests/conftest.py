@@ -23,8 +23,10 @@ settings.load_profile("any-load")  # no test depends on the machine's load
 def pytest_configure() -> None:
     """Let child processes receive SIGINT and SIGHUP, which background jobs and nohup ignore.
 
-    Child processes inherit that a signal is ignored, but no handlers.
+    Child processes inherit that a signal is ignored, but no handlers. Garbage is not collected
+    while tests are collected, which would take 15 % of that time.
     """
+    gc.disable()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
@@ -41,6 +43,7 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000)
+    gc.enable()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -94,7 +94,7 @@ def test_a_leader_that_is_killed_is_replaced(
     folder = lab.folder / "out"
 
     # Slow enough that an election takes a second or two of road time, not ten.
-    found = run_with(lab, road, faults, "--pace", "5")
+    found = run_with(lab, road, faults, "--pace", "5", "--vehicles-per-process", "4")
 
     assert final_lanes(folder) == final_lanes(finished_run("simulated"))
     leaders = {event["coordinator"] for event in events(folder, "leader")}
@@ -210,6 +210,7 @@ def test_each_group_is_cut_off_for_some_time(lab: Lab, short: Path) -> None:
     assert events(lab.folder / "out", "caretaker-took-over")
 
 
+@pytest.mark.more
 def test_a_fault_that_never_came_fails_the_run(lab: Lab, short: Path) -> None:
     faults = lab.path(
         "faults.toml", "[[kill]]\nat_s = 5000\n[[messages]]\nloss = 1\nfrom_s = 6000\n"

@@ -133,6 +133,7 @@ def test_status_of_a_deployment(lab: Lab) -> None:
     lab.check_nothing_left()
 
 
+@pytest.mark.more
 def test_metrics_of_a_coordinator(lab: Lab) -> None:
     config = deployment(lab, free_tcp())
     address, router_address = (free_tcp().removeprefix("tcp/") for _ in range(2))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.messages import Name
@@ -46,6 +48,7 @@ def watched(street: Street) -> Callable[[], bool]:
     return look
 
 
+@pytest.mark.more
 def test_on_a_bad_network_vehicles_are_late_at_worst(tmp_path: Path) -> None:
     street = Street(SCENARIO, tmp_path, DEMAND, BAD)
     street.start_coordinators(2)

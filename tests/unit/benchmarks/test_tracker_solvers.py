@@ -43,6 +43,7 @@ def test_every_family_and_solver_gets_a_row() -> None:
             assert row["first_jerk_difference_mps3"]["p99"] < 0.3
 
 
+@pytest.mark.more
 @pytest.mark.slow
 def test_a_recorded_program_is_that_of_its_tick(recording: Recording) -> None:
     """The dynamics' bounds lead from the recorded state to the predicted states."""
@@ -58,6 +59,7 @@ def test_a_recorded_program_is_that_of_its_tick(recording: Recording) -> None:
         assert tracker.program.high.all.tobytes() == problem.upper.tobytes()
 
 
+@pytest.mark.more
 @pytest.mark.slow
 def test_solvers_agree(recording: Recording) -> None:
     by_name = solvers(SCENARIO, recording.parts)

@@ -111,6 +111,7 @@ def held() -> tuple[VehiclesEnv, list[Any]]:
     return env, play(env, hold, 1)
 
 
+@pytest.mark.more
 def test_possible_agents_are_the_demanded_vehicles(held: tuple[VehiclesEnv, list[Any]]) -> None:
     env, _ = held
     assert env.possible_agents == [one.vehicle for one in arrivals(env.scenario)]
@@ -166,6 +167,7 @@ LANE_DROP = pytest.param(
 )
 
 
+@pytest.mark.more
 @pytest.mark.parametrize("policy", variants([any_move, into_others, into_one_lane]))
 @pytest.mark.parametrize("tables", variants([LANE_DROP, STRAIGHT, OBLIQUE]))
 def test_no_action_makes_bodies_overlap(
@@ -315,6 +317,7 @@ def test_observations_and_masks_of_a_vehicle_alone() -> None:
     assert not results[-1][0]["v0001"].any()
 
 
+@pytest.mark.more
 def test_vehicles_on_the_road_at_the_limit_are_truncated() -> None:
     env = parallel_env(SHORT | {"runtime": {"max_road_s": 40.0}})
     results = play(env, hold, 1)

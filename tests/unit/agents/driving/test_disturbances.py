@@ -38,6 +38,7 @@ def test_a_disturbance_that_takes_the_gap_makes_followers_brake() -> None:
     assert (response.speed_mps.min(axis=0) < -3.0).all()
 
 
+@pytest.mark.more
 def test_a_lane_change_is_disturbed_and_its_own_motion_is_no_error() -> None:
     response = respond(Case("switching", drop_mps=3.0, vehicles=9))
     assert response.moves > 0

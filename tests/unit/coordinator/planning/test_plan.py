@@ -52,7 +52,7 @@ def test_cost_is_optimal_or_infeasibility_is_proven(request: PlanRequest) -> Non
 
 
 @pytest.mark.slow
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(requests(limited=True), st.sampled_from(SOLVERS))
 def test_vehicles_drive_only_their_moves(request: PlanRequest, solver: str) -> None:
     """Both solvers find the optimum, alone, if vehicles cannot drive all moves."""

@@ -465,6 +465,7 @@ def test_a_flooding_client_is_refused_at_a_limited_rate() -> None:
     assert desk.ask(REQUEST, session=flood) in desk.replies
 
 
+@pytest.mark.more
 def test_a_refusal_is_held_back_for_at_most_the_longest_advice() -> None:
     desk = make_desk(client_queue_limit=1)
     flood = opened(desk, "flood")

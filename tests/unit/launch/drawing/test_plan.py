@@ -137,6 +137,7 @@ def test_the_longest_road_stays_within_memory(tmp_path: Path) -> None:
         assert 10_000 < image.width <= 30_000
 
 
+@pytest.mark.more
 @pytest.mark.slow
 def test_a_gif_moves_and_begins_again(tmp_path: Path) -> None:
     out = tmp_path / "plan.GIF"

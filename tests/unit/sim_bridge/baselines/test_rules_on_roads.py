@@ -294,6 +294,7 @@ def test_all_vehicles_leave_at_their_destinations(scenario: Scenario, rule: dict
 # --- crowds -----------------------------------------------------------------------------------
 
 
+@pytest.mark.more
 @pytest.mark.slow
 @settings(max_examples=40)
 @given(

@@ -83,6 +83,7 @@ def test_a_single_vehicle_waits_for_the_gap_that_comes_from_the_entrance() -> No
     assert road.vehicles[name].admission.cell == controller.hold_cell
 
 
+@pytest.mark.more
 def test_between_two_gaps_there_is_as_much_room_for_traffic() -> None:
     road = lonely_road(DROP, 900.0, 100.0)
     while road.t_s < 100.0:

@@ -100,6 +100,7 @@ def test_the_cells_of_a_ramp_get_owners_where_it_begins_and_no_two() -> None:
     assert len(on_ramp) > 0.9 * (last - first + 1)
 
 
+@pytest.mark.more
 def test_vehicles_in_the_lane_of_an_exit_leave_there_whatever_their_destination() -> None:
     road = LonelyRoad(WEAVING)
     run(road)

@@ -87,6 +87,7 @@ def drive(road: LonelyRoad) -> None:
         assert all(len(names) == 1 for names in owners_of(road).values())
 
 
+@pytest.mark.more
 def test_no_cell_has_two_owners_and_leaving_vehicles_have_that_of_their_exit() -> None:
     road = LonelyRoad(INTERCHANGE)
     seen = set[Name]()

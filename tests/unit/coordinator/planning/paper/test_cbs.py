@@ -37,7 +37,7 @@ def _search(tree: ConstraintTree, limit: float = math.inf) -> Node | None:
 
 
 @pytest.mark.slow
-@settings(max_examples=80)
+@settings(max_examples=40)
 @given(requests(), EVERY_SWITCH)
 def test_cost_is_that_of_the_joint_search(request: PlanRequest, switches: Improvements) -> None:
     assume(all(vehicle.eligible is None for vehicle in request.vehicles))

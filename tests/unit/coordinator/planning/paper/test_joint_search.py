@@ -20,7 +20,7 @@ from support.planning_oracles import cheapest_plan, requests
 
 
 @pytest.mark.slow
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(requests())
 def test_path_set_is_optimal_and_legal_or_there_is_none(request: PlanRequest) -> None:
     problem = request.problem()

@@ -107,7 +107,7 @@ def conflicts(draw: st.DrawFn) -> tuple[Case, Conflict, tuple[int, int]]:
 
 
 @pytest.mark.slow
-@settings(max_examples=80, suppress_health_check=MANY_WITHOUT_CONFLICT)
+@settings(max_examples=40, suppress_health_check=MANY_WITHOUT_CONFLICT)
 @given(conflicts())
 def test_children_share_the_solutions_and_none_keeps_the_conflict(
     drawn: tuple[Case, Conflict, tuple[int, int]],
@@ -138,7 +138,7 @@ def _cost_of_child(
 
 
 @pytest.mark.slow
-@settings(max_examples=60, suppress_health_check=MANY_WITHOUT_CONFLICT)
+@settings(max_examples=30, suppress_health_check=MANY_WITHOUT_CONFLICT)
 @given(conflicts())
 @pytest.mark.more
 def test_children_cost_more_as_predicted(drawn: tuple[Case, Conflict, tuple[int, int]]) -> None:

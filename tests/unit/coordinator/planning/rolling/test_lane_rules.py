@@ -94,7 +94,7 @@ def broken(
 
 
 @pytest.mark.slow
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(ruled_streams())
 def test_no_plan_breaks_a_rule_by_an_independent_computation(stream: Stream) -> None:
     road, slot, vehicles, blocked = stream
@@ -108,7 +108,7 @@ def test_no_plan_breaks_a_rule_by_an_independent_computation(stream: Stream) -> 
             assert broken(road, slot, vehicle, plan.paths[vehicle.vehicle]) == []
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(rules_of(ROAD), st.integers(0, 40), st.integers(0, 2), st.sampled_from((LEFT, RIGHT)))
 def test_the_validator_finds_what_the_independent_computation_finds(
     road: StreamRoad, column: int, lane: int, move: Cell

@@ -59,7 +59,7 @@ def is_legal(road: StreamRoad, plan: StreamPlan, vehicles: list[StreamVehicle]) 
 
 
 @pytest.mark.slow
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(streams())
 def test_every_stream_gets_complete_paths_without_conflicts(stream: Stream) -> None:
     road, slot, vehicles, blocked = stream
@@ -74,7 +74,7 @@ def test_every_stream_gets_complete_paths_without_conflicts(stream: Stream) -> N
 
 
 @pytest.mark.slow
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(streams())
 def test_vehicles_need_not_be_where_they_were_planned(stream: Stream) -> None:
     """All vehicles are a cell further; some are new, held, gone, or have other targets."""
@@ -153,7 +153,7 @@ LATERAL = frozenset({(0, 1), (0, -1)})
 
 
 @pytest.mark.slow
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(streams())
 def test_vehicles_that_do_not_change_columns_stay_in_theirs(stream: Stream) -> None:
     road, slot, drawn, blocked = stream

@@ -116,6 +116,7 @@ def test_lasting_faults_are_counted() -> None:
     assert LastingFaults.drawn(PROFILES["calm"], random.Random(1)).kinds() == {}
 
 
+@pytest.mark.more
 @pytest.mark.slow
 def test_every_kind_in_a_profile_can_be_applied() -> None:
     for kind in sorted({kind for profile in PROFILES.values() for kind in profile.event_kinds}):
