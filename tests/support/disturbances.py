@@ -30,7 +30,7 @@ from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import Name
-from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, MotionController
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, pose_of
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.demand import Arrival
@@ -227,7 +227,9 @@ class _Run:
         bodies = Bodies(poses, size.length_m, size.width_m)
         self.least_gap_m = min(self.least_gap_m, bodies.min_gaps().gap_m)
         self.overlaps += len(bodies.overlapping_pairs())
-        self.braked += sum(one.controller.rung is Rung.EMERGENCY for one in vehicles.values())
+        self.braked += sum(
+            one.controller.level is FallbackLevel.EMERGENCY for one in vehicles.values()
+        )
         self.motions |= {
             (name, one.controller.motion.origin, one.controller.hold_cell)
             for name, one in vehicles.items()

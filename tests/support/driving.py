@@ -22,7 +22,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import Command, Motion, Name, VehicleRecord
-from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose, pose_of
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -100,7 +100,8 @@ class Road:
     def braked(self) -> int:
         """Vehicle ticks of emergency braking by motion controllers."""
         return sum(
-            vehicle.controller.rung_ticks[Rung.EMERGENCY] for vehicle in self.vehicles.values()
+            vehicle.controller.level_ticks[FallbackLevel.EMERGENCY]
+            for vehicle in self.vehicles.values()
         )
 
     @property
@@ -130,7 +131,7 @@ class Road:
                 plant.brake(0.0)
             else:
                 vehicle.step(self.tick)
-            braked = name in braking or vehicle.controller.rung is Rung.EMERGENCY
+            braked = name in braking or vehicle.controller.level is FallbackLevel.EMERGENCY
             if braked:
                 self._emergencies.add(name)
             elif not recovering(plant, self.scenario.vehicle):

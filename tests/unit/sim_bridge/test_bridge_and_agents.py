@@ -9,7 +9,7 @@ import pytest
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
-from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.core import CATCH_UP_S, BridgeMetrics, TickPhase
 from support.bridge_bench import (
     A,
@@ -209,9 +209,9 @@ def test_the_move_of_an_agent_that_died_is_finished_and_held(
     ):
         assert (along, across) == pytest.approx(expected, abs=0.1)
     check_arrived(street, target)
-    rung_ticks = street.bridge.vehicles[A].controller.rung_ticks
-    assert (rung_ticks[Rung.HOLD] > 0) == (not restarts)
-    assert rung_ticks[Rung.EMERGENCY] == 0
+    level_ticks = street.bridge.vehicles[A].controller.level_ticks
+    assert (level_ticks[FallbackLevel.HOLD] > 0) == (not restarts)
+    assert level_ticks[FallbackLevel.EMERGENCY] == 0
     if restarts:
         execution = street.agents[A].execution
         assert execution is not None

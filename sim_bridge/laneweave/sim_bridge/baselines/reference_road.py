@@ -13,7 +13,7 @@ from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import RoadClock
-from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road.demand import Arrival, count_until
@@ -66,7 +66,7 @@ class ReferenceVehicle:
         """None, since the vehicle reserves no cells."""
 
     @property
-    def rung_ticks(self) -> Mapping[Rung, int]:
+    def level_ticks(self) -> Mapping[FallbackLevel, int]:
         """Empty, since there is no motion controller."""
         return {}
 

@@ -1,6 +1,6 @@
 """A vehicle's motion controller, which outlives the vehicle's agent process.
 
-It drives on one of the rungs of a fallback ladder (`Rung`):
+It drives on one of the fallback levels (`FallbackLevel`):
 
     execute     executes the trajectory of the newest command
     hold        steers into the cell of the newest command, and stays in it at v_F
@@ -9,10 +9,10 @@ It drives on one of the rungs of a fallback ladder (`Rung`):
 
 Without an agent or new commands, the controller executes its trajectory to the end. A trajectory
 that has ended or was interrupted by an emergency is not resumed: only a new command leads back to
-`execute`. The emergency brake acts on every rung and uses only local sensing.
+`execute`. The emergency brake acts on every level and uses only local sensing.
 
 **Lanes that end.** The stop line before a dead end counts as a vehicle that stands there, on every
-rung. A vehicle whose cell has passed the line leaves the lattice: it gives up its cells, drives up
+level. A vehicle whose cell has passed the line leaves the lattice: it gives up its cells, drives up
 to the line and waits. When the roadside has kept cells free for it, it drives out into the
 neighbouring lane and enters the lattice again. All of this needs neither agent nor messages.
 
@@ -82,8 +82,8 @@ class OffLatticePhase(Enum):
     """It drives into the neighbouring lane, towards the cell in which it will enter."""
 
 
-class Rung(IntEnum):
-    """Rung of the fallback ladder; see the module docstring."""
+class FallbackLevel(IntEnum):
+    """FallbackFallback level; see the module docstring."""
 
     EXECUTE = 0
     HOLD = 1
@@ -102,10 +102,10 @@ class MotionController:
     motion: CurrentMotion = field(init=False)
     command_tick: int = -1
     """Tick of the newest command; -1: none."""
-    rung: Rung = Rung.HOLD
-    """Rung in the last tick."""
-    rung_ticks: dict[Rung, int] = field(init=False)
-    """Number of ticks spent on each rung."""
+    level: FallbackLevel = FallbackLevel.HOLD
+    """FallbackLevel in the last tick."""
+    level_ticks: dict[FallbackLevel, int] = field(init=False)
+    """Number of ticks spent on each level."""
     neighbours: Neighbours = NO_NEIGHBOURS
     """Measured neighbours."""
     off_lattice: OffLatticePhase | None = None
@@ -132,7 +132,7 @@ class MotionController:
         record = VehicleRecord(joined=(self.lattice.block_of(self.hold_cell[0]),))
         self.store = RecordStore(record, territory_of(self._scenario))
         self.motion = CurrentMotion(self.hold_cell)
-        self.rung_ticks = dict.fromkeys(Rung, 0)
+        self.level_ticks = dict.fromkeys(FallbackLevel, 0)
         self._jerks = array("f")
         weakest, assumed = self._scenario.types.weakest_braking, self._scenario.braking
         self._brake = EmergencyBrake(self._limits, assumed, self.tick_s)
@@ -318,7 +318,7 @@ class MotionController:
             return False
         lane = command.hold_cell[1]
         if lane != self.hold_cell[1] and (
-            self.rung is Rung.EMERGENCY
+            self.level is FallbackLevel.EMERGENCY
             or self._is_beside(lane)
             or self._cuts_in(lane)
             or self._misses_exit(command.hold_cell, command.tick * self.tick_s)
@@ -364,16 +364,16 @@ class MotionController:
             near = self._relevant(near, measured[3])
         if self._lane_ends:
             near = [*near, *self._lines_ahead(measured, tick)]
-        rung, jerk = self._next(tick, near)
+        level, jerk = self._next(tick, near)
         if near and self._must_brake(measured, jerk, near):
-            rung = Rung.EMERGENCY
+            level = FallbackLevel.EMERGENCY
             # The body leaves its trajectory.
             self._jerks = self._jerks[:0]
             plant.brake(jerk[1])
         else:
             plant.step(*jerk)
-        self.rung = rung
-        self.rung_ticks[rung] += 1
+        self.level = level
+        self.level_ticks[level] += 1
         self._measured = None
 
     def _is_beside(self, lane: int) -> bool:
@@ -420,12 +420,12 @@ class MotionController:
             raise BadInputError("Command.jerks", "NaN or infinity", "finite numbers")
         return jerks
 
-    def _next(self, tick: int, near: Iterable[Neighbour]) -> tuple[Rung, Jerk]:
-        """Return the rung and jerk for a tick without an emergency."""
+    def _next(self, tick: int, near: Iterable[Neighbour]) -> tuple[FallbackLevel, Jerk]:
+        """Return the level and jerk for a tick without an emergency."""
         index = 2 * (tick - self._jerks_tick)
         stays_in_lane = self._must_stay_in_lane(tick)
         if 0 <= index < len(self._jerks) and not stays_in_lane:
-            return Rung.EXECUTE, (self._jerks[index], self._jerks[index + 1])
+            return FallbackLevel.EXECUTE, (self._jerks[index], self._jerks[index + 1])
         limits, speed_mps = self._limits, self.lattice.speed_mps
         body = self.measured
         state = commanded_state(body, self.plant.setpoint, limits, speed_mps)
@@ -447,7 +447,7 @@ class MotionController:
         ]
         min_gap_m = self._scenario.tracking.min_gap_m
         careful = keep_gap(state, jerk, ahead, limits, min_gap_m, self.tick_s)
-        return (Rung.HOLD if careful == jerk else Rung.GIVE_WAY), careful
+        return (FallbackLevel.HOLD if careful == jerk else FallbackLevel.GIVE_WAY), careful
 
     def _must_stay_in_lane(self, tick: int) -> bool:
         """Return whether the body must not enter the lane of its hold cell.
@@ -482,7 +482,7 @@ class MotionController:
         speed = measured[1] + limits.actuator_lag_s * measured[2]
         allowed = (limited_accel(speed, accel, jerk[0], limits, tick_s) - accel) / tick_s
         spare_m = self._brake.spare_m(measured, accel, (allowed, 0.0), near)
-        if self.rung is Rung.EMERGENCY:
+        if self.level is FallbackLevel.EMERGENCY:
             return spare_m < RELEASE_M + measured[1] * tick_s
         return spare_m < 0.0
 

@@ -53,7 +53,7 @@ from laneweave.protocol.wire.events import (
     RUN_ENDED,
 )
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
-from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.events import Events
 from laneweave.sim_bridge.recording.reports import ReportTotals
@@ -93,8 +93,8 @@ class RecordedVehicle(Protocol):
         """Cell that the vehicle holds or moves to; None: the method has no lattice."""
 
     @property
-    def rung_ticks(self) -> Mapping[Rung, int]:
-        """Ticks on each rung of the fallback ladder; empty without a motion controller."""
+    def level_ticks(self) -> Mapping[FallbackLevel, int]:
+        """Ticks on each fallback level; empty without a motion controller."""
 
 
 @define
@@ -158,7 +158,7 @@ class RunRecord:
         self._ticks = Ticks(folder / "ticks.parquet")
         self._leadership = _Leadership()
         self._reports = ReportTotals()
-        self._rung_ticks: Counter[Rung] = Counter()
+        self._level_ticks: Counter[FallbackLevel] = Counter()
         self._caretaker_takeovers = 0
         self._agent_takeovers = 0
         self._left_unattended = 0
@@ -231,7 +231,7 @@ class RunRecord:
         at_destination = section.serves(arrival.preferred_lane, arrival.destination)
         trip.at_destination = at_destination
         self._missed_exits += trip.exit != arrival.destination
-        self._rung_ticks.update(vehicle.rung_ticks)
+        self._level_ticks.update(vehicle.level_ticks)
         self._left_unattended += not attended
         where = {"vehicle": vehicle.name, "lane": lane, "exit": trip.exit}
         self.event(left_s, LEFT, **where, on_preferred_lane=at_destination)
@@ -253,7 +253,7 @@ class RunRecord:
 
     def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
         """Record a vehicle that is still on the road when the run ends."""
-        self._rung_ticks.update(vehicle.rung_ticks)
+        self._level_ticks.update(vehicle.level_ticks)
 
     def on_missed(self, agents: int) -> None:
         """Record the number of answers that were missing at a tick's deadline."""
@@ -386,15 +386,15 @@ class RunRecord:
         )
 
     def _tracking(self) -> Tracking:
-        reports, ticks = self._reports, self._rung_ticks
+        reports, ticks = self._reports, self._level_ticks
         solves, osqp_solves = reports.total("solves"), reports.total("osqp_solves")
         return Tracking(
             solves=solves,
             osqp_solves=osqp_solves,
             unconstrained_steps=solves - osqp_solves,
             unusable=reports.total("unusable"),
-            hold_law_ticks=ticks[Rung.HOLD] + ticks[Rung.GIVE_WAY],
-            emergency_ticks=ticks[Rung.EMERGENCY],
+            hold_law_ticks=ticks[FallbackLevel.HOLD] + ticks[FallbackLevel.GIVE_WAY],
+            emergency_ticks=ticks[FallbackLevel.EMERGENCY],
             missed_ticks=self.missed_ticks,
             caretaker_takeovers=self._caretaker_takeovers,
             agent_takeovers=self._agent_takeovers,

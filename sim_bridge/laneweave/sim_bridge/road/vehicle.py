@@ -12,7 +12,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import ClosedFormation, CurrentMotion, Name, Sense
-from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, MotionController
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import ExactNeighbours, Size
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.sensors import Sensors
@@ -116,9 +116,9 @@ class RoadVehicle:
         return self.controller.hold_cell
 
     @property
-    def rung_ticks(self) -> Mapping[Rung, int]:
-        """Ticks on each rung of the fallback ladder."""
-        return self.controller.rung_ticks
+    def level_ticks(self) -> Mapping[FallbackLevel, int]:
+        """Ticks on each fallback level."""
+        return self.controller.level_ticks
 
     def perceive(self, neighbours: ExactNeighbours) -> None:
         """Measure the states of the vehicle and of its neighbours."""

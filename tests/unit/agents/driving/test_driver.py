@@ -27,7 +27,7 @@ from laneweave.protocol.vehicle.motion import (
 )
 from laneweave.protocol.wire.messages import CurrentMotion, Neighbour, Report, Sense
 from laneweave.protocol.wire.topics import SENSE
-from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.plant import Plant
 from support.agent_rig import HOME, LATTICE, ME, MOVE_TICKS, SCENARIO, TICK_S, up_and_running
 from support.driving import Road
@@ -270,9 +270,9 @@ def test_meanwhile_the_body_goes_on_with_the_last_good_trajectory_and_then_holds
     trajectory = slice(0, broken_at + N + 1)
     assert np.array(bad)[trajectory] == pytest.approx(np.array(good)[trajectory], abs=1e-4)
     controller = roads[1].vehicles[ME].controller
-    assert controller.rung_ticks == {
-        Rung.EXECUTE: broken_at + N, Rung.HOLD: 10 + 4 * N - broken_at - N,
-        Rung.GIVE_WAY: 0, Rung.EMERGENCY: 0,
+    assert controller.level_ticks == {
+        FallbackLevel.EXECUTE: broken_at + N, FallbackLevel.HOLD: 10 + 4 * N - broken_at - N,
+        FallbackLevel.GIVE_WAY: 0, FallbackLevel.EMERGENCY: 0,
     }  # fmt: skip
     goal = cell_state(LATTICE, MOVE[2], roads[1].tick * TICK_S)
     assert bad[-1][0] == pytest.approx(goal, abs=0.01)

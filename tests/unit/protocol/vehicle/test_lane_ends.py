@@ -27,7 +27,7 @@ from laneweave.protocol.vehicle.lane_ends import (
 )
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.messages import CurrentMotion
-from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from support.closed_lanes import BLOCKED, DROP
 from support.convoy import ROLLING
 from support.road_vehicles import controller_in
@@ -200,7 +200,7 @@ def test_a_vehicle_that_stands_gets_out_before_the_end_and_into_its_cell(
         if y - half_m < lane_m:
             assert s < end.end_m
         t_s = (tick + 1) * tick_s
-        assert controller.rung is not Rung.EMERGENCY
+        assert controller.level is not FallbackLevel.EMERGENCY
         # The vehicles before and behind the gap.
         assert s < lattice.cell_s_m(column + 1, t_s)
         if y + half_m > lane_m:
@@ -280,7 +280,7 @@ def test_no_line_counts_in_a_lane_that_opens_again_for_a_move_behind_its_end(
         controller.perceive((s + error_m, v, a, y, v_y, a_y), controller.neighbours)
         assert controller._lines_ahead(controller.measured, tick) == []
         controller.step(tick)
-        assert controller.rung is Rung.EXECUTE
+        assert controller.level is FallbackLevel.EXECUTE
 
 
 def test_a_body_that_must_stay_in_its_lane_does_not_stop_at_the_line_of_another() -> None:

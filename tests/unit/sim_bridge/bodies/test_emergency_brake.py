@@ -12,7 +12,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake, last_tick_m
 from laneweave.protocol.vehicle.motion import Jerk, commanded_state, limited_jerk
 from laneweave.protocol.wire.messages import CurrentMotion, Name, Neighbour
-from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, MotionController
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Neighbours
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.sensors import Sensors
@@ -183,7 +183,7 @@ def test_commanding_more_than_the_body_can_brake_does_not_count_as_braking(jerk:
         controller.perceive(own.state, Neighbours((seen(own, wall),), ()))
         controller.step(tick)
         assert seen(own, wall).gap_m > MARGIN_M - 0.1
-    assert controller.rung_ticks[Rung.EMERGENCY] > 0
+    assert controller.level_ticks[FallbackLevel.EMERGENCY] > 0
 
 
 @for_each("number", range(24))
@@ -191,7 +191,7 @@ def test_errors_of_measurement_do_not_make_it_too_late(number: int) -> None:
     """A faulty agent speeds up behind a vehicle that brakes sooner or later."""
     least_m, controller = drive_behind(SCENARIO, number, 4.0 + number, braking_tick=3 * number)
     assert least_m > 0.0
-    assert controller.rung_ticks[Rung.EMERGENCY] > 0
+    assert controller.level_ticks[FallbackLevel.EMERGENCY] > 0
 
 
 def test_it_is_not_more_careful_than_it_has_to_be() -> None:

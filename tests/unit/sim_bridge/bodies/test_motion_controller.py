@@ -12,7 +12,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.motion import Jerk, cell_state
 from laneweave.protocol.wire.messages import Ballot, Command, CurrentMotion, Name, Neighbour
-from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, MotionController
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Neighbours
 from laneweave.sim_bridge.bodies.record_store import MAX_COLUMN
 from support import states
@@ -38,22 +38,22 @@ def command(
     return states.command(tick, *pairs, hold_cell=hold_cell, incarnation=incarnation)
 
 
-def driven(controller: MotionController) -> dict[Rung, int]:
-    """Return for how many ticks it drove by which rung."""
-    return {rung: ticks for rung, ticks in controller.rung_ticks.items() if ticks}
+def driven(controller: MotionController) -> dict[FallbackLevel, int]:
+    """Return for how many ticks it drove by which level."""
+    return {level: ticks for level, ticks in controller.level_ticks.items() if ticks}
 
 
 def plays(controller: MotionController, tick: int) -> Jerk | None:
     """Return the jerk that it would play at a tick; None: it would play nothing."""
-    rung, jerk = controller._next(tick, ())
-    return jerk if rung is Rung.EXECUTE else None
+    level, jerk = controller._next(tick, ())
+    return jerk if level is FallbackLevel.EXECUTE else None
 
 
 def test_without_a_command_it_holds_its_cell(controller: MotionController) -> None:
     for tick in range(50):
         controller.step(tick)
     assert controller.plant.state == pytest.approx(cell_state(LATTICE, HOME, 50 * TICK_S))
-    assert driven(controller) == {Rung.HOLD: 50}
+    assert driven(controller) == {FallbackLevel.HOLD: 50}
     assert controller.motion == CurrentMotion(HOME)
 
 
@@ -65,7 +65,7 @@ def test_plays_jerk_by_jerk_and_from_the_middle_when_ticks_were_missed(
     assert controller.plant.setpoint == pytest.approx((2.0 * TICK_S, 0.5 * TICK_S))
     controller.step(12)
     assert controller.plant.setpoint == pytest.approx((-2.0 * TICK_S, 0.5 * TICK_S))
-    assert driven(controller) == {Rung.EXECUTE: 2}
+    assert driven(controller) == {FallbackLevel.EXECUTE: 2}
 
 
 def test_comes_to_rest_in_the_last_cell_when_the_trajectory_has_run_out(
@@ -75,7 +75,7 @@ def test_comes_to_rest_in_the_last_cell_when_the_trajectory_has_run_out(
     controller.accept_command(command(0, *[(3.0, 0.0)] * 4, hold_cell=target))
     for tick in range(300):
         controller.step(tick)
-    assert driven(controller) == {Rung.EXECUTE: 4, Rung.HOLD: 296}
+    assert driven(controller) == {FallbackLevel.EXECUTE: 4, FallbackLevel.HOLD: 296}
     assert controller.plant.state == pytest.approx(cell_state(LATTICE, target, 30.0), abs=0.01)
 
 
@@ -98,11 +98,11 @@ def test_a_command_without_jerks_leaves_the_motion_as_it_is_unless_it_names_anot
     assert (controller.command_tick, controller.motion.end_tick) == (6, 8)
     controller.step(6)
     assert controller.plant.setpoint[0] == pytest.approx(2.0 * TICK_S)
-    assert driven(controller) == {Rung.EXECUTE: 2}
+    assert driven(controller) == {FallbackLevel.EXECUTE: 2}
     assert controller.accept_command(command(7, hold_cell=(2, 1)))  # by the hold law
     controller.step(7)
     assert controller.hold_cell == (2, 1)
-    assert driven(controller) == {Rung.EXECUTE: 2, Rung.HOLD: 1}
+    assert driven(controller) == {FallbackLevel.EXECUTE: 2, FallbackLevel.HOLD: 1}
 
 
 # --- the process in charge --------------------------------------------------------------------
@@ -367,9 +367,9 @@ def test_no_lane_change_begins_before_a_body_that_could_not_brake(
 
 
 def test_no_lane_change_begins_in_an_emergency(controller: MotionController) -> None:
-    controller.rung = Rung.EMERGENCY
+    controller.level = FallbackLevel.EMERGENCY
     assert not controller.accept_command(command(1, (0.0, 0.1), hold_cell=(HOME[0], 2)))
-    controller.rung = Rung.HOLD
+    controller.level = FallbackLevel.HOLD
     assert controller.accept_command(command(2, (0.0, 0.1), hold_cell=(HOME[0], 2)))
 
 

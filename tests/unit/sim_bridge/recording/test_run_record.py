@@ -15,7 +15,7 @@ import pytest
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report
-from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.columns import SCENARIO_KEY
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
@@ -191,11 +191,19 @@ def test_a_trip_is_recorded(record: RunRecord, tmp_path: Path) -> None:
     record.on_entered(traveller)
     plant = traveller.controller.plant
     plant._state = (SCENARIO.road.length_m + 6.0, 15.0, 0.0, 5.25, 0.0, 0.0)
-    traveller.controller.rung_ticks |= {Rung.EXECUTE: 90, Rung.HOLD: 3, Rung.GIVE_WAY: 1}
+    traveller.controller.level_ticks |= {
+        FallbackLevel.EXECUTE: 90,
+        FallbackLevel.HOLD: 3,
+        FallbackLevel.GIVE_WAY: 1,
+    }
     stays = vehicle("v0002")
     record.on_demanded(stays.admission.arrival)
     record.on_entered(stays)
-    stays.controller.rung_ticks |= {Rung.HOLD: 2, Rung.GIVE_WAY: 1, Rung.EMERGENCY: 5}
+    stays.controller.level_ticks |= {
+        FallbackLevel.HOLD: 2,
+        FallbackLevel.GIVE_WAY: 1,
+        FallbackLevel.EMERGENCY: 5,
+    }
     record.on_left(traveller, 70.0, attended=True)
     record.on_still_on_road(stays)
     record.close(70.0, Ending.LIMIT)

@@ -13,7 +13,7 @@ from laneweave.protocol.scenario.road_tables import Closure, Demand
 from laneweave.protocol.vehicle.lane_ends import dead_ends, drive_out
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
 from laneweave.protocol.wire.messages import Name
-from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.road.entry import EntryMeter
 from support import road_bugs
 from support.bugs import Bug, catches
@@ -41,7 +41,7 @@ def check(road: LonelyRoad, within_s: float = MAX_S) -> None:
         assert road.overlaps == []
         for name, vehicle in road.vehicles.items():
             controller = vehicle.controller
-            assert controller.rung is not Rung.EMERGENCY
+            assert controller.level is not FallbackLevel.EMERGENCY
             assert vehicle.state[2] > HARDEST_MPS2
             assert (controller.record.owned == ()) == (controller.off_lattice is not None)
             for cell in controller.record.owned:

@@ -18,7 +18,11 @@ from laneweave.protocol.wire.messages import (
     PendingTransfer,
     VehicleRecord,
 )
-from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase, Rung
+from laneweave.sim_bridge.bodies.motion_controller import (
+    FallbackLevel,
+    MotionController,
+    OffLatticePhase,
+)
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.demand import arrivals
 from laneweave.sim_bridge.road.roadside import Roadside
@@ -40,7 +44,7 @@ def run(road: LonelyRoad, *, owners_checked: bool = True) -> None:
         assert road.t_s < MAX_S, "a vehicle is still on the road"
         assert road.overlaps == []
         for name, vehicle in road.vehicles.items():
-            assert vehicle.controller.rung is not Rung.EMERGENCY
+            assert vehicle.controller.level is not FallbackLevel.EMERGENCY
             for cell in vehicle.controller.record.owned if owners_checked else ():
                 owner = owners.setdefault(cell, name)
                 assert owner == name or owner not in road.vehicles, "a cell has two owners"

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.motion import State, cell_state, commanded_state, hold_law
 from laneweave.protocol.wire.messages import Neighbour
-from laneweave.sim_bridge.bodies.motion_controller import RELEASE_M, Rung
+from laneweave.sim_bridge.bodies.motion_controller import RELEASE_M, FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, Neighbours
 from laneweave.sim_bridge.bodies.plant import Plant
 from support.paper import PAPER
@@ -43,7 +43,7 @@ class Track:
     def command(self, *pairs: tuple[float, float], hold_cell: Cell = HOME) -> None:
         assert self.controller.accept_command(command(self.tick, *pairs, hold_cell=hold_cell))
 
-    def step(self) -> Rung:
+    def step(self) -> FallbackLevel:
         around = NO_NEIGHBOURS
         if np.isfinite(self.rear_m):
             around = Neighbours((Neighbour(self.lane, self.gap_m, self.speed_mps),), ())
@@ -52,9 +52,9 @@ class Track:
         self.min_accel_mps2 = min(self.min_accel_mps2, self.plant.state[2])
         self.rear_m += self.speed_mps * TICK_S
         self.tick += 1
-        return self.controller.rung
+        return self.controller.level
 
-    def run(self, ticks: int) -> list[Rung]:
+    def run(self, ticks: int) -> list[FallbackLevel]:
         return [self.step() for _ in range(ticks)]
 
 
@@ -66,14 +66,14 @@ def track() -> Track:
     return made
 
 
-# --- the rungs ------------------------------------------------------------------------------------
+# --- the levels ------------------------------------------------------------------------------------
 
 
 def test_it_plays_a_command_as_long_as_it_could_still_brake(track: Track) -> None:
     """Four metres behind one that is as fast: nothing that it would do by itself."""
     track.put_ahead(4.0, V_F)
     track.command(*[(0.0, 0.0)] * 40)
-    assert set(track.run(40)) == {Rung.EXECUTE}
+    assert set(track.run(40)) == {FallbackLevel.EXECUTE}
     assert track.plant.state[1] == V_F
 
 
@@ -100,15 +100,15 @@ def test_a_holding_vehicle_gives_way_comfortably_on_its_target_lane(
     assert min(gaps) > SCENARIO.tracking.min_gap_m - 0.1
     assert track.plant.state[1] == pytest.approx(speed_mps, abs=0.1)
     assert track.min_accel_mps2 >= 0.6 * LIMITS.min_accel_mps2 - 1e-9
-    ticks = track.controller.rung_ticks
-    assert ticks[Rung.GIVE_WAY] > 20
-    assert ticks[Rung.EMERGENCY] == ticks[Rung.EXECUTE] == 0
+    ticks = track.controller.level_ticks
+    assert ticks[FallbackLevel.GIVE_WAY] > 20
+    assert ticks[FallbackLevel.EMERGENCY] == ticks[FallbackLevel.EXECUTE] == 0
 
 
 def test_vehicles_on_other_lanes_are_not_in_its_way(track: Track) -> None:
     for lane in (0, 2):
         track.put_ahead(40.0, 0.0, lane)
-        assert set(track.run(60)) == {Rung.HOLD}
+        assert set(track.run(60)) == {FallbackLevel.HOLD}
         assert track.gap_m < -20.0
 
 
@@ -118,11 +118,11 @@ def test_vehicles_on_other_lanes_are_not_in_its_way(track: Track) -> None:
 def test_an_emergency_overrides_the_command(track: Track) -> None:
     track.put_ahead(16.0, 0.0)
     track.command(*[(0.0, 0.0)] * 40)
-    rungs = track.run(40)
-    first = rungs.index(Rung.EMERGENCY)
-    assert set(rungs[:first]) <= {Rung.EXECUTE}
-    assert Rung.EXECUTE not in rungs[first:]
-    assert rungs[first : first + 12] == [Rung.EMERGENCY] * 12
+    levels = track.run(40)
+    first = levels.index(FallbackLevel.EMERGENCY)
+    assert set(levels[:first]) <= {FallbackLevel.EXECUTE}
+    assert FallbackLevel.EXECUTE not in levels[first:]
+    assert levels[first : first + 12] == [FallbackLevel.EMERGENCY] * 12
     assert track.min_accel_mps2 < -9.5
     assert track.plant.state[1] == pytest.approx(0.0, abs=0.01)
     assert track.gap_m > 0.2
@@ -131,25 +131,27 @@ def test_an_emergency_overrides_the_command(track: Track) -> None:
 def test_an_emergency_ends_in_a_hold_and_only_a_fresh_command_leads_back_up(track: Track) -> None:
     track.command(*[(0.0, 0.0)] * 60)
     track.put_ahead(9.0, 8.0)
-    assert track.run(2)[-1] is Rung.EMERGENCY
+    assert track.run(2)[-1] is FallbackLevel.EMERGENCY
     track.rear_m = np.inf
-    assert track.run(30) == [Rung.HOLD] * 30  # the trajectory would have gone on all the time
+    assert (
+        track.run(30) == [FallbackLevel.HOLD] * 30
+    )  # the trajectory would have gone on all the time
     track.command(hold_cell=HOME)  # it has nothing to play
-    assert track.step() is Rung.HOLD
+    assert track.step() is FallbackLevel.HOLD
     track.command(*[(1.0, 0.0)] * 3)
-    assert track.run(4) == [Rung.EXECUTE] * 3 + [Rung.HOLD]
+    assert track.run(4) == [FallbackLevel.EXECUTE] * 3 + [FallbackLevel.HOLD]
 
 
 def test_after_an_emergency_it_gives_way_behind_a_slow_vehicle(track: Track) -> None:
     track.command(*[(0.0, 0.0)] * 40)
     track.put_ahead(8.0, 6.0)
-    rungs = track.run(120)
+    levels = track.run(120)
     order = [
-        rung for rung, before in zip(rungs, [None, *rungs], strict=False) if rung is not before
+        level for level, before in zip(levels, [None, *levels], strict=False) if level is not before
     ]
-    assert order[0] is Rung.EMERGENCY
-    assert Rung.EXECUTE not in order
-    assert order[-1] is Rung.GIVE_WAY
+    assert order[0] is FallbackLevel.EMERGENCY
+    assert FallbackLevel.EXECUTE not in order
+    assert order[-1] is FallbackLevel.GIVE_WAY
     assert track.plant.state[1] == pytest.approx(6.0, abs=0.3)
     assert track.gap_m > 1.0
 
@@ -158,8 +160,8 @@ def test_a_fresh_command_does_not_end_an_emergency(track: Track) -> None:
     track.put_ahead(16.0, 0.0)
     for _ in range(30):
         track.command(*[(15.0, 0.0)] * 40)
-        rung = track.step()
-    assert rung is Rung.EMERGENCY
+        level = track.step()
+    assert level is FallbackLevel.EMERGENCY
     assert track.gap_m > 0.2
 
 
@@ -176,7 +178,7 @@ def test_an_emergency_ends_only_when_something_is_to_spare() -> None:
         controller.perceive(plant.state, Neighbours((other,), ()))
         controller.step(track.tick)
         track.tick += 1
-        brakes.append(controller.rung is Rung.EMERGENCY)
+        brakes.append(controller.level is FallbackLevel.EMERGENCY)
     assert brakes == [False, True, True, False]
 
 
@@ -187,10 +189,10 @@ def test_it_brakes_for_a_lane_that_it_enters_before_the_body_touches_it(
     """From the moment the move begins; the one beside stands 12 m ahead."""
     track.put_ahead(12.0, 0.0, lane)
     track.command(*[(0.0, 0.0)] * 40, hold_cell=(0, 2))
-    rung = track.step()
+    level = track.step()
     y_m = track.plant.state[3]
     assert int((y_m + LIMITS.width_m / 2.0) // LATTICE.lane_width_m) == HOME[1]
-    assert (rung is Rung.EMERGENCY) == (lane in {1, 2})
+    assert (level is FallbackLevel.EMERGENCY) == (lane in {1, 2})
 
 
 @pytest.mark.parametrize(("across_m", "brakes"), [(0.0, False), (0.8, False), (0.9, True)])
@@ -199,20 +201,20 @@ def test_it_brakes_for_a_lane_that_the_body_touches(across_m: float, *, brakes: 
     s, v, a, y, *_ = cell_state(LATTICE, HOME, 0.0)
     track = Track((s, v, a, y + across_m, 0.0, 0.0))
     track.put_ahead(12.0, 0.0, lane=2)
-    assert (track.step() is Rung.EMERGENCY) == brakes
+    assert (track.step() is FallbackLevel.EMERGENCY) == brakes
 
 
 def test_a_vehicle_behind_is_no_emergency(track: Track) -> None:
     track.controller.perceive(track.plant.state, Neighbours((), (Neighbour(HOME[1], -2.0, 25.0),)))
     track.controller.step(track.tick)
-    assert track.controller.rung is Rung.HOLD
+    assert track.controller.level is FallbackLevel.HOLD
 
 
 def test_it_steers_on_while_it_brakes(track: Track) -> None:
     track.put_ahead(12.0, 0.0)
     track.command(*[(0.0, 8.0)] * 40)
     track.step()
-    assert track.controller.rung is Rung.EMERGENCY
+    assert track.controller.level is FallbackLevel.EMERGENCY
     assert track.plant.setpoint == pytest.approx((LIMITS.min_accel_mps2, 0.8))
 
 
