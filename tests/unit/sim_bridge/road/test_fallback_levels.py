@@ -66,7 +66,7 @@ def track() -> Track:
     return made
 
 
-# --- the levels ------------------------------------------------------------------------------------
+# --- the levels -------------------------------------------------------------------------------
 
 
 def test_it_plays_a_command_as_long_as_it_could_still_brake(track: Track) -> None:
