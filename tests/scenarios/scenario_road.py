@@ -34,7 +34,7 @@ from laneweave.protocol.wire.messages import (
 )
 from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, STATE, Topic
 from laneweave.sim_bridge.bodies.plant import Plant
-from laneweave.sim_bridge.road.attendance import Attendance
+from laneweave.sim_bridge.road.caretakers import Caretakers
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -215,10 +215,10 @@ class CaretakerProcess:
         self.vehicle = vehicle
         self.tick = tick
         self.shown: VehicleState | None = None
-        self._attendance = Attendance(SCENARIO, lambda: next(vehicle.incarnations))
+        self._caretakers = Caretakers(SCENARIO, lambda: next(vehicle.incarnations))
         vehicle.place_body(tick)
-        list(self._attendance.take_charge(vehicle.road, tick))
-        self.execution: PlanExecution = self._attendance._caretakers[vehicle.name]._execution
+        list(self._caretakers.take_charge(vehicle.road, tick))
+        self.execution: PlanExecution = self._caretakers._caretakers[vehicle.name]._execution
         self.incarnation: int = self.execution.incarnation
         vehicle.caretakers.add(self.incarnation)
         self.sense(tick)
@@ -226,20 +226,20 @@ class CaretakerProcess:
     @property
     def in_charge(self) -> bool:
         """Whether no agent has taken charge since."""
-        return self.vehicle.name in self._attendance
+        return self.vehicle.name in self._caretakers
 
     def give_way(self) -> None:
         """An agent has taken charge."""
-        list(self._attendance._end_caretaker(self.vehicle.name))
+        list(self._caretakers._end_caretaker(self.vehicle.name))
 
     def sense(self, tick: int) -> None:
         self.tick = tick
         self.vehicle.place_body(tick)
-        self._note(self._attendance.states(tick))
+        self._note(self._caretakers.states(tick))
 
     def get(self, message: Prepare | Plan, tick: int) -> None:
         self.vehicle.place_body(tick)
-        self._note(self._attendance.on_message(self.vehicle.name, message, tick))
+        self._note(self._caretakers.on_message(self.vehicle.name, message, tick))
 
     def hear(self, state: VehicleState) -> None:
         """Ignore states of others: a caretaker never moves its vehicle."""

@@ -184,7 +184,7 @@ class Desk:
         """
         name = Name(vehicle)
         controller = self.core.vehicles[name].controller
-        cared_for = name in self.core.road.attendance
+        cared_for = name in self.core.road.caretakers
         unchanged: dict[str, Any] = {
             "vehicle": name,
             "record": VehicleRecord(max(controller.record.incarnation + cared_for, 1)),

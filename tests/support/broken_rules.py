@@ -42,7 +42,7 @@ from laneweave.protocol.wire.messages import (
 )
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.bodies.record_store import RecordStore
-from laneweave.sim_bridge.road.attendance import Attendance, Caretaker
+from laneweave.sim_bridge.road.caretakers import Caretaker, Caretakers
 from laneweave.sim_bridge.road.formation_building import ColumnBlocks
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.bugs import Plant, instead_of
@@ -394,7 +394,7 @@ def forget_promise(put_in_charge: Call, self: RecordStore, incarnation: int) -> 
 
 
 def forget_owned_cells(patch: Patch) -> None:
-    accept_command, take_charge = MotionController.accept_command, Attendance._put_caretaker
+    accept_command, take_charge = MotionController.accept_command, Caretakers._put_caretaker
 
     def forget(controller: MotionController, before: int) -> None:
         if before not in (0, controller.record.incarnation):
@@ -406,13 +406,13 @@ def forget_owned_cells(patch: Patch) -> None:
         forget(self, before)
         return taken
 
-    def cared_for(self: Attendance, vehicle: RoadVehicle, tick: int) -> None:
+    def cared_for(self: Caretakers, vehicle: RoadVehicle, tick: int) -> None:
         before = vehicle.controller.record.incarnation
         take_charge(self, vehicle, tick)
         forget(vehicle.controller, before)
 
     patch.setattr(MotionController, "accept_command", claimed)
-    patch.setattr(Attendance, "_put_caretaker", cared_for)
+    patch.setattr(Caretakers, "_put_caretaker", cared_for)
 
 
 @instead_of(PlanExecution, "state")

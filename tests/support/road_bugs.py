@@ -13,7 +13,7 @@ from laneweave.agents.core import AgentCore
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.scenario.vehicle_types import VehicleTypes
-from laneweave.protocol.vehicle.lane_ends import DriveOut, LaneEnd, LaneEnds
+from laneweave.protocol.vehicle.lane_ends import LaneEnd, LaneEnds, ReEntry
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.wire.messages import Census, CensusEntry, Command, Name, Sense
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase
@@ -91,7 +91,7 @@ def still_listed(patch: Patch) -> None:
 def gap_taken_too_early(
     update: Callable[..., Collection[object]], self: LaneEndControl, vehicles: Vehicles, t_s: float
 ) -> Collection[object]:
-    """A vehicle gets its cells when it begins to drive out, from another gap."""
+    """A vehicle gets its cells when it begins to re-enter, from another gap."""
     changes = list(update(self, vehicles, t_s))
     for gaps in self._gaps.values():
         for gap in gaps:
@@ -100,7 +100,7 @@ def gap_taken_too_early(
     return changes
 
 
-# --- stop lines, queues, and gaps for driving out ---------------------------------------------
+# --- stop lines, queues, and gaps for re-entry ---------------------------------------------
 
 
 @breaks(LANE_ENDS, MotionController, "_lines_ahead")
@@ -144,15 +144,15 @@ def gap_is_entered(patch: Patch) -> None:
     patch.setattr(EntryMeter, "keep_free", keep_free)
 
 
-@breaks(LANE_ENDS, lane_end_control, "drive_out", "own_drive_out")
-def gap_too_short(needed: Callable[..., DriveOut], *given: object) -> DriveOut:
-    """A gap has room for the vehicle, but not for driving out."""
+@breaks(LANE_ENDS, lane_end_control, "re_entry", "own_re_entry")
+def gap_too_short(needed: Callable[..., ReEntry], *given: object) -> ReEntry:
+    """A gap has room for the vehicle, but not for re-entry."""
     return evolve(needed(*given), columns=1)
 
 
 @breaks(LANE_ENDS)
 def starts_without_a_gap(patch: Patch) -> None:
-    """Vehicles drive out long before their gap passes."""
+    """Vehicles re-enter long before their gap passes."""
     start: Callable[..., object] = LaneEndControl._start
 
     def mutant(self: LaneEndControl, vehicle: object, gaps: object, t_s: float) -> object:
@@ -171,7 +171,7 @@ def waits_forever(patch: Patch) -> None:
 
 @breaks(LANE_ENDS, LaneEndControl, "_waiting")
 def last_first(waiting: Callable[..., list[object]], *given: object) -> list[object]:
-    """The rearmost vehicle of a queue drives out through the others."""
+    """The rearmost vehicle of a queue re-enters through the others."""
     return waiting(*given)[::-1]
 
 
@@ -179,19 +179,19 @@ def last_first(waiting: Callable[..., list[object]], *given: object) -> list[obj
 def drives_on(leave_lattice: Call, self: MotionController) -> None:
     """A vehicle off the lattice aims at its cell, which is beyond the end of the lane."""
     leave_lattice(self)
-    self.off_lattice, self._past_line = OffLatticePhase.DRIVING_OUT, True
+    self.off_lattice, self._past_line = OffLatticePhase.RE_ENTERING, True
 
 
 @breaks(LANE_ENDS)
 def line_forgotten_when_driving_out(patch: Patch) -> None:
     """The way out is blocked by the line at which the vehicle stands."""
-    drive_out = MotionController.drive_out
+    re_entry = MotionController.re_enter
 
     def mutant(self: MotionController, cell: Cell) -> None:
-        drive_out(self, cell)
+        re_entry(self, cell)
         self._past_line = False
 
-    patch.setattr(MotionController, "drive_out", mutant)
+    patch.setattr(MotionController, "re_enter", mutant)
     patch.setattr("laneweave.sim_bridge.bodies.motion_controller.STANDING_MPS", -1.0)
 
 

@@ -51,7 +51,7 @@ from laneweave.protocol.wire.topics import PLAN, PREPARE
 from laneweave.sim_bridge.bodies import record_store
 from laneweave.sim_bridge.bodies.record_store import RecordStore
 from laneweave.sim_bridge.road.allocation import CellAllocation
-from laneweave.sim_bridge.road.attendance import Attendance, Caretaker
+from laneweave.sim_bridge.road.caretakers import Caretaker, Caretakers
 from laneweave.sim_bridge.road.census import CensusPublisher
 from laneweave.sim_bridge.road.formation_building import GrowingFormations
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -316,7 +316,7 @@ def _store(store: RecordStore, pending: PendingTransfer, cells: tuple[Cell, ...]
     set_record(store, transfer=begun, owned=begun.before)
 
 
-# --- the motion controller, attendance --------------------------------------------------------
+# --- the motion controller, caretakers --------------------------------------------------------
 
 
 @breaks("ownership", RecordStore, "complete_transfer")
@@ -341,9 +341,9 @@ def joined_blocks_replaced(_: object, self: RecordStore, blocks: Iterable[int]) 
     set_record(self, joined=tuple(sorted(set(blocks))))
 
 
-@breaks("caretaker", Attendance, "take_charge", collides=False)
+@breaks("caretaker", Caretakers, "take_charge", collides=False)
 def caretaker_below_agent(
-    _: object, self: Attendance, vehicle: RoadVehicle, tick: int
+    _: object, self: Caretakers, vehicle: RoadVehicle, tick: int
 ) -> Iterator[Effect]:
     """A caretaker's incarnation is taken from the clock, even if the agent's is higher."""
     self._caretakers[vehicle.name] = Caretaker(vehicle, self._new_incarnation(), tick)
@@ -351,9 +351,9 @@ def caretaker_below_agent(
     yield Listen(PLAN, {"vehicle": vehicle.name})
 
 
-@breaks("charge", Attendance, "accept_command", collides=False)
+@breaks("charge", Caretakers, "accept_command", collides=False)
 def claim_is_no_presence(
-    _: object, self: Attendance, vehicle: RoadVehicle, command: Command
+    _: object, self: Caretakers, vehicle: RoadVehicle, command: Command
 ) -> Generator[Effect, None, bool]:
     """An agent that claims its vehicle counts as absent until its token appears."""
     controller = vehicle.controller

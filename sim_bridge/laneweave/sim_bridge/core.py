@@ -4,7 +4,7 @@ In each tick (`simulated_road`) vehicles enter, every vehicle on the road receiv
 agent answers with a trajectory, all bodies move by one tick, the world displays them, and gaps and
 overlaps are measured. SENSE is repeated to agents that have not answered (`tick_answers`); after
 the deadline their motion controllers continue their trajectories. A vehicle whose agent is absent,
-silent or always late gets a caretaker (`attendance`).
+silent or always late gets a caretaker (`caretakers`).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from laneweave.protocol.wire.topics import (
 )
 from laneweave.sim_bridge.recording.record_interface import Record
 from laneweave.sim_bridge.recording.run_record import Ending
-from laneweave.sim_bridge.road.attendance import notify_left
+from laneweave.sim_bridge.road.caretakers import notify_left
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, OutsideTraffic
 from laneweave.sim_bridge.road.roadside import Roadside
@@ -235,7 +235,7 @@ class BridgeCore:
                 vehicles_entered_total=clock.entered,
                 vehicles_left_total=clock.left,
                 vehicles_on_road=clock.on_road,
-                vehicles_unattended=self.road.attendance.caretaker_count,
+                vehicles_unattended=self.road.caretakers.caretaker_count,
             ),
         )
 
@@ -279,7 +279,7 @@ class BridgeCore:
         return effects
 
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
-        self.road.attendance.on_network(event, now_s)
+        self.road.caretakers.on_network(event, now_s)
         match event:
             case Started():
                 for subscribed in (EVENT, REPORT, HEARTBEAT):
@@ -378,7 +378,7 @@ class BridgeCore:
         if self._is_over():
             yield from self._shut_down(now_s)
             return
-        answering = not self._answers.all_silent and road.attendance.link_up
+        answering = not self._answers.all_silent and road.caretakers.link_up
         self._until_s = self._pace.next_s(now_s, answering=answering)
         self.phase = TickPhase.PACE
 
@@ -395,7 +395,7 @@ class BridgeCore:
     def _shut_down(self, now_s: float) -> Iterator[Effect]:
         on_road = self.vehicles.values()
         yield from self._roadside.publish(self.tick, self.t_s, on_road, ended=True)
-        yield from self.road.attendance.notify_departed(self.tick)
+        yield from self.road.caretakers.notify_departed(self.tick)
         for vehicle in on_road:
             yield notify_left(vehicle, self.tick)
         # Sent last, through the network like the other reports: the node adds its counters.

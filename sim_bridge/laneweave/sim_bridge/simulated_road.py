@@ -23,7 +23,7 @@ from laneweave.protocol.wire.events import AGENT_SILENT
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare
 from laneweave.protocol.wire.topics import BRIDGE_ALIVE, COMMAND, SENSE, VEHICLE_ALIVE
 from laneweave.sim_bridge.recording.record_interface import RoadRecord
-from laneweave.sim_bridge.road.attendance import Attendance
+from laneweave.sim_bridge.road.caretakers import Caretakers
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.tick_answers import Answers
@@ -62,7 +62,7 @@ class SimulatedRoad(Generic[VehicleT]):
         self.at_entrance: list[VehicleT] = []
         """Vehicles that enter when the next tick begins."""
         self.incarnation = incarnation
-        self.attendance = Attendance(scenario, new_incarnation)
+        self.caretakers = Caretakers(scenario, new_incarnation)
         self.bounds = scenario.runtime.bounds(incarnation)
         """Bounds of received numbers."""
         self._roadside = roadside
@@ -78,7 +78,7 @@ class SimulatedRoad(Generic[VehicleT]):
     @property
     def answers(self) -> Answers:
         """Answers of the agents."""
-        return self.attendance.answers
+        return self.caretakers.answers
 
     # --- messages -----------------------------------------------------------------------------
 
@@ -91,7 +91,7 @@ class SimulatedRoad(Generic[VehicleT]):
     def on_ballot(self, vehicle: Name, message: Prepare | Plan) -> Iterator[Effect]:
         """Pass a message of a leader to the vehicle's caretaker."""
         check_ballot(message.ballot, self.t_s)
-        yield from self.attendance.on_message(vehicle, message, self.tick)
+        yield from self.caretakers.on_message(vehicle, message, self.tick)
 
     def on_command(self, command: Command, now_s: float, *, in_time: bool) -> list[Effect]:
         """Store what a COMMAND requests, and execute its motion if it has arrived in time.
@@ -109,15 +109,15 @@ class SimulatedRoad(Generic[VehicleT]):
         self.bounds.check_claim(incarnation, in_charge, now_s)
         if incarnation >= in_charge:
             self.answers.received(name, now_s, current=in_time)
-        had_caretaker = name in self.attendance
-        if self.attendance.register_command(vehicle, command):
+        had_caretaker = name in self.caretakers
+        if self.caretakers.register_command(vehicle, command):
             effects.append(self.sense_of(vehicle))
         if not in_time:
             if command.tick < self.tick and incarnation == in_charge:
                 self.answers.late(name)
             return effects
         try:
-            effects += self.attendance.accept_command(vehicle, command)
+            effects += self.caretakers.accept_command(vehicle, command)
         except BadInputError as error:
             log.warning("command ignored", vehicle=name, reason=str(error))
             return effects
@@ -129,7 +129,7 @@ class SimulatedRoad(Generic[VehicleT]):
 
     def sense_of(self, vehicle: RoadVehicle) -> Effect:
         """Return the SENSE of a vehicle in the current tick."""
-        caretaker = vehicle.name in self.attendance
+        caretaker = vehicle.name in self.caretakers
         sense = vehicle.sense(self.tick, caretaker=caretaker)
         return Send(SENSE, sense, {"vehicle": vehicle.name})
 
@@ -155,7 +155,7 @@ class SimulatedRoad(Generic[VehicleT]):
     def begin_tick(self, now_s: float) -> Iterator[Effect]:
         """Begin a tick, after vehicles have entered."""
         for change in self._roadside.control_lane_ends(self.vehicles, self.t_s):
-            self.attendance.begin_anew(self.vehicles[change.vehicle], self.tick)
+            self.caretakers.begin_anew(self.vehicles[change.vehicle], self.tick)
             self._record.on_lane_end(self.t_s, change.vehicle, change.lane, change.kind)
         self._close_formations()
         self._roadside.assign_empty_cells(self.vehicles)
@@ -163,9 +163,9 @@ class SimulatedRoad(Generic[VehicleT]):
         yield from self._start_caretakers(now_s)
         for vehicle in self.vehicles.values():
             yield self.sense_of(vehicle)
-        yield from self.attendance.states(self.tick)
-        yield from self.attendance.notify_departed(self.tick)
-        self.attendance.start_tick(self.vehicles, now_s)
+        yield from self.caretakers.states(self.tick)
+        yield from self.caretakers.notify_departed(self.tick)
+        self.caretakers.start_tick(self.vehicles, now_s)
 
     def _close_formations(self) -> None:
         for closed in self._roadside.close_formations(self.t_s):
@@ -179,9 +179,9 @@ class SimulatedRoad(Generic[VehicleT]):
         """Put caretakers in charge of vehicles whose agents are absent, silent or always late."""
         for name in self.answers.update_durations(now_s):
             self._record.event(self.t_s, AGENT_SILENT, vehicle=name)
-        for vehicle, absence in self.attendance.unattended(self.vehicles, now_s):
+        for vehicle, absence in self.caretakers.unattended(self.vehicles, now_s):
             self._record.on_caretaker_took_over(self.t_s, vehicle.name, absence)
-            yield from self.attendance.take_charge(vehicle, self.tick)
+            yield from self.caretakers.take_charge(vehicle, self.tick)
 
     def step(self) -> None:
         """End the tick: move all bodies."""
@@ -200,8 +200,8 @@ class SimulatedRoad(Generic[VehicleT]):
 
     def remove(self, vehicle: VehicleT) -> Iterator[Effect]:
         """Remove a vehicle that has left the road."""
-        attended = vehicle.name not in self.attendance
+        attended = vehicle.name not in self.caretakers
         self._record.on_left(vehicle, self.t_s, attended=attended)
         del self.vehicles[vehicle.name]
         self._roadside.on_left(vehicle, self.vehicles, self.t_s)
-        yield from self.attendance.leave(vehicle)
+        yield from self.caretakers.leave(vehicle)

@@ -122,7 +122,7 @@ def test_an_agent_that_slept_until_its_vehicle_was_taken_care_of_does_not_move(
 ) -> None:
     """The caretaker may have promised its cell to others: it is back in charge, without a plan."""
     sleep(street, agent, target, MOVE_TICK - 2, asleep_ticks)
-    assert A in street.bridge.road.attendance
+    assert A in street.bridge.road.caretakers
     agent.asleep = False
     street.run_to(MOVE_TICK + asleep_ticks + 100)
     assert seen_in_cell(street)[-1] == pytest.approx((0.0, 0.0), abs=0.1)
@@ -132,7 +132,7 @@ def test_an_agent_that_slept_until_its_vehicle_was_taken_care_of_does_not_move(
 
 def check_in_charge_without_plan(street: Street, cell: Cell) -> None:
     agent = street.agents[A]
-    assert A not in street.bridge.road.attendance
+    assert A not in street.bridge.road.caretakers
     assert agent.in_charge
     execution = agent.execution
     assert execution is not None
@@ -246,7 +246,7 @@ def check_all_gone(street: Street) -> None:
     """Check that nothing is kept of vehicles that are no more."""
     bridge = street.bridge
     # The last one's token may vanish after its report, with which the run is over.
-    assert set(bridge.road.attendance.departed) <= bridge.road.answers.up <= {MANY[-1].vehicle}
+    assert set(bridge.road.caretakers.departed) <= bridge.road.answers.up <= {MANY[-1].vehicle}
     assert not bridge._reports._awaited
     for node in street.nodes:
         assert not getattr(node.core, "_agents", None)
@@ -268,7 +268,7 @@ def test_a_whole_run_counts_every_message_once_and_keeps_little_of_vehicles_that
 
     def look() -> bool:
         nonlocal most
-        most = max(most, len(bridge.road.attendance.departed))
+        most = max(most, len(bridge.road.caretakers.departed))
         if bridge.phase is TickPhase.SHUTTING_DOWN and not ended_s:
             ended_s.append(street.network.now_s)
         return bridge.phase is TickPhase.ENDED

@@ -227,7 +227,7 @@ def test_the_caretaker_takes_charge_when_no_answer_comes_in_time(attended: Desk)
 
 def test_an_agent_that_claims_its_vehicle_is_present_without_a_token(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, TWO)
-    desk.core.road.attendance._new_incarnation = lambda: 10**9
+    desk.core.road.caretakers._new_incarnation = lambda: 10**9
     desk.start(A)
     desk.drive_to_entry(A, B)
     check_cared_for(desk, "absent")  # its agent never came
@@ -255,7 +255,7 @@ def test_an_agent_that_is_back_at_once_needs_no_caretaker(attended: Desk) -> Non
 
 
 def test_caretakers_have_greater_incarnations_than_all_before(desk: Desk) -> None:
-    desk.core.road.attendance._new_incarnation = lambda: 5
+    desk.core.road.caretakers._new_incarnation = lambda: 5
     desk.answer(B, incarnation=10**13)
     desk.down(B)
     next_tick(desk, A)
@@ -272,10 +272,10 @@ def test_there_are_no_caretakers_while_the_bridge_is_off_the_network(attended: D
     assert read_events(attended.folder, "caretaker-took-over") == []
     attended.give(LinkUp())
     came_s, lease_s = attended.now_s, SCENARIO.network.lease_s
-    attended.drive(lambda: B in attended.core.road.attendance, B)
+    attended.drive(lambda: B in attended.core.road.caretakers, B)
     # The others reconnect about now, too: only later is B's silence evidence.
     assert came_s + lease_s <= attended.now_s <= came_s + lease_s + 2 * TICK_S
-    assert A not in attended.core.road.attendance
+    assert A not in attended.core.road.caretakers
 
 
 # --- messages of caretakers -------------------------------------------------------------------
@@ -394,7 +394,7 @@ def test_caretakers_end_with_their_vehicles(tmp_path: Path) -> None:
     desk.drive_to_entry(A, B)
     desk.drive(lambda: B not in desk.core.vehicles)
     assert listening(desk.effects)[-4:] == CARE_OF_B + CARE_OF_B_ENDS
-    assert B not in desk.core.road.attendance
+    assert B not in desk.core.road.caretakers
 
 
 def test_vehicles_that_leave_off_their_lane_are_reported(tmp_path: Path) -> None:
@@ -452,12 +452,12 @@ def test_a_claim_near_the_limit_leaves_room_for_successors(attended: Desk) -> No
     limit = DAY_NS
     attended.answer(B, incarnation=limit)
     assert attended.core.vehicles[B].controller.record.incarnation == limit
-    attended.drive(lambda: B in attended.core.road.attendance, B)
+    attended.drive(lambda: B in attended.core.road.caretakers, B)
     caretaker = attended.core.vehicles[B].controller.record.incarnation
     assert caretaker > limit
     attended.drive_to(attended.core.tick + 1, B)
     attended.answer(B, incarnation=above(5, caretaker))
-    assert B not in attended.core.road.attendance
+    assert B not in attended.core.road.caretakers
 
 
 def test_a_caretaker_promises_no_ballot_of_an_impossible_term(cared_for: Desk) -> None:

@@ -24,7 +24,7 @@ from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.messages import Census, CurrentMotion, Name, Report, RoadClock, Sense
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import pose_of
 from laneweave.sim_bridge.core import CATCH_UP_S, SHUT_DOWN_S, TickPhase
-from laneweave.sim_bridge.road.attendance import LEFT_REPEATS
+from laneweave.sim_bridge.road.caretakers import LEFT_REPEATS
 from support.bridge_bench import (
     TWO,
     A,
@@ -182,7 +182,7 @@ def test_an_agent_without_answers_is_awaited_to_each_deadline_until_it_is_silent
 ) -> None:
     for _ in range(MISSES):
         assert read_events(desk.folder, "agent-silent") == []
-        assert B not in desk.core.road.attendance
+        assert B not in desk.core.road.caretakers
         assert desk.core.road.answers.awaited == {A, B}
         began_s, tick = desk.now_s, desk.core.tick
         desk.answer(A)
@@ -211,7 +211,7 @@ def test_a_late_answer_ends_the_silence_and_does_nothing_else(desk: Desk) -> Non
     known = desk.known(B)
     assert desk.give(Arrived(topics.COMMAND, {"vehicle": B}, late)) == []
     assert desk.known(B) == known
-    assert B in desk.core.road.attendance  # until it claims its vehicle
+    assert B in desk.core.road.caretakers  # until it claims its vehicle
     desk.answer(A)  # this tick had not asked it to be waited for
     desk.wake()
     assert desk.core.road.answers.awaited == {A, B}
@@ -351,7 +351,7 @@ def test_departures_are_notified_until_the_agent_is_gone(tmp_path: Path) -> None
     desk.effects.clear()
     desk.drive_to(desk.core.tick + 2)
     assert not any(sense.left for sense in sent(desk.effects, Sense))
-    assert len(desk.core.road.attendance.departed) == 0
+    assert len(desk.core.road.caretakers.departed) == 0
 
 
 def test_departures_are_notified_a_limited_number_of_times(tmp_path: Path) -> None:
@@ -361,7 +361,7 @@ def test_departures_are_notified_a_limited_number_of_times(tmp_path: Path) -> No
     notified = [sense.vehicle for sense in sent(desk.effects, Sense) if sense.left]
     assert notified.count(A) == LEFT_REPEATS
     assert notified.count(B) == 1  # it was the last one
-    assert A not in desk.core.road.attendance.departed
+    assert A not in desk.core.road.caretakers.departed
 
 
 # --- the end ----------------------------------------------------------------------------------
@@ -476,7 +476,7 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
     core = desk.core
     assert core.phase is TickPhase.ENDED
     for left_over in (
-        *(core.vehicles, core.road.attendance.departed, core.road.attendance._caretakers),
+        *(core.vehicles, core.road.caretakers.departed, core.road.caretakers._caretakers),
         *(core.road.answers._without_message, core.road.answers._silence_s),
         *(core.road.answers.silent, core.road.answers.awaited, core.road.answers.up),
         *(core.road.at_entrance, core._reports._awaited, desk.world.states),

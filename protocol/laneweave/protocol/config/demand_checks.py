@@ -12,7 +12,7 @@ from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import formation_columns
 from laneweave.protocol.scenario.traffic_flow import Inflow
-from laneweave.protocol.vehicle.lane_ends import drive_out
+from laneweave.protocol.vehicle.lane_ends import re_entry
 
 MIN_SIDE_GAP_M = 0.5
 """Minimum lateral gap between bodies side by side; covers rotation and tracking errors."""
@@ -178,7 +178,7 @@ def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str)
         vehicles = formation.max_vehicles + scenario.flow.vehicles_from_ramps
         columns = formation_columns(vehicles, scenario.road.narrowest_lanes)
         from_m = max(from_m, *geometry.entry_m) + (columns - 1) * formation.gap_m
-        room_m = drive_out(scenario).room_m
+        room_m = re_entry(scenario).room_m
     from_m += scenario.types.longest_body_m
     advance_m = scenario.formation.speed_mps * scenario.timing.cycles_s[0]
     preferring = scenario.flow.inflows[lane].lane_shares

@@ -19,7 +19,7 @@ from laneweave.protocol.scenario.road_tables import (
     SolidLine,
     TypeShare,
 )
-from laneweave.protocol.vehicle.lane_ends import dead_ends, drive_out, lane_beside
+from laneweave.protocol.vehicle.lane_ends import dead_ends, lane_beside, re_entry
 from laneweave.protocol.wire.messages import CAR
 
 ROUNDED_SHARE = 1e-3
@@ -217,13 +217,13 @@ def check_exits(scenario: Scenario) -> None:
         for section in scenario.geometry.sections:
             begins_m = max(section.from_m, section.moves_from_m)
             first_m, first = _first_step(scenario, begins_m)
-            needed_m = first_m + drive_out(scenario).room_m
+            needed_m = first_m + re_entry(scenario).room_m
             require(
                 section.exit != exit_.name or exit_.at_m >= needed_m,
                 f"{name}.at_m",
                 exit_.at_m,
                 f"{first}, in lane {section.lane}, and "
-                f"{drive_out(scenario).room_m:g} m for completing a change after stopping",
+                f"{re_entry(scenario).room_m:g} m for completing a change after stopping",
                 needed_m,
             )
 
@@ -233,7 +233,7 @@ def check_dead_ends(scenario: Scenario) -> None:
     if not scenario.road.closures:
         return
     try:
-        needed = drive_out(scenario)
+        needed = re_entry(scenario)
     except ValueError as error:
         limits = {name: one.limits.max_accel_mps2 for name, one in scenario.types.items()}
         weakest = min(limits, key=lambda name: limits[name])

@@ -1,7 +1,7 @@
 """Ends of lanes: where vehicles stop that cannot leave a lane before it ends.
 
 Before each dead end there is a *stop line*, so far from the end that a vehicle standing at it can
-accelerate and change lanes before the end (`drive_out`). All cells of the lane beyond the line are
+accelerate and change lanes before the end (`re_entry`). All cells of the lane beyond the line are
 useless: no plan leads there, and a vehicle whose cell has passed the line has left the lattice.
 
 An exit before the end of the road needs no stop line: a vehicle in its lane leaves the road. But
@@ -41,8 +41,8 @@ body partly in the lane at its stop line."""
 START_S = 0.3
 """Time after the front of a gap has passed in which a waiting vehicle may start into it."""
 _MAX_COLUMNS = 48
-"""Upper bound on the columns that a vehicle needs to drive out."""
-_MAX_DRIVE_OUT_S = 120.0
+"""Upper bound on the columns that a vehicle needs to re-enter."""
+_MAX_RE_ENTRY_S = 120.0
 _FAR_M = 1000.0
 ROUNDING_M = 1e-6
 """Tolerance for comparing positions."""
@@ -66,7 +66,7 @@ class LaneEnd:
 
 
 @frozen
-class DriveOut:
+class ReEntry:
     """How a vehicle gets from standing at a stop line into the neighbouring lane."""
 
     room_m: float
@@ -76,9 +76,9 @@ class DriveOut:
     distance_m: float
     """Distance in which it settles in its cell."""
 
-    def covering(self, other: DriveOut) -> DriveOut:
+    def covering(self, other: ReEntry) -> ReEntry:
         """Return what suffices for both."""
-        return DriveOut(
+        return ReEntry(
             max(self.room_m, other.room_m),
             max(self.columns, other.columns),
             max(self.distance_m, other.distance_m),
@@ -238,7 +238,7 @@ def _ends(scenario: Scenario) -> Iterator[tuple[LaneSection, LaneEnd]]:
                 LaneEnd(
                     lane=section.lane,
                     from_m=section.from_m,
-                    line_m=section.to_m - drive_out(scenario).room_m,
+                    line_m=section.to_m - re_entry(scenario).room_m,
                     end_m=section.to_m,
                     reopens_m=min(later, default=math.inf),
                     moves_from_m=section.moves_from_m,
@@ -262,11 +262,11 @@ def _end_ahead(by_lane: Sequence[Sequence[LaneEnd]], lane: int, s_m: float) -> L
 
 
 def lane_beside(scenario: Scenario, end: LaneEnd) -> int | None:
-    """Return the lane into which vehicles drive out at a dead end; None: there is none.
+    """Return the lane into which vehicles re-enter at a dead end; None: there is none.
 
-    It is open from before the stop line until a vehicle that drives out has arrived in its cell.
+    It is open from before the stop line until a vehicle that re-enters has arrived in its cell.
     """
-    needed = drive_out(scenario)
+    needed = re_entry(scenario)
     pitch_m = scenario.lattice.pitch_m
     sections = sections_to_lines(scenario)
     from_m = end.line_m - needed.columns * pitch_m - scenario.types.longest_body_m
@@ -302,7 +302,7 @@ def early_start_m(scenario: Scenario) -> float:
     return 0.8 * max(before) * scenario.timing.move_s * scenario.formation.speed_mps
 
 
-def drive_out(scenario: Scenario) -> DriveOut:
+def re_entry(scenario: Scenario) -> ReEntry:
     """Return what every type of vehicle needs to drive from standing into the neighbouring lane.
 
     The motion controller drives with its hold law towards a cell of the neighbouring lane behind
@@ -312,32 +312,32 @@ def drive_out(scenario: Scenario) -> DriveOut:
     Raises:
         ValueError: the vehicle does not arrive in a cell (its limits are too low).
     """
-    first, *others = (own_drive_out(scenario, one.limits) for one in scenario.types.values())
-    return reduce(DriveOut.covering, others, first)
+    first, *others = (own_re_entry(scenario, one.limits) for one in scenario.types.values())
+    return reduce(ReEntry.covering, others, first)
 
 
 @lru_cache(maxsize=256)
-def own_drive_out(scenario: Scenario, limits: Vehicle) -> DriveOut:
-    """Return what vehicles with some limits need; see `drive_out`.
+def own_re_entry(scenario: Scenario, limits: Vehicle) -> ReEntry:
+    """Return what vehicles with some limits need; see `re_entry`.
 
     Raises:
         ValueError: the vehicle does not arrive in a cell.
     """
     for columns in range(2, _MAX_COLUMNS + 1):
-        found = [_drive_out(scenario, limits, columns, late_s) for late_s in (0.0, START_S)]
+        found = [_re_entry(scenario, limits, columns, late_s) for late_s in (0.0, START_S)]
         possible = [each for each in found if each is not None]
         if len(possible) == len(found):
             room_m, distance_m = (max(each) for each in zip(*possible, strict=True))
             # Settling takes up to a second longer for starts between the two.
             distance_m += scenario.formation.speed_mps
-            return DriveOut(math.ceil(room_m), columns, math.ceil(distance_m))
+            return ReEntry(math.ceil(room_m), columns, math.ceil(distance_m))
     raise ValueError("vehicles that stand cannot get into the lattice within their limits")
 
 
-def _drive_out(
+def _re_entry(
     scenario: Scenario, limits: Vehicle, columns: int, late_s: float
 ) -> tuple[float, float] | None:
-    """Return the `room_m` and `distance_m` of one motion of `drive_out`, not rounded.
+    """Return the `room_m` and `distance_m` of one motion of `re_entry`, not rounded.
 
     Args:
         scenario: lattice, tick, sensors and brakes.
@@ -357,7 +357,7 @@ def _drive_out(
     clear_m = 0.5 * (lattice.lane_width_m + limits.width_m)
     room_m = distance_m = settled_s = 0.0
     clear = False
-    for tick in range(1, round(_MAX_DRIVE_OUT_S / tick_s)):
+    for tick in range(1, round(_MAX_RE_ENTRY_S / tick_s)):
         t_s = late_s + tick * tick_s
         jerk = hold_law(state, cell_state(lattice, goal, t_s - tick_s), limits, tick_s)
         state = integrate(state, jerk, tick_s)
@@ -378,6 +378,6 @@ def _drive_out(
             clear = state[3] - lattice.cell_y_m(0) > clear_m
         if not has_settled(state, lattice, goal, t_s):
             distance_m, settled_s = s_m, t_s + tick_s
-    if not clear or settled_s > _MAX_DRIVE_OUT_S - 1.0:
+    if not clear or settled_s > _MAX_RE_ENTRY_S - 1.0:
         return None
     return room_m, distance_m

@@ -13,8 +13,8 @@ that has ended or was interrupted by an emergency is not resumed: only a new com
 
 **Lanes that end.** The stop line before a dead end counts as a vehicle that stands there, on every
 level. A vehicle whose cell has passed the line leaves the lattice: it gives up its cells, drives up
-to the line and waits. When the roadside has kept cells free for it, it drives out into the
-neighbouring lane and enters the lattice again. All of this needs neither agent nor messages.
+to the line and waits. When the roadside has kept cells free for it, it re-enters: it drives into
+the neighbouring lane and has cells again. All of this needs neither agent nor messages.
 
 The controller also stores the vehicle's record (`record_store`), which must survive the agent. Only
 the process in charge can change the hold cell and the trajectory.
@@ -78,7 +78,7 @@ class OffLatticePhase(Enum):
 
     WAITING = "waiting"
     """It drives up to the stop line of its lane, and waits there."""
-    DRIVING_OUT = "driving out"
+    RE_ENTERING = "re-entering"
     """It drives into the neighbouring lane, towards the cell in which it will enter."""
 
 
@@ -169,7 +169,7 @@ class MotionController:
         """
         if self.off_lattice is OffLatticePhase.WAITING or not self._lane_ends:
             return False
-        if self.off_lattice is OffLatticePhase.DRIVING_OUT and self._past_line:
+        if self.off_lattice is OffLatticePhase.RE_ENTERING and self._past_line:
             return False
         stays_free = self.store.territory.given_up_cells_stay_free
         if not stays_free and self._straddles and self.measured[1] > STANDING_MPS:
@@ -236,9 +236,9 @@ class MotionController:
         self.store.give_up_cells()
         self._stop_motion()
 
-    def drive_out(self, cell: Cell) -> None:
+    def re_enter(self, cell: Cell) -> None:
         """Start from standing towards a cell of the neighbouring lane, which is kept free."""
-        self.off_lattice, self.hold_cell = OffLatticePhase.DRIVING_OUT, cell
+        self.off_lattice, self.hold_cell = OffLatticePhase.RE_ENTERING, cell
         self._past_line = True
         self._stop_motion()
 
@@ -254,7 +254,7 @@ class MotionController:
     def _lines_ahead(self, measured: State, tick: int) -> list[Neighbour]:
         """Return the stop lines of the lanes that the body touches or enters, as vehicles.
 
-        For a vehicle that starts from standing and is partly in another lane, or drives out into
+        For a vehicle that starts from standing and is partly in another lane, or drives into
         it, the end of the lane counts instead.
         """
         s_m, speed_mps, goal = measured[0], measured[1], self.hold_cell[1]

@@ -17,7 +17,7 @@ from laneweave.protocol.scenario.formation_table import SLACK_S
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE, Closure
 from laneweave.protocol.scenario.timing import CYCLE_STEP_S, SHORTEST_CYCLE_S
 from laneweave.protocol.structuring import structure
-from laneweave.protocol.vehicle.lane_ends import drive_out, own_drive_out
+from laneweave.protocol.vehicle.lane_ends import own_re_entry, re_entry
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.corridors.corridor import (
     MAX_SPEED_MPS,
@@ -311,7 +311,7 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
     found = structure({"formation": formation, **kinds}, Scenario)
     for own in found.types.values():
         try:
-            own_drive_out(found, own.limits)
+            own_re_entry(found, own.limits)
         except ValueError as error:
             max_accel_mps2 = own.limits.max_accel_mps2
             field = (
@@ -336,7 +336,7 @@ def _cycle_s(scenario: Scenario, corridor: Corridor) -> float:
         math.sqrt(10.0 / math.sqrt(3.0) * lane_m / accel_mps2), math.cbrt(60.0 * lane_m / jerk_mps3)
     )
     shortest_s = CYCLE_STEP_S * math.ceil((move_s + SLACK_S) / CYCLE_STEP_S)
-    needed_m = drive_out(scenario).room_m + scenario.types.longest_body_m
+    needed_m = re_entry(scenario).room_m + scenario.types.longest_body_m
     rooms_m = [
         one.at_m - corridor.opens_m(one.lanes, one.at_m) - needed_m for one in corridor.ways_out
     ]

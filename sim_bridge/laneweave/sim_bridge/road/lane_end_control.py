@@ -23,9 +23,9 @@ from laneweave.protocol.vehicle.lane_ends import (
     START_S,
     LaneEnd,
     LaneEnds,
-    drive_out,
     lane_beside,
-    own_drive_out,
+    own_re_entry,
+    re_entry,
 )
 from laneweave.protocol.vehicle.territory import territory_of
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
@@ -82,10 +82,10 @@ class LaneEndControl:
         self._any = bool(ends)
         self._ends = tuple(ends)
         self._beside = {end: lane_beside(scenario, end) for end in self._ends}
-        needed = drive_out(scenario) if self._ends else None
+        needed = re_entry(scenario) if self._ends else None
         self._columns = needed.columns if needed is not None else 0
         self._distance_m = needed.distance_m if needed is not None else 0.0
-        """Distance behind a slow vehicle that is needed for driving out."""
+        """Distance behind a slow vehicle that is needed for re-entry."""
         self._queue_m = scenario.types.longest_body_m + scenario.tracking.min_gap_m
         """Distance between the fronts of vehicles that stand in a queue."""
         self._gaps: dict[LaneEnd, list[Gap]] = {end: [] for end in self._ends}
@@ -121,7 +121,7 @@ class LaneEndControl:
             if missed and controller.return_to_origin(t_s):
                 yield LaneEndChange(name, MISSED_EXIT, controller.hold_cell[1])
             elif (missed and self._cells_stay_free) or controller.has_lost_cell(t_s):
-                # While it drives out, a vehicle may come to another dead end.
+                # While it re-enters, a vehicle may come to another dead end.
                 self._forget(name)
                 yield self._take_off(name, vehicle)
         for end, gaps in self._gaps.items():
@@ -189,7 +189,7 @@ class LaneEndControl:
     def _start(
         self, vehicle: RoadVehicle, gaps: Collection[Gap], t_s: float
     ) -> Iterator[LaneEndChange]:
-        """Let the foremost waiting vehicle drive out if a gap is passing it."""
+        """Let the foremost waiting vehicle re-enter if a gap is passing it."""
         s_m, speed_mps = vehicle.state[0], vehicle.state[1]
         if speed_mps > STANDING_MPS:
             return
@@ -199,8 +199,8 @@ class LaneEndControl:
                 gap.vehicle = vehicle.name
                 # Weak types need more columns than strong ones, which arrive earlier.
                 limits = self._scenario.types[vehicle.arrival.vehicle_type].limits
-                own = own_drive_out(self._scenario, limits)
-                vehicle.controller.drive_out((gap.columns[-own.columns], gap.lane))
+                own = own_re_entry(self._scenario, limits)
+                vehicle.controller.re_enter((gap.columns[-own.columns], gap.lane))
                 yield LaneEndChange(vehicle.name, DRIVES_OUT, gap.lane)
                 return
 

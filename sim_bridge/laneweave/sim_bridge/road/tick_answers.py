@@ -26,9 +26,9 @@ from laneweave.protocol.scenario.deployment_fields import Runtime
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.road.message_loss import MessageLoss
 
-MAX_STRETCH = 8.0
+MAX_SLOWDOWN = 8.0
 """Maximum factor of `tick_deadline_s`."""
-_STRETCH, _RELAX = 1.5, 0.98
+_SLOW_DOWN, _RELAX = 1.5, 0.98
 """Multipliers of the deadline's factor after ticks with too many late answers, and after others."""
 _LATE_AGENTS = 0.05
 """Fraction of agents that may be late before the deadline is increased."""
@@ -80,7 +80,7 @@ class Answers:
     """Present agents that have not answered the current tick."""
     _late: set[Name] = field(factory=set)
     """Agents that have answered an earlier tick since the current tick started."""
-    _stretch: float = 1.0
+    _slowdown: float = 1.0
     _any_message: bool = False
     _all_silent_s: float = 0.0
     """Total duration of ticks since the last message from any agent."""
@@ -158,7 +158,7 @@ class Answers:
 
     def update_durations(self, now_s: float) -> list[Name]:
         """Update all durations after a tick; return the agents that have become silent."""
-        lasted_s = min(now_s - self._sent_s, self._stretch * self.runtime.tick_deadline_s)
+        lasted_s = min(now_s - self._sent_s, self._slowdown * self.runtime.tick_deadline_s)
         for name in self._without_answer & self.up:
             self._late_s[name] = self._late_s.get(name, 0.0) + lasted_s
         fallen_silent = []
@@ -186,14 +186,14 @@ class Answers:
         self.awaited = set() if self.all_silent else self._without_message - self.silent
         share = _LATE_AGENTS_LOSSY if self.lossy else _LATE_AGENTS
         slow = len(self._late) > share * len(self.up)
-        self._stretch *= _STRETCH if slow else _RELAX
-        self._stretch = min(max(self._stretch, 1.0), MAX_STRETCH)
+        self._slowdown *= _SLOW_DOWN if slow else _RELAX
+        self._slowdown = min(max(self._slowdown, 1.0), MAX_SLOWDOWN)
         self._late.clear()
         self._loss.start_tick()
         self._round_trip_s *= _FORGET
         self._sent_s, self._first_round_s = now_s, None
         self._begin_round(now_s, self.awaited)
-        self.deadline_s = now_s + self._stretch * self._patience_s
+        self.deadline_s = now_s + self._slowdown * self._patience_s
 
     def _begin_round(self, now_s: float, names: Iterable[Name]) -> None:
         """Register that a SENSE is being sent to agents."""
@@ -204,7 +204,7 @@ class Answers:
         else:
             self._round_s = now_s
             self._first_round_s = self._first_round_s or now_s
-            self.resend_s = now_s + self._stretch * self.runtime.tick_resend_s
+            self.resend_s = now_s + self._slowdown * self.runtime.tick_resend_s
 
     @property
     def _quiet_s(self) -> float:
@@ -214,7 +214,7 @@ class Answers:
         """
         longest_s = self.runtime.tick_resend_s
         needed_s = max(_FLOOR * longest_s, _ROUND_TRIPS * self._round_trip_s)
-        return self._stretch * min(longest_s, needed_s)
+        return self._slowdown * min(longest_s, needed_s)
 
     @property
     def _patience_s(self) -> float:
@@ -222,7 +222,7 @@ class Answers:
         runtime = self.runtime
         if not self.lossy:
             return runtime.tick_deadline_s
-        rounds_s = LOSSY_ROUNDS * self._quiet_s / self._stretch
+        rounds_s = LOSSY_ROUNDS * self._quiet_s / self._slowdown
         return min(runtime.tick_deadline_s, max(LOSSY_TICK * runtime.tick_s, rounds_s))
 
     def due_resends(self, now_s: float) -> list[Name]:

@@ -19,12 +19,12 @@ from laneweave.launch.web import road_script
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Closure
-from laneweave.protocol.vehicle.lane_ends import drive_out
+from laneweave.protocol.vehicle.lane_ends import re_entry
 from support.closed_lanes import BLOCKED, DROP, DROP_M
 from support.javascript import needs_node, printed_json
 from support.tables import for_each
 
-ROOM_M = drive_out(DROP).room_m
+ROOM_M = re_entry(DROP).room_m
 
 
 def five_lanes(*closures: Closure) -> Scenario:

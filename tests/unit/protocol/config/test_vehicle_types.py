@@ -14,7 +14,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import displacements
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_types import VehicleType
-from laneweave.protocol.vehicle.lane_ends import drive_out, own_drive_out
+from laneweave.protocol.vehicle.lane_ends import own_re_entry, re_entry
 from support.refusals import refusal
 from support.tables import for_each
 
@@ -74,9 +74,9 @@ def test_what_concerns_all_types_suits_the_longest_and_weakest() -> None:
         ],
     )
     assert found.timing.cycles_s == pytest.approx((5.2, 5.2))
-    needed = [own_drive_out(found, one.limits) for one in found.types.values()]
+    needed = [own_re_entry(found, one.limits) for one in found.types.values()]
     for name in ("room_m", "columns", "distance_m"):
-        assert getattr(drive_out(found), name) == max(getattr(one, name) for one in needed)
+        assert getattr(re_entry(found), name) == max(getattr(one, name) for one in needed)
     assert len(set(needed)) > 1
     assert found.types.longest_body_m == 12.0
 

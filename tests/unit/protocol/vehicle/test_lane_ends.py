@@ -20,9 +20,9 @@ from laneweave.protocol.vehicle.lane_ends import (
     LaneEnd,
     LaneEnds,
     dead_ends,
-    drive_out,
     early_start_m,
     lane_beside,
+    re_entry,
     sections_to_lines,
 )
 from laneweave.protocol.vehicle.motion import cell_state
@@ -72,7 +72,7 @@ def test_sections_by_which_a_vehicle_may_leave() -> None:
 
 
 def test_a_stop_line_lies_before_each_dead_end() -> None:
-    room_m = drive_out(DROP).room_m
+    room_m = re_entry(DROP).room_m
     assert dead_ends(DROP) == (LaneEnd(0, -INF, 800.0 - room_m, 800.0, INF),)
     assert dead_ends(BLOCKED) == (LaneEnd(1, -INF, 600.0 - room_m, 600.0, 700.0),)
     to_lines = sections_to_lines(BLOCKED)
@@ -151,7 +151,7 @@ def test_vehicles_drive_out_into_a_lane_that_is_open(
     assert lane_beside(scenario, end) == beside
 
 
-# --- driving out ------------------------------------------------------------------------------
+# --- re-entry ---------------------------------------------------------------------------------
 
 
 @settings(max_examples=40, deadline=None)
@@ -179,7 +179,7 @@ def test_a_vehicle_that_stands_gets_out_before_the_end_and_into_its_cell(
         road=evolve(DROP.road, lane_width_m=lane_m, closures=(Closure(0, 900.0),)),
     )
     try:
-        needed = drive_out(scenario)
+        needed = re_entry(scenario)
     except ValueError:
         return  # the limits are too low for this speed
     (end,) = dead_ends(scenario)
@@ -192,7 +192,7 @@ def test_a_vehicle_that_stands_gets_out_before_the_end_and_into_its_cell(
     controller = controller_in((0, 0), scenario, state=standing)
     controller.leave_lattice()
     goal: Cell = (column - needed.columns + 1, 1)
-    controller.drive_out(goal)
+    controller.re_enter(goal)
     half_m = 0.5 * vehicle.width_m
     for tick in range(start_tick, start_tick + 700):
         controller.step(tick)
@@ -215,7 +215,7 @@ def test_a_vehicle_that_stands_gets_out_before_the_end_and_into_its_cell(
 def test_a_vehicle_that_is_too_weak_is_refused_in_one_line() -> None:
     weak = evolve(DROP.vehicle, max_accel_mps2=0.1)
     with pytest.raises(ValueError, match="cannot get into the lattice"):
-        drive_out(evolve(DROP, vehicle=weak))
+        re_entry(evolve(DROP, vehicle=weak))
 
 
 # --- vehicles that reach the line -------------------------------------------------------------

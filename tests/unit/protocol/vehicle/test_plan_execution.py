@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
 from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, both_lanes_are_open
-from laneweave.protocol.vehicle.lane_ends import LATE_S, LaneEnds, drive_out, early_start_m
+from laneweave.protocol.vehicle.lane_ends import LATE_S, LaneEnds, early_start_m, re_entry
 from laneweave.protocol.vehicle.plan_execution import LISTEN_S, ExecutionPhase, PlanExecution
 from laneweave.protocol.vehicle.territory import BlockTerritory
 from laneweave.protocol.wire.messages import (
@@ -481,7 +481,7 @@ def test_a_move_from_or_into_a_lane_that_ends_begins_only_if_it_ends_before_the_
 ) -> None:
     # The move from (-4, 0) to (-4, 1) takes one slot; the line is where it ends if it is punctual.
     line_m = ROLLING.lattice.cell_s_m(-4, T0_S + SLOT_S)
-    room_m = drive_out(ROLLING).room_m
+    room_m = re_entry(ROLLING).room_m
     road = evolve(ROLLING.road, s3_m=20_000.0, closures=(Closure(lane, line_m + room_m + 1e-6),))
     execution = going()
     execution.lane_ends = LaneEnds(evolve(ROLLING, road=road))

@@ -16,7 +16,7 @@ from laneweave.protocol.wire.messages import (
     Prepare,
     VehicleState,
 )
-from laneweave.sim_bridge.road.attendance import Caretaker
+from laneweave.sim_bridge.road.caretakers import Caretaker
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.paper import PAPER
 from support.road_vehicles import vehicle_in

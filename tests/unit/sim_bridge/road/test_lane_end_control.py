@@ -10,7 +10,7 @@ from attrs import evolve
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Closure, Demand
-from laneweave.protocol.vehicle.lane_ends import dead_ends, drive_out
+from laneweave.protocol.vehicle.lane_ends import dead_ends, re_entry
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
@@ -77,7 +77,7 @@ def test_a_single_vehicle_waits_for_the_gap_that_comes_from_the_entrance() -> No
     assert in_s <= out_s + 15.0
     # It has entered the rearmost of the columns, and owns all of them.
     controller = road.vehicles[name].controller
-    columns = drive_out(DROP).columns
+    columns = re_entry(DROP).columns
     assert controller.hold_cell == controller.record.owned[0]
     assert len(controller.record.owned) == columns
     assert road.vehicles[name].admission.cell == controller.hold_cell
@@ -95,7 +95,7 @@ def test_between_two_gaps_there_is_as_much_room_for_traffic() -> None:
         if gap.vehicle is None
     )
     assert len(gaps) >= 3
-    columns = drive_out(DROP).columns
+    columns = re_entry(DROP).columns
     for (rear, front), (next_rear, _) in pairwise(gaps):
         assert front - rear == columns - 1
         assert next_rear - front > columns
@@ -167,7 +167,7 @@ def test_one_gap_for_each_vehicle() -> None:
 
 
 def test_a_vehicle_that_cannot_drive_out_in_time_waits_at_the_next_end() -> None:
-    """When it drives out, a vehicle stands in the next lane, which ends, too."""
+    """When it re-enters, a vehicle stands in the next lane, which ends, too."""
     road = lonely_road(road_with(Closure(0, 400.0), Closure(1, 700.0)), 40.0, 60.0)
     while DRIVES_OUT not in {kind for _, kind, _ in road.events}:
         road.step()

@@ -12,7 +12,7 @@ from laneweave.sim_bridge.road.tick_answers import (
     LATE_SHARE,
     LOSSY_ROUNDS,
     LOSSY_TICK,
-    MAX_STRETCH,
+    MAX_SLOWDOWN,
     Answers,
 )
 
@@ -268,12 +268,12 @@ def test_ticks_get_more_time_while_many_answers_are_late_and_less_again() -> Non
     assert answers.deadline_s == pytest.approx(1.0 + DEADLINE_S)
     assert slow_ticks(answers, names, 3, late=False) == pytest.approx(DEADLINE_S)
     assert slow_ticks(answers, names, 1, late=True) == pytest.approx(1.5 * DEADLINE_S)
-    assert slow_ticks(answers, names, 30, late=True) == pytest.approx(MAX_STRETCH * DEADLINE_S)
-    assert answers.resend_s - (answers.deadline_s - MAX_STRETCH * DEADLINE_S) == pytest.approx(
-        MAX_STRETCH * RUNTIME.tick_resend_s
+    assert slow_ticks(answers, names, 30, late=True) == pytest.approx(MAX_SLOWDOWN * DEADLINE_S)
+    assert answers.resend_s - (answers.deadline_s - MAX_SLOWDOWN * DEADLINE_S) == pytest.approx(
+        MAX_SLOWDOWN * RUNTIME.tick_resend_s
     )
     relaxed_s = slow_ticks(answers, names, 30, late=False)
-    assert DEADLINE_S < relaxed_s < MAX_STRETCH * DEADLINE_S
+    assert DEADLINE_S < relaxed_s < MAX_SLOWDOWN * DEADLINE_S
     assert slow_ticks(answers, names, 200, late=False) == pytest.approx(DEADLINE_S)
 
 

@@ -19,7 +19,7 @@ from laneweave.protocol.wire.messages import (
     VehicleRecord,
 )
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
-from laneweave.sim_bridge.road.attendance import Caretaker
+from laneweave.sim_bridge.road.caretakers import Caretaker
 from support.road_vehicles import controller_in, vehicle_in
 from support.rolling_samples import (
     AFTER,

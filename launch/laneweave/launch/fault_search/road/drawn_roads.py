@@ -19,7 +19,7 @@ RAMP_M = (30.0, 120.0)
 WEAVING_STEPS = (2.0, 6.0)
 """Range of the distances in which vehicles change to or from the special lane, in slots at v_F."""
 AFTER_M = 60.0
-"""Distance between the last lane change and the end of the lane (`drive_out` needs 50 m)."""
+"""Distance between the last lane change and the end of the lane (`re_entry` needs 50 m)."""
 BLOCKED_M = (30.0, 120.0)
 VOLUME_VEH_PER_H = 800.0
 """A volume for the fields of ramps; the arrivals are drawn elsewhere."""

@@ -27,7 +27,7 @@ from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.simulated_road import SimulatedRoad
 
-DRIVE_OUT_S = 8.0
+RE_ENTRY_S = 8.0
 """Time in which a vehicle drives from standing into its cell."""
 
 
@@ -108,7 +108,7 @@ class CheckedRoad:
             end = self._lane_ends.ahead(lane, body.state[0])
             body.stop_at(math.inf if end is None else end.line_m)
         elif kind == DRIVES_OUT:
-            body.drive_out(cell, t_s, DRIVE_OUT_S)
+            body.re_enter(cell, t_s, RE_ENTRY_S)
         elif kind == ENTERED_LATTICE:
             self._checker.enter(now_s, vehicle, cell, one.block)
 
@@ -236,7 +236,7 @@ class LightRoad:
 
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
         road = self._road
-        road.attendance.on_network(event, now_s)
+        road.caretakers.on_network(event, now_s)
         match event:
             case Arrived(_, _, Command() as command):
                 yield from self._on_command(command, now_s)
@@ -250,7 +250,7 @@ class LightRoad:
                 yield from self._begin_tick(now_s)
             case Started():
                 # The agents start at the same time.
-                road.attendance.on_network(LinkUp(), now_s)
+                road.caretakers.on_network(LinkUp(), now_s)
                 yield from road.connect()
                 yield from self._begin_tick(now_s)
             case _:

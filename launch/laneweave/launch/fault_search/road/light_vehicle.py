@@ -85,7 +85,7 @@ class LightBody(Plant):
         """Drive on to a position, and wait there."""
         self._stop_m = s_m
 
-    def drive_out(self, cell: Cell, now_s: float, lasts_s: float) -> None:
+    def re_enter(self, cell: Cell, now_s: float, lasts_s: float) -> None:
         """Begin a motion from the place where the body waits to a cell."""
         column = (self._stop_m - self._lattice.speed_mps * now_s) / self._lattice.pitch_m
         self._origin, self._goal = (column, self._goal[1]), cell

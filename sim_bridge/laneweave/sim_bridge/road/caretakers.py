@@ -1,4 +1,4 @@
-"""Attendance: the process in charge of each vehicle, its agent or a caretaker.
+"""Caretakers: the processes in charge of vehicles whose agents are absent, silent or always late.
 
 Rules, shared by the bridge and the fault search, for when an agent is present or silent, when a
 caretaker takes charge and is replaced, and how agents are notified that their vehicles have left.
@@ -100,7 +100,7 @@ class Caretaker:
         return execution.state(vehicle.sense(tick, caretaker=True), attended=False)
 
 
-class Attendance:
+class Caretakers:
     """Agents and caretakers of a road.
 
     The bridge subscribes to PREPARE and PLAN for a vehicle only while a caretaker is in charge.
