@@ -28,7 +28,7 @@ import numpy as np
 from attrs import field, frozen
 
 from evaluation.lattice_points import lattice_spacing
-from laneweave.launch.faults.specification import FaultSpec, load_faults
+from laneweave.launch.faults.fault_file import FaultSpec, load_faults
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks, read_trips
 from laneweave.launch.run.reference_run import ReferenceRun
 from laneweave.launch.run.simulated_run import SimulatedRun

@@ -24,7 +24,7 @@ from laneweave.agents.driving.trajectory import move_profile
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.launch.cli.main import command_line
 from laneweave.launch.cli.plan_answers import answer_request
-from laneweave.launch.faults.specification import (
+from laneweave.launch.faults.fault_file import (
     GROUPS,
     Kill,
     LinkFault,

@@ -97,7 +97,7 @@ class TickPhase(Enum):
     ANSWERS = "answers"
     PACE = "pace"
     """Start time of the next tick."""
-    SHUTTING_DOWN = "wind-up"
+    SHUTTING_DOWN = "shutting down"
     ENDED = "ended"
 
 

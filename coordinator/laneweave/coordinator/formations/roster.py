@@ -8,7 +8,7 @@ roster is complete.
 and its roster comprises all vehicles that entered there. After a plan has used two blocks, a
 vehicle from either may be in the other, so no later plan may use one without the vehicles of both:
 formations stay joined until their vehicles have left. Every vehicle stores the joined blocks
-(`VehicleState.joined`), so every leader learns them from the promises.
+(`VehicleState.record.joined`), so every leader learns them from the promises.
 """
 
 from __future__ import annotations

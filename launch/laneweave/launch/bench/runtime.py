@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from attrs import define, field
 from rich.table import Table
 
-from laneweave.launch.faults.specification import load_faults
+from laneweave.launch.faults.fault_file import load_faults
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.local_run import LocalRun
 from laneweave.protocol.config.participants import coordinator_names

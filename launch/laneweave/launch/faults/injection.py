@@ -14,13 +14,7 @@ import structlog
 from attrs import define, field
 
 from laneweave.launch.faults.failover import Failover
-from laneweave.launch.faults.network_namespaces import (
-    GroupNetwork,
-    Link,
-    NamespacesUnavailableError,
-)
-from laneweave.launch.faults.schedule import FaultEvent, FaultSchedule
-from laneweave.launch.faults.specification import (
+from laneweave.launch.faults.fault_file import (
     AGENT,
     COORDINATOR,
     LEADER,
@@ -30,6 +24,12 @@ from laneweave.launch.faults.specification import (
     LinkFault,
     Partition,
 )
+from laneweave.launch.faults.network_namespaces import (
+    GroupNetwork,
+    Link,
+    NamespacesUnavailableError,
+)
+from laneweave.launch.faults.schedule import FaultEvent, FaultSchedule
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.runtime.message_faults import MessageRule

@@ -25,9 +25,9 @@ from typing import Self
 
 from attrs import define, field, frozen
 
+from laneweave.launch.faults.fault_file import NAMESPACES, FaultSpec
 from laneweave.launch.faults.namespace_processes import ANSWER_S, hold_namespace
 from laneweave.launch.faults.packet_relay import MAX_WAITING, relay_packets
-from laneweave.launch.faults.specification import NAMESPACES, FaultSpec
 from laneweave.protocol.errors import BadInputError
 
 HUB_ADDRESS = "10.77.255.1"

@@ -14,7 +14,7 @@ from operator import attrgetter
 
 from attrs import field, frozen
 
-from laneweave.launch.faults.specification import (
+from laneweave.launch.faults.fault_file import (
     FaultSpec,
     Kill,
     Pause,

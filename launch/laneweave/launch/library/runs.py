@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 
 from laneweave.agents.driving.trajectory import check_moves
 from laneweave.coordinator.planning.solve import prepare
-from laneweave.launch.faults.specification import load_faults
+from laneweave.launch.faults.fault_file import load_faults
 from laneweave.launch.report.report import draw_report
 from laneweave.launch.run.local_run import LocalRun, StartPage
 from laneweave.launch.run.logs import log_by_default

@@ -19,10 +19,10 @@ import attrs
 from attrs import Factory, define, field
 
 from laneweave.coordinator.planning.kernels import KERNELS
+from laneweave.launch.faults.fault_file import ROUTER, SENDER_OF_GROUP, FaultSpec
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.network_namespaces import ENDPOINT, HUB, LISTEN, open_network
 from laneweave.launch.faults.shared_counters import MessageFaults, SharedBoard
-from laneweave.launch.faults.specification import ROUTER, SENDER_OF_GROUP, FaultSpec
 from laneweave.launch.observe.observer import Observer
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.logs import last_error

@@ -13,7 +13,7 @@ from typing import Any
 import structlog
 from attrs import define, field, frozen
 
-from laneweave.launch.faults.specification import ROUTER
+from laneweave.launch.faults.fault_file import ROUTER
 from laneweave.launch.run.roles import end_role, start_role
 
 log = structlog.get_logger(__name__)

@@ -13,9 +13,9 @@ from attrs import Factory, define, field
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
+from laneweave.launch.faults.fault_file import ROUTER, FaultSpec
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.shared_counters import LocalBoard
-from laneweave.launch.faults.specification import ROUTER, FaultSpec
 from laneweave.launch.observe.observer import TOPICS
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.outcome import Outcome, complete_summary

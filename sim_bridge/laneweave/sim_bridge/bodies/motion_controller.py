@@ -83,7 +83,7 @@ class OffLatticePhase(Enum):
 
 
 class FallbackLevel(IntEnum):
-    """FallbackFallback level; see the module docstring."""
+    """Fallback level; see the module docstring."""
 
     EXECUTE = 0
     HOLD = 1
@@ -103,7 +103,7 @@ class MotionController:
     command_tick: int = -1
     """Tick of the newest command; -1: none."""
     level: FallbackLevel = FallbackLevel.HOLD
-    """FallbackLevel in the last tick."""
+    """Level in the last tick."""
     level_ticks: dict[FallbackLevel, int] = field(init=False)
     """Number of ticks spent on each level."""
     neighbours: Neighbours = NO_NEIGHBOURS

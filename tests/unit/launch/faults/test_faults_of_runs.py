@@ -9,14 +9,7 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from laneweave.launch.faults.injection import FaultInjection
-from laneweave.launch.faults.network_namespaces import (
-    GroupNetwork,
-    Link,
-    NamespacesUnavailableError,
-)
-from laneweave.launch.faults.shared_counters import MessageFaults, SharedBoard
-from laneweave.launch.faults.specification import (
+from laneweave.launch.faults.fault_file import (
     GROUPS,
     FaultSpec,
     Kill,
@@ -25,6 +18,13 @@ from laneweave.launch.faults.specification import (
     Pause,
     load_faults,
 )
+from laneweave.launch.faults.injection import FaultInjection
+from laneweave.launch.faults.network_namespaces import (
+    GroupNetwork,
+    Link,
+    NamespacesUnavailableError,
+)
+from laneweave.launch.faults.shared_counters import MessageFaults, SharedBoard
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.local_run import add_faults, fault_injection
 from laneweave.launch.run.outcome import Outcome

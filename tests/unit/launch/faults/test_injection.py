@@ -6,8 +6,8 @@ from typing import Any
 
 from attrs import define, field
 
+from laneweave.launch.faults.fault_file import FaultSpec, Kill, Pause
 from laneweave.launch.faults.injection import FaultInjection
-from laneweave.launch.faults.specification import FaultSpec, Kill, Pause
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.wire.messages import Census, CensusEntry, Heartbeat, Name
 from support.tables import for_each

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from itertools import islice
 
+from laneweave.launch.faults.fault_file import FaultSpec, Kill, Partition, Pause
 from laneweave.launch.faults.schedule import FaultEvent, FaultSchedule
-from laneweave.launch.faults.specification import FaultSpec, Kill, Partition, Pause
 from laneweave.protocol.runtime.message_faults import MessageRule
 from support.tables import for_each
 

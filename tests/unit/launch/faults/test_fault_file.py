@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from laneweave.launch.faults.specification import (
+from laneweave.launch.faults.fault_file import (
     GROUPS,
     FaultSpec,
     Kill,
