@@ -16,22 +16,22 @@ LANE_ENDS, ROADS, FORMATIONS = "lane-ends", "roads", "entry-roads"
 QUICK: list[tuple[str, Bug, int]] = [
     (ROADS, road_bugs.ramps_are_issued_at_the_start, 0),
     (ROADS, road_bugs.cells_are_passed_on_twice, 0),
-    (ROADS, road_bugs.late_commands_repeat_moves, 386),
-    (ROADS, road_bugs.agents_insist, 337),
+    (ROADS, road_bugs.late_commands_repeat_moves, 11),
+    (ROADS, road_bugs.agents_insist, 56),
     (FORMATIONS, road_bugs.ramps_are_forgotten, 2),
     (FORMATIONS, road_bugs.columns_ahead_are_closed, 66),
 ]
 """Profiles, bugs, and a seed that catches each in a few seconds."""
 LONG: list[tuple[str, Bug, int]] = [
     (LANE_ENDS, road_bugs.never_leaves, 4),
-    (LANE_ENDS, road_bugs.agents_move_vehicles_without_cells, 17),
-    (LANE_ENDS, road_bugs.agent_remembers, 17),
+    (LANE_ENDS, road_bugs.agents_move_vehicles_without_cells, 4),
+    (LANE_ENDS, road_bugs.agent_remembers, 4),
     (ROADS, road_bugs.exits_are_closed, 1),
     (ROADS, road_bugs.types_are_ignored, 2),
     (FORMATIONS, road_bugs.never_leaves, 6),
-    (LANE_ENDS, road_bugs.gaps_are_given_away, 3),
+    (LANE_ENDS, road_bugs.gaps_are_given_away, 23),
     (LANE_ENDS, road_bugs.still_listed, 78),
-    (LANE_ENDS, road_bugs.gap_taken_too_early, 3),
+    (LANE_ENDS, road_bugs.gap_taken_too_early, 4),
     (FORMATIONS, road_bugs.columns_are_not_reserved, 17),
     (FORMATIONS, road_bugs.exits_are_closed, 8),
     (FORMATIONS, road_bugs.types_are_ignored, 11),
