@@ -38,7 +38,8 @@ class RecordStore:
         """
         if incarnation <= self.record.incarnation:
             raise ValueError(f"incarnation {incarnation} is not above {self.record.incarnation}")
-        self.record = replace(self.record, incarnation=incarnation, accepted=None)
+        claims = self.record.claims + 1
+        self.record = replace(self.record, incarnation=incarnation, accepted=None, claims=claims)
 
     def store(self, wanted: VehicleRecord) -> bool:
         """Store what the process in charge requests; return whether anything has changed."""
