@@ -184,7 +184,6 @@ class PlanExecution:
             promised=self.promised if self.territory.stores_promises else None,
             accepted=self.plan.ballot if self.plan is not None else None,
             transfer=self.transfer,
-            claims=self.stored.claims,
         )
 
     @property
@@ -227,7 +226,6 @@ class PlanExecution:
                 accepted=self.plan.ballot if self.plan is not None and self.accepted else None,
                 owned=stored.owned if stored.promised == self.promised else (),
                 transfer=stored.transfer,
-                claims=stored.claims,
             ),
             ready=self.ready,
             completed=self.completed,

@@ -113,8 +113,6 @@ class VehicleRecord(Message, frozen=True):
     """Rolling operation: cells that the vehicle owns, ascending."""
     transfer: PendingTransfer | None = None
     """Rolling operation: newest transfer of its cells."""
-    claims: Int64 = 0
-    """Number of processes that have been in charge of the vehicle."""
 
 
 class CurrentMotion(Message, frozen=True):

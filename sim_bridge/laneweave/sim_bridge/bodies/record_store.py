@@ -38,8 +38,7 @@ class RecordStore:
         """
         if incarnation <= self.record.incarnation:
             raise ValueError(f"incarnation {incarnation} is not above {self.record.incarnation}")
-        claims = self.record.claims + 1
-        self.record = replace(self.record, incarnation=incarnation, accepted=None, claims=claims)
+        self.record = replace(self.record, incarnation=incarnation, accepted=None)
 
     def store(self, wanted: VehicleRecord) -> bool:
         """Store what the process in charge requests; return whether anything has changed."""
