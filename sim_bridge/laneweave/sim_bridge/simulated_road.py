@@ -1,10 +1,10 @@
 """The simulated road: its vehicles, and what happens to them in a tick.
 
-A tick begins on a road whose bodies rest in time: vehicles enter, lane ends and formations are
-handled, caretakers take charge of vehicles without agents, and every vehicle gets a SENSE. COMMANDs
-arrive, then all bodies move by one tick, and those that have passed an exit leave. *When* a tick
-begins and ends, and which COMMANDs are in time, is decided elsewhere: `core.BridgeCore` waits for
-the agents, the fault search (`launch.fault_search`) for nothing.
+When a tick begins, vehicles enter, lane ends and formations are handled, caretakers take charge of
+vehicles without agents, and every vehicle gets a SENSE. COMMANDs arrive; then all bodies move by
+one tick, and those that have passed an exit leave. When ticks begin and end, and which COMMANDs are
+in time, is decided elsewhere: `core.BridgeCore` waits for the agents, the fault search
+(`launch.fault_search`) for nothing.
 """
 
 from __future__ import annotations
