@@ -135,42 +135,6 @@ class TickPace:
         return max(now_s, self._due_s, self._opened_s + self._min_duration_s)
 
 
-class FinalReports:
-    """The processes whose final report is awaited."""
-
-    def __init__(self) -> None:
-        """Await the report of the bridge."""
-        self._awaited: set[str] = {BRIDGE}
-        self._departures: deque[tuple[int, Name]] = deque()
-        """Tick and name of each vehicle that has left in the last `REPORT_TICKS`."""
-
-    @property
-    def complete(self) -> bool:
-        """Whether all reports have arrived."""
-        return not self._awaited
-
-    def expect(self, name: str) -> None:
-        """Await the report of an agent."""
-        self._awaited.add(name)
-
-    def take(self, report: Report) -> bool:
-        """Return whether a report is news: not from an earlier run, and no duplicate."""
-        if report.role not in ("agent", "bridge"):
-            return True
-        known = report.name in self._awaited
-        self._awaited.discard(report.name)
-        return known
-
-    def on_left(self, tick: int, vehicle: Name) -> None:
-        """Register that a vehicle has left."""
-        self._departures.append((tick, vehicle))
-
-    def forget(self, tick: int) -> None:
-        """Give up reports of vehicles that left long ago: lost, or their agents were killed."""
-        while self._departures and self._departures[0][0] < tick - REPORT_TICKS:
-            self._awaited.discard(self._departures.popleft()[1])
-
-
 class BridgeCore:
     """State machine of the bridge; a `Core`."""
 
@@ -211,7 +175,10 @@ class BridgeCore:
         )
         self._answers = self.road.answers
         self._pace = TickPace(scenario.runtime, pace)
-        self._reports = FinalReports()
+        self._unreported: set[str] = {BRIDGE}
+        """Processes whose final report is awaited."""
+        self._departures: deque[tuple[int, Name]] = deque()
+        """Tick and name of each vehicle that has left in the last `REPORT_TICKS`."""
         self._stopwatch = stopwatch
         self._tick_began = 0.0
         self._agent_wait_s = scenario.runtime.agent_start_s
@@ -292,7 +259,7 @@ class BridgeCore:
             case PeerUp(topic, parameters) if topic is VEHICLE_ALIVE:
                 self._agent_wait_s = self._scenario.runtime.agent_start_s
                 if parameters["vehicle"] in self.vehicles:
-                    self._reports.expect(parameters["vehicle"])
+                    self._unreported.add(parameters["vehicle"])
             case Wakeup() if self.phase is TickPhase.ANSWERS:
                 for name, copies in groupby(self._answers.due_resends(now_s)):
                     sense = self.road.sense_of(self.vehicles[name])  # encoded once
@@ -310,8 +277,8 @@ class BridgeCore:
         match message:
             case Prepare() | Plan():
                 yield from self.road.on_ballot(Name(parameters["vehicle"]), message)
-            case Report() if self._reports.take(message):
-                self._record.on_report(message)
+            case Report():
+                self._on_report(message)
             case LogEvent():
                 self._record.on_event(message)
             case Heartbeat():
@@ -324,6 +291,13 @@ class BridgeCore:
         # A late answer was computed for a past state and would lead to a wrong position.
         in_time = command.tick == self.tick and self.phase is TickPhase.ANSWERS
         return self.road.on_command(command, now_s, in_time=in_time)
+
+    def _on_report(self, report: Report) -> None:
+        if report.role in ("agent", "bridge"):
+            if report.name not in self._unreported:
+                return  # from an earlier run, or a duplicate
+            self._unreported.discard(report.name)
+        self._record.on_report(report)
 
     # --- the tick -----------------------------------------------------------------------------
 
@@ -340,7 +314,7 @@ class BridgeCore:
         if self.phase is TickPhase.ANSWERS and self._answers.complete(now_s):
             yield from self._end_tick(now_s)
         if self.phase is TickPhase.SHUTTING_DOWN and (
-            now_s >= self._until_s or self._reports.complete
+            now_s >= self._until_s or not self._unreported
         ):
             self._finish(self._ending)
             yield End()
@@ -357,7 +331,7 @@ class BridgeCore:
         for vehicle in self.road.enter():
             self._world.add(vehicle.name, vehicle.state, vehicle.arrival.vehicle_type)
             if vehicle.name in self._answers.up:
-                self._reports.expect(vehicle.name)
+                self._unreported.add(vehicle.name)
             else:
                 self._record.event(self.t_s, AGENT_MISSING, vehicle=vehicle.name)
                 # After a missing agent, wait only briefly for others until one appears.
@@ -370,9 +344,11 @@ class BridgeCore:
         show_bodies(self._world, road.vehicles, self._scenario, self._record, road.t_s)
         for vehicle in road.departed():
             self._world.remove(vehicle.name)
-            self._reports.on_left(road.tick, vehicle.name)
+            self._departures.append((road.tick, vehicle.name))
             yield from road.remove(vehicle)
-        self._reports.forget(road.tick)
+        while self._departures and self._departures[0][0] < road.tick - REPORT_TICKS:
+            # The agent was killed, or its report was lost.
+            self._unreported.discard(self._departures.popleft()[1])
         duration_s = self._stopwatch() - self._tick_began
         self._record.on_tick(road.t_s, len(road.vehicles), duration_s)
         if self._is_over():

@@ -247,7 +247,7 @@ def check_all_gone(street: Street) -> None:
     bridge = street.bridge
     # The last one's token may vanish after its report, with which the run is over.
     assert set(bridge.road.caretakers.departed) <= bridge.road.answers.up <= {MANY[-1].vehicle}
-    assert not bridge._reports._awaited
+    assert not bridge._unreported
     for node in street.nodes:
         assert not getattr(node.core, "_agents", None)
 

@@ -479,7 +479,7 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
         *(core.vehicles, core.road.caretakers.departed, core.road.caretakers._caretakers),
         *(core.road.answers._without_message, core.road.answers._silence_s),
         *(core.road.answers.silent, core.road.answers.awaited, core.road.answers.up),
-        *(core.road.at_entrance, core._reports._awaited, desk.world.states),
+        *(core.road.at_entrance, core._unreported, desk.world.states),
     ):
         assert not left_over
 

@@ -1,8 +1,8 @@
 """The road of the fault search: the bridge's simulated road with light vehicles, at a fixed rate.
 
 `LightRoad` waits for no agent, unlike the bridge: a tick begins every `tick_s`, and COMMANDs are
-executed when they arrive, also those for earlier ticks. `CheckedRoad` informs the checker about
-what happens on the road.
+executed when they arrive, also those for earlier ticks. It tells the checker what happens, and
+moves bodies accordingly.
 """
 
 from __future__ import annotations
@@ -40,111 +40,11 @@ class Reception(Enum):
     IN_TIME = "in time"
 
 
-class CheckedRoad:
-    """Tells the checker what happens on a road, and moves bodies accordingly.
-
-    For the checker, a vehicle without cells has left the road. Implements `RoadRecord`.
-    """
-
-    def __init__(
-        self,
-        scenario: Scenario,
-        roadside: Roadside,
-        checker: Checker,
-        new_incarnation: Callable[[], int],
-        new_vehicle: Callable[[Admission, float, Scenario, int], LightVehicle],
-        bridge: int,
-        began_s: float,
-    ) -> None:
-        """Begin with an empty road; arguments as those of `SimulatedRoad` and `LightRoad`."""
-        self.road = SimulatedRoad(scenario, roadside, self, new_incarnation, new_vehicle, bridge)
-        self.takeovers = 0
-        """Number of takeovers by caretakers."""
-        self._scenario = scenario
-        self._vehicles = self.road.vehicles
-        self._checker = checker
-        self._began_s = began_s
-        self._lane_ends = LaneEnds(scenario)
-        self._tick_m = 1.5 * scenario.lattice.speed_mps * scenario.runtime.tick_s
-        """Distance beyond an exit at which a vehicle has left the road."""
-
-    def event(self, t_s: float, kind: str, /, **data: object) -> None:
-        """Do nothing."""
-
-    def on_demanded(self, arrival: Arrival) -> None:
-        """Do nothing."""
-
-    def on_closed(self, closed: ClosedFormation, members: Sequence[Name]) -> None:
-        """Do nothing."""
-
-    def on_agent_took_over(self, t_s: float, vehicle: Name, previous: str) -> None:
-        """Do nothing."""
-
-    def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
-        """Count a takeover."""
-        del t_s, vehicle, reason
-        self.takeovers += 1
-
-    def on_entered(self, vehicle: RecordedVehicle) -> None:
-        """Let a vehicle enter."""
-        one = self._vehicles[Name(vehicle.name)]
-        self._checker.enter(self._began_s + one.body.t_s, one.name, one.cell, one.block)
-
-    def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
-        """Let a vehicle leave the road."""
-        del attended
-        if self._vehicles[Name(vehicle.name)].controller.off_lattice is None:
-            self._checker.leave(self._began_s + t_s, vehicle.name)
-
-    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
-        """Let a body stop before the end of its lane, and come back; see `LaneEndControl`."""
-        one, now_s = self._vehicles[vehicle], self._began_s + t_s
-        body, cell = one.body, one.cell
-        if kind == MISSED_EXIT:
-            self._checker.give_up_move(now_s, vehicle, cell)
-            body.go(cell, t_s, self._scenario.runtime.tick_s)
-        elif kind == LEFT_LATTICE:
-            self._checker.leave(now_s, vehicle)
-            end = self._lane_ends.ahead(lane, body.state[0])
-            body.stop_at(math.inf if end is None else end.line_m)
-        elif kind == DRIVES_OUT:
-            body.re_enter(cell, t_s, RE_ENTRY_S)
-        elif kind == ENTERED_LATTICE:
-            self._checker.enter(now_s, vehicle, cell, one.block)
-
-    def begin_move(self, vehicle: LightVehicle, held: Cell, now_s: float, lasts_s: float) -> None:
-        """Begin the motion from the cell that a vehicle held to the cell that it holds now."""
-        name, cell, in_charge = vehicle.name, vehicle.cell, vehicle.controller.record.incarnation
-        move = (held, cell)
-        self._checker.begin(now_s, name, in_charge, move, lasts_s, vehicle.latest_s)
-        along, across = cell[0] - held[0], cell[1] - held[1]
-        if (along, across) not in self._scenario.types[vehicle.arrival.vehicle_type].moves:
-            self._checker.undrivable(now_s, name, move)
-        vehicle.body.go(cell, now_s - self._began_s, lasts_s)
-
-    def report_stored(self, now_s: float, vehicle: LightVehicle) -> None:
-        """Report the record of a vehicle on the lattice."""
-        if vehicle.controller.off_lattice is None:
-            self._checker.store(now_s, vehicle.name, vehicle.controller.record)
-
-    def check_lanes(self, now_s: float) -> None:
-        """Report bodies in lanes that have ended, also partly at an exit."""
-        for name, vehicle in self._vehicles.items():
-            s_m, _, _, y_m, _, _ = vehicle.state
-            touched = self._scenario.lattice.lanes_touched(y_m, vehicle.size[1])
-            for lane in {*touched}:
-                exit_lane = self._lane_ends.exit_ahead(lane, s_m)
-                if exit_lane is not None and s_m > exit_lane.end_m + self._tick_m:
-                    text = f"in lanes {touched} at {s_m:.1f} m, exit at {exit_lane.end_m:g} m"
-                    self._checker.beyond_end(now_s, name, text)
-            end = self._lane_ends.ahead(vehicle.body_lane, s_m)
-            if end is not None and s_m > end.end_m:
-                text = f"at {s_m:.1f} m, its lane ends at {end.end_m:g} m"
-                self._checker.beyond_end(now_s, name, text)
-
-
 class LightRoad:
-    """Core of the road."""
+    """Core of the road; it implements `RoadRecord`, too.
+
+    For the checker, a vehicle without cells has left the road.
+    """
 
     def __init__(
         self,
@@ -174,22 +74,20 @@ class LightRoad:
             began_s: virtual time at road time 0.
         """
         self.began_s = began_s
-        self._checker = checker
-        self._checked = CheckedRoad(
-            scenario, roadside, checker, new_incarnation, self._new_vehicle, bridge, began_s
+        self.takeovers = 0
+        """Number of takeovers by caretakers."""
+        self._road = SimulatedRoad(
+            scenario, roadside, self, new_incarnation, self._new_vehicle, bridge
         )
-        self._road = self._checked.road
         self.vehicles = self._road.vehicles
+        self._scenario = scenario
+        self._checker = checker
+        self._lane_ends = LaneEnds(scenario)
         self._visits = visits
         self._move_lasts_s = move_lasts_s
         self._reception = reception
         self._preferred_lanes: Mapping[Name, int] = {}
         """Newest preferred lanes; empty: those at the entrance."""
-
-    @property
-    def takeovers(self) -> int:
-        """Number of takeovers by caretakers."""
-        return self._checked.takeovers
 
     @property
     def tick(self) -> int:
@@ -204,7 +102,7 @@ class LightRoad:
     @property
     def wakeup_s(self) -> float:
         """Time of the next tick."""
-        return self.began_s + (self.tick + 1) * self._road.scenario.runtime.tick_s
+        return self.began_s + (self.tick + 1) * self._scenario.runtime.tick_s
 
     def prefer(self, preferred_lanes: Mapping[Name, int]) -> None:
         """Change the preferred lanes of all vehicles, also of those that enter later."""
@@ -244,7 +142,7 @@ class LightRoad:
                 name = Name(parameters["vehicle"])
                 yield from road.on_ballot(name, message)
                 if name in self.vehicles:
-                    self._checked.report_stored(now_s, self.vehicles[name])
+                    self._report_stored(now_s, self.vehicles[name])
             case Wakeup() if now_s >= self.wakeup_s:
                 yield from self._end_tick()
                 yield from self._begin_tick(now_s)
@@ -264,20 +162,97 @@ class LightRoad:
         held = vehicle.cell
         in_time = reception is Reception.IN_TIME
         yield from self._road.on_command(command, now_s, in_time=in_time)
-        self._checked.report_stored(now_s, vehicle)
+        self._report_stored(now_s, vehicle)
         if vehicle.cell != held:
-            self._checked.begin_move(vehicle, held, now_s, self._move_lasts_s())
+            self._begin_move(vehicle, held, now_s, self._move_lasts_s())
 
     def _begin_tick(self, now_s: float) -> Iterator[Effect]:
         self._checker.advance(now_s)
         self._road.admit()
         self._road.enter()
         yield from self._road.begin_tick(now_s)
-        self._checked.check_lanes(now_s)
+        self._check_lanes(now_s)
         for vehicle in self.vehicles.values():
-            self._checked.report_stored(now_s, vehicle)
+            self._report_stored(now_s, vehicle)
 
     def _end_tick(self) -> Iterator[Effect]:
         self._road.step()
         for vehicle in self._road.departed():
             yield from self._road.remove(vehicle)
+
+    # --- what happens on the road -------------------------------------------------------------
+
+    def event(self, t_s: float, kind: str, /, **data: object) -> None:
+        """Do nothing."""
+
+    def on_demanded(self, arrival: Arrival) -> None:
+        """Do nothing."""
+
+    def on_closed(self, closed: ClosedFormation, members: Sequence[Name]) -> None:
+        """Do nothing."""
+
+    def on_agent_took_over(self, t_s: float, vehicle: Name, previous: str) -> None:
+        """Do nothing."""
+
+    def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
+        """Count a takeover."""
+        del t_s, vehicle, reason
+        self.takeovers += 1
+
+    def on_entered(self, vehicle: RecordedVehicle) -> None:
+        """Let a vehicle enter."""
+        one = self.vehicles[Name(vehicle.name)]
+        self._checker.enter(self.began_s + one.body.t_s, one.name, one.cell, one.block)
+
+    def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
+        """Let a vehicle leave the road."""
+        del attended
+        if self.vehicles[Name(vehicle.name)].controller.off_lattice is None:
+            self._checker.leave(self.began_s + t_s, vehicle.name)
+
+    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
+        """Let a body stop before the end of its lane, and come back; see `LaneEndControl`."""
+        one, now_s = self.vehicles[vehicle], self.began_s + t_s
+        body, cell = one.body, one.cell
+        if kind == MISSED_EXIT:
+            self._checker.give_up_move(now_s, vehicle, cell)
+            body.go(cell, t_s, self._scenario.runtime.tick_s)
+        elif kind == LEFT_LATTICE:
+            self._checker.leave(now_s, vehicle)
+            end = self._lane_ends.ahead(lane, body.state[0])
+            body.stop_at(math.inf if end is None else end.line_m)
+        elif kind == DRIVES_OUT:
+            body.re_enter(cell, t_s, RE_ENTRY_S)
+        elif kind == ENTERED_LATTICE:
+            self._checker.enter(now_s, vehicle, cell, one.block)
+
+    def _begin_move(self, vehicle: LightVehicle, held: Cell, now_s: float, lasts_s: float) -> None:
+        """Begin the motion from the cell that a vehicle held to the cell that it holds now."""
+        name, cell, in_charge = vehicle.name, vehicle.cell, vehicle.controller.record.incarnation
+        move = (held, cell)
+        self._checker.begin(now_s, name, in_charge, move, lasts_s, vehicle.latest_s)
+        along, across = cell[0] - held[0], cell[1] - held[1]
+        if (along, across) not in self._scenario.types[vehicle.arrival.vehicle_type].moves:
+            self._checker.undrivable(now_s, name, move)
+        vehicle.body.go(cell, now_s - self.began_s, lasts_s)
+
+    def _report_stored(self, now_s: float, vehicle: LightVehicle) -> None:
+        """Report the record of a vehicle on the lattice."""
+        if vehicle.controller.off_lattice is None:
+            self._checker.store(now_s, vehicle.name, vehicle.controller.record)
+
+    def _check_lanes(self, now_s: float) -> None:
+        """Report bodies in lanes that have ended, also partly at an exit."""
+        tick_m = 1.5 * self._scenario.lattice.speed_mps * self._scenario.runtime.tick_s
+        for name, vehicle in self.vehicles.items():
+            s_m, _, _, y_m, _, _ = vehicle.state
+            touched = self._scenario.lattice.lanes_touched(y_m, vehicle.size[1])
+            for lane in {*touched}:
+                exit_lane = self._lane_ends.exit_ahead(lane, s_m)
+                if exit_lane is not None and s_m > exit_lane.end_m + tick_m:
+                    text = f"in lanes {touched} at {s_m:.1f} m, exit at {exit_lane.end_m:g} m"
+                    self._checker.beyond_end(now_s, name, text)
+            end = self._lane_ends.ahead(vehicle.body_lane, s_m)
+            if end is not None and s_m > end.end_m:
+                text = f"at {s_m:.1f} m, its lane ends at {end.end_m:g} m"
+                self._checker.beyond_end(now_s, name, text)
