@@ -241,9 +241,9 @@ class Runner:
             process.get(message, self.tick)
 
     def _in_charge_of(self, vehicle: str) -> Process:
-        attendant = self.vehicles[vehicle].road.controller.record.incarnation
+        in_charge = self.vehicles[vehicle].road.controller.record.incarnation
         for process in self.processes.values():
-            if process.vehicle.name == vehicle and process.incarnation == attendant:
+            if process.vehicle.name == vehicle and process.incarnation == in_charge:
                 return process
         raise ScenarioError(f"no process is in charge of {vehicle}")
 

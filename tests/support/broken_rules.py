@@ -160,15 +160,36 @@ def need_one_less(needs_of: Dependencies, plan: Plan, vehicle: Name) -> tuple[Ne
 
 @instead_of(execution, "dependencies")
 def forget_corners(_: object, plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
-    def needs_of(step: int, cells: set[Cell]) -> Needs:
-        return {
+    return dependencies_where(
+        plan, vehicle, lambda *ends: frozenset(ends), lambda other, own: other < own
+    )
+
+
+def dependencies_where(
+    plan: Plan,
+    vehicle: Name,
+    cells_of: Callable[[Cell, Cell], frozenset[Cell]],
+    counts: Callable[[int, int], bool],
+) -> tuple[Needs, ...]:
+    """Return dependencies of a vehicle's moves that are not those of the protocol.
+
+    Args:
+        plan: its plan.
+        vehicle: the vehicle.
+        cells_of: the cells that a move from one cell to another uses.
+        counts: whether a move of another vehicle counts, by its step and that of the own move.
+    """
+    return tuple(
+        {
             other: index + 1
             for other, moves in plan.moves.items()
-            for index, (other_step, origin, target) in enumerate(moves)
-            if other != vehicle and other_step < step and cells & {origin, target}
+            for index, (other_step, *ends) in enumerate(moves)
+            if other != vehicle
+            and counts(other_step, step)
+            and cells_of(*ends) & cells_of(origin, target)
         }
-
-    return tuple(needs_of(step, {origin, target}) for step, origin, target in plan.moves[vehicle])
+        for step, origin, target in plan.moves[vehicle]
+    )
 
 
 def start_and_count(me: PlanExecution, _: object) -> None:

@@ -243,7 +243,7 @@ ROWS: Mapping[str, Callable[[Forger], None]] = {
     "state-time": lambda forger: forger.state(t_s=1e12),
     "state-incarnation": lambda forger: forger.state(incarnation=2**62),
     "command-incarnation": lambda forger: forger.change_victims(COMMAND, incarnation=HUGE),
-    "sense-attendant": lambda forger: forger.change_victims(SENSE, incarnation=HUGE),
+    "sense-in_charge": lambda forger: forger.change_victims(SENSE, incarnation=HUGE),
     "sense-caretaker": lambda forger: forger.change_victims(
         SENSE, incarnation=HUGE, caretaker=True, tick=forger.known(Sense).tick + 1
     ),

@@ -55,6 +55,7 @@ from laneweave.sim_bridge.road.caretakers import Caretaker, Caretakers
 from laneweave.sim_bridge.road.census import CensusPublisher
 from laneweave.sim_bridge.road.formation_building import GrowingFormations
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.broken_rules import dependencies_where
 from support.bugs import Bug, breaks
 from support.states import set_record
 
@@ -95,18 +96,7 @@ def motion_stays_in_plan(me: PlanExecution, _: object) -> None:
 @breaks("V6", execution, "dependencies")
 def dependency_on_last_step_only(_: object, plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
     """A move waits only for interfering moves of the step before it."""
-
-    def needs(step: int, cells: frozenset[Cell]) -> Needs:
-        return {
-            other: index + 1
-            for other, moves in plan.moves.items()
-            for index, (other_step, origin, target) in enumerate(moves)
-            if other != vehicle and other_step == step - 1 and cells & footprint(origin, target)
-        }
-
-    return tuple(
-        needs(step, footprint(origin, target)) for step, origin, target in plan.moves[vehicle]
-    )
+    return dependencies_where(plan, vehicle, footprint, lambda other, own: other == own - 1)
 
 
 @breaks("V3", execution.is_stored)
@@ -357,11 +347,11 @@ def claim_is_no_presence(
 ) -> Generator[Effect, None, bool]:
     """An agent that claims its vehicle counts as absent until its token appears."""
     controller = vehicle.controller
-    attendant = controller.record.incarnation
+    in_charge = controller.record.incarnation
     if not controller.accept_command(command):
         return False
     self.answers.in_time(vehicle.name)
-    if controller.record.incarnation != attendant:
+    if controller.record.incarnation != in_charge:
         yield from self._end_caretaker(vehicle.name)
     return True
 

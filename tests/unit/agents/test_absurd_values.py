@@ -46,7 +46,7 @@ class Seat:
         self.given = BRIDGE
         self.agent = AgentCore(ME, self._next, PAPER, LightDriver)
         self.tick = 50
-        self.attendant = 0
+        self.in_charge = 0
         self.caretaker = False
         self.drive(3)
         assert self.agent.in_charge
@@ -60,7 +60,7 @@ class Seat:
         return self.tick * TICK_S
 
     def sense(self, **changes: Any) -> Sense:  # noqa: ANN401 (fields)
-        values = {"incarnation": self.attendant, "caretaker": self.caretaker, "bridge": BRIDGE}
+        values = {"incarnation": self.in_charge, "caretaker": self.caretaker, "bridge": BRIDGE}
         return sense_in(HOME, **({"tick": self.tick} | values | changes))
 
     def feel(self, **changes: Any) -> list[Effect]:  # noqa: ANN401 (fields)
@@ -71,9 +71,9 @@ class Seat:
         for _ in range(ticks):
             self.tick += 1
             for command in sent(self.feel(), Command):
-                right = command.tick == self.tick and command.record.incarnation > self.attendant
+                right = command.tick == self.tick and command.record.incarnation > self.in_charge
                 if right and command.record.incarnation <= CLAIM_AHEAD_NS:
-                    self.attendant, self.caretaker = command.record.incarnation, False
+                    self.in_charge, self.caretaker = command.record.incarnation, False
 
     def prepare(self, ballot: Ballot) -> list[Effect]:
         message = Prepare(ballot, (0,), (ME,))
@@ -136,7 +136,7 @@ def test_what_the_road_does_not_show_is_forgotten(changes: dict[str, Any]) -> No
     assert execution.promised is None or execution.incarnation == before
 
 
-def test_a_claim_above_a_wrong_attendant_is_taken_back() -> None:
+def test_a_claim_above_a_wrong_process_in_charge_is_taken_back() -> None:
     seat = Seat()
     seat.tick += 1
     seat.feel(incarnation=DAY_NS // 2, caretaker=True)
@@ -146,10 +146,10 @@ def test_a_claim_above_a_wrong_attendant_is_taken_back() -> None:
     assert seat.agent._incarnation == seat.given < DAY_NS // 2
 
 
-def test_it_takes_charge_of_a_vehicle_whose_attendant_is_nearly_a_day_ahead() -> None:
+def test_it_takes_charge_of_a_vehicle_whose_process_in_charge_is_nearly_a_day_ahead() -> None:
     """Such as after a forged COMMAND, from which the caretaker took over."""
     seat = Seat()
-    seat.attendant, seat.caretaker = DAY_NS - 10**9, True
+    seat.in_charge, seat.caretaker = DAY_NS - 10**9, True
     seat.drive(3)
     assert seat.agent.in_charge
     assert seat.agent._incarnation == above(seat.given, DAY_NS - 10**9)

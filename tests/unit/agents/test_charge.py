@@ -73,10 +73,10 @@ class Seat:
     def shown(self) -> VehicleState:
         return self.rig.shown[-1]
 
-    def feel(self, attendant: int, *, cell: Cell = HOME, **more: Any) -> list[Effect]:  # noqa: ANN401
+    def feel(self, in_charge: int, *, cell: Cell = HOME, **more: Any) -> list[Effect]:  # noqa: ANN401
         """Send it the next tick, with a process in charge."""
         self.tick += 1
-        self.last = sense_in(cell, self.tick, incarnation=attendant, **more)
+        self.last = sense_in(cell, self.tick, incarnation=in_charge, **more)
         return self.rig.hand(SENSE, self.last)
 
     def repeat(self) -> list[Effect]:
@@ -88,12 +88,12 @@ class Seat:
         accepted: Ballot | None = BALLOT,
         *,
         joined: tuple[int, ...] = (0,),
-        attendant: int | None = None,
+        in_charge: int | None = None,
     ) -> list[Effect]:
         """Show it within the tick what the controller has noted, for the one in charge."""
-        if attendant is None:
-            attendant = self.last.record.incarnation
-        noted = changed(self.last, accepted=accepted, joined=joined, incarnation=attendant)
+        if in_charge is None:
+            in_charge = self.last.record.incarnation
+        noted = changed(self.last, accepted=accepted, joined=joined, incarnation=in_charge)
         return self.rig.hand(SENSE, noted)
 
     def take_charge(self, joined: tuple[int, ...] = (0,)) -> None:
@@ -163,8 +163,8 @@ def test_v1_is_repeated_while_a_claim_is_under_way() -> None:
     """Until the claim is granted, another process may have moved the vehicle."""
     seat = Seat()
     cells: tuple[Cell, ...] = ((-1, 1), (-2, 1), (-2, 2), (-3, 2), (-3, 1))
-    for attendant, cell in zip((0, 0, 0, 1, 1), cells, strict=True):
-        command = command_of(seat.feel(attendant, cell=cell))
+    for in_charge, cell in zip((0, 0, 0, 1, 1), cells, strict=True):
+        command = command_of(seat.feel(in_charge, cell=cell))
         # From the moment it is in charge the hold cell is its own business.
         assert command.hold_cell == (cell if seat.tick < 5 else cells[3])
     assert seat.driver.taken_over == [1, 2, 3, 4]
@@ -174,8 +174,8 @@ def test_v1_is_repeated_while_a_claim_is_under_way() -> None:
 def test_a_motion_and_joined_formations_are_taken_over_with_the_charge() -> None:
     seat = Seat()
     seat.driver.resting = False
-    for attendant in (0, 1):
-        assert command_of(seat.feel(attendant, joined=(0, 3))).record.joined == (0, 3)
+    for in_charge in (0, 1):
+        assert command_of(seat.feel(in_charge, joined=(0, 3))).record.joined == (0, 3)
     assert (seat.shown.moving, seat.shown.record.joined) == (True, (0, 3))
     seat.driver.resting = True
     seat.feel(1, joined=(0, 3))
@@ -289,17 +289,17 @@ def test_an_acceptance_is_requested_at_once_and_published_when_noted() -> None:
 
 
 @pytest.mark.parametrize(
-    ("noted", "attendant"),
+    ("noted", "in_charge"),
     [(None, 1), (BALLOT._replace(seq=0), 1), (BALLOT._replace(seq=2), 1), (BALLOT, 0), (BALLOT, 2)],
 )
 def test_a_note_for_another_plan_or_process_is_no_acceptance(
-    noted: Ballot | None, attendant: int
+    noted: Ballot | None, in_charge: int
 ) -> None:
     seat = taken()
-    assert kinds(seat.note(noted, attendant=attendant)) == [Command]
+    assert kinds(seat.note(noted, in_charge=in_charge)) == [Command]
     shown = len(seat.rig.shown)
-    seat.feel(attendant, accepted=noted)
-    assert len(seat.rig.shown) - shown == seat.agent.in_charge == (attendant == 1)
+    seat.feel(in_charge, accepted=noted)
+    assert len(seat.rig.shown) - shown == seat.agent.in_charge == (in_charge == 1)
     assert not seat.shown.accepted
 
 

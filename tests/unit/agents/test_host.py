@@ -57,7 +57,7 @@ def feel(
     tick: int = 1,
     **more: Any,  # noqa: ANN401 (fields)
 ) -> list[node.Effect]:
-    """Send a vehicle its SENSE; its agent is in charge, unless another attendant is given."""
+    """Send a vehicle its SENSE; its agent is in charge, unless another process is given."""
     felt = sense_in(cell, tick, vehicle=vehicle, **({"incarnation": 1} | more))
     return hand(host, topics.SENSE, vehicle, felt)
 

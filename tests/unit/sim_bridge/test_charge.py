@@ -186,11 +186,11 @@ def test_the_caretaker_takes_charge_when_the_agent_is_gone(attended: Desk) -> No
     attended.down(B)
     next_tick(attended, A)
     check_cared_for(attended, "absent")
-    attendant = sensed(attended, B).record.incarnation
-    assert attendant > AGENT
+    in_charge = sensed(attended, B).record.incarnation
+    assert in_charge > AGENT
     for _ in range(5):  # once
         assert listening(next_tick(attended, A)) == []
-        assert sensed(attended, B).record.incarnation == attendant
+        assert sensed(attended, B).record.incarnation == in_charge
 
 
 def test_the_caretaker_takes_charge_when_the_agent_is_silent(attended: Desk) -> None:

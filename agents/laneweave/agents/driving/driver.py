@@ -177,10 +177,10 @@ class TrackingDriver:
         self._solve_ms.append(result.solve_ms)
         self._unusable += not result.usable
         self._osqp_solves += result.iterations > 0
+        # A late body is still moving; an agent that takes over must know this.
         end_tick = max(reference.end_tick, tick + 1) if moving else 0
         if reference is self._settling and tick < reference.end_tick:
             end_tick = reference.end_tick  # ready for plans, but still settling
-        # A late body is still moving; an agent that takes over must know this.
         ticks = self._ticks if reference.origin != self._goal else 0
         return Drive(
             motion=CurrentMotion(reference.origin, end_tick, ticks),

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from laneweave.protocol.config.participants import coordinator_names
+from laneweave.protocol.config.participants import named_identities
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import host_of
@@ -65,7 +65,12 @@ def init(
     if folder == Path():
         raise BadInputError("DIR", "", "the name of a folder")
     settings = load_scenario(deployment)
-    identities = list(dict.fromkeys(_wanted(settings)))
+    identities = list(
+        dict.fromkeys(
+            parse_identity(one.common_name, f"{one.party} NAME")
+            for one in named_identities(settings)
+        )
+    )
     hosts = [*(host or ()), *_hosts(settings)]
     host_names(hosts)  # check before writing
     if keep and ca_path(folder).exists():
@@ -110,21 +115,6 @@ def add(
 def _check_days(days: float) -> None:
     if not 0.0 < days <= MAX_DAYS:
         raise BadInputError("--days", days, f"(0, {MAX_DAYS:g}]")
-
-
-def _wanted(settings: Scenario) -> Iterator[Identity]:
-    security = settings.security
-    yield Identity(Party.ROUTER)
-    yield Identity(Party.BRIDGE)
-    for party, names in (
-        (Party.COORDINATOR, coordinator_names(settings)),
-        (Party.FLEET, security.fleets),
-        (Party.CLIENT, security.clients),
-        (Party.OBSERVER, security.observers),
-        (Party.VEHICLE, security.vehicles),
-    ):
-        for name in names:
-            yield parse_identity(Identity(party, name).common_name, f"{party} NAME")
 
 
 def _hosts(settings: Scenario) -> Iterator[str]:

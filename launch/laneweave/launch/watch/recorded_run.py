@@ -76,7 +76,7 @@ class Recording:
         self.last = int(self._numbers[-1]) + 1 if len(self._numbers) else 0
         self._demands_s = np.sort([float(trip["demanded_s"]) for trip in self._trips.values()])
         self._times_s = [moment.t_s for moment in self._moments]
-        self.scene = scene_of(run.scenario, "recorded", run.title, self._step_s) | {}
+        self.scene = scene_of(run.scenario, "recorded", run.title, self._step_s)
         self.scene["has_formations"] &= run.method == FORMATION
 
     def frames(self, begin: int, end: int) -> list[str]:

@@ -56,7 +56,15 @@ def coordinator_names(scenario: Scenario) -> tuple[str, ...]:
 
 
 def identities_of(scenario: Scenario) -> Iterator[Identity]:
-    """Yield all identities of a deployment."""
+    """Yield all identities of a deployment: the named ones, and the vehicles of its demand."""
+    yield from named_identities(scenario)
+    if not scenario.security.vehicles:
+        for name in demanded_vehicles(scenario):
+            yield Identity(Party.VEHICLE, name)
+
+
+def named_identities(scenario: Scenario) -> Iterator[Identity]:
+    """Yield the identities that the deployment itself names."""
     security = scenario.security
     yield Identity(Party.ROUTER)
     yield Identity(Party.BRIDGE)
@@ -65,7 +73,7 @@ def identities_of(scenario: Scenario) -> Iterator[Identity]:
         (Party.FLEET, tuple(security.fleets)),
         (Party.CLIENT, security.clients),
         (Party.OBSERVER, security.observers),
-        (Party.VEHICLE, security.vehicles or demanded_vehicles(scenario)),
+        (Party.VEHICLE, security.vehicles),
     ):
         for name in names:
             yield Identity(party, name)

@@ -271,7 +271,7 @@ class PlanExecution:
 
     @property
     def too_late(self) -> bool:
-        """Whether the next move can no longer end before its lanes do."""
+        """Whether the next move can no longer end before one of its lanes does."""
         plan, move = self.plan, self.next_move
         if plan is None or move is None or not self.lane_ends:
             return False

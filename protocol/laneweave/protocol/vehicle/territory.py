@@ -27,14 +27,63 @@ from laneweave.protocol.wire.messages import (
 
 
 @frozen
-class BlockTerritory:
-    """Formations own blocks of columns; no block is ever used by two."""
+class Territory:
+    """What plans may use. Each rule is that of the operation that needs it; here it has no effect.
 
-    lattice: Lattice
+    A vehicle has a record, of joined blocks or of owned cells.
+    """
+
     stores_promises: ClassVar[bool] = False
     """Whether motion controllers store promises, which then bind later processes in charge."""
     given_up_cells_stay_free: ClassVar[bool] = False
     """Whether no vehicle is led into cells that a vehicle gives up; others of its formation are."""
+
+    def is_addressed(self, _record: VehicleRecord, _prepare: Prepare) -> bool:
+        """Return whether a PREPARE whose roster contains the vehicle is for it."""
+        return True
+
+    def joined_by(self, joined: tuple[int, ...], _prepare: Prepare) -> tuple[int, ...]:
+        """Return the blocks that a vehicle has joined once it promises a ballot."""
+        return joined
+
+    def contains(self, _plan: Plan) -> bool:
+        """Return whether all cells of a plan lie in its blocks."""
+        return True
+
+    def is_joined(self, _record: VehicleRecord, _plan: Plan) -> bool:
+        """Return whether the blocks of a plan are those that the vehicle has joined."""
+        return True
+
+    def may_transfer(self, _record: VehicleRecord, _plan: Plan, _vehicle: Name) -> bool:
+        """Return whether the transfers are valid, and the vehicle owns what it gives."""
+        return True
+
+    def transfer_in(self, _plan: Plan, _vehicle: Name) -> PendingTransfer | None:
+        """Return a vehicle's transfer in a plan; None: plans transfer no cells."""
+        return None
+
+    def may_accept(self, _record: VehicleRecord, _ballot: Ballot) -> bool:
+        """Return whether what the acceptance of a ballot needs is stored."""
+        return True
+
+    def may_hold(self, _record: VehicleRecord, _cell: Cell) -> bool:
+        """Return whether a vehicle may hold a cell."""
+        return True
+
+    def owned_among(self, _cells: Iterable[Cell]) -> Iterable[Cell]:
+        """Return those of the cells kept free for a vehicle that it then owns."""
+        return ()
+
+    def transfer_of_departed(self, record: VehicleRecord) -> PendingTransfer | None:
+        """Return the transfer in the record of a vehicle that gives up its cells."""
+        return record.transfer
+
+
+@frozen
+class BlockTerritory(Territory):
+    """Formations own blocks of columns; no block is ever used by two."""
+
+    lattice: Lattice
 
     def is_addressed(self, record: VehicleRecord, prepare: Prepare) -> bool:
         """Return whether a PREPARE is for a block that the vehicle has joined."""
@@ -42,7 +91,7 @@ class BlockTerritory:
         return not {*prepare.blocks}.isdisjoint(record.joined)
 
     def joined_by(self, joined: tuple[int, ...], prepare: Prepare) -> tuple[int, ...]:
-        """Return the blocks that a vehicle has joined once it promises a ballot."""
+        """Return these blocks and those of the ballot."""
         return tuple(sorted({*joined, *prepare.blocks}))
 
     def contains(self, plan: Plan) -> bool:
@@ -57,62 +106,13 @@ class BlockTerritory:
         """Return whether the blocks of a plan are those that the vehicle has joined."""
         return set(plan.blocks) == set(record.joined)
 
-    def may_transfer(self, record: VehicleRecord, plan: Plan, vehicle: Name) -> bool:
-        """Return True: no cells are transferred."""
-        del record, plan, vehicle
-        return True
-
-    def transfer_in(self, plan: Plan, vehicle: Name) -> PendingTransfer | None:
-        """Return None: no cells are transferred."""
-        del plan, vehicle
-        return None
-
-    def may_accept(self, record: VehicleRecord, ballot: Ballot) -> bool:
-        """Return True: an acceptance needs no transfer."""
-        del record, ballot
-        return True
-
-    def may_hold(self, record: VehicleRecord, cell: Cell) -> bool:
-        """Return True: plans of the formation keep cells exclusive."""
-        del record, cell
-        return True
-
-    def owned_among(self, cells: Iterable[Cell]) -> Iterable[Cell]:
-        """Return no cells: vehicles own none."""
-        del cells
-        return ()
-
-    def transfer_of_departed(self, record: VehicleRecord) -> PendingTransfer | None:
-        """Return the transfer in a record, which is None."""
-        return record.transfer
-
 
 @frozen
-class CellTerritory:
+class CellTerritory(Territory):
     """Each vehicle owns cells, which plans transfer (rolling operation)."""
 
     stores_promises: ClassVar[bool] = True
     given_up_cells_stay_free: ClassVar[bool] = True
-
-    def is_addressed(self, record: VehicleRecord, prepare: Prepare) -> bool:
-        """Return True: a PREPARE is for its roster."""
-        del record, prepare
-        return True
-
-    def joined_by(self, joined: tuple[int, ...], prepare: Prepare) -> tuple[int, ...]:
-        """Return the same blocks: promises join none."""
-        del prepare
-        return joined
-
-    def contains(self, plan: Plan) -> bool:
-        """Return True: a plan consists of owned cells (`may_transfer`)."""
-        del plan
-        return True
-
-    def is_joined(self, record: VehicleRecord, plan: Plan) -> bool:
-        """Return True: plans have no blocks."""
-        del record, plan
-        return True
 
     def may_transfer(self, record: VehicleRecord, plan: Plan, vehicle: Name) -> bool:
         """Return whether the transfers are valid, and the vehicle owns what it gives.
@@ -137,7 +137,7 @@ class CellTerritory:
         return cell in record.owned
 
     def owned_among(self, cells: Iterable[Cell]) -> Iterable[Cell]:
-        """Return all cells that were kept free for a vehicle: it owns them."""
+        """Return all of the cells."""
         return cells
 
     def transfer_of_departed(self, record: VehicleRecord) -> PendingTransfer | None:
@@ -149,9 +149,6 @@ class CellTerritory:
         known = record.promised, record.accepted, transfer.ballot if transfer is not None else None
         ballots = [ballot for ballot in known if ballot is not None]
         return PendingTransfer(max(ballots)) if ballots else None
-
-
-Territory = BlockTerritory | CellTerritory
 
 
 def territory_of(scenario: Scenario) -> Territory:

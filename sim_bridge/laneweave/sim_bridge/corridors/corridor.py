@@ -66,7 +66,7 @@ class CorridorEdge:
 
     @property
     def lanes(self) -> range:
-        """The corridor lanes of its lanes."""
+        """Numbers of its lanes in the corridor."""
         return range(self.first_lane, self.first_lane + len(self.edge.lanes))
 
     def lane(self, number: int) -> Lane:
