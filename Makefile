@@ -54,10 +54,10 @@ test: $(STAMP) ## run the tests that prove that everything works
 	$(PYTEST) -m 'not full and not more'
 
 test-more: $(STAMP) ## run what CI runs beyond them
-	$(PYTEST) -m 'more and not full'
+	$(PYTEST) -m '(more or hypothesis) and not full' --hypothesis-profile all
 
 test-full: $(STAMP) ## run all tests, including the long ones
-	$(PYTEST)
+	$(PYTEST) --hypothesis-profile all
 
 containers: $(STAMP) ## build the images of compose.yaml and run the deployment in containers (needs podman or docker)
 	$(BIN)/pytest -m full tests/system/test_containers.py

@@ -6,9 +6,9 @@ import gc
 import signal
 
 import pytest
-from hypothesis import HealthCheck, settings
 
 from support.chromium import NO_BROWSER
+from support.examples import register_profiles
 
 FIRST = ("tests/system/", "tests/simulation/")
 """Folders of long tests. They run first, so that parallel workers finish at about the same time."""
@@ -16,8 +16,7 @@ SHORT = "tests/system/test_bad_input.py"
 """System tests that are short."""
 
 
-settings.register_profile("any-load", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("any-load")  # no test depends on the machine's load
+register_profiles()
 
 
 def pytest_configure() -> None:

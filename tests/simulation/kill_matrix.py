@@ -41,6 +41,7 @@ from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.launch.fault_search.search import silence_logs
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from support.bugs import Bug
+from support.examples import PART
 from support.planted_bugs import EVERY_BUG
 
 ROOT = Path(__file__).parents[2]
@@ -110,7 +111,7 @@ class Examination:
         session.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
         # Failing examples are not made smaller.
         phases = (Phase.explicit, Phase.generate)
-        settings.register_profile("examination", settings.get_profile("any-load"), phases=phases)
+        settings.register_profile("examination", settings.get_profile(PART), phases=phases)
         settings.load_profile("examination")
         took_s = next(_forked({"": session.items}))[1]
         healthy = [item for item in session.items if isinstance(took_s[item.nodeid], float)]

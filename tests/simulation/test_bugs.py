@@ -50,6 +50,7 @@ def test_the_seed_that_found_a_planted_bug_finds_it(name: str) -> None:
     assert catch is not None
 
 
+@pytest.mark.more
 @pytest.mark.catches("no-gate")
 def test_a_search_finds_a_planted_bug() -> None:
     catch = first_catch(EVERY_BUG["no-gate"], range(25), "mixed")

@@ -13,16 +13,13 @@ from support import road_bugs
 from support.bugs import Bug, catches
 
 LANE_ENDS, ROADS, FORMATIONS = "lane-ends", "roads", "entry-roads"
-QUICK: list[tuple[str, Bug, int]] = [
+NOTICED: list[tuple[str, Bug, int]] = [
     (ROADS, road_bugs.ramps_are_issued_at_the_start, 0),
     (ROADS, road_bugs.cells_are_passed_on_twice, 0),
     (ROADS, road_bugs.late_commands_repeat_moves, 11),
     (ROADS, road_bugs.agents_insist, 56),
     (FORMATIONS, road_bugs.ramps_are_forgotten, 2),
     (FORMATIONS, road_bugs.columns_ahead_are_closed, 66),
-]
-"""Profiles, bugs, and a seed that catches each in a few seconds."""
-LONG: list[tuple[str, Bug, int]] = [
     (LANE_ENDS, road_bugs.never_leaves, 4),
     (LANE_ENDS, road_bugs.agents_move_vehicles_without_cells, 4),
     (LANE_ENDS, road_bugs.agent_remembers, 4),
@@ -36,19 +33,13 @@ LONG: list[tuple[str, Bug, int]] = [
     (FORMATIONS, road_bugs.exits_are_closed, 8),
     (FORMATIONS, road_bugs.types_are_ignored, 11),
 ]
+"""Profiles, bugs, and a seed that catches each."""
 
 
+@pytest.mark.more
 @pytest.mark.parametrize(
     ("profile", "bug", "seed"),
-    [
-        pytest.param(
-            *(profile, bug, seed),
-            id=f"{profile}-{bug.name}-{seed}",
-            marks=[catches(bug), *[pytest.mark.more] * more],
-        )
-        for more, rows in enumerate((QUICK, LONG))
-        for profile, bug, seed in rows
-    ],
+    [pytest.param(*row, id="{}-{.name}-{}".format(*row), marks=catches(row[1])) for row in NOTICED],
 )
 def test_planted_bugs_are_noticed(
     profile: str, bug: Bug, seed: int, monkeypatch: pytest.MonkeyPatch

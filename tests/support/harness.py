@@ -129,7 +129,12 @@ class Lab:
     def start_with(
         self, options: Mapping[str, Any], *arguments: object, **environment: str
     ) -> subprocess.Popen[str]:
-        """As `start`, with options of `subprocess.Popen`."""
+        """As `start`, with options of `subprocess.Popen`.
+
+        `run` draws a report only if it is told to, since this takes longer than a short run.
+        """
+        if arguments[0] == "run" and "--report" not in arguments:
+            arguments = (*arguments, "--no-report")
         process = subprocess.Popen(
             [LANEWEAVE, *map(str, arguments)],
             cwd=self.folder,

@@ -28,7 +28,7 @@ def road(lab: Lab) -> Path:
 FinishedRun = Callable[[str], Path]
 
 _RUNS: dict[str, tuple[str, ...]] = {
-    "zenoh": (),
+    "zenoh": ("--report",),
     "packed": ("--vehicles-per-process", "8"),
     "simulated": ("--transport", "simulated"),
 }

@@ -159,7 +159,7 @@ def test_a_run_goes_on_if_its_terminal_is_closed_under_nohup(lab: Lab, road: Pat
 @pytest.mark.more
 def test_a_run_ends_in_good_order_when_its_terminal_is_closed(lab: Lab, road: Path) -> None:
     terminal, process = start_in_terminal(
-        lab, "run", road, *DEMAND, "--duration", "600", *OVER_ZENOH, "--out", "out"
+        lab, "run", road, *DEMAND, "--duration", "600", *OVER_ZENOH, "--out", "out", "--report"
     )
     lab.wait_until(partial(has_entered, lab.folder / "out", 5))
 

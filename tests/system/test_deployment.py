@@ -48,6 +48,7 @@ def test_roles_by_hand(finished_run: FinishedRun, lab: Lab) -> None:
     assert final_lanes(lab.folder / "out") == final_lanes(finished_run("simulated"))
 
 
+@pytest.mark.more
 def test_the_planning_service(lab: Lab) -> None:
     config = deployment(lab, free_tcp())
     router = start_router(lab, config)

@@ -173,6 +173,7 @@ def show_tokens(transport: ZenohTransport) -> None:
         transport.withdraw(key)
 
 
+@pytest.mark.more
 def test_nonsense_changes_nothing(
     finished_run: FinishedRun,
     lab: Lab,

@@ -392,6 +392,7 @@ def test_a_role_says_in_one_line_what_is_wrong_with_its_certificate(
 # --- a whole deployment ---------------------------------------------------------------------------
 
 
+@pytest.mark.more
 @pytest.mark.parametrize("link", ONE_LINK)
 def test_a_secured_deployment_runs_to_its_end(lab: Lab, link: str) -> None:
     config = secured_deployment(lab, link.format(free_port()))

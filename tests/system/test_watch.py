@@ -305,7 +305,7 @@ def start_watched_run(lab: Lab, *arguments: object) -> tuple[subprocess.Popen[st
 @needs_chromium
 def test_a_run_is_watched_to_its_end(lab: Lab, page: Page, road: Path) -> None:
     run, address = start_watched_run(
-        lab, road, *DEMAND, "--watch-listen", "127.0.0.1:0", "--pace", "5"
+        lab, road, *DEMAND, "--watch-listen", "127.0.0.1:0", "--pace", "5", "--report"
     )
     page.open(address)
     page.wait_until(lambda: page.text("pill") == "live")

@@ -359,7 +359,7 @@ def test_commands_exist(path: Path) -> None:
         if words[1:] and words[1] in getattr(subcommand, "commands", {}):
             subcommand = subcommand.commands[words[1]]
             del words[0]
-        known = {option for parameter in subcommand.params for option in parameter.opts}
+        known = {one for given in subcommand.params for one in (*given.opts, *given.secondary_opts)}
         options = {word.partition("=")[0] for word in words if word.startswith("--")}
         assert options <= known | {"--help"}, command
         if len(words) > 1 and not re.search(r"[\[\]|>&]|\.\.\.|--help", command):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.agents.driving.driver import TrackingDriver
@@ -17,6 +17,7 @@ from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.examples import examples
 
 SCENARIO = Scenario()
 LATTICE, LIMITS, TICK_S = SCENARIO.lattice, SCENARIO.vehicle, SCENARIO.runtime.tick_s
@@ -50,7 +51,7 @@ def path(reference: Reference, tick: int = BEGIN_TICK) -> np.ndarray:
 
 
 @given(st.floats(-22.5, 22.5), st.floats(-1.0, 1.0))
-@settings(max_examples=50)
+@examples(50)
 def test_leads_from_where_it_is_to_rest_in_the_cell(offset_m: float, faster_mps: float) -> None:
     rows = path(settling(beside(offset_m, faster_mps=faster_mps)))
     np.testing.assert_allclose(rows[0], [offset_m, faster_mps, 0, 0, 0, 0], atol=1e-6)
@@ -58,7 +59,7 @@ def test_leads_from_where_it_is_to_rest_in_the_cell(offset_m: float, faster_mps:
 
 
 @given(st.floats(-22.5, 22.5))
-@settings(max_examples=30)
+@examples(30)
 def test_no_limit_is_approached_and_no_vehicle_overshoots(offset_m: float) -> None:
     reference = settling(beside(offset_m))
     rows = path(reference)

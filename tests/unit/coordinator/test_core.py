@@ -6,7 +6,7 @@ import time
 
 import pytest
 from attrs import evolve
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -66,9 +66,11 @@ from laneweave.protocol.wire.topics import (
     SERVICE_CANCEL,
     STATE,
 )
+from support.examples import examples
 from support.paper import PAPER
 from support.service_desk import T_S, Cells, Desk, census, jobs, leading, logged, messages, state
 from support.states import A, B, C, D, E, F, changed
+from support.variants import variants
 
 # --- starting, bridges, election --------------------------------------------------------------
 
@@ -391,7 +393,7 @@ def test_failed_planning_is_logged_and_tried_again_under_the_same_ballot(spoil: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cell", [(-4, 0), (77, 0), (0, 5), (-1, 1)])
+@pytest.mark.parametrize("cell", variants(map(pytest.param, ((-1, 1), (-4, 0), (77, 0), (0, 5)))))
 def test_cells_that_cannot_be_planned_from_do_not_stop_the_coordinator(cell: Cell) -> None:
     """Outside the block, or the cell of another vehicle."""
     desk = leading({A: (0, 0), B: (-1, 1)})
@@ -439,7 +441,7 @@ def rosters(draw: st.DrawFn) -> tuple[Cells, dict[Name, int]]:
 
 
 @pytest.mark.slow
-@settings(max_examples=15)
+@examples(15)
 @given(roster=rosters(), t_s=st.floats(4.1, 40.0))
 def test_every_plan_is_executable_and_serves_all_preferences(
     roster: tuple[Cells, dict[Name, int]], t_s: float

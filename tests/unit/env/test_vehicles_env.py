@@ -112,6 +112,7 @@ def held() -> tuple[VehiclesEnv, list[Any]]:
 
 
 @pytest.mark.more
+@pytest.mark.more
 def test_possible_agents_are_the_demanded_vehicles(held: tuple[VehiclesEnv, list[Any]]) -> None:
     env, _ = held
     assert env.possible_agents == [one.vehicle for one in arrivals(env.scenario)]
@@ -241,6 +242,7 @@ def test_opposite_requests_have_opposite_effects() -> None:
     assert lanes[1] > lanes[-1] + 0.5
 
 
+@pytest.mark.more
 def test_who_holds_stays_in_its_cell_and_arrives_only_if_it_entered_in_its_lane(
     held: tuple[VehiclesEnv, list[Any]],
 ) -> None:
@@ -258,6 +260,7 @@ def test_who_holds_stays_in_its_cell_and_arrives_only_if_it_entered_in_its_lane(
     assert all(len(each) == 1 for each in cells.values())
 
 
+@pytest.mark.more
 def test_rewards_sum_up_over_a_trip(held: tuple[VehiclesEnv, list[Any]]) -> None:
     env, results = held
     total: dict[str, float] = {}

@@ -126,6 +126,9 @@ def run(
             help="Address of this page; implies --watch. Default: 127.0.0.1:8080 or a free port.",
         ),
     ] = None,
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Draw the figures and report.html.")
+    ] = True,
     no_progress: NoProgress = False,
 ) -> None:
     """Run a scenario on this machine, and write the results to a folder."""
@@ -203,9 +206,9 @@ def run(
             warn=warn,
             start_page=None if page is None else page.start,
         )
-        report = _finish(outcome)
+        drawn = _finish(outcome, report=report)
         if page is not None:
-            page.end(f"{outcome.ending}, report at {report}" if report else outcome.ending)
+            page.end(f"{outcome.ending}, report at {drawn}" if drawn else outcome.ending)
     if compare and outcome.summary is not None and outcome.summary.ending == "complete":
         _compare(settings, outcome.folder, show=show)
     raise typer.Exit(outcome.exit_status)
@@ -228,12 +231,12 @@ def _check_sumo_options(settings: Scenario, volume: float | None, *, compare: bo
         raise BadInputError("--compare", "given", "none without a SUMO simulation (--sumocfg)")
 
 
-def _finish(outcome: Outcome) -> Path | None:
-    """Print the outcome of a run and write its report; return the path of the page, if any."""
+def _finish(outcome: Outcome, *, report: bool) -> Path | None:
+    """Print the outcome of a run and draw its report; return the path of the page, if any."""
     from laneweave.launch.run.outcome import print_outcome
 
     print_outcome(outcome, Console())
-    if not outcome.has_traffic:
+    if not report or not outcome.has_traffic:
         return None
     from laneweave.launch.report.report import draw_report
 

@@ -116,6 +116,7 @@ def regulated(problem: Problem) -> np.ndarray:
     return jerks
 
 
+@pytest.mark.more
 @pytest.mark.slow
 def test_the_fast_path_gives_the_programs_solution_where_no_row_binds(
     exact: Tracker,

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.agents.driving.reference import Reference
@@ -20,6 +20,7 @@ from laneweave.protocol.vehicle.motion import (
     integrate,
     limited_jerk,
 )
+from support.examples import examples
 from support.tables import for_each
 
 SCENARIO = Scenario()
@@ -49,7 +50,7 @@ def keepable_states() -> st.SearchStrategy[State]:
     return st.lists(st.tuples(JERK, JERK), max_size=12).map(walk)
 
 
-@settings(max_examples=150)
+@examples(150)
 @given(keepable_states(), st.tuples(JERK, JERK))
 def test_limited_jerk_keeps_every_limit(state: State, wanted: Jerk) -> None:
     for _ in range(40):
@@ -70,7 +71,7 @@ def test_limited_jerk_is_the_jerk_itself_where_no_limit_is_near() -> None:
     assert limited_jerk(state, (math.nan, math.nan), LIMITS, TICK_S) == (0.0, 0.0)
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(keepable_states())
 def test_hold_law_brings_the_vehicle_to_rest_in_the_cell(state: State) -> None:
     for tick in range(600):
@@ -101,7 +102,7 @@ def test_hold_law_takes_over_from_a_move_without_leaving_the_footprint(
     assert np.abs(error(state, (dx, 1 + dy), tick + 300)).max() < 0.01
 
 
-@settings(max_examples=100)
+@examples(100)
 @given(
     st.tuples(*[st.floats(-100, 100) for _ in range(6)]),
     st.tuples(JERK, JERK),

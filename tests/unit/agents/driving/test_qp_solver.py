@@ -8,11 +8,12 @@ import threading
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import sparse
 
 from laneweave.agents.driving.qp_solver import QPScale, QPSettings, QuadraticProgram
+from support.examples import examples
 
 TIGHT = QPSettings(eps_abs=1e-8, max_iter=4000, tolerance=1e-6)
 
@@ -35,7 +36,7 @@ def infeasible() -> QuadraticProgram:
     )
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=6))
 def test_solves_projections_onto_boxes(entries: list[tuple[float, float]]) -> None:
     lower, upper = np.sort(np.array(entries)).T.copy()

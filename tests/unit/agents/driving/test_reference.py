@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 from attrs import evolve
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.agents.driving.reference import Reference
@@ -22,6 +22,7 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state, integrate
+from support.examples import examples
 
 SCENARIO = Scenario()
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
@@ -96,7 +97,7 @@ def test_impossible_moves_raise(table: dict[str, dict[str, float]]) -> None:
         move_profile(parse_scenario(table), parse_scenario(table).vehicle, 1, 1)
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(st.sampled_from(MOVES), st.integers(38, 60))
 def test_slower_moves_keep_all_limits_and_end_at_rest(move: tuple[int, int], ticks: int) -> None:
     profile = move_profile(SCENARIO, SCENARIO.vehicle, *move, ticks)

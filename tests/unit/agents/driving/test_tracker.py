@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from attrs import evolve
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.agents.driving.reference import Reference, Window
@@ -18,6 +18,7 @@ from laneweave.agents.driving.tracking_problem import Gaps
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import Jerk, State, cell_state, integrate, limited_jerk
+from support.examples import examples
 from support.tables import for_each
 
 SCENARIO = Scenario()
@@ -112,7 +113,7 @@ def test_ideal_move_ends_in_the_target_cell_within_limits(dx: int, dy: int) -> N
 
 
 @pytest.mark.slow
-@settings(max_examples=12)
+@examples(12)
 @given(
     st.floats(-60, 60),
     st.floats(-14, 9),
@@ -157,7 +158,7 @@ def predicted(state: State, result: TrackResult) -> list[tuple[State, Jerk]]:
     return way
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     st.tuples(
         st.floats(-8, 8),

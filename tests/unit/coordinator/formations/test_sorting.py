@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from attrs import evolve
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.coordinator.formations.roster import Numbers
@@ -22,6 +22,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import DrivingStructure
 from laneweave.protocol.scenario.road_tables import Closure, Road
 from laneweave.protocol.wire.messages import Name
+from support.examples import examples
 from support.paper import FORMATIONS, PAPER
 
 SCENARIO = PAPER
@@ -315,7 +316,7 @@ def tasks(draw: st.DrawFn) -> SortingTask:
     return evolve(order, moves=dict.fromkeys(trucks, LANES_ONLY))
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(tasks())
 def test_sortings_stay_inside_and_name_vehicles_off_their_lanes(order: SortingTask) -> None:
     sorting = sort(order)
@@ -366,7 +367,7 @@ def tasks_on_roads(draw: st.DrawFn) -> SortingTask:
 
 
 @given(order=tasks_on_roads())
-@settings(max_examples=60)
+@examples(60)
 def test_closed_lanes_are_not_used_and_all_find_a_cell_in_lanes_that_go_on(
     order: SortingTask,
 ) -> None:

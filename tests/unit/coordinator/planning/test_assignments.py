@@ -4,7 +4,7 @@ import itertools
 import time
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.paper.assignments import (
@@ -13,6 +13,7 @@ from laneweave.coordinator.planning.paper.assignments import (
     IntMatrix,
     assignments,
 )
+from support.examples import examples
 
 
 @st.composite
@@ -36,7 +37,7 @@ def _sorted(costs: IntMatrix, allowed: BoolMatrix) -> list[Assignment]:
     return sorted(found, key=lambda a: (a.cost, a.targets))
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(matrices())
 def test_order_is_by_cost_then_by_vector_and_complete(case: tuple[IntMatrix, BoolMatrix]) -> None:
     assert list(assignments(*case)) == _sorted(*case)

@@ -8,7 +8,7 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
@@ -20,6 +20,7 @@ from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
+from support.examples import examples
 from support.tables import for_each
 
 INTERLACED = [[5, 1], [4, 0], [4, 2], [3, 1], [2, 0], [2, 2]]
@@ -120,7 +121,7 @@ def shortest_total_way(
 
 
 @pytest.mark.slow
-@settings(max_examples=300)
+@examples(300)
 @given(crowds(), st.sampled_from(STRUCTURES))
 def test_targets_are_a_structure_with_the_shortest_total_distance(
     crowd: tuple[Grid, list[Cell], list[int | None]], structure: str

@@ -3,7 +3,7 @@
 from itertools import product
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
@@ -11,6 +11,7 @@ from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import MoveTable, bits
 from laneweave.protocol.lattice import Cell, Mode, displacements
 from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS
+from support.examples import examples
 from support.tables import for_each
 
 GRIDS = [
@@ -62,7 +63,7 @@ def test_conflict_sets_hold_exactly_the_conflicting_moves(
         assert found == {b for b in moves if model.kind(a, b) is not None}
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(st.sampled_from(GRIDS), st.sampled_from([1, 2]), st.integers(0, 2**200))
 def test_sets_of_cells_and_moves(grid: Grid, mode: Mode, pattern: int) -> None:
     table = MoveTable(grid, mode, MODELS[0])

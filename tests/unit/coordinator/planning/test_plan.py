@@ -9,7 +9,7 @@ from pathlib import Path
 
 import attrs
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import laneweave.coordinator
@@ -24,6 +24,7 @@ from laneweave.launch.bench.request_families import block_request, formation_req
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS, SOLVERS
+from support.examples import examples
 from support.planning_oracles import CountingClock, cheapest_plan, faults, requests
 
 
@@ -40,7 +41,7 @@ def _corridor(*vehicles: tuple[Cell, int], columns: int = 4) -> PlanRequest:
 
 
 @pytest.mark.slow
-@settings(max_examples=120)
+@examples(120)
 @given(requests())
 def test_cost_is_optimal_or_infeasibility_is_proven(request: PlanRequest) -> None:
     response = plan(request)
@@ -52,7 +53,7 @@ def test_cost_is_optimal_or_infeasibility_is_proven(request: PlanRequest) -> Non
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
+@examples(25)
 @given(requests(limited=True), st.sampled_from(SOLVERS))
 def test_vehicles_drive_only_their_moves(request: PlanRequest, solver: str) -> None:
     """Both solvers find the optimum, alone, if vehicles cannot drive all moves."""

@@ -85,7 +85,7 @@ CROWDED = ((3, 2, 2), (4, 1, 2), (3, 2, 3), (2, 2, 3), (2, 2, 4))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("geometry", [*GEOMETRIES, TIGHT], ids=str)
+@pytest.mark.parametrize("geometry", variants([*GEOMETRIES, TIGHT], 2), ids=str)
 @pytest.mark.parametrize("mode", variants([2, 1]))
 def test_planner_agrees_with_joint_search_on_crowded_grids(
     geometry: dict[str, float], mode: Mode

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import combinations, permutations
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.targets import (
@@ -15,6 +15,7 @@ from laneweave.coordinator.planning.targets import (
 )
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Name
+from support.examples import examples
 
 COLUMNS, LANES = 4, 3
 GRID = [(column, lane) for column in range(COLUMNS) for lane in range(LANES)]
@@ -64,7 +65,7 @@ def parallel_targets(
 # --- a whole formation ------------------------------------------------------------------------
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(formations())
 def test_each_lane_provides_free_cells_for_those_who_prefer_it(
     drawn: tuple[dict[Name, Cell], dict[Name, int], set[Cell]],
@@ -82,7 +83,7 @@ def test_each_lane_provides_free_cells_for_those_who_prefer_it(
         assert sum(name in targets.off_lane for name in wanting) == max(0, len(wanting) - free)
 
 
-@settings(max_examples=100)
+@examples(100)
 @given(formations(most_blocked=0, fitting=True))
 def test_without_blocked_cells_it_is_the_parallel_structure_of_each_lane(
     drawn: tuple[dict[Name, Cell], dict[Name, int], set[Cell]],

@@ -150,6 +150,7 @@ def test_an_animation_has_a_frame_for_each_tick(tmp_path: Path) -> None:
 # --- the command ------------------------------------------------------------------------------
 
 
+@pytest.mark.more
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("scenario", "shown"), [(None, "3 steps of 4 s"), ("[formation]\ncycle_s = 6.0", "of 6 s")]

@@ -27,7 +27,6 @@ from laneweave.launch.fault_search.story import Story
 from laneweave.protocol.errors import BadInputError
 from support import commands
 from support.commands import LANEWEAVE, Here
-from support.variants import variants
 
 CALM = PROFILES["calm"]
 WELL_UNDER_WAY_S = 2.5
@@ -102,6 +101,7 @@ def test_timeline_of_a_run() -> None:
         assert words in told
 
 
+@pytest.mark.more
 @pytest.mark.slow
 def test_the_command() -> None:
     done = commands.laneweave(
@@ -137,8 +137,9 @@ def spent_s(pid: int) -> float:
     return spent
 
 
+@pytest.mark.more
 @pytest.mark.slow
-@pytest.mark.parametrize("jobs", variants(["2", "1"]))
+@pytest.mark.parametrize("jobs", ["2", "1"])
 def test_interrupted(jobs: str) -> None:
     process = subprocess.Popen(
         [LANEWEAVE, "simulate", "--seeds", "0:100000", "--jobs", jobs],

@@ -15,6 +15,7 @@ from laneweave.protocol.config.scenario_files import check_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.road_tables import Demand
 from laneweave.protocol.wire.messages import ClosedFormation, Name
+from support.variants import variants
 
 EVERY = pytest.mark.parametrize(
     "name",
@@ -25,7 +26,7 @@ ROLLING = pytest.mark.parametrize(
     [name for name, profile in PROFILES.items() if profile.rolling and not profile.roadside],
 )
 ROADSIDE = pytest.mark.parametrize(
-    "name", [name for name, profile in PROFILES.items() if profile.roadside]
+    "name", variants([name for name, profile in PROFILES.items() if profile.roadside], 2)
 )
 
 

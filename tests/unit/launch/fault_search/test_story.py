@@ -48,6 +48,7 @@ def test_a_malformed_story_is_refused_in_one_line(
     assert words in laneweave.refused("simulate", "--story", str(path))
 
 
+@pytest.mark.more
 @pytest.mark.slow
 def test_the_command_runs_a_story(tmp_path: Path) -> None:
     path = tmp_path / "story.json"

@@ -12,12 +12,12 @@ from support.sweeping import short_road, sweep
 
 @pytest.fixture(scope="session")
 def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a sweep: 28 s of demand at two volumes. It is to be left as it is."""
+    """Return the folder of a sweep: 16 s of demand at two volumes. It is to be left as it is."""
     return made_once(tmp_path_factory, "report", _sweep)
 
 
 def _sweep(out: Path) -> None:
-    lists = ("--volumes", "1000,1600", "--seeds", "1:2", "--duration", 28)
+    lists = ("--volumes", "1000,1600", "--seeds", "1:2", "--duration", 16)
     scenario = short_road(out.parent)
     # Long enough for everybody to settle, and to reach the preferred lane.
     text = scenario.read_text().replace("s3_m = 160.0", "s3_m = 240.0")

@@ -41,6 +41,7 @@ def _sweep(out: Path) -> None:
     assert len(points) == 4
 
 
+@pytest.mark.more
 def test_the_files_of_a_sweep(whole: Path) -> None:
     rows = pq.read_table(whole / "results.parquet").to_pylist()
     assert [(row["label"], row["volume_veh_per_lane_h"], row["seed"]) for row in rows] == [
@@ -136,11 +137,13 @@ def test_a_run_that_breaks_a_promise_is_a_failed_row_with_its_numbers(tmp_path: 
     assert (tmp_path / "sweep" / "formation-1600-1" / "log.txt").is_file()
 
 
+@pytest.mark.more
 def test_other_settings_are_refused(laneweave: Here, whole: Path, scenario: Path) -> None:
     line = laneweave.refused(*command(scenario, whole, *LISTS, "--duration", 7)[1:])
     assert line.startswith("demand.duration_s: got 7.0; allowed: 8.0, as recorded in ")
 
 
+@pytest.mark.more
 def test_settings_that_do_not_affect_a_method_may_differ(whole: Path, tmp_path: Path) -> None:
     scenario = short_road(tmp_path)
     scenario.write_text(scenario.read_text() + '\n[rule]\ngap = "net"\n')

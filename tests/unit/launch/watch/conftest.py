@@ -19,7 +19,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _run(out: Path) -> None:
     scenario = out.parent / "road.toml"
     scenario.write_text('schema = "laneweave.scenario/1"\n[road]\ns2_m = 60.0\ns3_m = 240.0\n')
-    options = ["--transport", "simulated", "--volume", "1600", "--duration", "12", "--no-progress"]
+    options = ["--transport", "simulated", "--volume", "1600", "--duration", "12", "--no-report"]
     assert not command_line()(
         ["run", str(scenario), *options, "--out", str(out)], standalone_mode=False
     )

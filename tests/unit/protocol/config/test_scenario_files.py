@@ -8,12 +8,13 @@ from pathlib import Path
 
 import attrs
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario, to_tables
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import FormationSettings
+from support.examples import examples
 from support.refusals import refusal
 
 FOLDER = Path(__file__).parents[4] / "scenarios"
@@ -121,7 +122,7 @@ SCENARIOS = st.builds(
 )
 
 
-@settings(max_examples=50)
+@examples(50)
 @given(SCENARIOS)
 def test_tables_give_the_same_scenario_back(scenario: Scenario) -> None:
     tables = to_tables(scenario)

@@ -17,6 +17,7 @@ from laneweave.protocol.scenario.vehicle_types import VehicleType
 from laneweave.protocol.vehicle.lane_ends import own_re_entry, re_entry
 from support.refusals import refusal
 from support.tables import for_each
+from support.variants import variants
 
 ROLLING = {"operation": "rolling", "gap_m": 20.0}
 TRUCK: dict[str, Any] = {
@@ -135,12 +136,14 @@ def test_moves_of_types() -> None:
 
 @pytest.mark.parametrize(
     ("tables", "shortest_s"),
-    [
-        ({}, 4.0),
-        ({"formation": {"gap_m": 16.0, "speed_mps": 12.0}}, 4.0),
-        ({"formation": {"gap_m": 20.0}, "vehicle_type": [TRUCK]}, 5.0),
-        ({"vehicle": {"max_accel_mps2": 3.0}}, 5.0),
-    ],
+    variants(
+        [
+            ({"formation": {"gap_m": 20.0}, "vehicle_type": [TRUCK]}, 5.0),
+            ({}, 4.0),
+            ({"formation": {"gap_m": 16.0, "speed_mps": 12.0}}, 4.0),
+            ({"vehicle": {"max_accel_mps2": 3.0}}, 5.0),
+        ]
+    ),
 )
 def test_formations_have_longer_slots_only_where_moves_need_them(
     tables: dict[str, Any], shortest_s: float

@@ -9,7 +9,7 @@ import statistics
 
 import pytest
 from attrs import evolve
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.protocol.config.motion_checks import min_pitch_m
@@ -26,6 +26,7 @@ from laneweave.protocol.vehicle.emergency_brake import (
 )
 from laneweave.protocol.vehicle.motion import Jerk, State
 from laneweave.protocol.wire.messages import Neighbour
+from support.examples import examples
 from support.refusals import refusal
 
 SCENARIO = Scenario()
@@ -69,7 +70,7 @@ def integrated_way_m(v: float, a: float, brake_mps2: float, lag_s: float) -> flo
     st.floats(5.0, 12.0),
     st.sampled_from((0.0, 0.1, 0.2)),
 )
-@settings(max_examples=60)
+@examples(60)
 def test_a_body_that_brakes_goes_as_far_as_integration_says(
     v_mps: float, share: float, brake_mps2: float, lag_s: float
 ) -> None:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 from attrs import evolve
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -30,6 +30,7 @@ from laneweave.protocol.wire.messages import CurrentMotion
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from support.closed_lanes import BLOCKED, DROP
 from support.convoy import ROLLING
+from support.examples import examples
 from support.road_vehicles import controller_in
 from support.states import command
 
@@ -154,7 +155,7 @@ def test_vehicles_drive_out_into_a_lane_that_is_open(
 # --- re-entry ---------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(
     st.floats(8.0, 32.0), st.floats(12.0, 35.0), st.floats(2.0, 8.0), st.floats(4.0, 10.0),
     st.floats(0.0, 0.4), st.sampled_from((2.8, 3.5, 4.5)),
@@ -221,7 +222,7 @@ def test_a_vehicle_that_is_too_weak_is_refused_in_one_line() -> None:
 # --- vehicles that reach the line -------------------------------------------------------------
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(st.data())
 def test_no_command_takes_a_vehicle_past_its_stop_line(data: st.DataObject) -> None:
     """Whatever its agent wants, and with measurement errors."""

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 from attrs import evolve
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.protocol.scenario.fields import Scenario
@@ -28,6 +28,7 @@ from laneweave.protocol.vehicle.motion import (
     keep_gap,
     nearly_settled,
 )
+from support.examples import examples
 
 SCENARIO = Scenario()
 LIMITS, LATTICE = SCENARIO.vehicle, SCENARIO.lattice
@@ -129,7 +130,7 @@ def test_stops_in_time_though_it_was_speeding_up(limits: Vehicle, v_mps: float) 
     other_mps=st.floats(0.0, 20.0),
     v_mps=st.floats(0.0, 20.0),
 )
-@settings(max_examples=150)
+@examples(150)
 def test_never_hits_the_vehicle_ahead_where_that_can_be_avoided(
     gap_m: float, other_mps: float, v_mps: float
 ) -> None:

@@ -6,13 +6,14 @@ import random
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.vehicle.plans import dependencies, plan_problems
 from laneweave.protocol.wire.messages import Name, Plan
+from support.examples import examples
 from support.states import make_plan
 
 A, B, C = Name("a"), Name("b"), Name("c")
@@ -101,7 +102,7 @@ ANY_PLANS = st.integers(0, 2**32).map(lambda seed: draw_plan(seed, careful=False
 # --- dependencies -----------------------------------------------------------------------------
 
 
-@settings(max_examples=150)
+@examples(150)
 @given(VALID_PLANS | ANY_PLANS)
 def test_dependencies_are_those_of_the_definition(plan: Plan) -> None:
     for vehicle in plan.roster:
@@ -114,7 +115,7 @@ def test_dependencies_are_those_of_the_definition(plan: Plan) -> None:
             assert found == {other: count for other, count in expected.items() if count}
 
 
-@settings(max_examples=100)
+@examples(100)
 @given(VALID_PLANS, st.integers(0, 2**32))
 def test_any_order_that_keeps_the_waits_is_safe_and_ends(plan: Plan, seed: int) -> None:
     rng = random.Random(seed)
@@ -152,7 +153,7 @@ def test_the_example_has_no_problems() -> None:
     assert plan_problems(make_plan({}, {})) == []
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(VALID_PLANS | ANY_PLANS)
 def test_a_plan_has_problems_exactly_if_bodies_meet(plan: Plan) -> None:
     assert (plan_problems(plan) == []) is is_executable_in_words(plan)
@@ -198,7 +199,7 @@ def test_each_kind_of_defect_is_found(text: str, changes: dict[str, Any]) -> Non
     assert any(text in problem for problem in problems), problems
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(VALID_PLANS)
 def test_every_cell_of_the_territory_is_needed(plan: Plan) -> None:
     for index in range(len(plan.territory)):

@@ -9,7 +9,7 @@ from typing import Any, Union, get_args, get_origin
 
 import msgpack
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import NODEFAULT
 from msgspec.structs import FieldInfo, fields
@@ -27,6 +27,7 @@ from laneweave.protocol.wire.messages import (
     RoadClock,
     Sense,
 )
+from support.examples import examples
 from support.refusals import refusal
 from support.tables import for_each
 from support.wire_samples import HINTS, different, filled, is_struct
@@ -173,7 +174,7 @@ def test_a_sample_comes_back_equal_and_well_typed(sample: object) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=200)
+@examples(200)
 @given(st.sampled_from([*KINDS.values()]).flatmap(values))
 def test_any_value_comes_back(message: object) -> None:
     decoded = decode(encode(message), type(message))
@@ -425,7 +426,7 @@ JUNK = st.recursive(
 
 
 @pytest.mark.slow
-@settings(max_examples=150)
+@examples(150)
 @given(st.sampled_from(list(SAMPLES.values())), st.data())
 def test_junk_in_a_field_never_gives_wrong_types(sample: object, data: st.DataObject) -> None:
     name = data.draw(st.sampled_from([*HINTS[type(sample)]]))

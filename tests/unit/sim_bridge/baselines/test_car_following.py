@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.sim_bridge.baselines.rules import Following
+from support.examples import examples
 from support.rule_road import PAPER, rule_scenario
 
 SPEEDS = st.floats(0.0, 15.0)
@@ -42,7 +43,7 @@ def test_a_small_gap_or_one_behind_a_slow_vehicle_does_not_suit() -> None:
     assert not following.is_safe(0.0, 15.0, 14.91, 0.0)
 
 
-@settings(max_examples=100)
+@examples(100)
 @given(
     gap=st.sampled_from(["front-to-front", "net"]),
     speed_mps=SPEEDS,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.protocol.config.scenario_files import parse_scenario
@@ -13,6 +13,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.sim_bridge.baselines.rule_based import check_rule
 from laneweave.sim_bridge.road.demand import arrivals
 from support.bridge_bench import arrival
+from support.examples import examples
 from support.rule_road import PAPER, RuleRoad, rule_scenario, vehicle
 from support.tables import for_each
 
@@ -74,7 +75,7 @@ def test_three_abreast_that_want_to_change_round_all_do(rule: dict[str, Any], s_
 
 
 @pytest.mark.slow
-@settings(max_examples=60)
+@examples(60)
 @given(
     rule=st.sampled_from(METHODS),
     places=st.lists(

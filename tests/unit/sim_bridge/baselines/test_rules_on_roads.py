@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from attrs import evolve
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.protocol.config.scenario_files import parse_scenario
@@ -20,8 +20,10 @@ from laneweave.sim_bridge.baselines.wanted_lanes import WantedLane, WantedLanes
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies
 from laneweave.sim_bridge.road.demand import arrivals
 from support.closed_lanes import ramp_road
+from support.examples import examples
 from support.rule_road import RuleRoad, vehicle
 from support.tables import for_each
+from support.variants import variants
 
 
 def closed_road(
@@ -160,7 +162,9 @@ def test_a_vehicle_that_cannot_leave_its_lane_waits_before_the_dead_end(
 # --- traffic ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rule", [{}, {"yielding": "all"}, {"lane_change_s": 4.0}], ids=str)
+@pytest.mark.parametrize(
+    "rule", variants([{}, {"yielding": "all"}, {"lane_change_s": 4.0}]), ids=str
+)
 @pytest.mark.parametrize(
     ("closure", "shares"),
     [
@@ -277,7 +281,9 @@ def test_a_vehicle_enters_a_ramp_behind_those_in_its_lane_ahead_of_it() -> None:
     assert road.step() == []
 
 
-@pytest.mark.parametrize("rule", [{}, {"yielding": "all"}, {"lane_change_s": 4.0}], ids=str)
+@pytest.mark.parametrize(
+    "rule", variants([{}, {"yielding": "all"}, {"lane_change_s": 4.0}]), ids=str
+)
 @pytest.mark.parametrize("scenario", [ON_RAMP, WEAVING], ids=["on-ramp", "weaving"])
 def test_all_vehicles_leave_at_their_destinations(scenario: Scenario, rule: dict[str, Any]) -> None:
     demand = evolve(scenario.demand, duration_s=30.0, volume_veh_per_lane_h=1000.0)
@@ -296,7 +302,7 @@ def test_all_vehicles_leave_at_their_destinations(scenario: Scenario, rule: dict
 
 @pytest.mark.more
 @pytest.mark.slow
-@settings(max_examples=40)
+@examples(40)
 @given(
     closures=st.sampled_from(
         [

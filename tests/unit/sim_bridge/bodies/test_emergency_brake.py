@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import attrs
 import pytest
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from msgspec.structs import astuple
 
@@ -16,6 +16,7 @@ from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, MotionC
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Neighbours
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.sensors import Sensors
+from support.examples import examples
 from support.paper import EXACT
 from support.road_vehicles import controller_in
 from support.states import command
@@ -85,7 +86,7 @@ JERKS = st.lists(st.sampled_from((-15.0, -5.0, 0.0, 5.0, 15.0)), min_size=1, max
 )
 @example((16.5, -6.0), (16.0, 0.0), 0.0, [-15.0], [-15.0], 0)
 @example((20.8, -8.48), (19.45, 0.1), 0.0, [-15.0], [-15.0], 0)
-@settings(max_examples=150)
+@examples(150)
 def test_no_vehicle_hits_one_that_brakes_as_hard_as_it_can(
     own_motion: tuple[float, float],
     other_motion: tuple[float, float],

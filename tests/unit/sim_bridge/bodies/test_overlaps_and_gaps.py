@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.protocol.wire.messages import Neighbour
@@ -25,6 +25,7 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import (
     corners,
     pose_of,
 )
+from support.examples import examples
 
 LENGTH_M, WIDTH_M, LANE_M = 5.0, 1.8, 3.5
 TRUCK: Size = (12.0, 2.5)
@@ -81,7 +82,7 @@ def depth(
 
 @pytest.mark.slow
 @given(ROADS)
-@settings(max_examples=150)
+@examples(150)
 def test_overlaps_agree_with_point_sampling(road: dict[str, Pose]) -> None:
     found = set(bodies(road).overlapping_pairs())
     for one, other in itertools.combinations(sorted(road), 2):
@@ -144,7 +145,7 @@ def brute_gap(road: dict[str, Pose]) -> float:
 
 @pytest.mark.slow
 @given(st.lists(POSES, min_size=2, max_size=4), TRUCKS)
-@settings(max_examples=25)
+@examples(25)
 def test_least_gap_agrees_with_slices(poses: list[Pose], trucks: list[bool]) -> None:
     poses = [(s, y, 0.0 if abs(heading) < 1e-3 else heading, v) for s, y, heading, v in poses]
     road = named(poses, trucks)
@@ -158,7 +159,7 @@ def test_least_gap_agrees_with_slices(poses: list[Pose], trucks: list[bool]) -> 
 
 
 @given(ROADS)
-@settings(max_examples=150)
+@examples(150)
 def test_a_negative_gap_means_an_overlap(road: dict[str, Pose]) -> None:
     gap = bodies(road).min_gaps().gap_m
     overlaps = bool(bodies(road).overlapping_pairs())
@@ -213,7 +214,7 @@ def test_sensing_sees_how_others_accelerate() -> None:
 
 
 @given(ROADS)
-@settings(max_examples=100)
+@examples(100)
 def test_sensing_agrees_with_brute_force(road: dict[str, Pose]) -> None:
     seen = sense(road)
     lanes_of = {}

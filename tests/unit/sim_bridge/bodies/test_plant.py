@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import pytest
 from attrs import evolve
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
@@ -15,6 +15,7 @@ from laneweave.protocol.vehicle.emergency_brake import stopping_distance_m
 from laneweave.protocol.vehicle.motion import Jerk, State, commanded_state, integrate
 from laneweave.sim_bridge.bodies.plant import Plant
 from support.driving import recovering
+from support.examples import examples
 
 LIMITS = Vehicle()
 RIGID = evolve(LIMITS, actuator_lag_s=0.0, lateral_actuator_lag_s=0.0)
@@ -60,7 +61,7 @@ def within(state: State, limits: Vehicle = LIMITS) -> bool:
 
 
 @given(SMALL, st.floats(0.05, 1.0), st.floats(0.05, 1.0))
-@settings(max_examples=25)
+@examples(25)
 def test_it_follows_its_set_point_as_a_first_order_lag_does(
     jerks: list[Jerk], lag_s: float, lateral_lag_s: float
 ) -> None:
@@ -75,7 +76,7 @@ def test_it_follows_its_set_point_as_a_first_order_lag_does(
 
 
 @given(SMALL, LAGS, LAGS, st.floats(0.0, 20.0))
-@settings(max_examples=100)
+@examples(100)
 def test_what_it_pursues_moves_as_if_there_were_no_lag(
     jerks: list[Jerk], lag_s: float, lateral_lag_s: float, speed_mps: float
 ) -> None:
@@ -103,7 +104,7 @@ SLIP_ROOM_MPS = 2.5
 
 
 @given(COMMANDS, LAGS, LAGS)
-@settings(max_examples=150)
+@examples(150)
 def test_limits_hold_whatever_is_commanded(
     commands: list[Jerk], lag_s: float, lateral_lag_s: float
 ) -> None:
@@ -123,7 +124,7 @@ def test_limits_hold_whatever_is_commanded(
 
 
 @given(st.lists(st.tuples(JERKS, JERKS, st.booleans()), min_size=1, max_size=100), LAGS)
-@settings(max_examples=100)
+@examples(100)
 def test_emergencies_break_the_limit_on_jerk_only(
     ticks: list[tuple[float, float, bool]], lag_s: float
 ) -> None:
@@ -165,7 +166,7 @@ def test_braking_puts_the_set_point_to_the_limit_at_once() -> None:
 
 
 @given(st.floats(0.0, 25.0), st.floats(-10.0, 5.0), LAGS.filter(lambda lag_s: lag_s <= 0.5))
-@settings(max_examples=100)
+@examples(100)
 def test_it_stops_where_its_commanded_state_does_and_does_not_go_back(
     speed_mps: float, accel_mps2: float, lag_s: float
 ) -> None:

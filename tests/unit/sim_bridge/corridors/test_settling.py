@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from attrs import evolve
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
@@ -21,6 +21,7 @@ from laneweave.sim_bridge.corridors.settling import (
     settling_s,
 )
 from laneweave.sim_bridge.corridors.take_over import _cruising_s, _shortest_s, _slow_mps
+from support.examples import examples
 
 SPEED_MPS = 25.0
 CAR = Vehicle(max_accel_mps2=2.6, min_accel_mps2=-9.0, max_speed_mps=40.0)
@@ -29,7 +30,7 @@ ROAD = evolve(Scenario(), formation=evolve(Scenario().formation, speed_mps=SPEED
 TICK_S = ROAD.runtime.tick_s
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(st.floats(0.0, 150.0), st.floats(-3.0, 15.0), st.sampled_from([CAR, TRUCK]))
 def test_a_vehicle_settles_within_its_limits_and_not_behind_its_cell(
     ahead_m: float, slower_mps: float, limits: Vehicle

@@ -61,6 +61,7 @@ def of_kind(events: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
     return [event for event in events if event["kind"] == kind]
 
 
+@pytest.mark.more
 def test_a_formation_takes_on_one_structure_after_the_other(tmp_path: Path) -> None:
     scenario = parse_scenario(
         {

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from attrs import evolve
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.road.demand import arrivals
+from support.examples import examples
 
 
 def scenario(seed: int = 1, lanes: int = 3, **demand: object) -> Scenario:
@@ -28,7 +29,7 @@ def test_equal_seeds_give_equal_arrivals_and_others_do_not() -> None:
     duration=st.floats(1.0, 200.0),
     longer=st.floats(0.0, 200.0),
 )
-@settings(max_examples=40)
+@examples(40)
 def test_a_longer_stream_begins_with_the_shorter_one(
     seed: int, volume: float, duration: float, longer: float
 ) -> None:

@@ -7,7 +7,7 @@ from collections import Counter
 from itertools import pairwise
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.protocol.config.scenario_files import parse_scenario
@@ -16,6 +16,7 @@ from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.sim_bridge.road.demand import Arrival, arrivals
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter, Goals
 from laneweave.sim_bridge.road.formation_building import ColumnBlocks, Entrances
+from support.examples import examples
 
 COLUMN_S, SMALL_S = 1.0, 1e-6
 
@@ -70,7 +71,7 @@ def check(grid: Lattice, spread_s: float, admissions: list[Admission]) -> None:
 @given(
     demands(), st.sampled_from([(0.0, True), (0.25, True), (1.0, True), (0.5, False), (0.7, False)])
 )
-@settings(max_examples=250)
+@examples(250)
 def test_rules_hold_and_everyone_enters(
     case: tuple[Lattice, int, list[Arrival]], how: tuple[float, bool]
 ) -> None:
@@ -92,7 +93,7 @@ def test_rules_hold_and_everyone_enters(
 
 
 @given(demands(), st.floats(0.05, 7.0))
-@settings(max_examples=100)
+@examples(100)
 def test_decisions_need_no_knowledge_of_the_future(
     case: tuple[Lattice, int, list[Arrival]], tick_s: float
 ) -> None:
@@ -243,7 +244,7 @@ def test_a_queue_of_trucks_uses_every_cell(pitch_m: float) -> None:
 
 
 @given(st.lists(st.floats(0.0, 60.0), min_size=1, max_size=30), st.integers(0, 2**20))
-@settings(max_examples=60)
+@examples(60)
 def test_trucks_enter_exactly_in_their_cells(times_s: list[float], bits: int) -> None:
     meter = EntryMeter(lattice(), 0.5, column_bound={"truck"})
     for number, t_s in enumerate(sorted(times_s)):

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 from attrs import define, field, frozen
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.protocol.lattice import Lattice
@@ -24,6 +24,7 @@ from laneweave.sim_bridge.road.formation_building import (
     GrowingFormations,
     formation_builder,
 )
+from support.examples import examples
 from support.paper import PAPER
 
 TICK_S = 0.1
@@ -158,7 +159,7 @@ def cases(draw: st.DrawFn) -> Case:
 @pytest.mark.slow
 @pytest.mark.parametrize("grows", [True, False], ids=["growing", "blocks of columns"])
 @given(case=cases())
-@settings(max_examples=150)
+@examples(150)
 def test_every_vehicle_is_in_one_formation_that_has_room_for_all_of_its_wishes(
     case: Case, *, grows: bool
 ) -> None:
@@ -235,7 +236,7 @@ RAMP_M = 52.0
 @pytest.mark.slow
 @pytest.mark.parametrize("grows", [True, False], ids=["growing", "blocks of columns"])
 @given(case=cases(), reserve_s=st.lists(st.floats(0.0, 60.0), max_size=3), on_ramp=st.booleans())
-@settings(max_examples=60)
+@examples(60)
 def test_ramps_and_reserved_columns_leave_every_vehicle_in_one_formation(
     case: Case, reserve_s: list[float], *, on_ramp: bool, grows: bool
 ) -> None:

@@ -197,18 +197,9 @@ BUGS: tuple[Bug, ...] = (
 )  # fmt: skip
 
 
-LATE = {"waits-forever", "drives-on", "line-forgotten-when-driving-out"}
-"""Bugs that are noticed only because vehicles are still on the road at `ENOUGH_S`."""
-
-
+@pytest.mark.more
 @pytest.mark.parametrize(
-    "bug",
-    [
-        pytest.param(
-            bug, marks=[catches(bug), *[pytest.mark.more] * (bug.name in LATE)], id=bug.name
-        )
-        for bug in BUGS
-    ],
+    "bug", [pytest.param(bug, marks=catches(bug), id=bug.name) for bug in BUGS]
 )
 def test_planted_bugs_are_noticed(bug: Bug, monkeypatch: pytest.MonkeyPatch) -> None:
     bug.plant(monkeypatch)
@@ -216,5 +207,6 @@ def test_planted_bugs_are_noticed(bug: Bug, monkeypatch: pytest.MonkeyPatch) -> 
         check(lonely_road(DROP, *CROWD), ENOUGH_S)
 
 
+@pytest.mark.more
 def test_without_a_bug_nothing_is_noticed() -> None:
     check(lonely_road(DROP, *CROWD), ENOUGH_S)

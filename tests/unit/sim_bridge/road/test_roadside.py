@@ -26,6 +26,7 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.outside import Outside
 from support.paper import closing_time_s, paper
 from support.road_vehicles import vehicle_in
+from support.variants import variants
 
 
 def crowded(operation: str = "paper", **runtime: Any) -> Scenario:  # noqa: ANN401 (fields)
@@ -280,7 +281,7 @@ class CensusWatch:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("volume", [30.0, 1000.0, 2000.0])
+@pytest.mark.parametrize("volume", variants([2000.0, 30.0, 1000.0]))
 def test_a_census_reports_owners_of_columns_and_closed_ones(volume: float) -> None:
     scenario = load_scenario(
         None, seed=3, demand__duration_s=200.0, demand__volume_veh_per_lane_h=volume

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from attrs import define, field
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.protocol.config.scenario_files import parse_scenario
@@ -16,6 +16,7 @@ from laneweave.sim_bridge.road.demand import Arrival, arrivals
 from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.examples import examples
 
 LANES = 3
 COLUMN_S = 1.0
@@ -43,7 +44,7 @@ def rolling_meter() -> EntryMeter:
 
 
 @given(streams(headway_s=COLUMN_S))
-@settings(max_examples=100)
+@examples(100)
 def test_a_vehicle_one_column_behind_its_predecessor_does_not_wait(stream: list[Arrival]) -> None:
     meter = rolling_meter()
     for arrival in stream:
@@ -129,7 +130,7 @@ class Entrance:
 
 @pytest.mark.slow
 @given(streams(), st.sampled_from([0.1, 0.3, 1.0, 2.5]))
-@settings(max_examples=60)
+@examples(60)
 @pytest.mark.more
 def test_every_cell_near_a_vehicle_has_an_owner(stream: list[Arrival], tick_s: float) -> None:
     entrance = Entrance(stream, tick_s=tick_s).run(120.0)

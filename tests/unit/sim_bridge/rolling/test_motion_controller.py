@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import permutations, product
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.protocol.lattice import Cell
@@ -20,6 +20,7 @@ from laneweave.protocol.wire.messages import (
 )
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.road.caretakers import Caretaker
+from support.examples import examples
 from support.road_vehicles import controller_in, vehicle_in
 from support.rolling_samples import (
     AFTER,
@@ -196,7 +197,7 @@ def histories(draw: st.DrawFn) -> list[Command | Cell]:
 
 @pytest.mark.slow
 @given(histories(), st.integers(0, 20))
-@settings(max_examples=200)
+@examples(200)
 def test_however_orders_arrive_what_is_kept_is_sound(
     history: list[Command | Cell], restart: int
 ) -> None:

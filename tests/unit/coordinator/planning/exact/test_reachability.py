@@ -1,7 +1,7 @@
 """The search over joint states."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from laneweave.coordinator.planning import conflict_kinds
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
@@ -19,6 +19,7 @@ from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS
+from support.examples import examples
 from support.planning_oracles import CountingClock, cheapest_plan, requests
 
 
@@ -27,7 +28,7 @@ def _explore(request: PlanRequest, max_moves: int = 10**6) -> tuple[Problem, Rea
     return problem, explore(problem, request.choices(), Budget(), max_moves)
 
 
-@settings(max_examples=80)
+@examples(80)
 @given(requests())
 def test_reachability_agrees_with_the_joint_search(request: PlanRequest) -> None:
     problem, verdict = _explore(request)

@@ -7,7 +7,7 @@ from random import Random
 import attrs
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from laneweave.agents.driving.trajectory import move_profile
@@ -34,6 +34,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Mode, displacements, footprint
 from laneweave.protocol.scenario.fields import Scenario
 from oracles.moving_bodies import Bodies, least_gap_m
+from support.examples import examples
 from support.tables import for_each
 from support.variants import variants
 
@@ -161,7 +162,7 @@ def test_waiting_in_a_crossed_cell_is_a_conflict(mode: Mode, lateness_s: float) 
 
 
 @pytest.mark.slow
-@settings(max_examples=20)
+@examples(20)
 @given(geometries())
 def test_the_table_is_symmetric_and_has_no_disjoint_footprints(geometry: BodyGeometry) -> None:
     """Those are separated by a column or by a lane."""
@@ -182,7 +183,7 @@ def test_backwards_it_forbids_the_same_or_more(geometry: BodyGeometry) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=15)
+@examples(15)
 @given(geometries(), st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 0.5))
 @pytest.mark.more
 def test_more_clearance_or_more_lateness_removes_nothing(
@@ -206,7 +207,7 @@ def test_more_clearance_or_more_lateness_removes_nothing(
 
 
 @pytest.mark.slow
-@settings(max_examples=12)
+@examples(12)
 @given(geometries(), st.integers(0, 10**6))
 def test_it_contains_what_simulated_bodies_do(geometry: BodyGeometry, seed: int) -> None:
     """Forbidden pairs are too close with slightly larger clearances."""

@@ -4,7 +4,7 @@ import math
 
 import attrs
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
@@ -13,6 +13,7 @@ from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.plan_validator import problems_of_paths
 from laneweave.coordinator.planning.problem import Solution
 from laneweave.coordinator.planning.request import PlanRequest
+from support.examples import examples
 from support.planning_oracles import cheapest_plan, requests
 
 ENOUGH = 600
@@ -37,7 +38,7 @@ def _search(tree: ConstraintTree, limit: float = math.inf) -> Node | None:
 
 
 @pytest.mark.slow
-@settings(max_examples=40)
+@examples(40)
 @given(requests(), EVERY_SWITCH)
 def test_cost_is_that_of_the_joint_search(request: PlanRequest, switches: Improvements) -> None:
     assume(all(vehicle.eligible is None for vehicle in request.vehicles))
@@ -55,7 +56,7 @@ def test_cost_is_that_of_the_joint_search(request: PlanRequest, switches: Improv
     assert path_map.cost() == node.cost
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(requests(), st.integers(-1, 2))
 def test_a_limit_excludes_exactly_the_solutions_that_are_not_better(
     request: PlanRequest, margin: int
@@ -67,7 +68,7 @@ def test_a_limit_excludes_exactly_the_solutions_that_are_not_better(
     assert (None if node is None else node.cost) == (best.cost if margin > 0 else None)
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(requests(most_vehicles=4, most_cells=12))
 def test_a_literal_node_has_a_child_for_each_entry_of_its_conflict_list(
     request: PlanRequest,

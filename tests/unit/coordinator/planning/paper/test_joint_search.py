@@ -4,7 +4,7 @@ import math
 
 import attrs
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.paper.assignments import Weights
@@ -16,11 +16,12 @@ from laneweave.coordinator.planning.plan_validator import problems_of_paths
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import traffic_request
+from support.examples import examples
 from support.planning_oracles import cheapest_plan, requests
 
 
 @pytest.mark.slow
-@settings(max_examples=60)
+@examples(60)
 @given(requests())
 def test_path_set_is_optimal_and_legal_or_there_is_none(request: PlanRequest) -> None:
     problem = request.problem()

@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
@@ -15,6 +15,7 @@ from laneweave.coordinator.planning.shortest_paths import (
     conflicting_moves,
     shortest_paths,
 )
+from support.examples import examples
 from support.planning_oracles import obeys
 
 MODEL = ConflictModel(["node", "edge", "special-1"])
@@ -74,7 +75,7 @@ def problems(draw: st.DrawFn) -> tuple[MoveTable, int, int, Bans]:
 
 
 @pytest.mark.slow
-@settings(max_examples=150)
+@examples(150)
 @given(problems())
 def test_diagram_holds_all_shortest_paths(case: tuple[MoveTable, int, int, Bans]) -> None:
     table, start, target, bans = case
@@ -87,7 +88,7 @@ def test_diagram_holds_all_shortest_paths(case: tuple[MoveTable, int, int, Bans]
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
+@examples(100)
 @given(problems(), st.data())
 def test_choice_has_fewest_conflicts_then_fewest_moves_then_lowest_index(
     case: tuple[MoveTable, int, int, Bans], data: st.DataObject

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, assume, given
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
@@ -23,6 +23,7 @@ from laneweave.coordinator.planning.problem import Bans, Diagram, MoveTable, Pat
 from laneweave.coordinator.planning.shortest_paths import choose_path, shortest_paths
 from laneweave.protocol.lattice import Mode
 from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS
+from support.examples import examples
 from support.planning_oracles import move_at, obeys
 
 STEPS = 3
@@ -107,7 +108,7 @@ def conflicts(draw: st.DrawFn) -> tuple[Case, Conflict, tuple[int, int]]:
 
 
 @pytest.mark.slow
-@settings(max_examples=40, suppress_health_check=MANY_WITHOUT_CONFLICT)
+@examples(40, suppress_health_check=MANY_WITHOUT_CONFLICT)
 @given(conflicts())
 def test_children_share_the_solutions_and_none_keeps_the_conflict(
     drawn: tuple[Case, Conflict, tuple[int, int]],
@@ -138,7 +139,7 @@ def _cost_of_child(
 
 
 @pytest.mark.slow
-@settings(max_examples=30, suppress_health_check=MANY_WITHOUT_CONFLICT)
+@examples(30, suppress_health_check=MANY_WITHOUT_CONFLICT)
 @given(conflicts())
 @pytest.mark.more
 def test_children_cost_more_as_predicted(drawn: tuple[Case, Conflict, tuple[int, int]]) -> None:

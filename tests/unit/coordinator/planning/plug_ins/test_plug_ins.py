@@ -76,20 +76,23 @@ def test_a_valid_plan_is_used_as_it_is(
 
 @pytest.mark.parametrize(
     ("body", "reason"),
-    [
-        ("return None", "it returned no paths"),
-        ("raise KeyError('lane')", "KeyError: 'lane'"),
-        ("return 7", "TypeError"),
-        ("return [[(0, 0), (0.5, 1)], [(2, 0)]]", "TypeError"),
-        ("return []", "2 vehicles, but"),
-        ("return [[], []]", "paths have 1 to"),
-        ("return [[(0, 0)] * 20_000, [(2, 0)]]", "paths have 1 to"),
-        ("return [[(0, 0), (0, 1)], [(2, 0)]]", "a ends at (0, 1), no target"),
-        ("return [[(0, 0), (1, 1)], [(2, 0)]]", "a jumps"),
-        ("return [[(0, 0), (1, 0), (2, 0)], [(2, 0)]]", "a prefers lane 1"),
-        ("return [[(0, 0), (1, 0), (1, 1)], [(2, 0), (1, 0), (2, 0)]]", "conflict"),
-        ("os._exit(3)", "its process died"),
-    ],
+    variants(
+        [
+            ("return None", "it returned no paths"),
+            ("raise KeyError('lane')", "KeyError: 'lane'"),
+            ("return [[(0, 0), (1, 1)], [(2, 0)]]", "a jumps"),
+            ("os._exit(3)", "its process died"),
+            ("return 7", "TypeError"),
+            ("return [[(0, 0), (0.5, 1)], [(2, 0)]]", "TypeError"),
+            ("return []", "2 vehicles, but"),
+            ("return [[], []]", "paths have 1 to"),
+            ("return [[(0, 0)] * 20_000, [(2, 0)]]", "paths have 1 to"),
+            ("return [[(0, 0), (0, 1)], [(2, 0)]]", "a ends at (0, 1), no target"),
+            ("return [[(0, 0), (1, 0), (2, 0)], [(2, 0)]]", "a prefers lane 1"),
+            ("return [[(0, 0), (1, 0), (1, 1)], [(2, 0), (1, 0), (2, 0)]]", "conflict"),
+        ],
+        4,
+    ),
 )
 def test_built_in_solvers_replace_a_plan_that_is_not_valid(
     install: Install, body: str, reason: str, capfd: pytest.CaptureFixture[str]

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import attrs
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.rolling.path_search import StreamPlanner
@@ -23,6 +23,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.formation_table import READY_LATE_S
 from laneweave.protocol.scenario.road_tables import LaneRule, Restriction, SolidLine
 from oracles.lane_rules import broken_rules
+from support.examples import examples
 from support.rolling_oracles import ROAD, Stream, streams
 
 TRUCKS = ("truck",)
@@ -94,7 +95,7 @@ def broken(
 
 
 @pytest.mark.slow
-@settings(max_examples=60)
+@examples(60)
 @given(ruled_streams())
 def test_no_plan_breaks_a_rule_by_an_independent_computation(stream: Stream) -> None:
     road, slot, vehicles, blocked = stream
@@ -108,7 +109,7 @@ def test_no_plan_breaks_a_rule_by_an_independent_computation(stream: Stream) -> 
             assert broken(road, slot, vehicle, plan.paths[vehicle.vehicle]) == []
 
 
-@settings(max_examples=100)
+@examples(100)
 @given(rules_of(ROAD), st.integers(0, 40), st.integers(0, 2), st.sampled_from((LEFT, RIGHT)))
 def test_the_validator_finds_what_the_independent_computation_finds(
     road: StreamRoad, column: int, lane: int, move: Cell
