@@ -370,7 +370,7 @@ class Street:
             {name: start},
             {name: ((0, start, target),)},
             blocks=blocks,
-            incarnations={name: agent._incarnation},
+            incarnations={name: agent._claim.incarnation},
             t0_s=t0_s,
             slot_s=self.scenario.timing.cycles_s[0],
         )

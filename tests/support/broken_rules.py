@@ -369,7 +369,9 @@ def keep_incarnation(
     on_sense: Callable[..., object], self: AgentCore, message: Sense, now_s: float
 ) -> object:
     # As if there had been no caretaker: earlier promises still count.
-    return on_sense(self, changed(message, incarnation=self._incarnation, caretaker=False), now_s)
+    return on_sense(
+        self, changed(message, incarnation=self._claim.incarnation, caretaker=False), now_s
+    )
 
 
 @instead_of(Caretaker, "on_message")

@@ -68,9 +68,9 @@ Call = Callable[..., None]
 @breaks("V1", AgentCore, "_take_over")
 def move_of_an_earlier_charge(take_over: Call, self: AgentCore, sense: Sense) -> None:
     """An agent that takes charge again resumes the last move of its earlier time in charge."""
-    move = self._move
+    begun = self._begun
     take_over(self, sense)
-    self._move = move
+    self._begun = begun
 
 
 def _gate_while_moving(row: Transition) -> Transition:

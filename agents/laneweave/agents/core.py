@@ -75,6 +75,26 @@ from laneweave.protocol.wire.topics import (
 )
 
 
+class _Claim:
+    """The incarnation with which this process claims its vehicle."""
+
+    def __init__(self, new_incarnation: Callable[[], int]) -> None:
+        self._new = new_incarnation
+        self.renew()
+
+    def renew(self) -> None:
+        """Take a new incarnation."""
+        self.incarnation = self._new()
+        self.raised = False
+        """Whether it is above the clock because that of a process in charge was."""
+
+    def raise_above(self, other: int) -> None:
+        """Take a new incarnation, above that of the process in charge."""
+        number = self._new()
+        self.incarnation = above(number, other)
+        self.raised = self.incarnation != number
+
+
 class AgentCore:
     """State machine of one vehicle's agent; see `Core`."""
 
@@ -101,12 +121,9 @@ class AgentCore:
         self.execution: PlanExecution | None = None
         """None before the first SENSE."""
         self._scenario = scenario
-        self._new_incarnation = new_incarnation
-        self._incarnation = new_incarnation()
-        self._raised = False
-        """Whether the incarnation is above the clock because that of a process in charge was."""
+        self._claim = _Claim(new_incarnation)
         runtime = scenario.runtime
-        self._bounds = runtime.bounds(self._incarnation)
+        self._bounds = runtime.bounds(self._claim.incarnation)
         self._road = NewestRoad(runtime.max_pace)
         self._make_driver = make_driver
         self._vehicle_type: str = CAR
@@ -118,10 +135,8 @@ class AgentCore:
         """Stretches of columns whose motions are needed now; empty while not in charge."""
         self.wanted_states: tuple[int, ...] = ()
         """Blocks whose states are needed now."""
-        self._move: PlannedMove | None = None
-        """Most recently begun move."""
-        self._move_ticks = 0
-        """Duration of `_move`."""
+        self._begun: tuple[PlannedMove, int] | None = None
+        """The move that was begun last, and its duration in ticks."""
         self._sense: Sense | None = None
         self._command: Command | None = None
         self._own = {"vehicle": vehicle}
@@ -137,7 +152,7 @@ class AgentCore:
         sense = self._sense
         return (
             sense is not None
-            and sense.record.incarnation == self._incarnation
+            and sense.record.incarnation == self._claim.incarnation
             and not sense.caretaker
             and not self.ended
         )
@@ -235,15 +250,15 @@ class AgentCore:
         self._sense = sense
         # Clocks of different machines may give a caretaker the same incarnation.
         incarnation = sense.record.incarnation
-        taken = sense.caretaker and incarnation == self._incarnation
-        if taken or incarnation > self._incarnation:
+        taken = sense.caretaker and incarnation == self._claim.incarnation
+        if taken or incarnation > self._claim.incarnation:
             self._command, self.wanted_motions = None, ()
             if not sense.caretaker:
                 return []  # another agent is in charge
-            self._claim_above(incarnation)
-        elif incarnation < self._incarnation and self._raised:
+            self._claim.raise_above(incarnation)
+        elif incarnation < self._claim.incarnation and self._claim.raised:
             # The incarnation in an earlier SENSE may have been wrong, and the claim too high.
-            self._claim_above(incarnation)
+            self._claim.raise_above(incarnation)
         return self._act(sense, drove=drove)
 
     def _set_type(self, vehicle_type: str) -> None:
@@ -264,21 +279,22 @@ class AgentCore:
         It has left the lattice and entered it again while no SENSE arrived, or it is too late for
         the move that this process has begun or may begin.
         """
-        execution, move = self.execution, self._move
+        execution = self.execution
         if execution is None or not self._lane_ends:
             return False
         if sense.hold_cell == execution.hold_cell:
             # An open gate for a move that can no longer begin would keep leaders waiting.
             return execution.stuck
-        if move is None or sense.hold_cell != move[1]:
+        if self._begun is None:
             return True
-        return self._lane_ends.too_late(move[1], move[2], sense.t_s)
+        (_, origin, target), _ = self._begun
+        return sense.hold_cell != origin or self._lane_ends.too_late(origin, target, sense.t_s)
 
     def _wait(self, sense: Sense) -> list[Effect]:
         """Keep the claim on a vehicle without a cell, which its motion controller drives alone."""
         self._command = Command(
             vehicle=self.vehicle,
-            record=VehicleRecord(incarnation=self._incarnation),
+            record=VehicleRecord(incarnation=self._claim.incarnation),
             tick=sense.tick,
             hold_cell=sense.hold_cell,
             motion=CurrentMotion(sense.motion.origin, sense.motion.end_tick),
@@ -290,7 +306,7 @@ class AgentCore:
         """Answer a tick; `drove`: whether this process has driven the vehicle until now."""
         if drove and (sense.off_lattice or self._has_lost_track(sense)):
             # What it has promised and accepted is void: it begins anew, like another process.
-            self._claim_above(self._incarnation)
+            self._claim.raise_above(self._claim.incarnation)
         in_charge = self.in_charge
         if not (drove and in_charge) or sense.off_lattice:
             # Repeated while a claim is pending, since another process may still begin a move.
@@ -320,14 +336,14 @@ class AgentCore:
             course = self._driver.motion(sense.tick)
             if course is not None:
                 stretch = stretch_of(course[0][0])
-                motion = Motion(self.vehicle, self._incarnation, stretch, *course, sense.tick)
+                motion = Motion(self.vehicle, self._claim.incarnation, stretch, *course, sense.tick)
                 effects.append(Send(MOTION, motion, {"stretch": stretch, **self._own}))
         return effects
 
     def _on_confirmation(self, sense: Sense) -> list[Effect]:
         """Handle a repeated SENSE: the controller may have stored something within the tick."""
         execution = self.execution
-        stale = sense.record.incarnation != self._incarnation
+        stale = sense.record.incarnation != self._claim.incarnation
         if execution is None or not self.in_charge or stale:
             return []
         self._sense = sense
@@ -342,23 +358,17 @@ class AgentCore:
 
     def _forget_road(self) -> None:
         """Discard the state of an earlier bridge's vehicle, as after a restart (V1)."""
-        self._incarnation, self._raised = self._new_incarnation(), False
-        self._sense = self._command = self._move = self.execution = None
+        self._claim.renew()
+        self._sense = self._command = self._begun = self.execution = None
         self.wanted_motions, self.wanted_states = (), ()
-
-    def _claim_above(self, incarnation: int) -> None:
-        """Take a new incarnation, above that of the process in charge."""
-        number = self._new_incarnation()
-        self._incarnation = above(number, incarnation)
-        self._raised = self._incarnation != number
 
     def _take_over(self, sense: Sense) -> None:
         """V1: continue the motion controller's current motion."""
-        self._move = None
+        self._begun = None
         self._driver.take_over(sense)
         self.execution = PlanExecution(
             vehicle=self.vehicle,
-            incarnation=self._incarnation,
+            incarnation=self._claim.incarnation,
             hold_cell=sense.hold_cell,
             territory=self._territory,
             stored=sense.record,
@@ -370,10 +380,10 @@ class AgentCore:
 
     def _decide(self, sense: Sense, execution: PlanExecution) -> None:
         """Advance plan execution by a tick, and begin the move that starts now."""
-        if execution.moving and self._move is not None and sense.hold_cell != self._move[2]:
+        if execution.moving and self._begun is not None and sense.hold_cell != self._begun[0][2]:
             # The COMMAND with the move was lost, so the body is still at its origin: a trajectory
             # that began earlier would be ahead of it. The plan may have been dropped since.
-            self._driver.begin(self._move, sense.tick, self._move_ticks)
+            self._begin(sense)
         scenario, cell = self._scenario, execution.hold_cell
         room_ahead_m = scenario.types.room_ahead_m
         move = execution.on_sense(
@@ -382,9 +392,14 @@ class AgentCore:
             displaced=displaced(sense.measured, scenario.lattice, cell, sense.t_s, room_ahead_m),
         )
         if move is not None and execution.plan is not None:
-            self._move = move
-            self._move_ticks = scenario.timing.move_ticks(execution.plan.slot_s)
-            self._driver.begin(move, sense.tick, self._move_ticks)
+            self._begun = move, scenario.timing.move_ticks(execution.plan.slot_s)
+            self._begin(sense)
+
+    def _begin(self, sense: Sense) -> None:
+        """Begin the trajectory of the move that was begun last."""
+        if self._begun is not None:
+            move, ticks = self._begun
+            self._driver.begin(move, sense.tick, ticks)
 
     # --- messages to other processes -----------------------------------------------------------
 

@@ -125,7 +125,7 @@ def test_what_the_road_does_not_show_is_forgotten(changes: dict[str, Any]) -> No
     """Afterwards the agent acts like a new process: it has promised nothing."""
     seat = Seat()
     seat.prepare(BALLOT)
-    before = seat.agent._incarnation
+    before = seat.agent._claim.incarnation
     for _ in range(10):
         seat.feel(**changes)
         seat.drive(1)
@@ -140,10 +140,10 @@ def test_a_claim_above_a_wrong_process_in_charge_is_taken_back() -> None:
     seat = Seat()
     seat.tick += 1
     seat.feel(incarnation=DAY_NS // 2, caretaker=True)
-    assert seat.agent._incarnation > DAY_NS // 2
+    assert seat.agent._claim.incarnation > DAY_NS // 2
     seat.drive(3)
     assert seat.agent.in_charge
-    assert seat.agent._incarnation == seat.given < DAY_NS // 2
+    assert seat.agent._claim.incarnation == seat.given < DAY_NS // 2
 
 
 def test_it_takes_charge_of_a_vehicle_whose_process_in_charge_is_nearly_a_day_ahead() -> None:
@@ -152,7 +152,7 @@ def test_it_takes_charge_of_a_vehicle_whose_process_in_charge_is_nearly_a_day_ah
     seat.in_charge, seat.caretaker = DAY_NS - 10**9, True
     seat.drive(3)
     assert seat.agent.in_charge
-    assert seat.agent._incarnation == above(seat.given, DAY_NS - 10**9)
+    assert seat.agent._claim.incarnation == above(seat.given, DAY_NS - 10**9)
 
 
 def test_a_ballot_of_an_impossible_term_is_not_promised() -> None:

@@ -21,6 +21,28 @@ Span = tuple[int, int]
 
 
 @frozen(kw_only=True)
+class LastingRanges:
+    """The ranges of faults that last throughout the fault phase, and of slow moves."""
+
+    loss: tuple[float, ...] = (0.0, 0.0, 0.1, 0.3, 0.5, 0.8)
+    """Probability that a receiver loses a message."""
+    duplication: tuple[float, ...] = (0.0, 0.0, 0.3)
+    jitter_s: tuple[float, ...] = (0.003, 0.003, 0.003, 0.05, 0.05, 0.3, 0.3, 1.0, 5.0)
+    """Maximum additional delay of a message; the minimum delay is 2 ms."""
+    command_loss: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
+    """Additional loss of SENSE and COMMAND messages."""
+    late_commands: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
+    """Share of commands whose motion is refused, as if they came too late for their tick."""
+    slow_moves: tuple[float, ...] = (0.0, 0.2, 0.5)
+    """Share of motions that last up to three slots."""
+    compute_failure: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
+    compute_jitter_s: tuple[float, ...] = (0.0, 0.0, 0.3, 2.0)
+    """Maximum additional planning time."""
+    wrong_clocks: float = 0.7
+    """Share of runs with wrong clocks: offsets up to 50 ms, rate errors up to 5 %."""
+
+
+@frozen(kw_only=True)
 class Profile:
     """The ranges and choices from which the runs of a search draw."""
 
@@ -47,22 +69,7 @@ class Profile:
     """Share of runs in which more vehicles may prefer a lane than their block has cells there."""
     leavers: float = 0.15
     """Share of vehicles that leave the road during the fault phase."""
-    loss: tuple[float, ...] = (0.0, 0.0, 0.1, 0.3, 0.5, 0.8)
-    """Probability that a receiver loses a message."""
-    duplication: tuple[float, ...] = (0.0, 0.0, 0.3)
-    jitter_s: tuple[float, ...] = (0.003, 0.003, 0.003, 0.05, 0.05, 0.3, 0.3, 1.0, 5.0)
-    """Maximum additional delay of a message; the minimum delay is 2 ms."""
-    command_loss: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
-    """Additional loss of SENSE and COMMAND messages."""
-    late_commands: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
-    """Share of commands whose motion is refused, as if they came too late for their tick."""
-    slow_moves: tuple[float, ...] = (0.0, 0.2, 0.5)
-    """Share of motions that last up to three slots."""
-    compute_failure: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
-    compute_jitter_s: tuple[float, ...] = (0.0, 0.0, 0.3, 2.0)
-    """Maximum additional planning time."""
-    wrong_clocks: float = 0.7
-    """Share of runs with wrong clocks: offsets up to 50 ms, rate errors up to 5 %."""
+    lasting: LastingRanges = LastingRanges()
     event_kinds: tuple[str, ...] = ()
     """Kinds of fault events, equally likely; kinds may be repeated. See `faults`."""
     events: Span = (0, 12)
@@ -80,7 +87,8 @@ def _load() -> Iterator[Profile]:
     tables: dict[str, dict[str, Any]] = {}
     for name, table in tomllib.loads(text).items():
         base = tables.get(table.pop("base", ""), {})
-        tables[name] = base | table | {"name": name}
+        lasting = base.get("lasting", {}) | table.get("lasting", {})
+        tables[name] = base | table | {"name": name, "lasting": lasting}
         yield structure(tables[name], Profile)
 
 

@@ -108,6 +108,18 @@ class _Leadership:
     recovery_s: list[float] = field(factory=list)
 
 
+@define
+class _Counts:
+    """What is counted of vehicles and of the processes in charge of them."""
+
+    caretaker_takeovers: int = 0
+    agent_takeovers: int = 0
+    left_unattended: int = 0
+    missed_exits: int = 0
+    stopped: set[Name] = field(factory=set)
+    """Vehicles that have left the lattice at the end of a lane."""
+
+
 class Ending(Enum):
     """Reason why a run ended."""
 
@@ -159,13 +171,8 @@ class RunRecord:
         self._leadership = _Leadership()
         self._reports = ReportTotals()
         self._level_ticks: Counter[FallbackLevel] = Counter()
-        self._caretaker_takeovers = 0
-        self._agent_takeovers = 0
-        self._left_unattended = 0
+        self._counts = _Counts()
         self._left_out = left_out
-        self._missed_exits = 0
-        self._stopped = set[Name]()
-        """Vehicles that have left the lattice at the end of a lane."""
         self._exits = Exits(scenario.geometry.sections, scenario.road.length_m)
         self._closed = False
         self.missed_ticks = 0
@@ -230,9 +237,9 @@ class RunRecord:
         trip.exit = section.exit if section.to_m < self._scenario.road.length_m else END_OF_ROAD
         at_destination = section.serves(arrival.preferred_lane, arrival.destination)
         trip.at_destination = at_destination
-        self._missed_exits += trip.exit != arrival.destination
+        self._counts.missed_exits += trip.exit != arrival.destination
         self._level_ticks.update(vehicle.level_ticks)
-        self._left_unattended += not attended
+        self._counts.left_unattended += not attended
         where = {"vehicle": vehicle.name, "lane": lane, "exit": trip.exit}
         self.event(left_s, LEFT, **where, on_preferred_lane=at_destination)
         if not at_destination:
@@ -248,7 +255,7 @@ class RunRecord:
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Record that a vehicle has left the lattice at a dead end, or comes back; see `events`."""
         if kind == LEFT_LATTICE:
-            self._stopped.add(vehicle)
+            self._counts.stopped.add(vehicle)
         self.event(t_s, kind, vehicle=vehicle, lane=lane)
 
     def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
@@ -261,12 +268,12 @@ class RunRecord:
 
     def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
         """Record that a caretaker has taken charge; `reason` is an `Absence`."""
-        self._caretaker_takeovers += 1
+        self._counts.caretaker_takeovers += 1
         self.event(t_s, CARETAKER_TOOK_OVER, vehicle=vehicle, reason=reason)
 
     def on_agent_took_over(self, t_s: float, vehicle: Name, previous: str) -> None:
         """Record that an agent has taken charge from the `caretaker` or an earlier `agent`."""
-        self._agent_takeovers += 1
+        self._counts.agent_takeovers += 1
         self.event(t_s, AGENT_TOOK_OVER, vehicle=vehicle, previous=previous)
 
     def on_positions(
@@ -356,10 +363,10 @@ class RunRecord:
                 at_destination=on_preferred_lane,
                 peak=self._trajectories.peak,
                 left_off_lane=left - on_preferred_lane,
-                missed_exits=self._missed_exits,
-                stopped_at_lane_end=len(self._stopped),
+                missed_exits=self._counts.missed_exits,
+                stopped_at_lane_end=len(self._counts.stopped),
                 left_out=dict(self._left_out) or None,
-                left_unattended=self._left_unattended,
+                left_unattended=self._counts.left_unattended,
             ),
             travel_time_s=travel_time(trips),
             throughput_veh_per_lane_h=throughput(trips, scenario.road.lanes),
@@ -396,8 +403,8 @@ class RunRecord:
             hold_law_ticks=ticks[FallbackLevel.HOLD] + ticks[FallbackLevel.GIVE_WAY],
             emergency_ticks=ticks[FallbackLevel.EMERGENCY],
             missed_ticks=self.missed_ticks,
-            caretaker_takeovers=self._caretaker_takeovers,
-            agent_takeovers=self._agent_takeovers,
+            caretaker_takeovers=self._counts.caretaker_takeovers,
+            agent_takeovers=self._counts.agent_takeovers,
             solve_ms=reports.solve_ms(),
         )
 

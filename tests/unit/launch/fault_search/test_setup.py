@@ -105,7 +105,7 @@ def test_lanes_are_crowded_now_and_then() -> None:
 def test_profiles_draw_from_their_ranges() -> None:
     for name, profile in PROFILES.items():
         for setup, _ in draw(name):
-            assert setup.lasting.conditions.loss in profile.loss
+            assert setup.lasting.conditions.loss in profile.lasting.loss
             assert setup.scenario.road.lanes in range(profile.lanes[0], profile.lanes[1] + 1)
             if not (profile.rolling or profile.roadside):
                 assert len(setup.formations) in range(profile.blocks[0], profile.blocks[1] + 1)

@@ -36,20 +36,21 @@ class LastingFaults:
     @classmethod
     def drawn(cls, profile: Profile, rng: random.Random) -> LastingFaults:
         """Draw faults from a profile."""
+        ranges = profile.lasting
         return cls(
             conditions=Conditions(
-                loss=rng.choice(profile.loss),
-                duplication=rng.choice(profile.duplication),
-                jitter_s=rng.choice(profile.jitter_s),
+                loss=rng.choice(ranges.loss),
+                duplication=rng.choice(ranges.duplication),
+                jitter_s=rng.choice(ranges.jitter_s),
                 lease_s=LEASE_S,
                 compute_s=COMPUTE_S,
-                compute_jitter_s=rng.choice(profile.compute_jitter_s),
-                compute_failure=rng.choice(profile.compute_failure),
+                compute_jitter_s=rng.choice(ranges.compute_jitter_s),
+                compute_failure=rng.choice(ranges.compute_failure),
             ),
-            command_loss=rng.choice(profile.command_loss),
-            late_commands=rng.choice(profile.late_commands),
-            slow_moves=rng.choice(profile.slow_moves),
-            wrong_clocks=rng.random() < profile.wrong_clocks,
+            command_loss=rng.choice(ranges.command_loss),
+            late_commands=rng.choice(ranges.late_commands),
+            slow_moves=rng.choice(ranges.slow_moves),
+            wrong_clocks=rng.random() < ranges.wrong_clocks,
             fault_s=rng.uniform(*profile.fault_s),
         )
 

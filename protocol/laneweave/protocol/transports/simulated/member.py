@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
+from attrs import define, field
+
 from laneweave.protocol.runtime.node import (
     Compute,
     Computed,
@@ -38,6 +40,19 @@ INJECTED_FAILURE = "injected failure"
 _DELIVERIES = (Received, Overflow, TokenUp, TokenDown, LinkUp, LinkDown, Query)
 
 
+@define
+class Declarations:
+    """What a node has declared to the network, in order."""
+
+    subscriptions: dict[str, None] = field(factory=dict)
+    watched: dict[str, None] = field(factory=dict)
+    """Expressions of the tokens that it watches."""
+    tokens: dict[str, None] = field(factory=dict)
+    served: set[str] = field(factory=set)
+    routed: dict[str, None] = field(factory=dict)
+    """Keys with routes that its messages led to."""
+
+
 class Member:
     """A node with its clock, alarm, computations and connection."""
 
@@ -49,12 +64,7 @@ class Member:
         self.name = name
         self.number = number
         """Position in the order in which members joined, from 0."""
-        self.subscriptions: dict[str, None] = {}
-        self.watched: dict[str, None] = {}
-        self.tokens: dict[str, None] = {}
-        self.served: set[str] = set()
-        self.routed: dict[str, None] = {}
-        """Keys with routes that messages of this member led to."""
+        self.declared = Declarations()
         self.closed = False
         self.clock: Clock | None = None
         """None: virtual time."""
@@ -75,10 +85,8 @@ class Member:
         """Tokens that the node has been notified of."""
         self._simulation = simulation
         self._backlog: list[Item] = []
-        self._alarm = 0
-        """Id of the newest alarm; older alarms are ignored."""
-        self._alarm_s = math.inf
-        """Virtual time of the newest alarm; infinite: none."""
+        self._alarm = 0, math.inf
+        """Id of the newest alarm, and its virtual time; infinite: none. Older ones are ignored."""
         self._computed_s = {Compute: 0.0, Delegate: 0.0}
         """Virtual time at which the newest computation of each kind ends."""
 
@@ -149,7 +157,7 @@ class Member:
         self._reset_alarm()
 
     def _reset_alarm(self) -> None:
-        self._alarm_s = math.inf
+        self._alarm = self._alarm[0], math.inf
         self._set_alarm()
 
     def _set_alarm(self, min_s: float = 0.0) -> None:
@@ -163,16 +171,16 @@ class Member:
         if wakeup_s is None:
             return
         due_s = wakeup_s if self.clock is None else self.clock.virtual_s(wakeup_s)
-        if due_s < self._alarm_s:
-            self._alarm_s = due_s
-            self._alarm += 1
+        newest, newest_s = self._alarm
+        if due_s < newest_s:
+            self._alarm = newest + 1, due_s
             at_s = due_s if due_s > self._simulation.now_s else min_s
-            self._simulation.at(at_s, self._ring, self._alarm)
+            self._simulation.at(at_s, self._ring, newest + 1)
 
     def _ring(self, alarm: int) -> None:
-        if self.closed or self.paused or self._alarm != alarm:
+        if self.closed or self.paused or self._alarm[0] != alarm:
             return
-        self._alarm_s = math.inf
+        self._alarm = alarm, math.inf
         now_s = self._simulation.now_s
         wakeup_s = self.node.core.wakeup_s
         local_s = self._local_s()
@@ -241,7 +249,7 @@ class Tokens:
                 event = kind(key)
                 for member in self._members.values():
                     watches = member is not exclude and member.connected
-                    if watches and matches_any(member.watched, key):
+                    if watches and matches_any(member.declared.watched, key):
                         self._send(member, event)
 
     def report_existing(self, watcher: Member, expressions: Iterable[str]) -> None:
@@ -250,7 +258,7 @@ class Tokens:
             key
             for member in self._members.values()
             if member.visible
-            for key in member.tokens
+            for key in member.declared.tokens
             if matches_any(expressions, key)
         )
         for key in dict.fromkeys(keys):
@@ -259,7 +267,7 @@ class Tokens:
     def _declared_elsewhere(self, key: str, owner: Member) -> bool:
         """Return whether another visible member has a token on this key."""
         return any(
-            member is not owner and member.visible and key in member.tokens
+            member is not owner and member.visible and key in member.declared.tokens
             for member in self._members.values()
         )
 

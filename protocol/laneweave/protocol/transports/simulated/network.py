@@ -69,32 +69,32 @@ class _Transport:
             self._network.transmit(self._member.name, key, payload)
 
     def subscribe(self, key_expression: str) -> None:
-        self._member.subscriptions[key_expression] = None
+        self._member.declared.subscriptions[key_expression] = None
         self._network.update_routes(self._member, key_expression)
 
     def unsubscribe(self, key_expression: str) -> None:
-        self._member.subscriptions.pop(key_expression, None)
+        self._member.declared.subscriptions.pop(key_expression, None)
         self._network.update_routes(self._member, key_expression)
 
     def announce(self, key: str) -> None:
-        if key not in self._member.tokens and not self._member.closed:
-            self._member.tokens[key] = None
+        if key not in self._member.declared.tokens and not self._member.closed:
+            self._member.declared.tokens[key] = None
             self._network.tokens.report(TokenUp, self._member, (key,))
 
     def withdraw(self, key: str) -> None:
-        if key in self._member.tokens and not self._member.closed:
-            del self._member.tokens[key]
+        if key in self._member.declared.tokens and not self._member.closed:
+            del self._member.declared.tokens[key]
             self._network.tokens.report(TokenDown, self._member, (key,))
 
     def watch(self, key_expression: str) -> None:
         member = self._member
-        if key_expression not in member.watched and not member.closed:
-            member.watched[key_expression] = None
+        if key_expression not in member.declared.watched and not member.closed:
+            member.declared.watched[key_expression] = None
             if member.connected:
                 self._network.tokens.report_existing(member, (key_expression,))
 
     def serve(self, key: str) -> None:
-        self._member.served.add(key)
+        self._member.declared.served.add(key)
 
     def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
         self._network.accept_answer(self._member, token, Answer(payload, ok, encoding))
@@ -211,7 +211,7 @@ class SimulatedNetwork(Simulation):
             return
         if member.lapsed:
             member.lapsed = False
-            self.tokens.report(TokenUp, member, member.tokens)
+            self.tokens.report(TokenUp, member, member.declared.tokens)
         member.resume()
         self._rejoin_later(member)
 
@@ -308,7 +308,9 @@ class SimulatedNetwork(Simulation):
         The answer is None if there is no server, or if all have declined, exited or disconnected.
         """
         servers = [
-            member for member in self._members.values() if member.connected and key in member.served
+            member
+            for member in self._members.values()
+            if member.connected and key in member.declared.served
         ]
         numbered = {next(self._token_count): server for server in servers}
         tokens = set(numbered)
@@ -343,7 +345,7 @@ class SimulatedNetwork(Simulation):
         """Update the routes of all keys that a changed subscription matches."""
         for key in self._known_keys(expression):
             receivers = [other for other in self._routes[key] if other is not member]
-            if not member.closed and matches_any(member.subscriptions, key):
+            if not member.closed and matches_any(member.declared.subscriptions, key):
                 insort(receivers, member, key=lambda other: other.number)
             if receivers:
                 self._routes[key] = tuple(receivers)
@@ -376,9 +378,9 @@ class SimulatedNetwork(Simulation):
         if member is None:
             return
         member.closed = True
-        for expression in member.subscriptions:
+        for expression in member.declared.subscriptions:
             self.update_routes(member, expression)
-        for key in list(member.routed):
+        for key in list(member.declared.routed):
             self._forget_route(key)
         if member.visible:
             self.at(self.now_s + seen_after_s, self._hide, member)
@@ -386,7 +388,7 @@ class SimulatedNetwork(Simulation):
 
     def _hide(self, member: Member) -> None:
         """Report to all other members that the tokens of a member have vanished."""
-        self.tokens.report(TokenDown, member, member.tokens, exclude=member)
+        self.tokens.report(TokenDown, member, member.declared.tokens, exclude=member)
 
     def _lapse(self, member: Member, pause: int) -> None:
         if member.paused and member.pauses == pause and not member.closed:
@@ -412,8 +414,8 @@ class SimulatedNetwork(Simulation):
         if member.connected:
             return
         member.connected = True
-        self.tokens.report(TokenUp, member, member.tokens, exclude=member)
-        self.tokens.report_existing(member, member.watched)
+        self.tokens.report(TokenUp, member, member.declared.tokens, exclude=member)
+        self.tokens.report_existing(member, member.declared.watched)
         member.handle(LinkUp())
 
     def _rejoin_later(self, member: Member) -> None:
@@ -430,7 +432,9 @@ class SimulatedNetwork(Simulation):
     def _receivers(self, key: str) -> tuple[Member, ...]:
         """Return the members that subscribe to a key, in the order in which they started."""
         return tuple(
-            member for member in self._members.values() if matches_any(member.subscriptions, key)
+            member
+            for member in self._members.values()
+            if matches_any(member.declared.subscriptions, key)
         )
 
     def _new_route(self, key: str, sender: Member) -> tuple[Member, ...]:
@@ -439,12 +443,12 @@ class SimulatedNetwork(Simulation):
         if route:
             self._routes[key], self._first_sender[key] = route, sender
             self._keys_by_prefix.setdefault(_prefix_of(key), {})[key] = None
-            sender.routed[key] = None
+            sender.declared.routed[key] = None
         return route
 
     def _forget_route(self, key: str) -> None:
         if self._routes.pop(key, None) is not None:
-            del self._first_sender.pop(key).routed[key]
+            del self._first_sender.pop(key).declared.routed[key]
             prefix = _prefix_of(key)
             keys = self._keys_by_prefix[prefix]
             del keys[key]
