@@ -6,9 +6,9 @@ STAMP  := $(VENV)/.installed
 RUN    ?= runs/demo
 BUDGET ?= 90
 
-# Tests of real processes mostly wait, so three workers use two cores better than two: with two, the 12
-# minutes of CPU time of `make test` take 11:20 on a machine with other work. Each worker collects all
-# tests (9 s of CPU time). An idle worker takes over half of another worker's remaining tests.
+# Tests of real processes mostly wait, so three workers use two cores better than two, and four need
+# more CPU time. Each worker collects all tests (9 s of CPU time). An idle worker takes over half of
+# another worker's remaining tests.
 PYTEST := $(BIN)/pytest -n 3 --dist worksteal
 
 # One thread for linear algebra: many processes share few cores.

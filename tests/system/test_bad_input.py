@@ -105,7 +105,9 @@ def _file(path: Path) -> None:
     path.write_text("")
 
 
-@pytest.mark.parametrize(("make", "out"), [(_full, "out"), (_file, "out"), (_file, "out/below")])
+@pytest.mark.parametrize(
+    ("make", "out"), variants([(_full, "out"), (_file, "out"), (_file, "out/below")])
+)
 def test_folders_that_cannot_be_written(lab: Lab, make: Callable[[Path], None], out: str) -> None:
     make(lab.folder / "out")
     for command in (

@@ -318,6 +318,7 @@ def test_vehicles_arrive_though_an_agent_is_killed(lab: Lab) -> None:
     assert f"FAILED: {agent} ended with status -9" in ended.out
 
 
+@pytest.mark.more
 def test_the_reason_of_a_failure_is_printed(lab: Lab, road: Path) -> None:
     broken = lab.folder / "broken" / "libsumo"
     broken.mkdir(parents=True)

@@ -66,7 +66,7 @@ def injected(found: dict[str, Any], verb: str) -> list[str]:
 def test_half_of_all_messages_are_lost(lab: Lab) -> None:
     road = lab.path("quick.toml", SHORT_ROAD + QUICK_TICKS)
 
-    found = run_with(lab, road, "lossy50")
+    found = run_with(lab, road, "lossy50", "--duration", "7")
 
     # A message has one receiver or more, and the reports that count those published are lost too.
     published, dropped = found["messages"]["published"], found["messages"]["dropped_by_faults"]

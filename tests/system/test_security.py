@@ -309,6 +309,7 @@ def test_what_is_too_long_does_not_come_in(network: Network) -> None:
 # --- who gets in at all ---------------------------------------------------------------------------
 
 
+@pytest.mark.more
 def test_outsiders_do_not_get_in(network: Network, tmp_path: Path) -> None:
     endpoint, ours = network.scenario.network.endpoint, network.folder
     ca = {"root_ca_certificate": ours / "ca.pem"}

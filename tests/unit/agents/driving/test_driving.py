@@ -11,7 +11,6 @@ from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name
 from support import emergencies, switches
 from support.driving import Record, Road, lattice_errors_m, limit_use, road_scenario
-from support.variants import variants
 
 SCENARIO = road_scenario(seed=0)
 ME, OTHER = Name("me"), Name("other")
@@ -23,8 +22,9 @@ SWITCHES = 12
 """In each mode."""
 
 
+@pytest.mark.more
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", variants([2, 1]))
+@pytest.mark.parametrize("mode", [2, 1])
 def test_formation_switches_reach_all_goals(mode: int) -> None:
     numbers = range(mode - 1, 2 * SWITCHES, 2)
     results = [switches.switch_result(0, n, vehicles=(3, 5), columns=(6, 7)) for n in numbers]

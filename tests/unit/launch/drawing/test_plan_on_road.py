@@ -121,6 +121,7 @@ def test_long_plans_are_drawn_at_some_instants() -> None:
     assert (roads[0].get_ylabel(), roads[-1].get_ylabel()) == ("0.0 s", "76.0 s")
 
 
+@pytest.mark.more
 @pytest.mark.slow
 def test_without_a_plan_the_start_is_drawn(tmp_path: Path) -> None:
     figure = road_figure(_Picture.of(REQUEST, NO_PLAN, SCENARIO))

@@ -206,6 +206,7 @@ def test_more_clearance_or_more_lateness_removes_nothing(
 # -------------------------------------------------------------------------- against simulation
 
 
+@pytest.mark.more
 @pytest.mark.slow
 @examples(12)
 @given(geometries(), st.integers(0, 10**6))
