@@ -308,6 +308,7 @@ def _stops(sumo: SumoProcess, name: str) -> tuple[Attributes, ...]:
             "parking": f"{bool(one.stopFlags & _PARKING)}".lower(),
         }
         for one in sumo.vehicle.getStops(name)
+        if one.arrival < 0.0  # SUMO's time; its output contains those that have been reached
     )
 
 

@@ -203,6 +203,15 @@ def test_a_departure_at_the_begin_is_one(tmp_path: Path) -> None:
     }
 
 
+def test_a_stop_in_which_the_demand_ends_is_one_stop(tmp_path: Path) -> None:
+    stops = "".join(f'<stop lane="off_0" endPos="{at_m}" duration="60"/>' for at_m in (100, 200))
+    bus = f'<vehicle id="bus" type="car" depart="0"><route edges="off"/>{stops}</vehicle>'
+    config = write_interchange(tmp_path, [bus, vehicle("a", 1.0, "main")])
+    simulation = read_corridor(config, CORRIDOR, TimeWindow(end_s=40.0)).simulation
+    found = next(one for one in simulation.vehicles if one.name == "bus")
+    assert [float(stop["endPos"]) for stop in found.stops] == [100.0, 200.0]
+
+
 def test_vehicles_with_stops_are_left_out_of_the_corridor_only(tmp_path: Path) -> None:
     bus = (
         '<vehicle id="bus" type="car" depart="0"><route edges="main1 main2 main3 main4 main5"/>'
