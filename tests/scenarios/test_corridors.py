@@ -26,6 +26,7 @@ from support.interchange import (
     CORRIDOR,
     DRIVEN_S,
     EXIT_FIRST,
+    FORK,
     RAMP_FIRST,
     RAMP_SPEED_MPS,
     TRUCKS,
@@ -142,6 +143,22 @@ def test_sumo_drives_the_same_vehicles_alone(
     page = (folder / "comparison.html").read_text(encoding="utf-8")
     assert "start of the corridor" in page
     assert "SUMO alone" in page
+
+
+@pytest.mark.parametrize("origin", ["", "upstream "])
+def test_at_a_fork_everybody_is_in_a_lane_that_leads_to_the_next_edge(
+    tmp_path: Path, origin: str
+) -> None:
+    turns = ["left", "right", "ahead"]
+    vehicles = [vehicle(f"v{n}", n, origin + turns[n % 3]) for n in range(12)]
+    config = write_interchange(tmp_path, vehicles, network=FORK)
+    summary, _ = drive(scenario_of(config, "main1:main1"), tmp_path / "run")
+    assert summary["vehicles"]["on_preferred_lane"] == summary["vehicles"]["demanded"] == 12
+    assert summary["safety"]["overlaps"] == summary["safety"]["sumo_collisions"] == 0
+    assert summary["safety"]["min_accel_mps2"] >= -3.0
+    leads_to = {"right": {0}, "ahead": {0, 1}, "left": {2}}
+    for trip in read_trips(tmp_path / "run").values():
+        assert trip["final_lane"] in leads_to[turns[int(trip["sumo_id"][1:]) % 3]]
 
 
 @pytest.mark.more

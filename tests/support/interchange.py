@@ -105,6 +105,23 @@ RAMP_FIRST = Network(
     ),
 )
 
+FORK = Network(
+    (
+        _Edge("start", "Z", "A", -400.0, 0.0, _centres(0, 3)),
+        _Edge("main1", "A", "B", 0.0, 900.0, _centres(0, 3)),
+        _Edge("right", "B", "C", 900.0, 1200.0, _centres(0, 1, -20.0)),
+        _Edge("ahead", "B", "D", 900.0, 1200.0, _centres(0, 2)),
+        _Edge("left", "B", "E", 900.0, 1200.0, _centres(2, 1, 20.0)),
+    ),
+    (
+        *(("start", lane, "main1", lane) for lane in range(3)),
+        ("main1", 0, "right", 0),
+        *(("main1", lane, "ahead", lane) for lane in range(2)),
+        ("main1", 2, "left", 0),
+    ),
+)
+"""An edge whose lanes lead to different edges."""
+
 
 def write_interchange(
     folder: Path,
@@ -144,8 +161,10 @@ ROUTES = {
     "upstream exit": "start main1 main2 off",
     "late exit": "main1 main2 main3 main4 off",
     "early ramp": "before on main2 main3 main4 main5",
+    **{turn: f"main1 {turn}" for turn in ("right", "ahead", "left")},
+    **{f"upstream {turn}": f"start main1 {turn}" for turn in ("right", "ahead", "left")},
 }
-"""Edges of routes; the last two are those of `RAMP_FIRST`."""
+"""Edges of routes; `late exit` and `early ramp` are for `RAMP_FIRST`, turns for `FORK`."""
 
 
 def vehicle(name: str, depart_s: float, route: str, kind: str = "car") -> str:
@@ -175,9 +194,9 @@ DRIVEN_S = 15
 """Duration of the stream of `driven_interchange`."""
 
 
-def scenario_of(config: Path) -> Scenario:
+def scenario_of(config: Path, corridor: str = CORRIDOR) -> Scenario:
     """Return the scenario of the corridor of a simulation, for the whole of its demand."""
-    return parse_scenario(corridor_tables(read_corridor(config, CORRIDOR), config, WHOLE))
+    return parse_scenario(corridor_tables(read_corridor(config, corridor), config, WHOLE))
 
 
 def driven_interchange(factory: pytest.TempPathFactory) -> tuple[Scenario, Path]:

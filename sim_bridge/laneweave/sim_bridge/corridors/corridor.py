@@ -15,6 +15,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 from statistics import median
+from types import MappingProxyType
 
 from attrs import evolve, field, frozen
 
@@ -42,6 +43,7 @@ REACTION_S, DECEL_MPS2 = 1.0, 4.0
 """Reaction time of SUMO's default drivers, and deceleration of its default trucks, with which
 vehicles that are given back stop before crossings and traffic lights."""
 OPTION = "--corridor"
+NO_LANES: Mapping[str, tuple[int, ...]] = MappingProxyType({})
 
 
 @frozen
@@ -124,6 +126,8 @@ class Corridor:
     closures: tuple[Closure, ...]
     ramps: tuple[Ramp, ...] = ()
     ways_out: tuple[WayOut, ...] = ()
+    lanes_to: Mapping[str, tuple[int, ...]] = NO_LANES
+    """The lanes at its end that lead to each edge behind it; empty: every lane leads to all."""
     unused: tuple[str, ...] = ()
     """Ways into the corridor and out of it that vehicles cannot use, in words."""
 
@@ -201,25 +205,9 @@ def corridor_of(
     for edge in way:
         if not edge.car_lanes:
             raise BadInputError(OPTION, edge.name, "edges with a lane for cars")
-    _check_end(network, way[-1])
     for before, after in pairwise(way):
         _check_right_of_way(network, before, after)
     return _Derivation(network, way, departing).corridor()
-
-
-def _check_end(network: Network, last: Edge) -> None:
-    """Check that vehicles may leave the last edge in any lane, wherever their routes lead."""
-    ahead = {
-        lane.index: {link.target.edge for link in network.links_from(lane)}
-        for lane in last.car_lanes
-    }
-    if len({frozenset(edges) for edges in ahead.values()}) > 1:
-        lanes = "; ".join(
-            f"lane {index} to {' and '.join(sorted(edges)) or 'nowhere'}"
-            for index, edges in ahead.items()
-        )
-        allowed = f"a last edge whose lanes all lead to the same edges, but there are {lanes}"
-        raise BadInputError(OPTION, last.name, allowed)
 
 
 def _way(network: Network, first: str, last: str) -> tuple[Edge, ...]:
@@ -330,8 +318,20 @@ class _Derivation:
             closures=tuple(self._closures(parts, lanes, ramps, ways_out)),
             ramps=ramps,
             ways_out=ways_out,
+            lanes_to=self._lanes_to(),
             unused=tuple(self._unused),
         )
+
+    def _lanes_to(self) -> Mapping[str, tuple[int, ...]]:
+        """Return which lanes of the last edge lead to each edge behind it; none if all do."""
+        last = self._edges[-1]
+        found: dict[str, list[int]] = {}
+        for lane in last.edge.car_lanes:
+            for edge in {link.target.edge for link in self._network.links_from(lane)}:
+                found.setdefault(edge, []).append(last.first_lane + lane.index)
+        if all(len(lanes) == len(last.edge.car_lanes) for lanes in found.values()):
+            return NO_LANES
+        return {edge: tuple(lanes) for edge, lanes in sorted(found.items())}
 
     def _given_back_m(self, edge: CorridorEdge, links: Sequence[Link]) -> float:
         """Return where vehicles are given back on an edge, before links that lead out of it.

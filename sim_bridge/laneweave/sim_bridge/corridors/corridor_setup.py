@@ -18,7 +18,6 @@ from attrs import frozen
 
 from laneweave.protocol.config.participants import vehicle_name
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.wire.messages import CAR
@@ -181,7 +180,7 @@ def _arrivals(found: SumoCorridor, scenario: Scenario) -> Iterator[CorridorArriv
         if one.upstream:
             lane = scenario.road.first_lanes[0]  # which one it is depends on SUMO
         elif one.entrance == MAIN_ENTRANCE:
-            lane = choose.lane(t_s, one.destination, vehicle_type)
+            lane = choose.lane(t_s, one, vehicle_type)
         elif one.entrance in lanes:
             lane = lanes[one.entrance]
         else:
@@ -190,7 +189,7 @@ def _arrivals(found: SumoCorridor, scenario: Scenario) -> Iterator[CorridorArriv
         arrival = Arrival(
             vehicle_name(number),
             lane,
-            ANY_LANE,
+            one.preferred_lane(lane),
             max(t_s, FIRST_ENTRY_S),
             one.destination,
             vehicle_type,
@@ -235,14 +234,14 @@ class _LaneChoice:
         self._scenario = scenario
         self._exit_lanes = {each.name: each.lanes for each in scenario.exit}
 
-    def lane(self, t_s: float, destination: str, vehicle_type: str) -> int:
+    def lane(self, t_s: float, way: Pass, vehicle_type: str) -> int:
         """Return the lane of the next vehicle, in which its type may drive."""
         is_closed = partial(self._scenario.road.is_restricted, s_m=0.0, vehicle_type=vehicle_type)
         lanes: Sequence[int] = [lane for lane in self._free_s if not is_closed(lane)]
         lanes = lanes or [*self._free_s]
-        if destination in self._exit_lanes:
-            nearest = self._exit_lanes[destination]
-            lanes = [min(lanes, key=lambda lane: min(abs(lane - own) for own in nearest))]
+        if wanted := self._exit_lanes.get(way.destination, way.lanes):
+            away = {lane: min(abs(lane - own) for own in wanted) for lane in lanes}
+            lanes = [lane for lane in lanes if away[lane] == min(away.values())]
         chosen = min(lanes, key=lambda lane: (max(self._free_s[lane], t_s), -lane))
         self._free_s[chosen] = max(self._free_s[chosen], t_s) + self._spacing_s
         return chosen

@@ -139,7 +139,8 @@ class CorridorWorld(SumoProcess, BodiesWorld):
                     factor = api.getSpeedFactor(vehicle)
                     limits = tuple((to_m, factor * limit) for to_m, limit in way.limits)
                     speed_mps = api.getSpeed(vehicle)
-                    arrival = evolve(coming.arrival, lane=lane)
+                    preferred_lane = coming.origin.preferred_lane(lane)
+                    arrival = evolve(coming.arrival, lane=lane, preferred_lane=preferred_lane)
                     yield Approaching(arrival, s_m, speed_mps, limits, way.upstream)
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
@@ -267,13 +268,14 @@ class CorridorWorld(SumoProcess, BodiesWorld):
             api.setTau(name, min(tau_s, SLOWING_TAU_S))
 
     def _correct_route(self, name: str) -> None:
-        """Give a vehicle that leaves elsewhere than its route does a route from there.
+        """Give a vehicle that leaves by another exit than its own a route from there.
 
-        SUMO would stop it, or put it in front of others on the next edge of its route.
+        SUMO would stop it, or put it in front of others on the next edge of its route. At the end
+        of the corridor it may still change lanes.
         """
         api, network = self.vehicle, self._network
         edge, _, index = api.getLaneID(name).rpartition("_")
-        if edge not in network.edges:
+        if edge not in network.edges or edge == self._setup.found.corridor.edges[-1].name:
             return
         route = self._setup.by_name[name].origin.vehicle.route
         lane = network.edges[edge].lanes[int(index)]

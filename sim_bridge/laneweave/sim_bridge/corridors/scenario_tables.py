@@ -156,6 +156,7 @@ def scenario_tables(found: SumoCorridor) -> Tables:
             "volume_veh_per_lane_h": _volume(len(main), duration_s, first_lanes),
             "duration_s": float(math.ceil(duration_s)),
             "destinations": _destinations(main),
+            "lane_shares": _lane_shares(found.passes, corridor.lanes),
         },
         "vehicle": {**car.limits, "max_speed_mps": round(fastest_mps, 2)},
         "vehicle_type": [
@@ -275,6 +276,15 @@ def _destinations(passes: Sequence[Pass]) -> list[dict[str, Any]]:
         for name, count in sorted(counts.items())
         if name != END_OF_ROAD
     ]
+
+
+def _lane_shares(passes: Sequence[Pass], lanes: int) -> list[float]:
+    """Return the shares of lanes in which vehicles want to leave at the end; none: no preferences.
+
+    A vehicle whose route continues from several lanes counts for each of them.
+    """
+    counts = Counter(lane for one in passes for lane in one.lanes)
+    return [round(counts[lane] / counts.total(), 4) for lane in range(lanes)] if counts else []
 
 
 def _shares_of_types(passes: Sequence[Pass]) -> Mapping[SumoType, float]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.road_layout import END_OF_ROAD
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor, corridor_of, unique_name
 from laneweave.sim_bridge.corridors.sumo_network import Link, Network
@@ -64,11 +64,17 @@ class Pass:
     """`END_OF_ROAD`, or the name of an exit."""
     upstream: str = ""
     """Edge from which it comes to the start; empty: it departs on the first edge, or by a ramp."""
+    lanes: tuple[int, ...] = ()
+    """Lanes at the end of the corridor from which its route continues; empty: any."""
 
     @property
     def departs_at_start(self) -> bool:
         """Whether it departs on the first edge of the corridor; others come from outside."""
         return self.entrance == MAIN_ENTRANCE and not self.upstream
+
+    def preferred_lane(self, lane: int) -> int:
+        """Return the lane in which it wants to leave, if it enters in some lane: the nearest."""
+        return min(self.lanes, key=lambda one: abs(one - lane), default=ANY_LANE)
 
 
 @frozen(slots=False)
@@ -170,7 +176,7 @@ def _pass_of(vehicle: SumoVehicle, corridor: Corridor) -> Pass | str:
     if vehicle.stops:
         return "stop on their way"
     before, after = ("", *route)[first], (*route, "")[last + 1]
-    entrance, destination, upstream = MAIN_ENTRANCE, END_OF_ROAD, ""
+    entrance, destination, upstream, lanes = MAIN_ENTRANCE, END_OF_ROAD, "", tuple[int, ...]()
     if begin == 0:
         upstream = before
     else:
@@ -183,7 +189,11 @@ def _pass_of(vehicle: SumoVehicle, corridor: Corridor) -> Pass | str:
         if (route[last], after) not in exits:
             return f"leave to {after}" if after else f"end on {route[last]}"
         destination = exits[route[last], after]
-    return Pass(vehicle, entrance, destination, upstream)
+    elif after and corridor.lanes_to:
+        if after not in corridor.lanes_to:
+            return f"leave to {after}"
+        lanes = corridor.lanes_to[after]
+    return Pass(vehicle, entrance, destination, upstream, lanes)
 
 
 def _ways_in(corridor: Corridor) -> Iterator[WayIn]:

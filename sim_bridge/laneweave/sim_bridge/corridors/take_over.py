@@ -239,7 +239,8 @@ class TakeOver(OutsideTraffic):
 
     def _arrival(self, one: Approaching) -> Arrival:
         """Return the arrival of a vehicle in the lane to which it comes."""
-        return evolve(self._known[one.arrival.vehicle], lane=one.arrival.lane)
+        lane, preferred_lane = one.arrival.lane, one.arrival.preferred_lane
+        return evolve(self._known[one.arrival.vehicle], lane=lane, preferred_lane=preferred_lane)
 
     def _choose(
         self,

@@ -12,6 +12,7 @@ from attrs import evolve
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.sim_bridge.corridors.corridor import (
@@ -28,6 +29,7 @@ from laneweave.sim_bridge.corridors.sumo_corridor import SumoCorridor, corridor_
 from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network
 from support.interchange import (
     CORRIDOR,
+    FORK,
     LONGEST_CORRIDOR,
     MAIN_SPEED_MPS,
     RAMP_SPEED_MPS,
@@ -93,6 +95,20 @@ def test_a_part_of_the_edges_is_a_corridor_too(network: Network) -> None:
     assert (single.lanes, single.closures, single.ramps) == (3, (), ())
 
 
+def test_lanes_of_the_last_edge_may_lead_to_different_edges(tmp_path: Path) -> None:
+    # Lane 0 leads ahead, too; nobody may leave by an edge that cars do not reach.
+    routes = ("left", "ahead", "right", "left")
+    vehicles = [vehicle(str(number), number, route) for number, route in enumerate(routes)]
+    vehicles.append('<trip id="ends" depart="9" from="main1" to="main1"/>')
+    found = read_corridor(write_interchange(tmp_path, vehicles, network=FORK), "main1:main1")
+    assert found.corridor.lanes_to == {"ahead": (0, 1), "left": (2,), "right": (0,)}
+    assert not found.corridor.ways_out
+    assert [one.lanes for one in found.passes] == [(2,), (0, 1), (0,), (2,), ()]
+    assert [found.passes[1].preferred_lane(lane) for lane in range(3)] == [0, 1, 1]
+    assert found.passes[4].preferred_lane(1) == ANY_LANE
+    assert scenario_tables(found)["demand"]["lane_shares"] == [0.4, 0.2, 0.4]
+
+
 def test_names_of_edges_may_contain_colons(tmp_path: Path) -> None:
     config = write_interchange(tmp_path, stream(3), types=TRUCKS)
     for name, expected in (
@@ -151,19 +167,18 @@ def two_lane_ramp(network: Network) -> Network:
 
 
 @pytest.mark.parametrize(
-    ("change", "last", "expected"),
+    ("change", "expected"),
     [
-        (None, "main2", "lane 0 to off; lane 1 to main3"),
-        (giving_way, "main5", "its state is 'm'"),
-        (two_lane_ramp, "main5", "on-ramps of one lane, but 2 lanes of on lead"),
+        (giving_way, "its state is 'm'"),
+        (two_lane_ramp, "on-ramps of one lane, but 2 lanes of on lead"),
     ],
-    ids=["lanes-part", "gives-way", "two-lane-ramp"],
+    ids=["gives-way", "two-lane-ramp"],
 )
 def test_what_is_no_corridor_is_refused_in_words_of_the_network(
-    network: Network, change: Callable[[Network], Network] | None, last: str, expected: str
+    network: Network, change: Callable[[Network], Network], expected: str
 ) -> None:
     with pytest.raises(BadInputError, match=expected):
-        corridor_of(network if change is None else change(network), "main1", last)
+        corridor_of(change(network), "main1", "main5")
 
 
 @pytest.mark.parametrize("text", ["", "<net", "<routes/>"])
