@@ -187,7 +187,7 @@ def _results(bug: Bug | None, items: Sequence[pytest.Item]) -> Results:
     for item, following in zip(items, [*items[1:], None], strict=True):
         try:
             results[item.nodeid] = _run(item, following, LONGEST_S if bug is None else LIMIT_S)
-        except (TooLongError, TypeError):  # it may come while pytest itself works on a report
+        except (TooLongError, TypeError):  # the signal came inside pytest's report
             results[item.nodeid] = "too long"
             with contextlib.suppress(Exception):
                 item.session._setupstate.teardown_exact(None)

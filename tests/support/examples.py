@@ -7,11 +7,11 @@ from collections.abc import Collection
 from hypothesis import HealthCheck, settings
 
 SUPPRESSED = (HealthCheck.too_slow,)
-"""No test depends on the load of the machine."""
+"""Health checks of hypothesis that fail while the machine is busy."""
 ALL = "all"
-"""Profile of hypothesis (`--hypothesis-profile`) in which each test tries all of its examples."""
+"""Profile (`--hypothesis-profile`) in which each test tries all of its examples."""
 PART = "part"
-"""Profile without that option."""
+"""Profile in which each test tries a part of its examples, the default."""
 DIVISOR = 4
 FEWEST = 10
 USUAL = 100
@@ -31,7 +31,7 @@ def register_profiles() -> None:
 
 
 def examples(number: int, *, suppress_health_check: Collection[HealthCheck] = ()) -> settings:
-    """Return settings for a test that tries a number of examples in the profile `ALL`."""
+    """Return settings for a test; `number` is that of its examples in the profile `ALL`."""
     return settings(
         max_examples=_tried(number, settings.get_current_profile_name()),
         suppress_health_check=[*SUPPRESSED, *suppress_health_check],

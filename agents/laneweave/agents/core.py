@@ -383,7 +383,7 @@ class AgentCore:
         if execution.moving and self._begun is not None and sense.hold_cell != self._begun[0][2]:
             # The COMMAND with the move was lost, so the body is still at its origin: a trajectory
             # that began earlier would be ahead of it. The plan may have been dropped since.
-            self._begin(sense)
+            self._begin(*self._begun, sense.tick)
         scenario, cell = self._scenario, execution.hold_cell
         room_ahead_m = scenario.types.room_ahead_m
         move = execution.on_sense(
@@ -392,14 +392,12 @@ class AgentCore:
             displaced=displaced(sense.measured, scenario.lattice, cell, sense.t_s, room_ahead_m),
         )
         if move is not None and execution.plan is not None:
-            self._begun = move, scenario.timing.move_ticks(execution.plan.slot_s)
-            self._begin(sense)
+            self._begin(move, scenario.timing.move_ticks(execution.plan.slot_s), sense.tick)
 
-    def _begin(self, sense: Sense) -> None:
-        """Begin the trajectory of the move that was begun last."""
-        if self._begun is not None:
-            move, ticks = self._begun
-            self._driver.begin(move, sense.tick, ticks)
+    def _begin(self, move: PlannedMove, lasts_ticks: int, tick: int) -> None:
+        """Begin a move, or begin it anew."""
+        self._begun = move, lasts_ticks
+        self._driver.begin(move, tick, lasts_ticks)
 
     # --- messages to other processes -----------------------------------------------------------
 

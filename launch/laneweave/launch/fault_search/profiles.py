@@ -22,7 +22,7 @@ Span = tuple[int, int]
 
 @frozen(kw_only=True)
 class LastingRanges:
-    """The ranges of faults that last throughout the fault phase, and of slow moves."""
+    """The ranges from which the faults throughout the fault phase are drawn."""
 
     loss: tuple[float, ...] = (0.0, 0.0, 0.1, 0.3, 0.5, 0.8)
     """Probability that a receiver loses a message."""

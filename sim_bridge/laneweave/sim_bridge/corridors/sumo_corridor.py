@@ -73,7 +73,7 @@ class Pass:
         return self.entrance == MAIN_ENTRANCE and not self.upstream
 
     def preferred_lane(self, lane: int) -> int:
-        """Return the lane in which it wants to leave, if it enters in some lane: the nearest."""
+        """Return its preferred lane, the one nearest to the lane in which it enters."""
         return min(self.lanes, key=lambda one: abs(one - lane), default=ANY_LANE)
 
 

@@ -239,8 +239,7 @@ class TakeOver(OutsideTraffic):
 
     def _arrival(self, one: Approaching) -> Arrival:
         """Return the arrival of a vehicle in the lane to which it comes."""
-        lane, preferred_lane = one.arrival.lane, one.arrival.preferred_lane
-        return evolve(self._known[one.arrival.vehicle], lane=lane, preferred_lane=preferred_lane)
+        return evolve(one.arrival, t_s=self._known[one.arrival.vehicle].t_s)
 
     def _choose(
         self,

@@ -110,7 +110,7 @@ class _Leadership:
 
 @define
 class _Counts:
-    """What is counted of vehicles and of the processes in charge of them."""
+    """Counts of vehicles, and of changes of the process in charge."""
 
     caretaker_takeovers: int = 0
     agent_takeovers: int = 0

@@ -242,7 +242,7 @@ class LightRoad:
             self._checker.store(now_s, vehicle.name, vehicle.controller.record)
 
     def _check_lanes(self, now_s: float) -> None:
-        """Report bodies in lanes that have ended, also partly at an exit."""
+        """Report bodies behind the end of their lane, or partly behind an exit."""
         tick_m = 1.5 * self._scenario.lattice.speed_mps * self._scenario.runtime.tick_s
         for name, vehicle in self.vehicles.items():
             s_m, _, _, y_m, _, _ = vehicle.state
