@@ -195,6 +195,8 @@ class RunRecord:
         """Record a vehicle that has entered the road."""
         trip = self._trips[Name(vehicle.name)]
         trip.entered_s, trip.formation = vehicle.entered_s, vehicle.formation
+        # One from outside may have changed lanes since it was demanded.
+        trip.arrival = vehicle.arrival
         self.event(
             vehicle.entered_s,
             ENTERED,

@@ -219,6 +219,16 @@ def test_a_trip_is_recorded(record: RunRecord, tmp_path: Path) -> None:
     assert summary["tracking"]["emergency_ticks"] == 5
 
 
+def test_a_trip_has_the_lanes_with_which_its_vehicle_entered(
+    record: RunRecord, tmp_path: Path
+) -> None:
+    record.on_demanded(vehicle(lane=0, preferred_lane=1).admission.arrival)
+    record.on_entered(vehicle(lane=2, preferred_lane=2))
+    record.close(70.0, Ending.LIMIT)
+    (trip,) = pq.read_table(tmp_path / "trips.parquet").to_pylist()
+    assert (trip["arrival_lane"], trip["preferred_lane"], trip["demanded_s"]) == (2, 2, 0.5)
+
+
 def test_a_vehicle_that_stands_at_the_end_has_left(record: RunRecord, tmp_path: Path) -> None:
     traveller = vehicle()
     record.on_demanded(traveller.admission.arrival)
