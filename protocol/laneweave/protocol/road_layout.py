@@ -139,10 +139,18 @@ class Exits:
         """
         if s_m < self._first_m:
             return None
+        found = self.section_at(lane, s_m)
+        if found is not None and found.exit and s_m >= found.to_m:
+            return found
+        return None if s_m < self._length_m else LaneSection(lane, to_m=self._length_m)
+
+    def section_at(self, lane: int, s_m: float) -> LaneSection | None:
+        """Return the section in which a position is, or which it has passed; None: there is none.
+
+        Arguments as those of `left_by`.
+        """
         found = None
         for section in self._by_lane[lane] if 0 <= lane < len(self._by_lane) else ():
             if section.from_m <= s_m:
                 found = section
-        if found is not None and found.exit and s_m >= found.to_m:
-            return found
-        return None if s_m < self._length_m else LaneSection(lane, to_m=self._length_m)
+        return found

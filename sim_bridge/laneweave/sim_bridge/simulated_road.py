@@ -10,7 +10,7 @@ in time, is decided elsewhere: `core.BridgeCore` waits for the agents, the fault
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Generic, TypeVar
+from typing import Generic
 
 import structlog
 
@@ -27,11 +27,9 @@ from laneweave.sim_bridge.road.caretakers import Caretakers
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.tick_answers import Answers
-from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from laneweave.sim_bridge.road.vehicle import RoadVehicle, VehicleT
 
 log = structlog.get_logger(__name__)
-
-VehicleT = TypeVar("VehicleT", bound=RoadVehicle)
 
 
 class SimulatedRoad(Generic[VehicleT]):
@@ -191,17 +189,25 @@ class SimulatedRoad(Generic[VehicleT]):
         self.tick += 1
 
     def departed(self) -> list[VehicleT]:
-        """Return the vehicles that have left by an exit, and have not been removed yet."""
-        return [
+        """Return the vehicles that have left and have not been removed yet.
+
+        They have passed an exit, or a simulator has taken them back before it.
+        """
+        left = [vehicle for vehicle in self.vehicles.values() if self._has_passed_exit(vehicle)]
+        return left + [
             vehicle
-            for vehicle in self.vehicles.values()
-            if self._exits.left_by(vehicle.body_lane, vehicle.state[0]) is not None
+            for vehicle in self._roadside.given_back(self.vehicles.values())
+            if vehicle not in left
         ]
+
+    def _has_passed_exit(self, vehicle: VehicleT) -> bool:
+        return self._exits.left_by(vehicle.body_lane, vehicle.state[0]) is not None
 
     def remove(self, vehicle: VehicleT) -> Iterator[Effect]:
         """Remove a vehicle that has left the road."""
         attended = vehicle.name not in self.caretakers
         self._record.on_left(vehicle, self.t_s, attended=attended)
         del self.vehicles[vehicle.name]
-        self._roadside.on_left(vehicle, self.vehicles, self.t_s)
+        still_in = None if self._has_passed_exit(vehicle) else vehicle.body_lane
+        self._roadside.on_left(vehicle, self.vehicles, self.t_s, still_in)
         yield from self.caretakers.leave(vehicle)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Protocol
 
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR, Name
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import ExactNeighbour, OtherBody, Pose
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import (
+    ExactNeighbour,
+    ExactNeighbours,
+    OtherBody,
+    Pose,
+)
 from laneweave.sim_bridge.recording.record_interface import Record
 from laneweave.sim_bridge.road.sized_bodies import bodies_of
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -36,7 +41,7 @@ class World(Protocol):
         """Return the pairs that the world itself reports as colliding."""
 
     def others(self) -> Sequence[OtherBody]:
-        """Return the bodies behind the exits, the nearest ones first."""
+        """Return the bodies of others on the road and behind its exits, the rearmost first."""
 
     def remove(self, vehicle: str) -> None:
         """Remove a vehicle from the road."""
@@ -68,9 +73,9 @@ def show_bodies(
         for name, vehicle in vehicles.items():
             ahead, behind = neighbours[name]
             ahead = _before_exits(vehicle, ahead, exits_m)
-            seen, touched = _behind_exits(vehicle, others, ahead, scenario)
-            neighbours[name] = seen, behind
-            touching += [(name, other) for other in touched]
+            in_sight = [*_in_sight(vehicle, others, exits_m)]
+            neighbours[name] = _with_others(vehicle, in_sight, (ahead, behind))
+            touching += [(name, other) for other in _touched(vehicle, in_sight, scenario)]
     for name, vehicle in vehicles.items():
         vehicle.perceive(neighbours[name])
     record.on_positions(
@@ -104,25 +109,45 @@ def _before_exits(
     ]
 
 
-def _behind_exits(
-    vehicle: RoadVehicle,
-    others: Sequence[OtherBody],
-    ahead: Sequence[ExactNeighbour],
-    scenario: Scenario,
-) -> tuple[list[ExactNeighbour], list[str]]:
-    """Return what a vehicle sees ahead, and the names of the bodies behind exits that it touches.
+def _in_sight(
+    vehicle: RoadVehicle, others: Sequence[OtherBody], exits_m: Sequence[tuple[int, float]]
+) -> Iterator[OtherBody]:
+    """Yield the bodies of others in lanes that do not end by an exit before them, or have ended."""
+    s_m = vehicle.state[0]
+    for other in others:
+        if s_m <= other.exit_m + EXIT_TOLERANCE_M and not any(
+            lane == other.lane and s_m <= at_m < other.exit_m for lane, at_m in exits_m
+        ):
+            yield other
 
-    The nearest body behind the exit of a lane is seen if there is none in the lane before.
-    """
+
+def _with_others(
+    vehicle: RoadVehicle, others: Sequence[OtherBody], neighbours: ExactNeighbours
+) -> ExactNeighbours:
+    """Return the nearest neighbours of a vehicle in each lane, bodies of others included."""
+    s_m = vehicle.state[0]
+    rear_m = s_m - vehicle.size[0]
+    ahead, behind = ({one[0]: one for one in side} for side in neighbours)
+    for other in others:
+        is_ahead = other.front_m > s_m
+        gap_m = other.rear_m - s_m if is_ahead else rear_m - other.front_m
+        side = ahead if is_ahead else behind
+        nearest = side.get(other.lane)
+        if nearest is None or gap_m < nearest[1]:
+            side[other.lane] = other.lane, gap_m, other.speed_mps, other.accel_mps2
+    return [*ahead.values()], [*behind.values()]
+
+
+def _touched(
+    vehicle: RoadVehicle, others: Sequence[OtherBody], scenario: Scenario
+) -> Iterator[str]:
+    """Yield the names of the bodies of others that a vehicle overlaps."""
     s_m, _, _, y_m, _, _ = vehicle.state
     first, last = scenario.lattice.lanes_touched(y_m, vehicle.size[1])
-    seen, touched = list(ahead), list[str]()
     for other in others:
-        if not s_m <= other.exit_m + EXIT_TOLERANCE_M:
-            continue
-        gap_m = other.rear_m - s_m
-        if first <= other.lane <= last and gap_m < 0.0:
-            touched.append(other.name)
-        if all(lane != other.lane for lane, _, _, _ in seen):
-            seen.append((other.lane, gap_m, other.speed_mps, other.accel_mps2))
-    return seen, touched
+        if (
+            first <= other.lane <= last
+            and other.rear_m < s_m
+            and other.front_m > s_m - vehicle.size[0]
+        ):
+            yield other.name

@@ -86,10 +86,11 @@ class KnownRoad:
         return tuple(vehicles.values()), blocked
 
     def section_ends_m(self) -> dict[int, float]:
-        """Return where sections end before vehicles without cells [m], by index."""
+        """Return where sections end before vehicles without cells or agents [m], by index."""
         ends_m: dict[int, float] = {}
         on_road = self.snapshot.census.on_road
         bodies = [entry.off_lattice for entry in on_road if entry.off_lattice is not None]
+        bodies += self.snapshot.census.ends
         for number, section in enumerate(self.scenario.geometry.sections):
             inside = [
                 body.rear_m

@@ -425,6 +425,8 @@ class Census(Message, frozen=True):
     """All blocks up to this number are closed: their vehicles are listed or have left."""
     bridge: Int64 = 0
     """Incarnation of the bridge [ns]; a new value means a new road; 0: not given."""
+    ends: tuple[OffLattice, ...] = ()
+    """Lanes that end earlier now for plans, since vehicles without agents are ahead."""
 
     @property
     def on_lattice(self) -> tuple[CensusEntry, ...]:

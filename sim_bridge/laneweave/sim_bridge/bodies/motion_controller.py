@@ -37,6 +37,7 @@ from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import (
+    ARRIVED_ACROSS_M,
     DISPLACED_ALONG_M,
     NEARLY_SETTLED_MPS,
     Jerk,
@@ -177,6 +178,13 @@ class MotionController:
         # Behind an exit the lane may belong to a ramp, to whose end the body does not come.
         cell = self.hold_cell[0], self._body_lane
         return self._lane_ends.has_passed(cell, t_s, body_m=self.measured[0])
+
+    @property
+    def keeps_lane(self) -> bool:
+        """Whether the body is in its lane, and no plan in force leads it out of its cell."""
+        across_m = self.measured[3] - self.lattice.cell_y_m(self.hold_cell[1])
+        owned = self.off_lattice is not None or self.hold_cell in self.store.certain_cells
+        return owned and abs(across_m) <= ARRIVED_ACROSS_M
 
     @property
     def _straddles(self) -> bool:

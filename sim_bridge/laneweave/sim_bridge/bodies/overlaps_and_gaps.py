@@ -39,17 +39,23 @@ _TOUCH_M = 1e-9
 
 @frozen
 class OtherBody:
-    """A body behind an exit or the end of the road, which the bridge does not drive."""
+    """A body in a lane of the road, or behind its exit, which the bridge does not drive."""
 
     name: str
     lane: int
-    """Lane that leads to it."""
+    """Lane in which it is, or that leads to it."""
     exit_m: float
     """Where this lane leaves the road; vehicles before see the body."""
     rear_m: float
     """Distance of its rear from the start of the road, along this lane."""
+    length_m: float
     speed_mps: float
     accel_mps2: float
+
+    @property
+    def front_m(self) -> float:
+        """Distance of its front from the start of the road, along this lane."""
+        return self.rear_m + self.length_m
 
 
 class MinGaps(NamedTuple):

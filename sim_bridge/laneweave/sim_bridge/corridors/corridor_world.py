@@ -18,6 +18,7 @@ from pathlib import Path
 from attrs import evolve, frozen
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.vehicle.motion import State
@@ -41,6 +42,8 @@ _PLANTS = {
 """Options with which SUMO displays bodies as the bridge drives them."""
 _OWN_SPEED_MODE, _OWN_LANE_CHANGES = 31, 1621
 """SUMO's defaults: it drives."""
+_LANE_CHANGES_OF_ROUTES = 0b011000000001
+"""The same without lane changes that its route does not require."""
 _SLOWING_MODE = 0b1011011
 """The same with a given speed: above the limits of lanes, and braking as hard as is necessary."""
 SLOWS_MPS2, SLOWS_S = 0.5, 5.0
@@ -94,6 +97,8 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         """Names in SUMO of vehicles that have been given back and have not arrived."""
         self._elsewhere: list[Arrival] = []
         """Vehicles that have arrived without coming to their entrances."""
+        self._inside: set[str] = set()
+        """Those of them that are still on the corridor, and change lanes for their routes only."""
         self._slowing: dict[str, _Slowing] = {}
         """Vehicles that slow down since a lower limit is ahead, by name."""
         entrances = {one.name for one in scenario.entrance}
@@ -161,7 +166,7 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         ]
 
     def others(self) -> Sequence[OtherBody]:
-        """Return SUMO's own vehicles behind the exits and the end of the road."""
+        """Return the vehicles that SUMO drives on the road and behind its exits."""
         if self._others is None:
             self._others = sorted(self._find_others(), key=lambda one: one.rear_m)
         return self._others
@@ -173,10 +178,11 @@ class CorridorWorld(SumoProcess, BodiesWorld):
             for vehicle in self.lane.getLastStepVehicleIDs(name):
                 if inside and vehicle in self._coming:
                     continue  # it is driven here, or on its way to its entrance
-                rear_m = api.getLanePosition(vehicle) - api.getLength(vehicle)
-                if from_m + rear_m <= exit_m + SEEN_BEYOND_M:
-                    speed_mps, accel_mps2 = api.getSpeed(vehicle), api.getAcceleration(vehicle)
-                    yield OtherBody(vehicle, lane, exit_m, from_m + rear_m, speed_mps, accel_mps2)
+                length_m = api.getLength(vehicle)
+                rear_m = from_m + api.getLanePosition(vehicle) - length_m
+                if rear_m <= exit_m + SEEN_BEYOND_M:
+                    motion = api.getSpeed(vehicle), api.getAcceleration(vehicle)
+                    yield OtherBody(vehicle, lane, exit_m, rear_m, length_m, *motion)
 
     def _is_outside(self, coming: CorridorArrival) -> bool:
         """Return whether SUMO drives a vehicle to its entrance."""
@@ -254,7 +260,8 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         super().remove(vehicle)
         name, api = self._sumo_name[vehicle], self.vehicle
         api.setSpeedMode(name, _OWN_SPEED_MODE)
-        api.setLaneChangeMode(name, _OWN_LANE_CHANGES)
+        api.setLaneChangeMode(name, _LANE_CHANGES_OF_ROUTES)
+        self._inside.add(name)
         api.setSpeedFactor(name, self._coming[name].origin.vehicle.speed_factor)
         del self._coming[name]
         self._returned.add(name)
@@ -310,8 +317,13 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         super().step()
         arrived = self.simulation.getArrivedIDList()
         self._returned.difference_update(arrived)
+        self._inside.difference_update(arrived)
         for name in arrived:
             self._slowing.pop(name, None)
+        edges = self._setup.found.corridor.edge_numbers
+        for name in [name for name in self._inside if api.getRoadID(name) not in edges]:
+            api.setLaneChangeMode(name, _OWN_LANE_CHANGES)
+            self._inside.remove(name)
 
     def drive_on(self) -> None:
         """Let SUMO drive on until the vehicles that it got back have arrived (statistics)."""
@@ -333,26 +345,22 @@ class CorridorWorld(SumoProcess, BodiesWorld):
 def _beyond(
     corridor: Corridor, scenario: Scenario
 ) -> Iterator[tuple[str, tuple[int, float, float]]]:
-    """Yield SUMO's lanes before and behind the exits: (name, (lane, exit, beginning of the lane)).
+    """Yield SUMO's lanes up to the exits and behind: (name, (lane, exit, beginning of the lane)).
 
     Positions are distances [m] from the start of the road, along the lane of the corridor. Those of
     exits are the scenario's, which are rounded.
     """
-    last, at_m = corridor.edges[-1], {one.name: one.at_m for one in scenario.exit}
-    exits = {
-        (one.from_edge, lane): at_m.get(one.name, one.at_m)
-        for one in corridor.ways_out
-        for lane in one.lanes
-    }
-    exits |= {(last.name, lane): corridor.length_m for lane in last.lanes}
+    exits = Exits(scenario.geometry.sections, scenario.road.length_m)
     for one in corridor.edges:
         for lane in one.edge.car_lanes:
-            number = one.first_lane + lane.index
-            exit_m = exits.get((one.name, number))
-            if exit_m is not None:
-                yield lane.name, (number, exit_m, one.to_m - lane.length_m)
-                for ahead, from_m in _ahead(corridor, lane, one.to_m, exit_m + SEEN_BEYOND_M):
-                    yield ahead, (number, exit_m, from_m)
+            number, from_m = one.first_lane + lane.index, one.to_m - lane.length_m
+            section = exits.section_at(number, 0.5 * (one.from_m + one.to_m))
+            if section is None or not section.exit:
+                continue
+            yield lane.name, (number, section.to_m, from_m)
+            until_m = section.to_m + SEEN_BEYOND_M if one.to_m >= section.to_m else one.to_m
+            for ahead, ahead_m in _ahead(corridor, lane, one.to_m, until_m):
+                yield ahead, (number, section.to_m, ahead_m)
 
 
 def _ahead(
@@ -360,14 +368,17 @@ def _ahead(
 ) -> Iterator[tuple[str, float]]:
     """Yield name and beginning of the lanes behind a lane that ends at a position.
 
-    They begin before `until_m`, and are no lanes of the corridor.
+    They begin before `until_m`, and are no lanes of the corridor's edges. Those across the junction
+    to the next edge of the corridor are among them.
     """
-    for link in corridor.network.links_from(lane) if end_m < until_m else ():
-        if link.target.edge in corridor.edge_numbers:
+    for link in corridor.network.links_from(lane):
+        leaves = link.target.edge not in corridor.edge_numbers
+        if leaves and end_m >= until_m:
             continue
         from_m = end_m
         for across in link.across:
             yield across.name, from_m
             from_m += across.length_m
-        yield link.target.name, from_m
-        yield from _ahead(corridor, link.target, from_m + link.target.length_m, until_m)
+        if leaves:
+            yield link.target.name, from_m
+            yield from _ahead(corridor, link.target, from_m + link.target.length_m, until_m)

@@ -20,12 +20,15 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
 from laneweave.protocol.vehicle.lane_ends import dead_ends
+from laneweave.protocol.wire.messages import OffLattice
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.corridors.exit_room import ExitRoom
+from laneweave.sim_bridge.corridors.hand_over import HandOver
 from laneweave.sim_bridge.corridors.settling import LONGEST_S, before_rest_s, fall_back, settling_s
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import OutsideTraffic
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter, EntryState
+from laneweave.sim_bridge.road.vehicle import VehicleT
 
 ADVICE_SHARE = 0.9
 """Share of its maximum acceleration with which a vehicle is expected to accelerate."""
@@ -117,6 +120,7 @@ class TakeOver(OutsideTraffic):
         }
         """Where moves out of each of these lanes have ended."""
         self._exit_room = ExitRoom(scenario)
+        self._hand_over = HandOver(scenario)
         self._occupied = set[Cell]()
         """Cells in which vehicles are, or to which they move."""
         self._known: dict[str, Arrival] = {}
@@ -169,8 +173,11 @@ class TakeOver(OutsideTraffic):
         return self._exit_room.release(coming, ahead, self._world.others)
 
     def full_lanes(self) -> set[int]:
-        """Return the lanes to whose start a vehicle is too close for another to enter before it."""
-        return {
+        """Return the lanes that no vehicle may enter at their start now.
+
+        A queue ahead leaves no room to brake, or a vehicle from upstream would come too close.
+        """
+        return self._hand_over.full_lanes(self._world.others()) | {
             lane
             for lane, at_m in self._at_m.items()
             if at_m <= 0.0
@@ -195,6 +202,14 @@ class TakeOver(OutsideTraffic):
                 column = admissions[-1].cell[0] - 1
                 del self._known[one.arrival.vehicle]
         return admissions
+
+    def given_back(self, vehicles: Iterable[VehicleT]) -> Iterable[VehicleT]:
+        """Return the vehicles that SUMO takes back before their exits; see `HandOver`."""
+        return self._hand_over.given_back(vehicles, self._world.others())
+
+    def plans_end(self) -> tuple[OffLattice, ...]:
+        """Return lanes with positions behind which no plan may lead a vehicle into them."""
+        return self._hand_over.plans_end(self._world.others())
 
     def is_stuck(self, t_s: float, *, moving: bool) -> bool:
         """Return whether all vehicles have stood for long in queues, and no more will come.

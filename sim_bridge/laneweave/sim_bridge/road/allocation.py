@@ -66,7 +66,11 @@ class BlockAllocation:
         """Assign no cells."""
 
     def on_left(
-        self, vehicle: RoadVehicle, vehicles: Mapping[Name, RoadVehicle], t_s: float
+        self,
+        vehicle: RoadVehicle,
+        vehicles: Mapping[Name, RoadVehicle],
+        t_s: float,
+        still_in: int | None,
     ) -> None:
         """Do nothing: vehicles own no cells."""
 
@@ -246,12 +250,16 @@ class CellAllocation:
         self._recent.append((column, lane, name))
 
     def on_left(
-        self, vehicle: RoadVehicle, vehicles: Mapping[Name, RoadVehicle], t_s: float
+        self,
+        vehicle: RoadVehicle,
+        vehicles: Mapping[Name, RoadVehicle],
+        t_s: float,
+        still_in: int | None,
     ) -> None:
         """Pass on the cells of a vehicle that has left the road.
 
         No later plan can contain it, so the cells that it owns whichever way its pending transfer
-        resolves can be assigned again.
+        resolves can be assigned again; those of the lane in which it is still driven are not.
         """
         lattice, certain = self._lattice, vehicle.controller.store.certain_cells
         self._lost |= {
@@ -272,8 +280,8 @@ class CellAllocation:
             return
         for column, lane in sorted(certain):
             s_m = lattice.cell_s_m(column, t_s)
-            if lane in self._shared_lanes and s_m < self._entry_m[lane]:
-                continue  # for vehicles on the ramp
+            if lane == still_in or (lane in self._shared_lanes and s_m < self._entry_m[lane]):
+                continue  # nobody must be led into it, or it is for vehicles on the ramp
             if s_m < self._length_m:
                 near = min(
                     on_lattice,

@@ -18,7 +18,7 @@ from laneweave.protocol.wire.messages import (
     RoadClock,
 )
 from laneweave.protocol.wire.topics import CENSUS, CLOCK
-from laneweave.sim_bridge.road.demand_queue import DemandQueue
+from laneweave.sim_bridge.road.demand_queue import DemandQueue, OutsideTraffic
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 CENSUS_EVERY_TICKS = 10
@@ -32,9 +32,11 @@ class CensusPublisher:
         bridge: int,
         demand: DemandQueue,
         off_lattice: Callable[[Mapping[Name, RoadVehicle]], Mapping[Name, OffLattice]],
+        outside: OutsideTraffic,
         closed_to: int,
     ) -> None:
         """Begin without vehicles; `bridge` is the incarnation of the bridge."""
+        self._outside = outside
         self._bridge = bridge
         self._demand = demand
         self._off_lattice = off_lattice
@@ -120,4 +122,5 @@ class CensusPublisher:
             formations=tuple(self._closed),
             closed_to=self._closed_to,
             bridge=self._bridge,
+            ends=self._outside.plans_end(),
         )

@@ -12,9 +12,10 @@ from itertools import chain
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.wire.messages import Announcement, Name
+from laneweave.protocol.wire.messages import Announcement, Name, OffLattice
 from laneweave.sim_bridge.road.demand import Arrival, count_until
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter
+from laneweave.sim_bridge.road.vehicle import VehicleT
 
 
 class OutsideTraffic:
@@ -69,6 +70,15 @@ class OutsideTraffic:
         """
         del t_s, meter, occupied
         return []
+
+    def given_back(self, vehicles: Iterable[VehicleT]) -> Iterable[VehicleT]:
+        """Return the vehicles on the road that the simulator takes back before their exits."""
+        del vehicles
+        return ()
+
+    def plans_end(self) -> tuple[OffLattice, ...]:
+        """Return lanes with positions behind which no plan may lead a vehicle into them."""
+        return ()
 
     def is_stuck(self, t_s: float, *, moving: bool) -> bool:
         """Return whether vehicles, of which some or none are `moving`, will not leave the road."""

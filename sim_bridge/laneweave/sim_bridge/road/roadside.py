@@ -17,7 +17,7 @@ from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, DemandQueue, OutsideTraffic
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter, Goals
 from laneweave.sim_bridge.road.lane_end_control import LaneEndChange, LaneEndControl
-from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from laneweave.sim_bridge.road.vehicle import RoadVehicle, VehicleT
 
 QUEUE_ROOM_M = 20.0
 """Spare distance behind a slow vehicle near the entrance, beyond that for the hardest braking."""
@@ -116,7 +116,7 @@ class Roadside:
         self._room = EntranceRoom(scenario)
         self.demand = DemandQueue(scenario, stream, self._meter, outside_traffic)
         self.publisher = CensusPublisher(
-            bridge, self.demand, self._lane_ends.bodies, self._allocation.closed_to
+            bridge, self.demand, self._lane_ends.bodies, outside_traffic, self._allocation.closed_to
         )
 
     def admit(
@@ -168,12 +168,23 @@ class Roadside:
         closed = [self._meter.closed_column(lane) + (lane in upstream) for lane in self._lanes]
         self._allocation.assign_empty_cells(vehicles, closed)
 
+    def given_back(self, vehicles: Iterable[VehicleT]) -> Sequence[VehicleT]:
+        """Return the vehicles that a simulator takes back before their exits."""
+        return [*self.outside.given_back(vehicles)]
+
     def on_left(
-        self, vehicle: RoadVehicle, vehicles: Mapping[Name, RoadVehicle], t_s: float
+        self,
+        vehicle: RoadVehicle,
+        vehicles: Mapping[Name, RoadVehicle],
+        t_s: float,
+        still_in: int | None = None,
     ) -> None:
-        """Count a vehicle that has left the road, and pass its cells on to those on the road."""
+        """Count a vehicle that has left the road, and pass its cells on to those on the road.
+
+        `still_in`: lane in which a simulator drives it on; its cells there are not passed on.
+        """
         self.publisher.on_changed(left=1)
-        self._allocation.on_left(vehicle, vehicles, t_s)
+        self._allocation.on_left(vehicle, vehicles, t_s, still_in)
 
     def publish(
         self, tick: int, t_s: float, on_road: Collection[RoadVehicle], *, ended: bool = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Self
+from typing import Self, TypeVar
 
 from attrs import define, evolve
 
@@ -158,3 +158,6 @@ class RoadVehicle:
     def step(self, tick: int) -> None:
         """Advance from `tick` to the next one."""
         self.controller.step(tick)
+
+
+VehicleT = TypeVar("VehicleT", bound=RoadVehicle)

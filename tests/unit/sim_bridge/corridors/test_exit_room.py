@@ -15,7 +15,7 @@ from laneweave.sim_bridge.corridors.exit_room import QUEUE_DECEL_MPS2, SPACE_M, 
 def body(scenario: Scenario, rear_m: float, speed_mps: float = 0.0, lane: int = 0) -> OtherBody:
     """Return a body behind the end of the exit's edge, 4 m after vehicles are given back."""
     exit_m = scenario.exit[0].at_m
-    return OtherBody("other", lane, exit_m, exit_m + 4.0 + rear_m, speed_mps, 0.0)
+    return OtherBody("other", lane, exit_m, exit_m + 4.0 + rear_m, 5.0, speed_mps, 0.0)
 
 
 def places(scenario: Scenario, *others: OtherBody, waiting: int = 0) -> int:

@@ -219,7 +219,7 @@ class Standing:
     def __init__(self, rear_m: float) -> None:
         """Let a body stand with its rear there."""
         self.at: dict[str, Pose] = {}
-        self.body = OtherBody("other", 0, EXIT_M, rear_m, 0.0, 0.0)
+        self.body = OtherBody("other", 0, EXIT_M, rear_m, 5.0, 0.0, 0.0)
 
     def place(self, vehicle: str, state: State) -> None:
         self.at[vehicle] = pose_of(state)

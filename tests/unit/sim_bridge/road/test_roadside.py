@@ -318,7 +318,7 @@ OFF_RAMP = {
 }
 
 
-QUEUE = OtherBody("queue", 0, 800.0, 801.0, 0.0, 0.0)
+QUEUE = OtherBody("queue", 0, 800.0, 801.0, 5.0, 0.0, 0.0)
 """It leaves no room behind the exit."""
 
 

@@ -1,0 +1,121 @@
+"""Where SUMO takes vehicles back: before the queue of a lane that leads out of a corridor.
+
+A vehicle would have to brake for what SUMO drives ahead of it: vehicles behind its exit or the end
+of the road, and those that were given back before. As long as it can still brake comfortably, it
+is given back, with its speed; the next one behind it follows when that one brakes, and so on. So
+the line at which vehicles are given back moves with the queue, lane by lane. Plans end before it,
+and nobody enters behind it.
+
+A vehicle in another lane than the one that it prefers is given back where it is, when it passes the
+line of either lane; SUMO decides on its further lane changes. docs/SAFETY.md says why others may go
+on with their plans meanwhile.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+
+from laneweave.protocol.road_layout import END_OF_ROAD, LaneSection, end_exit
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.wire.messages import OffLattice
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
+from laneweave.sim_bridge.corridors.corridor import DECEL_MPS2
+from laneweave.sim_bridge.corridors.exit_room import SPACE_M
+from laneweave.sim_bridge.road.vehicle import RoadVehicle, VehicleT
+
+REACTION_S = 0.5
+"""Time in which a vehicle that is given back keeps its speed."""
+PLANS_END_M = 15.0
+"""Distance by which a queue may grow before a move that is planned now has ended."""
+
+
+class HandOver:
+    """Decides which vehicles SUMO takes back before their exits."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Read the exits of a road."""
+        self._lattice = scenario.lattice
+        self._sections = tuple(one for one in scenario.geometry.sections if one.exit)
+        speed_mps = scenario.lattice.speed_mps
+        self._braking_m = SPACE_M + REACTION_S * speed_mps + _stops_m(speed_mps)
+        """Distance in which a vehicle at v_F stops comfortably behind another one."""
+
+    def lines_m(self, others: Iterable[OtherBody]) -> dict[LaneSection, float]:
+        """Return where vehicles at v_F have to brake, by section, if others are ahead."""
+        lines_m: dict[LaneSection, float] = {}
+        for other in others:
+            for section in self._sections:
+                if (section.lane, section.to_m) == (other.lane, other.exit_m):
+                    line_m = other.rear_m + _stops_m(other.speed_mps) - self._braking_m
+                    lines_m[section] = min(lines_m.get(section, math.inf), line_m)
+        return lines_m
+
+    def plans_end(self, others: Iterable[OtherBody]) -> tuple[OffLattice, ...]:
+        """Return lanes with positions behind which no plan may lead a vehicle into them."""
+        ends = [
+            OffLattice(section.lane, max(line_m - PLANS_END_M, section.from_m, 0.0))
+            for section, line_m in self.lines_m(others).items()
+            if line_m - PLANS_END_M < section.to_m
+        ]
+        return tuple(ends)
+
+    def full_lanes(self, others: Iterable[OtherBody]) -> set[int]:
+        """Return the lanes at whose start vehicles would have to brake at once."""
+        lines_m = self.lines_m(others)
+        return {one.lane for one, line_m in lines_m.items() if line_m < 0.0 >= one.from_m}
+
+    def given_back(
+        self, vehicles: Iterable[VehicleT], others: Sequence[OtherBody]
+    ) -> Iterator[VehicleT]:
+        """Yield the vehicles that SUMO takes back now."""
+        if not others:
+            return
+        lines_m = self.lines_m(others)
+        by_lane = {one.lane: line_m for one, line_m in lines_m.items() if _is_last(one)}
+        for vehicle in vehicles:
+            section = self._section_of(vehicle)
+            if section is None or not vehicle.controller.keeps_lane:
+                continue
+            arrival, s_m = vehicle.arrival, vehicle.state[0]
+            beside_m = by_lane.get(arrival.preferred_lane, math.inf)
+            misses = _is_last(section) and s_m >= beside_m and arrival.preferred_lane >= 0
+            if misses or self._has_to_brake(vehicle, section, others):
+                yield vehicle
+
+    def _section_of(self, vehicle: RoadVehicle) -> LaneSection | None:
+        """Return the section in which a vehicle is, if it may leave the road by its end."""
+        lane, s_m, destination = vehicle.body_lane, vehicle.state[0], vehicle.arrival.destination
+        for one in self._sections:
+            if one.lane == lane and one.from_m <= s_m <= one.to_m:
+                leaves = _is_last(one) if destination == END_OF_ROAD else one.exit == destination
+                return one if leaves else None
+        return None
+
+    def _has_to_brake(
+        self, vehicle: RoadVehicle, section: LaneSection, others: Iterable[OtherBody]
+    ) -> bool:
+        """Return whether a vehicle has to brake comfortably for another one ahead."""
+        s_m, speed_mps = vehicle.state[:2]
+        for other in others:
+            closing_mps = speed_mps - other.speed_mps
+            if (
+                (other.lane, other.exit_m) == (section.lane, section.to_m)
+                and other.front_m > s_m
+                and closing_mps > 0.0
+            ):
+                brakes_m = _stops_m(speed_mps) - _stops_m(other.speed_mps)
+                needed_m = SPACE_M + REACTION_S * closing_mps + brakes_m
+                if other.rear_m - s_m <= needed_m:
+                    return True
+        return False
+
+
+def _is_last(section: LaneSection) -> bool:
+    """Return whether a section ends with the road."""
+    return section.exit == end_exit(section.lane)
+
+
+def _stops_m(speed_mps: float) -> float:
+    """Return the distance in which a vehicle stops by braking comfortably."""
+    return speed_mps**2 / (2.0 * DECEL_MPS2)
