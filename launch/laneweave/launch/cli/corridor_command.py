@@ -14,7 +14,9 @@ from rich.table import Table
 from laneweave.protocol.errors import BadInputError
 
 if TYPE_CHECKING:
-    from laneweave.sim_bridge.corridors.corridor_search import Candidate
+    from collections.abc import Mapping, Sequence
+
+    from laneweave.sim_bridge.corridors.corridor_search import Approach, Candidate
     from laneweave.sim_bridge.corridors.sumo_corridor import SumoCorridor
     from laneweave.sim_bridge.corridors.sumo_simulation import TimeWindow
 
@@ -105,35 +107,73 @@ def corridor_tables(found: SumoCorridor, sumocfg: Path, window: TimeWindow) -> d
 
 def _list(sumocfg: Path, window: TimeWindow) -> None:
     from laneweave.sim_bridge.corridors.corridor_search import (
+        MIN_APPROACH_M,
         MIN_LANES,
         MIN_LENGTH_M,
         MIN_SPEED_MPS,
+        find_approaches,
         find_corridors,
     )
     from laneweave.sim_bridge.corridors.sumo_simulation import read_simulation
 
-    found = find_corridors(read_simulation(sumocfg, window))
-    if not found:
+    simulation = read_simulation(sumocfg, window)
+    approaches = find_approaches(simulation)
+    known = {one.name for one in approaches}
+    found = [one for one in find_corridors(simulation) if one.name not in known]
+    if not found and not approaches:
         raise BadInputError(
             "SUMOCFG",
             str(sumocfg),
             f"a network with a chain of edges of at least {MIN_LENGTH_M:g} m, with at least "
             f"{MIN_LANES} lanes for cars and a speed limit of at least {MIN_SPEED_MPS:g} m/s, "
-            "whose vehicles have priority; --corridor names shorter or slower ones",
+            f"whose vehicles have priority, or of {MIN_APPROACH_M:g} m before an intersection; "
+            "--corridor names shorter or slower ones",
         )
-    table = Table(title=f"corridors of {escape(sumocfg.name)}")
-    # Names are to be copied, however narrow the terminal is.
-    table.add_column("--corridor", min_width=max(len(one.name) for one in found))
-    for column in ("edges", "lanes", "m", "m/s", "ramps", "exits", "veh/h"):
-        table.add_column(column, justify="right")
-    for one in found:
-        table.add_row(escape(one.name), *_numbers(one))
     console = Console()
-    console.print(table)
-    for one in found:
-        remark = _remark(one, sumocfg, window)
+    if found:
+        numbers = {one.name: _numbers(one) for one in found}
+        columns = ("edges", "lanes", "m", "m/s", "ramps", "exits", "veh/h")
+        console.print(_table(f"corridors of {escape(sumocfg.name)}", columns, numbers))
+    if approaches:
+        numbers = {one.name: _approach_numbers(one) for one in approaches}
+        columns = ("lanes", "m", "control", "lanes to: veh/h", "veh/h", "worth it")
+        title = f"approaches of intersections in {escape(sumocfg.name)}"
+        console.print(_table(title, columns, numbers))
+    remarks = {one.name: one.problem for one in found}
+    for one in (*found, *approaches):
+        if one.found is not None:
+            remarks[one.name] = _remark(one.found, sumocfg, window)
+    for name, remark in remarks.items():
         if remark:
-            console.print(f"{escape(one.name)}: {escape(remark)}", soft_wrap=True)
+            console.print(f"{escape(name)}: {escape(remark)}", soft_wrap=True)
+
+
+def _table(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]) -> Table:
+    """Return a table of corridors; their names are to be copied, however narrow a terminal is."""
+    table = Table(title=title)
+    table.add_column("--corridor", min_width=max(map(len, rows)))
+    for column in columns:
+        text = column in ("control", "lanes to: veh/h", "worth it")
+        table.add_column(column, justify="left" if text else "right", no_wrap=text)
+    for name, cells in rows.items():
+        table.add_row(escape(name), *map(escape, cells))
+    return table
+
+
+def _approach_numbers(one: Approach) -> tuple[str, ...]:
+    corridor = one.found.corridor
+    turns = [
+        f"{' '.join(map(str, turn.lanes))} to {turn.edge}: {turn.volume_veh_per_h:.0f}"
+        for turn in one.turns
+    ]
+    return (
+        f"{corridor.lanes}",
+        f"{corridor.length_m:.0f}",
+        one.control,
+        "\n".join(turns),
+        f"{one.found.volume_veh_per_h:.0f}",
+        f"{'yes' if one.is_worth_it else 'hardly'}, {one.used_share:.0%} full",
+    )
 
 
 def _numbers(one: Candidate) -> tuple[str, ...]:
@@ -151,15 +191,13 @@ def _numbers(one: Candidate) -> tuple[str, ...]:
     )
 
 
-def _remark(one: Candidate, sumocfg: Path, window: TimeWindow) -> str:
+def _remark(found: SumoCorridor, sumocfg: Path, window: TimeWindow) -> str:
     """Return why laneweave cannot drive a corridor, or what it does not use."""
-    if one.found is None:
-        return one.problem
     try:
-        corridor_tables(one.found, sumocfg, window)
+        corridor_tables(found, sumocfg, window)
     except BadInputError as error:
         return str(error)
-    unused = len(one.found.corridor.unused)
+    unused = len(found.corridor.unused)
     return f"{unused} ways not used" if unused else ""
 
 

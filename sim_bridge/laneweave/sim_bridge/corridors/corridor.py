@@ -35,6 +35,10 @@ MIN_AT_M = 1.0
 HANDOVER_M = 4.0
 """Distance before the end of an edge at which vehicles are given back to SUMO, if they need not
 give way behind it."""
+POCKET_S = 5.0
+"""Time at v_F before the end of the corridor, and `POCKET_M`, from which on no vehicle changes into
+a lane that opens there: SUMO drives into these turn pockets."""
+POCKET_M = 15.0
 SPEED_SHARE = 0.9
 """v_F as a share of the speed limit: vehicles that move to a cell ahead are faster."""
 MAX_SPEED_MPS = 60.0
@@ -127,7 +131,8 @@ class Corridor:
     ramps: tuple[Ramp, ...] = ()
     ways_out: tuple[WayOut, ...] = ()
     lanes_to: Mapping[str, tuple[int, ...]] = NO_LANES
-    """The lanes at its end that lead to each edge behind it; empty: every lane leads to all."""
+    """The lanes at its end that lead to each edge behind it, or that are next to a turn pocket that
+    does; empty: every lane leads to all."""
     unused: tuple[str, ...] = ()
     """Ways into the corridor and out of it that vehicles cannot use, in words."""
 
@@ -274,6 +279,17 @@ class _OpenPart:
         """Where it ends."""
         return self.edges[-1].to_m
 
+    def ends_with(self, edge: Edge) -> bool:
+        """Return whether it reaches the end of an edge."""
+        return self.edges[-1].edge is edge
+
+
+def _nearest_lanes(lanes: Sequence[int], open_lanes: Collection[int]) -> tuple[int, ...]:
+    """Return the open ones of some lanes; if there are none, those nearest to them."""
+    usable = open_lanes or lanes
+    away = {lane: min(abs(lane - one) for one in lanes) for lane in usable}
+    return tuple(sorted(lane for lane in usable if away[lane] == min(away.values())))
+
 
 class _Derivation:
     """The derivation of one corridor."""
@@ -308,22 +324,28 @@ class _Derivation:
                 raise BadInputError(OPTION, f"{first.name}:{last.name}", f"{allowed} corridor")
         ways_out = tuple(self._ways_out(parts))
         links = [link for lane in last.car_lanes for link in self._network.links_from(lane)]
+        length_m = self._given_back_m(self._edges[-1], links)
+        pockets_m = length_m - POCKET_M - POCKET_S * SPEED_SHARE * self._limit_mps
+        parts = [part for part in parts if part.from_m <= max(pockets_m, 0.0)]
         return Corridor(
             network=self._network,
             edges=self._edges,
             lanes=lanes,
-            length_m=self._given_back_m(self._edges[-1], links),
+            length_m=length_m,
             lane_width_m=min(lane.width_m for one in self._edges for lane in one.edge.car_lanes),
             speed_mps=self._limit_mps,
             closures=tuple(self._closures(parts, lanes, ramps, ways_out)),
             ramps=ramps,
             ways_out=ways_out,
-            lanes_to=self._lanes_to(),
+            lanes_to=self._lanes_to({part.lane for part in parts if part.ends_with(last)}),
             unused=tuple(self._unused),
         )
 
-    def _lanes_to(self) -> Mapping[str, tuple[int, ...]]:
-        """Return which lanes of the last edge lead to each edge behind it; none if all do."""
+    def _lanes_to(self, open_lanes: Collection[int]) -> Mapping[str, tuple[int, ...]]:
+        """Return which lanes at the end lead to each edge behind it; none if all do.
+
+        For an edge to which turn pockets alone lead, the lanes nearest to them count.
+        """
         last = self._edges[-1]
         found: dict[str, list[int]] = {}
         for lane in last.edge.car_lanes:
@@ -331,7 +353,7 @@ class _Derivation:
                 found.setdefault(edge, []).append(last.first_lane + lane.index)
         if all(len(lanes) == len(last.edge.car_lanes) for lanes in found.values()):
             return NO_LANES
-        return {edge: tuple(lanes) for edge, lanes in sorted(found.items())}
+        return {edge: _nearest_lanes(lanes, open_lanes) for edge, lanes in sorted(found.items())}
 
     def _given_back_m(self, edge: CorridorEdge, links: Sequence[Link]) -> float:
         """Return where vehicles are given back on an edge, before links that lead out of it.

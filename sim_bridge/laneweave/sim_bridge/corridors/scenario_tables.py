@@ -317,7 +317,7 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
             round(max(ramps_m[name], 0.0), 1),
             f"at least {MIN_SETTLE_S * speed_mps:g} m, for {speed_mps:g} m/s",
         )
-    formation |= {"gap_m": float(pitch_m), "settle_s": math.floor(10.0 * settle_s) / 10.0}
+    formation |= {"gap_m": float(pitch_m)}
     found = structure({"formation": formation, **kinds}, Scenario)
     for own in found.types.values():
         try:
@@ -330,7 +330,14 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
             raise BadInputError(
                 field, max_accel_mps2, f"more, for {speed_mps:g} m/s: {error}"
             ) from error
-    return formation | {"cycle_s": _cycle_s(found, corridor)}
+    cycle_s = _cycle_s(found, corridor)
+    # A short approach leaves the room for its lane changes.
+    advance_m = speed_mps * cycle_s
+    moves_m = max((corridor.lanes - 1) * advance_m, found.formation.longest_m + advance_m)
+    room_m = corridor.length_m - moves_m - found.types.longest_body_m
+    settle_s = max(MIN_SETTLE_S, min(settle_s, room_m / speed_mps))
+    settle_s = math.floor(10.0 * settle_s) / 10.0
+    return formation | {"settle_s": settle_s, "cycle_s": cycle_s}
 
 
 def _cycle_s(scenario: Scenario, corridor: Corridor) -> float:
@@ -355,6 +362,10 @@ def _cycle_s(scenario: Scenario, corridor: Corridor) -> float:
         0.5 * (corridor.ends_m(ramp.lane, ramp.merge_m) - ramp.merge_m - needed_m)
         for ramp in corridor.ramps
     ]
-    longest_s = min(rooms_m, default=math.inf) / scenario.formation.speed_mps
+    speed_mps = scenario.formation.speed_mps
+    if corridor.lanes_to:
+        room_m = corridor.length_m - MIN_SETTLE_S * speed_mps - scenario.types.longest_body_m
+        rooms_m.append(0.5 * room_m / (corridor.lanes - 1))
+    longest_s = min(rooms_m, default=math.inf) / speed_mps
     steps = math.floor(min(longest_s, SHORTEST_CYCLE_S) / CYCLE_STEP_S + 1e-9)
     return round(max(CYCLE_STEP_S * steps, shortest_s), 1)

@@ -83,6 +83,8 @@ class Link:
     state: str = _HAS_PRIORITY
     """SUMO's letter for the right of way."""
     traffic_light: str = ""
+    green_share: float = 1.0
+    """Share of the time in which the traffic light is green."""
 
     @property
     def length_m(self) -> float:
@@ -179,9 +181,11 @@ def _lane(sumo: SumoProcess, name: str) -> Lane:
 def _links(sumo: SumoProcess, edges: Mapping[str, Edge]) -> Iterator[Link]:
     """Yield the links of all edges that cars may use."""
     lights = {
-        (origin, target): light
+        (origin, target): (light, share)
         for light in sumo.trafficlight.getIDList()
-        for links in sumo.trafficlight.getControlledLinks(light)
+        for links, share in zip(
+            sumo.trafficlight.getControlledLinks(light), _green_shares(sumo, light), strict=False
+        )
         for origin, target, _ in links
     }
     for edge in edges.values():
@@ -190,8 +194,30 @@ def _links(sumo: SumoProcess, edges: Mapping[str, Edge]) -> Iterator[Link]:
                 name, _, index = to.rpartition("_")
                 if name in edges and edges[name].lanes[int(index)].allows(CARS):
                     across = tuple(_across(sumo, via))
-                    light = lights.get((origin.name, to), "")
-                    yield Link(origin, edges[name].lanes[int(index)], across, state, light)
+                    light, share = lights.get((origin.name, to), ("", 1.0))
+                    target = edges[name].lanes[int(index)]
+                    yield Link(origin, target, across, state, light, share)
+
+
+def _green_shares(sumo: SumoProcess, light: str) -> Sequence[float]:
+    """Return for each link of a traffic light how much of the time it is green."""
+    api = sumo.trafficlight
+    current = api.getProgram(light)
+    phases = [
+        (phase.duration, phase.state)
+        for program in api.getAllProgramLogics(light)
+        if program.programID == current
+        for phase in program.phases
+    ]
+    cycle_s = sum(duration_s for duration_s, _ in phases)
+    if cycle_s <= 0.0:
+        return [1.0] * len(api.getControlledLinks(light))
+    states = zip(*(state for _, state in phases), strict=True)
+    return [
+        sum(duration_s for (duration_s, _), one in zip(phases, link, strict=True) if one in "Gg")
+        / cycle_s
+        for link in states
+    ]
 
 
 def _across(sumo: SumoProcess, via: str) -> Iterator[Lane]:
