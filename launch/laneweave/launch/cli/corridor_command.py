@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from laneweave.sim_bridge.corridors.sumo_corridor import SumoCorridor
     from laneweave.sim_bridge.corridors.sumo_simulation import TimeWindow
 
+TURNS = "lanes to edge: veh/h"
+"""Title of a column: the lanes that lead to each edge behind an approach, and their volume."""
 MAX_BEGIN_S = 1e9
 MAX_SCALE = 1e3
 CORRIDOR_HELP = "The corridor's first and last edge."
@@ -131,18 +133,19 @@ def _list(sumocfg: Path, window: TimeWindow) -> None:
         )
     console = Console()
     if found:
-        numbers = {one.name: _numbers(one) for one in found}
-        columns = ("edges", "lanes", "m", "m/s", "ramps", "exits", "veh/h")
-        console.print(_table(f"corridors of {escape(sumocfg.name)}", columns, numbers))
+        rows = {one.name: _numbers(one) for one in found}
+        title = f"corridors of {escape(sumocfg.name)}"
+        columns = "edges", "lanes", "m", "m/s", "ramps", "exits", "veh/h"
+        console.print(_table(title, columns, rows))
     if approaches:
-        numbers = {one.name: _approach_numbers(one) for one in approaches}
-        columns = ("lanes", "m", "control", "lanes to: veh/h", "veh/h", "worth it")
+        rows = {one.name: _approach_numbers(one) for one in approaches}
+        approach_columns = ("lanes", "m", "control", TURNS, "worth it")
         title = f"approaches of intersections in {escape(sumocfg.name)}"
-        console.print(_table(title, columns, numbers))
+        console.print(_table(title, approach_columns, rows))
     remarks = {one.name: one.problem for one in found}
-    for one in (*found, *approaches):
-        if one.found is not None:
-            remarks[one.name] = _remark(one.found, sumocfg, window)
+    corridors = [one.found for one in found if one.found is not None]
+    for each in (*corridors, *(one.found for one in approaches)):
+        remarks[each.corridor.name] = _remark(each, sumocfg, window)
     for name, remark in remarks.items():
         if remark:
             console.print(f"{escape(name)}: {escape(remark)}", soft_wrap=True)
@@ -153,14 +156,14 @@ def _table(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]
     table = Table(title=title)
     table.add_column("--corridor", min_width=max(map(len, rows)))
     for column in columns:
-        text = column in ("control", "lanes to: veh/h", "worth it")
+        text = column in ("control", TURNS, "worth it")
         table.add_column(column, justify="left" if text else "right", no_wrap=text)
     for name, cells in rows.items():
         table.add_row(escape(name), *map(escape, cells))
     return table
 
 
-def _approach_numbers(one: Approach) -> tuple[str, ...]:
+def _approach_numbers(one: Approach) -> Sequence[str]:
     corridor = one.found.corridor
     turns = [
         f"{' '.join(map(str, turn.lanes))} to {turn.edge}: {turn.volume_veh_per_h:.0f}"
@@ -171,12 +174,11 @@ def _approach_numbers(one: Approach) -> tuple[str, ...]:
         f"{corridor.length_m:.0f}",
         one.control,
         "\n".join(turns),
-        f"{one.found.volume_veh_per_h:.0f}",
-        f"{'yes' if one.is_worth_it else 'hardly'}, {one.used_share:.0%} full",
+        f"{'yes' if one.is_worth_it else 'hardly'}, {one.used_share:.0%}",
     )
 
 
-def _numbers(one: Candidate) -> tuple[str, ...]:
+def _numbers(one: Candidate) -> Sequence[str]:
     if one.found is None:
         return ("",) * 7
     corridor = one.found.corridor
