@@ -161,6 +161,34 @@ def test_at_a_fork_everybody_is_in_a_lane_that_leads_to_the_next_edge(
         assert trip["final_lane"] in leads_to[turns[int(trip["sumo_id"][1:]) % 3]]
 
 
+@pytest.mark.parametrize("origin", ["", "upstream "])
+def test_sumo_takes_vehicles_back_before_the_queue_of_their_lane(
+    tmp_path: Path, origin: str
+) -> None:
+    """The queue reaches 200 m back into the lane that turns left; the others drive past it."""
+    stands = (
+        '<vehicle id="stands" type="car" depart="0" departPos="5"><route edges="left"/>'
+        '<stop lane="left_0" endPos="10" duration="110"/></vehicle>'
+    )
+    turns = ["left", "left", "ahead"]
+    vehicles = [vehicle(f"v{n}", n, origin + turns[n % 3]) for n in range(36)]
+    config = write_interchange(tmp_path, [stands, *vehicles], network=FORK)
+    summary, _ = drive(scenario_of(config, "main1:main1"), tmp_path / "run")
+    assert summary["vehicles"]["on_preferred_lane"] == summary["vehicles"]["demanded"] == 36
+    safety = summary["safety"]
+    assert safety["overlaps"] == safety["sumo_collisions"] == safety["hard_brakes"] == 0
+    left, ahead = [], []
+    last = {one["vehicle"]: one["s_m"] for one in read_trajectories(tmp_path / "run").to_pylist()}
+    for name, trip in read_trips(tmp_path / "run").items():
+        turn = turns[int(trip["sumo_id"][1:]) % 3]
+        (left if turn == "left" else ahead).append((last[name], trip["travel_time_s"]))
+    # Those that turn left are given back one after another, each farther back than the one before.
+    assert [s_m for s_m, _ in left] == sorted((s_m for s_m, _ in left), reverse=True)
+    assert left[-1][0] < left[0][0] - 150.0
+    assert all(s_m > 850.0 for s_m, _ in ahead)
+    assert max(time_s for _, time_s in ahead) < 1.15 * min(time_s for _, time_s in ahead)
+
+
 @pytest.mark.more
 def test_a_vehicle_that_never_comes_to_the_corridor_is_counted(tmp_path: Path) -> None:
     stands = (

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 
-from laneweave.protocol.road_layout import END_OF_ROAD, LaneSection, end_exit
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, end_exit
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import OffLattice
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
@@ -77,9 +77,9 @@ class HandOver:
             section = self._section_of(vehicle)
             if section is None or not vehicle.controller.keeps_lane:
                 continue
-            arrival, s_m = vehicle.arrival, vehicle.state[0]
-            beside_m = by_lane.get(arrival.preferred_lane, math.inf)
-            misses = _is_last(section) and s_m >= beside_m and arrival.preferred_lane >= 0
+            wanted, s_m = vehicle.arrival.preferred_lane, vehicle.state[0]
+            beside = _is_last(section) and wanted not in (section.lane, ANY_LANE)
+            misses = beside and s_m >= by_lane.get(wanted, math.inf)
             if misses or self._has_to_brake(vehicle, section, others):
                 yield vehicle
 

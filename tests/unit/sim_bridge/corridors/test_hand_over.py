@@ -1,0 +1,134 @@
+"""Which vehicles SUMO takes back before the queue in their lane, and where plans end."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import pytest
+from attrs import evolve
+
+from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.protocol.wire.messages import Ballot, Name, PendingTransfer
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
+from laneweave.sim_bridge.bodies.plant import Plant
+from laneweave.sim_bridge.corridors.corridor import DECEL_MPS2
+from laneweave.sim_bridge.corridors.exit_room import SPACE_M
+from laneweave.sim_bridge.corridors.hand_over import PLANS_END_M, REACTION_S, HandOver
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.road_vehicles import vehicle_in
+
+APPROACH = parse_scenario(
+    {
+        "road": {"lanes": 3, "s1_m": 100.0, "s2_m": 0.0, "s3_m": 300.0},
+        "formation": {"operation": "rolling", "speed_mps": 12.5, "gap_m": 15.0},
+    }
+)
+END_M = APPROACH.road.length_m
+SPEED_MPS = APPROACH.lattice.speed_mps
+NEEDED_M = SPACE_M + REACTION_S * SPEED_MPS + SPEED_MPS**2 / (2.0 * DECEL_MPS2)
+"""Distance in which a vehicle stops comfortably behind one that stands."""
+CELL: Cell = (2, 1)
+
+
+def other(rear_m: float, speed_mps: float = 0.0, lane: int = 1) -> OtherBody:
+    return OtherBody("other", lane, END_M, rear_m, 5.0, speed_mps, 0.0)
+
+
+def vehicle(cell: Cell = CELL, preferred_lane: int | None = None) -> RoadVehicle:
+    """Return a vehicle at rest in its cell."""
+    found = vehicle_in(cell, scenario=APPROACH)
+    found.controller.enter_lattice([cell])
+    if preferred_lane is not None:
+        arrival = evolve(found.arrival, preferred_lane=preferred_lane)
+        found.admission = evolve(found.admission, arrival=arrival)
+    return found
+
+
+def is_given_back(one: RoadVehicle, *others: OtherBody) -> bool:
+    return [*HandOver(APPROACH).given_back([one], others)] == [one]
+
+
+def test_a_vehicle_is_given_back_while_it_can_still_brake_comfortably() -> None:
+    one = vehicle()
+    s_m = one.state[0]
+    assert not is_given_back(one)
+    assert is_given_back(one, other(s_m + NEEDED_M - 0.1))
+    assert not is_given_back(one, other(s_m + NEEDED_M + 0.1))
+    # Neither a queue beside it nor one behind it matters.
+    assert not is_given_back(one, other(s_m + 10.0, lane=0), other(s_m - 40.0))
+
+
+@dataclass
+class _Ahead:
+    speed_mps: float
+    gap_m: float
+
+
+@pytest.mark.parametrize(
+    ("ahead", "due"),
+    [
+        # As fast as it: the usual gap in the lattice is enough.
+        (_Ahead(SPEED_MPS, 10.0), False),
+        (_Ahead(SPEED_MPS + 2.0, 4.0), False),
+        (_Ahead(SPEED_MPS - 0.5, 10.0), False),
+        # It has begun to brake.
+        (_Ahead(SPEED_MPS - 2.5, 10.0), True),
+        (_Ahead(SPEED_MPS - 2.5, 20.0), False),
+    ],
+)
+def test_one_follows_the_other_when_that_one_brakes(ahead: _Ahead, *, due: bool) -> None:
+    one = vehicle()
+    assert is_given_back(one, other(one.state[0] + ahead.gap_m, ahead.speed_mps)) == due
+
+
+def test_the_line_moves_with_the_queue_lane_by_lane() -> None:
+    hand_over = HandOver(APPROACH)
+    queues = [other(300.0), other(250.0), other(390.0, lane=2)]
+    lines_m = {one.lane: line_m for one, line_m in hand_over.lines_m(queues).items()}
+    assert lines_m == pytest.approx({1: 250.0 - NEEDED_M, 2: 390.0 - NEEDED_M})
+    moving_m = 8.0**2 / (2.0 * DECEL_MPS2)
+    ((_, line_m),) = hand_over.lines_m([other(250.0, 8.0)]).items()
+    assert line_m == pytest.approx(250.0 + moving_m - NEEDED_M)
+    ends = {one.lane: one.rear_m for one in hand_over.plans_end(queues)}
+    assert ends == pytest.approx({lane: line_m - PLANS_END_M for lane, line_m in lines_m.items()})
+    # A queue far behind the end ends no plans.
+    assert not hand_over.plans_end([other(END_M + NEEDED_M + PLANS_END_M + 1.0)])
+
+
+def test_nobody_enters_a_lane_whose_queue_reaches_the_start() -> None:
+    hand_over = HandOver(APPROACH)
+    assert hand_over.full_lanes([other(NEEDED_M - 1.0), other(NEEDED_M + 1.0, lane=0)]) == {1}
+    ((end),) = hand_over.plans_end([other(10.0)])
+    assert end.rear_m == 0.0
+
+
+def test_one_in_a_wrong_lane_is_given_back_at_the_line_of_either_lane() -> None:
+    one = vehicle(preferred_lane=2)
+    s_m = one.state[0]
+    assert is_given_back(one, other(s_m + NEEDED_M - 0.1, lane=2))
+    assert is_given_back(one, other(s_m + NEEDED_M - 0.1))
+    assert not is_given_back(one, other(s_m + NEEDED_M - 0.1, lane=0))
+
+
+def test_one_that_leaves_its_cell_by_a_plan_in_force_is_not_given_back() -> None:
+    """Another one may be led into its cell."""
+    one = vehicle()
+    queue = other(one.state[0] + 20.0)
+    assert is_given_back(one, queue)
+    ballot = Ballot(1, Name("c1"), 1, 1)
+    one.controller.store.store_promise(ballot)
+    moves = PendingTransfer(ballot, before=(CELL,), after=((2, 2),), roster=(Name("A"),))
+    one.controller.store.begin_transfer(moves)
+    assert not is_given_back(one, queue)
+
+
+def test_one_between_two_lanes_is_not_given_back() -> None:
+    one = vehicle()
+    rest = cell_state(APPROACH.lattice, CELL, 0.0)
+    between = (*rest[:3], rest[3] + 1.0, *rest[4:])
+    one.controller.plant = Plant(between, APPROACH.vehicle, APPROACH.runtime.tick_s)
+    assert not is_given_back(one, other(one.state[0] + 20.0))
+    assert math.isclose(one.state[3] - rest[3], 1.0)
