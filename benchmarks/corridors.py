@@ -18,7 +18,7 @@ from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
-from laneweave.sim_bridge.corridors.corridor_search import find_corridors
+from laneweave.sim_bridge.corridors.corridor_search import find_approaches, find_corridors
 from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
 from laneweave.sim_bridge.corridors.sumo_simulation import TimeWindow, read_simulation
 
@@ -43,7 +43,8 @@ def driven(file: Path, name: str, window: TimeWindow) -> str:
     return (
         f"{found.corridor.length_m:.0f} m, {found.corridor.lanes} lanes; "
         f"{safety.overlaps} overlaps, {safety.sumo_collisions} collisions, "
-        f"{vehicles.missed_exits} missed exits, {vehicles.stopped_at_lane_end} stopped at the end "
+        f"{vehicles.missed_exits} missed exits, {vehicles.on_preferred_lane} of {vehicles.left} in "
+        f"a right lane, {vehicles.stopped_at_lane_end} stopped at the end "
         f"of a lane, {safety.hard_brakes} braked hard, lowest {safety.min_accel_mps2} m/s2, left "
         f"out {dict(vehicles.left_out or {})}; laneweave and SUMO alone: {trips}"
     )
@@ -53,12 +54,13 @@ def lines(file: Path, names: Sequence[str], window: TimeWindow) -> Iterator[str]
     """Yield a line for each corridor of a simulation, or why it cannot be read."""
     try:
         simulation = read_simulation(file, window)
-        candidates = find_corridors(simulation)
+        found = [one.name for one in find_corridors(simulation)]
+        found += [one.name for one in find_approaches(simulation)]
     except (BadInputError, CommandFailedError) as error:
         yield f"refused: {error}"
         return
-    yield f"{len(simulation.network.edges)} edges, {len(candidates)} chains of edges"
-    for name in names or [one.name for one in candidates]:
+    yield f"{len(simulation.network.edges)} edges, {len({*found})} chains of edges"
+    for name in names or dict.fromkeys(found):
         try:
             yield f"{name}: {driven(file, name, window)}"
         except (BadInputError, CommandFailedError) as error:

@@ -177,16 +177,18 @@ def test_sumo_takes_vehicles_back_before_the_queue_of_their_lane(
     assert summary["vehicles"]["on_preferred_lane"] == summary["vehicles"]["demanded"] == 36
     safety = summary["safety"]
     assert safety["overlaps"] == safety["sumo_collisions"] == safety["hard_brakes"] == 0
-    left, ahead = [], []
+    found: dict[str, list[tuple[float, float]]] = {"left": [], "ahead": []}
     last = {one["vehicle"]: one["s_m"] for one in read_trajectories(tmp_path / "run").to_pylist()}
     for name, trip in read_trips(tmp_path / "run").items():
         turn = turns[int(trip["sumo_id"][1:]) % 3]
-        (left if turn == "left" else ahead).append((last[name], trip["travel_time_s"]))
+        found[turn].append((last[name], trip["travel_time_s"]))
     # Those that turn left are given back one after another, each farther back than the one before.
-    assert [s_m for s_m, _ in left] == sorted((s_m for s_m, _ in left), reverse=True)
-    assert left[-1][0] < left[0][0] - 150.0
-    assert all(s_m > 850.0 for s_m, _ in ahead)
-    assert max(time_s for _, time_s in ahead) < 1.15 * min(time_s for _, time_s in ahead)
+    lines_m = [s_m for s_m, _ in found["left"]]
+    assert lines_m == sorted(lines_m, reverse=True)
+    assert lines_m[-1] < lines_m[0] - 150.0
+    assert all(s_m > 850.0 for s_m, _ in found["ahead"])
+    times_s = [time_s for _, time_s in found["ahead"]]
+    assert max(times_s) < 1.15 * min(times_s)
 
 
 @pytest.mark.more

@@ -10,7 +10,7 @@ in time, is decided elsewhere: `core.BridgeCore` waits for the agents, the fault
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Generic
+from typing import Generic, TypeVar
 
 import structlog
 
@@ -27,9 +27,11 @@ from laneweave.sim_bridge.road.caretakers import Caretakers
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.tick_answers import Answers
-from laneweave.sim_bridge.road.vehicle import RoadVehicle, VehicleT
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 log = structlog.get_logger(__name__)
+
+VehicleT = TypeVar("VehicleT", bound=RoadVehicle)
 
 
 class SimulatedRoad(Generic[VehicleT]):

@@ -82,10 +82,7 @@ class PendingTransfer(Message, frozen=True):
 
     @property
     def withdrawn(self) -> bool:
-        """Whether the vehicle has left the lattice since; cells and roster are then empty.
-
-        For this ballot and all lower ones, the vehicle is gone.
-        """
+        """Whether the vehicle has left the lattice, and is gone for this and all lower ballots."""
         return not self.open and not self.roster
 
     @property

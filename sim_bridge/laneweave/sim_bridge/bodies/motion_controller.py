@@ -182,9 +182,9 @@ class MotionController:
     @property
     def keeps_lane(self) -> bool:
         """Whether the body is in its lane, and no plan in force leads it out of its cell."""
-        across_m = self.measured[3] - self.lattice.cell_y_m(self.hold_cell[1])
-        owned = self.off_lattice is not None or self.hold_cell in self.store.certain_cells
-        return owned and abs(across_m) <= ARRIVED_ACROSS_M
+        if self.off_lattice is None and self.hold_cell not in self.store.certain_cells:
+            return False
+        return abs(self.measured[3] - self.lattice.cell_y_m(self.hold_cell[1])) <= ARRIVED_ACROSS_M
 
     @property
     def _straddles(self) -> bool:
@@ -401,7 +401,7 @@ class MotionController:
         if self._scenario.formation.change_columns:
             return False
         speed_mps, touching_s = self.measured[1], BEFORE_ENTERING * self._scenario.timing.move_s
-        for other in self.neighbours[1]:
+        for other in self.neighbours.behind:
             if other.lane != lane or other.speed_mps < self.lattice.speed_mps + CATCHING_UP_MPS:
                 continue
             closes_m = max(0.0, other.speed_mps - speed_mps) * touching_s
@@ -434,8 +434,7 @@ class MotionController:
         stays_in_lane = self._must_stay_in_lane(tick)
         if 0 <= index < len(self._jerks) and not stays_in_lane:
             return FallbackLevel.EXECUTE, (self._jerks[index], self._jerks[index + 1])
-        limits, speed_mps = self._limits, self.lattice.speed_mps
-        body = self.measured
+        limits, speed_mps, body = self._limits, self.lattice.speed_mps, self.measured
         state = commanded_state(body, self.plant.setpoint, limits, speed_mps)
         goal = cell_state(self.lattice, self.hold_cell, tick * self.tick_s)
         if self.off_lattice is OffLatticePhase.WAITING:

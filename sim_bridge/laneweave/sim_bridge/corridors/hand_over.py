@@ -22,7 +22,7 @@ from laneweave.protocol.wire.messages import OffLattice
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.corridors.corridor import DECEL_MPS2
 from laneweave.sim_bridge.corridors.exit_room import SPACE_M
-from laneweave.sim_bridge.road.vehicle import RoadVehicle, VehicleT
+from laneweave.sim_bridge.road.demand_queue import OnRoad, OnRoadT
 
 REACTION_S = 0.5
 """Time in which a vehicle that is given back keeps its speed."""
@@ -66,8 +66,8 @@ class HandOver:
         return {one.lane for one, line_m in lines_m.items() if line_m < 0.0 >= one.from_m}
 
     def given_back(
-        self, vehicles: Iterable[VehicleT], others: Sequence[OtherBody]
-    ) -> Iterator[VehicleT]:
+        self, vehicles: Iterable[OnRoadT], others: Sequence[OtherBody]
+    ) -> Iterator[OnRoadT]:
         """Yield the vehicles that SUMO takes back now."""
         if not others:
             return
@@ -75,7 +75,7 @@ class HandOver:
         by_lane = {one.lane: line_m for one, line_m in lines_m.items() if _is_last(one)}
         for vehicle in vehicles:
             section = self._section_of(vehicle)
-            if section is None or not vehicle.controller.keeps_lane:
+            if section is None or not vehicle.keeps_lane:
                 continue
             wanted, s_m = vehicle.arrival.preferred_lane, vehicle.state[0]
             beside = _is_last(section) and wanted not in (section.lane, ANY_LANE)
@@ -83,7 +83,7 @@ class HandOver:
             if misses or self._has_to_brake(vehicle, section, others):
                 yield vehicle
 
-    def _section_of(self, vehicle: RoadVehicle) -> LaneSection | None:
+    def _section_of(self, vehicle: OnRoad) -> LaneSection | None:
         """Return the section in which a vehicle is, if it may leave the road by its end."""
         lane, s_m, destination = vehicle.body_lane, vehicle.state[0], vehicle.arrival.destination
         for one in self._sections:
@@ -93,7 +93,7 @@ class HandOver:
         return None
 
     def _has_to_brake(
-        self, vehicle: RoadVehicle, section: LaneSection, others: Iterable[OtherBody]
+        self, vehicle: OnRoad, section: LaneSection, others: Iterable[OtherBody]
     ) -> bool:
         """Return whether a vehicle has to brake comfortably for another one ahead."""
         s_m, speed_mps = vehicle.state[:2]

@@ -26,9 +26,8 @@ from laneweave.sim_bridge.corridors.exit_room import ExitRoom
 from laneweave.sim_bridge.corridors.hand_over import HandOver
 from laneweave.sim_bridge.corridors.settling import LONGEST_S, before_rest_s, fall_back, settling_s
 from laneweave.sim_bridge.road.demand import Arrival
-from laneweave.sim_bridge.road.demand_queue import OutsideTraffic
+from laneweave.sim_bridge.road.demand_queue import OnRoadT, OutsideTraffic
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter, EntryState
-from laneweave.sim_bridge.road.vehicle import VehicleT
 
 ADVICE_SHARE = 0.9
 """Share of its maximum acceleration with which a vehicle is expected to accelerate."""
@@ -203,7 +202,7 @@ class TakeOver(OutsideTraffic):
                 del self._known[one.arrival.vehicle]
         return admissions
 
-    def given_back(self, vehicles: Iterable[VehicleT]) -> Iterable[VehicleT]:
+    def given_back(self, vehicles: Iterable[OnRoadT]) -> Iterable[OnRoadT]:
         """Return the vehicles that SUMO takes back before their exits; see `HandOver`."""
         return self._hand_over.given_back(vehicles, self._world.others())
 

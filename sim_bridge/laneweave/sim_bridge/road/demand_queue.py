@@ -9,13 +9,37 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from itertools import chain
+from typing import Protocol, TypeVar
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Announcement, Name, OffLattice
 from laneweave.sim_bridge.road.demand import Arrival, count_until
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter
-from laneweave.sim_bridge.road.vehicle import VehicleT
+
+
+class OnRoad(Protocol):
+    """A vehicle on the road, as the simulator of outside traffic needs to know it."""
+
+    @property
+    def arrival(self) -> Arrival:
+        """Its arrival at the entrance."""
+
+    @property
+    def state(self) -> State:
+        """Position, speed and acceleration of its body."""
+
+    @property
+    def body_lane(self) -> int:
+        """Lane in which the centre of its body is."""
+
+    @property
+    def keeps_lane(self) -> bool:
+        """Whether the body is in its lane, and no plan in force leads it out of its cell."""
+
+
+OnRoadT = TypeVar("OnRoadT", bound=OnRoad)
 
 
 class OutsideTraffic:
@@ -71,7 +95,7 @@ class OutsideTraffic:
         del t_s, meter, occupied
         return []
 
-    def given_back(self, vehicles: Iterable[VehicleT]) -> Iterable[VehicleT]:
+    def given_back(self, vehicles: Iterable[OnRoadT]) -> Iterable[OnRoadT]:
         """Return the vehicles on the road that the simulator takes back before their exits."""
         del vehicles
         return ()

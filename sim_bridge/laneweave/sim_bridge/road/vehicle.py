@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Self, TypeVar
+from typing import Self
 
 from attrs import define, evolve
 
@@ -91,6 +91,11 @@ class RoadVehicle:
         return int(self.state[3] // self.controller.lattice.lane_width_m)
 
     @property
+    def keeps_lane(self) -> bool:
+        """Whether the body is in its lane, and no plan in force leads it out of its cell."""
+        return self.controller.keeps_lane
+
+    @property
     def block(self) -> int:
         """Number of the block in which the vehicle entered."""
         return self.controller.lattice.block_of(self.admission.cell[0])
@@ -158,6 +163,3 @@ class RoadVehicle:
     def step(self, tick: int) -> None:
         """Advance from `tick` to the next one."""
         self.controller.step(tick)
-
-
-VehicleT = TypeVar("VehicleT", bound=RoadVehicle)
