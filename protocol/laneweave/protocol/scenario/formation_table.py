@@ -180,7 +180,9 @@ class FormationSettings:
 
     @property
     def max_length(self) -> int:
-        """Maximum number of columns of a formation."""
+        """Maximum number of columns of a formation; without formations, 1."""
+        if not self.traits.has_formations:
+            return 1
         return self.max_columns if self.closes_by_vehicles else self.block_columns
 
     @property
