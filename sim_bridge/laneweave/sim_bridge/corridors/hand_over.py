@@ -6,15 +6,15 @@ is given back, with its speed; the next one behind it follows when that one brak
 the line at which vehicles are given back moves with the queue, lane by lane. Plans end before it,
 and nobody enters behind it.
 
-A vehicle in another lane than the one that it prefers is given back where it is, when it passes the
-line of either lane; SUMO decides on its further lane changes. docs/SAFETY.md says why others may go
-on with their plans meanwhile.
+A vehicle that cannot reach the lane that it prefers before the line of this lane is given back
+where it is, as soon as this is certain; SUMO decides on its further lane changes. docs/SAFETY.md
+says why others may go on with their plans meanwhile.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, end_exit
 from laneweave.protocol.scenario.fields import Scenario
@@ -38,6 +38,8 @@ class HandOver:
         self._lattice = scenario.lattice
         self._sections = tuple(one for one in scenario.geometry.sections if one.exit)
         speed_mps = scenario.lattice.speed_mps
+        self._move_m = scenario.timing.cycles_s[0] * speed_mps
+        """Distance in which a vehicle changes lanes once."""
         self._braking_m = SPACE_M + REACTION_S * speed_mps + _stops_m(speed_mps)
         """Distance in which a vehicle at v_F stops comfortably behind another one."""
 
@@ -69,19 +71,26 @@ class HandOver:
         self, vehicles: Iterable[OnRoadT], others: Sequence[OtherBody]
     ) -> Iterator[OnRoadT]:
         """Yield the vehicles that SUMO takes back now."""
-        if not others:
-            return
         lines_m = self.lines_m(others)
-        by_lane = {one.lane: line_m for one, line_m in lines_m.items() if _is_last(one)}
+        last_m = {one.lane: lines_m.get(one, one.to_m) for one in self._sections if _is_last(one)}
         for vehicle in vehicles:
             section = self._section_of(vehicle)
             if section is None or not vehicle.keeps_lane:
                 continue
-            wanted, s_m = vehicle.arrival.preferred_lane, vehicle.state[0]
-            beside = _is_last(section) and wanted not in (section.lane, ANY_LANE)
-            misses = beside and s_m >= by_lane.get(wanted, math.inf)
-            if misses or self._has_to_brake(vehicle, section, others):
+            if self._misses_lane(vehicle, section, last_m) or self._has_to_brake(
+                vehicle, section, others
+            ):
                 yield vehicle
+
+    def _misses_lane(
+        self, vehicle: OnRoad, section: LaneSection, lines_m: Mapping[int, float]
+    ) -> bool:
+        """Return whether it is too late for a vehicle to reach its lane before the line there."""
+        wanted = vehicle.arrival.preferred_lane
+        if not _is_last(section) or wanted in (section.lane, ANY_LANE):
+            return False
+        moves_m = self._move_m * abs(wanted - section.lane)
+        return vehicle.state[0] + moves_m > lines_m.get(wanted, -math.inf)
 
     def _section_of(self, vehicle: OnRoad) -> LaneSection | None:
         """Return the section in which a vehicle is, if it may leave the road by its end."""

@@ -36,8 +36,9 @@ SPARE_PITCH_M = 2.0
 HEADWAY_S = 1.0
 """Minimum column pitch as a time, as the paper's 15 m at 15 m/s. A vehicle that has fallen behind
 its cell can then catch up without coming so close to the one ahead that it has to brake."""
-MAX_SETTLE_S = 8.0
-"""Time in which vehicles settle in their cells, if ramps are long enough."""
+MAX_SETTLE_S, APPROACH_SETTLE_S = 8.0, 4.0
+"""Time in which vehicles settle in their cells, if ramps are long enough; on approaches, where
+there is little room before the queue, lane changes begin sooner."""
 _WIDE_M = 100.0
 """A column pitch that suits all types."""
 Tables = dict[str, Any]
@@ -305,7 +306,8 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
     least_m = max(min_pitch_m(wide, own.limits) for own in wide.types.values()) + SPARE_PITCH_M
     pitch_m = math.ceil(max(least_m, HEADWAY_S * speed_mps))
     ramps_m = {one["name"]: one["merge_m"] - one["at_m"] for one in tables["entrance"]}
-    settle_s = min([MAX_SETTLE_S, *(length_m / speed_mps for length_m in ramps_m.values())])
+    longest_s = APPROACH_SETTLE_S if corridor.lanes_to else MAX_SETTLE_S
+    settle_s = min([longest_s, *(length_m / speed_mps for length_m in ramps_m.values())])
     if settle_s < MIN_SETTLE_S:
         name = min(ramps_m, key=ramps_m.__getitem__)
         ramp = next(one for one in corridor.ramps if one.name == name)
@@ -362,10 +364,8 @@ def _cycle_s(scenario: Scenario, corridor: Corridor) -> float:
         0.5 * (corridor.ends_m(ramp.lane, ramp.merge_m) - ramp.merge_m - needed_m)
         for ramp in corridor.ramps
     ]
-    speed_mps = scenario.formation.speed_mps
     if corridor.lanes_to:
-        room_m = corridor.length_m - MIN_SETTLE_S * speed_mps - scenario.types.longest_body_m
-        rooms_m.append(0.5 * room_m / (corridor.lanes - 1))
-    longest_s = min(rooms_m, default=math.inf) / speed_mps
+        rooms_m.append(0.0)  # the queue may leave little room: the sooner a move ends, the better
+    longest_s = min(rooms_m, default=math.inf) / scenario.formation.speed_mps
     steps = math.floor(min(longest_s, SHORTEST_CYCLE_S) / CYCLE_STEP_S + 1e-9)
     return round(max(CYCLE_STEP_S * steps, shortest_s), 1)

@@ -10,7 +10,7 @@ laneweave takes over.
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
@@ -45,6 +45,8 @@ BESIDE_COLUMNS = 1
 """Number of columns by which a vehicle rather falls back than entering beside another vehicle."""
 STANDING_S = 120.0
 """Time for which all vehicles stand in queues behind exits when a run ends, after all entries."""
+VEHICLES_PER_CHANGE = 2
+"""Vehicles that a lane has to have less than another for a lane change into it."""
 MAX_COLUMNS = 40
 """Maximum number of columns that are tried."""
 
@@ -62,6 +64,8 @@ class Approaching:
     """Where each lane on its way ends [m], from its own on, and how fast it drives there [m/s]."""
     upstream: bool = False
     """Whether it still has to pass a junction where ways join, so that others may come before."""
+    lanes: tuple[int, ...] = ()
+    """Lanes at the end of the road from which its route continues; empty: any."""
 
 
 class SumoTraffic(Protocol):
@@ -120,6 +124,8 @@ class TakeOver(OutsideTraffic):
         """Where moves out of each of these lanes have ended."""
         self._exit_room = ExitRoom(scenario)
         self._hand_over = HandOver(scenario)
+        self._going = Counter[int]()
+        """Vehicles that queue at the entrances or are on the road, by preferred lane."""
         self._occupied = set[Cell]()
         """Cells in which vehicles are, or to which they move."""
         self._known: dict[str, Arrival] = {}
@@ -169,7 +175,9 @@ class TakeOver(OutsideTraffic):
 
     def release(self, coming: Sequence[Arrival], ahead: Iterable[Arrival]) -> Sequence[Arrival]:
         """Return which of the vehicles at the start may enter; see `ExitRoom`."""
-        return self._exit_room.release(coming, ahead, self._world.others)
+        known = [*ahead]
+        self._going = Counter(one.preferred_lane for one in known)
+        return self._exit_room.release(coming, known, self._world.others)
 
     def full_lanes(self) -> set[int]:
         """Return the lanes that no vehicle may enter at their start now.
@@ -197,6 +205,7 @@ class TakeOver(OutsideTraffic):
                     column = self._advise(one, lane, column, t_s, meter)
                     continue
                 admissions.append(self._take(one, column, t_s, meter))
+                self._going[admissions[-1].arrival.preferred_lane] += 1
                 self._occupied.add(admissions[-1].cell)
                 column = admissions[-1].cell[0] - 1
                 del self._known[one.arrival.vehicle]
@@ -252,8 +261,21 @@ class TakeOver(OutsideTraffic):
         return Admission(arrival, (column, arrival.lane), t_s, ahead_m(column), more, start)
 
     def _arrival(self, one: Approaching) -> Arrival:
-        """Return the arrival of a vehicle in the lane to which it comes."""
-        return evolve(one.arrival, t_s=self._known[one.arrival.vehicle].t_s)
+        """Return the arrival of a vehicle in the lane to which it comes.
+
+        If its route continues from several lanes, it prefers the one with the fewest vehicles; a
+        lane change has to save it as much time as some vehicles need at the stop line.
+        """
+        arrival = evolve(one.arrival, t_s=self._known[one.arrival.vehicle].t_s)
+        if len(one.lanes) < 2:
+            return arrival
+        there = self._going + Counter(other.lane for other in self._world.others())
+
+        def cost(lane: int) -> tuple[int, int]:
+            away = abs(lane - arrival.lane)
+            return there[lane] + VEHICLES_PER_CHANGE * away, away
+
+        return evolve(arrival, preferred_lane=min(one.lanes, key=cost))
 
     def _choose(
         self,

@@ -88,16 +88,15 @@ class StreamPlanner:
             kernel.set_paths(
                 arrays.table, arrays.paths, arrays.costs, *earlier, rng, arrays.scratch
             )
-            if len(order) > 1:
-                rounds = kernel.improve(
-                    arrays.table,
-                    arrays.paths,
-                    arrays.costs,
-                    road.rounds,
-                    road.max_paths,
-                    rng,
-                    arrays.scratch,
-                )
+            rounds = kernel.improve(
+                arrays.table,
+                arrays.paths,
+                arrays.costs,
+                road.rounds,
+                road.max_paths,
+                rng,
+                arrays.scratch,
+            )
             paths |= _paths_of(order, arrays)
         missed = tuple(
             v.vehicle
