@@ -39,6 +39,9 @@ its cell can then catch up without coming so close to the one ahead that it has 
 MAX_SETTLE_S, APPROACH_SETTLE_S = 8.0, 4.0
 """Time in which vehicles settle in their cells, if ramps are long enough; on approaches, where
 there is little room before the queue, lane changes begin sooner."""
+APPROACH_S = 6.0
+"""Time from the entrance of an approach after which vehicles that come slowly change lanes."""
+MIN_APPROACH_MPS = 8.0
 _WIDE_M = 100.0
 """A column pitch that suits all types."""
 Tables = dict[str, Any]
@@ -166,10 +169,18 @@ def scenario_tables(found: SumoCorridor) -> Tables:
         ],
     }
     _check_widths(corridor, names)
-    speed_mps = math.floor(2.0 * SPEED_SHARE * fastest_mps) / 2.0
-    formation = tables["formation"] = _motion(tables, corridor, speed_mps)
-    # Lanes that open so late that no vehicle can change into them are closed to the end.
+    speed_mps = _rounded_mps(SPEED_SHARE * fastest_mps)
+    formation = _motion(tables, corridor, speed_mps)
     body_m = max(one.length_m for one in names)
+    if corridor.lanes_to:
+        # Where an approach is short, vehicles drive so slowly that they reach their lanes.
+        takes_s = APPROACH_S + (corridor.lanes - 1) * formation["cycle_s"]
+        enough_mps = _rounded_mps((corridor.length_m - body_m) / takes_s)
+        if enough_mps < speed_mps:
+            speed_mps = max(enough_mps, MIN_APPROACH_MPS)
+            formation = _motion(tables, corridor, speed_mps)
+    tables["formation"] = formation
+    # Lanes that open so late that no vehicle can change into them are closed to the end.
     latest_m = corridor.length_m - body_m - speed_mps * formation["cycle_s"]
     for closure in tables["road"]["closures"]:
         if closure.get("to_m", 0.0) > latest_m:
@@ -227,6 +238,10 @@ def _check_widths(corridor: Corridor, names: Mapping[SumoType, str]) -> None:
 def _volume(vehicles: int, duration_s: float, lanes: int = 1) -> float:
     """Return a volume [veh/h] as scenarios allow it; it is that of a drawn demand only."""
     return min(round(3600.0 / duration_s * vehicles / lanes, 1), MAX_VOLUME_VEH_PER_H)
+
+
+def _rounded_mps(speed_mps: float) -> float:
+    return math.floor(2.0 * speed_mps) / 2.0
 
 
 def _m(position_m: float) -> float:
