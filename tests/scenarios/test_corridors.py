@@ -19,6 +19,7 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.sim_bridge.corridors import corridor_setup, sumo_statistics
+from laneweave.sim_bridge.corridors.hand_over import HandOver
 from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
 from laneweave.sim_bridge.corridors.sumo_simulation import TimeWindow
 from laneweave.sim_bridge.corridors.sumo_statistics import read_statistics
@@ -27,6 +28,7 @@ from support.interchange import (
     DRIVEN_S,
     EXIT_FIRST,
     FORK,
+    POCKET,
     RAMP_FIRST,
     RAMP_SPEED_MPS,
     TRUCKS,
@@ -192,6 +194,19 @@ def test_sumo_takes_vehicles_back_before_the_queue_of_their_lane(
 
 
 @pytest.mark.more
+def test_sumo_drives_into_turn_pockets(tmp_path: Path) -> None:
+    turns = ["left", "ahead"]
+    vehicles = [vehicle(f"v{n}", n, f"pocket {turns[n % 2]}") for n in range(12)]
+    config = write_interchange(tmp_path, vehicles, network=POCKET)
+    summary, _ = drive(scenario_of(config, "main1:main2"), tmp_path / "run")
+    assert summary["vehicles"]["on_preferred_lane"] == summary["vehicles"]["demanded"] == 12
+    assert summary["safety"]["overlaps"] == summary["safety"]["sumo_collisions"] == 0
+    arrived = ET.parse(tmp_path / "run" / "tripinfo.xml").getroot()  # noqa: S314 (own file)
+    edges = {one.get("id"): str(one.get("arrivalLane")).rpartition("_")[0] for one in arrived}
+    assert edges == {f"v{n}": turns[n % 2] for n in range(12)}
+
+
+@pytest.mark.more
 def test_a_vehicle_that_never_comes_to_the_corridor_is_counted(tmp_path: Path) -> None:
     stands = (
         '<vehicle id="stands" type="car" depart="0" departPos="200"><route edges="before"/>'
@@ -301,10 +316,14 @@ def test_equal_runs_are_equal(tmp_path: Path) -> None:
 
 
 @pytest.mark.more
+@pytest.mark.parametrize("given_back", [True, False])
 def test_a_queue_behind_the_exit_is_braked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, given_back: bool
 ) -> None:
+    """Vehicles are given back before it; if they could not be, they would brake by themselves."""
     monkeypatch.setattr(sumo_statistics, "CONFLICT_S", 5.0)  # so that there are some
+    if not given_back:
+        monkeypatch.setattr(HandOver, "given_back", lambda *_: ())
     standing = standing_vehicle(22, 25, 'duration="60"')
     leaving = [vehicle(f"e{n}", 4.0 * n, "exit") for n in range(6)]
     own = scenario(tmp_path, [*leaving, standing, vehicle("m", 24.0, "main")])
@@ -314,10 +333,16 @@ def test_a_queue_behind_the_exit_is_braked_for(
     trips = {trip["sumo_id"]: trip for trip in read_trips(tmp_path / "run").values()}
     # The queue, which begins when all are inside, reaches back into the corridor for 60 s.
     assert all(trips[f"e{n}"]["entered_s"] < 22.0 for n in range(6))
+    rows = read_rows(tmp_path / "run")
+    names = {trip["sumo_id"]: name for name, trip in read_trips(tmp_path / "run").items()}
+    if given_back:
+        last_m = max(s_m for (name, _), (s_m, _) in rows.items() if name == names["e5"])
+        assert last_m < own.exit[0].at_m - 20.0
+        assert summary["safety"]["hard_brakes"] == 0
+        return
     assert trips["e5"]["left_s"] > 80.0
     # Times to collision that SUMO reports are those of the recorded trajectories.
-    names = {trip["sumo_id"]: name for name, trip in read_trips(tmp_path / "run").items()}
-    rows, checked = read_rows(tmp_path / "run"), 0
+    checked = 0
     for one in read_statistics(tmp_path / "run").conflicts:
         tick = round(one.at_s / own.runtime.tick_s)
         keys = [(names.get(name, ""), tick) for name in one.vehicles]

@@ -121,6 +121,20 @@ FORK = Network(
     ),
 )
 """An edge whose lanes lead to different edges."""
+POCKET = Network(
+    (
+        _Edge("main1", "A", "B", 0.0, 800.0, _centres(0, 2)),
+        _Edge("main2", "B", "C", 800.0, 930.0, _centres(0, 3)),
+        _Edge("ahead", "C", "D", 930.0, 1200.0, _centres(0, 2)),
+        _Edge("left", "C", "E", 930.0, 1200.0, _centres(2, 1, 20.0)),
+    ),
+    (
+        *(("main1", lane, "main2", lane) for lane in range(2)),
+        *(("main2", lane, "ahead", lane) for lane in range(2)),
+        ("main2", 2, "left", 0),
+    ),
+)
+"""A turn pocket, 130 m long, before a fork."""
 
 
 def write_interchange(
@@ -163,6 +177,7 @@ ROUTES = {
     "early ramp": "before on main2 main3 main4 main5",
     **{turn: f"main1 {turn}" for turn in ("right", "ahead", "left")},
     **{f"upstream {turn}": f"start main1 {turn}" for turn in ("right", "ahead", "left")},
+    **{f"pocket {turn}": f"main1 main2 {turn}" for turn in ("ahead", "left")},
 }
 """Edges of routes; `late exit` and `early ramp` are for `RAMP_FIRST`, turns for `FORK`."""
 

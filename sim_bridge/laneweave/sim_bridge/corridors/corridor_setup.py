@@ -194,6 +194,7 @@ def _arrivals(found: SumoCorridor, scenario: Scenario) -> Iterator[CorridorArriv
             one.destination,
             vehicle_type,
             vehicle.name,
+            one.lanes,
         )
         first = vehicle.route[0]
         departs_on_ramp = first in on_ramp.get(one.entrance, ())

@@ -146,8 +146,7 @@ class CorridorWorld(SumoProcess, BodiesWorld):
                     speed_mps = api.getSpeed(vehicle)
                     preferred_lane = coming.origin.preferred_lane(lane)
                     arrival = evolve(coming.arrival, lane=lane, preferred_lane=preferred_lane)
-                    lanes = coming.origin.lanes
-                    yield Approaching(arrival, s_m, speed_mps, limits, way.upstream, lanes)
+                    yield Approaching(arrival, s_m, speed_mps, limits, way.upstream)
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
         """Set the speed at which SUMO drives a vehicle, as far as it is safe; None: its own."""

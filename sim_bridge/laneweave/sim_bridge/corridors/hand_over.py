@@ -53,6 +53,19 @@ class HandOver:
                     lines_m[section] = min(lines_m.get(section, math.inf), line_m)
         return lines_m
 
+    def last_lines_m(self, others: Iterable[OtherBody]) -> dict[int, float]:
+        """Return the same by lane for those that reach the end of the road, which is the latest."""
+        lines_m = self.lines_m(others)
+        return {
+            one.lane: min(lines_m.get(one, one.to_m), one.to_m)
+            for one in self._sections
+            if _is_last(one)
+        }
+
+    def moves_m(self, lanes: int) -> float:
+        """Return the distance in which a vehicle changes a number of lanes."""
+        return lanes * self._move_m
+
     def plans_end(self, others: Iterable[OtherBody]) -> tuple[OffLattice, ...]:
         """Return lanes with positions behind which no plan may lead a vehicle into them."""
         ends = [
@@ -71,8 +84,7 @@ class HandOver:
         self, vehicles: Iterable[OnRoadT], others: Sequence[OtherBody]
     ) -> Iterator[OnRoadT]:
         """Yield the vehicles that SUMO takes back now."""
-        lines_m = self.lines_m(others)
-        last_m = {one.lane: lines_m.get(one, one.to_m) for one in self._sections if _is_last(one)}
+        last_m = self.last_lines_m(others)
         for vehicle in vehicles:
             section = self._section_of(vehicle)
             if section is None or not vehicle.keeps_lane:
@@ -86,11 +98,12 @@ class HandOver:
         self, vehicle: OnRoad, section: LaneSection, lines_m: Mapping[int, float]
     ) -> bool:
         """Return whether it is too late for a vehicle to reach its lane before the line there."""
-        wanted = vehicle.arrival.preferred_lane
-        if not _is_last(section) or wanted in (section.lane, ANY_LANE):
+        arrival, lane = vehicle.arrival, section.lane
+        wanted = arrival.preferred_lane
+        if not _is_last(section) or wanted in (lane, ANY_LANE) or lane in arrival.right_lanes:
             return False
-        moves_m = self._move_m * abs(wanted - section.lane)
-        return vehicle.state[0] + moves_m > lines_m.get(wanted, -math.inf)
+        reaches_m = vehicle.state[0] + self.moves_m(abs(wanted - lane))
+        return reaches_m > lines_m.get(wanted, -math.inf)
 
     def _section_of(self, vehicle: OnRoad) -> LaneSection | None:
         """Return the section in which a vehicle is, if it may leave the road by its end."""

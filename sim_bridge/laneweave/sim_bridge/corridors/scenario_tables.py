@@ -180,11 +180,6 @@ def scenario_tables(found: SumoCorridor) -> Tables:
             speed_mps = max(enough_mps, MIN_APPROACH_MPS)
             formation = _motion(tables, corridor, speed_mps)
     tables["formation"] = formation
-    # Lanes that open so late that no vehicle can change into them are closed to the end.
-    latest_m = corridor.length_m - body_m - speed_mps * formation["cycle_s"]
-    for closure in tables["road"]["closures"]:
-        if closure.get("to_m", 0.0) > latest_m:
-            del closure["to_m"]
     settled_m = _m(speed_mps * formation["settle_s"])
     if settled_m >= corridor.length_m:
         raise BadInputError(OPTION, corridor.name, f"a corridor longer than {settled_m:g} m")

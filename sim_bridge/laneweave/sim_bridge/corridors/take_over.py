@@ -45,6 +45,8 @@ BESIDE_COLUMNS = 1
 """Number of columns by which a vehicle rather falls back than entering beside another vehicle."""
 STANDING_S = 120.0
 """Time for which all vehicles stand in queues behind exits when a run ends, after all entries."""
+SETTLES_S = 6.0
+"""Time after its entry in which a vehicle begins to change lanes."""
 VEHICLES_PER_CHANGE = 2
 """Vehicles that a lane has to have less than another for a lane change into it."""
 MAX_COLUMNS = 40
@@ -64,8 +66,6 @@ class Approaching:
     """Where each lane on its way ends [m], from its own on, and how fast it drives there [m/s]."""
     upstream: bool = False
     """Whether it still has to pass a junction where ways join, so that others may come before."""
-    lanes: tuple[int, ...] = ()
-    """Lanes at the end of the road from which its route continues; empty: any."""
 
 
 class SumoTraffic(Protocol):
@@ -263,19 +263,25 @@ class TakeOver(OutsideTraffic):
     def _arrival(self, one: Approaching) -> Arrival:
         """Return the arrival of a vehicle in the lane to which it comes.
 
-        If its route continues from several lanes, it prefers the one with the fewest vehicles; a
-        lane change has to save it as much time as some vehicles need at the stop line.
+        If its route continues from several lanes, it prefers the one with the fewest vehicles of
+        those that it can reach; a lane change has to save it the time that some vehicles need at
+        the stop line.
         """
         arrival = evolve(one.arrival, t_s=self._known[one.arrival.vehicle].t_s)
-        if len(one.lanes) < 2:
+        lanes = arrival.right_lanes
+        if len(lanes) < 2:
             return arrival
-        there = self._going + Counter(other.lane for other in self._world.others())
+        others = self._world.others()
+        there = self._going + Counter(other.lane for other in others)
+        within_m = self._hand_over.last_lines_m(others)
+        settled_m = max(one.s_m, 0.0) + SETTLES_S * self._lattice.speed_mps
 
-        def cost(lane: int) -> tuple[int, int]:
+        def cost(lane: int) -> tuple[bool, int, int]:
             away = abs(lane - arrival.lane)
-            return there[lane] + VEHICLES_PER_CHANGE * away, away
+            late = settled_m + self._hand_over.moves_m(away) > within_m.get(lane, 0.0)
+            return away > 0 and late, there[lane] + VEHICLES_PER_CHANGE * away, away
 
-        return evolve(arrival, preferred_lane=min(one.lanes, key=cost))
+        return evolve(arrival, preferred_lane=min(lanes, key=cost))
 
     def _choose(
         self,

@@ -240,7 +240,9 @@ class RunRecord:
         trip = self._trips[Name(vehicle.name)]
         trip.left_s, trip.final_lane = left_s, lane
         trip.exit = section.exit if section.to_m < self._scenario.road.length_m else END_OF_ROAD
-        at_destination = section.serves(arrival.preferred_lane, arrival.destination)
+        at_destination = section.serves(arrival.preferred_lane, arrival.destination) or (
+            lane in arrival.right_lanes and section.serves(lane, arrival.destination)
+        )
         trip.at_destination = at_destination
         self._counts.missed_exits += trip.exit != arrival.destination
         self._level_ticks.update(vehicle.level_ticks)

@@ -47,6 +47,9 @@ class Arrival:
     vehicle_type: str = CAR
     sumo_id: str = ""
     """Its name in a SUMO simulation of the user; empty: it has been drawn."""
+    right_lanes: tuple[int, ...] = ()
+    """Lanes at the end of the road from which its route continues; empty: the preferred one, or
+    any."""
 
 
 def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:

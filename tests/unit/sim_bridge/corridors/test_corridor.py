@@ -23,7 +23,7 @@ from laneweave.sim_bridge.corridors.corridor import (
     braking_m,
     corridor_of,
 )
-from laneweave.sim_bridge.corridors.corridor_search import find_corridors
+from laneweave.sim_bridge.corridors.corridor_search import find_approaches, find_corridors
 from laneweave.sim_bridge.corridors.scenario_tables import checked_tables, scenario_tables
 from laneweave.sim_bridge.corridors.sumo_corridor import SumoCorridor, corridor_in, read_corridor
 from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network
@@ -32,6 +32,7 @@ from support.interchange import (
     FORK,
     LONGEST_CORRIDOR,
     MAIN_SPEED_MPS,
+    POCKET,
     RAMP_SPEED_MPS,
     TRUCKS,
     stream,
@@ -294,11 +295,22 @@ def test_types_that_are_too_weak_or_too_wide_are_named(
         scenario_tables(found)
 
 
-def test_a_lane_that_begins_just_before_the_end_is_not_used(interchange: SumoCorridor) -> None:
-    *others, last = interchange.corridor.closures
-    beyond = Closure(0, last.from_m, interchange.corridor.length_m - 50.0)
-    closures = checked(interchange, closures=(*others, beyond))["road"]["closures"]
-    assert closures[-1] == {"lane": 0, "from_m": beyond.from_m}
+def test_to_a_turn_pocket_sumo_drives_from_the_lane_beside_it(tmp_path: Path) -> None:
+    vehicles = [vehicle(turn, 1.0, f"pocket {turn}") for turn in ("ahead", "left")]
+    found = read_corridor(write_interchange(tmp_path, vehicles, network=POCKET), "main1:main2")
+    assert found.corridor.closures == (Closure(2, 0.0),)
+    assert found.corridor.lanes_to == {"ahead": (0, 1), "left": (1,)}
+    assert [one.lanes for one in found.passes] == [(0, 1), (1,)]
+    assert parse_scenario(checked(found)).road.first_lanes == (0, 1)
+    network = found.simulation.network
+    links = (
+        evolve(link, state="m", traffic_light="B") if link.origin.edge == "main2" else link
+        for link in network.links
+    )
+    signals = evolve(found.simulation, network=evolve(network, links=tuple(links)))
+    (approach,) = find_approaches(signals)
+    assert (approach.name, approach.control) == ("main1:main2", "light")
+    assert [(one.edge, one.lanes) for one in approach.turns] == [("ahead", (0, 1)), ("left", (2,))]
 
 
 def test_more_vehicles_than_the_road_carries_wait_and_prefer_no_lane(tmp_path: Path) -> None:

@@ -105,12 +105,21 @@ def test_nobody_enters_a_lane_whose_queue_reaches_the_start() -> None:
     assert end.rear_m == 0.0
 
 
-def test_one_in_a_wrong_lane_is_given_back_at_the_line_of_either_lane() -> None:
+def test_one_that_cannot_reach_its_lane_before_the_line_there_is_given_back_at_once() -> None:
+    move_m = APPROACH.timing.cycles_s[0] * SPEED_MPS
+    for away, preferred_lane in ((1, 2), (2, 2)):
+        one = vehicle((2, 2 - away), preferred_lane)
+        line_m = one.state[0] + away * move_m
+        assert is_given_back(one, other(line_m - 0.1 + NEEDED_M, lane=2))
+        assert not is_given_back(one, other(line_m + 0.1 + NEEDED_M, lane=2))
+    # Without a queue, the end of the road is the line.
+    late = math.ceil((END_M - move_m) / APPROACH.lattice.pitch_m)
+    assert is_given_back(vehicle((late, 1), 2))
+    assert not is_given_back(vehicle((late - 1, 1), 2))
+    # It may also have to brake in its own lane, and a queue in a third lane does not matter.
     one = vehicle(preferred_lane=2)
-    s_m = one.state[0]
-    assert is_given_back(one, other(s_m + NEEDED_M - 0.1, lane=2))
-    assert is_given_back(one, other(s_m + NEEDED_M - 0.1))
-    assert not is_given_back(one, other(s_m + NEEDED_M - 0.1, lane=0))
+    assert is_given_back(one, other(one.state[0] + NEEDED_M - 0.1))
+    assert not is_given_back(one, other(one.state[0] + NEEDED_M - 0.1, lane=0))
 
 
 def test_one_that_leaves_its_cell_by_a_plan_in_force_is_not_given_back() -> None:

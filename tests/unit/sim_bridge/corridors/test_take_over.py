@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from attrs import evolve
 
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.corridors.take_over import Approaching
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
+from laneweave.sim_bridge.corridors.take_over import VEHICLES_PER_CHANGE, Approaching
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
 from support.outside import Outside
@@ -96,3 +98,37 @@ def test_a_vehicle_that_would_be_too_early_is_slowed_down_on_its_way(scenario: S
     slowed = outside.advice["b"]
     assert slowed is not None
     assert 3.0 <= slowed < 20.0
+
+
+def test_of_several_right_lanes_a_vehicle_prefers_the_one_with_the_fewest_vehicles() -> None:
+    approach = parse_scenario(
+        {
+            "road": {"lanes": 4, "s1_m": 50.0, "s2_m": 0.0, "s3_m": 350.0},
+            "formation": {"operation": "rolling", "change_columns": False, "gap_m": 20.0},
+        }
+    )
+
+    def preferred(in_lane_1: int, in_lane_2: int, on_road: int = 0, lane: int = 0) -> int:
+        counts = {1: in_lane_1, 2: in_lane_2}
+        bodies = [
+            OtherBody(f"{lane}.{number}", lane, 400.0, 390.0 - 7.5 * number, 5.0, 0.0, 0.0)
+            for lane, count in counts.items()
+            for number in range(count)
+        ]
+        outside = Outside(bodies=bodies, start_lanes=(0, 1, 2, 3))
+        arrival = Arrival("a", lane, 1, 0.0, right_lanes=(1, 2))
+        outside.coming.append(Approaching(arrival, 0.5, 12.0, ((9e9, 14.0),)))
+        take_over = outside.take_over(approach)
+        take_over.demanded(50.0)
+        take_over.release((), [Arrival(f"r{n}", 3, 1, 0.0) for n in range(on_road)])
+        (admission,) = take_over.admit(50.0, EntryMeter(approach.lattice, 0.5), ())
+        return admission.arrival.preferred_lane
+
+    assert preferred(0, 0) == preferred(4, 4) == preferred(5, 3) == 1
+    assert preferred(6, 3) == preferred(5, 3, on_road=1) == 2
+    # A lane change is worth it only if it saves the time of some vehicles.
+    assert preferred(VEHICLES_PER_CHANGE, 0) == 1
+    assert preferred(VEHICLES_PER_CHANGE + 1, 0) == 2
+    # Nor does it prefer a lane that it cannot reach before the queue there.
+    assert preferred(30, 20, lane=1) == 2
+    assert preferred(40, 30, lane=1) == 1

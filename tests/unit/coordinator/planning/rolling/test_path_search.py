@@ -111,6 +111,16 @@ def test_one_vehicle_from_anywhere(column: int) -> None:
         assert plan.missed == (("v",) if lane > max(0, slots) else ())
 
 
+def test_a_lone_vehicle_that_has_missed_its_lane_is_planned_anew() -> None:
+    """Its cells were blocked before; the earlier path is still valid, but leads elsewhere."""
+    vehicle = StreamVehicle("v", (30, 1), 0)
+    blocked = [(column, 0) for column in range(20, 60)]
+    planner = StreamPlanner(ROAD)
+    before = planner.plan(0, [vehicle], None, blocked)
+    assert before.missed == ("v",)
+    assert planner.plan(1, [vehicle], before).missed == ()
+
+
 def test_vehicles_beyond_the_road_have_no_path() -> None:
     vehicles = [StreamVehicle("past", (67, 0), 2), StreamVehicle("last", (66, 0), 0)]
     plan = StreamPlanner(ROAD).plan(0, vehicles)
