@@ -37,8 +37,11 @@ def part(page: Page, name: str, expression: str) -> object:
 
 def test_following_does_not_change_the_time(page: Page, address: str) -> None:
     page.open(address)
-    page.run("document.querySelector('[data-part=time]').value = 30")
-    part(page, "time", "dispatchEvent(new Event('input'))")
+    # In one script: the page plays, and the next frame would set the slider.
+    page.run(
+        "(time => { time.value = 30; time.dispatchEvent(new Event('input')); })"
+        "(document.querySelector('[data-part=time]'))"
+    )
     part(page, "view", "dispatchEvent(new Event('pointerdown'))")
     before = part(page, "now", "textContent")
     assert str(before).startswith("30.0 s")
