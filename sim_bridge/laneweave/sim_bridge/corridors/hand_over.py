@@ -35,7 +35,6 @@ class HandOver:
 
     def __init__(self, scenario: Scenario) -> None:
         """Read the exits of a road."""
-        self._lattice = scenario.lattice
         self._sections = tuple(one for one in scenario.geometry.sections if one.exit)
         speed_mps = scenario.lattice.speed_mps
         self._move_m = scenario.timing.cycles_s[0] * speed_mps
