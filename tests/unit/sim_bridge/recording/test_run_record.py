@@ -11,6 +11,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+from attrs import evolve
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
@@ -227,6 +228,24 @@ def test_a_trip_has_the_lanes_with_which_its_vehicle_entered(
     record.close(70.0, Ending.LIMIT)
     (trip,) = pq.read_table(tmp_path / "trips.parquet").to_pylist()
     assert (trip["arrival_lane"], trip["preferred_lane"], trip["demanded_s"]) == (2, 2, 0.5)
+
+
+@pytest.mark.parametrize(("lane", "right"), [(0, True), (1, True), (2, False)])
+def test_a_vehicle_that_sumo_takes_back_before_the_end_has_left_by_its_lane(
+    record: RunRecord, tmp_path: Path, lane: int, *, right: bool
+) -> None:
+    traveller = vehicle(preferred_lane=1)
+    arrival = evolve(traveller.admission.arrival, right_lanes=(0, 1))
+    traveller.admission = evolve(traveller.admission, arrival=arrival)
+    record.on_demanded(arrival)
+    record.on_entered(traveller)
+    y_m = SCENARIO.lattice.cell_y_m(lane)
+    traveller.controller.plant._state = (400.0, 12.0, 0.0, y_m, 0.0, 0.0)
+    record.on_left(traveller, 30.0, attended=True)
+    (left,) = read_events(tmp_path, "left")
+    assert (left["t_s"], left["exit"], left["on_preferred_lane"]) == (30.0, "end", right)
+    record.close(30.0, Ending.LIMIT)
+    assert read_summary(tmp_path)["vehicles"]["missed_exits"] == 0
 
 
 def test_a_vehicle_that_stands_at_the_end_has_left(record: RunRecord, tmp_path: Path) -> None:

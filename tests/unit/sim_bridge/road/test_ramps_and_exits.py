@@ -142,7 +142,9 @@ def test_a_queue_on_a_ramp_keeps_vehicles_from_entering_until_there_is_room_to_m
 # --- cells of vehicles that have left ---------------------------------------------------------
 
 
-def departed(transfer: PendingTransfer | None) -> tuple[MotionController, MotionController]:
+def departed(
+    transfer: PendingTransfer | None, still_in: int | None = None
+) -> tuple[MotionController, MotionController]:
     """Let a vehicle with two cells leave; return its controller and that of the one behind it."""
     roadside = Roadside(WEAVING, ())
     gone, behind = (
@@ -154,7 +156,7 @@ def departed(transfer: PendingTransfer | None) -> tuple[MotionController, Motion
         gone.controller.store.store_promise(transfer.ballot)
         gone.controller.store.begin_transfer(transfer)
     others = {vehicle.name: vehicle for vehicle in (behind, far)}
-    roadside.on_left(gone, others, 20.0)
+    roadside.on_left(gone, others, 20.0, still_in)
     assert far.controller.record.owned == ((-30, 1),)
     return gone.controller, behind.controller
 
@@ -162,6 +164,11 @@ def departed(transfer: PendingTransfer | None) -> tuple[MotionController, Motion
 def test_the_cells_of_a_vehicle_that_has_left_go_to_the_nearest_one() -> None:
     _, behind = departed(None)
     assert set(behind.record.owned) == {(-3, 1), (0, 1), (-1, 0)}
+
+
+def test_cells_in_the_lane_in_which_sumo_drives_a_vehicle_on_go_to_nobody() -> None:
+    _, behind = departed(None, still_in=1)
+    assert set(behind.record.owned) == {(-3, 1), (-1, 0)}
 
 
 def test_cells_that_a_pending_transfer_may_have_given_away_stay_without_owner() -> None:

@@ -267,3 +267,29 @@ def test_a_vehicle_before_the_exit_sees_what_is_behind_it_and_no_vehicle_on_the_
     assert ahead[0].speed_mps == pytest.approx(0.0, abs=0.3)
     assert 0 in {one.lane for one in other.controller.neighbours.ahead}
     assert record.pairs == ([("A", "other")] if touches else [])
+
+
+@pytest.mark.parametrize(
+    ("rear_m", "ahead_m", "behind_m", "touches"),
+    [
+        (-4.0, -4.0, None, True),  # beside it, its front ahead
+        (-8.0, None, -2.0, True),  # beside it, its front behind
+        (-40.0, None, 30.0, False),
+    ],
+)
+def test_bodies_that_sumo_drives_beside_and_behind_are_neighbours(
+    rear_m: float, ahead_m: float | None, behind_m: float | None, *, touches: bool
+) -> None:
+    """Distances are from the front of the vehicle, which is 5 m long, as the body is."""
+    own = vehicle_in((0, 0), "A", INTERCHANGE)
+    t_s = LATTICE.passing_time_s(0, EXIT_M - 100.0)
+    rest = cell_state(LATTICE, own.cell, t_s)
+    own.controller.plant = Plant(rest, INTERCHANGE.vehicle, INTERCHANGE.runtime.tick_s)
+    own.sensors = Sensors(INTERCHANGE, own.name)
+    record = Overlaps()
+    world = Standing(rest[0] + rear_m)
+    show_bodies(world, {own.name: own}, INTERCHANGE, record, t_s)  # type: ignore[arg-type]
+    for side, gap_m in zip(own.controller.neighbours, (ahead_m, behind_m), strict=True):
+        found = [one.gap_m for one in side if one.lane == 0]
+        assert found == ([] if gap_m is None else [pytest.approx(gap_m, abs=0.5)])
+    assert record.pairs == ([("A", "other")] if touches else [])
