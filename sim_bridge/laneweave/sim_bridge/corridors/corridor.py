@@ -9,7 +9,6 @@ with its acceleration lane, and a lane whose links lead out of it an exit.
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
@@ -22,7 +21,7 @@ from attrs import evolve, field, frozen
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE, Closure
-from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network
+from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network, unique_name
 
 MAX_LANES = 8
 MAX_RAMP_M = 400.0
@@ -166,20 +165,16 @@ class Corridor:
         ends_m = [one.from_m for one in self.closures if one.lane == lane]
         return min((end_m for end_m in ends_m if end_m > behind_m), default=math.inf)
 
+    @property
+    def most_changes(self) -> int:
+        """Largest number of lane changes that a vehicle may need to reach its lane at the end."""
+        ends = {lane for lanes in self.lanes_to.values() for lane in lanes}
+        return max((abs(end - lane) for end in ends for lane in self.edges[0].lanes), default=0)
+
     @cached_property
     def edge_numbers(self) -> Mapping[str, int]:
         """The numbers of its edges, by name."""
         return {edge.name: number for number, edge in enumerate(self.edges)}
-
-
-def unique_name(name: str, taken: Collection[str]) -> str:
-    """Return a name in the characters that scenarios allow, different from all that are taken."""
-    stem = re.sub(r"[^A-Za-z0-9_.-]", "_", name).lstrip("-._") or "edge"
-    stem = stem.replace("lane-", "lane_", 1)  # exits at the end of the road have such names
-    found, number = stem, 2
-    while found in taken:
-        found, number = f"{stem}-{number}", number + 1
-    return found
 
 
 def braking_m(speed_mps: float) -> float:
@@ -326,7 +321,15 @@ class _Derivation:
         links = [link for lane in last.car_lanes for link in self._network.links_from(lane)]
         length_m = self._given_back_m(self._edges[-1], links)
         pockets_m = length_m - POCKET_M - POCKET_S * SPEED_SHARE * self._limit_mps
-        parts = [part for part in parts if part.from_m <= max(pockets_m, 0.0)]
+        before = [one for one in parts if one.from_m <= max(pockets_m, 0.0)]
+        lanes_to = self._lanes_to({one.lane for one in before if one.ends_with(last)})
+        if lanes_to:
+            into = {(ramp.lane, ramp.merge_m) for ramp in ramps}
+            parts = [
+                part
+                for part in parts
+                if part.from_m <= max(pockets_m, 0.0) or (part.lane, part.from_m) in into
+            ]
         return Corridor(
             network=self._network,
             edges=self._edges,
@@ -337,7 +340,7 @@ class _Derivation:
             closures=tuple(self._closures(parts, lanes, ramps, ways_out)),
             ramps=ramps,
             ways_out=ways_out,
-            lanes_to=self._lanes_to({part.lane for part in parts if part.ends_with(last)}),
+            lanes_to=lanes_to,
             unused=tuple(self._unused),
         )
 

@@ -95,10 +95,10 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         self._setup, self._network = setup, corridor.network
         self._returned: set[str] = set()
         """Names in SUMO of vehicles that have been given back and have not arrived."""
-        self._elsewhere: list[Arrival] = []
-        """Vehicles that have arrived without coming to their entrances."""
         self._inside: set[str] = set()
         """Those of them that are still on the corridor, and change lanes for their routes only."""
+        self._elsewhere: list[Arrival] = []
+        """Vehicles that have arrived without coming to their entrances."""
         self._slowing: dict[str, _Slowing] = {}
         """Vehicles that slow down since a lower limit is ahead, by name."""
         entrances = {one.name for one in scenario.entrance}
@@ -268,7 +268,8 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         self._others = None
         self._correct_route(name)
         limit_mps = self._next_limit_mps(name)
-        if speed_mps > limit_mps:
+        rest_m = self.lane.getLength(api.getLaneID(name)) - api.getLanePosition(name)
+        if speed_mps > limit_mps and rest_m <= SLOWS_S * speed_mps:
             now_s, tau_s = self.simulation.getTime(), api.getTau(name)
             self._slowing[name] = _Slowing(now_s, speed_mps, limit_mps, tau_s)
             api.setSpeedMode(name, _SLOWING_MODE)
@@ -321,9 +322,11 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         for name in arrived:
             self._slowing.pop(name, None)
         edges = self._setup.found.corridor.edge_numbers
-        for name in [name for name in self._inside if api.getRoadID(name) not in edges]:
-            api.setLaneChangeMode(name, _OWN_LANE_CHANGES)
-            self._inside.remove(name)
+        for name in [*self._inside]:
+            road = api.getRoadID(name)
+            if road not in edges and not road.startswith(":"):  # nor in a junction
+                api.setLaneChangeMode(name, _OWN_LANE_CHANGES)
+                self._inside.remove(name)
 
     def drive_on(self) -> None:
         """Let SUMO drive on until the vehicles that it got back have arrived (statistics)."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, end_exit
+from laneweave.protocol.road_layout import ANY_LANE, LaneSection, end_exit
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import OffLattice
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
@@ -26,6 +26,10 @@ from laneweave.sim_bridge.road.demand_queue import OnRoad, OnRoadT
 
 REACTION_S = 0.5
 """Time in which a vehicle that is given back keeps its speed."""
+AS_FAST_MPS = 0.5
+"""Difference to v_F up to which nobody has to brake for a vehicle."""
+STANDING_MPS, STANDING_M = 1.0, 8.0
+"""Speed below which a vehicle stands, and its distance from another one of the same queue."""
 PLANS_END_M = 15.0
 """Distance by which a queue may grow before a move that is planned now has ended."""
 
@@ -36,16 +40,18 @@ class HandOver:
     def __init__(self, scenario: Scenario) -> None:
         """Read the exits of a road."""
         self._sections = tuple(one for one in scenario.geometry.sections if one.exit)
-        speed_mps = scenario.lattice.speed_mps
+        self._speed_mps = speed_mps = scenario.lattice.speed_mps
         self._move_m = scenario.timing.cycles_s[0] * speed_mps
         """Distance in which a vehicle changes lanes once."""
         self._braking_m = SPACE_M + REACTION_S * speed_mps + _stops_m(speed_mps)
         """Distance in which a vehicle at v_F stops comfortably behind another one."""
 
     def lines_m(self, others: Iterable[OtherBody]) -> dict[LaneSection, float]:
-        """Return where vehicles at v_F have to brake, by section, if others are ahead."""
+        """Return where vehicles at v_F have to brake, by section, if slower ones are ahead."""
         lines_m: dict[LaneSection, float] = {}
         for other in others:
+            if other.speed_mps >= self._speed_mps - AS_FAST_MPS:
+                continue
             for section in self._sections:
                 if (section.lane, section.to_m) == (other.lane, other.exit_m):
                     line_m = other.rear_m + _stops_m(other.speed_mps) - self._braking_m
@@ -66,11 +72,14 @@ class HandOver:
         return lanes * self._move_m
 
     def plans_end(self, others: Iterable[OtherBody]) -> tuple[OffLattice, ...]:
-        """Return lanes with positions behind which no plan may lead a vehicle into them."""
+        """Return lanes with positions beyond which no plan may use them.
+
+        Only lanes to the end of the road: whoever is beyond could not leave its lane any more.
+        """
         ends = [
             OffLattice(section.lane, max(line_m - PLANS_END_M, section.from_m, 0.0))
             for section, line_m in self.lines_m(others).items()
-            if line_m - PLANS_END_M < section.to_m
+            if _is_last(section) and line_m - PLANS_END_M < section.to_m
         ]
         return tuple(ends)
 
@@ -83,33 +92,46 @@ class HandOver:
         self, vehicles: Iterable[OnRoadT], others: Sequence[OtherBody]
     ) -> Iterator[OnRoadT]:
         """Yield the vehicles that SUMO takes back now."""
-        last_m = self.last_lines_m(others)
+        ends_m = {one.lane: one.rear_m for one in self.plans_end(others)}
         for vehicle in vehicles:
             section = self._section_of(vehicle)
             if section is None or not vehicle.keeps_lane:
                 continue
-            if self._misses_lane(vehicle, section, last_m) or self._has_to_brake(
+            if self._misses_lane(vehicle, section, others, ends_m) or self._has_to_brake(
                 vehicle, section, others
             ):
                 yield vehicle
 
     def _misses_lane(
-        self, vehicle: OnRoad, section: LaneSection, lines_m: Mapping[int, float]
+        self,
+        vehicle: OnRoad,
+        section: LaneSection,
+        others: Sequence[OtherBody],
+        ends_m: Mapping[int, float],
     ) -> bool:
-        """Return whether it is too late for a vehicle to reach its lane before the line there."""
+        """Return whether it is too late for a vehicle to reach its lane before the line there.
+
+        It is, too, if its own lane has ended for plans, by lane in `ends_m`.
+        """
         arrival, lane = vehicle.arrival, section.lane
         wanted = arrival.preferred_lane
         if not _is_last(section) or wanted in (lane, ANY_LANE) or lane in arrival.right_lanes:
             return False
-        reaches_m = vehicle.state[0] + self.moves_m(abs(wanted - lane))
-        return reaches_m > lines_m.get(wanted, -math.inf)
+        s_m = vehicle.state[0]
+        if s_m + self._move_m > ends_m.get(lane, math.inf):
+            return True
+        ahead = [other for other in others if other.front_m > s_m]
+        line_m = self.last_lines_m(ahead).get(wanted, -math.inf)
+        return s_m + self.moves_m(abs(wanted - lane)) > line_m
 
     def _section_of(self, vehicle: OnRoad) -> LaneSection | None:
         """Return the section in which a vehicle is, if it may leave the road by its end."""
         lane, s_m, destination = vehicle.body_lane, vehicle.state[0], vehicle.arrival.destination
+        # One that has passed its exit drives to the end of the road.
+        to_exit = any(one.exit == destination and s_m <= one.to_m for one in self._sections)
         for one in self._sections:
             if one.lane == lane and one.from_m <= s_m <= one.to_m:
-                leaves = _is_last(one) if destination == END_OF_ROAD else one.exit == destination
+                leaves = one.exit == destination if to_exit else _is_last(one)
                 return one if leaves else None
         return None
 
@@ -123,11 +145,11 @@ class HandOver:
             if (
                 (other.lane, other.exit_m) == (section.lane, section.to_m)
                 and other.front_m > s_m
-                and closing_mps > 0.0
+                and (closing_mps > 0.0 or speed_mps < STANDING_MPS)
             ):
                 brakes_m = _stops_m(speed_mps) - _stops_m(other.speed_mps)
                 needed_m = SPACE_M + REACTION_S * closing_mps + brakes_m
-                if other.rear_m - s_m <= needed_m:
+                if other.rear_m - s_m <= (STANDING_M if speed_mps < STANDING_MPS else needed_m):
                     return True
         return False
 

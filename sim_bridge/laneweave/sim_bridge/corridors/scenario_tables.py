@@ -41,7 +41,8 @@ MAX_SETTLE_S, APPROACH_SETTLE_S = 8.0, 4.0
 there is little room before the queue, lane changes begin sooner."""
 APPROACH_S = 6.0
 """Time from the entrance of an approach after which vehicles that come slowly change lanes."""
-MIN_APPROACH_MPS = 8.0
+MIN_SPEED_MPS = 8.0
+"""Lowest v_F for this reason."""
 _WIDE_M = 100.0
 """A column pitch that suits all types."""
 Tables = dict[str, Any]
@@ -174,10 +175,10 @@ def scenario_tables(found: SumoCorridor) -> Tables:
     body_m = max(one.length_m for one in names)
     if corridor.lanes_to:
         # Where an approach is short, vehicles drive so slowly that they reach their lanes.
-        takes_s = APPROACH_S + (corridor.lanes - 1) * formation["cycle_s"]
+        takes_s = APPROACH_S + corridor.most_changes * formation["cycle_s"]
         enough_mps = _rounded_mps((corridor.length_m - body_m) / takes_s)
         if enough_mps < speed_mps:
-            speed_mps = max(enough_mps, MIN_APPROACH_MPS)
+            speed_mps = min(speed_mps, max(enough_mps, MIN_SPEED_MPS))
             formation = _motion(tables, corridor, speed_mps)
     tables["formation"] = formation
     settled_m = _m(speed_mps * formation["settle_s"])
@@ -345,7 +346,7 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
     cycle_s = _cycle_s(found, corridor)
     # A short approach leaves the room for its lane changes.
     advance_m = speed_mps * cycle_s
-    moves_m = max((corridor.lanes - 1) * advance_m, found.formation.longest_m + advance_m)
+    moves_m = max(corridor.most_changes, 1) * advance_m
     room_m = corridor.length_m - moves_m - found.types.longest_body_m
     settle_s = max(MIN_SETTLE_S, min(settle_s, room_m / speed_mps))
     settle_s = math.floor(10.0 * settle_s) / 10.0

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -146,6 +147,16 @@ def _grouped(pairs: Iterable[tuple[str, Link]]) -> Mapping[str, list[Link]]:
     return groups
 
 
+def unique_name(name: str, taken: Collection[str]) -> str:
+    """Return a name in the characters that scenarios allow, different from all that are taken."""
+    stem = re.sub(r"[^A-Za-z0-9_.-]", "_", name).lstrip("-._") or "edge"
+    stem = stem.replace("lane-", "lane_", 1)  # exits at the end of the road have such names
+    found, number = stem, 2
+    while found in taken:
+        found, number = f"{stem}-{number}", number + 1
+    return found
+
+
 def read_network(sumo: SumoProcess) -> Network:
     """Return the network of a simulation.
 
@@ -212,9 +223,9 @@ def _green_shares(sumo: SumoProcess, light: str) -> Sequence[float]:
     cycle_s = sum(duration_s for duration_s, _ in phases)
     if cycle_s <= 0.0:
         return [1.0] * len(api.getControlledLinks(light))
-    states = zip(*(state for _, state in phases), strict=True)
+    states = zip(*(state for _, state in phases), strict=False)
     return [
-        sum(duration_s for (duration_s, _), one in zip(phases, link, strict=True) if one in "Gg")
+        sum(duration_s for (duration_s, _), one in zip(phases, link, strict=True) if one in "GgOo")
         / cycle_s
         for link in states
     ]

@@ -22,7 +22,7 @@ from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
 from laneweave.protocol.vehicle.lane_ends import dead_ends
 from laneweave.protocol.wire.messages import OffLattice
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
-from laneweave.sim_bridge.corridors.exit_room import ExitRoom
+from laneweave.sim_bridge.corridors.exit_room import QUEUEING_MPS, ExitRoom
 from laneweave.sim_bridge.corridors.hand_over import HandOver
 from laneweave.sim_bridge.corridors.settling import LONGEST_S, before_rest_s, fall_back, settling_s
 from laneweave.sim_bridge.road.demand import Arrival
@@ -216,7 +216,7 @@ class TakeOver(OutsideTraffic):
         return self._hand_over.given_back(vehicles, self._world.others())
 
     def plans_end(self) -> tuple[OffLattice, ...]:
-        """Return lanes with positions behind which no plan may lead a vehicle into them."""
+        """Return lanes with positions beyond which no plan may use them."""
         return self._hand_over.plans_end(self._world.others())
 
     def is_stuck(self, t_s: float, *, moving: bool) -> bool:
@@ -272,7 +272,12 @@ class TakeOver(OutsideTraffic):
         if len(lanes) < 2:
             return arrival
         others = self._world.others()
-        there = self._going + Counter(other.lane for other in others)
+        queueing = (
+            other.lane
+            for other in others
+            if other.rear_m < other.exit_m or other.speed_mps < QUEUEING_MPS
+        )
+        there = self._going + Counter(queueing)
         within_m = self._hand_over.last_lines_m(others)
         settled_m = max(one.s_m, 0.0) + SETTLES_S * self._lattice.speed_mps
 

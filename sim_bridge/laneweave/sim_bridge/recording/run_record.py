@@ -228,7 +228,7 @@ class RunRecord:
     def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
         """Record a vehicle that has left the road since the last tick, by its end or an exit.
 
-        One that a simulator has taken back before counts as if it had left by the end of its lane.
+        One that a simulator has taken back before has left by the end of its lane, at once.
 
         `attended`: whether the vehicle's agent was in charge, not a caretaker.
         """
@@ -239,6 +239,7 @@ class RunRecord:
         left_s = t_s - max(s_m - section.to_m, 0.0) / v_mps if v_mps > 0 else t_s
         trip = self._trips[Name(vehicle.name)]
         trip.left_s, trip.final_lane = left_s, lane
+        trip.free_flow_s -= max(section.to_m - s_m, 0.0) / self._scenario.formation.speed_mps
         trip.exit = section.exit if section.to_m < self._scenario.road.length_m else END_OF_ROAD
         at_destination = section.serves(arrival.preferred_lane, arrival.destination) or (
             lane in arrival.right_lanes and section.serves(lane, arrival.destination)

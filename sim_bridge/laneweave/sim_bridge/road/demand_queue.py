@@ -81,7 +81,7 @@ class OutsideTraffic:
         return coming
 
     def full_lanes(self) -> set[int]:
-        """Return the lanes to whose start a vehicle is too close for another to enter before it."""
+        """Return the lanes that no vehicle may enter at their start now."""
         return set()
 
     def admit(self, t_s: float, meter: EntryMeter, occupied: Iterable[Cell]) -> list[Admission]:
@@ -101,7 +101,7 @@ class OutsideTraffic:
         return ()
 
     def plans_end(self) -> tuple[OffLattice, ...]:
-        """Return lanes with positions behind which no plan may lead a vehicle into them."""
+        """Return lanes with positions beyond which no plan may use them."""
         return ()
 
     def is_stuck(self, t_s: float, *, moving: bool) -> bool:

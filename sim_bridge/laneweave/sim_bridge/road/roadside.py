@@ -201,7 +201,7 @@ class Roadside:
         """Return whether the road will not change any more."""
         moving = any(one.state[1] > MOVING_MPS for one in vehicles.values())
         stuck = self.outside.is_stuck(t_s, moving=moving)
-        return stuck if vehicles else self.demand.exhausted(t_s)
+        return stuck or (not vehicles and self.demand.exhausted(t_s))
 
     def _is_kept_free(self, cell: Cell) -> bool:
         return self._lane_ends.is_kept_free(cell)

@@ -10,6 +10,7 @@ from attrs import evolve
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.messages import Ballot, Name, PendingTransfer
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
@@ -120,6 +121,73 @@ def test_one_that_cannot_reach_its_lane_before_the_line_there_is_given_back_at_o
     one = vehicle(preferred_lane=2)
     assert is_given_back(one, other(one.state[0] + NEEDED_M - 0.1))
     assert not is_given_back(one, other(one.state[0] + NEEDED_M - 0.1, lane=0))
+
+
+def test_bodies_behind_a_vehicle_or_as_fast_as_it_do_not_close_the_lane_beside_it() -> None:
+    one = vehicle((10, 0), 1)
+    s_m = one.state[0]
+    assert s_m == 150.0
+    assert not is_given_back(one, other(30.0, SPEED_MPS))
+    assert not is_given_back(one, other(30.0))
+    assert not is_given_back(one, other(s_m + 40.0, SPEED_MPS))
+    assert is_given_back(one, other(s_m + 40.0))
+    hand_over = HandOver(APPROACH)
+    assert not hand_over.plans_end([other(30.0, SPEED_MPS)])
+
+
+def test_one_whose_own_lane_has_ended_for_plans_is_given_back() -> None:
+    """A slow body behind it ends its lane, so no plan would lead it out."""
+    assert is_given_back(vehicle((10, 0), 1), other(30.0, lane=0))
+    assert not is_given_back(vehicle((10, 0), 0), other(30.0, lane=0))
+
+
+def test_one_that_stands_in_a_queue_is_given_back() -> None:
+    one = vehicle()
+    rest = cell_state(APPROACH.lattice, CELL, 0.0)
+    standing = (rest[0], 0.0, *rest[2:])
+    one.controller.plant = Plant(standing, APPROACH.vehicle, APPROACH.runtime.tick_s)
+    assert is_given_back(one, other(rest[0] + 7.0))
+    assert not is_given_back(one, other(rest[0] + 9.0))
+
+
+OFF_RAMP = parse_scenario(
+    {
+        "road": {
+            "lanes": 4,
+            "s1_m": 100.0,
+            "s2_m": 0.0,
+            "s3_m": 900.0,
+            "closures": [{"lane": 0, "to_m": 300.0}, {"lane": 0, "from_m": 600.0}],
+        },
+        "exit": [{"name": "off", "lanes": [0], "at_m": 600.0}],
+        "formation": {"operation": "rolling"},
+    }
+)
+
+
+@pytest.mark.parametrize(
+    ("lane", "s_m", "destination", "due"),
+    [
+        (0, 500.0, "off", True),
+        (1, 500.0, "off", False),  # SUMO would stop it for its exit
+        (0, 500.0, END_OF_ROAD, False),
+        (1, 500.0, END_OF_ROAD, True),
+        (1, 700.0, "off", True),  # it has passed its exit
+    ],
+)
+def test_one_is_given_back_where_it_leaves_the_road(
+    lane: int, s_m: float, destination: str, *, due: bool
+) -> None:
+    cell = round(s_m / OFF_RAMP.lattice.pitch_m), lane
+    one = vehicle_in(cell, scenario=OFF_RAMP)
+    one.controller.enter_lattice([cell])
+    arrival = evolve(one.arrival, destination=destination, preferred_lane=ANY_LANE)
+    one.admission = evolve(one.admission, arrival=arrival)
+    exit_m = 600.0 if lane == 0 else OFF_RAMP.road.length_m
+    queue = OtherBody("other", lane, exit_m, one.state[0] + 20.0, 5.0, 0.0, 0.0)
+    assert ([*HandOver(OFF_RAMP).given_back([one], [queue])] == [one]) == due
+    # The lane of the exit stays open for plans: others may have to leave it.
+    assert bool(HandOver(OFF_RAMP).plans_end([queue])) == (lane > 0)
 
 
 def test_one_that_leaves_its_cell_by_a_plan_in_force_is_not_given_back() -> None:
