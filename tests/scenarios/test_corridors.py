@@ -39,6 +39,7 @@ from support.interchange import (
     vehicle,
     write_interchange,
 )
+from support.variants import variants
 
 Events = list[dict[str, Any]]
 
@@ -147,7 +148,7 @@ def test_sumo_drives_the_same_vehicles_alone(
     assert "SUMO alone" in page
 
 
-@pytest.mark.parametrize("origin", ["", "upstream "])
+@pytest.mark.parametrize("origin", variants(["", "upstream "]))
 def test_at_a_fork_everybody_is_in_a_lane_that_leads_to_the_next_edge(
     tmp_path: Path, origin: str
 ) -> None:
@@ -163,7 +164,7 @@ def test_at_a_fork_everybody_is_in_a_lane_that_leads_to_the_next_edge(
         assert trip["final_lane"] in leads_to[turns[int(trip["sumo_id"][1:]) % 3]]
 
 
-@pytest.mark.parametrize("origin", ["", "upstream "])
+@pytest.mark.parametrize("origin", variants(["upstream ", ""]))
 def test_sumo_takes_vehicles_back_before_the_queue_of_their_lane(
     tmp_path: Path, origin: str
 ) -> None:
