@@ -195,12 +195,10 @@ class SimulatedRoad(Generic[VehicleT]):
 
         They have passed an exit, or a simulator has taken them back before it.
         """
-        left = [vehicle for vehicle in self.vehicles.values() if self._has_passed_exit(vehicle)]
-        return left + [
-            vehicle
-            for vehicle in self._roadside.given_back(self.vehicles.values())
-            if vehicle not in left
-        ]
+        left, on_road = list[VehicleT](), list[VehicleT]()
+        for vehicle in self.vehicles.values():
+            (left if self._has_passed_exit(vehicle) else on_road).append(vehicle)
+        return [*left, *self._roadside.outside.given_back(on_road)]
 
     def _has_passed_exit(self, vehicle: VehicleT) -> bool:
         return self._exits.left_by(vehicle.body_lane, vehicle.state[0]) is not None

@@ -34,10 +34,9 @@ MIN_AT_M = 1.0
 HANDOVER_M = 4.0
 """Distance before the end of an edge at which vehicles are given back to SUMO, if they need not
 give way behind it."""
-POCKET_S = 5.0
-"""Time at v_F before the end of the corridor, and `POCKET_M`, from which on no vehicle changes into
-a lane that opens there: SUMO drives into these turn pockets."""
-POCKET_M = 15.0
+POCKET_S, POCKET_M = 5.0, 15.0
+"""Time at v_F, plus a distance, before the end of an approach. Lanes that open later are turn
+pockets: no vehicle of laneweave changes into them, but SUMO does."""
 SPEED_SHARE = 0.9
 """v_F as a share of the speed limit: vehicles that move to a cell ahead are faster."""
 MAX_SPEED_MPS = 60.0
@@ -177,9 +176,18 @@ class Corridor:
         return {edge.name: number for number, edge in enumerate(self.edges)}
 
 
-def braking_m(speed_mps: float) -> float:
-    """Return the distance in which SUMO's vehicles stop."""
-    return speed_mps * REACTION_S + speed_mps**2 / (2.0 * DECEL_MPS2)
+def braking_m(speed_mps: float, reaction_s: float = REACTION_S) -> float:
+    """Return the distance in which vehicles stop that SUMO drives."""
+    return speed_mps * reaction_s + speed_mps**2 / (2.0 * DECEL_MPS2)
+
+
+def lanes_by_edge(network: Network, last: CorridorEdge) -> dict[str, list[int]]:
+    """Return which lanes of a corridor's last edge lead to each edge behind it, in order."""
+    found: dict[str, list[int]] = {}
+    for lane in last.edge.car_lanes:
+        for edge in dict.fromkeys(link.target.edge for link in network.links_from(lane)):
+            found.setdefault(edge, []).append(last.first_lane + lane.index)
+    return found
 
 
 def corridor_of(
@@ -274,10 +282,6 @@ class _OpenPart:
         """Where it ends."""
         return self.edges[-1].to_m
 
-    def ends_with(self, edge: Edge) -> bool:
-        """Return whether it reaches the end of an edge."""
-        return self.edges[-1].edge is edge
-
 
 def _nearest_lanes(lanes: Sequence[int], open_lanes: Collection[int]) -> tuple[int, ...]:
     """Return the open ones of some lanes; if there are none, those nearest to them."""
@@ -320,16 +324,12 @@ class _Derivation:
         ways_out = tuple(self._ways_out(parts))
         links = [link for lane in last.car_lanes for link in self._network.links_from(lane)]
         length_m = self._given_back_m(self._edges[-1], links)
-        pockets_m = length_m - POCKET_M - POCKET_S * SPEED_SHARE * self._limit_mps
-        before = [one for one in parts if one.from_m <= max(pockets_m, 0.0)]
-        lanes_to = self._lanes_to({one.lane for one in before if one.ends_with(last)})
+        latest_m = max(length_m - POCKET_M - POCKET_S * SPEED_SHARE * self._limit_mps, 0.0)
+        early = [part for part in parts if part.from_m <= latest_m]
+        lanes_to = self._lanes_to({part.lane for part in early if part.edges[-1].edge is last})
         if lanes_to:
             into = {(ramp.lane, ramp.merge_m) for ramp in ramps}
-            parts = [
-                part
-                for part in parts
-                if part.from_m <= max(pockets_m, 0.0) or (part.lane, part.from_m) in into
-            ]
+            parts = [part for part in parts if part in early or (part.lane, part.from_m) in into]
         return Corridor(
             network=self._network,
             edges=self._edges,
@@ -350,10 +350,7 @@ class _Derivation:
         For an edge to which turn pockets alone lead, the lanes nearest to them count.
         """
         last = self._edges[-1]
-        found: dict[str, list[int]] = {}
-        for lane in last.edge.car_lanes:
-            for edge in {link.target.edge for link in self._network.links_from(lane)}:
-                found.setdefault(edge, []).append(last.first_lane + lane.index)
+        found = lanes_by_edge(self._network, last)
         if all(len(lanes) == len(last.edge.car_lanes) for lanes in found.values()):
             return NO_LANES
         return {edge: _nearest_lanes(lanes, open_lanes) for edge, lanes in sorted(found.items())}

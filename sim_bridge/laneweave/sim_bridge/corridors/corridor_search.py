@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.sim_bridge.corridors.corridor import through_links
+from laneweave.sim_bridge.corridors.corridor import lanes_by_edge, through_links
 from laneweave.sim_bridge.corridors.sumo_corridor import SumoCorridor, corridor_in
 from laneweave.sim_bridge.corridors.sumo_network import Edge, Link, Network
 from laneweave.sim_bridge.corridors.sumo_simulation import SumoSimulation
@@ -21,7 +21,7 @@ MIN_LANES = 2
 MIN_SPEED_MPS = 13.0
 MIN_LENGTH_M = 500.0
 MIN_APPROACH_MPS = 8.0
-MIN_APPROACH_M, APPROACH_M = 100.0, 300.0
+MIN_APPROACH_M, USUAL_APPROACH_M = 100.0, 300.0
 """Length of an approach: at least, and usually at most."""
 SATURATION_VEH_PER_H = 2100.0
 """Vehicles that pass a green light in an hour, by lane: SUMO's default drivers follow each other
@@ -97,12 +97,12 @@ def find_approaches(simulation: SumoSimulation) -> list[Approach]:
     """Return the approaches on which vehicles drive, the busiest first.
 
     An approach is as long as its chain of edges, but no longer than the last ones that together
-    have `APPROACH_M`.
+    have `USUAL_APPROACH_M`.
     """
     found = []
     for chain in _chains(simulation.network, MIN_APPROACH_MPS):
         length_m, first = 0.0, len(chain)
-        while first and length_m < APPROACH_M:
+        while first and length_m < USUAL_APPROACH_M:
             first -= 1
             length_m += chain[first].length_m
         if length_m < MIN_APPROACH_M:
@@ -120,13 +120,14 @@ def _approach(found: SumoCorridor) -> Approach:
     counts = Counter(route[route.index(last.name) + 1] for route in routes)
     per_h = 3600.0 / found.simulation.duration_s
     links = [link for lane in last.edge.car_lanes for link in network.links_from(lane)]
-    lanes: dict[str, set[int]] = {}
     green = dict.fromkeys(last.lanes, MIN_GREEN_SHARE)
     for link in links:
         lane = last.first_lane + link.origin.index
-        lanes.setdefault(link.target.edge, set()).add(lane)
         green[lane] = max(green[lane], link.green_share)
-    turns = tuple(Turn(edge, tuple(sorted(lanes[edge])), per_h * counts[edge]) for edge in lanes)
+    turns = tuple(
+        Turn(edge, tuple(lanes), per_h * counts[edge])
+        for edge, lanes in lanes_by_edge(network, last).items()
+    )
     control = "light" if any(link.traffic_light for link in links) else "gives way"
     if all(link.has_priority for link in links):
         control = "priority"

@@ -3,8 +3,8 @@
 SUMO drives all vehicles outside. A vehicle that departs on the first edge of the corridor waits at
 the start of the road, and is added to SUMO when it enters. A vehicle from another edge is driven by
 SUMO until it comes to its ramp. Inside, SUMO displays all vehicles where their plants are, on the
-lanes of its network. At an exit, or at the end of the road, a vehicle is given back with its speed,
-and SUMO drives on along its route.
+lanes of its network. At an exit, at the end of the road, or before a queue, a vehicle is given back
+with its speed, and SUMO drives on along its route.
 
 What SUMO drives near the corridor is seen by the sensors of vehicles inside (`others`).
 """
@@ -42,10 +42,10 @@ _PLANTS = {
 """Options with which SUMO displays bodies as the bridge drives them."""
 _OWN_SPEED_MODE, _OWN_LANE_CHANGES = 31, 1621
 """SUMO's defaults: it drives."""
-_LANE_CHANGES_OF_ROUTES = 0b011000000001
-"""The same without lane changes that its route does not require."""
 _SLOWING_MODE = 0b1011011
 """The same with a given speed: above the limits of lanes, and braking as hard as is necessary."""
+_LANE_CHANGES_OF_ROUTES = 0b011000000001
+"""SUMO changes lanes only where the route of a vehicle requires it."""
 SLOWS_MPS2, SLOWS_S = 0.5, 5.0
 """Deceleration of a vehicle that is given back before a lower limit, and for how long at most. SUMO
 would brake it as hard as its type allows, and a truck one column behind, which is still inside,
@@ -120,7 +120,7 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         self._approaching: dict[int, list[Approaching]] = {}
         """What SUMO has been asked since its last step, by lane."""
         self._others: list[OtherBody] | None = None
-        """The same for bodies behind the exits; None: it has not been asked."""
+        """The bodies that SUMO drives on the road and behind its exits; None: not asked yet."""
 
     # --- traffic that SUMO drives -------------------------------------------------------------
 

@@ -78,7 +78,7 @@ class ExitRoom:
     ) -> Sequence[Arrival]:
         """Return which vehicles at the start may enter; see `OutsideTraffic.release`.
 
-        `others` returns the bodies behind the exits.
+        `others` returns the bodies on the road and behind its exits.
         """
         held = [*self._held, *coming]
         if not held:
@@ -114,7 +114,7 @@ class ExitRoom:
             destination: name of its exit, or `END_OF_ROAD`, which is not watched.
             going: number of vehicles that are on the way to the same exit.
             waiting: number of those that are held back.
-            others: bodies behind the exits.
+            others: bodies on the road and behind its exits.
         """
         if destination == END_OF_ROAD:
             return True

@@ -4,7 +4,7 @@ A vehicle would have to brake for what SUMO drives ahead of it: vehicles behind 
 of the road, and those that were given back before. As long as it can still brake comfortably, it
 is given back, with its speed; the next one behind it follows when that one brakes, and so on. So
 the line at which vehicles are given back moves with the queue, lane by lane. Plans end before it,
-and nobody enters behind it.
+and no vehicle that departs at the start enters a lane whose line is not on the road.
 
 A vehicle that cannot reach the lane that it prefers before the line of this lane is given back
 where it is, as soon as this is certain; SUMO decides on its further lane changes. docs/SAFETY.md
@@ -16,11 +16,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from laneweave.protocol.road_layout import ANY_LANE, LaneSection, end_exit
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, Exits, LaneSection
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import OffLattice
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
-from laneweave.sim_bridge.corridors.corridor import DECEL_MPS2
+from laneweave.sim_bridge.corridors.corridor import braking_m
 from laneweave.sim_bridge.corridors.exit_room import SPACE_M
 from laneweave.sim_bridge.road.demand_queue import OnRoad, OnRoadT
 
@@ -39,32 +39,33 @@ class HandOver:
 
     def __init__(self, scenario: Scenario) -> None:
         """Read the exits of a road."""
-        self._sections = tuple(one for one in scenario.geometry.sections if one.exit)
+        sections = scenario.geometry.sections
+        self._exits = Exits(sections, scenario.road.length_m)
+        self._sections = {(one.lane, one.to_m): one for one in sections if one.exit}
+        """Sections that end at an exit, by lane and end."""
         self._speed_mps = speed_mps = scenario.lattice.speed_mps
         self._move_m = scenario.timing.cycles_s[0] * speed_mps
-        """Distance in which a vehicle changes lanes once."""
-        self._braking_m = SPACE_M + REACTION_S * speed_mps + _stops_m(speed_mps)
+        """Distance that a vehicle drives in one lane change."""
+        self._braking_m = SPACE_M + braking_m(speed_mps, REACTION_S)
         """Distance in which a vehicle at v_F stops comfortably behind another one."""
 
     def lines_m(self, others: Iterable[OtherBody]) -> dict[LaneSection, float]:
         """Return where vehicles at v_F have to brake, by section, if slower ones are ahead."""
         lines_m: dict[LaneSection, float] = {}
         for other in others:
-            if other.speed_mps >= self._speed_mps - AS_FAST_MPS:
-                continue
-            for section in self._sections:
-                if (section.lane, section.to_m) == (other.lane, other.exit_m):
-                    line_m = other.rear_m + _stops_m(other.speed_mps) - self._braking_m
-                    lines_m[section] = min(lines_m.get(section, math.inf), line_m)
+            section = self._sections.get((other.lane, other.exit_m))
+            if section is not None and other.speed_mps < self._speed_mps - AS_FAST_MPS:
+                line_m = other.rear_m + braking_m(other.speed_mps, 0.0) - self._braking_m
+                lines_m[section] = min(lines_m.get(section, math.inf), line_m)
         return lines_m
 
     def last_lines_m(self, others: Iterable[OtherBody]) -> dict[int, float]:
-        """Return the same by lane for those that reach the end of the road, which is the latest."""
+        """Return these lines by lane, for lanes to the end of the road; at the latest, they end."""
         lines_m = self.lines_m(others)
         return {
             one.lane: min(lines_m.get(one, one.to_m), one.to_m)
-            for one in self._sections
-            if _is_last(one)
+            for one in self._sections.values()
+            if one.serves(ANY_LANE)
         }
 
     def moves_m(self, lanes: int) -> float:
@@ -79,7 +80,7 @@ class HandOver:
         ends = [
             OffLattice(section.lane, max(line_m - PLANS_END_M, section.from_m, 0.0))
             for section, line_m in self.lines_m(others).items()
-            if _is_last(section) and line_m - PLANS_END_M < section.to_m
+            if section.serves(ANY_LANE) and line_m - PLANS_END_M < section.to_m
         ]
         return tuple(ends)
 
@@ -115,7 +116,8 @@ class HandOver:
         """
         arrival, lane = vehicle.arrival, section.lane
         wanted = arrival.preferred_lane
-        if not _is_last(section) or wanted in (lane, ANY_LANE) or lane in arrival.right_lanes:
+        is_right = wanted in (lane, ANY_LANE) or lane in arrival.right_lanes
+        if is_right or not section.serves(ANY_LANE):
             return False
         s_m = vehicle.state[0]
         if s_m + self._move_m > ends_m.get(lane, math.inf):
@@ -126,14 +128,13 @@ class HandOver:
 
     def _section_of(self, vehicle: OnRoad) -> LaneSection | None:
         """Return the section in which a vehicle is, if it may leave the road by its end."""
-        lane, s_m, destination = vehicle.body_lane, vehicle.state[0], vehicle.arrival.destination
-        # One that has passed its exit drives to the end of the road.
-        to_exit = any(one.exit == destination and s_m <= one.to_m for one in self._sections)
-        for one in self._sections:
-            if one.lane == lane and one.from_m <= s_m <= one.to_m:
-                leaves = one.exit == destination if to_exit else _is_last(one)
-                return one if leaves else None
-        return None
+        s_m, destination = vehicle.state[0], vehicle.arrival.destination
+        ends_m = [end_m for (_, end_m), one in self._sections.items() if one.exit == destination]
+        if max(ends_m, default=-math.inf) < s_m:
+            destination = END_OF_ROAD  # it has passed its exit
+        section = self._exits.section_at(vehicle.body_lane, s_m)
+        leaves = section is not None and section.serves(ANY_LANE, destination)
+        return section if leaves else None
 
     def _has_to_brake(
         self, vehicle: OnRoad, section: LaneSection, others: Iterable[OtherBody]
@@ -147,18 +148,8 @@ class HandOver:
                 and other.front_m > s_m
                 and (closing_mps > 0.0 or speed_mps < STANDING_MPS)
             ):
-                brakes_m = _stops_m(speed_mps) - _stops_m(other.speed_mps)
+                brakes_m = braking_m(speed_mps, 0.0) - braking_m(other.speed_mps, 0.0)
                 needed_m = SPACE_M + REACTION_S * closing_mps + brakes_m
                 if other.rear_m - s_m <= (STANDING_M if speed_mps < STANDING_MPS else needed_m):
                     return True
         return False
-
-
-def _is_last(section: LaneSection) -> bool:
-    """Return whether a section ends with the road."""
-    return section.exit == end_exit(section.lane)
-
-
-def _stops_m(speed_mps: float) -> float:
-    """Return the distance in which a vehicle stops by braking comfortably."""
-    return speed_mps**2 / (2.0 * DECEL_MPS2)

@@ -26,6 +26,7 @@ from laneweave.sim_bridge.corridors.corridor import (
     Corridor,
     Ramp,
 )
+from laneweave.sim_bridge.corridors.settling import SLOW_ENTRY_S
 from laneweave.sim_bridge.corridors.sumo_corridor import Pass, SumoCorridor
 from laneweave.sim_bridge.corridors.sumo_simulation import SumoType
 
@@ -39,10 +40,8 @@ its cell can then catch up without coming so close to the one ahead that it has 
 MAX_SETTLE_S, APPROACH_SETTLE_S = 8.0, 4.0
 """Time in which vehicles settle in their cells, if ramps are long enough; on approaches, where
 there is little room before the queue, lane changes begin sooner."""
-APPROACH_S = 6.0
-"""Time from the entrance of an approach after which vehicles that come slowly change lanes."""
-MIN_SPEED_MPS = 8.0
-"""Lowest v_F for this reason."""
+SLOWEST_MPS = 8.0
+"""v_F to which a short approach is slowed down at most."""
 _WIDE_M = 100.0
 """A column pitch that suits all types."""
 Tables = dict[str, Any]
@@ -175,10 +174,10 @@ def scenario_tables(found: SumoCorridor) -> Tables:
     body_m = max(one.length_m for one in names)
     if corridor.lanes_to:
         # Where an approach is short, vehicles drive so slowly that they reach their lanes.
-        takes_s = APPROACH_S + corridor.most_changes * formation["cycle_s"]
+        takes_s = SLOW_ENTRY_S + corridor.most_changes * formation["cycle_s"]
         enough_mps = _rounded_mps((corridor.length_m - body_m) / takes_s)
         if enough_mps < speed_mps:
-            speed_mps = min(speed_mps, max(enough_mps, MIN_SPEED_MPS))
+            speed_mps = min(speed_mps, max(enough_mps, SLOWEST_MPS))
             formation = _motion(tables, corridor, speed_mps)
     tables["formation"] = formation
     settled_m = _m(speed_mps * formation["settle_s"])

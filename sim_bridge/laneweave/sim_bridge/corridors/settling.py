@@ -21,6 +21,8 @@ BRAKE_MPS2 = 2.0
 MIN_SPEED_MPS = 6.0
 """Lowest speed to which a vehicle brakes."""
 LONGEST_S = 60.0
+SLOW_ENTRY_S = 6.0
+"""Time after its entry in which a vehicle that comes slowly is ready to change lanes, as a rule."""
 _SHORTEST_S = 1.0
 _SLACK_S = 0.3
 """Spare time: ticks are discrete."""

@@ -24,7 +24,13 @@ from laneweave.protocol.wire.messages import OffLattice
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.corridors.exit_room import QUEUEING_MPS, ExitRoom
 from laneweave.sim_bridge.corridors.hand_over import HandOver
-from laneweave.sim_bridge.corridors.settling import LONGEST_S, before_rest_s, fall_back, settling_s
+from laneweave.sim_bridge.corridors.settling import (
+    LONGEST_S,
+    SLOW_ENTRY_S,
+    before_rest_s,
+    fall_back,
+    settling_s,
+)
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import OnRoadT, OutsideTraffic
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter, EntryState
@@ -45,10 +51,8 @@ BESIDE_COLUMNS = 1
 """Number of columns by which a vehicle rather falls back than entering beside another vehicle."""
 STANDING_S = 120.0
 """Time for which all vehicles stand in queues behind exits when a run ends, after all entries."""
-SETTLES_S = 6.0
-"""Time after its entry in which a vehicle begins to change lanes."""
 VEHICLES_PER_CHANGE = 2
-"""Vehicles that a lane has to have less than another for a lane change into it."""
+"""Number of vehicles by which a queue has to be shorter for each lane change towards it."""
 MAX_COLUMNS = 40
 """Maximum number of columns that are tried."""
 
@@ -279,7 +283,7 @@ class TakeOver(OutsideTraffic):
         )
         there = self._going + Counter(queueing)
         within_m = self._hand_over.last_lines_m(others)
-        settled_m = max(one.s_m, 0.0) + SETTLES_S * self._lattice.speed_mps
+        settled_m = max(one.s_m, 0.0) + SLOW_ENTRY_S * self._lattice.speed_mps
 
         def cost(lane: int) -> tuple[bool, int, int]:
             away = abs(lane - arrival.lane)

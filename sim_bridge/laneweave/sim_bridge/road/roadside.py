@@ -14,12 +14,7 @@ from laneweave.protocol.wire.messages import ClosedFormation, Name, Neighbour
 from laneweave.sim_bridge.road.allocation import NO_VEHICLES, Allocation, allocation_of
 from laneweave.sim_bridge.road.census import CensusPublisher
 from laneweave.sim_bridge.road.demand import Arrival
-from laneweave.sim_bridge.road.demand_queue import (
-    NO_OUTSIDE_TRAFFIC,
-    DemandQueue,
-    OnRoadT,
-    OutsideTraffic,
-)
+from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, DemandQueue, OutsideTraffic
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter, Goals
 from laneweave.sim_bridge.road.lane_end_control import LaneEndChange, LaneEndControl
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -172,10 +167,6 @@ class Roadside:
         upstream = self.outside.start_lanes
         closed = [self._meter.closed_column(lane) + (lane in upstream) for lane in self._lanes]
         self._allocation.assign_empty_cells(vehicles, closed)
-
-    def given_back(self, vehicles: Iterable[OnRoadT]) -> Sequence[OnRoadT]:
-        """Return the vehicles that a simulator takes back before their exits."""
-        return [*self.outside.given_back(vehicles)]
 
     def on_left(
         self,

@@ -136,7 +136,7 @@ def test_bodies_behind_a_vehicle_or_as_fast_as_it_do_not_close_the_lane_beside_i
 
 
 def test_one_whose_own_lane_has_ended_for_plans_is_given_back() -> None:
-    """A slow body behind it ends its lane, so no plan would lead it out."""
+    """No plan uses the lane beyond a slow body, not even to leave it."""
     assert is_given_back(vehicle((10, 0), 1), other(30.0, lane=0))
     assert not is_given_back(vehicle((10, 0), 0), other(30.0, lane=0))
 
