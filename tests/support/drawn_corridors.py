@@ -1,8 +1,10 @@
 """Corridors drawn at random, written with netconvert.
 
-A drawn network is a main road of two to four lanes with an on-ramp, exits, both or neither, in any
-order, with any lengths; the corridor may begin and end on any of its main edges. Vehicles depart on
-the first edge, upstream of it or on the ramp, anywhere on their edges.
+A drawn network is a main road of two to four lanes with on-ramps, exits, both or neither, in any
+order, with any lengths: several interchanges one after another, and exits whose lanes are open from
+the start of the network on. The corridor may begin and end on any of its main edges, also on those
+with the lane of a ramp. Vehicles depart on the first edge, upstream of it or on a ramp, anywhere on
+their edges.
 """
 
 from __future__ import annotations
@@ -20,6 +22,22 @@ from support import corridor_oracle
 
 NETCONVERT = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
 DEMAND_S = 60
+KINDS = (
+    "plain",
+    "ramp",
+    "exit",
+    "ramp-exit",
+    "exit-ramp",
+    "weaving",
+    "exit-exit",
+    "ramp-ramp",
+    "exit-ramp-exit-ramp",
+    "ramp-weaving-ramp",
+    "drop",
+    "drop-ramp",
+    "drop-ramp-exit-ramp",
+)
+"""Parts of the main road, in order; `drop`: an exit whose lane is open from the start on."""
 CAR, TRUCK = (4.5, 1.8), (7.1, 2.4)
 """(length, width) [m] of the drawn types."""
 
@@ -88,9 +106,7 @@ def draw_corridor(seed: int, folder: Path) -> DrawnCorridor:
     """Write the files of a drawn simulation."""
     rng = Random(seed)
     main = _Main(rng, rng.choice((2, 2, 3, 3, 4)), rng.choice((16.67, 22.22, 27.78)))
-    kind = rng.choice(
-        ("plain", "ramp", "ramp", "exit", "exit", "ramp-exit", "exit-ramp", "weaving", "exits")
-    )
+    kind = rng.choice(KINDS)
     _draw_road(main, kind)
     first, last = _draw_ends(main)
     left_hand = rng.random() < 0.1
@@ -121,19 +137,26 @@ def _draw_road(main: _Main, kind: str) -> None:
     """Draw the edges: a feature needs lanes that are long enough for the speed."""
     rng = main.rng
     per_mps = main.speed_mps / 27.78
+    parts = kind.split("-")
+    drop = parts[0] == "drop"
     for _ in range(rng.choice((0, 0, 1, 2))):
-        main.extend(rng.uniform(120.0, 400.0))
-    main.extend(rng.uniform(350.0, 700.0))
-    for part in kind.replace("exits", "exit-exit").split("-"):
+        main.extend(rng.uniform(120.0, 400.0), extra=drop)
+    main.extend(rng.uniform(350.0, 700.0), extra=drop)
+    for before, after in pairwise(main.main):
+        main.connect(before, after, [(n, n) for n in range(main.lanes + drop)])
+    for part in parts:
         if part == "plain":
             continue
-        if part in ("ramp", "weaving"):
-            _draw_ramp(main)
-        extra = main.extend(per_mps * rng.uniform(260.0, 480.0), extra=True)
-        main.connect(main.main[-2], extra, [(n, n + 1) for n in range(main.lanes)])
+        if part == "drop":
+            extra = main.main[-1]
+        else:
+            if part in ("ramp", "weaving"):
+                _draw_ramp(main)
+            extra = main.extend(per_mps * rng.uniform(260.0, 480.0), extra=True)
+            main.connect(main.main[-2], extra, [(n, n + 1) for n in range(main.lanes)])
         if part in ("ramp", "weaving"):
             main.connect(main.ramps[-1][0].replace("far", "on"), extra, [(0, 0)])
-        if part in ("exit", "weaving"):
+        if part in ("exit", "weaving", "drop"):
             out = f"off{len(main.exits)}"
             end = main.node(main.x_m + 250.0, -60.0)
             main.edge(out, f"n{main.last}", end, 1, main.speed_mps * rng.choice((0.8, 1.0)))
@@ -165,9 +188,13 @@ def _draw_ends(main: _Main) -> tuple[int, int]:
     """Return the numbers of the first and the last main edge of a corridor."""
     rng = main.rng
     special = {number for _, number in (*main.exits, *main.ramps)}
-    firsts = [n for n in range(len(main.main)) if n < min(special, default=len(main.main))]
+    firsts = [n for n in range(len(main.main)) if n <= min(special, default=len(main.main))]
     first = rng.choice((0, firsts[-1], rng.choice(firsts)))
-    lasts = [n for n in range(first, len(main.main)) if n > max(special, default=-1)]
+    last_exit = max((number for _, number in main.exits), default=-1)
+    last_ramp = max((number for _, number in main.ramps), default=-1)
+    lasts = [
+        n for n in range(first, len(main.main)) if n > last_exit and n >= max(last_ramp, first)
+    ]
     return first, rng.choice((lasts[0], lasts[-1], rng.choice(lasts)))
 
 

@@ -195,7 +195,7 @@ def line_forgotten_when_driving_out(patch: Patch) -> None:
     patch.setattr("laneweave.sim_bridge.bodies.motion_controller.STANDING_MPS", -1.0)
 
 
-@breaks(LANE_ENDS, EntranceRoom, "full_lanes")
+@breaks(LANE_ENDS, EntranceRoom, "full_points")
 def full_lanes_are_entered(*_: object) -> set[int]:
     """Vehicles enter a lane whose queue reaches the entrance."""
     return set()
@@ -216,10 +216,15 @@ def ramps_are_issued_at_the_start(assign: Call, self: Roadside, vehicles: Vehicl
 
 @breaks(RAMPS, Roadside, "on_left")
 def cells_are_passed_on_twice(
-    on_left: Call, self: Roadside, vehicle: RoadVehicle, vehicles: Vehicles, t_s: float
+    on_left: Call,
+    self: Roadside,
+    vehicle: RoadVehicle,
+    vehicles: Vehicles,
+    t_s: float,
+    still_in: int | None = None,
 ) -> None:
     """Two vehicles get each cell of a vehicle that leaves."""
-    on_left(self, vehicle, vehicles, t_s)
+    on_left(self, vehicle, vehicles, t_s, still_in)
     for one in list(vehicles.values())[:1]:
         for cell in vehicle.controller.store.certain_cells:
             one.controller.store.assign_cell(cell)

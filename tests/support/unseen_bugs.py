@@ -364,9 +364,9 @@ def waiting_cell_assigned_again(
     assign: Call, self: CellAllocation, vehicles: Mapping[Name, RoadVehicle], closed: Sequence[int]
 ) -> None:
     """An empty cell that waited for a vehicle is assigned again at each tick."""
-    waiting = list(self._unassigned)
+    waiting = dict(self._unassigned)
     assign(self, vehicles, closed)
-    self._unassigned = [*waiting, *(one for one in self._unassigned if one not in waiting)]
+    self._unassigned = waiting | self._unassigned
 
 
 @breaks("census", CensusPublisher, "census", collides=False)

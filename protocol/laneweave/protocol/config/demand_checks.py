@@ -11,6 +11,7 @@ from laneweave.protocol.config.rules import compare, require
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import formation_columns
+from laneweave.protocol.scenario.road_geometry import EntryPoint
 from laneweave.protocol.scenario.traffic_flow import Inflow
 from laneweave.protocol.vehicle.lane_ends import re_entry
 
@@ -75,19 +76,20 @@ def check_volumes(scenario: Scenario) -> None:
 def _check_lane_volumes(scenario: Scenario) -> None:
     """Check that vehicles can enter each lane as often as its volume says."""
     road, demand = scenario.road, scenario.demand
+    points = scenario.geometry.entry_points
     ramps = {
-        one.lane: (f"entrance[{number}].volume_veh_per_h", one.volume_veh_per_h)
+        one.name: (f"entrance[{number}].volume_veh_per_h", one.volume_veh_per_h)
         for number, one in enumerate(scenario.entrance)
     }
     most, because = min(3600.0 / max(demand.min_headway_s, 1e-9), 3600.0), "demand.min_headway_s"
     if road.closures and scenario.formation.bound_veh_per_lane_h < most:
         most, because = scenario.formation.bound_veh_per_lane_h, "one in each cell of the lattice"
     main = ("demand.volume_veh_per_lane_h", demand.volume_veh_per_lane_h)
-    for lane, inflow in scenario.flow.inflows.items():
-        name, value = ramps.get(lane, main)
+    for number, inflow in scenario.flow.inflows.items():
+        name, value = ramps.get(points[number].entrance, main)
         volume, allowed = inflow.volume_veh_per_h, f"at most {most:g}"
-        if lane not in ramps and demand.arrival_shares:
-            allowed += f" vehicles per hour in each lane; lane {lane} has {volume:g}"
+        if points[number].entrance not in ramps and demand.arrival_shares:
+            allowed += f" vehicles per hour in each lane; lane {number} has {volume:g}"
         require(volume <= most * (1.0 + 1e-9), name, value, f"{allowed} ({because})")
 
 
@@ -103,10 +105,10 @@ def _check_capacity(scenario: Scenario) -> None:
     if not road.closures:
         return  # the bound of the entrance holds everywhere
     exits_m = {one.name: one.at_m for one in scenario.exit}
-    entry_m, flow, formation = scenario.geometry.entry_m, scenario.flow, scenario.formation
+    points, flow, formation = scenario.geometry.entry_points, scenario.flow, scenario.formation
     parts = [
-        (entry_m[lane], inflow.volume_veh_per_h * share, exits_m.get(name, math.inf))
-        for lane, inflow in flow.inflows.items()
+        (points[number].at_m, inflow.volume_veh_per_h * share, exits_m.get(name, math.inf))
+        for number, inflow in flow.inflows.items()
         for name, share in _shares(inflow)
     ]
     volume = scenario.demand.volume_veh_per_lane_h
@@ -129,7 +131,7 @@ def _check_capacity(scenario: Scenario) -> None:
             f"{formation.max_vehicles} (formation.max_vehicles) need more columns"
             + ("" if change_columns else ", and those with weaker types one more"),
         )
-    for s_m in sorted({0.0, *entry_m, *(one.from_m for one in road.closures)}):
+    for s_m in sorted({0.0, *(one.at_m for one in points), *(one.from_m for one in road.closures)}):
         flows = [(from_m, own) for from_m, own, to_m in parts if from_m <= s_m < to_m]
         from_ramps = sum(own for from_m, own in flows if from_m > 0.0)
         main_lanes = sum(own for from_m, own in flows if from_m <= 0.0) / volume
@@ -154,9 +156,10 @@ def _shares(inflow: Inflow) -> list[tuple[str, float]]:
 def check_destinations(scenario: Scenario) -> None:
     """Check that destinations exist, and that the vehicles of each entrance can reach theirs."""
     names = [one.name for one in scenario.exit]
-    tables = {one.lane: f"entrance[{number}]" for number, one in enumerate(scenario.entrance)}
-    for lane, inflow in scenario.flow.inflows.items():
-        name, shares = f"{tables.get(lane, 'demand')}.destinations", _shares(inflow)
+    tables = {one.name: f"entrance[{number}]" for number, one in enumerate(scenario.entrance)}
+    for number, inflow in scenario.flow.inflows.items():
+        point = scenario.geometry.entry_points[number]
+        name, shares = f"{tables.get(point.entrance, 'demand')}.destinations", _shares(inflow)
         listed = [*map(attrs.astuple, inflow.destinations)]
         require(shares[-1][1] >= -1e-9, name, listed, "shares whose sum is at most 1")
         for destination, share in shares:
@@ -164,13 +167,24 @@ def check_destinations(scenario: Scenario) -> None:
                 allowed = f"an exit: {', '.join(names) or 'there is none'}"
                 require(destination in names, f"{name}.exit", destination, allowed)
             if share > 0.0:
-                _check_reachable(scenario, name, lane, destination)
+                preferred = [lane for lane, share in enumerate(inflow.lane_shares) if share]
+                _check_reachable(scenario, name, point, destination, preferred or [ANY_LANE])
 
 
-def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str) -> None:
-    """Check that a vehicle from a lane has room for all lane changes to its destination."""
-    geometry = scenario.geometry
-    own = min((one for one in geometry.sections if one.lane == lane), key=lambda one: one.from_m)
+def _check_reachable(
+    scenario: Scenario, name: str, point: EntryPoint, destination: str, wanted: Sequence[int]
+) -> None:
+    """Check that a vehicle has room for all lane changes to its destination.
+
+    Args:
+        scenario: road and lattice.
+        name: field of the destination.
+        point: where the vehicle enters.
+        destination: its destination.
+        wanted: lanes that it may prefer at the end of the road.
+    """
+    geometry, lane = scenario.geometry, point.lane
+    own = next(one for one in geometry.sections if one.lane == lane and point.at_m < one.to_m)
     from_m, room_m = max(own.from_m, own.moves_from_m, geometry.moves_from_m), 0.0
     if scenario.road.closures and scenario.formation.traits.has_formations:
         # At the volumes at which vehicles must cross lanes one after another, formations are full.
@@ -181,8 +195,6 @@ def _check_reachable(scenario: Scenario, name: str, lane: int, destination: str)
         room_m = re_entry(scenario).room_m
     from_m += scenario.types.longest_body_m
     advance_m = scenario.formation.speed_mps * scenario.timing.cycles_s[0]
-    preferring = scenario.flow.inflows[lane].lane_shares
-    wanted = [lane for lane, share in enumerate(preferring) if share] or [ANY_LANE]
     for preferred in wanted if destination == END_OF_ROAD else [ANY_LANE]:
         room = [
             (section.to_m - room_m if section.to_m < scenario.road.length_m else section.to_m)

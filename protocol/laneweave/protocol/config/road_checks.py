@@ -109,20 +109,20 @@ def _check_permitted_lanes(scenario: Scenario) -> None:
     road, demand = scenario.road, scenario.demand
     if not road.restrictions:
         return
-    sections, entry_m = scenario.geometry.sections, scenario.geometry.entry_m
+    sections = scenario.geometry.sections
     shares = [TypeShare(one.name, one.share) for one in scenario.vehicle_type]
-    entrances = [(MAIN_ENTRANCE, road.first_lanes, shares, demand.destinations)]
+    entrances = [(MAIN_ENTRANCE, 0.0, road.first_lanes, shares, demand.destinations)]
     entrances += [
-        (one.name, (one.lane,), list(one.vehicle_types) or shares, one.destinations)
+        (one.name, one.at_m, (one.lane,), list(one.vehicle_types) or shares, one.destinations)
         for one in scenario.entrance
     ]
-    for entrance, lanes, types, destinations in entrances:
+    for entrance, at_m, lanes, types, destinations in entrances:
         cars = TypeShare(CAR, max(0.0, 1.0 - sum(one.share for one in types)))
         wanted = [one.exit for one in destinations if one.share > 0.0]
         if sum(one.share for one in destinations) < 1.0:
             wanted.append(END_OF_ROAD)
         for name in [one.type for one in (*types, cars) if one.share > ROUNDED_SHARE]:
-            enters = any(not road.is_restricted(lane, entry_m[lane], name) for lane in lanes)
+            enters = any(not road.is_restricted(lane, at_m, name) for lane in lanes)
             _require_lane(enters, scenario, name, lanes, f"at entrance {entrance}")
             for destination in wanted if not scenario.sumo.config else ():
                 ends = [one for one in sections if one.serves(ANY_LANE, destination)]
@@ -149,19 +149,25 @@ def _require_lane(
 def check_entrances(scenario: Scenario) -> None:
     """Check that ramps are where lanes open, and that they are long enough."""
     road, names = scenario.road, {MAIN_ENTRANCE}
-    lanes = set[int]()
     for number, entrance in enumerate(scenario.entrance):
         name, lane = f"entrance[{number}]", entrance.lane
         allowed = f"a name of its own, other than {MAIN_ENTRANCE}"
         require(entrance.name not in names, f"{name}.name", entrance.name, allowed)
         names.add(entrance.name)
-        allowed = "a lane that is closed from the start of the road to its only entrance"
-        opens_m = [one.to_m for one in road.closures if one.lane == lane]
-        is_closed = any(one.lane == lane and one.from_m <= 0.0 for one in road.closures)
-        require(is_closed and lane not in lanes, f"{name}.lane", lane, allowed)
-        lanes.add(lane)
-        _check_opening(scenario, f"{name}.at_m", entrance, opens_m)
         formation = scenario.formation
+        opens_m = [one.to_m for one in road.closures if one.lane == lane]
+        earlier = [(one.lane, one.at_m) for one in scenario.entrance[:number]]
+        if formation.change_columns:
+            allowed = "a lane that is closed from the start of the road to its only entrance"
+            is_closed = any(one.lane == lane and one.from_m <= 0.0 for one in road.closures)
+            ok = is_closed and lane not in dict(earlier)
+        else:
+            allowed = "a lane that opens behind the start of the road (road.closures)"
+            ok = bool(opens_m)
+        require(ok, f"{name}.lane", lane, allowed)
+        _check_opening(scenario, f"{name}.at_m", entrance, opens_m)
+        ok = (lane, entrance.at_m) not in earlier
+        require(ok, f"{name}.at_m", entrance.at_m, "a position without another entrance")
         low_m = entrance.at_m + formation.speed_mps * formation.settle_s
         sections = [one for one in scenario.geometry.sections if one.lane == lane]
         ends_m = [one.to_m for one in sections if one.to_m > entrance.at_m]
@@ -178,21 +184,21 @@ def check_entrances(scenario: Scenario) -> None:
 def _check_opening(
     scenario: Scenario, field: str, entrance: Entrance, opens_m: Sequence[float]
 ) -> None:
-    """Check that the lane of a ramp opens at its beginning, for the first time or behind exits."""
+    """Check that the lane of a ramp opens at its beginning; if it was open, far enough behind."""
     where = f"where lane {entrance.lane} opens"
     if scenario.formation.change_columns:
         require(entrance.at_m == opens_m[0], field, entrance.at_m, f"{opens_m[0]:g}, {where}")
         return
     sections = [one for one in scenario.geometry.sections if one.lane == entrance.lane]
     before = [one for one in sections if one.to_m <= entrance.at_m]
-    # The bodies of vehicles that leave and of vehicles that enter must not overlap on the road.
+    # Bodies that leave by an exit and bodies that enter must not overlap on the road.
     tick_m = scenario.vehicle.max_speed_mps * scenario.runtime.tick_s
     after_m = max((one.to_m for one in before), default=-math.inf)
     after_m += scenario.types.longest_body_m + tick_m
-    possible = [one for one in opens_m if one >= after_m and all(each.exit for each in before)]
+    possible = [one for one in opens_m if one >= after_m]
     allowed = f"{' or '.join(f'{one:g}' for one in possible) or 'no position'}, {where}"
     if before:
-        allowed += f" behind exits, and {after_m:g} or more"
+        allowed += f" again, and {after_m:g} or more"
     require(entrance.at_m in possible, field, entrance.at_m, allowed)
 
 

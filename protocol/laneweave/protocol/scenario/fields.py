@@ -113,6 +113,6 @@ class Scenario:
             self.entrance,
             self.formation,
             tuple(TypeShare(one.name, one.share) for one in self.vehicle_type),
-            self.geometry.entry_m,
+            self.geometry.entry_points,
             drawn=not self.sumo.config,
         )

@@ -18,6 +18,15 @@ from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE, Closure, Entr
 
 
 @frozen
+class EntryPoint:
+    """Where vehicles enter in a lane: at the start of the road, or at the beginning of a ramp."""
+
+    lane: int
+    at_m: float = 0.0
+    entrance: str = MAIN_ENTRANCE
+
+
+@frozen
 class RoadGeometry:
     """Sections of lanes, entrances, exits, and times at v_F between them."""
 
@@ -60,16 +69,54 @@ class RoadGeometry:
         return wanted
 
     @cached_property
-    def entry_m(self) -> tuple[float, ...]:
-        """Where the cells of each lane are assigned and vehicles enter: at 0, or on a ramp."""
-        at_m = {entrance.lane: entrance.at_m for entrance in self._entrances}
-        return tuple(at_m.get(lane, 0.0) for lane in range(self._road.lanes))
+    def entry_points(self) -> tuple[EntryPoint, ...]:
+        """Where vehicles enter: first the first entry point of each lane, then all later ones.
+
+        So entry points 0 to lanes - 1 have the numbers of their lanes. A lane that is closed from
+        the start of the road on, and has no ramp, has one, too, by which nobody enters.
+        """
+        ramps = sorted(
+            (EntryPoint(one.lane, one.at_m, one.name) for one in self._entrances),
+            key=lambda point: point.at_m,
+        )
+        found = {lane: EntryPoint(lane) for lane in self._road.first_lanes}
+        for point in ramps:
+            found.setdefault(point.lane, point)
+        first = [found.get(lane, EntryPoint(lane)) for lane in range(self._road.lanes)]
+        return (*first, *(point for point in ramps if point not in first))
 
     @cached_property
-    def shared_exit_lanes(self) -> frozenset[int]:
-        """Lanes in which a ramp follows an exit, as in most interchanges."""
+    def entry_m(self) -> tuple[float, ...]:
+        """Where the first vehicles enter each lane: at 0, or on a ramp."""
+        return tuple(point.at_m for point in self.entry_points[: self._road.lanes])
+
+    @cached_property
+    def last_entry_m(self) -> tuple[float, ...]:
+        """Where the last vehicles enter each lane."""
+        at_m = {point.lane: point.at_m for point in self.entry_points}
+        return tuple(at_m[lane] for lane in range(self._road.lanes))
+
+    def entry_point_of(self, entrance: str) -> int:
+        """Return the number of the entry point of a ramp."""
+        names = [point.entrance for point in self.entry_points]
+        return names.index(entrance)
+
+    def entry_point_before(self, lane: int, s_m: float) -> int:
+        """Return the number of the last entry point of a lane before a position."""
+        later = [
+            number
+            for number, point in enumerate(self.entry_points)
+            if point.lane == lane and point.at_m < s_m
+        ]
+        return max(later, default=lane)
+
+    @cached_property
+    def shared_lanes(self) -> frozenset[int]:
+        """Lanes in which a ramp follows an exit or a dead end, as in most interchanges."""
         return frozenset(
-            section.lane for section in self.sections if section.to_m <= self.entry_m[section.lane]
+            section.lane
+            for section in self.sections
+            if section.to_m <= self.last_entry_m[section.lane]
         )
 
     def closed_to_bodies(self, body_m: float, tick_m: float) -> tuple[Closure, ...]:
@@ -94,11 +141,6 @@ class RoadGeometry:
                 parts.append(Closure(one.lane, from_m, to_m))
         return tuple(parts)
 
-    def entrance_of(self, lane: int) -> str:
-        """Return the name of the entrance of vehicles that arrive in a lane."""
-        names = {entrance.lane: entrance.name for entrance in self._entrances}
-        return names.get(lane, MAIN_ENTRANCE)
-
     def exit_lane(self, destination: str) -> int:
         """Return the lane of an exit; `ANY_LANE` if it has several, or for `END_OF_ROAD`."""
         lanes = next((one.lanes for one in self._exits if one.name == destination), ())
@@ -109,11 +151,11 @@ class RoadGeometry:
         """Time [s] in which a vehicle passes the whole road at v_F."""
         return self._road.length_m / self._formation.speed_mps
 
-    def free_flow_trip_s(self, lane: int, destination: str = END_OF_ROAD) -> float:
-        """Return the time [s] at v_F from the entrance of a lane to a destination."""
+    def free_flow_trip_s(self, entry_point: int, destination: str = END_OF_ROAD) -> float:
+        """Return the time [s] at v_F from an entry point to a destination."""
         ends_m = {one.name: one.at_m for one in self._exits}
         to_m = ends_m.get(destination, self._road.length_m)
-        return (to_m - self.entry_m[lane]) / self._formation.speed_mps
+        return (to_m - self.entry_points[entry_point].at_m) / self._formation.speed_mps
 
     @property
     def moves_from_m(self) -> float:

@@ -11,6 +11,7 @@ import attrs
 from attrs import frozen
 
 from laneweave.protocol.scenario.formation_table import FormationSettings, formation_columns
+from laneweave.protocol.scenario.road_geometry import EntryPoint
 from laneweave.protocol.scenario.road_tables import (
     Demand,
     DestinationShare,
@@ -23,7 +24,7 @@ from laneweave.protocol.wire.messages import CAR
 
 @frozen
 class Inflow:
-    """The vehicles that enter the road in one lane."""
+    """The vehicles that enter the road at one entry point."""
 
     volume_veh_per_h: float
     destinations: tuple[DestinationShare, ...]
@@ -36,7 +37,7 @@ class Inflow:
 
 @frozen
 class TrafficFlow:
-    """Inflows by lane, and the volumes for which formations have room."""
+    """Inflows by entry point, and the volumes for which formations have room."""
 
     _road: Road
     _demand: Demand
@@ -44,8 +45,7 @@ class TrafficFlow:
     _formation: FormationSettings
     _types: tuple[TypeShare, ...]
     """Shares of all types but cars, at entrances without shares of their own."""
-    _entry_m: Sequence[float]
-    """Where vehicles enter in each lane."""
+    _entry_points: Sequence[EntryPoint]
     _drawn: bool
     """Whether vehicles are drawn at random, and not those of a SUMO simulation."""
 
@@ -59,7 +59,7 @@ class TrafficFlow:
 
     @cached_property
     def inflows(self) -> Mapping[int, Inflow]:
-        """The vehicles that enter in each lane, by lane; lanes in which none enter are left out.
+        """The vehicles that enter, by number of their entry point, if any enter there.
 
         A type that may not drive in some lanes at the start of the road enters in the others.
         """
@@ -83,7 +83,12 @@ class TrafficFlow:
                 preferring or self.lane_shares,
                 one.vehicle_types or types,
             )
-            found |= self._permitted({one.lane: own})
+            number = next(
+                number
+                for number, point in enumerate(self._entry_points)
+                if point.entrance == one.name
+            )
+            found |= self._permitted({number: own})
         return MappingProxyType(dict(sorted(found.items())))
 
     def _permitted(self, inflows: Mapping[int, Inflow]) -> dict[int, Inflow]:
@@ -96,25 +101,26 @@ class TrafficFlow:
             return dict(inflows)
         shares = {one.type: one.share for one in next(iter(inflows.values())).types}
         shares[CAR] = max(0.0, 1.0 - sum(shares.values()))
-        lanes_of = {
+        points = self._entry_points
+        entering_at = {
             name: [
-                lane
-                for lane in inflows
-                if not self._road.is_restricted(lane, self._entry_m[lane], name)
+                number
+                for number in inflows
+                if not self._road.is_restricted(points[number].lane, points[number].at_m, name)
             ]
             for name in shares
         }
-        entering = sum(share for name, share in shares.items() if lanes_of[name])
+        entering = sum(share for name, share in shares.items() if entering_at[name])
         total = sum(one.volume_veh_per_h for one in inflows.values())
         found = {}
-        for lane, inflow in inflows.items():
+        for number, inflow in inflows.items():
             volumes = {
                 name: total
                 * (share / entering)
                 * inflow.volume_veh_per_h
-                / sum(inflows[other].volume_veh_per_h for other in lanes_of[name])
+                / sum(inflows[other].volume_veh_per_h for other in entering_at[name])
                 for name, share in shares.items()
-                if share > 0.0 and lane in lanes_of[name]
+                if share > 0.0 and number in entering_at[name]
             }
             volume = sum(volumes.values())
             if volume > 0.0:
@@ -123,7 +129,7 @@ class TrafficFlow:
                     for name, own in volumes.items()
                     if name != CAR
                 )
-                found[lane] = attrs.evolve(inflow, volume_veh_per_h=volume, types=types)
+                found[number] = attrs.evolve(inflow, volume_veh_per_h=volume, types=types)
         return found
 
     @property

@@ -42,7 +42,8 @@ class Lc2013Traffic:
         self._sumo = sumo
         self._vehicles: dict[str, ReferenceVehicle] = {}
         self._offered: dict[str, int] = {}
-        """Lane of each vehicle that waits for SUMO to insert it, at most one per lane."""
+        """Entry point of each vehicle that SUMO is to insert, at most one at each of them."""
+        self._entry_points = len(scenario.geometry.entry_points)
         self._kept_in_lane: set[ReferenceVehicle] = set()
         """Vehicles that must not change lanes yet."""
         self._poses: dict[str, Pose] = {}
@@ -84,14 +85,14 @@ class Lc2013Traffic:
         self._sumo.remove(vehicle.name)
 
     def _offer(self, t_s: float, entrance: Entrance) -> None:
-        """Queue the next vehicle of each lane in SUMO, which inserts it when there is room."""
-        for lane in range(self._road.lanes):
-            arrival = entrance.next_in(lane)
+        """Offer the next vehicle of each queue to SUMO, which inserts it when there is room."""
+        for point in range(self._entry_points):
+            arrival = entrance.next_at(point)
             if arrival is not None and arrival.vehicle not in self._offered:
                 self._sumo.offer(arrival, entrance.max_entry_m(arrival, t_s))
                 if not self._everywhere:
                     self._sumo.allow_lane_changes(arrival.vehicle, allowed=False)
-                self._offered[arrival.vehicle] = arrival.lane
+                self._offered[arrival.vehicle] = point
 
     def _entered(self, name: str, t_s: float, entrance: Entrance) -> ReferenceVehicle:
         s_m, y_m, _, speed_mps = self._poses[name]

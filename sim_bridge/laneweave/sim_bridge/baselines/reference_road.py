@@ -72,12 +72,12 @@ class ReferenceVehicle:
 
 
 class Entrance:
-    """Queue of waiting vehicles for each lane, at the start of the road or of a ramp."""
+    """Queues of waiting vehicles at the entry points of a road."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Create empty queues."""
-        self._queues: list[deque[Arrival]] = [deque() for _ in range(scenario.road.lanes)]
-        self._entry_m = scenario.geometry.entry_m
+        self._queues: list[deque[Arrival]] = [deque() for _ in scenario.geometry.entry_points]
+        self._entry_m = [point.at_m for point in scenario.geometry.entry_points]
         self._speed_mps = scenario.formation.speed_mps
         self._tick_s = scenario.runtime.tick_s
 
@@ -86,12 +86,12 @@ class Entrance:
         return sum(map(len, self._queues))
 
     def queue(self, arrival: Arrival) -> None:
-        """Add a vehicle to the queue of its lane."""
-        self._queues[arrival.lane].append(arrival)
+        """Add a vehicle to the queue of its entry point."""
+        self._queues[arrival.entry_point].append(arrival)
 
-    def next_in(self, lane: int) -> Arrival | None:
-        """Return the next vehicle in the queue of a lane, if any."""
-        return self._queues[lane][0] if self._queues[lane] else None
+    def next_at(self, point: int) -> Arrival | None:
+        """Return the next vehicle in the queue of an entry point, if any."""
+        return self._queues[point][0] if self._queues[point] else None
 
     def max_entry_m(self, arrival: Arrival, t_s: float) -> float:
         """Return the maximum position at which a vehicle can enter in this tick.
@@ -99,24 +99,24 @@ class Entrance:
         A vehicle that arrived between two ticks and did not wait has driven at v_F since then.
         """
         driven_s = min(max(t_s - arrival.t_s, 0.0), self._tick_s)
-        return self._entry_m[arrival.lane] + self._speed_mps * driven_s
+        return self._entry_m[arrival.entry_point] + self._speed_mps * driven_s
 
     def entered_s(self, arrival: Arrival, s_m: float, t_s: float) -> float:
         """Return when a vehicle that is at `s_m` at `t_s` passed its entrance at v_F."""
-        return t_s - (s_m - self._entry_m[arrival.lane]) / self._speed_mps
+        return t_s - (s_m - self._entry_m[arrival.entry_point]) / self._speed_mps
 
     def enter(
-        self, lane: int, t_s: float, s_m: float, y_m: float, speed_mps: float
+        self, point: int, t_s: float, s_m: float, y_m: float, speed_mps: float
     ) -> ReferenceVehicle:
-        """Remove the next vehicle from the queue of a lane, and return it on the road at `t_s`."""
-        arrival = self.take(lane)
+        """Remove the next vehicle from a queue, and return it on the road at `t_s`."""
+        arrival = self.take(point)
         return ReferenceVehicle(
-            arrival, self.entered_s(arrival, s_m, t_s), s_m, speed_mps, y_m, lane
+            arrival, self.entered_s(arrival, s_m, t_s), s_m, speed_mps, y_m, arrival.lane
         )
 
-    def take(self, lane: int) -> Arrival:
-        """Remove and return the next vehicle in the queue of a lane."""
-        return self._queues[lane].popleft()
+    def take(self, point: int) -> Arrival:
+        """Remove and return the next vehicle in the queue of an entry point."""
+        return self._queues[point].popleft()
 
 
 class Traffic(Protocol):

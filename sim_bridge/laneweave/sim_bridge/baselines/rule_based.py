@@ -54,7 +54,7 @@ class RuleTraffic:
         self._limits = scenario.vehicle
         self._rule = scenario.rule
         self._road = scenario.road
-        self._entry_m = scenario.geometry.entry_m
+        self._points = scenario.geometry.entry_points
         self._centre_m = scenario.lattice.cell_y_m
         self._speed_mps = scenario.formation.speed_mps
         self._tick_s = scenario.runtime.tick_s
@@ -140,13 +140,14 @@ class RuleTraffic:
 
     def _admit(self, t_s: float, entrance: Entrance) -> list[ReferenceVehicle]:
         entered = []
-        for lane in range(self._road.lanes):
-            while (arrival := entrance.next_in(lane)) is not None:
+        for number, point in enumerate(self._points):
+            lane = point.lane
+            while (arrival := entrance.next_at(number)) is not None:
                 s_m = self._room_m(arrival, entrance.max_entry_m(arrival, t_s))
                 if s_m is None:
                     break
                 y_m = self._centre_m(lane)
-                vehicle = entrance.enter(lane, t_s, s_m, y_m, self._speed_mps)
+                vehicle = entrance.enter(number, t_s, s_m, y_m, self._speed_mps)
                 self._vehicles[vehicle.name] = vehicle
                 self._lanes.enter(vehicle, lane)
                 self._world.add(vehicle.name, vehicle.state)
@@ -155,7 +156,7 @@ class RuleTraffic:
 
     def _room_m(self, arrival: Arrival, max_entry_m: float) -> float | None:
         """Return the position at which a vehicle can enter its lane at v_F; None if it cannot."""
-        entry_m, speed_mps = self._entry_m[arrival.lane], self._speed_mps
+        entry_m, speed_mps = self._points[arrival.entry_point].at_m, self._speed_mps
         beyond = [one for one in self._lanes[arrival.lane] if one.s_m >= entry_m]
         if not beyond:
             return max_entry_m

@@ -168,7 +168,8 @@ def setup_of(found: SumoCorridor, scenario: Scenario) -> CorridorSetup:
 def _arrivals(found: SumoCorridor, scenario: Scenario) -> Iterator[CorridorArrival]:
     """Yield the vehicles of a corridor in order of departure."""
     types = _types_in(scenario, found.type_names())
-    lanes = {entrance.name: entrance.lane for entrance in scenario.entrance}
+    geometry = scenario.geometry
+    entrances = {one.name for one in scenario.entrance}
     corridor, begin_s = found.corridor, found.simulation.begin_s
     on_ramp = {ramp.name: {link.origin.edge for link in ramp.path} for ramp in corridor.ramps}
     near = {lane.rpartition("_")[0] for way in found.ways_in for lane in way.lanes}
@@ -178,14 +179,15 @@ def _arrivals(found: SumoCorridor, scenario: Scenario) -> Iterator[CorridorArriv
         vehicle, vehicle_type = one.vehicle, types[one.vehicle.vehicle_type]
         t_s = vehicle.depart_s - begin_s
         if one.upstream:
-            lane = scenario.road.first_lanes[0]  # which one it is depends on SUMO
+            point = scenario.road.first_lanes[0]  # which one it is depends on SUMO
         elif one.entrance == MAIN_ENTRANCE:
-            lane = choose.lane(t_s, one, vehicle_type)
-        elif one.entrance in lanes:
-            lane = lanes[one.entrance]
+            point = choose.lane(t_s, one, vehicle_type)
+        elif one.entrance in entrances:
+            point = geometry.entry_point_of(one.entrance)
         else:
             allowed = f"an entrance {one.entrance}: {vehicle.name} of the simulation needs it"
-            raise BadInputError("entrance", [*lanes], allowed)
+            raise BadInputError("entrance", sorted(entrances), allowed)
+        lane = geometry.entry_points[point].lane
         arrival = Arrival(
             vehicle_name(number),
             lane,
@@ -195,6 +197,7 @@ def _arrivals(found: SumoCorridor, scenario: Scenario) -> Iterator[CorridorArriv
             vehicle_type,
             vehicle.name,
             one.lanes,
+            point,
         )
         first = vehicle.route[0]
         departs_on_ramp = first in on_ramp.get(one.entrance, ())

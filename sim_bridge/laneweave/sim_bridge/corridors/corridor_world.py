@@ -17,7 +17,6 @@ from pathlib import Path
 
 from attrs import evolve, frozen
 
-from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
@@ -25,7 +24,7 @@ from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.bodies.bodies_world import BodiesWorld
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, pose_of
-from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor
+from laneweave.sim_bridge.corridors.corridor import Corridor
 from laneweave.sim_bridge.corridors.corridor_setup import MAX_WAIT_S, CorridorArrival, CorridorSetup
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
 from laneweave.sim_bridge.corridors.exit_room import SEEN_BEYOND_M
@@ -107,45 +106,57 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         ways = [one for one in found.ways_in if one.entrance in entrances]
         self.start_lanes = tuple(one.lane for one in ways if one.entrance == MAIN_ENTRANCE)
         """Lanes to whose beginning vehicles come from upstream."""
-        self._ways_in = {one.lane: one.lanes for one in ways}
-        ramps = {one.lane for one in ways if one.entrance != MAIN_ENTRANCE}
-        if both := ramps.intersection(self.start_lanes):
-            allowed = f"one whose lane {min(both)} is either open at the start or that of a ramp"
-            raise BadInputError(OPTION, corridor.name, allowed)
+        self._ways_in = {
+            one.lane
+            if one.entrance == MAIN_ENTRANCE
+            else scenario.geometry.entry_point_of(one.entrance): one
+            for one in ways
+        }
+        """The ways to the entry points to which SUMO drives vehicles."""
         self.departing = tuple(
             one.arrival for one in setup.arrivals if one.near and not one.origin.departs_at_start
         )
         """Vehicles that depart near an entrance, in order of departure."""
         self._beyond = tuple(dict.fromkeys(_beyond(corridor, scenario)))
         self._approaching: dict[int, list[Approaching]] = {}
-        """What SUMO has been asked since its last step, by lane."""
+        """What SUMO has been asked since its last step, by entry point."""
         self._others: list[OtherBody] | None = None
         """The bodies that SUMO drives on the road and behind its exits; None: not asked yet."""
 
     # --- traffic that SUMO drives -------------------------------------------------------------
 
-    def approaching(self, lane: int) -> list[Approaching]:
-        """Return the vehicles that come to the entrance of a lane, the foremost first."""
-        if lane not in self._approaching:
-            self._approaching[lane] = sorted(self._find_approaching(lane), key=lambda one: -one.s_m)
-        return self._approaching[lane]
+    def approaching(self, entry_point: int) -> list[Approaching]:
+        """Return the vehicles that come to an entry point, the foremost first."""
+        if entry_point not in self._approaching:
+            found = self._find_approaching(entry_point) if entry_point in self._ways_in else ()
+            self._approaching[entry_point] = sorted(found, key=lambda one: -one.s_m)
+        return self._approaching[entry_point]
 
-    def _find_approaching(self, lane: int) -> Iterator[Approaching]:
-        api = self.vehicle
-        for name, way in self._ways_in.get(lane, {}).items():
+    def _find_approaching(self, entry_point: int) -> Iterator[Approaching]:
+        api, way_in = self.vehicle, self._ways_in[entry_point]
+        from_start = way_in.entrance == MAIN_ENTRANCE
+        for name, way in way_in.lanes.items():
             for vehicle in self.lane.getLastStepVehicleIDs(name):
                 coming = self._coming.get(vehicle)
                 if (
                     coming is not None
                     and coming.arrival.vehicle not in self.states
-                    and (coming.arrival.lane == lane or coming.origin.upstream)
+                    and (
+                        coming.origin.upstream
+                        if from_start
+                        else coming.arrival.entry_point == entry_point
+                    )
                 ):
                     s_m = way.from_m + api.getLanePosition(vehicle)
                     factor = api.getSpeedFactor(vehicle)
                     limits = tuple((to_m, factor * limit) for to_m, limit in way.limits)
                     speed_mps = api.getSpeed(vehicle)
-                    preferred_lane = coming.origin.preferred_lane(lane)
-                    arrival = evolve(coming.arrival, lane=lane, preferred_lane=preferred_lane)
+                    arrival = evolve(
+                        coming.arrival,
+                        lane=way_in.lane,
+                        preferred_lane=coming.origin.preferred_lane(way_in.lane),
+                        entry_point=entry_point,
+                    )
                     yield Approaching(arrival, s_m, speed_mps, limits, way.upstream)
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:

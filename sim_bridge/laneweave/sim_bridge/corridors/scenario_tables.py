@@ -69,11 +69,6 @@ def checked_tables(found: SumoCorridor, sumo: Tables) -> Tables:
         allowed = error.allowed
         if error.at_least is not None and isinstance(error.value, float):
             allowed += f"; {error.at_least - error.value:.0f} m longer are enough"
-        elif error.field.endswith("].lane"):
-            allowed = (
-                "a ramp in line with no lane that is open at the start of the corridor: begin the "
-                "corridor on a later edge"
-            )
         raise BadInputError(field, error.value, allowed) from error
     return tables
 

@@ -19,6 +19,7 @@ from attrs import evolve, frozen
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.vehicle.lane_ends import dead_ends
 from laneweave.protocol.wire.messages import OffLattice
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
@@ -91,8 +92,8 @@ class SumoTraffic(Protocol):
     def exhausted(self) -> bool:
         """Whether no more vehicles will come."""
 
-    def approaching(self, lane: int) -> Sequence[Approaching]:
-        """Return the vehicles that approach the entrance of a lane, the first one first."""
+    def approaching(self, entry_point: int) -> Sequence[Approaching]:
+        """Return the vehicles that approach an entry point, the first one first."""
 
     def others(self) -> Sequence[OtherBody]:
         """Return the bodies of SUMO's vehicles near the road."""
@@ -109,9 +110,13 @@ class TakeOver(OutsideTraffic):
         self._world = world
         self._lattice = scenario.lattice
         self._limits = {name: one.limits for name, one in scenario.types.items()}
-        self._at_m = {one.lane: one.at_m for one in scenario.entrance}
-        """Positions of the entrances, by lane."""
-        self._at_m |= dict.fromkeys(world.start_lanes, 0.0)
+        points = scenario.geometry.entry_points
+        self._at_m = {
+            number: point.at_m
+            for number, point in enumerate(points)
+            if point.entrance != MAIN_ENTRANCE or number in world.start_lanes
+        }
+        """Positions of the entry points to which SUMO drives vehicles, by number."""
         self._before_rest_s = {
             name: before_rest_s(scenario.types.room_ahead_m, one.limits)
             for name, one in scenario.types.items()
@@ -119,13 +124,17 @@ class TakeOver(OutsideTraffic):
         self._slot_s = scenario.timing.cycles_s[0]
         ends = dead_ends(scenario)
         self._lines_m = {
-            lane: min(
-                (end.line_m for end in ends if end.lane == lane and end.end_m > at_m),
+            number: min(
+                (
+                    end.line_m
+                    for end in ends
+                    if end.lane == points[number].lane and end.end_m > at_m
+                ),
                 default=scenario.road.length_m,
             )
-            for lane, at_m in self._at_m.items()
+            for number, at_m in self._at_m.items()
         }
-        """Where moves out of each of these lanes have ended."""
+        """Where moves out of the lane of each entry point have ended."""
         self._exit_room = ExitRoom(scenario)
         self._hand_over = HandOver(scenario)
         self._going = Counter[int]()
@@ -144,8 +153,8 @@ class TakeOver(OutsideTraffic):
     def demanded(self, t_s: float) -> Sequence[Arrival]:
         """Return the vehicles that have come near an entrance since the last call."""
         new = []
-        for lane, at_m in self._at_m.items():
-            for one in self._world.approaching(lane):
+        for point, at_m in self._at_m.items():
+            for one in self._world.approaching(point):
                 name = one.arrival.vehicle
                 if name not in self._known:
                     fastest_mps = max(one.speed_mps, self._lattice.speed_mps)
@@ -190,8 +199,7 @@ class TakeOver(OutsideTraffic):
         """
         return self._hand_over.full_lanes(self._world.others()) | {
             lane
-            for lane, at_m in self._at_m.items()
-            if at_m <= 0.0
+            for lane in self._world.start_lanes
             for one in self._world.approaching(lane)[:1]
             if one.s_m > -NEAR_S * max(one.speed_mps, self._lattice.speed_mps)
         }
@@ -200,13 +208,13 @@ class TakeOver(OutsideTraffic):
         """Take over the vehicles whose fronts are at their entrances, and advise the others."""
         admissions = []
         self._occupied = set(occupied)
-        for lane, at_m in self._at_m.items():
-            column = meter.next_open(lane, t_s)
-            for one in self._world.approaching(lane):
+        for point, at_m in self._at_m.items():
+            column = meter.next_open(point, t_s)
+            for one in self._world.approaching(point):
                 if one.arrival.vehicle not in self._known:
                     continue  # it has come since `demanded`
                 if one.s_m < at_m:
-                    column = self._advise(one, lane, column, t_s, meter)
+                    column = self._advise(one, column, t_s, meter)
                     continue
                 admissions.append(self._take(one, column, t_s, meter))
                 self._going[admissions[-1].arrival.preferred_lane] += 1
@@ -257,7 +265,7 @@ class TakeOver(OutsideTraffic):
         ready_s = max(0.0, time_s - self._before_rest_s[arrival.vehicle_type])
         start = EntryState(one.s_m, one.speed_mps, time_s, ready_s)
         more = meter.exit_cells(arrival, column)
-        if self._at_m[arrival.lane] <= 0.0:
+        if self._at_m[arrival.entry_point] <= 0.0:
             # From the lanes beside it, no vehicle may enter the cells that it may touch. The last
             # one past the start is not assigned yet (`Roadside.assign_empty_cells`).
             last = first if (first + 1, arrival.lane) in self._occupied else first + 1
@@ -331,7 +339,7 @@ class TakeOver(OutsideTraffic):
         """
         entry_s, settle_s = times
         move_m = self._slot_s * self._lattice.speed_mps
-        ahead_m = self._lines_m[arrival.lane] - move_m - self._lattice.cell_s_m(column, 0.0)
+        ahead_m = self._lines_m[arrival.entry_point] - move_m - self._lattice.cell_s_m(column, 0.0)
         # The last slot in which it can change lanes, and the first that is planned with it.
         last = math.floor(ahead_m / move_m + TIME_TOLERANCE_S)
         planned = math.ceil((entry_s + CENSUS_S - SNAPSHOT_S) / self._slot_s) + 1
@@ -339,19 +347,18 @@ class TakeOver(OutsideTraffic):
         latest_s = min(last * self._slot_s + READY_LATE_S, ahead_m / self._lattice.speed_mps)
         return ready_s > latest_s or last < planned + beside
 
-    def _advise(
-        self, one: Approaching, lane: int, first: int, t_s: float, meter: EntryMeter
-    ) -> int:
+    def _advise(self, one: Approaching, first: int, t_s: float, meter: EntryMeter) -> int:
         """Advise a vehicle for the first cell that it can reach; return the column behind it."""
         arrival = self._arrival(one)
         lattice, limits = self._lattice, self._limits[arrival.vehicle_type]
-        distance_m = self._at_m[lane] - one.s_m
+        at_m = self._at_m[arrival.entry_point]
+        distance_m = at_m - one.s_m
         accel_mps2 = ADVICE_SHARE * limits.max_accel_mps2
-        takes_s, comes_mps = _soonest(one, self._at_m[lane], accel_mps2, lattice.speed_mps)
+        takes_s, comes_mps = _soonest(one, at_m, accel_mps2, lattice.speed_mps)
         slower_mps = math.ceil(lattice.speed_mps - comes_mps)
         falls_back_m, settle_s = fall_back(slower_mps, lattice.speed_mps, limits)
         comes_s = t_s + takes_s
-        cell_m = self._at_m[lane] - falls_back_m
+        cell_m = at_m - falls_back_m
 
         def entry(column: int) -> tuple[float, float] | None:
             at_ramp_s = lattice.passing_time_s(column, cell_m)

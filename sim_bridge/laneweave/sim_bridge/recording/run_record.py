@@ -187,8 +187,8 @@ class RunRecord:
     def on_demanded(self, arrival: Arrival) -> None:
         """Record the arrival of a vehicle."""
         scenario = self._scenario
-        free_s = scenario.geometry.free_flow_trip_s(arrival.lane, arrival.destination)
-        entrance = scenario.geometry.entrance_of(arrival.lane)
+        free_s = scenario.geometry.free_flow_trip_s(arrival.entry_point, arrival.destination)
+        entrance = scenario.geometry.entry_points[arrival.entry_point].entrance
         self._trips.add(Trip(arrival, entrance=entrance, free_flow_s=round(free_s, 6)))
 
     def on_entered(self, vehicle: RecordedVehicle) -> None:

@@ -7,6 +7,7 @@ operation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
@@ -90,9 +91,18 @@ class CellAllocation:
         """
         self._lattice: Lattice = scenario.lattice
         self._length_m = scenario.road.length_m
-        self._entry_m = scenario.geometry.entry_m
-        """Where the cells of each lane are assigned."""
-        self._shared_lanes = scenario.geometry.shared_exit_lanes
+        self._points = scenario.geometry.entry_points
+        self._last_entry_m = scenario.geometry.last_entry_m
+        self._shared_lanes = scenario.geometry.shared_lanes
+        self._exits_m = [
+            {
+                section.exit: section.to_m
+                for section in scenario.geometry.sections
+                if section.lane == lane and section.exit and section.to_m <= last_m
+            }
+            for lane, last_m in enumerate(self._last_entry_m)
+        ]
+        """Exits before the last ramp of each lane, with their positions."""
         self._keep_columns = not scenario.formation.change_columns
         self._is_kept_free = is_kept_free
         columns = int(scenario.geometry.moves_from_m / self._lattice.pitch_m)
@@ -105,16 +115,20 @@ class CellAllocation:
         """Cells that a vehicle may own, and those in `_lost`; None: not determined yet."""
         self._recent: list[tuple[int, int, Name]] = []
         """(column, lane, name) of recently entered vehicles."""
-        self._next: list[list[tuple[int, Name]]] = [[] for _ in self._entry_m]
-        """Vehicles that have entered since cells were last assigned, by lane, foremost first."""
-        self._unassigned: list[Cell] = []
-        """Empty cells without an owner."""
+        self._next: list[list[tuple[int, Name]]] = [[] for _ in self._points]
+        """Vehicles that have entered since cells were last assigned, by entry point, foremost
+        first."""
+        self._unassigned: dict[Cell, int] = {}
+        """Empty cells without an owner, with their entry points."""
         self._assigned_to = [
-            MAX_EMPTY + int(at_m // self._lattice.pitch_m) + 1 for at_m in self._entry_m
+            MAX_EMPTY + int(point.at_m // self._lattice.pitch_m) + 1 for point in self._points
         ]
-        """Last column of each lane whose cells have been processed."""
-        self._ownerless_from = tuple(self._assigned_to)
-        """First column of each lane that had passed its entrance before the road began."""
+        """Last column of each entry point whose cells have been processed."""
+        self._ownerless_from = {
+            point.lane: column
+            for point, column in zip(self._points, self._assigned_to, strict=True)
+        }
+        """First column of each lane that had passed its last entry point before the road began."""
         self._ownerless = set[Cell]()
         """Cells that have never had an owner, since no vehicle was near them at the entrance."""
         self._given = set[Cell]()
@@ -131,12 +145,17 @@ class CellAllocation:
 
     def admit(self, admissions: list[Admission]) -> list[Admission]:
         """Return the vehicles that enter, with all cells that they get."""
-        admissions = [self._with_ownerless(admission) for admission in admissions]
-        for admission in admissions:
-            column, lane = admission.cell
-            self._next[lane].append((column, Name(admission.arrival.vehicle)))
-            self._given.update(admission.more_cells)
-        return admissions
+        entering = []
+        for one in admissions:
+            # Of several vehicles of a column that need a cell, the first one gets it.
+            more_cells = tuple(cell for cell in one.more_cells if cell not in self._given)
+            self._given.update(more_cells)
+            self._ownerless.discard(one.cell)
+            self._unassigned.pop(one.cell, None)
+            entering.append(self._with_ownerless(evolve(one, more_cells=more_cells)))
+            arrival = one.arrival
+            self._next[arrival.entry_point].append((one.cell[0], Name(arrival.vehicle)))
+        return entering
 
     def _with_ownerless(self, admission: Admission) -> Admission:
         """Add cells beside a vehicle from a ramp that have never had an owner.
@@ -144,13 +163,14 @@ class CellAllocation:
         Without an owner no vehicle could enter them. A vehicle that changes columns reaches others.
         """
         column, lane = admission.cell
-        if self._entry_m[lane] <= 0.0 or not self._keep_columns:
+        if self._points[admission.arrival.entry_point].at_m <= 0.0 or not self._keep_columns:
             return admission
-        beside = [(column, other) for other in range(len(self._entry_m)) if other != lane]
+        beside = [(column, other) for other in range(self._lattice.lanes) if other != lane]
         free = [cell for cell in beside if self._is_ownerless(cell)]
         self._given.update(free)
         self._ownerless.difference_update(free)
-        self._unassigned = [cell for cell in self._unassigned if cell not in self._given]
+        for cell in free:
+            self._unassigned.pop(cell, None)
         return evolve(admission, more_cells=(*admission.more_cells, *free))
 
     def _is_ownerless(self, cell: Cell) -> bool:
@@ -165,39 +185,52 @@ class CellAllocation:
     ) -> None:
         """Assign empty cells at the entrances to vehicles near them.
 
-        A cell is assigned once no vehicle can enter it any more: up to the `closed` column of each
-        lane. A cell without a vehicle nearby waits for the next vehicles; if it is too far ahead of
-        them, it remains without an owner.
+        A cell is assigned once no vehicle can enter it any more: up to the `closed` column of the
+        last entry point of its lane. A cell without a vehicle nearby waits for the next vehicles;
+        if it is too far ahead of them, it remains without an owner.
         """
         self._owned = None
-        for lane, last in enumerate(closed):
-            for column in range(self._assigned_to[lane] - 1, last - 1, -1):
-                if self._next[lane] and self._next[lane][0][0] == column:
-                    self._store_recent(column, lane, self._next[lane].pop(0)[1])
+        for point, last in enumerate(closed):
+            lane, entered = self._points[point].lane, self._next[point]
+            for column in range(self._assigned_to[point] - 1, last - 1, -1):
+                cell = (column, lane)
+                if entered and entered[0][0] == column:
+                    self._store_recent(column, lane, entered.pop(0)[1])
                 elif (
-                    not self._is_kept_free((column, lane))
-                    and (column, lane) not in self._given
-                    and (lane not in self._shared_lanes or self.is_free((column, lane)))
+                    self._assigns_at(point)
+                    and not self._is_kept_free(cell)
+                    and cell not in self._given
+                    and (lane not in self._shared_lanes or self.is_free(cell))
                 ):
-                    self._assign((column, lane), vehicles)
-            self._assigned_to[lane] = last
-        unassigned, self._unassigned = self._unassigned, []
-        for cell in unassigned:
-            if cell[0] <= self._assigned_to[cell[1]] + 2 * self._max_empty:
-                self._assign(cell, vehicles)
+                    self._assign(cell, point, vehicles)
+            self._assigned_to[point] = last
+        unassigned, self._unassigned = self._unassigned, {}
+        for cell, point in unassigned.items():
+            if cell[0] <= self._assigned_to[point] + 2 * self._max_empty:
+                self._assign(cell, point, vehicles)
             else:
                 self._ownerless.add(cell)
+
+    def _assigns_at(self, point: int) -> bool:
+        """Return whether empty cells are assigned at an entry point: the last one of its lane.
+
+        At the start of the road, too, but to vehicles that leave the lane before the ramp.
+        """
+        return self._is_last(point) or self._points[point].at_m <= 0.0
+
+    def _is_last(self, point: int) -> bool:
+        return self._points[point].at_m == self._last_entry_m[self._points[point].lane]
 
     def is_free(self, cell: Cell) -> bool:
         """Return whether a vehicle on a ramp can use a cell.
 
-        Behind an exit in the same lane, no vehicle may own it. A pending transfer may give the cell
-        to a vehicle later; those of vehicles that have left are in `_lost`. Vehicles that do not
-        change columns must not enter beside a gap that is kept free, which they could not enter.
+        In a shared lane, no vehicle may own it. A pending transfer may give the cell to a vehicle
+        later; those of vehicles that have left are in `_lost`. Nobody enters a gap that is kept
+        free, nor beside it if vehicles do not change columns: they could not enter it.
         """
         column, lane = cell
         if self._keep_columns and any(
-            self._is_kept_free((column, beside)) for beside in (lane - 1, lane + 1)
+            self._is_kept_free((column, beside)) for beside in (lane - 1, lane, lane + 1)
         ):
             return False
         if lane not in self._shared_lanes:
@@ -208,11 +241,16 @@ class CellAllocation:
             )
         return cell not in self._owned
 
-    def _assign(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
+    def _assign(self, cell: Cell, point: int, vehicles: Mapping[Name, RoadVehicle]) -> None:
         """Assign an empty cell to a nearby vehicle, preferably one ahead of it in its lane.
 
         If vehicles keep their columns, only those of its column need the cell: preferably one of
         them, so that few vehicles have to agree to a move.
+
+        Args:
+            cell: the cell.
+            point: entry point at which it is assigned.
+            vehicles: the vehicles on the road.
         """
         column, lane = cell
         first, last = column - self._max_empty, column + self._max_empty
@@ -228,12 +266,16 @@ class CellAllocation:
             if first <= entered <= last
             and name in vehicles
             and vehicles[name].controller.off_lattice is None
-            and self._keeps_cells(vehicles[name])
+            and (
+                self._keeps_cells(vehicles[name])
+                if self._is_last(point)
+                else self._leaves_by(vehicles[name], cell, self._points[point].at_m)
+            )
         ]
         if near:
             vehicles[min(near)[-1]].controller.store.assign_cell(cell)
         else:
-            self._unassigned.append(cell)
+            self._unassigned[cell] = point
 
     def _keeps_cells(self, vehicle: RoadVehicle) -> bool:
         """Return whether a vehicle may get empty cells.
@@ -242,6 +284,18 @@ class CellAllocation:
         need the agreement of the owners of such cells, while these leave.
         """
         return not self._shared_lanes or vehicle.arrival.destination == END_OF_ROAD
+
+    def _leaves_by(self, vehicle: RoadVehicle, cell: Cell, s_m: float) -> bool:
+        """Return whether a vehicle needs a cell of its column to leave before a ramp.
+
+        Args:
+            vehicle: the vehicle.
+            cell: a cell of a shared lane.
+            s_m: position behind which the exit is.
+        """
+        column, lane = cell
+        exit_m = self._exits_m[lane].get(vehicle.arrival.destination, -math.inf)
+        return exit_m > s_m and vehicle.controller.hold_cell[0] == column
 
     def _store_recent(self, column: int, lane: int, name: Name) -> None:
         """Add an entered vehicle to the recent ones, and drop those far ahead of it."""
@@ -271,20 +325,20 @@ class CellAllocation:
             cells -= {
                 cell for cell in cells if lattice.passing_time_s(cell[0], self._length_m) < t_s
             }
-        on_lattice = [
-            one
-            for one in vehicles.values()
-            if one.controller.off_lattice is None and self._keeps_cells(one)
-        ]
-        if not on_lattice:
-            return
+        on_lattice = [one for one in vehicles.values() if one.controller.off_lattice is None]
+        staying = [one for one in on_lattice if self._keeps_cells(one)]
         for column, lane in sorted(certain):
             s_m = lattice.cell_s_m(column, t_s)
-            if lane == still_in or (lane in self._shared_lanes and s_m < self._entry_m[lane]):
-                continue  # nobody must be led into it, or it is for vehicles on the ramp
-            if s_m < self._length_m:
+            if lane == still_in or s_m >= self._length_m:
+                continue  # nobody must be led into it
+            possible = staying
+            if lane in self._shared_lanes and s_m < self._last_entry_m[lane]:
+                # It is for vehicles on the ramp, but for those that leave before.
+                cell = (column, lane)
+                possible = [one for one in on_lattice if self._leaves_by(one, cell, s_m)]
+            if possible:
                 near = min(
-                    on_lattice,
+                    possible,
                     key=lambda one: (
                         abs(one.controller.hold_cell[0] - column),
                         abs(one.controller.hold_cell[1] - lane),

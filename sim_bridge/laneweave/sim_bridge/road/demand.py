@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from itertools import accumulate
 
 import numpy as np
-from attrs import frozen
+from attrs import Factory, field, frozen
 from numpy.random import SeedSequence, default_rng
 
 from laneweave.protocol.config.participants import vehicle_name
@@ -50,18 +50,30 @@ class Arrival:
     right_lanes: tuple[int, ...] = ()
     """Lanes at the end of the road from which its route continues; empty: the preferred one, or
     any."""
+    entry_point: int = field(default=Factory(lambda self: self.lane, takes_self=True))
+    """Number of its entry point (`RoadGeometry.entry_points`); by default, the first of its
+    lane."""
 
 
 def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
-    """Return the seeded arrivals in [0, demand.duration_s], sorted by time, then lane."""
+    """Return the seeded arrivals in [0, demand.duration_s], sorted by time, then entry point."""
     drawn = sorted(
         one
-        for lane, inflow in scenario.flow.inflows.items()
-        for one in _arrivals_in(lane, inflow, scenario)
+        for point, inflow in scenario.flow.inflows.items()
+        for one in _arrivals_at(point, inflow, scenario)
     )
+    points = scenario.geometry.entry_points
     return tuple(
-        Arrival(vehicle_name(number), lane, preferred, t_s, destination, vehicle_type)
-        for number, (t_s, lane, preferred, destination, vehicle_type) in enumerate(drawn, start=1)
+        Arrival(
+            vehicle_name(number),
+            points[point].lane,
+            preferred,
+            t_s,
+            destination,
+            vehicle_type,
+            entry_point=point,
+        )
+        for number, (t_s, point, preferred, destination, vehicle_type) in enumerate(drawn, start=1)
     )
 
 
@@ -70,14 +82,14 @@ def count_until(stream: Sequence[Arrival], t_s: float) -> int:
     return bisect_right(stream, t_s, key=lambda arrival: arrival.t_s)
 
 
-def _arrivals_in(
-    lane: int, inflow: Inflow, scenario: Scenario
+def _arrivals_at(
+    point: int, inflow: Inflow, scenario: Scenario
 ) -> list[tuple[float, int, int, str, str]]:
-    """Return (time [s], lane, preferred lane, destination, type) of each arrival in one lane."""
+    """Return (time [s], entry point, preferred lane, destination, type) of each arrival there."""
     demand = scenario.demand
     mean_excess_s = max(0.0, 3600.0 / inflow.volume_veh_per_h - demand.min_headway_s)
     headways, preferences, types = (
-        default_rng(SeedSequence(scenario.seed, spawn_key=(purpose, lane)))
+        default_rng(SeedSequence(scenario.seed, spawn_key=(purpose, point)))
         for purpose in (_HEADWAYS, _PREFERENCES, _TYPES)
     )
     names = [*(one.type for one in inflow.types), CAR]
@@ -99,7 +111,7 @@ def _arrivals_in(
         kind = names[int(np.searchsorted(type_bounds, types.random(), side="right"))]
         number = int(np.searchsorted(bounds[kind], preferences.random(), side="right"))
         _, preferred, destination = choices[kind][number]
-        result.append((float(t_s), lane, preferred, destination, kind))
+        result.append((float(t_s), point, preferred, destination, kind))
 
 
 def _destinations(

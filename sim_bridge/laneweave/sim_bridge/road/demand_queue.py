@@ -130,11 +130,11 @@ class DemandQueue:
         self._arrivals = arrivals
         self._meter = meter
         self._outside = outside
-        self._lanes = scenario.road.lanes
+        self._entry_points = len(scenario.geometry.entry_points)
         self._announce_s = scenario.runtime.announce_s
         self._tick_s = scenario.runtime.tick_s
         ahead_s = self._announce_s + self._tick_s
-        self._announced_per_lane = math.ceil(ahead_s / scenario.formation.entry_spacing_s) + 1
+        self._announced_each = math.ceil(ahead_s / scenario.formation.entry_spacing_s) + 1
         self._arrived = 0
         """Arrivals so far."""
         self._queued = 0
@@ -166,12 +166,12 @@ class DemandQueue:
 
     def announcements(self, t_s: float) -> tuple[Announcement, ...]:
         """Return the vehicles that may enter within `announce_s`."""
-        room = [self._announced_per_lane] * self._lanes
+        room = [self._announced_each] * self._entry_points
         coming = [*self._outside.announced(t_s)]
         until = count_until(self._arrivals, t_s + self._announce_s)
         for arrival in (*self._meter.waiting, *self._arrivals[self._queued : until]):
-            if room[arrival.lane] > 0:
-                room[arrival.lane] -= 1
+            if room[arrival.entry_point] > 0:
+                room[arrival.entry_point] -= 1
                 coming.append(arrival)
         return tuple(
             Announcement(

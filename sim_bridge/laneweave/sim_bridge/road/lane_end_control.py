@@ -89,8 +89,8 @@ class LaneEndControl:
         self._queue_m = scenario.types.longest_body_m + scenario.tracking.min_gap_m
         """Distance between the fronts of vehicles that stand in a queue."""
         self._gaps: dict[LaneEnd, list[Gap]] = {end: [] for end in self._ends}
-        self._last_gap_column: list[float] = [math.inf] * scenario.road.lanes
-        """Rearmost column of the last gap of each lane."""
+        self._last_gap_column: dict[int, float] = {}
+        """Rearmost column of the last gap, by entry point."""
         self._entered_gaps: list[range] = []
         """Columns of gaps that vehicles have entered, since they were last taken."""
         self._end_of: dict[Name, LaneEnd | None] = {}
@@ -133,7 +133,7 @@ class LaneEndControl:
             gaps[:] = [gap for gap in gaps if gap.vehicle or not self._is_over(gap, end, t_s)]
             coming = sum(gap.vehicle is None for gap in gaps)
             if len(waiting) > coming:
-                self._request(self._beside[end], gaps, t_s)
+                self._request(end, gaps, t_s)
 
     def bodies(self, vehicles: Mapping[Name, RoadVehicle]) -> dict[Name, OffLattice]:
         """Return the lane and the rear of each vehicle without cells.
@@ -153,17 +153,19 @@ class LaneEndControl:
                 found[name] = OffLattice(lane, s_m - vehicles[name].size[0])
         return found
 
-    def _request(self, lane: int | None, gaps: list[Gap], t_s: float) -> None:
-        """Keep the next columns of a lane free, unless the last gap was too close ahead."""
+    def _request(self, end: LaneEnd, gaps: list[Gap], t_s: float) -> None:
+        """Keep the next columns beside an end free, unless the last gap was too close ahead."""
+        lane = self._beside[end]
         if lane is None:
             return  # `road_checks` refuses such roads
-        taken = self._meter.lanes_kept_free(lane)
-        crowded = any(arrival.lane in taken for arrival in self._meter.waiting)
+        point = self._scenario.geometry.entry_point_before(lane, end.line_m)
+        taken = self._meter.points_kept_free(point)
+        crowded = any(arrival.entry_point in taken for arrival in self._meter.waiting)
         between = (CROWDED_GAPS if crowded else OPEN_GAPS) * self._columns
-        if self._meter.next_column(lane) < self._last_gap_column[lane] - between:
-            columns = self._meter.keep_free(lane, self._columns, t_s)
-            for each in taken:
-                self._last_gap_column[each] = columns[0]
+        last = self._last_gap_column.get(point, math.inf)
+        if self._meter.next_column(point) < last - between:
+            columns = self._meter.keep_free(point, self._columns, t_s)
+            self._last_gap_column |= dict.fromkeys(taken, columns[0])
             gaps.append(Gap(lane, columns))
 
     def _take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:

@@ -26,7 +26,7 @@ MOVING_MPS = 0.1
 
 
 class EntranceRoom:
-    """Knows the lanes whose entrances are full."""
+    """Knows the entry points that are full."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Read the entrances of a road."""
@@ -37,19 +37,26 @@ class EntranceRoom:
         stopping_m = lattice.speed_mps**2 / -weakest.min_accel_mps2
         self._room_m = longest_m + stopping_m + lattice.speed_mps + QUEUE_ROOM_M
         """Distance from an entrance within which bodies may keep others from entering."""
-        self._entry_m = scenario.geometry.entry_m
-        self._merging_m = {
-            one.lane: one.merge_m + scenario.types.step_m for one in scenario.entrance
-        }
-        """Where a queue on a ramp leaves room for merging, by lane."""
+        merge_m = {one.name: one.merge_m for one in scenario.entrance}
+        points = scenario.geometry.entry_points
+        self._points = [
+            (
+                number,
+                point.lane,
+                point.at_m,
+                merge_m.get(point.entrance, -math.inf) + scenario.types.step_m,
+            )
+            for number, point in enumerate(points)
+        ]
+        """(number, lane, position, where a queue on its ramp leaves room for merging)."""
         self._near_m = max(
-            self._room_m + max(self._entry_m),
-            longest_m + max(self._merging_m.values(), default=0.0),
+            max(at_m + self._room_m, merging_m + longest_m)
+            for _, _, at_m, merging_m in self._points
         )
         """Position up to which bodies may keep others from entering."""
 
-    def full_lanes(self, vehicles: Iterable[RoadVehicle]) -> set[int]:
-        """Return the lanes in which a body at the entrance leaves too little room to brake.
+    def full_points(self, vehicles: Iterable[RoadVehicle]) -> set[int]:
+        """Return the entry points at which a body leaves too little room to brake.
 
         A ramp is full, too, while a queue at its end leaves no room for merging.
         """
@@ -63,18 +70,20 @@ class EntranceRoom:
             length_m, width_m = vehicle.size
             first, last = lattice.lanes_touched(y_m, width_m)
             waits = vehicle.controller.off_lattice is not None
-            for lane in {*range(first, last + 1)} - full:
-                beyond_m = s_m - self._entry_m[lane]
-                if waits and s_m - length_m < self._merging_m.get(lane, -math.inf):
-                    full.add(lane)
+            for number, lane, at_m, merging_m in self._points:
+                beyond_m = s_m - at_m
+                if number in full or beyond_m < 0.0 or not first <= lane <= last:
                     continue
-                if not 0.0 <= beyond_m <= self._room_m:
+                if waits and s_m - length_m < merging_m:
+                    full.add(number)
+                    continue
+                if beyond_m > self._room_m:
                     continue
                 body = Neighbour(0, beyond_m - length_m, speed_mps, accel_mps2)
                 spare_m = self._brake.spare_m(entering, 0.0, (0.0, 0.0), [body])
                 slow = speed_mps < 0.5 * lattice.speed_mps
                 if spare_m < (QUEUE_ROOM_M if slow else 0.0):
-                    full.add(lane)
+                    full.add(number)
         return full
 
 
@@ -99,17 +108,16 @@ class Roadside:
             allocation: what vehicles get besides their cells; None: that of the operation.
         """
         self.outside = outside_traffic
-        self._lanes = range(scenario.road.lanes)
         self._allocation = allocation or allocation_of(scenario, self._is_kept_free)
         self._meter = EntryMeter(
             scenario.lattice,
             scenario.formation.entry_spread_s,
             self._allocation.builder,
             interlaced=scenario.formation.interlaced,
-            entry_m=scenario.geometry.entry_m,
+            entry_points=scenario.geometry.entry_points,
             column_bound=[name for name, one in scenario.types.items() if not one.changes_columns],
             goals_of=partial(_goals, scenario),
-            shared_lanes=scenario.geometry.shared_exit_lanes,
+            shared_lanes=scenario.geometry.shared_lanes,
             is_free=self._allocation.is_free,
         )
         self._lane_ends = LaneEndControl(scenario, self._meter)
@@ -132,7 +140,7 @@ class Roadside:
         """
         self._allocation.begin_tick(vehicles)
         self.demand.queue(t_s, (one.arrival for one in vehicles.values()))
-        full = self._room.full_lanes(vehicles.values()) | self.outside.full_lanes()
+        full = self._room.full_points(vehicles.values()) | self.outside.full_lanes()
         admissions = self._meter.admit(t_s, full)
         occupied = (one.controller.hold_cell for one in vehicles.values())
         admissions += self.outside.admit(t_s, self._meter, occupied)
@@ -163,9 +171,13 @@ class Roadside:
 
     def assign_empty_cells(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
         """Assign empty cells at the entrance to vehicles near them (rolling operation)."""
-        # A vehicle from upstream may touch one column more.
+        # A vehicle from upstream may touch one column more. At the start, the numbers of entry
+        # points are those of their lanes.
         upstream = self.outside.start_lanes
-        closed = [self._meter.closed_column(lane) + (lane in upstream) for lane in self._lanes]
+        closed = [
+            column + (point in upstream)
+            for point, column in enumerate(self._meter.closed_columns())
+        ]
         self._allocation.assign_empty_cells(vehicles, closed)
 
     def on_left(

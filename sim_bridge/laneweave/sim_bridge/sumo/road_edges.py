@@ -108,7 +108,7 @@ def route_of(scenario: Scenario, arrival: Arrival) -> str:
     end = arrival.destination
     if end == END_OF_ROAD and arrival.preferred_lane != ANY_LANE:
         end = end_exit(arrival.preferred_lane)
-    return route_name(scenario.geometry.entrance_of(arrival.lane), end)
+    return route_name(scenario.geometry.entry_points[arrival.entry_point].entrance, end)
 
 
 def margin_m(scenario: Scenario) -> float:

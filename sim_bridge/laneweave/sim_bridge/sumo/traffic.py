@@ -44,7 +44,7 @@ class SumoTraffic(SumoSession):
             s_m: entry position of the front bumper.
         """
         self.set_type(arrival.vehicle, arrival.vehicle_type)
-        edge = self._edges.entry(self._scenario.geometry.entrance_of(arrival.lane))
+        edge = self._edges.entry(self._scenario.geometry.entry_points[arrival.entry_point].entrance)
         self.vehicle.add(
             arrival.vehicle,
             route_of(self._scenario, arrival),

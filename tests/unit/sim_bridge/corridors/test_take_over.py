@@ -19,7 +19,7 @@ def meter_of(scenario: Scenario, taken: frozenset[Cell] = frozenset()) -> EntryM
     return EntryMeter(
         scenario.lattice,
         0.5,
-        entry_m=scenario.geometry.entry_m,
+        entry_points=scenario.geometry.entry_points,
         column_bound={"car", "truck"},
         is_free=lambda cell: cell not in taken,
     )

@@ -158,8 +158,10 @@ def test_impossible_demands_are_refused() -> None:
     meter.demand(Arrival("twice", 0, 0, 0.0))
     with pytest.raises(ValueError, match="already waiting"):
         meter.demand(Arrival("twice", 1, 0, 0.0))
-    with pytest.raises(ValueError, match="lanes 0 to 2"):
+    with pytest.raises(ValueError, match="an entry point of its lane"):
         meter.demand(Arrival("off", 3, 0, 0.0))
+    with pytest.raises(ValueError, match="an entry point of its lane"):
+        meter.demand(Arrival("off", 1, 0, 0.0, entry_point=0))
     with pytest.raises(ValueError, match="lanes 0 to 2"):
         meter.demand(Arrival("off", 0, -2, 0.0))
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import formation_columns
+from laneweave.protocol.scenario.road_geometry import EntryPoint
 from laneweave.protocol.wire.messages import ClosedFormation
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
@@ -52,7 +53,7 @@ class Entrance:
     builder: FormationBuilder
     spread_s: float
     interlaced: bool = False
-    entry_m: tuple[float, ...] = ()
+    entry_points: tuple[EntryPoint, ...] = ()
     reserve_s: tuple[float, ...] = ()
     """Times at which columns are reserved."""
     reserved: list[range] = field(factory=list)
@@ -71,7 +72,7 @@ class Entrance:
             self.spread_s,
             self.builder,
             interlaced=self.interlaced,
-            entry_m=self.entry_m,
+            entry_points=self.entry_points,
         )
         pending, tick, rest = list(stream), 0, 0
         while rest < 400:
@@ -252,8 +253,9 @@ def test_ramps_and_reserved_columns_leave_every_vehicle_in_one_formation(
         if grows
         else ColumnBlocks(grid, most, case.spread_s, entrances)
     )
+    points = tuple(EntryPoint(lane, at_m) for lane, at_m in enumerate(entry_m))
     entrance = Entrance(
-        grid, builder, case.spread_s, case.interlaced, entry_m, tuple(sorted(reserve_s))
+        grid, builder, case.spread_s, case.interlaced, points, tuple(sorted(reserve_s))
     )
     entrance.run(list(case.stream))
     assert {each.arrival for each in entrance.admissions} == set(case.stream)

@@ -59,7 +59,7 @@ LATTICE = INTERCHANGE.lattice
 
 
 def test_such_a_road_needs_vehicles_that_keep_their_columns() -> None:
-    assert INTERCHANGE.geometry.shared_exit_lanes == {0}
+    assert INTERCHANGE.geometry.shared_lanes == {0}
     with pytest.raises(BadInputError, match=r"entrance\[0\].at_m: got 520.0; allowed: 300"):
         parse_scenario(tables(change_columns=True))
 
@@ -67,7 +67,7 @@ def test_such_a_road_needs_vehicles_that_keep_their_columns() -> None:
 def test_the_bodies_of_leaving_and_entering_vehicles_are_apart_on_the_road() -> None:
     data = tables()
     data["road"]["closures"][1]["to_m"] = data["entrance"][0]["at_m"] = 506.0
-    with pytest.raises(BadInputError, match=r"behind exits, and 507\.5 or more"):
+    with pytest.raises(BadInputError, match=r"opens again, and 507\.5 or more"):
         parse_scenario(data)
 
 

@@ -68,7 +68,7 @@ def test_a_column_closes_when_no_vehicle_can_enter_it() -> None:
     closed = [1]
     for tick in range(40):
         meter.admit(tick * 0.1)
-        closed.append(meter.closed_column(1))
+        closed.append(meter.closed_columns()[1])
         assert LATTICE.passing_time_s(closed[-1]) + COLUMN_S / 2 <= tick * 0.1 + SMALL_S
     assert closed == sorted(closed, reverse=True)
     assert closed[-1] == -3
