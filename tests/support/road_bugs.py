@@ -115,7 +115,7 @@ def line_at_the_end(patch: Patch) -> None:
     ahead, ends_of = LaneEnds.ahead, LaneEnds.__iter__
 
     def at_the_end(end: LaneEnd) -> LaneEnd:
-        return evolve(end, line_m=end.end_m)
+        return evolve(end, line_m=end.end_m, stop_m=end.end_m)
 
     def ahead_of(self: LaneEnds, lane: int, s_m: float) -> LaneEnd | None:
         end = ahead(self, lane, s_m)

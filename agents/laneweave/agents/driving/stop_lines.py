@@ -56,7 +56,7 @@ class StopLines:
         ]
         latest = gaps.latest
         for end, touching in lines:
-            line_m = end.line_m - self._before_m
+            line_m = end.stop_m - self._before_m
             if not (touching & (states[:, 0] > line_m)).any():
                 continue
             limit = np.where(touching, line_m, np.inf)

@@ -10,7 +10,7 @@ import attrs
 from laneweave.protocol.config.motion_checks import limit_name
 from laneweave.protocol.config.rules import require
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, end_exit
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, end_exit
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import (
     MAIN_ENTRANCE,
@@ -19,7 +19,15 @@ from laneweave.protocol.scenario.road_tables import (
     SolidLine,
     TypeShare,
 )
-from laneweave.protocol.vehicle.lane_ends import dead_ends, lane_beside, re_entry
+from laneweave.protocol.vehicle.lane_ends import (
+    LaneEnd,
+    dead_ends,
+    early_start_m,
+    exit_lanes,
+    first_step_m,
+    lane_beside,
+    re_entry,
+)
 from laneweave.protocol.wire.messages import CAR
 
 ROUNDED_SHARE = 1e-3
@@ -171,7 +179,8 @@ def check_entrances(scenario: Scenario) -> None:
         low_m = entrance.at_m + formation.speed_mps * formation.settle_s
         sections = [one for one in scenario.geometry.sections if one.lane == lane]
         ends_m = [one.to_m for one in sections if one.to_m > entrance.at_m]
-        high_m = min(ends_m, default=road.length_m) - scenario.types.step_m
+        early_m = early_start_m(scenario) if scenario.sumo.config else 0.0
+        high_m = min(ends_m, default=road.length_m) - scenario.types.step_m + early_m
         require(
             low_m <= entrance.merge_m <= high_m,
             f"{name}.merge_m",
@@ -220,17 +229,17 @@ def check_exits(scenario: Scenario) -> None:
             f"lanes that are closed from exit.at_m = {exit_.at_m:g} on, without another exit",
         )
         used |= places
+        ends_by_lane = {end.lane: end for end in exit_lanes(scenario) if end.end_m == exit_.at_m}
         for section in scenario.geometry.sections:
-            begins_m = max(section.from_m, section.moves_from_m)
-            first_m, first = _first_step(scenario, begins_m)
-            needed_m = first_m + re_entry(scenario).room_m
-            require(
-                section.exit != exit_.name or exit_.at_m >= needed_m,
+            if section.exit != exit_.name or section.lane not in ends_by_lane:
+                continue
+            _check_room(
+                scenario,
                 f"{name}.at_m",
-                exit_.at_m,
-                f"{first}, in lane {section.lane}, and "
-                f"{re_entry(scenario).room_m:g} m for completing a change after stopping",
-                needed_m,
+                section,
+                ends_by_lane[section.lane],
+                f"in lane {section.lane}, and {re_entry(scenario).room_m:g} m for completing a "
+                "change after stopping",
             )
 
 
@@ -251,17 +260,20 @@ def check_dead_ends(scenario: Scenario) -> None:
             for number, closure in enumerate(scenario.road.closures)
             if (closure.lane, closure.from_m) == (end.lane, end.end_m)
         )
-        first_m, first = _first_step(scenario, max(end.from_m, end.moves_from_m))
-        require(
-            end.line_m >= first_m,
+        section = next(
+            one
+            for one in scenario.geometry.sections
+            if (one.lane, one.to_m) == (end.lane, end.end_m)
+        )
+        _check_room(
+            scenario,
             name,
-            end.end_m,
-            f"{first}, and {needed.room_m:g} m for driving on "
-            "after stopping at the end of the lane",
-            first_m + needed.room_m,
+            section,
+            end,
+            f"and {needed.room_m:g} m for driving on after stopping at the end of the lane",
         )
         require(
-            lane_beside(scenario, end) is not None,
+            end.taken_back or lane_beside(scenario, end) is not None,
             name,
             end.end_m,
             f"the end of a lane beside one that is open from {end.line_m:g} m, its stop line, to "
@@ -281,16 +293,33 @@ def check_dead_ends(scenario: Scenario) -> None:
         )
 
 
-def _first_step(scenario: Scenario, from_m: float) -> tuple[float, str]:
-    """Return where the first move ends in a section, and what has to fit before that.
-
-    Moves may begin at a position, at the earliest.
+def _check_room(
+    scenario: Scenario, field: str, section: LaneSection, end: LaneEnd, room: str
+) -> None:
+    """Check that the first move in a section that ends before the road ends before its line.
 
     The vehicles of a formation are known once it has passed all entrances, and it moves once all of
     it is in the section.
+
+    Args:
+        scenario: the scenario.
+        field: name of the position of the end.
+        section: the section.
+        end: its end.
+        room: what else has to fit, if vehicles are not taken back.
     """
-    from_m, what = max(from_m, scenario.geometry.moves_from_m), "a step for changing lanes"
-    if scenario.formation.traits.has_formations:
-        from_m = max(from_m, *scenario.geometry.entry_m) + scenario.formation.longest_m
-        what = f"a formation that has passed all entrances, and {what}"
-    return from_m + scenario.types.step_m, what
+    what, before_m = "a step for changing lanes", end.end_m - end.line_m
+    if end.taken_back:
+        early_m = early_start_m(scenario)
+        needed_m = before_m + first_step_m(scenario, section, early_m=early_m)
+        room = "and room to stop while the body is in the lane"
+    else:
+        needed_m = first_step_m(scenario, section) + before_m
+        if scenario.formation.traits.has_formations:
+            longest_m = scenario.formation.longest_m
+            begins_m = max(section.from_m, section.moves_from_m, scenario.geometry.moves_from_m)
+            begins_m = max(begins_m, *scenario.geometry.entry_m) + longest_m
+            needed_m = begins_m + scenario.types.step_m + before_m
+            what = f"a formation that has passed all entrances, and {what}"
+    allowed = f"{what}, {room}"
+    require(end.end_m >= needed_m, field, end.end_m, allowed, needed_m)

@@ -153,9 +153,13 @@ class RoadGeometry:
 
     def free_flow_trip_s(self, entry_point: int, destination: str = END_OF_ROAD) -> float:
         """Return the time [s] at v_F from an entry point to a destination."""
+        return self.rest_s(self.entry_points[entry_point].at_m, destination)
+
+    def rest_s(self, s_m: float, destination: str) -> float:
+        """Return the time [s] at v_F from a position to a destination; negative: it is behind."""
         ends_m = {one.name: one.at_m for one in self._exits}
         to_m = ends_m.get(destination, self._road.length_m)
-        return (to_m - self.entry_points[entry_point].at_m) / self._formation.speed_mps
+        return (to_m - s_m) / self._formation.speed_mps
 
     @property
     def moves_from_m(self) -> float:

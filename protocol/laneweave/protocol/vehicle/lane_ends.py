@@ -7,6 +7,11 @@ useless: no plan leads there, and a vehicle whose cell has passed the line has l
 An exit before the end of the road needs no stop line: a vehicle in its lane leaves the road. But
 lane changes end as far before it (`LaneEnd.line_m`), so that a body that was stopped in one can
 complete it before the lanes part. docs/SAFETY.md derives the rules.
+
+In a corridor of a SUMO simulation, a section may be too short for a lane change before the line.
+Then vehicles do not re-enter: SUMO takes back each one that has not begun to change lanes in time
+(`LaneEnd.taken_back`). The line is only so far from the end that a body can stop before it until
+it has left the lane.
 """
 
 from __future__ import annotations
@@ -21,7 +26,13 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import LaneSection
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
-from laneweave.protocol.vehicle.emergency_brake import ERROR_SIGMAS, EmergencyBrake, spare_error_m
+from laneweave.protocol.vehicle.emergency_brake import (
+    ERROR_SIGMAS,
+    EmergencyBrake,
+    own_braking_mps2,
+    spare_error_m,
+    stopping_distance_m,
+)
 from laneweave.protocol.vehicle.motion import (
     ARRIVED_ALONG_M,
     State,
@@ -44,6 +55,13 @@ _MAX_COLUMNS = 48
 """Upper bound on the columns that a vehicle needs to re-enter."""
 _MAX_RE_ENTRY_S = 120.0
 _FAR_M = 1000.0
+HANDOVER_M = 4.0
+"""Length of the lane behind an exit of a SUMO simulation, where SUMO takes vehicles back."""
+TAKEN_BACK_M = 1.0
+"""Distance of the line from a dead end before which SUMO takes vehicles back."""
+TRACKING_SHARE = 0.9
+"""Share of the time before a body touches the other lane by which a move may begin early; the rest
+is kept for tracking errors."""
 ROUNDING_M = 1e-6
 """Tolerance for comparing positions."""
 
@@ -57,12 +75,17 @@ class LaneEnd:
     """Where the section begins; -inf: before the start of the road."""
     line_m: float
     """Dead end: the stop line. Exit: where lane changes into and out of the section have ended."""
+    stop_m: float
+    """Dead end: where vehicles stop. Exit: where bodies stop that are partly in its lane. It is the
+    line, or the end of an exit, but for sections that are `taken_back`."""
     end_m: float
     """Where the lane ends; at an exit, where vehicles leave the road."""
     reopens_m: float
     """Where the lane is open again; inf: nowhere."""
     moves_from_m: float = -math.inf
     """Where moves may begin in the section; -inf: everywhere."""
+    taken_back: bool = False
+    """Whether SUMO takes vehicles back that do not change lanes: nobody re-enters at the line."""
 
 
 @frozen
@@ -233,17 +256,57 @@ def _ends(scenario: Scenario) -> Iterator[tuple[LaneSection, LaneEnd]]:
     for number, section in enumerate(sections):
         if not section.exit or section.to_m < scenario.road.length_m:
             later = [each.from_m for each in sections[number + 1 :] if each.lane == section.lane]
+            line_m = section.to_m - re_entry(scenario).room_m
+            stop_m = section.to_m if section.exit else line_m
+            taken_back = bool(scenario.sumo.config) and line_m < first_step_m(scenario, section)
+            if taken_back:
+                stop_m = section.to_m + (HANDOVER_M if section.exit else -TAKEN_BACK_M)
+                line_m = stop_m - _stopping_room_m(scenario)
             yield (
                 section,
                 LaneEnd(
                     lane=section.lane,
                     from_m=section.from_m,
-                    line_m=section.to_m - re_entry(scenario).room_m,
+                    line_m=line_m,
+                    stop_m=stop_m,
                     end_m=section.to_m,
                     reopens_m=min(later, default=math.inf),
                     moves_from_m=section.moves_from_m,
+                    taken_back=taken_back,
                 ),
             )
+
+
+def _stopping_room_m(scenario: Scenario) -> float:
+    """Return the room behind a lane change in which a body stops that brakes as it leaves its lane.
+
+    The motion of a lane change is symmetric: the body leaves the lane as long before the end as it
+    begins to touch the other one after the beginning.
+    """
+    speed_mps, assumed, timing = scenario.formation.speed_mps, scenario.braking, scenario.timing
+    braking_m = max(
+        stopping_distance_m(
+            speed_mps, 0.0, own_braking_mps2(one.limits, assumed), one.limits.actuator_lag_s
+        )
+        for one in scenario.types.values()
+    )
+    # A move begins up to a tick late, and the brake acts a reaction time later.
+    late_s = scenario.runtime.tick_s + assumed.reaction_s
+    spare_s = timing.cycles_s[0] - timing.move_s - late_s
+    after_m = early_start_m(scenario) + spare_s * speed_mps
+    return max(0.0, braking_m + assumed.margin_m - after_m)
+
+
+def first_step_m(scenario: Scenario, section: LaneSection, *, early_m: float = 0.0) -> float:
+    """Return where the first move ends in a section, at the earliest.
+
+    Args:
+        scenario: the scenario.
+        section: the section.
+        early_m: distance by which a move begins before its body is in the section.
+    """
+    begins_m = max(section.from_m, section.moves_from_m) - early_m
+    return max(begins_m, scenario.geometry.moves_from_m) + scenario.types.step_m
 
 
 def _by_lane(ends: Iterable[LaneEnd], lanes: range) -> tuple[tuple[LaneEnd, ...], ...]:
@@ -292,14 +355,14 @@ def early_start_m(scenario: Scenario) -> float:
     """Return the distance driven in a lane change before any body touches the other lane.
 
     A minimum-jerk motion from rest to rest has covered 10 x^3 - 15 x^4 + 6 x^5 of its way at the
-    share x of its time; a fifth of the distance is kept for tracking errors.
+    share x of its time.
     """
     lane_m = scenario.road.lane_width_m
     untouched = 0.5 * (lane_m - scenario.types.widest_body_m) / lane_m
     ticks = scenario.timing.move_ticks(scenario.timing.cycles_s[0])
     shares = (tick / ticks for tick in range(ticks + 1))
     before = [x for x in shares if x**3 * (10.0 - 15.0 * x + 6.0 * x * x) <= untouched]
-    return 0.8 * max(before) * scenario.timing.move_s * scenario.formation.speed_mps
+    return TRACKING_SHARE * max(before) * scenario.timing.move_s * scenario.formation.speed_mps
 
 
 def re_entry(scenario: Scenario) -> ReEntry:

@@ -281,13 +281,13 @@ class MotionController:
         elif speed_mps < STANDING_MPS and self._body_lane == goal:
             self._past_line = True
         lines = [
-            (end.lane, (end.end_m if self._past_line and end.lane != goal else end.line_m) - s_m)
+            (end.lane, (end.end_m if self._past_line and end.lane != goal else end.stop_m) - s_m)
             for end in ends
         ]
         if first != last:
             # Where an exit lane parts from the road, a body must not be in both.
             exits = [self._lane_ends.exit_ahead(lane, s_m) for lane in (first, last)]
-            lines += [(each.lane, each.end_m - s_m) for each in exits if each is not None]
+            lines += [(each.lane, each.stop_m - s_m) for each in exits if each is not None]
         return [Neighbour(lane, gap_m, 0.0) for lane, gap_m in lines if gap_m < MAX_LINE_GAP_M]
 
     def accept_command(self, command: Command) -> bool:

@@ -21,6 +21,7 @@ from attrs import evolve, field, frozen
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE, Closure
+from laneweave.protocol.vehicle.lane_ends import HANDOVER_M
 from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network, unique_name
 
 MAX_LANES = 8
@@ -31,14 +32,13 @@ BEHIND_EXIT_M = 15.0
 though in the world they never meet."""
 MIN_AT_M = 1.0
 """Position of ramps that begin before the corridor: their lanes are closed at its start."""
-HANDOVER_M = 4.0
-"""Distance before the end of an edge at which vehicles are given back to SUMO, if they need not
-give way behind it."""
 POCKET_S, POCKET_M = 5.0, 15.0
 """Time at v_F, plus a distance, before the end of an approach. Lanes that open later are turn
 pockets: no vehicle of laneweave changes into them, but SUMO does."""
-SPEED_SHARE = 0.9
-"""v_F as a share of the speed limit: vehicles that move to a cell ahead are faster."""
+RESERVE_MPS, RESERVE_SHARE = 1.0, 0.1
+"""Difference between v_F and the speed limit, absolute and as a share; the smaller one applies.
+Vehicles that have fallen behind their cells catch up with it. Where ramps or exits are too short,
+v_F is lower, by up to the share."""
 MAX_SPEED_MPS = 60.0
 """Highest speed of vehicles."""
 REACTION_S, DECEL_MPS2 = 1.0, 4.0
@@ -80,10 +80,12 @@ class CorridorEdge:
 
 @frozen
 class Ramp:
-    """An on-ramp with an acceleration lane."""
+    """A lane of an on-ramp, with its acceleration lane."""
 
     name: str
     """Name of its entrance in scenarios."""
+    entrance: str
+    """The same of the rightmost lane of the on-ramp, for all of its lanes."""
     edge: str
     """Name of the last edge before the corridor."""
     to_edge: str
@@ -179,6 +181,11 @@ class Corridor:
 def braking_m(speed_mps: float, reaction_s: float = REACTION_S) -> float:
     """Return the distance in which vehicles stop that SUMO drives."""
     return speed_mps * reaction_s + speed_mps**2 / (2.0 * DECEL_MPS2)
+
+
+def lattice_speed_mps(limit_mps: float) -> float:
+    """Return v_F at a speed limit."""
+    return limit_mps - min(RESERVE_MPS, RESERVE_SHARE * limit_mps)
 
 
 def lanes_by_edge(network: Network, last: CorridorEdge) -> dict[str, list[int]]:
@@ -307,6 +314,8 @@ class _Derivation:
         self._edges = tuple(evolve(one, first_lane=one.first_lane - lowest) for one in edges)
         self._unused: list[str] = []
         self._taken = [MAIN_ENTRANCE, END_OF_ROAD]
+        self._entrances: dict[tuple[str, str], str] = {}
+        """Names of the rightmost lanes of ramps, by last edge of the ramp and first one behind."""
 
     def corridor(self) -> Corridor:
         """Return the corridor."""
@@ -316,15 +325,11 @@ class _Derivation:
             raise BadInputError(OPTION, f"{lanes} lanes", f"at most {MAX_LANES} lanes")
         found = (self._ramp(part, parts[:number]) for number, part in enumerate(parts))
         ramps = tuple(ramp for ramp in found if ramp is not None)
-        first, last = self._edges[0].edge, self._edges[-1].edge
-        for edge, count in Counter(ramp.edge for ramp in ramps).items():
-            if count > 1:
-                allowed = f"on-ramps of one lane, but {count} lanes of {edge} lead into the"
-                raise BadInputError(OPTION, f"{first.name}:{last.name}", f"{allowed} corridor")
+        last = self._edges[-1].edge
         ways_out = tuple(self._ways_out(parts))
         links = [link for lane in last.car_lanes for link in self._network.links_from(lane)]
         length_m = self._given_back_m(self._edges[-1], links)
-        latest_m = max(length_m - POCKET_M - POCKET_S * SPEED_SHARE * self._limit_mps, 0.0)
+        latest_m = max(length_m - POCKET_M - POCKET_S * lattice_speed_mps(self._limit_mps), 0.0)
         early = [part for part in parts if part.from_m <= latest_m]
         lanes_to = self._lanes_to({part.lane for part in early if part.edges[-1].edge is last})
         if lanes_to:
@@ -361,7 +366,7 @@ class _Derivation:
         Raises:
             BadInputError: the edge is too short for SUMO to brake there.
         """
-        brakes_m = braking_m(SPEED_SHARE * min(self._limit_mps, MAX_SPEED_MPS))
+        brakes_m = braking_m(lattice_speed_mps(min(self._limit_mps, MAX_SPEED_MPS)))
         nearest_m = min((self._gives_way_m(link, brakes_m) for link in links), default=math.inf)
         handover_m = max(HANDOVER_M, brakes_m - nearest_m)
         length_m = edge.to_m - edge.from_m
@@ -419,7 +424,8 @@ class _Derivation:
         at_m = max(MIN_AT_M, part.from_m - min(length_m, MAX_RAMP_M), *ends_m)
         edge = feeding[0].origin.edge
         name = self._name(edge)
-        return Ramp(name, edge, first.name, part.lane, at_m, part.from_m, speed_mps, path)
+        entrance = self._entrances.setdefault((edge, first.name), name)
+        return Ramp(name, entrance, edge, first.name, part.lane, at_m, part.from_m, speed_mps, path)
 
     def _name(self, edge: str) -> str:
         """Return a name for an entrance or exit that no other one has."""

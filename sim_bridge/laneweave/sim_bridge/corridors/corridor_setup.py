@@ -171,7 +171,7 @@ def _arrivals(found: SumoCorridor, scenario: Scenario) -> Iterator[CorridorArriv
     geometry = scenario.geometry
     entrances = {one.name for one in scenario.entrance}
     corridor, begin_s = found.corridor, found.simulation.begin_s
-    on_ramp = {ramp.name: {link.origin.edge for link in ramp.path} for ramp in corridor.ramps}
+    on_ramp = {ramp.entrance: {link.origin.edge for link in ramp.path} for ramp in corridor.ramps}
     near = {lane.rpartition("_")[0] for way in found.ways_in for lane in way.lanes}
     near -= corridor.edge_numbers.keys()
     choose = _LaneChoice(scenario)

@@ -28,6 +28,7 @@ from laneweave.sim_bridge.corridors.corridor import Corridor
 from laneweave.sim_bridge.corridors.corridor_setup import MAX_WAIT_S, CorridorArrival, CorridorSetup
 from laneweave.sim_bridge.corridors.corridor_shape import CorridorShape
 from laneweave.sim_bridge.corridors.exit_room import SEEN_BEYOND_M
+from laneweave.sim_bridge.corridors.hand_over import STANDING_MPS
 from laneweave.sim_bridge.corridors.sumo_network import Lane
 from laneweave.sim_bridge.corridors.take_over import Approaching
 from laneweave.sim_bridge.road.demand import Arrival
@@ -52,6 +53,8 @@ would brake in an emergency."""
 SLOWING_TAU_S = 0.5
 """Headway that SUMO keeps meanwhile. That of the lattice may be shorter than SUMO's default, 1 s,
 and SUMO would brake to lengthen it."""
+AT_END_M = 10.0
+"""Distance from the end of a lane at which a vehicle cannot change lanes any more."""
 MAX_DISPLAY_ERROR_M = 0.1
 """Maximum distance between a body and where SUMO displays it."""
 
@@ -106,11 +109,9 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         ways = [one for one in found.ways_in if one.entrance in entrances]
         self.start_lanes = tuple(one.lane for one in ways if one.entrance == MAIN_ENTRANCE)
         """Lanes to whose beginning vehicles come from upstream."""
+        points = scenario.geometry
         self._ways_in = {
-            one.lane
-            if one.entrance == MAIN_ENTRANCE
-            else scenario.geometry.entry_point_of(one.entrance): one
-            for one in ways
+            points.entry_point_of(one.ramp) if one.ramp else one.lane: one for one in ways
         }
         """The ways to the entry points to which SUMO drives vehicles."""
         self.departing = tuple(
@@ -134,18 +135,13 @@ class CorridorWorld(SumoProcess, BodiesWorld):
 
     def _find_approaching(self, entry_point: int) -> Iterator[Approaching]:
         api, way_in = self.vehicle, self._ways_in[entry_point]
-        from_start = way_in.entrance == MAIN_ENTRANCE
         for name, way in way_in.lanes.items():
             for vehicle in self.lane.getLastStepVehicleIDs(name):
                 coming = self._coming.get(vehicle)
                 if (
                     coming is not None
                     and coming.arrival.vehicle not in self.states
-                    and (
-                        coming.origin.upstream
-                        if from_start
-                        else coming.arrival.entry_point == entry_point
-                    )
+                    and coming.origin.entrance == way_in.entrance
                 ):
                     s_m = way.from_m + api.getLanePosition(vehicle)
                     factor = api.getSpeedFactor(vehicle)
@@ -277,14 +273,20 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         del self._coming[name]
         self._returned.add(name)
         self._others = None
-        self._correct_route(name)
+        rest_m = self._rest_m(name)
+        if rest_m <= AT_END_M:
+            self._correct_route(name)
         limit_mps = self._next_limit_mps(name)
-        rest_m = self.lane.getLength(api.getLaneID(name)) - api.getLanePosition(name)
         if speed_mps > limit_mps and rest_m <= SLOWS_S * speed_mps:
             now_s, tau_s = self.simulation.getTime(), api.getTau(name)
             self._slowing[name] = _Slowing(now_s, speed_mps, limit_mps, tau_s)
             api.setSpeedMode(name, _SLOWING_MODE)
             api.setTau(name, min(tau_s, SLOWING_TAU_S))
+
+    def _rest_m(self, name: str) -> float:
+        """Return how far a vehicle is from the end of its lane."""
+        rest_m = self.lane.getLength(self.vehicle.getLaneID(name))
+        return float(rest_m - self.vehicle.getLanePosition(name))
 
     def _correct_route(self, name: str) -> None:
         """Give a vehicle that leaves by another exit than its own a route from there.
@@ -338,6 +340,8 @@ class CorridorWorld(SumoProcess, BodiesWorld):
             if road not in edges and not road.startswith(":"):  # nor in a junction
                 api.setLaneChangeMode(name, _OWN_LANE_CHANGES)
                 self._inside.remove(name)
+            elif api.getSpeed(name) < STANDING_MPS and self._rest_m(name) <= AT_END_M:
+                self._correct_route(name)  # it has not got into the lane of its exit
 
     def drive_on(self) -> None:
         """Let SUMO drive on until the vehicles that it got back have arrived (statistics)."""

@@ -6,9 +6,10 @@ is given back, with its speed; the next one behind it follows when that one brak
 the line at which vehicles are given back moves with the queue, lane by lane. Plans end before it,
 and no vehicle that departs at the start enters a lane whose line is not on the road.
 
-A vehicle that cannot reach the lane that it prefers before the line of this lane is given back
-where it is, as soon as this is certain; SUMO decides on its further lane changes. docs/SAFETY.md
-says why others may go on with their plans meanwhile.
+A vehicle that cannot reach the lane that it prefers before the line of this lane, or the lane of
+its exit in time, is given back where it is, as soon as this is certain; SUMO decides on its further
+lane changes. So is one that cannot leave a ramp that is too short for re-entry
+(`LaneEnd.taken_back`). docs/SAFETY.md says why others may go on with their plans meanwhile.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, Exits, LaneSection
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.lane_ends import LATE_S, dead_ends, exit_lanes
 from laneweave.protocol.wire.messages import OffLattice
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
 from laneweave.sim_bridge.corridors.corridor import braking_m
@@ -46,6 +48,17 @@ class HandOver:
         self._speed_mps = speed_mps = scenario.lattice.speed_mps
         self._move_m = scenario.timing.cycles_s[0] * speed_mps
         """Distance that a vehicle drives in one lane change."""
+        exits = exit_lanes(scenario)
+        no_re_entry = [end for end in dead_ends(scenario) if end.taken_back]
+        self._lines_m = {(end.lane, end.end_m): end.line_m for end in (*exits, *no_re_entry)}
+        """Lines of exits, and of dead ends at which nobody re-enters, by lane and end."""
+        self._exit_places = {
+            name: [
+                (lane, end_m) for (lane, end_m), one in self._sections.items() if one.exit == name
+            ]
+            for name in {one.exit for one in self._sections.values()}
+        }
+        """(lane, position) of each exit."""
         self._braking_m = SPACE_M + braking_m(speed_mps, REACTION_S)
         """Distance in which a vehicle at v_F stops comfortably behind another one."""
 
@@ -96,12 +109,31 @@ class HandOver:
         ends_m = {one.lane: one.rear_m for one in self.plans_end(others)}
         for vehicle in vehicles:
             section = self._section_of(vehicle)
-            if section is None or not vehicle.keeps_lane:
+            if not vehicle.keeps_lane:
                 continue
-            if self._misses_lane(vehicle, section, others, ends_m) or self._has_to_brake(
-                vehicle, section, others
+            if (
+                self._misses_way_out(vehicle)
+                if section is None
+                else self._misses_lane(vehicle, section, others, ends_m)
+                or self._has_to_brake(vehicle, section, others)
             ):
                 yield vehicle
+
+    def _misses_way_out(self, vehicle: OnRoad) -> bool:
+        """Return whether it is too late for a vehicle to leave its lane, or to come to its exit."""
+        s_m, lane = vehicle.state[0], vehicle.body_lane
+        begins_m = s_m - LATE_S * self._speed_mps
+        here = self._exits.section_at(lane, s_m)
+        if here is not None:
+            line_m = self._lines_m.get((lane, here.to_m), math.inf)
+            if begins_m + self._move_m > line_m:
+                return True
+        rooms_m = [
+            self._lines_m[place] - begins_m - self.moves_m(abs(place[0] - lane))
+            for place in self._exit_places.get(vehicle.arrival.destination, ())
+            if place in self._lines_m and s_m < place[1]
+        ]
+        return max(rooms_m, default=0.0) < 0.0
 
     def _misses_lane(
         self,

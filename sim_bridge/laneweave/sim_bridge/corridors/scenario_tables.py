@@ -22,9 +22,10 @@ from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.corridors.corridor import (
     MAX_SPEED_MPS,
     OPTION,
-    SPEED_SHARE,
+    RESERVE_SHARE,
     Corridor,
     Ramp,
+    lattice_speed_mps,
 )
 from laneweave.sim_bridge.corridors.settling import SLOW_ENTRY_S
 from laneweave.sim_bridge.corridors.sumo_corridor import Pass, SumoCorridor
@@ -40,6 +41,8 @@ its cell can then catch up without coming so close to the one ahead that it has 
 MAX_SETTLE_S, APPROACH_SETTLE_S = 8.0, 4.0
 """Time in which vehicles settle in their cells, if ramps are long enough; on approaches, where
 there is little room before the queue, lane changes begin sooner."""
+SPEED_STEP_MPS = 0.5
+"""v_F is a multiple of it."""
 SLOWEST_MPS = 8.0
 """v_F to which a short approach is slowed down at most."""
 _WIDE_M = 100.0
@@ -57,8 +60,20 @@ def checked_tables(found: SumoCorridor, sumo: Tables) -> Tables:
     Raises:
         BadInputError: it cannot; the error names the ramp, exit or edge.
     """
+    fastest_mps = _fastest_mps(found)
+    spare_mps = lattice_speed_mps(fastest_mps) - (1.0 - RESERVE_SHARE) * fastest_mps
+    for step in range(int(spare_mps / SPEED_STEP_MPS)):
+        try:
+            return _checked(found, sumo, step * SPEED_STEP_MPS)
+        except BadInputError:
+            continue  # what is too short for v_F may be long enough for a lower one
+    return _checked(found, sumo, spare_mps)
+
+
+def _checked(found: SumoCorridor, sumo: Tables, slower_mps: float) -> Tables:
+    """Return the tables with a v_F that is lower than usual; see `checked_tables`."""
     corridor = found.corridor
-    tables = scenario_tables(found) | {"sumo": sumo}
+    tables = scenario_tables(found, slower_mps) | {"sumo": sumo}
     try:
         parse_scenario(tables)
     except BadInputError as error:
@@ -96,12 +111,23 @@ def _places(tables: Tables, corridor: Corridor) -> Iterator[tuple[str, str]]:
         yield f"road.closures[{number}]", f"end of lane {end}"
 
 
-def scenario_tables(found: SumoCorridor) -> Tables:
+def _fastest_mps(found: SumoCorridor) -> float:
+    """Return the lowest speed limit of edges and types."""
+    types = found.type_names()
+    return min(MAX_SPEED_MPS, found.corridor.speed_mps, *(one.max_speed_mps for one in types))
+
+
+def scenario_tables(found: SumoCorridor, slower_mps: float = 0.0) -> Tables:
     """Return the tables of a scenario file, not checked against each other.
 
     Vehicles arrive at random with the mean volumes of the simulation. No vehicle exceeds the lowest
-    speed limit of edges and types, and v_F is 90 % of it. The column pitch is the minimum that
-    suits all types, but at least `HEADWAY_S` long, and T_F is long enough for moves between lanes.
+    speed limit of edges and types, and v_F is a little lower (`lattice_speed_mps`). The column
+    pitch is the minimum that suits all types, but at least `HEADWAY_S` long, and T_F is long enough
+    for moves between lanes.
+
+    Args:
+        found: the corridor with its vehicles.
+        slower_mps: by how much v_F is lower still.
 
     Raises:
         BadInputError: no vehicle enters at the start of the corridor, or it is too short.
@@ -119,9 +145,10 @@ def scenario_tables(found: SumoCorridor) -> Tables:
     names = found.type_names()
     car, *others = names
     own_names = {**names, car: CAR}
-    fastest_mps = min(MAX_SPEED_MPS, corridor.speed_mps, *(one.max_speed_mps for one in names))
+    fastest_mps = _fastest_mps(found)
     duration_s = found.simulation.duration_s
-    ramps = [ramp for ramp in corridor.ramps if ramp.name in by_entrance]
+    ramps = [ramp for ramp in corridor.ramps if ramp.entrance in by_entrance]
+    lanes_of = Counter(ramp.entrance for ramp in ramps)
     first_lanes = corridor.lanes - sum(one.from_m <= 0.0 for one in corridor.closures)
     tables: Tables = {
         "road": {
@@ -137,11 +164,13 @@ def scenario_tables(found: SumoCorridor) -> Tables:
                 "lane": ramp.lane,
                 "at_m": _m(ramp.at_m),
                 "merge_m": _m(ramp.merge_m),
-                "volume_veh_per_h": _volume(len(by_entrance[ramp.name]), duration_s),
-                "destinations": _destinations(by_entrance[ramp.name]),
+                "volume_veh_per_h": _volume(
+                    len(by_entrance[ramp.entrance]), duration_s, lanes_of[ramp.entrance]
+                ),
+                "destinations": _destinations(by_entrance[ramp.entrance]),
                 "vehicle_types": [
                     {"type": names[one], "share": share}
-                    for one, share in _shares_of_types(by_entrance[ramp.name]).items()
+                    for one, share in _shares_of_types(by_entrance[ramp.entrance]).items()
                     if one != car
                 ],
             }
@@ -164,7 +193,7 @@ def scenario_tables(found: SumoCorridor) -> Tables:
         ],
     }
     _check_widths(corridor, names)
-    speed_mps = _rounded_mps(SPEED_SHARE * fastest_mps)
+    speed_mps = _rounded_mps(lattice_speed_mps(fastest_mps) - slower_mps)
     formation = _motion(tables, corridor, speed_mps)
     body_m = max(one.length_m for one in names)
     if corridor.lanes_to:
@@ -197,7 +226,7 @@ def remarks(found: SumoCorridor, tables: Tables) -> list[str]:
     slowest = min(counts, key=lambda kind: kind.max_speed_mps, default=None)
     if slowest is not None and slowest.max_speed_mps < allowed_mps:
         remarks.append(
-            f"v_F is 90 % of {slowest.max_speed_mps:.1f} m/s, the maximum speed of class "
+            f"v_F follows from {slowest.max_speed_mps:.1f} m/s, the maximum speed of class "
             f"{slowest.vehicle_class} ({counts[slowest]} of {len(found.passes)} vehicles); the "
             f"lanes allow {allowed_mps:.1f} m/s"
         )
@@ -231,7 +260,7 @@ def _volume(vehicles: int, duration_s: float, lanes: int = 1) -> float:
 
 
 def _rounded_mps(speed_mps: float) -> float:
-    return math.floor(2.0 * speed_mps) / 2.0
+    return math.floor(speed_mps / SPEED_STEP_MPS) * SPEED_STEP_MPS
 
 
 def _m(position_m: float) -> float:
@@ -338,13 +367,34 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
                 field, max_accel_mps2, f"more, for {speed_mps:g} m/s: {error}"
             ) from error
     cycle_s = _cycle_s(found, corridor)
-    # A short approach leaves the room for its lane changes.
-    advance_m = speed_mps * cycle_s
-    moves_m = max(corridor.most_changes, 1) * advance_m
-    room_m = corridor.length_m - moves_m - found.types.longest_body_m
+    room_m = _settling_room_m(found, corridor, speed_mps * cycle_s)
     settle_s = max(MIN_SETTLE_S, min(settle_s, room_m / speed_mps))
     settle_s = math.floor(10.0 * settle_s) / 10.0
     return formation | {"settle_s": settle_s, "cycle_s": cycle_s}
+
+
+def _settling_room_m(scenario: Scenario, corridor: Corridor, advance_m: float) -> float:
+    """Return how far vehicles may drive from the start before lane changes have to begin.
+
+    Lanes that are open at the start may end soon, and an approach is short: corridors may begin
+    where a ramp joins.
+
+    Args:
+        scenario: types, lattice and limits.
+        corridor: the corridor.
+        advance_m: distance driven in a lane change.
+    """
+    body_m, stopping_m = scenario.types.longest_body_m, re_entry(scenario).room_m
+    rooms_m = [corridor.length_m - max(corridor.most_changes, 1) * advance_m]
+    for lane in corridor.edges[0].lanes:
+        end_m = corridor.ends_m(lane, 0.0)
+        if end_m < corridor.length_m:
+            # A slot may begin just before it is possible to begin moves.
+            rooms_m.append(end_m - stopping_m - 2.0 * advance_m)
+        for out in corridor.ways_out:
+            changes = min(abs(one - lane) for one in out.lanes)
+            rooms_m.append(out.at_m - stopping_m - (changes + 1) * advance_m)
+    return min(rooms_m) - body_m
 
 
 def _cycle_s(scenario: Scenario, corridor: Corridor) -> float:

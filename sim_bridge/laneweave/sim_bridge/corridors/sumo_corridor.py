@@ -46,11 +46,13 @@ class WayIn:
     """The lanes that lead to an entrance."""
 
     entrance: str
-    """`MAIN_ENTRANCE`, or the name of a ramp."""
+    """`MAIN_ENTRANCE`, or the name of an on-ramp: that of its rightmost lane."""
     lane: int
     """The lane of the road to which they lead."""
     lanes: Mapping[str, LaneBefore]
     """By their names in SUMO, those inside junctions included."""
+    ramp: str = ""
+    """Name of the lane of the on-ramp."""
 
 
 @frozen
@@ -180,7 +182,7 @@ def _pass_of(vehicle: SumoVehicle, corridor: Corridor) -> Pass | str:
     if begin == 0:
         upstream = before
     else:
-        ramps = {(one.edge, one.to_edge): one.name for one in corridor.ramps}
+        ramps = {(one.edge, one.to_edge): one.entrance for one in corridor.ramps}
         if (before, route[first]) not in ramps:
             return f"enter from {before}" if before else f"start on {route[first]}"
         entrance = ramps[before, route[first]]
@@ -211,9 +213,13 @@ def _ways_in(corridor: Corridor) -> Iterator[WayIn]:
             yield WayIn(MAIN_ENTRANCE, first.first_lane + lane.index, {lane.name: end, **lanes})
     for ramp in corridor.ramps:
         links = network.between(network.edges[ramp.edge], network.edges[ramp.to_edge])
+        parallel = sum(one.entrance == ramp.entrance for one in corridor.ramps) > 1
+        if parallel:
+            first_lane = corridor.edges[corridor.edge_numbers[ramp.to_edge]].first_lane
+            links = [one for one in links if first_lane + one.target.index == ramp.lane]
         single = {one.origin.edge for one in ramp.path}
-        lanes = _lanes_before(corridor, links, ramp.merge_m, ramp.at_m, single, parallel=False)
-        yield WayIn(ramp.name, ramp.lane, lanes)
+        lanes = _lanes_before(corridor, links, ramp.merge_m, ramp.at_m, single, parallel=parallel)
+        yield WayIn(ramp.entrance, ramp.lane, lanes, ramp.name)
 
 
 def _lanes_before(

@@ -228,19 +228,24 @@ class RunRecord:
     def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
         """Record a vehicle that has left the road since the last tick, by its end or an exit.
 
-        One that a simulator has taken back before has left by the end of its lane, at once.
+        One that a simulator has taken back before counts as on its way to its destination.
 
         `attended`: whether the vehicle's agent was in charge, not a caretaker.
         """
         s_m, v_mps, _, y_m, _, _ = vehicle.state
         lane, arrival = int(y_m // self._scenario.road.lane_width_m), vehicle.arrival
-        section = self._exits.left_by(lane, s_m) or self._exits.section_at(lane, s_m)
-        section = section or LaneSection(lane, to_m=s_m)
+        left_by = self._exits.left_by(lane, s_m)
+        section = left_by or self._exits.section_at(lane, s_m) or LaneSection(lane, to_m=s_m)
         left_s = t_s - max(s_m - section.to_m, 0.0) / v_mps if v_mps > 0 else t_s
         trip = self._trips[Name(vehicle.name)]
         trip.left_s, trip.final_lane = left_s, lane
-        trip.free_flow_s -= max(section.to_m - s_m, 0.0) / self._scenario.formation.speed_mps
-        trip.exit = section.exit if section.to_m < self._scenario.road.length_m else END_OF_ROAD
+        geometry = self._scenario.geometry
+        rest_s = geometry.rest_s(s_m, arrival.destination)
+        if left_by is None and rest_s >= 0.0:
+            trip.exit = arrival.destination
+            trip.free_flow_s -= rest_s
+        else:
+            trip.exit = section.exit if section.to_m < self._scenario.road.length_m else END_OF_ROAD
         at_destination = section.serves(arrival.preferred_lane, arrival.destination) or (
             lane in arrival.right_lanes and section.serves(lane, arrival.destination)
         )

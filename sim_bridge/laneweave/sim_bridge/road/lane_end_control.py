@@ -81,7 +81,9 @@ class LaneEndControl:
         ends = LaneEnds(scenario)
         self._any = bool(ends)
         self._ends = tuple(ends)
-        self._beside = {end: lane_beside(scenario, end) for end in self._ends}
+        self._beside = {
+            end: None if end.taken_back else lane_beside(scenario, end) for end in self._ends
+        }
         needed = re_entry(scenario) if self._ends else None
         self._columns = needed.columns if needed is not None else 0
         self._distance_m = needed.distance_m if needed is not None else 0.0
@@ -157,7 +159,7 @@ class LaneEndControl:
         """Keep the next columns beside an end free, unless the last gap was too close ahead."""
         lane = self._beside[end]
         if lane is None:
-            return  # `road_checks` refuses such roads
+            return  # SUMO takes the vehicle back
         point = self._scenario.geometry.entry_point_before(lane, end.line_m)
         taken = self._meter.points_kept_free(point)
         crowded = any(arrival.entry_point in taken for arrival in self._meter.waiting)

@@ -153,7 +153,12 @@ def test_the_time_at_v_f_counts_from_the_entrance_to_the_destination() -> None:
     scenario = parse_scenario(WEAVING)
     assert scenario.geometry.free_flow_trip_s(0) == pytest.approx(50.0)
     assert scenario.geometry.free_flow_trip_s(1, "off") == pytest.approx(700.0 / 15.0)
-    assert [one.entrance for one in scenario.geometry.entry_points] == ["on", "main", "main", "main"]
+    assert [one.entrance for one in scenario.geometry.entry_points] == [
+        "on",
+        "main",
+        "main",
+        "main",
+    ]
 
 
 @pytest.mark.parametrize(

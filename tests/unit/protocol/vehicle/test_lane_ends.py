@@ -74,8 +74,8 @@ def test_sections_by_which_a_vehicle_may_leave() -> None:
 
 def test_a_stop_line_lies_before_each_dead_end() -> None:
     room_m = re_entry(DROP).room_m
-    assert dead_ends(DROP) == (LaneEnd(0, -INF, 800.0 - room_m, 800.0, INF),)
-    assert dead_ends(BLOCKED) == (LaneEnd(1, -INF, 600.0 - room_m, 600.0, 700.0),)
+    assert dead_ends(DROP) == (LaneEnd(0, -INF, 800.0 - room_m, 800.0 - room_m, 800.0, INF),)
+    assert dead_ends(BLOCKED) == (LaneEnd(1, -INF, 600.0 - room_m, 600.0 - room_m, 600.0, 700.0),)
     to_lines = sections_to_lines(BLOCKED)
     assert [section.to_m for section in to_lines] == [1000.0, 600.0 - room_m, 1000.0, 1000.0]
     assert [section.from_m for section in to_lines] == [-INF, -INF, 700.0, -INF]

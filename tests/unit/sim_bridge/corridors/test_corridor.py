@@ -15,13 +15,13 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Closure
+from laneweave.protocol.vehicle.lane_ends import HANDOVER_M
 from laneweave.sim_bridge.corridors.corridor import (
-    HANDOVER_M,
     MIN_AT_M,
-    SPEED_SHARE,
     Corridor,
     braking_m,
     corridor_of,
+    lattice_speed_mps,
 )
 from laneweave.sim_bridge.corridors.corridor_search import find_approaches, find_corridors
 from laneweave.sim_bridge.corridors.scenario_tables import checked_tables, scenario_tables
@@ -131,8 +131,8 @@ def test_names_of_edges_may_contain_colons(tmp_path: Path) -> None:
 def test_sumo_has_room_to_brake_where_vehicles_give_way_behind_the_corridor(
     network: Network,
 ) -> None:
-    brakes_m = braking_m(SPEED_SHARE * MAIN_SPEED_MPS)
-    assert brakes_m == pytest.approx(103.1, abs=0.1)
+    brakes_m = braking_m(lattice_speed_mps(MAIN_SPEED_MPS))
+    assert brakes_m == pytest.approx(116.4, abs=0.1)
 
     def with_crossing(length_m: float) -> Network:
         """The exit gives way; behind main5, after `length_m`, is a traffic light."""
@@ -167,19 +167,16 @@ def two_lane_ramp(network: Network) -> Network:
     return Network(edges, tuple(links))
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (giving_way, "its state is 'm'"),
-        (two_lane_ramp, "on-ramps of one lane, but 2 lanes of on lead"),
-    ],
-    ids=["gives-way", "two-lane-ramp"],
-)
-def test_what_is_no_corridor_is_refused_in_words_of_the_network(
-    network: Network, change: Callable[[Network], Network], expected: str
-) -> None:
-    with pytest.raises(BadInputError, match=expected):
-        corridor_of(change(network), "main1", "main5")
+def test_each_lane_of_a_ramp_is_an_entrance(network: Network) -> None:
+    corridor = corridor_of(two_lane_ramp(network), "main1", "main5")
+    first, second = corridor.ramps
+    assert (first.edge, second.edge, first.lane, second.lane) == ("on", "on", 0, 1)
+    assert first.name == first.entrance == second.entrance != second.name
+
+
+def test_vehicles_must_not_have_to_give_way_on_a_corridor(network: Network) -> None:
+    with pytest.raises(BadInputError, match="its state is 'm'"):
+        corridor_of(giving_way(network), "main1", "main5")
 
 
 @pytest.mark.parametrize("text", ["", "<net", "<routes/>"])
@@ -228,7 +225,7 @@ def test_the_longest_chain_with_priority_is_found(interchange: SumoCorridor) -> 
 
 def test_the_tables_are_a_valid_scenario(scenario: Scenario) -> None:
     assert scenario.geometry.shared_lanes == {0}
-    assert scenario.formation.speed_mps == 25.0
+    assert scenario.formation.speed_mps == 26.5
     assert not scenario.formation.change_columns
     truck = scenario.types["truck"].limits
     assert (truck.length_m, truck.max_accel_mps2) == (7.1, 1.3)

@@ -169,8 +169,10 @@ OFF_RAMP = parse_scenario(
     ("lane", "s_m", "destination", "due"),
     [
         (0, 500.0, "off", True),
-        (1, 500.0, "off", False),  # SUMO would stop it for its exit
-        (0, 500.0, END_OF_ROAD, False),
+        (1, 450.0, "off", False),
+        (1, 500.0, "off", True),  # it is too late to change into the lane of its exit
+        (0, 450.0, END_OF_ROAD, False),
+        (0, 500.0, END_OF_ROAD, True),  # or to leave it
         (1, 500.0, END_OF_ROAD, True),
         (1, 700.0, "off", True),  # it has passed its exit
     ],

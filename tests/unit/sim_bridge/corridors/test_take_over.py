@@ -79,13 +79,13 @@ def test_a_vehicle_never_gets_a_cell_that_it_cannot_have(scenario: Scenario) -> 
 
 def test_a_vehicle_rather_enters_where_nobody_has_to_make_room(scenario: Scenario) -> None:
     at_m = scenario.entrance[0].at_m
-    (alone,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 20.0))
+    (alone,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 22.0))
     column = alone.cell[0]
     beside = frozenset({(column, 1)})
-    (moved,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 20.0), occupied=beside)
+    (moved,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 22.0), occupied=beside)
     assert moved.cell[0] == column - 1
     everywhere = frozenset((column - number, 1) for number in range(20))
-    (same,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 20.0), occupied=everywhere)
+    (same,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 22.0), occupied=everywhere)
     assert same.cell[0] == column
 
 

@@ -239,10 +239,11 @@ def _table(
             is_blocked[lane, column - low] = True
     steps = displacements(road.mode)
     load = np.zeros((slots, len(steps), road.lanes, columns), dtype=np.float32)
-    section, left, open_ = _sections(road, at_m)
+    section, left, latest_m = _sections(road, at_m)
     found = _zones(section, rules.restricted, len(road.sections))
     zone = found.of_cell
-    may_move = _may_move(road, open_, is_blocked)
+    starts_m = np.stack([_starts_m(road, at_m[:-1], lane) for lane in range(road.lanes)], axis=1)
+    may_move = _may_move(road, starts_m, latest_m, is_blocked)
     load[:, 1:][~may_move] = FIXED * ENTERING
     may_leave: Bools = np.asarray(may_move.any(axis=(1, 2)))
     moving_columns = np.stack(
@@ -307,8 +308,8 @@ def _starts_m(road: StreamRoad, front_m: Floats, lane: int) -> Floats:
     starts_m = front_m.copy()
     if road.early_m is None:
         return starts_m
-    for from_m, to_m, number in road.lane_sections[lane]:
-        begins_m = road.first_m(from_m, number)
+    for _, to_m, number in road.lane_sections[lane]:
+        begins_m = road.first_m(number)
         later = (front_m < road.line_m(number, to_m)) & (front_m < begins_m)
         later &= begins_m <= front_m + road.advance_m
         starts_m[later] = np.maximum(starts_m[later], begins_m)
@@ -339,42 +340,51 @@ def _zones(section: NDArray[np.int16], restricted: Bools, sections: int) -> _Zon
     )
 
 
-def _sections(road: StreamRoad, at_m: Floats) -> tuple[NDArray[np.int16], Bools, Bools]:
-    """Return sections, `Table.left`, and the cells that are open throughout each slot.
+def _sections(road: StreamRoad, at_m: Floats) -> tuple[NDArray[np.int16], Bools, Floats]:
+    """Return sections, `Table.left`, and where moves have to begin in each slot at the latest.
 
     The section of a cell is the one in which it is when a slot begins, or beyond whose end; -1:
-    none. A cell is open if the whole body is, from the beginning of a move to its end a slot later.
+    none. A move whose front begins there ends before the line of its section; -inf: no section is
+    open for the whole body.
     """
     slots, columns = at_m.shape[0] - 1, at_m.shape[1]
     section = np.full((slots + 1, road.lanes, columns), -1, dtype=np.int16)
     left = np.zeros((slots + 1, road.lanes, columns), dtype=np.bool_)
-    is_open = np.zeros((slots, road.lanes, columns), dtype=np.bool_)
+    latest_m = np.full((slots, road.lanes, columns), -np.inf)
     start_m, end_m = road.sorting_m
     for lane, sections in enumerate(road.lane_sections):
         for from_m, to_m, number in sections:
             begun = at_m >= from_m - ROUNDING_M
             section[:, lane][begun] = number
             left[:, lane][begun] = (at_m > to_m + ROUNDING_M)[begun]
-            first_m, line_m = road.first_m(from_m, number), min(end_m, road.line_m(number, to_m))
+            first_m, line_m = road.first_m(number), min(end_m, road.line_m(number, to_m))
             begins = at_m[:-1] - road.body_m >= start_m - ROUNDING_M
-            if road.early_m is None:
-                begins &= at_m[:-1] >= first_m - ROUNDING_M
-                ends_m = at_m[1:]
-            else:
-                begins &= at_m[1:] >= first_m - ROUNDING_M
-                ends_m = np.maximum(at_m[:-1], first_m) + road.advance_m
-            is_open[:, lane] |= begins & (ends_m <= line_m + ROUNDING_M)
-    return section, left, is_open
+            # A move may begin later in the slot, when its lane opens (`StreamRoad.early_m`).
+            until_m = at_m[:-1] if road.early_m is None else at_m[1:]
+            begins &= until_m >= first_m - ROUNDING_M
+            begins &= np.maximum(at_m[:-1], first_m) + road.advance_m <= line_m + ROUNDING_M
+            latest_m[:, lane][begins] = line_m - road.advance_m + ROUNDING_M
+    return section, left, latest_m
 
 
-def _may_move(road: StreamRoad, is_open: Bools, is_blocked: Bools) -> Bools:
+def _may_move(road: StreamRoad, starts_m: Floats, latest_m: Floats, is_blocked: Bools) -> Bools:
     """Return whether each move stays in open cells of S3 and enters no blocked cell.
 
-    The corners of an oblique move count as entered, except the vehicle's own cell. Shape:
-    (slots, displacements without the first, lanes, columns).
+    The corners of an oblique move count as entered, except the vehicle's own cell. A lane change
+    begins when both lanes are open, and must end before the lines of both.
+
+    Args:
+        road: the road.
+        starts_m: where moves begin in each lane, by slot, lane and column (`_starts_m`).
+        latest_m: where they begin at the latest (`_sections`).
+        is_blocked: cells that no plan may use, by lane and column.
+
+    Returns:
+        Shape (slots, displacements without the first, lanes, columns).
     """
     lanes, columns = is_blocked.shape
     steps = displacements(road.mode)[1:]
+    is_open: Bools = starts_m <= latest_m
     allowed = np.zeros((len(is_open), len(steps), lanes, columns), dtype=np.bool_)
     for d, (column, lane) in enumerate(steps):
         here_c = slice(max(0, -column), columns - max(0, column))
@@ -382,6 +392,9 @@ def _may_move(road: StreamRoad, is_open: Bools, is_blocked: Bools) -> Bools:
         here_l = slice(max(0, -lane), lanes - max(0, lane))
         there_l = slice(max(0, lane), lanes + min(0, lane))
         inside = is_open[:, here_l, here_c] & is_open[:, there_l, there_c]
+        if lane and not column:
+            begins_m = np.maximum(starts_m[:, here_l], starts_m[:, there_l])
+            inside &= begins_m <= np.minimum(latest_m[:, here_l], latest_m[:, there_l])
         free = ~is_blocked[there_l, there_c]
         if column and lane:
             inside &= is_open[:, here_l, there_c] & is_open[:, there_l, here_c]

@@ -99,15 +99,16 @@ class StreamRoad:
         opens_m = [
             begins_m
             for lane in lanes
-            for from_m, to_m, number in self.lane_sections[lane]
+            for _, to_m, number in self.lane_sections[lane]
             if front_m < self.line_m(number, to_m)
-            and front_m < (begins_m := self.first_m(from_m, number)) <= front_m + self.advance_m
+            and front_m < (begins_m := self.first_m(number)) <= front_m + self.advance_m
         ]
         return max(opens_m, default=front_m)
 
-    def first_m(self, from_m: float, number: int) -> float:
+    def first_m(self, number: int) -> float:
         """Return the position of the front at which moves may begin in a section."""
-        begins_m = max(from_m, self.sections[number].moves_from_m)
+        section = self.sections[number]
+        begins_m = max(section.from_m, section.moves_from_m)
         return begins_m + self.body_m - (self.early_m or 0.0)
 
     def line_m(self, number: int, to_m: float) -> float:
@@ -130,7 +131,11 @@ class StreamRoad:
 
     @cached_property
     def lane_sections(self) -> tuple[tuple[Section, ...], ...]:
-        """The sections of each lane, in the direction of travel."""
+        """The sections of each lane, in the direction of travel.
+
+        Each begins where it opens, or where moves into it may begin: a body that changes lanes so
+        early does not touch the lane before it opens.
+        """
         by_lane = [
             sorted(
                 (each.from_m, each.to_m, number)
@@ -148,8 +153,10 @@ class StreamRoad:
         """
         jump_m = self.advance_m + self.pitch_m
         next_m = [from_m - jump_m for from_m, _, _ in sections[1:]] + [math.inf]
+        before_m = -math.inf
         for (from_m, to_m, number), latest_m in zip(sections, next_m, strict=True):
-            yield from_m, min(to_m, latest_m), number
+            yield min(from_m, max(self.first_m(number), before_m)), min(to_m, latest_m), number
+            before_m = to_m
 
     @cached_property
     def first_end_m(self) -> float:
@@ -174,9 +181,9 @@ class StreamRoad:
     def is_open(self, lane: int, rear_m: float, front_m: float) -> bool:
         """Return whether moves are possible in a lane everywhere between two positions."""
         return any(
-            self.first_m(from_m, number) - self.body_m <= rear_m + ROUNDING_M
+            self.first_m(number) - self.body_m <= rear_m + ROUNDING_M
             and front_m <= self.line_m(number, to_m) + ROUNDING_M
-            for from_m, to_m, number in self.lane_sections[lane]
+            for _, to_m, number in self.lane_sections[lane]
         )
 
     def has_left(self, slot: int, cell: Cell) -> bool:
