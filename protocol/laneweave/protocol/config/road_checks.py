@@ -163,13 +163,15 @@ def check_entrances(scenario: Scenario) -> None:
         require(entrance.name not in names, f"{name}.name", entrance.name, allowed)
         names.add(entrance.name)
         formation = scenario.formation
-        opens_m = [one.to_m for one in road.closures if one.lane == lane]
+        closures = [one for one in road.closures if one.lane == lane]
+        opens_m = [one.to_m for one in closures]
         earlier = [(one.lane, one.at_m) for one in scenario.entrance[:number]]
         if formation.change_columns:
             allowed = "a lane that is closed from the start of the road to its only entrance"
-            is_closed = any(one.lane == lane and one.from_m <= 0.0 for one in road.closures)
+            is_closed = any(one.from_m <= 0.0 for one in closures)
             ok = is_closed and lane not in dict(earlier)
         else:
+            opens_m = [one_m for one_m in opens_m if one_m < road.length_m]
             allowed = "a lane that opens behind the start of the road (road.closures)"
             ok = bool(opens_m)
         require(ok, f"{name}.lane", lane, allowed)

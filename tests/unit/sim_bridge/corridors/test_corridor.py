@@ -154,7 +154,7 @@ def test_sumo_has_room_to_brake_where_vehicles_give_way_behind_the_corridor(
     assert any((one.lane, one.from_m) == (0, exit_.at_m) for one in corridor.closures)
     far = corridor_of(with_crossing(200.0), "main1", "main5")
     assert far.length_m == 1960.0 - HANDOVER_M
-    with pytest.raises(BadInputError, match=r"length of behind: got 50\.0; allowed: at least 58 m"):
+    with pytest.raises(BadInputError, match=r"length of behind: got 50\.0; allowed: at least 64 m"):
         corridor_of(with_crossing(50.0), "main1", "behind")
 
 

@@ -79,14 +79,14 @@ def test_a_vehicle_never_gets_a_cell_that_it_cannot_have(scenario: Scenario) -> 
 
 def test_a_vehicle_rather_enters_where_nobody_has_to_make_room(scenario: Scenario) -> None:
     at_m = scenario.entrance[0].at_m
-    (alone,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 22.0))
+    (alone,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 20.0))
     column = alone.cell[0]
     beside = frozenset({(column, 1)})
-    (moved,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 22.0), occupied=beside)
+    (moved,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 20.0), occupied=beside)
     assert moved.cell[0] == column - 1
     everywhere = frozenset((column - number, 1) for number in range(20))
-    (same,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 22.0), occupied=everywhere)
-    assert same.cell[0] == column
+    (same,), _ = admit(scenario, on_ramp("a", at_m + 1.0, 20.0), occupied=everywhere)
+    assert column - same.cell[0] <= 1  # those beside it may need the time of a column
 
 
 def test_a_vehicle_that_would_be_too_early_is_slowed_down_on_its_way(scenario: Scenario) -> None:

@@ -43,6 +43,24 @@ def test_every_vehicle_has_a_slot_for_the_exit() -> None:
     assert not all(reaches_exit(SHARED, column) for column in range(8, 12))
 
 
+def test_every_vehicle_has_a_slot_for_the_shortest_possible_exit() -> None:
+    """At the beginning of a slot it may still be before the lane in which it moves."""
+    shortest = evolve(SHARED.sections[0], to_m=OPENS_M + 5.0 - 10.0 + 60.0)
+    road = evolve(EARLY, sections=(shortest, *SHARED.sections[1:]))
+    assert all(reaches_exit(road, column) for column in range(8, 12))
+
+
+def test_a_move_that_waits_for_its_lane_ends_before_the_other_lane_does() -> None:
+    """It begins at 395 m and ends at 455 m, 19 m later than it would in its own lane alone."""
+    for end_m, possible in ((456.0, True), (454.0, False)):
+        beside = evolve(SHARED.sections[2], to_m=end_m, exit="")
+        road = evolve(EARLY, sections=(*SHARED.sections[:2], beside, SHARED.sections[3]))
+        leaving = StreamVehicle("x", (25, 1), 0, moves=LATERAL)
+        plan = StreamPlanner(road).plan(0, [leaving])
+        assert problems_of_plan(road, plan, [leaving]) == []
+        assert (plan.missed == ()) == possible
+
+
 def test_a_vehicle_on_the_ramp_gets_on_the_road_before_its_lane_ends() -> None:
     for column in range(35, 39):
         on_ramp = StreamVehicle("r", (column, 0), {2, 3}, moves=LATERAL)
