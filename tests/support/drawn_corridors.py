@@ -1,10 +1,10 @@
 """Corridors drawn at random, written with netconvert.
 
 A drawn network is a main road of two to four lanes with on-ramps, exits, both or neither, in any
-order, with any lengths: several interchanges one after another, and exits whose lanes are open from
-the start of the network on. The corridor may begin and end on any of its main edges, also on those
-with the lane of a ramp. Vehicles depart on the first edge, upstream of it or on a ramp, anywhere on
-their edges.
+order, with any lengths: several interchanges one after another, ramps of two lanes, lanes that end
+like a zipper, and exits whose lanes are open from the start of the network on. The corridor may
+begin and end on any of its main edges, also on those with the lane of a ramp. Vehicles depart on
+the first edge, upstream of it or on a ramp, anywhere on their edges.
 """
 
 from __future__ import annotations
@@ -36,8 +36,16 @@ KINDS = (
     "drop",
     "drop-ramp",
     "drop-ramp-exit-ramp",
+    "wide",
+    "exit-wide-exit",
+    "zipper",
+    "zipper-exit-ramp",
 )
-"""Parts of the main road, in order; `drop`: an exit whose lane is open from the start on."""
+"""Parts of the main road, in order.
+
+`drop`: an exit whose lane is open from the start on; `wide`: a ramp of two lanes; `zipper`: a lane
+that is open from the start on merges with the next one.
+"""
 CAR, TRUCK = (4.5, 1.8), (7.1, 2.4)
 """(length, width) [m] of the drawn types."""
 
@@ -71,9 +79,9 @@ class _Main:
     """Names of the ramps' first edges, and the numbers of the main edges behind."""
     x_m: float = 0.0
 
-    def node(self, x_m: float, y_m: float = 0.0) -> str:
+    def node(self, x_m: float, y_m: float = 0.0, kind: str = "priority") -> str:
         name = f"n{len(self.nodes)}"
-        self.nodes.append(f'<node id="{name}" x="{x_m:.2f}" y="{y_m:.2f}" type="priority"/>')
+        self.nodes.append(f'<node id="{name}" x="{x_m:.2f}" y="{y_m:.2f}" type="{kind}"/>')
         return name
 
     def edge(self, name: str, begin: str, end: str, lanes: int, speed_mps: float = 0.0) -> str:
@@ -89,11 +97,11 @@ class _Main:
             for a, b in pairs
         ]
 
-    def extend(self, length_m: float, *, extra: bool = False) -> str:
-        """Add a main edge; `extra`: with a lane 0 beside the others."""
+    def extend(self, length_m: float, *, extra: int = 0, ends: str = "priority") -> str:
+        """Add a main edge with `extra` lanes on the right; `ends`: type of the junction behind."""
         begin = self.node(self.x_m) if not self.nodes else f"n{self.last}"
         self.x_m += length_m
-        end = self.node(self.x_m)
+        end = self.node(self.x_m, kind=ends)
         self.last = int(end[1:])
         name = self.edge(f"e{len(self.main)}", begin, end, self.lanes + extra)
         self.main.append(name)
@@ -138,32 +146,16 @@ def _draw_road(main: _Main, kind: str) -> None:
     rng = main.rng
     per_mps = main.speed_mps / 27.78
     parts = kind.split("-")
-    drop = parts[0] == "drop"
+    drop = int(parts[0] in ("drop", "zipper"))
     for _ in range(rng.choice((0, 0, 1, 2))):
         main.extend(rng.uniform(120.0, 400.0), extra=drop)
-    main.extend(rng.uniform(350.0, 700.0), extra=drop)
+    ends = "zipper" if parts[0] == "zipper" else "priority"
+    main.extend(rng.uniform(350.0, 700.0), extra=drop, ends=ends)
     for before, after in pairwise(main.main):
         main.connect(before, after, [(n, n) for n in range(main.lanes + drop)])
     for part in parts:
-        if part == "plain":
-            continue
-        if part == "drop":
-            extra = main.main[-1]
-        else:
-            if part in ("ramp", "weaving"):
-                _draw_ramp(main)
-            extra = main.extend(per_mps * rng.uniform(260.0, 480.0), extra=True)
-            main.connect(main.main[-2], extra, [(n, n + 1) for n in range(main.lanes)])
-        if part in ("ramp", "weaving"):
-            main.connect(main.ramps[-1][0].replace("far", "on"), extra, [(0, 0)])
-        if part in ("exit", "weaving", "drop"):
-            out = f"off{len(main.exits)}"
-            end = main.node(main.x_m + 250.0, -60.0)
-            main.edge(out, f"n{main.last}", end, 1, main.speed_mps * rng.choice((0.8, 1.0)))
-            main.exits.append((out, len(main.main) - 1))
-            main.connect(extra, out, [(0, 0)])
-        after = main.extend(rng.uniform(320.0, 600.0))
-        main.connect(extra, after, [(n + 1, n) for n in range(main.lanes)])
+        if part != "plain":
+            _draw_part(main, part, per_mps)
     for _ in range(rng.choice((0, 0, 1))):
         main.extend(rng.uniform(60.0, 300.0))
     for before, after in pairwise(main.main):
@@ -171,16 +163,53 @@ def _draw_road(main: _Main, kind: str) -> None:
             main.connect(before, after, [(n, n) for n in range(main.lanes)])
 
 
-def _draw_ramp(main: _Main) -> None:
+def _draw_part(main: _Main, part: str, per_mps: float) -> None:
+    """Draw a ramp, exit or merge, and the main edge behind it."""
+    rng, lanes = main.rng, range(main.lanes)
+    if part == "wide":
+        _draw_wide_ramp(main)
+    if part in ("drop", "zipper", "wide"):
+        extra = main.main[-1]
+    else:
+        if part in ("ramp", "weaving"):
+            _draw_ramp(main)
+        extra = main.extend(per_mps * rng.uniform(260.0, 480.0), extra=1)
+        main.connect(main.main[-2], extra, [(n, n + 1) for n in lanes])
+    if part in ("ramp", "weaving"):
+        main.connect(main.ramps[-1][0].replace("far", "on"), extra, [(0, 0)])
+    if part in ("exit", "weaving", "drop"):
+        out = f"off{len(main.exits)}"
+        end = main.node(main.x_m + 250.0, -60.0)
+        main.edge(out, f"n{main.last}", end, 1, main.speed_mps * rng.choice((0.8, 1.0)))
+        main.exits.append((out, len(main.main) - 1))
+        main.connect(extra, out, [(0, 0)])
+    after = main.extend(rng.uniform(320.0, 600.0))
+    main.connect(extra, after, [(n + 1, n) for n in lanes])
+    if part == "zipper":
+        main.connect(extra, after, [(0, 0)])
+
+
+def _draw_wide_ramp(main: _Main) -> None:
+    """Draw an on-ramp of two lanes, which end one after the other, the right one first."""
+    length_m = main.speed_mps * main.rng.uniform(10.0, 16.0)
+    _draw_ramp(main, lanes=2)
+    both = main.extend(length_m, extra=2)
+    main.connect(main.main[-2], both, [(n, n + 2) for n in range(main.lanes)])
+    main.connect(main.ramps[-1][0].replace("far", "on"), both, [(0, 0), (1, 1)])
+    left = main.extend(length_m, extra=1)
+    main.connect(both, left, [(n + 1, n) for n in range(main.lanes + 1)])
+
+
+def _draw_ramp(main: _Main, lanes: int = 1) -> None:
     """Draw an on-ramp of one or two edges to the present end of the main road."""
     rng, number = main.rng, len(main.ramps)
     length_m, speed_mps = rng.uniform(150.0, 330.0), main.speed_mps * rng.choice((0.8, 1.0))
     middle = main.node(main.x_m - length_m, -0.3 * length_m)
-    main.edge(f"on{number}", middle, f"n{main.last}", 1, speed_mps)
+    main.edge(f"on{number}", middle, f"n{main.last}", lanes, speed_mps)
     name = f"on{number}"
     if rng.random() < 0.5:
         far = main.node(main.x_m - length_m - rng.uniform(60.0, 250.0), -0.6 * length_m)
-        name = main.edge(f"far{number}", far, middle, 1, speed_mps)
+        name = main.edge(f"far{number}", far, middle, lanes, speed_mps)
     main.ramps.append((name, len(main.main)))
 
 

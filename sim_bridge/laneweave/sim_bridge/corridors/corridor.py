@@ -267,7 +267,9 @@ def _check_right_of_way(network: Network, before: Edge, after: Edge) -> None:
         reason = f"its state is {link.state!r}"
         if link.traffic_light:
             reason = f"traffic light {link.traffic_light} controls it"
-        if not link.has_priority:
+        elif joins := network.joins(link):
+            reason = f"{joins} merges like a zipper, and would need an acceleration lane of its own"
+        if network.gives_way_at(link):
             allowed = f"a corridor without crossings: the way to {after.name} has to have priority"
             raise BadInputError(OPTION, before.name, f"{allowed}, but {reason}")
 

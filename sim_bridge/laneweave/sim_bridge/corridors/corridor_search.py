@@ -172,7 +172,7 @@ def _chains(network: Network, min_speed_mps: float) -> Iterator[list[Edge]]:
         ahead = [
             after.name
             for after in network.following(edge)
-            if after.name in edges and all(link.has_priority for link in links(name, after.name))
+            if after.name in edges and not any(map(network.gives_way_at, links(name, after.name)))
         ]
         if not ahead:
             continue

@@ -19,6 +19,8 @@ IGNORING = "ignoring"
 """Class of vehicles that may drive anywhere."""
 _HAS_PRIORITY = "M"
 """State of a link whose vehicles give way to nobody."""
+ZIPPER = "Z"
+"""State of a link whose vehicles pass in turn with those of another one into the same lane."""
 _MOST_ACROSS = 8
 """Most lanes one after another inside a junction; a loop of them is a broken file."""
 _SIDES = {"left": 1, "right": -1}
@@ -133,6 +135,19 @@ class Network:
         """Return the links from an edge to another."""
         links = (link for lane in before.lanes for link in self.links_from(lane))
         return tuple(link for link in links if link.target.edge == after.name)
+
+    def joins(self, link: Link) -> str:
+        """Return the edge whose lane merges like a zipper into the one to which a link leads.
+
+        Empty: there is none, or two lanes of an edge merge, of which one can count as ending there.
+        """
+        others = {each.origin.edge for each in self.links_to(link.target)} - {link.origin.edge}
+        return min(others, default="") if link.state == ZIPPER else ""
+
+    def gives_way_at(self, link: Link) -> bool:
+        """Return whether vehicles on a corridor have to give way at a link of it."""
+        is_drop = link.state == ZIPPER and not link.traffic_light and not self.joins(link)
+        return not (is_drop or link.has_priority)
 
     def following(self, edge: Edge) -> tuple[Edge, ...]:
         """Return the edges to which an edge has links."""
