@@ -32,6 +32,8 @@ AS_FAST_MPS = 0.5
 """Difference to v_F up to which nobody has to brake for a vehicle."""
 STANDING_MPS, STANDING_M = 1.0, 8.0
 """Speed below which a vehicle stands, and its distance from another one of the same queue."""
+STUCK_MPS = 0.1
+"""Speed below which a vehicle that has stopped in a lane change stands."""
 PLANS_END_M = 15.0
 """Distance by which a queue may grow before a move that is planned now has ended."""
 
@@ -49,8 +51,9 @@ class HandOver:
         self._move_m = scenario.timing.cycles_s[0] * speed_mps
         """Distance that a vehicle drives in one lane change."""
         exits = exit_lanes(scenario)
-        no_re_entry = [end for end in dead_ends(scenario) if end.taken_back]
-        self._lines_m = {(end.lane, end.end_m): end.line_m for end in (*exits, *no_re_entry)}
+        self._short = [end for end in dead_ends(scenario) if end.taken_back]
+        """Dead ends at which nobody re-enters."""
+        self._lines_m = {(end.lane, end.end_m): end.line_m for end in (*exits, *self._short)}
         """Lines of exits, and of dead ends at which nobody re-enters, by lane and end."""
         self._exit_places = {
             name: [
@@ -110,14 +113,23 @@ class HandOver:
         for vehicle in vehicles:
             section = self._section_of(vehicle)
             if not vehicle.keeps_lane:
-                continue
-            if (
-                self._misses_way_out(vehicle)
-                if section is None
-                else self._misses_lane(vehicle, section, others, ends_m)
-                or self._has_to_brake(vehicle, section, others)
-            ):
+                due = self._is_stuck(vehicle)
+            elif section is None:
+                due = self._misses_way_out(vehicle)
+            else:
+                due = self._misses_lane(vehicle, section, others, ends_m) or self._has_to_brake(
+                    vehicle, section, others
+                )
+            if due:
                 yield vehicle
+
+    def _is_stuck(self, vehicle: OnRoad) -> bool:
+        """Return whether a vehicle has stopped in a lane change without the room to complete it."""
+        s_m, speed_mps = vehicle.state[:2]
+        return speed_mps < STUCK_MPS and any(
+            abs(vehicle.body_lane - end.lane) <= 1 and end.line_m - self._move_m < s_m <= end.end_m
+            for end in self._short
+        )
 
     def _misses_way_out(self, vehicle: OnRoad) -> bool:
         """Return whether it is too late for a vehicle to leave its lane, or to come to its exit."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
+from itertools import chain, takewhile
 from typing import Protocol
 
 from attrs import evolve, frozen
@@ -44,6 +45,8 @@ UPSTREAM_SHARE = 0.6
 """Share of its own speed at which a vehicle is advised to drive at least before a junction."""
 NEAR_S = 2.0
 """Time before its arrival at the start within which no other vehicle enters before a vehicle."""
+AWAITED_S = 60.0
+"""Time for which SUMO may be unable to let a vehicle depart, and no other one enters before it."""
 EARLY_S = 0.3
 """Time by which a vehicle may be too early without advice."""
 CENSUS_S = 0.7
@@ -110,7 +113,7 @@ class TakeOver(OutsideTraffic):
         self._world = world
         self._lattice = scenario.lattice
         self._limits = {name: one.limits for name, one in scenario.types.items()}
-        points = scenario.geometry.entry_points
+        self._points = points = scenario.geometry.entry_points
         self._at_m = {
             number: point.at_m
             for number, point in enumerate(points)
@@ -147,12 +150,14 @@ class TakeOver(OutsideTraffic):
         self._departing = deque(world.departing)
         self._due: dict[str, Arrival] = {}
         """Announced vehicles that have not departed."""
+        self._now_s = 0.0
+        """Road time of the newest tick."""
         self._moved_s = 0.0
         """Road time at which a vehicle on the road moved the last time."""
 
     def demanded(self, t_s: float) -> Sequence[Arrival]:
         """Return the vehicles that have come near an entrance since the last call."""
-        new = []
+        self._now_s, new = t_s, list[Arrival]()
         for point, at_m in self._at_m.items():
             for one in self._world.approaching(point):
                 name = one.arrival.vehicle
@@ -195,14 +200,30 @@ class TakeOver(OutsideTraffic):
     def full_lanes(self) -> set[int]:
         """Return the lanes that no vehicle may enter at their start now.
 
-        A queue ahead leaves no room to brake, or a vehicle from upstream would come too close.
+        A queue ahead leaves no room to brake, or a vehicle from upstream would come too close. One
+        that SUMO lets depart just before the start may appear in any lane, at any moment.
         """
-        return self._hand_over.full_lanes(self._world.others()) | {
+        full = self._hand_over.full_lanes(self._world.others())
+        if self._departs_upstream():
+            return full | {*self._world.start_lanes}
+        return full | {
             lane
             for lane in self._world.start_lanes
             for one in self._world.approaching(lane)[:1]
             if one.s_m > -NEAR_S * max(one.speed_mps, self._lattice.speed_mps)
         }
+
+    def _departs_upstream(self) -> bool:
+        """Return whether a vehicle is to depart just before the start of the road now."""
+        due = takewhile(
+            lambda one: one.t_s <= self._now_s + NEAR_S,
+            chain(self._due.values(), self._departing),
+        )
+        return any(
+            self._points[one.entry_point].entrance == MAIN_ENTRANCE
+            and one.t_s > self._now_s - AWAITED_S
+            for one in due
+        )
 
     def admit(self, t_s: float, meter: EntryMeter, occupied: Iterable[Cell]) -> list[Admission]:
         """Take over the vehicles whose fronts are at their entrances, and advise the others."""

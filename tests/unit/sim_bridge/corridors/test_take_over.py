@@ -89,6 +89,24 @@ def test_a_vehicle_rather_enters_where_nobody_has_to_make_room(scenario: Scenari
     assert column - same.cell[0] <= 1  # those beside it may need the time of a column
 
 
+def test_nobody_enters_while_sumo_may_let_a_vehicle_depart_just_before_the_start(
+    scenario: Scenario,
+) -> None:
+    upstream = Arrival("u", 1, ANY_LANE, 100.0)
+    ramp = Arrival("r", 0, ANY_LANE, 50.0)
+    outside = Outside(start_lanes=(1, 2), departing=(ramp, upstream))
+    take_over = outside.take_over(scenario)
+
+    def full(t_s: float) -> set[int]:
+        take_over.demanded(t_s)
+        take_over.announced(t_s)
+        return take_over.full_lanes()
+
+    times_s = (50.0, 97.0, 98.5, 140.0)
+    assert [full(t_s) for t_s in times_s] == [set(), set(), {1, 2}, {1, 2}]
+    assert full(161.0) == set()  # SUMO has given up
+
+
 def test_a_vehicle_that_would_be_too_early_is_slowed_down_on_its_way(scenario: Scenario) -> None:
     at_m = scenario.entrance[0].at_m
     ahead = on_ramp("a", at_m - 150.0, 20.0)
