@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 from attrs import evolve
 
 from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
+from laneweave.protocol.vehicle.lane_ends import dead_ends
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.messages import Ballot, Name, PendingTransfer
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody
@@ -211,3 +214,80 @@ def test_one_between_two_lanes_is_not_given_back() -> None:
     one.controller.plant = Plant(between, APPROACH.vehicle, APPROACH.runtime.tick_s)
     assert not is_given_back(one, other(one.state[0] + 20.0))
     assert math.isclose(one.state[3] - rest[3], 1.0)
+
+
+SHORT_RAMP: dict[str, Any] = {
+    "road": {
+        "lanes": 3,
+        "lane_width_m": 3.2,
+        "s1_m": 100.0,
+        "s2_m": 0.0,
+        "s3_m": 1400.0,
+        "closures": [{"lane": 0, "to_m": 400.0}, {"lane": 0, "from_m": 692.0}],
+    },
+    "entrance": [
+        {"name": "on", "lane": 0, "at_m": 400.0, "merge_m": 600.0, "volume_veh_per_h": 300.0}
+    ],
+    "vehicle": {"max_speed_mps": 28.0, "max_accel_mps2": 2.6, "min_accel_mps2": -9.0},
+    "formation": {
+        "operation": "rolling",
+        "change_columns": False,
+        "sort_in_s2": True,
+        "speed_mps": 27.0,
+        "gap_m": 27.0,
+        "settle_s": 3.0,
+        "cycle_s": 3.2,
+    },
+}
+OF_SUMO = {"sumo": {"config": "my.sumocfg", "corridor": "a:b"}}
+
+
+def test_a_lane_that_is_too_short_for_re_entry_is_for_corridors_only() -> None:
+    with pytest.raises(BadInputError, match="for driving on after stopping"):
+        parse_scenario(SHORT_RAMP)
+    (end,) = dead_ends(parse_scenario(SHORT_RAMP | OF_SUMO))
+    assert end.taken_back
+    assert end.line_m < end.stop_m < end.end_m == 692.0
+    shorter = {"closures": [{"lane": 0, "to_m": 400.0}, {"lane": 0, "from_m": 670.0}]}
+    with pytest.raises(BadInputError, match="room to stop while the body is in the lane"):
+        parse_scenario(SHORT_RAMP | OF_SUMO | {"road": SHORT_RAMP["road"] | shorter})
+
+
+@pytest.mark.parametrize(
+    ("before_line_m", "lane", "pending", "due"),
+    [
+        (95.0, 0, False, False),  # there is still time for a lane change
+        (75.0, 0, False, True),
+        (75.0, 0, True, False),  # it may be about to change lanes
+        (75.0, 1, False, False),
+    ],
+)
+def test_one_that_does_not_leave_a_short_lane_in_time_is_given_back(
+    before_line_m: float, lane: int, *, pending: bool, due: bool
+) -> None:
+    scenario = parse_scenario(SHORT_RAMP | OF_SUMO)
+    (end,) = dead_ends(scenario)
+    one = vehicle_in((0, lane), scenario=scenario)
+    one.controller.enter_lattice([(0, lane)])
+    rest = cell_state(scenario.lattice, (0, lane), 0.0)
+    state = (end.line_m - before_line_m, *rest[1:])
+    one.controller.plant = Plant(state, scenario.vehicle, scenario.runtime.tick_s)
+    if pending:
+        ballot = Ballot(1, Name("c"), 1, 1)
+        cells = ((0, 0),), ((0, 1),)
+        one.controller.store.store_promise(ballot)
+        one.controller.store.begin_transfer(PendingTransfer(ballot, *cells, (Name("A"),)))
+    assert ([*HandOver(scenario).given_back([one], [])] == [one]) == due
+
+
+@pytest.mark.parametrize(("speed_mps", "due"), [(0.0, True), (5.0, False)])
+def test_one_that_has_stopped_in_a_lane_change_there_is_given_back(
+    speed_mps: float, *, due: bool
+) -> None:
+    scenario = parse_scenario(SHORT_RAMP | OF_SUMO)
+    (end,) = dead_ends(scenario)
+    one = vehicle_in((0, 1), scenario=scenario)
+    one.controller.enter_lattice([(0, 1)])
+    state = (end.stop_m - 1.0, speed_mps, 0.0, scenario.lattice.lane_width_m, 0.0, 0.0)
+    one.controller.plant = Plant(state, scenario.vehicle, scenario.runtime.tick_s)
+    assert ([*HandOver(scenario).given_back([one], [])] == [one]) == due
