@@ -13,9 +13,12 @@ from support import road_bugs
 from support.bugs import Bug, catches
 
 LANE_ENDS, ROADS, FORMATIONS = "lane-ends", "roads", "entry-roads"
+INTERCHANGES = "interchanges"
 NOTICED: list[tuple[str, Bug, int]] = [
     (ROADS, road_bugs.ramps_are_issued_at_the_start, 0),
     (ROADS, road_bugs.cells_are_passed_on_twice, 0),
+    (INTERCHANGES, road_bugs.cells_are_passed_on_twice, 0),
+    (INTERCHANGES, road_bugs.owned_cells_are_entered, 1),
     (ROADS, road_bugs.late_commands_repeat_moves, 11),
     (ROADS, road_bugs.agents_insist, 56),
     (FORMATIONS, road_bugs.ramps_are_forgotten, 2),
@@ -64,7 +67,11 @@ def test_an_agent_gives_up_a_move_that_its_lane_end_does_not_allow_any_more(
 @pytest.mark.more
 @pytest.mark.parametrize(
     ("profile", "seed"),
-    [(profile, n) for profile, count in ((ROADS, 20), (FORMATIONS, 6)) for n in range(count)],
+    [
+        (profile, n)
+        for profile, count in ((ROADS, 20), (INTERCHANGES, 10), (FORMATIONS, 6))
+        for n in range(count)
+    ],
 )
 def test_runs_without_violations(profile: str, seed: int) -> None:
     assert run_story(Story.drawn(seed, PROFILES[profile])).violations == ()
@@ -75,7 +82,12 @@ def test_runs_without_violations(profile: str, seed: int) -> None:
     ("profile", "seed"),
     [
         (profile, seed)
-        for profile, count in ((LANE_ENDS, 100), (ROADS, 200), (FORMATIONS, 200))
+        for profile, count in (
+            (LANE_ENDS, 100),
+            (ROADS, 200),
+            (INTERCHANGES, 200),
+            (FORMATIONS, 200),
+        )
         for seed in range(1000, 1000 + count)
     ],
 )

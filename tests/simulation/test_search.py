@@ -26,7 +26,7 @@ from support.variants import variants
 BATCH = 5
 SEEDS = 20
 LONG = {
-    *("roads", "entry-roads", "lane-ends", "dense", "clocks"),
+    *("roads", "interchanges", "entry-roads", "lane-ends", "dense", "clocks"),
     *("rolling", "rolling-dense", "entry-rolling", "harmful-rolling"),
 }
 """Profiles whose search takes more than ten seconds."""

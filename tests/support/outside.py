@@ -17,6 +17,7 @@ class Outside:
     coming: list[Approaching] = field(factory=list)
     bodies: list[OtherBody] = field(factory=list)
     advice: dict[str, float | None] = field(factory=dict)
+    keeping_lane: set[str] = field(factory=set)
     exhausted: bool = False
     start_lanes: tuple[int, ...] = ()
     departing: tuple[Arrival, ...] = ()
@@ -34,3 +35,6 @@ class Outside:
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
         self.advice[vehicle] = speed_mps
+
+    def keep_lane(self, vehicle: str) -> None:
+        self.keeping_lane.add(vehicle)

@@ -18,6 +18,7 @@ from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.wire.messages import Census, CensusEntry, Command, Name, Sense
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase
 from laneweave.sim_bridge.road import lane_end_control
+from laneweave.sim_bridge.road.allocation import CellAllocation
 from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.formation_building import (
     ColumnBlocks,
@@ -212,6 +213,12 @@ def ramps_are_issued_at_the_start(assign: Call, self: Roadside, vehicles: Vehicl
         for lane, entry_m in enumerate(self._meter._entry_m):
             if entry_m > 0.0 and one.arrival.lane != lane:
                 one.controller.store.assign_cell((one.admission.cell[0], lane))
+
+
+@breaks(RAMPS, CellAllocation, "is_free")
+def owned_cells_are_entered(*_: object) -> bool:
+    """Vehicles enter from a ramp into cells that others may own."""
+    return True
 
 
 @breaks(RAMPS, Roadside, "on_left")

@@ -57,6 +57,8 @@ class Profile:
     """Whether lane 0 ends before the road (rolling operation at the real roadside)."""
     roads: bool = False
     """Whether a lane ends, joins or leaves, as drawn (at the real roadside)."""
+    interchanges: bool = False
+    """Whether a lane leads to an exit, and ramps behind it join (rolling, at the roadside)."""
     density: tuple[float, float] = (0.3, 0.7)
     """Occupied share of the cells in which vehicles may enter (rolling operation)."""
     vehicles: Span = (2, 16)

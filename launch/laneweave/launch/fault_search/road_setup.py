@@ -75,6 +75,7 @@ class RoadSetup:
                 move_s=self.move_s,
                 mode=self.mode,
                 sort_in_s2=False,
+                change_columns=not self.drawn.keeps_columns,
             )
             s3_m = SLOTS_ON_ROAD * self.slot_s * formation.speed_mps
         else:

@@ -23,6 +23,7 @@ from laneweave.launch.fault_search.road.drawn_entrance import DrawnTraffic, Gran
 from laneweave.launch.fault_search.road.drawn_roads import (
     EXIT,
     DrawnRoad,
+    draw_interchange,
     draw_road,
 )
 from laneweave.launch.fault_search.road.light_vehicle import Visit
@@ -162,6 +163,9 @@ class Setup:
             elif profile.roads:
                 step_m = FormationSettings().speed_mps * road.slot_s
                 road = evolve(road, drawn=draw_road(lanes, road.before_m, step_m, rng))
+            elif profile.interchanges:
+                step_m = FormationSettings().speed_mps * road.slot_s
+                road = evolve(road, drawn=draw_interchange(lanes, road.before_m, step_m, rng))
         else:
             road = RoadSetup(
                 lanes=lanes,
@@ -183,20 +187,26 @@ class Setup:
         scenario = road.make_scenario()
         lasting = LastingFaults.drawn(profile, rng)
         mean_s = rng.uniform(*MEAN_HEADWAYS_S)
-        entered = [*scenario.flow.inflows]
-        next_s = {lane: rng.uniform(0.0, mean_s) for lane in entered}
+        points = scenario.geometry.entry_points
+        next_s = {point: rng.uniform(0.0, mean_s) for point in scenario.flow.inflows}
         visits, types_rng = [], rng_of_types(road, "vehicles")
         for number in range(1, rng.randint(*profile.vehicles) + 1):
-            arrival_s, lane = min((t_s, lane) for lane, t_s in next_s.items())
-            next_s[lane] += 1.0 + rng.expovariate(1.0 / mean_s)
+            arrival_s, point = min((t_s, point) for point, t_s in next_s.items())
+            next_s[point] += 1.0 + rng.expovariate(1.0 / mean_s)
             leaves = number > 1 and rng.random() < profile.leavers
-            visit = _visit(number, (0, lane), leaves, scenario, lasting, rng)
+            cell = (0, points[point].lane)
+            visit = _visit(number, cell, leaves, scenario, lasting, rng)
             is_truck = road.trucks and types_rng.random() < TRUCK.share
             vehicle_type = TRUCK.name if is_truck else CAR
-            visits.append(evolve(visit, enters_s=arrival_s, vehicle_type=vehicle_type))
+            visits.append(
+                evolve(visit, enters_s=arrival_s, vehicle_type=vehicle_type, entry_point=point)
+            )
         crowded = rng.random() < profile.crowding
         leaving = tuple(
-            visit.vehicle for visit in visits if road.drawn.exit and rng.random() < LEAVING
+            visit.vehicle
+            for visit in visits
+            for exit_ in road.drawn.exit
+            if rng.random() < LEAVING and points[visit.entry_point].at_m < exit_.at_m
         )
         return cls(
             road,
@@ -220,6 +230,7 @@ class Setup:
                 visit.enters_s,
                 EXIT if visit.vehicle in self.leaving else END_OF_ROAD,
                 visit.vehicle_type,
+                entry_point=visit.entry_point,
             )
             for visit in sorted(self.visits, key=lambda visit: visit.enters_s)
         )

@@ -11,7 +11,7 @@ from laneweave.protocol.config.rules import compare, require
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import formation_columns
-from laneweave.protocol.scenario.road_geometry import EntryPoint
+from laneweave.protocol.scenario.road_tables import EntryPoint
 from laneweave.protocol.scenario.traffic_flow import Inflow
 from laneweave.protocol.vehicle.lane_ends import re_entry
 

@@ -14,16 +14,7 @@ from laneweave.protocol.road_layout import (
     sections_for,
 )
 from laneweave.protocol.scenario.formation_table import FormationSettings
-from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE, Closure, Entrance, Exit, Road
-
-
-@frozen
-class EntryPoint:
-    """Where vehicles enter in a lane: at the start of the road, or at the beginning of a ramp."""
-
-    lane: int
-    at_m: float = 0.0
-    entrance: str = MAIN_ENTRANCE
+from laneweave.protocol.scenario.road_tables import Closure, Entrance, EntryPoint, Exit, Road
 
 
 @frozen

@@ -156,6 +156,15 @@ class TypeShare:
 
 
 @frozen
+class EntryPoint:
+    """Where vehicles enter in a lane: at the start of the road, or at the beginning of a ramp."""
+
+    lane: int
+    at_m: float = 0.0
+    entrance: str = MAIN_ENTRANCE
+
+
+@frozen
 class Exit:
     """An exit before the end of the road, by which vehicles leave."""
 

@@ -11,11 +11,11 @@ import attrs
 from attrs import frozen
 
 from laneweave.protocol.scenario.formation_table import FormationSettings, formation_columns
-from laneweave.protocol.scenario.road_geometry import EntryPoint
 from laneweave.protocol.scenario.road_tables import (
     Demand,
     DestinationShare,
     Entrance,
+    EntryPoint,
     Road,
     TypeShare,
 )

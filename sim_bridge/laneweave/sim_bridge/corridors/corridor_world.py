@@ -159,6 +159,10 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         """Set the speed at which SUMO drives a vehicle, as far as it is safe; None: its own."""
         self.vehicle.setSpeed(self._sumo_name[vehicle], -1.0 if speed_mps is None else speed_mps)
 
+    def keep_lane(self, vehicle: str) -> None:
+        """Forbid a vehicle to change lanes, until it is taken over."""
+        self.vehicle.setLaneChangeMode(self._sumo_name[vehicle], 0)
+
     @property
     def exhausted(self) -> bool:
         """Whether no vehicles come to an entrance any more, or they have not come for long."""

@@ -45,6 +45,9 @@ UPSTREAM_SHARE = 0.6
 """Share of its own speed at which a vehicle is advised to drive at least before a junction."""
 NEAR_S = 2.0
 """Time before its arrival at the start within which no other vehicle enters before a vehicle."""
+KEEPS_LANE_S = 3.0
+"""Time before its arrival at the start from which a vehicle keeps its lane: in another one, a
+vehicle could enter beside it in the same tick in which it changes lanes."""
 AWAITED_S = 60.0
 """Time for which SUMO may be unable to let a vehicle depart, and no other one enters before it."""
 EARLY_S = 0.3
@@ -103,6 +106,9 @@ class SumoTraffic(Protocol):
 
     def advise(self, vehicle: str, speed_mps: float | None) -> None:
         """Advise a vehicle's speed; None: its driver decides."""
+
+    def keep_lane(self, vehicle: str) -> None:
+        """Forbid a vehicle to change lanes, until it is taken over."""
 
 
 class TakeOver(OutsideTraffic):
@@ -374,6 +380,8 @@ class TakeOver(OutsideTraffic):
         lattice, limits = self._lattice, self._limits[arrival.vehicle_type]
         at_m = self._at_m[arrival.entry_point]
         distance_m = at_m - one.s_m
+        if at_m <= 0.0 and distance_m <= KEEPS_LANE_S * max(one.speed_mps, lattice.speed_mps):
+            self._world.keep_lane(arrival.vehicle)
         accel_mps2 = ADVICE_SHARE * limits.max_accel_mps2
         takes_s, comes_mps = _soonest(one, at_m, accel_mps2, lattice.speed_mps)
         slower_mps = math.ceil(lattice.speed_mps - comes_mps)

@@ -34,7 +34,7 @@ from attrs import frozen
 
 from laneweave.protocol.lattice import Cell, Lattice
 from laneweave.protocol.road_layout import ANY_LANE
-from laneweave.protocol.scenario.road_geometry import EntryPoint
+from laneweave.protocol.scenario.road_tables import EntryPoint
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.formation_building import FormationBuilder
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import formation_columns
-from laneweave.protocol.scenario.road_geometry import EntryPoint
+from laneweave.protocol.scenario.road_tables import EntryPoint
 from laneweave.protocol.wire.messages import ClosedFormation
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter

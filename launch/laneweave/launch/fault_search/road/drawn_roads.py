@@ -1,7 +1,7 @@
 """Roads whose lanes end, join or leave, drawn at random (at the real roadside).
 
 One lane at an edge of the road is special: it ends, is blocked, comes from a ramp, leads to an
-exit, or both.
+exit, or both. Or it leads to an exit, and then several ramps lead into it, one after another.
 """
 
 from __future__ import annotations
@@ -24,6 +24,12 @@ BLOCKED_M = (30.0, 120.0)
 VOLUME_VEH_PER_H = 800.0
 """A volume for the fields of ramps; the arrivals are drawn elsewhere."""
 EXIT = "off-ramp"
+RAMPS = 2
+"""Number of ramps behind the exit of an interchange."""
+SHORT_RAMP_M, SHORT_STEPS = (30.0, 60.0), (2.0, 3.0)
+"""The same as `RAMP_M` and `WEAVING_STEPS` for interchanges: roads are short."""
+BEHIND_M = (7.0, 30.0)
+"""Range of the distances between the end of a lane and the next ramp into it."""
 
 
 @frozen
@@ -33,6 +39,8 @@ class DrawnRoad:
     closures: tuple[Closure, ...] = ()
     entrance: tuple[Entrance, ...] = ()
     exit: tuple[Exit, ...] = ()
+    keeps_columns: bool = False
+    """Whether vehicles change lanes only."""
 
 
 STRAIGHT_ROAD = DrawnRoad()
@@ -69,3 +77,27 @@ def draw_road(
     entrance = (Entrance("on-ramp", lane, at_m, merge_m, VOLUME_VEH_PER_H),)
     exits = (Exit(EXIT, (lane,), end_m),) if kind == "weaving" else ()
     return DrawnRoad(closures, entrance, exits)
+
+
+def draw_interchange(
+    lanes: int, moves_from_m: float, step_m: float, rng: random.Random
+) -> DrawnRoad:
+    """Draw a road with an exit, and ramps behind it, in the same lane; arguments as `draw_road`."""
+    lane = rng.choice((0, lanes - 1))
+    opens_m = rng.choice((0.0, round(rng.uniform(0.5, 1.0) * moves_from_m, 1)))
+    closures = [Closure(lane, 0.0, opens_m)] if opens_m else []
+
+    def end_m(from_m: float) -> float:
+        return round(from_m + rng.uniform(*SHORT_STEPS) * step_m + AFTER_M, 1)
+
+    ends_m = end_m(max(opens_m, moves_from_m))
+    exits = (Exit(EXIT, (lane,), ends_m),)
+    ramps = []
+    for number in range(RAMPS):
+        at_m = round(ends_m + rng.uniform(*BEHIND_M), 1)
+        merge_m = round(at_m + rng.uniform(*SHORT_RAMP_M), 1)
+        closures.append(Closure(lane, ends_m, at_m))
+        ramps.append(Entrance(f"on-ramp-{number}", lane, at_m, merge_m, VOLUME_VEH_PER_H))
+        ends_m = end_m(merge_m)
+    closures.append(Closure(lane, ends_m))
+    return DrawnRoad(tuple(closures), tuple(ramps), exits, keeps_columns=True)

@@ -38,6 +38,8 @@ class Visit:
     clock_drift: float = 0.0
     """Error of the clock rate: seconds gained per second."""
     vehicle_type: str = CAR
+    entry_point: int = 0
+    """Number of its entry point at the real roadside."""
 
     @property
     def until_s(self) -> float:
