@@ -64,7 +64,7 @@ class RoadGeometry:
         """Where vehicles enter: first the first entry point of each lane, then all later ones.
 
         So entry points 0 to lanes - 1 have the numbers of their lanes. A lane that is closed from
-        the start of the road on, and has no ramp, has one, too, by which nobody enters.
+        the start of the road on, and has no ramp, has one, too, which no vehicle uses.
         """
         ramps = sorted(
             (EntryPoint(one.lane, one.at_m, one.name) for one in self._entrances),

@@ -85,7 +85,7 @@ class LaneEnd:
     moves_from_m: float = -math.inf
     """Where moves may begin in the section; -inf: everywhere."""
     taken_back: bool = False
-    """Whether SUMO takes vehicles back that do not change lanes: nobody re-enters at the line."""
+    """Whether SUMO takes back vehicles that do not change lanes; there is no re-entry."""
 
 
 @frozen

@@ -52,9 +52,9 @@ class HandOver:
         """Distance that a vehicle drives in one lane change."""
         exits = exit_lanes(scenario)
         self._short = [end for end in dead_ends(scenario) if end.taken_back]
-        """Dead ends at which nobody re-enters."""
+        """Dead ends without re-entry."""
         self._lines_m = {(end.lane, end.end_m): end.line_m for end in (*exits, *self._short)}
-        """Lines of exits, and of dead ends at which nobody re-enters, by lane and end."""
+        """Lines of exits, and of dead ends without re-entry, by lane and end."""
         self._exit_places = {
             name: [
                 (lane, end_m) for (lane, end_m), one in self._sections.items() if one.exit == name

@@ -225,8 +225,8 @@ class CellAllocation:
         """Return whether a vehicle on a ramp can use a cell.
 
         In a shared lane, no vehicle may own it. A pending transfer may give the cell to a vehicle
-        later; those of vehicles that have left are in `_lost`. Nobody enters a gap that is kept
-        free, nor beside it if vehicles do not change columns: they could not enter it.
+        later; those of vehicles that have left are in `_lost`. No vehicle enters a gap that is
+        kept free, or beside it if vehicles do not change columns: they could not enter it.
         """
         column, lane = cell
         if self._keep_columns and any(
@@ -330,7 +330,7 @@ class CellAllocation:
         for column, lane in sorted(certain):
             s_m = lattice.cell_s_m(column, t_s)
             if lane == still_in or s_m >= self._length_m:
-                continue  # nobody must be led into it
+                continue  # no vehicle must be led into it
             possible = staying
             if lane in self._shared_lanes and s_m < self._last_entry_m[lane]:
                 # It is for vehicles on the ramp, but for those that leave before.

@@ -89,7 +89,7 @@ def test_a_vehicle_rather_enters_where_nobody_has_to_make_room(scenario: Scenari
     assert column - same.cell[0] <= 1  # those beside it may need the time of a column
 
 
-def test_nobody_enters_while_sumo_may_let_a_vehicle_depart_just_before_the_start(
+def test_no_vehicle_enters_while_sumo_may_let_a_vehicle_depart_just_before_the_start(
     scenario: Scenario,
 ) -> None:
     upstream = Arrival("u", 1, ANY_LANE, 100.0)
