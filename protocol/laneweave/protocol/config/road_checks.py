@@ -171,7 +171,7 @@ def check_entrances(scenario: Scenario) -> None:
             is_closed = any(one.from_m <= 0.0 for one in closures)
             ok = is_closed and lane not in dict(earlier)
         else:
-            opens_m = [one_m for one_m in opens_m if one_m < road.length_m]
+            opens_m = [at_m for at_m in opens_m if at_m < road.length_m]
             allowed = "a lane that opens behind the start of the road (road.closures)"
             ok = bool(opens_m)
         require(ok, f"{name}.lane", lane, allowed)
@@ -187,8 +187,8 @@ def check_entrances(scenario: Scenario) -> None:
             low_m <= entrance.merge_m <= high_m,
             f"{name}.merge_m",
             entrance.merge_m,
-            f"from {low_m:g}, formation.settle_s after entrance.at_m, to {high_m:g}, a step before "
-            "the end of the lane",
+            f"from {low_m:g}, formation.settle_s after entrance.at_m, to {high_m:g}, so that a "
+            "step fits in before the end of the lane",
         )
 
 
@@ -240,8 +240,7 @@ def check_exits(scenario: Scenario) -> None:
                 f"{name}.at_m",
                 section,
                 ends_by_lane[section.lane],
-                f"in lane {section.lane}, and {re_entry(scenario).room_m:g} m for completing a "
-                "change after stopping",
+                f"{re_entry(scenario).room_m:g} m for completing a change after stopping",
             )
 
 
@@ -272,7 +271,7 @@ def check_dead_ends(scenario: Scenario) -> None:
             name,
             section,
             end,
-            f"and {needed.room_m:g} m for driving on after stopping at the end of the lane",
+            f"{needed.room_m:g} m for driving on after stopping at the end of the lane",
         )
         require(
             end.taken_back or lane_beside(scenario, end) is not None,
@@ -314,7 +313,7 @@ def _check_room(
     if end.taken_back:
         early_m = early_start_m(scenario)
         needed_m = before_m + first_step_m(scenario, section, early_m=early_m)
-        room = "and room to stop while the body is in the lane"
+        room = "room to stop while the body is in the lane"
     else:
         needed_m = first_step_m(scenario, section) + before_m
         if scenario.formation.traits.has_formations:
@@ -323,5 +322,5 @@ def _check_room(
             begins_m = max(begins_m, *scenario.geometry.entry_m) + longest_m
             needed_m = begins_m + scenario.types.step_m + before_m
             what = f"a formation that has passed all entrances, and {what}"
-    allowed = f"{what}, {room}"
+    allowed = f"{what}, in lane {section.lane}, and {room}"
     require(end.end_m >= needed_m, field, end.end_m, allowed, needed_m)

@@ -92,15 +92,6 @@ class RoadGeometry:
         names = [point.entrance for point in self.entry_points]
         return names.index(entrance)
 
-    def entry_point_before(self, lane: int, s_m: float) -> int:
-        """Return the number of the last entry point of a lane before a position."""
-        later = [
-            number
-            for number, point in enumerate(self.entry_points)
-            if point.lane == lane and point.at_m < s_m
-        ]
-        return max(later, default=lane)
-
     @cached_property
     def shared_lanes(self) -> frozenset[int]:
         """Lanes in which a ramp follows an exit or a dead end, as in most interchanges."""

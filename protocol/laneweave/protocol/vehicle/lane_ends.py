@@ -327,14 +327,18 @@ def _end_ahead(by_lane: Sequence[Sequence[LaneEnd]], lane: int, s_m: float) -> L
 def lane_beside(scenario: Scenario, end: LaneEnd) -> int | None:
     """Return the lane into which vehicles re-enter at a dead end; None: there is none.
 
-    It is open from before the stop line until a vehicle that re-enters has arrived in its cell.
+    It is open from before the stop line until a vehicle that re-enters has arrived in its cell, and
+    the first vehicles enter it before the line: there, its cells can be kept free.
     """
     needed = re_entry(scenario)
     pitch_m = scenario.lattice.pitch_m
     sections = sections_to_lines(scenario)
     from_m = end.line_m - needed.columns * pitch_m - scenario.types.longest_body_m
     to_m = min(end.line_m + needed.distance_m, scenario.road.length_m)
+    entry_m = dict(enumerate(scenario.geometry.entry_m))
     for lane in (end.lane + 1, end.lane - 1):
+        if entry_m.get(lane, math.inf) > end.line_m:
+            continue
         for section in sections:
             begins_m = max(section.from_m, section.moves_from_m)
             if section.lane == lane and begins_m <= from_m and to_m <= section.to_m:

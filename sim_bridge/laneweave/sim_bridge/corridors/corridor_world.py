@@ -17,6 +17,7 @@ from pathlib import Path
 
 from attrs import evolve, frozen
 
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
@@ -109,9 +110,13 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         ways = [one for one in found.ways_in if one.entrance in entrances]
         self.start_lanes = tuple(one.lane for one in ways if one.entrance == MAIN_ENTRANCE)
         """Lanes to whose beginning vehicles come from upstream."""
-        points = scenario.geometry
+        geometry = scenario.geometry
+        closed = {*self.start_lanes} - {*scenario.road.first_lanes}
+        if closed:
+            allowed = f"lanes that stay open at the start: vehicles from upstream come to {closed}"
+            raise BadInputError("road.closures", f"lane {min(closed)}", allowed)
         self._ways_in = {
-            points.entry_point_of(one.ramp) if one.ramp else one.lane: one for one in ways
+            geometry.entry_point_of(one.ramp) if one.ramp else one.lane: one for one in ways
         }
         """The ways to the entry points to which SUMO drives vehicles."""
         self.departing = tuple(
@@ -302,7 +307,7 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         edge, _, index = api.getLaneID(name).rpartition("_")
         if edge not in network.edges or edge == self._setup.found.corridor.edges[-1].name:
             return
-        route = self._setup.by_name[name].origin.vehicle.route
+        route = api.getRoute(name)
         lane = network.edges[edge].lanes[int(index)]
         ahead = [link.target.edge for link in network.links_from(lane)]
         following = route[route.index(edge) + 1 :] if edge in route else ()

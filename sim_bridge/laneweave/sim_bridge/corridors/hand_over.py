@@ -48,6 +48,10 @@ class HandOver:
         self._sections = {(one.lane, one.to_m): one for one in sections if one.exit}
         """Sections that end at an exit, by lane and end."""
         self._speed_mps = speed_mps = scenario.lattice.speed_mps
+        self._late_m = LATE_S * speed_mps + scenario.types.room_ahead_m
+        self._lattice = scenario.lattice
+        self._touch_m = 0.5 * (scenario.road.lane_width_m + scenario.types.widest_body_m)
+        """Distance from the middle of a lane within which bodies touch it."""
         self._move_m = scenario.timing.cycles_s[0] * speed_mps
         """Distance that a vehicle drives in one lane change."""
         exits = exit_lanes(scenario)
@@ -125,16 +129,18 @@ class HandOver:
 
     def _is_stuck(self, vehicle: OnRoad) -> bool:
         """Return whether a vehicle has stopped in a lane change without the room to complete it."""
-        s_m, speed_mps = vehicle.state[:2]
+        s_m, speed_mps, _, y_m = vehicle.state[:4]
         return speed_mps < STUCK_MPS and any(
-            abs(vehicle.body_lane - end.lane) <= 1 and end.line_m - self._move_m < s_m <= end.end_m
+            end.line_m - self._move_m < s_m <= end.end_m
+            and abs(y_m - self._lattice.cell_y_m(end.lane)) < self._touch_m
             for end in self._short
         )
 
     def _misses_way_out(self, vehicle: OnRoad) -> bool:
         """Return whether it is too late for a vehicle to leave its lane, or to come to its exit."""
         s_m, lane = vehicle.state[0], vehicle.body_lane
-        begins_m = s_m - LATE_S * self._speed_mps
+        # A vehicle that settles may be ahead of its cell, which counts for its plans.
+        begins_m = s_m - self._late_m
         here = self._exits.section_at(lane, s_m)
         if here is not None:
             line_m = self._lines_m.get((lane, here.to_m), math.inf)

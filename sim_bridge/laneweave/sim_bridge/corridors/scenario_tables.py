@@ -62,7 +62,7 @@ def checked_tables(found: SumoCorridor, sumo: Tables) -> Tables:
     """
     fastest_mps = _fastest_mps(found)
     spare_mps = lattice_speed_mps(fastest_mps) - (1.0 - RESERVE_SHARE) * fastest_mps
-    for step in range(int(spare_mps / SPEED_STEP_MPS)):
+    for step in range(math.ceil(spare_mps / SPEED_STEP_MPS)):
         try:
             return _checked(found, sumo, step * SPEED_STEP_MPS)
         except BadInputError:

@@ -46,10 +46,12 @@ UPSTREAM_SHARE = 0.6
 NEAR_S = 2.0
 """Time before its arrival at the start within which no other vehicle enters before a vehicle."""
 KEEPS_LANE_S = 3.0
-"""Time before its arrival at the start from which a vehicle keeps its lane: in another one, a
-vehicle could enter beside it in the same tick in which it changes lanes."""
-AWAITED_S = 60.0
-"""Time for which SUMO may be unable to let a vehicle depart, and no other one enters before it."""
+"""Time before its arrival at the start from which a vehicle keeps its lane. It could otherwise
+change into a lane in the tick in which another vehicle enters there."""
+DEPARTS_S, AWAITED_S = 0.3, 5.0
+"""Time before and after its departure within which a vehicle may appear just before the start.
+SUMO sees the vehicles that have entered a tick before; it may be unable to let it depart at once.
+"""
 EARLY_S = 0.3
 """Time by which a vehicle may be too early without advice."""
 CENSUS_S = 0.7
@@ -222,7 +224,7 @@ class TakeOver(OutsideTraffic):
     def _departs_upstream(self) -> bool:
         """Return whether a vehicle is to depart just before the start of the road now."""
         due = takewhile(
-            lambda one: one.t_s <= self._now_s + NEAR_S,
+            lambda one: one.t_s <= self._now_s + DEPARTS_S,
             chain(self._due.values(), self._departing),
         )
         return any(

@@ -145,13 +145,17 @@ class CellAllocation:
 
     def admit(self, admissions: list[Admission]) -> list[Admission]:
         """Return the vehicles that enter, with all cells that they get."""
-        entering = []
+        entering, entered = [], {one.cell for one in admissions}
+        self._ownerless -= entered
+        for cell in entered:
+            self._unassigned.pop(cell, None)
         for one in admissions:
             # Of several vehicles of a column that need a cell, the first one gets it.
-            more_cells = tuple(cell for cell in one.more_cells if cell not in self._given)
+            taken = self._given | entered
+            more_cells = tuple(
+                cell for cell in one.more_cells if cell not in taken and not self._is_owned(cell)
+            )
             self._given.update(more_cells)
-            self._ownerless.discard(one.cell)
-            self._unassigned.pop(one.cell, None)
             entering.append(self._with_ownerless(evolve(one, more_cells=more_cells)))
             arrival = one.arrival
             self._next[arrival.entry_point].append((one.cell[0], Name(arrival.vehicle)))
@@ -233,13 +237,17 @@ class CellAllocation:
             self._is_kept_free((column, beside)) for beside in (lane - 1, lane, lane + 1)
         ):
             return False
-        if lane not in self._shared_lanes:
-            return True
+        return not self._is_owned(cell)
+
+    def _is_owned(self, cell: Cell) -> bool:
+        """Return whether a vehicle may own a cell of a shared lane; others are assigned once."""
+        if cell[1] not in self._shared_lanes:
+            return False
         if self._owned is None:
             self._owned = self._lost.union(
                 *(vehicle.controller.store.possible_cells for vehicle in self._vehicles.values())
             )
-        return cell not in self._owned
+        return cell in self._owned
 
     def _assign(self, cell: Cell, point: int, vehicles: Mapping[Name, RoadVehicle]) -> None:
         """Assign an empty cell to a nearby vehicle, preferably one ahead of it in its lane.
@@ -274,6 +282,7 @@ class CellAllocation:
         ]
         if near:
             vehicles[min(near)[-1]].controller.store.assign_cell(cell)
+            self._ownerless.discard(cell)
         else:
             self._unassigned[cell] = point
 

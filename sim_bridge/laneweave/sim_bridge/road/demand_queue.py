@@ -81,7 +81,10 @@ class OutsideTraffic:
         return coming
 
     def full_lanes(self) -> set[int]:
-        """Return the lanes that no vehicle may enter at their start now."""
+        """Return the lanes that no vehicle may enter at their start now.
+
+        There, the numbers of lanes are those of entry points.
+        """
         return set()
 
     def admit(self, t_s: float, meter: EntryMeter, occupied: Iterable[Cell]) -> list[Admission]:

@@ -18,7 +18,8 @@ settle, and a long one behind another has little room to approach it.
 
 A ramp may follow an exit or a dead end in the same lane (`RoadGeometry.shared_lanes`). Cells of
 such a lane are not assigned to vehicles near them before the last ramp: each vehicle that leaves by
-an exit before gets the cell of its column, and once it has left, a ramp can use the cell.
+an exit before gets the cells of its column in the lanes of the exit, unless they have an owner, and
+once it has left, a ramp can use them.
 
 Decisions do not depend on later arrivals: they are made in order of time and, at equal times, of
 the numbers of entry points.

@@ -160,7 +160,8 @@ class LaneEndControl:
         lane = self._beside[end]
         if lane is None:
             return  # SUMO takes the vehicle back
-        point = self._scenario.geometry.entry_point_before(lane, end.line_m)
+        # Behind the first entry point of the lane, vehicles may own its cells.
+        point = lane
         taken = self._meter.points_kept_free(point)
         crowded = any(arrival.entry_point in taken for arrival in self._meter.waiting)
         between = (CROWDED_GAPS if crowded else OPEN_GAPS) * self._columns

@@ -257,9 +257,9 @@ def test_a_lane_that_is_too_short_for_re_entry_is_for_corridors_only() -> None:
     ("before_line_m", "lane", "pending", "due"),
     [
         (95.0, 0, False, False),  # there is still time for a lane change
-        (75.0, 0, False, True),
-        (75.0, 0, True, False),  # it may be about to change lanes
-        (75.0, 1, False, False),
+        (70.0, 0, False, True),
+        (70.0, 0, True, False),  # it may be about to change lanes
+        (70.0, 1, False, False),
     ],
 )
 def test_one_that_does_not_leave_a_short_lane_in_time_is_given_back(

@@ -78,8 +78,6 @@ def test_the_first_entry_points_have_the_numbers_of_their_lanes() -> None:
     assert found == [(0, "on0"), *main, (0, "on1")]
     found = [(one.lane, one.entrance) for one in OPEN.geometry.entry_points]
     assert found == [(0, "main"), *main, (0, "on0"), (0, "on1")]
-    assert [OPEN.geometry.entry_point_before(0, s_m) for s_m in (900.0, 1700.0)] == [4, 5]
-    assert [OPEN.geometry.entry_point_before(1, s_m) for s_m in (900.0, 1700.0)] == [1, 1]
 
 
 def test_drawn_vehicles_arrive_at_each_entry_point() -> None:
@@ -116,6 +114,76 @@ def test_no_cell_has_two_owners(scenario: Scenario) -> None:
         road.step()
         assert_single_owners(road)
     assert len(road.left) > 10
+
+
+def wide_tables(
+    closures: list[tuple[int, float, float]], ramps: list[tuple[int, float]], exits: list[int]
+) -> dict[str, Any]:
+    """Return a road of five lanes; vehicles leave by an exit at the first end of its lanes."""
+    exit_m = min(from_m for lane, from_m, _ in closures if lane in exits and from_m)
+    leaving = [{"exit": "off", "share": 0.3}]
+    return {
+        "road": {
+            "lanes": 5,
+            "s1_m": 50.0,
+            "s2_m": 50.0,
+            "s3_m": 2000.0,
+            "closures": [{"lane": a, "from_m": b, "to_m": c} for a, b, c in closures],
+        },
+        "entrance": [
+            {
+                "name": f"on{number}",
+                "lane": lane,
+                "at_m": at_m,
+                "merge_m": at_m + 170.0,
+                "volume_veh_per_h": 1300.0,
+                "destinations": leaving if at_m < exit_m else [],
+            }
+            for number, (lane, at_m) in enumerate(ramps)
+        ],
+        "exit": [{"name": "off", "lanes": exits, "at_m": exit_m}],
+        "demand": {
+            "volume_veh_per_lane_h": 500.0,
+            "duration_s": 80.0,
+            "destinations": leaving,
+        },
+        "formation": {"operation": "rolling", "change_columns": False},
+    }
+
+
+END_M = 60_000.0
+WIDE = {
+    "two-lane exit, then two-lane ramp": wide_tables(
+        [(0, 500.0, 520.0), (1, 500.0, 520.0)], [(0, 520.0), (1, 520.0)], [0, 1]
+    ),
+    "ramps on both sides": wide_tables(
+        [(0, 500.0, 520.0), (4, 0.0, 700.0)], [(0, 520.0), (4, 700.0)], [0]
+    ),
+    "two-lane ramp before a two-lane exit": wide_tables(
+        [
+            *((lane, 0.0, 250.0) for lane in (0, 1)),
+            *((lane, 900.0, 920.0) for lane in (0, 1)),
+        ],
+        [(lane, at_m) for at_m in (250.0, 920.0) for lane in (0, 1)],
+        [0, 1],
+    ),
+    "a lane that ends beside a shared one": wide_tables(
+        [(0, 500.0, 520.0), (1, 500.0, 520.0), (0, 900.0, END_M)], [(0, 520.0), (1, 520.0)], [0, 1]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WIDE)
+def test_no_cell_has_two_owners_on_wide_ramps_and_exits(name: str) -> None:
+    road = LonelyRoad(parse_scenario(WIDE[name]))
+    while road.t_s < 170.0:
+        road.step()
+        assert_single_owners(road)
+        owned = [
+            cell for one in road.vehicles.values() for cell in one.controller.store.possible_cells
+        ]
+        assert not any(map(road.roadside._is_kept_free, owned))
+    assert len(road.vehicles) + len(road.left) > 50
 
 
 def enter(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from attrs import define, evolve, field, frozen
+from attrs import Factory, define, evolve, field, frozen
 from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell
@@ -38,8 +38,8 @@ class Visit:
     clock_drift: float = 0.0
     """Error of the clock rate: seconds gained per second."""
     vehicle_type: str = CAR
-    entry_point: int = 0
-    """Number of its entry point at the real roadside."""
+    entry_point: int = field(default=Factory(lambda self: self.cell[1], takes_self=True))
+    """Number of its entry point at the real roadside; by default, the first of its lane."""
 
     @property
     def until_s(self) -> float:
