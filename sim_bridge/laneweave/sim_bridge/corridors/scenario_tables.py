@@ -22,6 +22,8 @@ from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.corridors.corridor import (
     MAX_SPEED_MPS,
     OPTION,
+    POCKET_M,
+    POCKET_S,
     RESERVE_SHARE,
     Corridor,
     Ramp,
@@ -268,11 +270,15 @@ def _m(position_m: float) -> float:
 
 
 def _closure(closure: Closure, corridor: Corridor, ramps: Sequence[Ramp]) -> dict[str, Any]:
-    """Return the table of a closed part; a ramp that nobody uses is closed."""
+    """Return the table of a closed part.
+
+    A ramp without vehicles is closed; so is its acceleration lane if it begins just before the end.
+    """
     to_m = closure.to_m
+    late_m = POCKET_M + POCKET_S * lattice_speed_mps(corridor.speed_mps)
     for ramp in corridor.ramps:
         if (ramp.lane, ramp.at_m) == (closure.lane, to_m) and ramp not in ramps:
-            to_m = ramp.merge_m
+            to_m = ramp.merge_m if ramp.merge_m <= corridor.length_m - late_m else math.inf
     table: dict[str, Any] = {"lane": closure.lane}
     table |= {"from_m": _m(closure.from_m)} if closure.from_m > 0.0 else {}
     return table | ({"to_m": _m(to_m)} if to_m < corridor.length_m else {})

@@ -220,6 +220,24 @@ def test_the_longest_chain_with_priority_is_found(interchange: SumoCorridor) -> 
     assert found.found.corridor.length_m == 1200.0 - HANDOVER_M
 
 
+def test_the_lane_of_an_unused_ramp_stays_closed_if_it_begins_just_before_the_end(
+    interchange: SumoCorridor,
+) -> None:
+    corridor = interchange.corridor
+    (ramp,) = corridor.ramps
+    passes = tuple(one for one in interchange.passes if one.entrance != ramp.entrance)
+
+    def opens_m(merge_m: float) -> float | None:
+        changed = evolve(corridor, ramps=(evolve(ramp, merge_m=merge_m),))
+        tables = scenario_tables(evolve(interchange, corridor=changed, passes=passes))
+        closed = [one for one in tables["road"]["closures"] if one["lane"] == ramp.lane]
+        found: list[float | None] = [one.get("to_m") for one in closed if "from_m" in one]
+        return found[0]
+
+    assert opens_m(ramp.merge_m) == pytest.approx(ramp.merge_m, abs=0.01)
+    assert opens_m(corridor.length_m - 20.0) is None
+
+
 # --- the scenario -----------------------------------------------------------------------------
 
 
