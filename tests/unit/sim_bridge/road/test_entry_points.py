@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from attrs import evolve
 
 from laneweave.launch.faults.fault_file import FaultSpec
 from laneweave.launch.run.simulated_run import SimulatedRun
@@ -110,10 +111,10 @@ def assert_single_owners(road: LonelyRoad) -> None:
 @pytest.mark.parametrize("scenario", [INTERCHANGES, OPEN], ids=["closed", "open"])
 def test_no_cell_has_two_owners(scenario: Scenario) -> None:
     road = LonelyRoad(scenario)
-    while road.t_s < 160.0:
+    while road.t_s < 145.0:
         road.step()
         assert_single_owners(road)
-    assert len(road.left) > 10
+    assert road.left
 
 
 def wide_tables(
@@ -173,10 +174,16 @@ WIDE = {
 }
 
 
-@pytest.mark.parametrize("name", WIDE)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.more if number else ())
+        for number, name in enumerate(WIDE)
+    ],
+)
 def test_no_cell_has_two_owners_on_wide_ramps_and_exits(name: str) -> None:
     road = LonelyRoad(parse_scenario(WIDE[name]))
-    while road.t_s < 170.0:
+    while road.t_s < 100.0:
         road.step()
         assert_single_owners(road)
         owned = [
@@ -259,9 +266,11 @@ def test_empty_cells_of_a_lane_before_its_ramps_belong_to_those_who_leave_there(
 
 
 @pytest.mark.more
-@pytest.mark.parametrize("scenario", [INTERCHANGES, OPEN], ids=["closed", "open"])
-@pytest.mark.parametrize("loss", [0.0, 0.3])
+@pytest.mark.parametrize(
+    ("scenario", "loss"), [(INTERCHANGES, 0.3), (OPEN, 0.0)], ids=["loss", "open"]
+)
 def test_all_leave_at_their_destinations(tmp_path: Path, scenario: Scenario, loss: float) -> None:
+    scenario = evolve(scenario, demand=evolve(scenario.demand, duration_s=25.0))
     faults = FaultSpec(messages=(MessageRule(loss=loss),)) if loss else FaultSpec()
     outcome = SimulatedRun(scenario, tmp_path / "run", faults, show_progress=False).run()
     assert outcome.summary is not None

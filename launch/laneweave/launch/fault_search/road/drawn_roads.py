@@ -28,6 +28,8 @@ RAMPS = 2
 """Number of ramps behind the exit of an interchange."""
 SHORT_RAMP_M, SHORT_STEPS = (30.0, 60.0), (2.0, 3.0)
 """The same as `RAMP_M` and `WEAVING_STEPS` for interchanges: roads are short."""
+WIDE, WIDE_SHARE = 2, 0.4
+"""Number of lanes of wide exits and ramps, and the share of interchanges with them."""
 BEHIND_M = (7.0, 30.0)
 """Range of the distances between the end of a lane and the next ramp into it."""
 
@@ -82,7 +84,12 @@ def draw_road(
 def draw_interchange(
     lanes: int, moves_from_m: float, step_m: float, rng: random.Random
 ) -> DrawnRoad:
-    """Draw a road with an exit, and ramps behind it, in the same lane; arguments as `draw_road`."""
+    """Draw a road with an exit, and ramps behind it, in the same lane; arguments as `draw_road`.
+
+    Or the exit has two lanes, and a ramp of two lanes follows, which go on to the end of the road.
+    """
+    if lanes > WIDE and rng.random() < WIDE_SHARE:
+        return _draw_wide_interchange(lanes, moves_from_m, step_m, rng)
     lane = rng.choice((0, lanes - 1))
     opens_m = rng.choice((0.0, round(rng.uniform(0.5, 1.0) * moves_from_m, 1)))
     closures = [Closure(lane, 0.0, opens_m)] if opens_m else []
@@ -101,3 +108,20 @@ def draw_interchange(
         ends_m = end_m(merge_m)
     closures.append(Closure(lane, ends_m))
     return DrawnRoad(tuple(closures), tuple(ramps), exits, keeps_columns=True)
+
+
+def _draw_wide_interchange(
+    lanes: int, moves_from_m: float, step_m: float, rng: random.Random
+) -> DrawnRoad:
+    special = rng.choice((tuple(range(WIDE)), tuple(range(lanes - WIDE, lanes))))
+    exit_m = round(moves_from_m + WIDE * rng.uniform(*SHORT_STEPS) * step_m + AFTER_M, 1)
+    at_m = round(exit_m + rng.uniform(*BEHIND_M), 1)
+    merge_m = round(at_m + rng.uniform(*SHORT_RAMP_M), 1)
+    return DrawnRoad(
+        tuple(Closure(lane, exit_m, at_m) for lane in special),
+        tuple(
+            Entrance(f"on-ramp-{lane}", lane, at_m, merge_m, VOLUME_VEH_PER_H) for lane in special
+        ),
+        (Exit(EXIT, special, exit_m),),
+        keeps_columns=True,
+    )
