@@ -10,7 +10,7 @@ import attrs
 from laneweave.protocol.config.motion_checks import limit_name
 from laneweave.protocol.config.rules import require
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, end_exit
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, end_exit
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import (
     MAIN_ENTRANCE,
@@ -231,17 +231,10 @@ def check_exits(scenario: Scenario) -> None:
             f"lanes that are closed from exit.at_m = {exit_.at_m:g} on, without another exit",
         )
         used |= places
-        ends_by_lane = {end.lane: end for end in exit_lanes(scenario) if end.end_m == exit_.at_m}
-        for section in scenario.geometry.sections:
-            if section.exit != exit_.name or section.lane not in ends_by_lane:
-                continue
-            _check_room(
-                scenario,
-                f"{name}.at_m",
-                section,
-                ends_by_lane[section.lane],
-                f"{re_entry(scenario).room_m:g} m for completing a change after stopping",
-            )
+        room = f"{re_entry(scenario).room_m:g} m for completing a change after stopping"
+        for end in exit_lanes(scenario):
+            if (end.lane, end.end_m) in places:
+                _check_room(scenario, f"{name}.at_m", end, room)
 
 
 def check_dead_ends(scenario: Scenario) -> None:
@@ -261,15 +254,9 @@ def check_dead_ends(scenario: Scenario) -> None:
             for number, closure in enumerate(scenario.road.closures)
             if (closure.lane, closure.from_m) == (end.lane, end.end_m)
         )
-        section = next(
-            one
-            for one in scenario.geometry.sections
-            if (one.lane, one.to_m) == (end.lane, end.end_m)
-        )
         _check_room(
             scenario,
             name,
-            section,
             end,
             f"{needed.room_m:g} m for driving on after stopping at the end of the lane",
         )
@@ -294,9 +281,7 @@ def check_dead_ends(scenario: Scenario) -> None:
         )
 
 
-def _check_room(
-    scenario: Scenario, field: str, section: LaneSection, end: LaneEnd, room: str
-) -> None:
+def _check_room(scenario: Scenario, field: str, end: LaneEnd, room: str) -> None:
     """Check that the first move in a section that ends before the road ends before its line.
 
     The vehicles of a formation are known once it has passed all entrances, and it moves once all of
@@ -305,22 +290,18 @@ def _check_room(
     Args:
         scenario: the scenario.
         field: name of the position of the end.
-        section: the section.
-        end: its end.
+        end: the end of the section.
         room: what else has to fit, if vehicles are not taken back.
     """
-    what, before_m = "a step for changing lanes", end.end_m - end.line_m
+    what, begins_m = "a step for changing lanes", max(end.from_m, end.moves_from_m)
     if end.taken_back:
-        early_m = early_start_m(scenario)
-        needed_m = before_m + first_step_m(scenario, section, early_m=early_m)
+        begins_m -= early_start_m(scenario)
         room = "room to stop while the body is in the lane"
-    else:
-        needed_m = first_step_m(scenario, section) + before_m
-        if scenario.formation.traits.has_formations:
-            longest_m = scenario.formation.longest_m
-            begins_m = max(section.from_m, section.moves_from_m, scenario.geometry.moves_from_m)
-            begins_m = max(begins_m, *scenario.geometry.entry_m) + longest_m
-            needed_m = begins_m + scenario.types.step_m + before_m
-            what = f"a formation that has passed all entrances, and {what}"
-    allowed = f"{what}, in lane {section.lane}, and {room}"
+    elif scenario.formation.traits.has_formations:
+        geometry = scenario.geometry
+        begins_m = max(begins_m, geometry.moves_from_m, *geometry.entry_m)
+        begins_m += scenario.formation.longest_m
+        what = f"a formation that has passed all entrances, and {what}"
+    needed_m = first_step_m(scenario, begins_m) + end.end_m - end.line_m
+    allowed = f"{what}, in lane {end.lane}, and {room}"
     require(end.end_m >= needed_m, field, end.end_m, allowed, needed_m)

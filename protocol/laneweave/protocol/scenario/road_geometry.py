@@ -61,10 +61,10 @@ class RoadGeometry:
 
     @cached_property
     def entry_points(self) -> tuple[EntryPoint, ...]:
-        """Where vehicles enter: first the first entry point of each lane, then all later ones.
+        """Where vehicles enter: the first entry point of each lane, then the later ones.
 
-        So entry points 0 to lanes - 1 have the numbers of their lanes. A lane that is closed from
-        the start of the road on, and has no ramp, has one, too, which no vehicle uses.
+        Entry points 0 to lanes - 1 have the numbers of their lanes. A lane without an entrance has
+        an entry point that no vehicle uses.
         """
         ramps = sorted(
             (EntryPoint(one.lane, one.at_m, one.name) for one in self._entrances),
@@ -138,7 +138,7 @@ class RoadGeometry:
         return self.rest_s(self.entry_points[entry_point].at_m, destination)
 
     def rest_s(self, s_m: float, destination: str) -> float:
-        """Return the time [s] at v_F from a position to a destination; negative: it is behind."""
+        """Return the time [s] at v_F from a position to a destination; negative if it is behind."""
         ends_m = {one.name: one.at_m for one in self._exits}
         to_m = ends_m.get(destination, self._road.length_m)
         return (to_m - s_m) / self._formation.speed_mps

@@ -59,7 +59,7 @@ class TrafficFlow:
 
     @cached_property
     def inflows(self) -> Mapping[int, Inflow]:
-        """The vehicles that enter, by number of their entry point, if any enter there.
+        """The vehicles that enter, by number of entry point; those without vehicles are left out.
 
         A type that may not drive in some lanes at the start of the road enters in the others.
         """
@@ -75,6 +75,7 @@ class TrafficFlow:
         }
         found = self._permitted(found)
         every = range(self._road.lanes)
+        numbers = {point.entrance: number for number, point in enumerate(self._entry_points)}
         for one in self._entrances:
             preferring = _normalised(one.lane_shares, every) if one.lane_shares else ()
             own = Inflow(
@@ -83,12 +84,7 @@ class TrafficFlow:
                 preferring or self.lane_shares,
                 one.vehicle_types or types,
             )
-            number = next(
-                number
-                for number, point in enumerate(self._entry_points)
-                if point.entrance == one.name
-            )
-            found |= self._permitted({number: own})
+            found |= self._permitted({numbers[one.name]: own})
         return MappingProxyType(dict(sorted(found.items())))
 
     def _permitted(self, inflows: Mapping[int, Inflow]) -> dict[int, Inflow]:

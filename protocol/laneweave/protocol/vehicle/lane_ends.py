@@ -258,7 +258,9 @@ def _ends(scenario: Scenario) -> Iterator[tuple[LaneSection, LaneEnd]]:
             later = [each.from_m for each in sections[number + 1 :] if each.lane == section.lane]
             line_m = section.to_m - re_entry(scenario).room_m
             stop_m = section.to_m if section.exit else line_m
-            taken_back = bool(scenario.sumo.config) and line_m < first_step_m(scenario, section)
+            taken_back = bool(scenario.sumo.config) and line_m < first_step_m(
+                scenario, max(section.from_m, section.moves_from_m)
+            )
             if taken_back:
                 stop_m = section.to_m + (HANDOVER_M if section.exit else -TAKEN_BACK_M)
                 line_m = stop_m - _stopping_room_m(scenario)
@@ -278,10 +280,10 @@ def _ends(scenario: Scenario) -> Iterator[tuple[LaneSection, LaneEnd]]:
 
 
 def _stopping_room_m(scenario: Scenario) -> float:
-    """Return the room behind a lane change in which a body stops that brakes as it leaves its lane.
+    """Return the distance from the end of a lane change to where a body stops.
 
-    The motion of a lane change is symmetric: the body leaves the lane as long before the end as it
-    begins to touch the other one after the beginning.
+    It brakes as it leaves its lane. The motion of a lane change is symmetric: the body leaves the
+    lane as long before the end as it begins to touch the other one after the beginning.
     """
     speed_mps, assumed, timing = scenario.formation.speed_mps, scenario.braking, scenario.timing
     braking_m = max(
@@ -297,15 +299,8 @@ def _stopping_room_m(scenario: Scenario) -> float:
     return max(0.0, braking_m + assumed.margin_m - after_m)
 
 
-def first_step_m(scenario: Scenario, section: LaneSection, *, early_m: float = 0.0) -> float:
-    """Return where the first move ends in a section, at the earliest.
-
-    Args:
-        scenario: the scenario.
-        section: the section.
-        early_m: distance by which a move begins before its body is in the section.
-    """
-    begins_m = max(section.from_m, section.moves_from_m) - early_m
+def first_step_m(scenario: Scenario, begins_m: float) -> float:
+    """Return where a move ends, at the earliest, that may begin from a position on."""
     return max(begins_m, scenario.geometry.moves_from_m) + scenario.types.step_m
 
 

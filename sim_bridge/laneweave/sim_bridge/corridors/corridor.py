@@ -85,7 +85,7 @@ class Ramp:
     name: str
     """Name of its entrance in scenarios."""
     entrance: str
-    """The same of the rightmost lane of the on-ramp, for all of its lanes."""
+    """Name of the on-ramp: that of the entrance of its rightmost lane."""
     edge: str
     """Name of the last edge before the corridor."""
     to_edge: str

@@ -111,9 +111,8 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         self.start_lanes = tuple(one.lane for one in ways if one.entrance == MAIN_ENTRANCE)
         """Lanes to whose beginning vehicles come from upstream."""
         geometry = scenario.geometry
-        closed = {*self.start_lanes} - {*scenario.road.first_lanes}
-        if closed:
-            allowed = f"lanes that stay open at the start: vehicles from upstream come to {closed}"
+        if closed := {*self.start_lanes} - {*scenario.road.first_lanes}:
+            allowed = "lanes that are open at the start, to which vehicles come from upstream"
             raise BadInputError("road.closures", f"lane {min(closed)}", allowed)
         self._ways_in = {
             geometry.entry_point_of(one.ramp) if one.ramp else one.lane: one for one in ways
@@ -293,7 +292,7 @@ class CorridorWorld(SumoProcess, BodiesWorld):
             api.setTau(name, min(tau_s, SLOWING_TAU_S))
 
     def _rest_m(self, name: str) -> float:
-        """Return how far a vehicle is from the end of its lane."""
+        """Return the distance from a vehicle to the end of its lane."""
         rest_m = self.lane.getLength(self.vehicle.getLaneID(name))
         return float(rest_m - self.vehicle.getLanePosition(name))
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, Exits, LaneSection
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, Exits, LanePosition, LaneSection
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import LATE_S, dead_ends, exit_lanes
 from laneweave.protocol.wire.messages import OffLattice
@@ -59,13 +59,11 @@ class HandOver:
         """Dead ends without re-entry."""
         self._lines_m = {(end.lane, end.end_m): end.line_m for end in (*exits, *self._short)}
         """Lines of exits, and of dead ends without re-entry, by lane and end."""
-        self._exit_places = {
-            name: [
-                (lane, end_m) for (lane, end_m), one in self._sections.items() if one.exit == name
-            ]
-            for name in {one.exit for one in self._sections.values()}
-        }
-        """(lane, position) of each exit."""
+        self._exit_places: dict[str, list[LanePosition]] = {}
+        """The exits before the end of the road, by name."""
+        for end in exits:
+            place = end.lane, end.end_m
+            self._exit_places.setdefault(self._sections[place].exit, []).append(place)
         self._braking_m = SPACE_M + braking_m(speed_mps, REACTION_S)
         """Distance in which a vehicle at v_F stops comfortably behind another one."""
 
@@ -137,7 +135,7 @@ class HandOver:
         )
 
     def _misses_way_out(self, vehicle: OnRoad) -> bool:
-        """Return whether it is too late for a vehicle to leave its lane, or to come to its exit."""
+        """Return whether a vehicle can no longer leave its lane in time, or reach its exit."""
         s_m, lane = vehicle.state[0], vehicle.body_lane
         # A vehicle that settles may be ahead of its cell, which counts for its plans.
         begins_m = s_m - self._late_m
@@ -149,7 +147,7 @@ class HandOver:
         rooms_m = [
             self._lines_m[place] - begins_m - self.moves_m(abs(place[0] - lane))
             for place in self._exit_places.get(vehicle.arrival.destination, ())
-            if place in self._lines_m and s_m < place[1]
+            if s_m < place[1]
         ]
         return max(rooms_m, default=0.0) < 0.0
 
@@ -179,8 +177,8 @@ class HandOver:
     def _section_of(self, vehicle: OnRoad) -> LaneSection | None:
         """Return the section in which a vehicle is, if it may leave the road by its end."""
         s_m, destination = vehicle.state[0], vehicle.arrival.destination
-        ends_m = [end_m for (_, end_m), one in self._sections.items() if one.exit == destination]
-        if max(ends_m, default=-math.inf) < s_m:
+        places = self._exit_places.get(destination, ())
+        if max((end_m for _, end_m in places), default=-math.inf) < s_m:
             destination = END_OF_ROAD  # it has passed its exit
         section = self._exits.section_at(vehicle.body_lane, s_m)
         leaves = section is not None and section.serves(ANY_LANE, destination)

@@ -46,7 +46,7 @@ there is little room before the queue, lane changes begin sooner."""
 SPEED_STEP_MPS = 0.5
 """v_F is a multiple of it."""
 SLOWEST_MPS = 8.0
-"""v_F to which a short approach is slowed down at most."""
+"""Lowest v_F of a short approach."""
 _WIDE_M = 100.0
 """A column pitch that suits all types."""
 Tables = dict[str, Any]
@@ -73,7 +73,7 @@ def checked_tables(found: SumoCorridor, sumo: Tables) -> Tables:
 
 
 def _checked(found: SumoCorridor, sumo: Tables, slower_mps: float) -> Tables:
-    """Return the tables with a v_F that is lower than usual; see `checked_tables`."""
+    """Return the tables for a v_F that is lower by `slower_mps`; see `checked_tables`."""
     corridor = found.corridor
     tables = scenario_tables(found, slower_mps) | {"sumo": sumo}
     try:

@@ -22,7 +22,7 @@ MIN_SPEED_MPS = 6.0
 """Lowest speed to which a vehicle brakes."""
 LONGEST_S = 60.0
 SLOW_ENTRY_S = 6.0
-"""Time after its entry in which a vehicle that comes slowly is ready to change lanes, as a rule."""
+"""Time after its entry in which a slow vehicle is usually ready to change lanes."""
 _SHORTEST_S = 1.0
 _SLACK_S = 0.3
 """Spare time: ticks are discrete."""

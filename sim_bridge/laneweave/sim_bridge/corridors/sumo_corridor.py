@@ -52,7 +52,7 @@ class WayIn:
     lanes: Mapping[str, LaneBefore]
     """By their names in SUMO, those inside junctions included."""
     ramp: str = ""
-    """Name of the lane of the on-ramp."""
+    """Name of the entrance in scenarios (`Ramp.name`); empty: the start of the road."""
 
 
 @frozen

@@ -158,14 +158,12 @@ class TakeOver(OutsideTraffic):
         self._departing = deque(world.departing)
         self._due: dict[str, Arrival] = {}
         """Announced vehicles that have not departed."""
-        self._now_s = 0.0
-        """Road time of the newest tick."""
         self._moved_s = 0.0
         """Road time at which a vehicle on the road moved the last time."""
 
     def demanded(self, t_s: float) -> Sequence[Arrival]:
         """Return the vehicles that have come near an entrance since the last call."""
-        self._now_s, new = t_s, list[Arrival]()
+        new = []
         for point, at_m in self._at_m.items():
             for one in self._world.approaching(point):
                 name = one.arrival.vehicle
@@ -205,14 +203,14 @@ class TakeOver(OutsideTraffic):
         self._going = Counter(one.preferred_lane for one in known)
         return self._exit_room.release(coming, known, self._world.others)
 
-    def full_lanes(self) -> set[int]:
+    def full_lanes(self, t_s: float) -> set[int]:
         """Return the lanes that no vehicle may enter at their start now.
 
-        A queue ahead leaves no room to brake, or a vehicle from upstream would come too close. One
-        that SUMO lets depart just before the start may appear in any lane, at any moment.
+        A queue ahead leaves no room to brake, or a vehicle from upstream would come too close. A
+        vehicle that SUMO lets depart just before the start may appear in any lane.
         """
         full = self._hand_over.full_lanes(self._world.others())
-        if self._departs_upstream():
+        if self._departs_upstream(t_s):
             return full | {*self._world.start_lanes}
         return full | {
             lane
@@ -221,15 +219,14 @@ class TakeOver(OutsideTraffic):
             if one.s_m > -NEAR_S * max(one.speed_mps, self._lattice.speed_mps)
         }
 
-    def _departs_upstream(self) -> bool:
-        """Return whether a vehicle is to depart just before the start of the road now."""
+    def _departs_upstream(self, t_s: float) -> bool:
+        """Return whether a vehicle may appear just before the start of the road, in this tick."""
         due = takewhile(
-            lambda one: one.t_s <= self._now_s + DEPARTS_S,
+            lambda one: one.t_s <= t_s + DEPARTS_S,
             chain(self._due.values(), self._departing),
         )
         return any(
-            self._points[one.entry_point].entrance == MAIN_ENTRANCE
-            and one.t_s > self._now_s - AWAITED_S
+            self._points[one.entry_point].entrance == MAIN_ENTRANCE and one.t_s > t_s - AWAITED_S
             for one in due
         )
 

@@ -151,9 +151,10 @@ class CellAllocation:
             self._unassigned.pop(cell, None)
         for one in admissions:
             # Of several vehicles of a column that need a cell, the first one gets it.
-            taken = self._given | entered
             more_cells = tuple(
-                cell for cell in one.more_cells if cell not in taken and not self._is_owned(cell)
+                cell
+                for cell in one.more_cells
+                if not (cell in self._given or cell in entered or self._is_owned(cell))
             )
             self._given.update(more_cells)
             entering.append(self._with_ownerless(evolve(one, more_cells=more_cells)))
@@ -240,7 +241,10 @@ class CellAllocation:
         return not self._is_owned(cell)
 
     def _is_owned(self, cell: Cell) -> bool:
-        """Return whether a vehicle may own a cell of a shared lane; others are assigned once."""
+        """Return whether a vehicle may own a cell of a shared lane.
+
+        Cells of other lanes are assigned once, so it returns False.
+        """
         if cell[1] not in self._shared_lanes:
             return False
         if self._owned is None:
@@ -342,7 +346,7 @@ class CellAllocation:
                 continue  # no vehicle must be led into it
             possible = staying
             if lane in self._shared_lanes and s_m < self._last_entry_m[lane]:
-                # It is for vehicles on the ramp, but for those that leave before.
+                # Vehicles from the ramp need it, unless one of its column leaves before.
                 cell = (column, lane)
                 possible = [one for one in on_lattice if self._leaves_by(one, cell, s_m)]
             if possible:

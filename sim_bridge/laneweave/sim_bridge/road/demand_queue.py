@@ -80,11 +80,12 @@ class OutsideTraffic:
         del ahead
         return coming
 
-    def full_lanes(self) -> set[int]:
+    def full_lanes(self, t_s: float) -> set[int]:
         """Return the lanes that no vehicle may enter at their start now.
 
         There, the numbers of lanes are those of entry points.
         """
+        del t_s
         return set()
 
     def admit(self, t_s: float, meter: EntryMeter, occupied: Iterable[Cell]) -> list[Admission]:

@@ -140,7 +140,7 @@ class Roadside:
         """
         self._allocation.begin_tick(vehicles)
         self.demand.queue(t_s, (one.arrival for one in vehicles.values()))
-        full = self._room.full_points(vehicles.values()) | self.outside.full_lanes()
+        full = self._room.full_points(vehicles.values()) | self.outside.full_lanes(t_s)
         admissions = self._meter.admit(t_s, full)
         occupied = (one.controller.hold_cell for one in vehicles.values())
         admissions += self.outside.admit(t_s, self._meter, occupied)

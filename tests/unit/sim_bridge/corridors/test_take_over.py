@@ -100,7 +100,7 @@ def test_no_vehicle_enters_while_sumo_may_let_a_vehicle_depart_just_before_the_s
     def full(t_s: float) -> set[int]:
         take_over.demanded(t_s)
         take_over.announced(t_s)
-        return take_over.full_lanes()
+        return take_over.full_lanes(t_s)
 
     times_s = (50.0, 99.0, 99.8, 104.0)
     assert [full(t_s) for t_s in times_s] == [set(), set(), {1, 2}, {1, 2}]

@@ -28,7 +28,7 @@ EXITS_M = 500.0, 1300.0
 
 
 def tables(*, open_at_start: bool = False) -> dict[str, Any]:
-    """Return four lanes; lane 0 is that of two exits, each with an on-ramp behind it."""
+    """Return a road of four lanes; lane 0 has two exits, each with an on-ramp behind it."""
     first = [] if open_at_start else [{"lane": 0, "to_m": 250.0}]
     ramps = [
         {
@@ -120,7 +120,7 @@ def test_no_cell_has_two_owners(scenario: Scenario) -> None:
 def wide_tables(
     closures: list[tuple[int, float, float]], ramps: list[tuple[int, float]], exits: list[int]
 ) -> dict[str, Any]:
-    """Return a road of five lanes; vehicles leave by an exit at the first end of its lanes."""
+    """Return a road of five lanes with one exit, at the first end of the lanes in `exits`."""
     exit_m = min(from_m for lane, from_m, _ in closures if lane in exits and from_m)
     leaving = [{"exit": "off", "share": 0.3}]
     return {

@@ -214,8 +214,9 @@ def window(
     # Add slots for vehicles that fall back.
     slots += int(np.ceil(reach * road.pitch_m / road.advance_m))
     at_m = now_m + np.arange(slots + 1)[:, None] * road.advance_m
-    rules = _lane_rules(road, vehicles, at_m)
-    table, own_zones = _table(road, at_m, low, blocked, rules)
+    starts_m = _starts_m(road, at_m[:-1])
+    rules = _lane_rules(road, vehicles, at_m, starts_m)
+    table, own_zones = _table(road, at_m, starts_m, low, blocked, rules)
     # A path must remain cheaper than one with a forbidden move.
     costs = evolve(costs, restricted=min(costs.restricted, _MAX_RESTRICTED_COST / slots))
     return Window(
@@ -228,7 +229,12 @@ def window(
 
 
 def _table(
-    road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell], rules: _LaneRules
+    road: StreamRoad,
+    at_m: Floats,
+    starts_m: Floats,
+    low: int,
+    blocked: Collection[Cell],
+    rules: _LaneRules,
 ) -> tuple[Table, _Zones]:
     """Return an empty table and its zones; `at_m`: positions of columns when slots begin."""
     slots, columns = at_m.shape[0] - 1, at_m.shape[1]
@@ -242,7 +248,6 @@ def _table(
     section, left, latest_m = _sections(road, at_m)
     found = _zones(section, rules.restricted, len(road.sections))
     zone = found.of_cell
-    starts_m = np.stack([_starts_m(road, at_m[:-1], lane) for lane in range(road.lanes)], axis=1)
     may_move = _may_move(road, starts_m, latest_m, is_blocked)
     load[:, 1:][~may_move] = FIXED * ENTERING
     may_leave: Bools = np.asarray(may_move.any(axis=(1, 2)))
@@ -268,7 +273,9 @@ def _table(
     return table, found
 
 
-def _lane_rules(road: StreamRoad, vehicles: Sequence[StreamVehicle], at_m: Floats) -> _LaneRules:
+def _lane_rules(
+    road: StreamRoad, vehicles: Sequence[StreamVehicle], at_m: Floats, starts_m: Floats
+) -> _LaneRules:
     """Return the rules for vehicles; `at_m`: positions of columns at the beginning of slots."""
     types = [one.vehicle_type for one in vehicles]
     names = [name for name in sorted(set(types)) if road.rules_of(name)]
@@ -283,12 +290,11 @@ def _lane_rules(road: StreamRoad, vehicles: Sequence[StreamVehicle], at_m: Float
     )
     if not names:
         return rules
-    starts_m = [_starts_m(road, at_m[:-1], lane) for lane in range(road.lanes)]
     for name, forbidden, restricted in zip(names, rules.forbidden, rules.restricted, strict=True):
         for (lane, to_lane), from_m, to_m in road.forbidden_changes(name):
             if not 0 <= min(lane, to_lane) <= max(lane, to_lane) < road.lanes:
                 continue
-            start_m = np.maximum(starts_m[lane], starts_m[to_lane])
+            start_m = np.maximum(starts_m[:, lane], starts_m[:, to_lane])
             for d, (column, side) in enumerate(steps):
                 if side == to_lane - lane:
                     rear_m = start_m - road.body_m + min(0, column) * road.pitch_m
@@ -303,16 +309,18 @@ def _lane_rules(road: StreamRoad, vehicles: Sequence[StreamVehicle], at_m: Float
     return rules
 
 
-def _starts_m(road: StreamRoad, front_m: Floats, lane: int) -> Floats:
-    """Return `StreamRoad.start_m` for many positions of the front, and one lane."""
-    starts_m = front_m.copy()
-    if road.early_m is None:
-        return starts_m
-    for _, to_m, number in road.lane_sections[lane]:
-        begins_m = road.first_m(number)
-        later = (front_m < road.line_m(number, to_m)) & (front_m < begins_m)
-        later &= begins_m <= front_m + road.advance_m
-        starts_m[later] = np.maximum(starts_m[later], begins_m)
+def _starts_m(road: StreamRoad, front_m: Floats) -> Floats:
+    """Return `StreamRoad.start_m` for positions (slots, columns) of the front, for each lane.
+
+    Shape: (slots, lanes, columns).
+    """
+    starts_m = np.repeat(front_m[:, None], road.lanes, axis=1)
+    for lane, sections in enumerate(road.lane_sections if road.early_m is not None else ()):
+        for _, to_m, number in sections:
+            begins_m = road.first_m(number)
+            later = (front_m < road.line_m(number, to_m)) & (front_m < begins_m)
+            later &= begins_m <= front_m + road.advance_m
+            np.maximum(starts_m[:, lane], begins_m, out=starts_m[:, lane], where=later)
     return starts_m
 
 
@@ -371,16 +379,8 @@ def _may_move(road: StreamRoad, starts_m: Floats, latest_m: Floats, is_blocked: 
     """Return whether each move stays in open cells of S3 and enters no blocked cell.
 
     The corners of an oblique move count as entered, except the vehicle's own cell. A lane change
-    begins when both lanes are open, and must end before the lines of both.
-
-    Args:
-        road: the road.
-        starts_m: where moves begin in each lane, by slot, lane and column (`_starts_m`).
-        latest_m: where they begin at the latest (`_sections`).
-        is_blocked: cells that no plan may use, by lane and column.
-
-    Returns:
-        Shape (slots, displacements without the first, lanes, columns).
+    begins when both lanes are open (`starts_m`), and must end before both lines (`latest_m`).
+    Shape: (slots, displacements without the first, lanes, columns).
     """
     lanes, columns = is_blocked.shape
     steps = displacements(road.mode)[1:]

@@ -51,7 +51,7 @@ def test_every_vehicle_has_a_slot_for_the_shortest_possible_exit() -> None:
 
 
 def test_a_move_that_waits_for_its_lane_ends_before_the_other_lane_does() -> None:
-    """It begins at 395 m and ends at 455 m, 19 m later than it would in its own lane alone."""
+    """It begins at 395 m and ends at 455 m, 20 m farther than in its own lane alone."""
     for end_m, possible in ((456.0, True), (454.0, False)):
         beside = evolve(SHARED.sections[2], to_m=end_m, exit="")
         road = evolve(EARLY, sections=(*SHARED.sections[:2], beside, SHARED.sections[3]))
