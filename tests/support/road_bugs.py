@@ -17,6 +17,7 @@ from laneweave.protocol.vehicle.lane_ends import LaneEnd, LaneEnds, ReEntry
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.wire.messages import Census, CensusEntry, Command, Name, Sense
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase
+from laneweave.sim_bridge.bodies.stop_lines import StopLinesAhead
 from laneweave.sim_bridge.road import lane_end_control
 from laneweave.sim_bridge.road.allocation import CellAllocation
 from laneweave.sim_bridge.road.entry import EntryMeter
@@ -104,8 +105,8 @@ def gap_taken_too_early(
 # --- stop lines, queues, and gaps for re-entry ---------------------------------------------
 
 
-@breaks(LANE_ENDS, MotionController, "_lines_ahead")
-def no_stop_line(*_: object) -> list[object]:
+@breaks(LANE_ENDS, StopLinesAhead, "lines")
+def no_stop_line(*_: object, **__: object) -> list[object]:
     """Vehicles do not stop before the end of their lane."""
     return []
 
@@ -180,7 +181,7 @@ def last_first(waiting: Callable[..., list[object]], *given: object) -> list[obj
 def drives_on(leave_lattice: Call, self: MotionController) -> None:
     """A vehicle off the lattice aims at its cell, which is beyond the end of the lane."""
     leave_lattice(self)
-    self.off_lattice, self._past_line = OffLatticePhase.RE_ENTERING, True
+    self.off_lattice, self._stop_lines.passed = OffLatticePhase.RE_ENTERING, True
 
 
 @breaks(LANE_ENDS)
@@ -190,10 +191,10 @@ def line_forgotten_when_driving_out(patch: Patch) -> None:
 
     def mutant(self: MotionController, cell: Cell) -> None:
         re_entry(self, cell)
-        self._past_line = False
+        self._stop_lines.passed = False
 
     patch.setattr(MotionController, "re_enter", mutant)
-    patch.setattr("laneweave.sim_bridge.bodies.motion_controller.STANDING_MPS", -1.0)
+    patch.setattr("laneweave.sim_bridge.bodies.stop_lines.STANDING_MPS", -1.0)
 
 
 @breaks(LANE_ENDS, EntranceRoom, "full_points")

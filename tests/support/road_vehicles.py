@@ -5,6 +5,8 @@ from __future__ import annotations
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state
+from laneweave.protocol.wire.messages import CAR
+from laneweave.sim_bridge.bodies.command_checks import NEIGHBOURING
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.demand import Arrival
@@ -26,7 +28,8 @@ def controller_in(
     """
     start = cell_state(scenario.lattice, cell, 0.0) if state is None else state
     plant = Plant(start, scenario.vehicle, scenario.runtime.tick_s)
-    controller = MotionController(plant, scenario, cell)
+    moves = scenario.types.moves_of(CAR) or NEIGHBOURING
+    controller = MotionController(plant, scenario, cell, moves)
     if incarnation:
         controller.store.put_in_charge(incarnation)
     return controller

@@ -12,6 +12,7 @@ from laneweave.protocol.road_layout import Exits, LaneSection
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.events import PLANNING_FAILED
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
+from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.run_record import Ending, RecordedVehicle
 from laneweave.sim_bridge.road.demand import Arrival
@@ -77,6 +78,9 @@ class EpisodeRecord:
         trip = self.trips[vehicle.name]
         trip.left_s = t_s - (s_m - section.to_m) / v_mps if v_mps > 0 else t_s
         trip.at_destination = section.serves(arrival.preferred_lane, arrival.destination)
+
+    def on_refused(self, t_s: float, vehicle: Name, refusal: Refusal) -> None:
+        """Do nothing."""
 
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Count that a vehicle has left the lattice at a dead end, or comes back."""

@@ -115,6 +115,9 @@ class Safety:
     max_jerk_mps3: float | None = figure(
         "maximum of the change of acceleration between two ticks over their distance", "m/s3"
     )
+    commands_refused: int | None = optional(
+        "commands that motion controllers refused, as no correct agent sends them"
+    )
 
 
 @frozen(kw_only=True)

@@ -25,6 +25,7 @@ from laneweave.protocol.wire.topics import BRIDGE_ALIVE, COMMAND, SENSE, VEHICLE
 from laneweave.sim_bridge.recording.record_interface import RoadRecord
 from laneweave.sim_bridge.road.caretakers import Caretakers
 from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.occupied_cells import OccupiedCells
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.tick_answers import Answers
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -45,6 +46,8 @@ class SimulatedRoad(Generic[VehicleT]):
         new_incarnation: Callable[[], int],
         new_vehicle: Callable[[Admission, float, Scenario, int], VehicleT],
         incarnation: int = 0,
+        *,
+        guards_cells: bool = True,
     ) -> None:
         """Begin with an empty road before the first tick.
 
@@ -55,6 +58,8 @@ class SimulatedRoad(Generic[VehicleT]):
             new_incarnation: returns an unused incarnation, for caretakers.
             new_vehicle: makes the vehicles; arguments as those of `RoadVehicle.entering`.
             incarnation: distinguishes this road from earlier roads of the same deployment.
+            guards_cells: whether motion controllers refuse moves into cells of other vehicles. The
+                fault search tests that plans never lead there.
         """
         self.scenario = scenario
         self.tick = 0
@@ -65,6 +70,9 @@ class SimulatedRoad(Generic[VehicleT]):
         self.caretakers = Caretakers(scenario, new_incarnation)
         self.bounds = scenario.runtime.bounds(incarnation)
         """Bounds of received numbers."""
+        self._occupied_cells = (
+            OccupiedCells(self.vehicles, roadside.is_kept_free) if guards_cells else None
+        )
         self._roadside = roadside
         self._record = record
         self._new_vehicle = new_vehicle
@@ -121,6 +129,8 @@ class SimulatedRoad(Generic[VehicleT]):
         except BadInputError as error:
             log.warning("command ignored", vehicle=name, reason=str(error))
             return effects
+        finally:
+            self._record_refusal(vehicle)
         # Only an accepted command can change the process in charge.
         if in_charge not in (0, vehicle.controller.record.incarnation):
             previous = "caretaker" if had_caretaker else "agent"
@@ -148,6 +158,7 @@ class SimulatedRoad(Generic[VehicleT]):
         """Let the vehicles at the entrance enter, and return them."""
         entered, self.at_entrance = self.at_entrance, []
         for vehicle in entered:
+            vehicle.controller.occupancy = self._occupied_cells
             self.vehicles[vehicle.name] = vehicle
             self._record.on_entered(vehicle)
         return entered
@@ -162,6 +173,7 @@ class SimulatedRoad(Generic[VehicleT]):
         yield from self._roadside.publish(self.tick, self.t_s, self.vehicles.values())
         yield from self._start_caretakers(now_s)
         for vehicle in self.vehicles.values():
+            vehicle.controller.end_move(self.t_s)
             yield self.sense_of(vehicle)
         yield from self.caretakers.states(self.tick)
         yield from self.caretakers.notify_departed(self.tick)
@@ -188,7 +200,15 @@ class SimulatedRoad(Generic[VehicleT]):
         tick = self.tick
         for vehicle in self.vehicles.values():
             vehicle.step(tick)
+            if vehicle.controller.refusal is not None:
+                self._record_refusal(vehicle)
         self.tick += 1
+
+    def _record_refusal(self, vehicle: RoadVehicle) -> None:
+        """Record what a motion controller has refused, if anything."""
+        refusal, vehicle.controller.refusal = vehicle.controller.refusal, None
+        if refusal is not None:
+            self._record.on_refused(self.t_s, vehicle.name, refusal)
 
     def departed(self) -> list[VehicleT]:
         """Return the vehicles that have left and have not been removed yet.

@@ -104,9 +104,9 @@ def test_a_tick_ends_when_all_have_answered(desk: Desk) -> None:
 def test_the_answers_are_played_from_this_tick_on(desk: Desk) -> None:
     plants = {name: desk.core.vehicles[name].controller.plant for name in (A, B)}
     before = {name: plant.setpoint for name, plant in plants.items()}
-    desk.answer(A, jerks=jerks((2.0, 0.0), (-3.0, 1.0)))
+    desk.answer(A, jerks=jerks((-2.0, 0.0), (-3.0, 1.0)))
     desk.answer(B)
-    assert plants[A].setpoint[0] == pytest.approx(before[A][0] + 2.0 * TICK_S)
+    assert plants[A].setpoint[0] == pytest.approx(before[A][0] - 2.0 * TICK_S)
     assert plants[B].setpoint[0] == before[B][0]
 
 

@@ -84,6 +84,8 @@ def _safety_rows(safety: Safety) -> Iterator[Row]:
     if safety.hard_brakes:
         yield f"braked with more than {HARD_BRAKE_MPS2:g} m/s²", f"{safety.hard_brakes} vehicles"
     yield "emergency brakes", f"{safety.emergency_brakes:,}"
+    if safety.commands_refused:
+        yield "refused commands of agents", f"{safety.commands_refused:,}"
 
 
 def _accel_unit(value: float | None) -> str:

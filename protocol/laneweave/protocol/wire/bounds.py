@@ -9,6 +9,8 @@ repeat are forgotten (`newest`). Safety depends on neither: a refused message is
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from attrs import define
 
 from laneweave.protocol.errors import BadInputError
@@ -37,6 +39,8 @@ of its election only if a vehicle has promised a ballot of a higher term."""
 DAY_NS = 86_400 * 10**9
 CLAIM_AHEAD_NS = DAY_NS
 """Maximum lead of the incarnation in a COMMAND over the bridge's clock."""
+MAX_COLUMN = 2**31 - 1
+"""Maximum column: columns are recorded as 32-bit integers. Block numbers are no larger."""
 AHEAD_NS = 2 * DAY_NS
 """Maximum lead of all other incarnations; more than `CLAIM_AHEAD_NS`, because every process must
 accept what the bridge has accepted."""
@@ -167,3 +171,8 @@ def check_ballot(ballot: Ballot, road_s: float) -> None:
 def _check_term(term: int, road_s: float) -> None:
     if not 0 <= term <= max_term(road_s):
         raise BadInputError("term", term, f"0 to {max_term(road_s)}")
+
+
+def blocks_in_range(blocks: Iterable[int]) -> bool:
+    """Return whether block numbers can be recorded."""
+    return max(map(abs, blocks), default=0) <= MAX_COLUMN

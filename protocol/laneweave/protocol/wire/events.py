@@ -61,6 +61,8 @@ CARETAKER_TOOK_OVER: Final = "caretaker-took-over"
 """Bridge: the caretaker has taken charge of a vehicle."""
 AGENT_TOOK_OVER: Final = "agent-took-over"
 """Bridge: an agent has taken charge of a vehicle from its caretaker or an earlier agent."""
+COMMAND_REFUSED: Final = "command-refused"
+"""Bridge: a motion controller has refused a command that no correct agent sends (or several)."""
 OVERLAP: Final = "overlap"
 """Bridge: two bodies intersect; a closed part of a lane counts as a body named `closure-N`."""
 RUN_ENDED: Final = "run-ended"
@@ -103,6 +105,7 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     AGENT_SILENT: ("vehicle",),
     CARETAKER_TOOK_OVER: ("vehicle", "reason"),
     AGENT_TOOK_OVER: ("vehicle", "previous"),
+    COMMAND_REFUSED: ("vehicle", "reason", "excess_m", "occupant"),
     OVERLAP: ("vehicles",),
     RUN_ENDED: ("ending",),
 }
@@ -149,7 +152,9 @@ MEANINGS: Final[Mapping[str, str]] = {
     "exit": "name of the exit by which the vehicle left; end: end of the road",
     "on_preferred_lane": "whether the vehicle left where it wanted to",
     "attended": "whether its agent was in charge, not a caretaker",
-    "reason": "why the agent was not in charge",
+    "reason": "why the agent was not in charge; what is wrong with the command",
+    "occupant": "vehicle, or gap for one, that occupies a cell on the way",
+    "excess_m": "how far the command would have led the body out of its cells [m]",
     "previous": "who was in charge before: caretaker or agent",
     "ending": "as in summary.json",
 }

@@ -1,6 +1,6 @@
 """A vehicle's motion controller, which outlives the vehicle's agent process.
 
-It drives on one of the fallback levels (`FallbackLevel`):
+It drives on one of these levels (`FallbackLevel`):
 
     execute     executes the trajectory of the newest command
     hold        steers into the cell of the newest command, and stays in it at v_F
@@ -22,8 +22,6 @@ the process in charge can change the hold cell and the trajectory.
 
 from __future__ import annotations
 
-import math
-import sys
 from array import array
 from collections.abc import Iterable, Sequence
 from enum import Enum, IntEnum
@@ -31,7 +29,7 @@ from enum import Enum, IntEnum
 from attrs import define, field
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.lattice import Cell, Lattice
+from laneweave.protocol.lattice import Cell, Lattice, footprint
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
@@ -52,23 +50,28 @@ from laneweave.protocol.vehicle.motion import (
     limited_accel,
 )
 from laneweave.protocol.vehicle.territory import territory_of
-from laneweave.protocol.wire.messages import Command, CurrentMotion, Neighbour, VehicleRecord
+from laneweave.protocol.wire.messages import (
+    Command,
+    CurrentMotion,
+    Neighbour,
+    VehicleRecord,
+)
+from laneweave.sim_bridge.bodies.cell_guard import CellGuard
+from laneweave.sim_bridge.bodies.command_checks import (
+    NEIGHBOURING,
+    LaneGaps,
+    Occupancy,
+    Problem,
+    Refusal,
+    decoded_jerks,
+)
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, Neighbours
 from laneweave.sim_bridge.bodies.plant import Plant
-from laneweave.sim_bridge.bodies.record_store import MAX_COLUMN, RecordStore, blocks_in_range
+from laneweave.sim_bridge.bodies.record_store import RecordStore
+from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS, StopLinesAhead
 
-MAX_LINE_GAP_M = 200.0
-"""Distance from which stop lines are seen; more than any stopping distance."""
-BESIDE_M = 1.0
-"""Net gap along the road below which another body is beside this one."""
-BEFORE_ENTERING = 0.4
-"""Share of a move before a body touches the other lane."""
-CATCHING_UP_MPS = 1.0
-"""Speed above v_F from which a body that keeps its column catches up with its cell."""
 SLOWED_MPS = 2.0
 """Loss of speed from which a body does not enter another lane."""
-STANDING_MPS = 0.3
-"""Speed below which a vehicle stands."""
 RELEASE_M = 1.0
 """Spare distance, beyond the distance driven in a tick, at which an emergency ends. Without it,
 favourable measurement errors would release the brake repeatedly, and lost distance add up."""
@@ -99,6 +102,12 @@ class MotionController:
     plant: Plant
     _scenario: Scenario
     hold_cell: Cell
+    _moves: frozenset[Cell] = NEIGHBOURING
+    """Moves (columns, lanes) that the type of the vehicle drives."""
+    occupancy: Occupancy | None = None
+    """Cells of other vehicles; None: not known."""
+    refusal: Refusal | None = None
+    """The newest refusal; whoever reports it removes it."""
     store: RecordStore = field(init=False)
     motion: CurrentMotion = field(init=False)
     command_tick: int = -1
@@ -111,8 +120,6 @@ class MotionController:
     """Measured neighbours."""
     off_lattice: OffLatticePhase | None = None
     """None: the vehicle has cells."""
-    _past_line: bool = False
-    """Whether the vehicle has started from standing at a stop line, into another lane."""
     _measured: State | None = None
     _jerks: array[float] = field(init=False)
     """Pairs (along, across) for successive ticks [m/s3]."""
@@ -121,9 +128,10 @@ class MotionController:
     lattice: Lattice = field(init=False)
     tick_s: float = field(init=False)
     _brake: EmergencyBrake = field(init=False)
-    _weakest_brake: EmergencyBrake = field(init=False)
-    """Emergency brake of the type with the least maximum deceleration."""
+    _lane_gaps: LaneGaps = field(init=False)
     _lane_ends: LaneEnds = field(init=False)
+    _stop_lines: StopLinesAhead = field(init=False)
+    _guard: CellGuard = field(init=False)
 
     def __attrs_post_init__(self) -> None:
         """Begin without a trajectory, in the block of the cell."""
@@ -131,14 +139,15 @@ class MotionController:
         self.tick_s = self._scenario.runtime.tick_s
         # The other blocks of the formation are not known until it is closed.
         record = VehicleRecord(joined=(self.lattice.block_of(self.hold_cell[0]),))
-        self.store = RecordStore(record, territory_of(self._scenario))
+        self.store = RecordStore(record, territory_of(self._scenario), self.lattice.lanes)
         self.motion = CurrentMotion(self.hold_cell)
         self.level_ticks = dict.fromkeys(FallbackLevel, 0)
         self._jerks = array("f")
-        weakest, assumed = self._scenario.types.weakest_braking, self._scenario.braking
-        self._brake = EmergencyBrake(self._limits, assumed, self.tick_s)
-        self._weakest_brake = EmergencyBrake(weakest, assumed, self.tick_s)
+        self._brake = EmergencyBrake(self._limits, self._scenario.braking, self.tick_s)
+        self._lane_gaps = LaneGaps(self._scenario)
         self._lane_ends = LaneEnds(self._scenario)
+        self._stop_lines = StopLinesAhead(self._lane_ends, self._limits, self.lattice)
+        self._guard = CellGuard(self._scenario, self._limits)
 
     @property
     def record(self) -> VehicleRecord:
@@ -159,6 +168,20 @@ class MotionController:
         """Set the measurements of this tick."""
         self._measured, self.neighbours = measured, neighbours
 
+    @property
+    def occupied(self) -> frozenset[Cell]:
+        """Cells of the vehicle: its cell, or the footprint of the move in progress."""
+        if self.off_lattice is OffLatticePhase.WAITING:
+            return frozenset()
+        return self._guard.region(self.hold_cell)
+
+    def end_move(self, t_s: float) -> None:
+        """End the move in progress if the body rests in its cell at road time `t_s`.
+
+        Called before each SENSE, so before any process can report the end.
+        """
+        self._guard.update(self.measured, self.hold_cell, t_s)
+
     # --- lanes that end -----------------------------------------------------------------------
 
     def has_lost_cell(self, t_s: float) -> bool:
@@ -170,10 +193,11 @@ class MotionController:
         """
         if self.off_lattice is OffLatticePhase.WAITING or not self._lane_ends:
             return False
-        if self.off_lattice is OffLatticePhase.RE_ENTERING and self._past_line:
+        if self.off_lattice is OffLatticePhase.RE_ENTERING and self._stop_lines.passed:
             return False
         stays_free = self.store.territory.given_up_cells_stay_free
-        if not stays_free and self._straddles and self.measured[1] > STANDING_MPS:
+        first, last = self.lattice.lanes_touched(self.measured[3], self._limits.width_m)
+        if not stays_free and first != last and self.measured[1] > STANDING_MPS:
             return False
         # Behind an exit the lane may belong to a ramp, to whose end the body does not come.
         cell = self.hold_cell[0], self._body_lane
@@ -185,13 +209,6 @@ class MotionController:
         if self.off_lattice is None and self.hold_cell not in self.store.certain_cells:
             return False
         return abs(self.measured[3] - self.lattice.cell_y_m(self.hold_cell[1])) <= ARRIVED_ACROSS_M
-
-    @property
-    def _straddles(self) -> bool:
-        """Whether the body touches two lanes."""
-        width_m = self._limits.width_m
-        first, last = self.lattice.lanes_touched(self.measured[3], width_m)
-        return first != last
 
     def has_missed_exit(self, t_s: float) -> bool:
         """Return whether a move into or out of the lane of an exit did not begin in time.
@@ -216,15 +233,10 @@ class MotionController:
             return False
         if self.motion.origin[1] != self._body_lane:
             return False
-        self.hold_cell = self.motion.origin
+        self._guard.moving_from, self.hold_cell = self.hold_cell, self.motion.origin
         self.command_tick = max(self.command_tick, round(t_s / self.tick_s) - 1)
         self._stop_motion()
         return True
-
-    @property
-    def size_m(self) -> tuple[float, float]:
-        """Length and width of the body."""
-        return self._limits.size_m
 
     @property
     def _body_lane(self) -> int:
@@ -239,7 +251,7 @@ class MotionController:
 
     def leave_lattice(self) -> None:
         """Give up all cells; no process can move the vehicle, which stays in its lane."""
-        self.off_lattice = OffLatticePhase.WAITING
+        self.off_lattice, self._guard.moving_from = OffLatticePhase.WAITING, None
         self.hold_cell = (self.hold_cell[0], self._body_lane)
         self.store.give_up_cells()
         self._stop_motion()
@@ -247,7 +259,7 @@ class MotionController:
     def re_enter(self, cell: Cell) -> None:
         """Start from standing towards a cell of the neighbouring lane, which is kept free."""
         self.off_lattice, self.hold_cell = OffLatticePhase.RE_ENTERING, cell
-        self._past_line = True
+        self._stop_lines.passed = True
         self._stop_motion()
 
     def enter_lattice(self, cells: Iterable[Cell]) -> None:
@@ -259,46 +271,16 @@ class MotionController:
         self._jerks = self._jerks[:0]
         self.motion = CurrentMotion(self.hold_cell)
 
-    def _lines_ahead(self, measured: State, tick: int) -> list[Neighbour]:
-        """Return the stop lines of the lanes that the body touches or enters, as vehicles.
-
-        For a vehicle that starts from standing and is partly in another lane, or drives into
-        it, the end of the lane counts instead.
-        """
-        s_m, speed_mps, goal = measured[0], measured[1], self.hold_cell[1]
-        first, last = self.lattice.lanes_touched(measured[3], self._limits.width_m)
-        in_lane_m = dict.fromkeys(range(first, last + 1), s_m)
-        if goal not in in_lane_m and not self._must_stay_in_lane(tick):
-            # The lane may open ahead, behind the end of another section.
-            in_lane_m[goal] = self._lane_ends.in_section_m(self.hold_cell, tick * self.tick_s)
-        ends = [
-            end
-            for lane, at_m in in_lane_m.items()
-            if (end := self._lane_ends.ahead(lane, at_m)) is not None
-        ]
-        if all(end.lane == goal for end in ends):
-            self._past_line = False
-        elif speed_mps < STANDING_MPS and self._body_lane == goal:
-            self._past_line = True
-        lines = [
-            (end.lane, (end.end_m if self._past_line and end.lane != goal else end.stop_m) - s_m)
-            for end in ends
-        ]
-        if first != last:
-            # Where an exit lane parts from the road, a body must not be in both.
-            exits = [self._lane_ends.exit_ahead(lane, s_m) for lane in (first, last)]
-            lines += [(each.lane, each.stop_m - s_m) for each in exits if each is not None]
-        return [Neighbour(lane, gap_m, 0.0) for lane, gap_m in lines if gap_m < MAX_LINE_GAP_M]
-
     def accept_command(self, command: Command) -> bool:
         """Accept a command from the process in charge, or from a newer one, which takes charge.
 
-        A command is rejected if its incarnation is older than that of the process in charge, if its
-        tick is not later than that of the last command, if the vehicle may not hold its hold cell,
-        or if it changes lanes in an emergency, beside another body, before one
-        that could not brake for it, or too late for an exit. A newer incarnation takes charge. Its
-        first command must keep the hold cell: no plan can allow a process to move the vehicle
-        before it is in charge. A rejected process may try again at the next tick.
+        A command is rejected if its incarnation is older than that of the process in charge, or if
+        its tick is not later than that of the last command. One for another cell is rejected if no
+        correct agent sends it (`command_checks.Problem`, `refusal`), or if it changes lanes in an
+        emergency, beside another body, before one that could not brake for it, or too late for an
+        exit. A newer incarnation takes charge. Its first command must keep the hold cell: no plan
+        can allow a process to move the vehicle before it is in charge. A rejected process may try
+        again at the next tick.
 
         A command without jerks and with the current hold cell does not change the motion.
 
@@ -312,7 +294,11 @@ class MotionController:
         incarnation, in_charge = command.record.incarnation, self.record.incarnation
         if incarnation < in_charge or command.tick <= self.command_tick:
             return False
-        jerks = self._checked_jerks(command)
+        try:
+            jerks = decoded_jerks(command, self.lattice)
+        except BadInputError:
+            self.refusal = Refusal(Problem.VALUES)
+            raise
         leaves = command.hold_cell != self.hold_cell
         if self.off_lattice is not None and (leaves or len(jerks) > 0):
             return False
@@ -322,21 +308,52 @@ class MotionController:
             self.store.put_in_charge(incarnation)
         self.command_tick = command.tick
         self.store_requests(command)
-        if leaves and not self.store.territory.may_hold(self.record, command.hold_cell):
+        t_s = command.tick * self.tick_s
+        if not leaves and command.motion.origin not in (self.hold_cell, self.motion.origin):
+            self.refusal = Refusal(Problem.MOVE)
             return False
+        if leaves:
+            self.end_move(t_s)
+            self.refusal = self._refusal_of_move(command)
+            if self.refusal is not None:
+                return False
         lane = command.hold_cell[1]
         if lane != self.hold_cell[1] and (
             self.level is FallbackLevel.EMERGENCY
-            or self._is_beside(lane)
-            or self._cuts_in(lane)
-            or self._misses_exit(command.hold_cell, command.tick * self.tick_s)
+            or not self._lane_gaps.allow(lane, self.neighbours, self.measured[1])
+            or self._misses_exit(command.hold_cell, t_s)
+            or not self._lane_is_open(command.hold_cell, t_s)
         ):
             return False
         if len(jerks) > 0 or leaves:
+            if leaves:
+                self._guard.moving_from = self.hold_cell
             self._jerks, self._jerks_tick = jerks, command.tick
             self.hold_cell = command.hold_cell
             self.motion = command.motion
         return True
+
+    def _refusal_of_move(self, command: Command) -> Refusal | None:
+        """Return what is wrong with a command for another cell, apart from the situation."""
+        origin, target = self.hold_cell, command.hold_cell
+        if self._guard.moving_from is not None or command.motion.origin != origin:
+            return Refusal(Problem.MOVE)
+        if (target[0] - origin[0], target[1] - origin[1]) not in self._moves:
+            return Refusal(Problem.MOVE)
+        if not self.store.territory.may_hold(self.record, target):
+            return Refusal(Problem.NOT_OWNED)
+        if self.occupancy is not None:
+            occupant = self.occupancy.occupant(footprint(origin, target), self)
+            if occupant is not None:
+                return Refusal(Problem.OCCUPIED, occupant=occupant)
+        return None
+
+    def _lane_is_open(self, target: Cell, t_s: float) -> bool:
+        """Return whether a move may lead into the lane of a cell here."""
+        ends = self._lane_ends
+        if not ends:
+            return True
+        return ends.may_begin(self.hold_cell, target, t_s) and not ends.has_passed(target, t_s)
 
     def store_requests(self, command: Command) -> bool:
         """Store the record of a command for any tick; return whether anything has changed.
@@ -371,8 +388,12 @@ class MotionController:
         if near:
             near = self._relevant(near, measured[3])
         if self._lane_ends:
-            near = [*near, *self._lines_ahead(measured, tick)]
+            enters, t_s = not self._must_stay_in_lane(tick), tick * self.tick_s
+            lines = self._stop_lines.lines(measured, self.hold_cell, t_s, enters=enters)
+            near = [*near, *lines]
         level, jerk = self._next(tick, near)
+        if self.off_lattice is None:
+            level, jerk = self._within_cells(tick, near, level, jerk)
         if near and self._must_brake(measured, jerk, near):
             level = FallbackLevel.EMERGENCY
             # The body leaves its trajectory.
@@ -384,62 +405,39 @@ class MotionController:
         self.level_ticks[level] += 1
         self._measured = None
 
-    def _is_beside(self, lane: int) -> bool:
-        """Return whether a measured neighbour in a lane is beside this vehicle.
-
-        In cells that are free there is none; a body may have stopped there meanwhile.
-        """
-        ahead, behind = self.neighbours
-        return any(other.lane == lane and other.gap_m < BESIDE_M for other in (*ahead, *behind))
-
-    def _cuts_in(self, lane: int) -> bool:
-        """Return whether one that catches up in a lane could not brake for this vehicle.
-
-        It has had to stop, and passes the cells of others: vehicles that keep their columns change
-        lanes in them.
-        """
-        if self._scenario.formation.change_columns:
-            return False
-        speed_mps, touching_s = self.measured[1], BEFORE_ENTERING * self._scenario.timing.move_s
-        for other in self.neighbours.behind:
-            if other.lane != lane or other.speed_mps < self.lattice.speed_mps + CATCHING_UP_MPS:
-                continue
-            closes_m = max(0.0, other.speed_mps - speed_mps) * touching_s
-            body = Neighbour(lane, other.gap_m - closes_m, speed_mps, 0.0)
-            state = (0.0, other.speed_mps, 0.0, 0.0, 0.0, 0.0)
-            if self._weakest_brake.spare_m(state, 0.0, (0.0, 0.0), [body]) < 0.0:
-                return True
-        return False
-
-    def _checked_jerks(self, command: Command) -> array[float]:
-        for cell in (command.hold_cell, command.motion.origin):
-            if not (0 <= cell[1] < self.lattice.lanes and abs(cell[0]) <= MAX_COLUMN):
-                raise BadInputError("Command", cell, f"cells in {self.lattice.lanes} lanes")
-        joined = command.record.joined
-        if not blocks_in_range(joined):
-            raise BadInputError("Command.record.joined", joined, f"at most {MAX_COLUMN}")
-        if len(command.jerks) % 8:
-            raise BadInputError("Command.jerks", f"{len(command.jerks)} bytes", "float32 pairs")
-        jerks = array("f", command.jerks)
-        if sys.byteorder == "big":
-            jerks.byteswap()
-        # Finite 32-bit numbers have a finite sum.
-        if not math.isfinite(sum(jerks)):
-            raise BadInputError("Command.jerks", "NaN or infinity", "finite numbers")
-        return jerks
+    def _within_cells(
+        self, tick: int, near: Sequence[Neighbour], level: FallbackLevel, jerk: Jerk
+    ) -> tuple[FallbackLevel, Jerk]:
+        """Return level and jerk for a tick, within the cells of the vehicle (`cell_guard`)."""
+        t_s, guard = tick * self.tick_s, self._guard
+        cells = guard.cells(self.measured, self.hold_cell)
+        commanded = commanded_state(
+            self.measured, self.plant.setpoint, self._limits, self.lattice.speed_mps
+        )
+        excess_m = guard.excess_m(commanded, jerk, cells, t_s)
+        if excess_m <= 0.0:
+            return level, jerk
+        if level is FallbackLevel.EXECUTE:
+            self.refusal = Refusal(Problem.LEAVES_CELLS, excess_m)
+            self._jerks = self._jerks[:0]
+            level, jerk = self._hold(tick, near)
+        return level, guard.keep_in_cells(commanded, jerk, cells, t_s)
 
     def _next(self, tick: int, near: Iterable[Neighbour]) -> tuple[FallbackLevel, Jerk]:
         """Return the level and jerk for a tick without an emergency."""
         index = 2 * (tick - self._jerks_tick)
-        stays_in_lane = self._must_stay_in_lane(tick)
-        if 0 <= index < len(self._jerks) and not stays_in_lane:
+        if 0 <= index < len(self._jerks) and not self._must_stay_in_lane(tick):
             return FallbackLevel.EXECUTE, (self._jerks[index], self._jerks[index + 1])
+        return self._hold(tick, near)
+
+    def _hold(self, tick: int, near: Iterable[Neighbour]) -> tuple[FallbackLevel, Jerk]:
+        """Return the level and jerk with which the vehicle drives into its cell, and stays."""
         limits, speed_mps, body = self._limits, self.lattice.speed_mps, self.measured
         state = commanded_state(body, self.plant.setpoint, limits, speed_mps)
         goal = cell_state(self.lattice, self.hold_cell, tick * self.tick_s)
         if self.off_lattice is OffLatticePhase.WAITING:
             goal = (state[0], *goal[1:])  # at v_F in its lane, up to the line
-        elif stays_in_lane:
+        elif self._must_stay_in_lane(tick):
             goal = (*goal[:3], self.lattice.cell_y_m(self._body_lane), 0.0, 0.0)
         jerk = hold_law(state, goal, limits, self.tick_s)
         lag_s, goal_lane = limits.actuator_lag_s, self.hold_cell[1]
@@ -450,7 +448,7 @@ class MotionController:
             )
             for other in near
             # A vehicle that starts into another lane brakes for the end of its own only if it must.
-            if not self._past_line or other.lane == goal_lane
+            if not self._stop_lines.passed or other.lane == goal_lane
         ]
         min_gap_m = self._scenario.tracking.min_gap_m
         careful = keep_gap(state, jerk, ahead, limits, min_gap_m, self.tick_s)
@@ -465,6 +463,8 @@ class MotionController:
         """
         if self._body_lane == self.hold_cell[1] or self.off_lattice is not None:
             return False
+        if self._lane_gaps.blocked(self.hold_cell[1], self.neighbours, self.measured[1]):
+            return True  # a body has come too near meanwhile
         s_m, speed_mps = self.measured[:2]
         columns = self.motion.origin[0], self.hold_cell[0]
         t_s = tick * self.tick_s

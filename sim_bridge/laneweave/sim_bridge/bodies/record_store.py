@@ -13,10 +13,11 @@ from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.territory import Territory
+from laneweave.protocol.wire.bounds import MAX_COLUMN, blocks_in_range
 from laneweave.protocol.wire.messages import Ballot, PendingTransfer, VehicleRecord
 
-MAX_COLUMN = 2**31 - 1
-"""Maximum column: columns are recorded as 32-bit integers. Block numbers are no larger."""
+MAX_CELLS = 2000
+"""Maximum number of cells, vehicles or blocks in a record; plans need far fewer."""
 
 
 @define
@@ -25,6 +26,8 @@ class RecordStore:
 
     record: VehicleRecord
     territory: Territory
+    lanes: int
+    """Number of lanes of the road."""
     _granted: frozenset[Cell] = frozenset()
     """Cells assigned by the roadside that are not part of any plan yet."""
     _given_up: frozenset[Cell] = frozenset()
@@ -59,8 +62,10 @@ class RecordStore:
         return replace(self.record, owned=before.owned) != before
 
     def join(self, blocks: Iterable[int]) -> None:
-        """Add joined blocks."""
+        """Add joined blocks, unless they are too many for a record."""
         joined = tuple(sorted({*self.record.joined, *blocks}))
+        if len(joined) > MAX_CELLS:
+            return
         self.record = replace(self.record, joined=joined)
 
     def store_promise(self, ballot: Ballot) -> None:
@@ -84,10 +89,22 @@ class RecordStore:
         """
         stored, promised = self.record.transfer, self.record.promised
         newer = stored is None or transfer.ballot > stored.ballot
-        if newer and promised is not None and transfer.ballot >= promised:
+        if (
+            newer
+            and self._is_possible(transfer)
+            and promised is not None
+            and transfer.ballot >= promised
+        ):
             self._granted -= set(transfer.before)
             begun = _with_cells(transfer, self._granted)
             self.record = replace(self.record, transfer=begun, owned=begun.before)
+
+    def _is_possible(self, transfer: PendingTransfer) -> bool:
+        """Return whether all cells of a transfer are in lanes, and not too many."""
+        cells = (*transfer.before, *transfer.after)
+        return max(len(cells), len(transfer.roster)) <= MAX_CELLS and all(
+            0 <= lane < self.lanes and abs(column) <= MAX_COLUMN for column, lane in cells
+        )
 
     def complete_transfer(self, ballot: Ballot) -> None:
         """Complete the pending transfer of a plan whose start gate is open."""
@@ -135,11 +152,6 @@ class RecordStore:
         if transfer is None or not transfer.undecided:
             return owned
         return owned | frozenset(transfer.before) | frozenset(transfer.after)
-
-
-def blocks_in_range(blocks: Iterable[int]) -> bool:
-    """Return whether block numbers can be recorded."""
-    return max(map(abs, blocks), default=0) <= MAX_COLUMN
 
 
 def _with_cells(transfer: PendingTransfer, cells: Iterable[Cell]) -> PendingTransfer:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Protocol
 
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
+from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.run_record import Ending, RecordedVehicle
 from laneweave.sim_bridge.road.demand import Arrival
@@ -31,6 +32,9 @@ class RoadRecord(Protocol):
 
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Record that a vehicle has left the lattice at a dead end, or comes back."""
+
+    def on_refused(self, t_s: float, vehicle: Name, refusal: Refusal) -> None:
+        """Record that a motion controller has refused a command that no correct agent sends."""
 
     def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
         """Record that a caretaker has taken charge of a vehicle."""

@@ -15,6 +15,7 @@ figures can be drawn from these files alone. The columns are declared in the mod
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
@@ -24,7 +25,7 @@ from types import MappingProxyType
 from typing import Protocol
 
 import pyarrow as pa
-from attrs import define, field
+from attrs import define, evolve, field
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import END_OF_ROAD, Exits, LaneSection
@@ -43,6 +44,7 @@ from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.events import (
     AGENT_TOOK_OVER,
     CARETAKER_TOOK_OVER,
+    COMMAND_REFUSED,
     ENTERED,
     FORMATION_CLOSED,
     LEADER,
@@ -53,6 +55,7 @@ from laneweave.protocol.wire.events import (
     RUN_ENDED,
 )
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
+from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.events import Events
@@ -62,6 +65,8 @@ from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import Trip, Trips, metadata_of, throughput, travel_time
 from laneweave.sim_bridge.road.demand import Arrival
 
+REPEAT_REFUSAL_S = 10.0
+"""Shortest time between two events for refused commands of a vehicle, for one reason."""
 NONE_LEFT_OUT: Mapping[str, int] = MappingProxyType({})
 
 
@@ -116,6 +121,8 @@ class _Counts:
     agent_takeovers: int = 0
     left_unattended: int = 0
     missed_exits: int = 0
+    refused: int = 0
+    """Commands that motion controllers have refused."""
     stopped: set[Name] = field(factory=set)
     """Vehicles that have left the lattice at the end of a lane."""
 
@@ -173,6 +180,8 @@ class RunRecord:
         self._level_ticks: Counter[FallbackLevel] = Counter()
         self._counts = _Counts()
         self._left_out = left_out
+        self._refused_s = dict[tuple[Name, str], float]()
+        """Time of the last event for a refused command, by vehicle and reason."""
         self._exits = Exits(scenario.geometry.sections, scenario.road.length_m)
         self._closed = False
         self.missed_ticks = 0
@@ -270,6 +279,22 @@ class RunRecord:
         if kind == LEFT_LATTICE:
             self._counts.stopped.add(vehicle)
         self.event(t_s, kind, vehicle=vehicle, lane=lane)
+
+    def on_refused(self, t_s: float, vehicle: Name, refusal: Refusal) -> None:
+        """Count a refused command; write an event if there was none for a while."""
+        self._counts.refused += 1
+        reason = refusal.problem.value
+        if t_s >= self._refused_s.get((vehicle, reason), -math.inf) + REPEAT_REFUSAL_S:
+            self._refused_s[vehicle, reason] = t_s
+            excess_m = round(refusal.excess_m, 3)
+            self.event(
+                t_s,
+                COMMAND_REFUSED,
+                vehicle=vehicle,
+                reason=reason,
+                excess_m=excess_m,
+                occupant=refusal.occupant,
+            )
 
     def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
         """Record a vehicle that is still on the road when the run ends."""
@@ -383,7 +408,7 @@ class RunRecord:
             ),
             travel_time_s=travel_time(trips),
             throughput_veh_per_lane_h=throughput(trips, scenario.road.lanes),
-            safety=self._trajectories.safety(),
+            safety=evolve(self._trajectories.safety(), commands_refused=self._counts.refused),
             ending=ending.value,
             planning=self._events.planning(),
             tracking=self._tracking(),

@@ -180,9 +180,12 @@ class Caretakers:
         """
         controller = vehicle.controller
         in_charge = controller.record.incarnation
-        if not controller.accept_command(command):
+        accepted = controller.accept_command(command)
+        if controller.command_tick == command.tick:
+            # Also if it is refused: the process in charge has answered.
+            self.answers.in_time(vehicle.name)
+        if not accepted:
             return False
-        self.answers.in_time(vehicle.name)
         if controller.record.incarnation != in_charge:
             # An agent that claims a vehicle is present, even before its token appears.
             self.answers.agent_up(vehicle.name)

@@ -30,11 +30,9 @@ from laneweave.protocol.vehicle.lane_ends import (
 from laneweave.protocol.vehicle.territory import territory_of
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
 from laneweave.protocol.wire.messages import Name, OffLattice
-from laneweave.sim_bridge.bodies.motion_controller import (
-    BESIDE_M,
-    STANDING_MPS,
-    OffLatticePhase,
-)
+from laneweave.sim_bridge.bodies.command_checks import BESIDE_M
+from laneweave.sim_bridge.bodies.motion_controller import OffLatticePhase
+from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
 from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 

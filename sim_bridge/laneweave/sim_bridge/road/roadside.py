@@ -69,10 +69,13 @@ class EntranceRoom:
                 continue
             length_m, width_m = vehicle.size
             first, last = lattice.lanes_touched(y_m, width_m)
+            goal = vehicle.cell[1]
             waits = vehicle.controller.off_lattice is not None
             for number, lane, at_m, merging_m in self._points:
                 beyond_m = s_m - at_m
-                if number in full or beyond_m < 0.0 or not first <= lane <= last:
+                if number in full or beyond_m < 0.0:
+                    continue
+                if not first <= lane <= last and lane != goal:
                     continue
                 if waits and s_m - length_m < merging_m:
                     full.add(number)
@@ -108,7 +111,7 @@ class Roadside:
             allocation: what vehicles get besides their cells; None: that of the operation.
         """
         self.outside = outside_traffic
-        self._allocation = allocation or allocation_of(scenario, self._is_kept_free)
+        self._allocation = allocation or allocation_of(scenario, self.is_kept_free)
         self._meter = EntryMeter(
             scenario.lattice,
             scenario.formation.entry_spread_s,
@@ -206,7 +209,8 @@ class Roadside:
         stuck = self.outside.is_stuck(t_s, moving=moving)
         return stuck or (not vehicles and self.demand.exhausted(t_s))
 
-    def _is_kept_free(self, cell: Cell) -> bool:
+    def is_kept_free(self, cell: Cell) -> bool:
+        """Return whether a cell belongs to a gap for a vehicle at the end of its lane."""
         return self._lane_ends.is_kept_free(cell)
 
 

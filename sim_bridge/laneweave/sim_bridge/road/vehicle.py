@@ -12,6 +12,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import ClosedFormation, CurrentMotion, Name, Sense
+from laneweave.sim_bridge.bodies.command_checks import NEIGHBOURING
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, MotionController
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import ExactNeighbours, Size
 from laneweave.sim_bridge.bodies.plant import Plant
@@ -66,7 +67,8 @@ class RoadVehicle:
         name = Name(admission.arrival.vehicle)
         limits = scenario.types[admission.arrival.vehicle_type].limits
         body = make_body((s_m, speed_mps, *rest[2:]), limits, tick_s)
-        controller = MotionController(body, scenario, admission.cell)
+        moves = scenario.types.moves_of(admission.arrival.vehicle_type) or NEIGHBOURING
+        controller = MotionController(body, scenario, admission.cell, moves)
         if settle_s > 0.0:
             end_tick = round((t_s + settle_s) / tick_s)
             controller.motion = CurrentMotion(admission.cell, end_tick)
@@ -83,7 +85,7 @@ class RoadVehicle:
     @property
     def size(self) -> Size:
         """Length and width of the body [m]."""
-        return self.controller.size_m
+        return self.controller.plant.limits.size_m
 
     @property
     def body_lane(self) -> int:

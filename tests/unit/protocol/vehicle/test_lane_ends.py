@@ -26,8 +26,8 @@ from laneweave.protocol.vehicle.lane_ends import (
     sections_to_lines,
 )
 from laneweave.protocol.vehicle.motion import cell_state
-from laneweave.protocol.wire.messages import CurrentMotion
-from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
+from laneweave.protocol.wire.messages import CurrentMotion, Neighbour
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, MotionController
 from support.closed_lanes import BLOCKED, DROP
 from support.convoy import ROLLING
 from support.examples import examples
@@ -247,13 +247,23 @@ def test_no_command_takes_a_vehicle_past_its_stop_line(data: st.DataObject) -> N
         assert controller.plant.state[0] <= end.line_m
 
 
+def lines(controller: MotionController, tick: int) -> list[Neighbour]:
+    """Return the stop lines that a controller sees at a tick."""
+    return controller._stop_lines.lines(
+        controller.measured,
+        controller.hold_cell,
+        tick * controller.tick_s,
+        enters=not controller._must_stay_in_lane(tick),
+    )
+
+
 def test_the_line_counts_for_a_lane_that_the_vehicle_is_about_to_enter() -> None:
     (end,) = dead_ends(DROP)
     state = (end.line_m - 10.0, 15.0, 0.0, DROP.lattice.cell_y_m(1), 0.0, 0.0)
     controller = controller_in((0, 1), DROP, state=state)
-    assert controller._lines_ahead(state, 493) == []
+    assert lines(controller, 493) == []
     controller.hold_cell = (0, 0)
-    (line,) = controller._lines_ahead(state, 493)
+    (line,) = lines(controller, 493)
     assert (line.lane, line.speed_mps) == (0, 0.0)
     assert line.gap_m == pytest.approx(10.0)
 
@@ -279,7 +289,7 @@ def test_no_line_counts_in_a_lane_that_opens_again_for_a_move_behind_its_end(
     for tick in range(begin_tick, begin_tick + len(window.jerks)):
         s, v, a, y, v_y, a_y = controller.plant.state
         controller.perceive((s + error_m, v, a, y, v_y, a_y), controller.neighbours)
-        assert controller._lines_ahead(controller.measured, tick) == []
+        assert lines(controller, tick) == []
         controller.step(tick)
         assert controller.level is FallbackLevel.EXECUTE
 

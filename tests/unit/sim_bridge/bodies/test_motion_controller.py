@@ -11,13 +11,24 @@ from msgspec.structs import replace
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.motion import Jerk, cell_state
-from laneweave.protocol.wire.messages import Ballot, Command, CurrentMotion, Name, Neighbour
+from laneweave.protocol.wire.bounds import MAX_COLUMN
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Command,
+    CurrentMotion,
+    Name,
+    Neighbour,
+    PendingTransfer,
+)
+from laneweave.sim_bridge.bodies.command_checks import Problem, Refusal
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, MotionController
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Neighbours
-from laneweave.sim_bridge.bodies.record_store import MAX_COLUMN
+from laneweave.sim_bridge.bodies.record_store import MAX_CELLS
+from laneweave.sim_bridge.road.occupied_cells import OccupiedCells
 from support import states
+from support.convoy import ROLLING
 from support.paper import PAPER
-from support.road_vehicles import controller_in, known
+from support.road_vehicles import controller_in, known, vehicle_in
 from support.states import changed
 
 SCENARIO = PAPER
@@ -99,10 +110,16 @@ def test_a_command_without_jerks_leaves_the_motion_as_it_is_unless_it_names_anot
     controller.step(6)
     assert controller.plant.setpoint[0] == pytest.approx(2.0 * TICK_S)
     assert driven(controller) == {FallbackLevel.EXECUTE: 2}
-    assert controller.accept_command(command(7, hold_cell=(2, 1)))  # by the hold law
-    controller.step(7)
+    for tick in range(7, 200):  # by the hold law
+        controller.step(tick)
+    assert controller.accept_command(
+        replace(command(200, hold_cell=(2, 1)), motion=CurrentMotion((1, 1)))
+    )
+    controller.step(200)
     assert controller.hold_cell == (2, 1)
-    assert driven(controller) == {FallbackLevel.EXECUTE: 2, FallbackLevel.HOLD: 1}
+    assert driven(controller) == {FallbackLevel.EXECUTE: 3, FallbackLevel.HOLD: 193}
+    controller.step(201)
+    assert controller.plant.setpoint[0] > 0.0
 
 
 # --- the process in charge --------------------------------------------------------------------
@@ -331,7 +348,8 @@ def test_no_lane_change_begins_beside_another_body(
     assert controller.accept_command(command(1, (0.0, 0.1), hold_cell=there)) == accepted
     assert controller.hold_cell == (there if accepted else HOME)
     # A move within the lane may begin.
-    controller.hold_cell = HOME
+    controller = controller_in(HOME, incarnation=AGENT)
+    controller.perceive(controller.plant.state, seen)
     ahead: Cell = (HOME[0] + 1, HOME[1])
     assert controller.accept_command(command(2, (0.1, 0.0), hold_cell=ahead))
 
@@ -392,7 +410,7 @@ def test_a_body_that_had_to_brake_stays_in_its_lane(
     """Beside it are cells of others; one that is partly in the other lane goes on."""
     s, v, a, y, v_y, a_y = cell_state(LATTICE, HOME, 0.0)
     state = (s - behind_m, v - slower_mps, a, y + across_m, v_y, a_y)
-    controller = controller_in(HOME, incarnation=AGENT, state=state)
+    controller = controller_in(origin, incarnation=AGENT, state=state)
     there: Cell = (HOME[0], HOME[1] + 1)
     # The agent wants to move over, too.
     jerks = [(0.0, 2.0)] * 6 + [(0.0, 0.0)] * 20
@@ -413,3 +431,123 @@ def test_a_body_that_has_caught_up_changes_lanes(controller: MotionController) -
     for tick in range(300):
         controller.step(tick)
     assert controller.has_settled(300 * TICK_S)
+
+
+# --- commands that no correct agent sends -----------------------------------------------------
+
+
+def moved(tick: int, target: Cell, origin: Cell = HOME) -> Command:
+    """Return a command for a move."""
+    made = command(tick, (0.0, 0.0), hold_cell=target)
+    return replace(made, motion=CurrentMotion(origin, tick + 38))
+
+
+def refused(controller: MotionController, wrong: Command) -> Problem | None:
+    """Return why a controller refuses a command; None: it accepts it."""
+    before = known(controller)[3:]
+    if controller.accept_command(wrong):
+        return None
+    assert known(controller)[4:] == before[1:]  # but for the tick of the command
+    assert controller.refusal is not None
+    return controller.refusal.problem
+
+
+@pytest.mark.parametrize("target", [(2, 1), (0, 3), (1, 3), (-2, 0), (40, 1)])
+def test_moves_lead_to_neighbouring_cells(target: Cell) -> None:
+    five_lanes = evolve(SCENARIO, road=evolve(SCENARIO.road, lanes=5))
+    controller = controller_in(HOME, five_lanes, incarnation=AGENT)
+    assert refused(controller, moved(1, target)) is Problem.MOVE
+
+
+def test_a_move_begins_in_the_cell_of_the_vehicle(controller: MotionController) -> None:
+    assert refused(controller, moved(1, (1, 1), origin=(1, 2))) is Problem.MOVE
+    assert refused(controller, moved(2, HOME, origin=(3, 1))) is Problem.MOVE
+    assert refused(controller, moved(3, (1, 1))) is None
+
+
+def test_a_move_begins_when_the_last_one_is_complete(controller: MotionController) -> None:
+    assert refused(controller, moved(0, (1, 1))) is None
+    assert controller.occupied == {HOME, (1, 1)}
+    assert refused(controller, moved(1, (2, 1), origin=(1, 1))) is Problem.MOVE
+    for tick in range(1, 200):
+        controller.step(tick)
+    controller.end_move(200 * TICK_S)
+    assert controller.occupied == {(1, 1)}
+    assert refused(controller, moved(200, (2, 1), origin=(1, 1))) is None
+
+
+def test_a_type_that_keeps_its_column_changes_lanes_only() -> None:
+    controller = controller_in(HOME, KEEPING, incarnation=AGENT)
+    assert controller.occupied == {HOME}
+    assert refused(controller, moved(1, (1, 1))) is Problem.MOVE
+    assert refused(controller, moved(2, (0, 2))) is None
+
+
+def test_no_move_leads_through_a_cell_that_is_occupied(controller: MotionController) -> None:
+    other, gap = vehicle_in((1, 2), "B"), (0, 0)
+    vehicles = {Name("B"): other}
+    controller.occupancy = OccupiedCells(vehicles, lambda cell: cell == gap)
+    for tick, (target, occupant) in enumerate([((1, 2), "B"), ((1, 1), None)], start=1):
+        wrong = moved(tick, target)
+        assert refused(controller, wrong) is (Problem.OCCUPIED if occupant else None)
+        if occupant is not None:
+            assert controller.refusal == Refusal(Problem.OCCUPIED, occupant=occupant)
+    controller = controller_in(HOME, incarnation=AGENT)
+    controller.occupancy = OccupiedCells(vehicles, lambda cell: cell == gap)
+    assert refused(controller, moved(1, gap)) is Problem.OCCUPIED
+    # An oblique move takes the corners, too.
+    assert refused(controller, moved(2, (-1, 0))) is Problem.OCCUPIED
+    other.controller.leave_lattice()
+    assert refused(controller, moved(3, (1, 2))) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "allowed"),
+    [
+        ({"end_tick": 10**6}, False),
+        ({"end_tick": 2**62}, False),
+        ({"ticks": -1}, False),
+        ({"ticks": 2**40}, False),
+        ({"end_tick": 400, "ticks": 38}, True),
+    ],
+)
+def test_motions_end(
+    controller: MotionController, changes: dict[str, int], *, allowed: bool
+) -> None:
+    """An agent that takes over plans until their end."""
+    made = command(1, (0.0, 0.0))
+    made = replace(made, motion=replace(made.motion, **changes))
+    if allowed:
+        assert controller.accept_command(made)
+        return
+    with pytest.raises(BadInputError, match="motion"):
+        controller.accept_command(made)
+    assert controller.refusal == Refusal(Problem.VALUES)
+
+
+def test_a_trajectory_that_leads_out_of_the_cell_is_dropped(controller: MotionController) -> None:
+    controller.accept_command(command(0, *[(0.0, 8.0)] * 30))
+    tick = 0
+    while controller.refusal is None:
+        controller.step(tick)
+        tick += 1
+    assert controller.refusal.problem is Problem.LEAVES_CELLS
+    assert controller.refusal.excess_m > 0.0
+    while tick < 100:
+        controller.step(tick)
+        tick += 1
+        assert abs(controller.plant.state[3] - LATTICE.cell_y_m(HOME[1])) < 0.31
+    assert controller.level is FallbackLevel.HOLD
+
+
+def test_no_record_asks_for_cells_that_do_not_exist_or_for_too_many() -> None:
+    controller = controller_in(HOME, ROLLING, incarnation=AGENT)
+    controller.store.assign_cell(HOME)
+    ballot = Ballot(1, Name("c1"), 1, 1)
+    for after in (((0, 7),), ((2**40, 1),), tuple((n, 1) for n in range(MAX_CELLS + 1))):
+        transfer = PendingTransfer(ballot, (HOME,), after, (Name("me"),))
+        controller.store_requests(changed(command(1), promised=ballot, transfer=transfer))
+        assert controller.record.transfer is None
+    transfer = PendingTransfer(ballot, (HOME,), (HOME, (0, 2)), (Name("me"),))
+    controller.store_requests(changed(command(1), promised=ballot, transfer=transfer))
+    assert controller.record.transfer is not None

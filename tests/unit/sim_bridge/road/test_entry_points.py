@@ -189,7 +189,7 @@ def test_no_cell_has_two_owners_on_wide_ramps_and_exits(name: str) -> None:
         owned = [
             cell for one in road.vehicles.values() for cell in one.controller.store.possible_cells
         ]
-        assert not any(map(road.roadside._is_kept_free, owned))
+        assert not any(map(road.roadside.is_kept_free, owned))
     assert len(road.vehicles) + len(road.left) > 50
 
 

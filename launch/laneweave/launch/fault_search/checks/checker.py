@@ -14,6 +14,7 @@ machines of the processes, and shares no code with them.
 | `owner` | a cell has two owners (rolling operation, see `cell_ownership`) |
 | `trespass` | a body is in a cell that its vehicle does not own (rolling operation) |
 | `gate` | a motion begins before any vehicle of the plan has taken possession (rolling operation) |
+| `refused` | a motion controller refuses a command that no correct agent sends |
 | `closed` | a body is in a lane that has ended |
 | `monotone` | a process revokes a promise, an acceptance, progress, a join, or a takeover |
 | `leader` | a coordinator without a connection leads, or there is not one leader at the end |
@@ -201,10 +202,9 @@ class Checker:
             self._ownership.move(t_s, vehicle, ballot)
             self._check_members(t_s, vehicle, ballot)
 
-    def undrivable(self, t_s: float, vehicle: str, move: tuple[Cell, Cell]) -> None:
-        """Report a move that the type of a vehicle does not drive."""
-        text = f"its type does not drive from {move[0]} to {move[1]}"
-        self._report("motion", t_s, [vehicle], text)
+    def refused(self, t_s: float, vehicle: str, problem: str) -> None:
+        """Report a command that a motion controller has refused as none of a correct agent."""
+        self._report("refused", t_s, [vehicle], f"its command was refused: {problem}")
 
     def advance(self, t_s: float) -> None:
         """Check for overlaps since the last call, and close completed motions."""

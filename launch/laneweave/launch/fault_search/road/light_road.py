@@ -21,6 +21,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
 from laneweave.protocol.wire.messages import ClosedFormation, Command, Name, Plan, Prepare, Sense
+from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.recording.run_record import RecordedVehicle
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
@@ -77,7 +78,13 @@ class LightRoad:
         self.takeovers = 0
         """Number of takeovers by caretakers."""
         self._road = SimulatedRoad(
-            scenario, roadside, self, new_incarnation, self._new_vehicle, bridge
+            scenario,
+            roadside,
+            self,
+            new_incarnation,
+            self._new_vehicle,
+            bridge,
+            guards_cells=False,
         )
         self.vehicles = self._road.vehicles
         self._scenario = scenario
@@ -210,6 +217,10 @@ class LightRoad:
         if self.vehicles[Name(vehicle.name)].controller.off_lattice is None:
             self._checker.leave(self.began_s + t_s, vehicle.name)
 
+    def on_refused(self, t_s: float, vehicle: Name, refusal: Refusal) -> None:
+        """Report a refused command: agents are correct here."""
+        self._checker.refused(self.began_s + t_s, vehicle, refusal.problem.value)
+
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Let a body stop before the end of its lane, and come back; see `LaneEndControl`."""
         one, now_s = self.vehicles[vehicle], self.began_s + t_s
@@ -231,9 +242,6 @@ class LightRoad:
         name, cell, in_charge = vehicle.name, vehicle.cell, vehicle.controller.record.incarnation
         move = (held, cell)
         self._checker.begin(now_s, name, in_charge, move, lasts_s, vehicle.latest_s)
-        along, across = cell[0] - held[0], cell[1] - held[1]
-        if (along, across) not in self._scenario.types[vehicle.arrival.vehicle_type].moves:
-            self._checker.undrivable(now_s, name, move)
         vehicle.body.go(cell, now_s - self.began_s, lasts_s)
 
     def _report_stored(self, now_s: float, vehicle: LightVehicle) -> None:
