@@ -231,7 +231,11 @@ class RunSummary:
     safety: Safety
     ending: str | None = optional(
         "complete: all demanded vehicles have left; limit: runtime.max_road_s was reached; "
-        "interrupted: the run was stopped, or something failed"
+        "interrupted: the run was stopped, or something failed; unfinished: the run goes on, or "
+        "the process that recorded it was killed"
+    )
+    recorded_until_s: float | None = optional(
+        "road time until which the run is recorded, if the disk failed", "s"
     )
     planning: Planning
     tracking: Tracking

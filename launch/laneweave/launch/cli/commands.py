@@ -78,6 +78,11 @@ COMMANDS = {
         "report",
         "Write figures and a page for each finished run, and for a sweep or several runs together.",
     ),
+    "repair": CommandEntry(
+        "study_commands",
+        "repair",
+        "Complete the files of runs whose process was killed.",
+    ),
     "simulate": CommandEntry(
         "simulate_command",
         "simulate",

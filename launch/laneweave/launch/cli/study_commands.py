@@ -1,4 +1,4 @@
-"""`laneweave sweep`: make many runs; `laneweave report`: report finished ones."""
+"""`laneweave sweep`: make many runs; `report`: report them; `repair`: complete killed ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from laneweave.launch.cli.options import (
     parse_seeds,
 )
 from laneweave.launch.drawing.figures import FigureFormat
-from laneweave.launch.run.run_folder import timestamped_folder
+from laneweave.launch.run.run_folder import repair_run, timestamped_folder
 from laneweave.launch.run_methods import METHODS, KeepTrajectories
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
@@ -159,3 +159,18 @@ def report(
             typer.echo(f"{page}: written")
     except OSError as error:
         raise CommandFailedError(f"the report cannot be written: {error}") from error
+
+
+def repair(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Folders of runs.", show_default=False)
+    ],
+) -> None:
+    """Complete the files of runs whose process was killed.
+
+    Everything until a few seconds before remains: the summary of that time, which then says
+    `interrupted`, and the rows of all files.
+    """
+    for folder in folders:
+        summary = repair_run(folder)
+        typer.echo(f"{folder}: complete until {summary.simulated_s:g} s of road time")

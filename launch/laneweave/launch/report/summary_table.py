@@ -50,6 +50,8 @@ def _traffic_rows(summary: RunSummary, *, preferences: bool) -> Iterator[Row]:
     yield "vehicles entered", f"{vehicles.entered}"
     yield "vehicles left", f"{vehicles.left}"
     outside = vehicles.demanded - vehicles.entered
+    if summary.ending == "unfinished":
+        yield "unfinished: recorded until", f"{summary.simulated_s:.1f} s"
     if outside and summary.ending == "complete":
         yield "never entered: did not come to the corridor, or exit full", f"{outside}"
     for reason, count in sorted((vehicles.left_out or {}).items()):

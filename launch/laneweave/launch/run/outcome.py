@@ -136,6 +136,8 @@ def _violations(summary: RunSummary, *, interrupted: bool, of_sumo: bool) -> lis
     found = []
     if safety.overlaps:
         found.append(f"{safety.overlaps} pairs of vehicles overlapped")
+    if summary.recorded_until_s is not None:
+        found.append(f"the run is recorded until {summary.recorded_until_s:g} s: the disk failed")
     if interrupted:
         return found
     complete = summary.ending == "complete"

@@ -11,9 +11,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from attrs import evolve
+
 from laneweave.protocol.errors import BadInputError, RefusedError
+from laneweave.protocol.files import write_atomically
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.summary import SUMMARY_FILE, read_summary
+from laneweave.protocol.summary import SUMMARY_FILE, RunSummary, read_summary, write_summary
 from laneweave.protocol.wire.events import ENTERED
 
 LOG_FILE = "log.jsonl"
@@ -25,6 +28,8 @@ EARLY_FILES = frozenset(
     (LOG_FILE, EVENTS_FILE, SUMMARY_FILE, "ticks.parquet", "trajectories.parquet", "trips.parquet")
 )
 """Files that an interrupted run may have before a vehicle enters."""
+INTERRUPTED, UNFINISHED = "interrupted", "unfinished"
+"""Values of `ending` in the summary."""
 FOLDER_RULE = "a new or empty folder"
 
 
@@ -124,4 +129,31 @@ def _is_unused(folder: Path) -> bool:
     if not (folder / SUMMARY_FILE).exists():
         return True
     summary = read_summary(folder)
-    return summary is not None and summary.ending == "interrupted"
+    return summary is not None and summary.ending in (INTERRUPTED, UNFINISHED)
+
+
+def repair_run(folder: Path) -> RunSummary:
+    """Complete the files of a run whose process was killed, and return its summary.
+
+    Raises:
+        BadInputError: the folder is not that of a killed run: it has no summary, the run has ended,
+            or it goes on.
+    """
+    summary = read_summary(folder)
+    if summary is None:
+        allowed = "the folder of a run that was killed after its first seconds"
+        raise BadInputError("DIR", str(folder), allowed)
+    if summary.ending != UNFINISHED:
+        raise BadInputError("DIR", f"{folder} ({summary.ending})", "a run that was killed")
+    try:
+        with (folder / LOG_FILE).open("ab") as log:
+            _lock(log.fileno(), fcntl.LOCK_EX)
+    except BlockingIOError as error:
+        raise BadInputError("DIR", f"{folder} (in use)", "a run that was killed") from error
+    events = folder / EVENTS_FILE
+    lines = events.read_bytes()
+    if not lines.endswith(b"\n"):
+        write_atomically(events, lines[: lines.rfind(b"\n") + 1].decode())
+    summary = evolve(summary, ending=INTERRUPTED)
+    write_summary(folder, summary)
+    return summary

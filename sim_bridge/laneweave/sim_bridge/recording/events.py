@@ -15,16 +15,18 @@ import numpy as np
 from laneweave.protocol.scenario.formation_table import SOLVERS, solver_of_event
 from laneweave.protocol.summary import Planning, PlanningMs
 from laneweave.protocol.wire.events import PLAN_EVENTS
+from laneweave.sim_bridge.recording.disk import Disk
 from laneweave.sim_bridge.recording.trips import percentiles_of
 
 
 class Events:
     """Writer of events, each of which is in the file at once."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, disk: Disk | None = None) -> None:
         """Open the file."""
         self._path = path
-        self._file = path.open("w", encoding="utf-8", buffering=1)
+        self._disk = disk or Disk()
+        self._file = path.open("wb", buffering=0)
 
     def add(self, t_s: float, kind: str, data: Mapping[str, object]) -> None:
         """Write an event; after `close`, ignore it.
@@ -32,9 +34,11 @@ class Events:
         Values that JSON does not support are written as text; keys `t_s` and `kind` in the data are
         ignored.
         """
-        if not self._file.closed:
+        if not self._file.closed and self._disk.works:
             own: dict[str, object] = {"t_s": t_s, "kind": kind}
-            self._file.write(json.dumps({**own, **data, **own}, default=str) + "\n")
+            line = json.dumps({**own, **data, **own}, default=str) + "\n"
+            with self._disk.writing():
+                self._file.write(line.encode())
 
     def close(self) -> None:
         """Close the file. Idempotent."""
@@ -65,7 +69,10 @@ class Events:
 
     def _plans(self) -> Iterator[dict[str, Any]]:
         with self._path.open(encoding="utf-8") as lines:
-            for event in map(json.loads, lines):
+            for line in lines:
+                if not line.endswith("\n"):
+                    return  # the disk was full
+                event = json.loads(line)
                 if event["kind"] in PLAN_EVENTS:
                     yield event
 

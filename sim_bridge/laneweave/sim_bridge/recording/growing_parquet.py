@@ -3,17 +3,23 @@
 A Parquet file ends with a footer that lists its row groups. Each batch is written over the footer,
 together with a new one, in a single write. So a file can be read during the run, and a process that
 is killed loses only the rows that it has not written yet.
+
+Large row groups are small and fast to read. So that rows need not wait for one to fill up, they can
+be written as a provisional row group, over which the next batch is written.
 """
 
 from __future__ import annotations
 
 import io
+import os
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+
+from laneweave.sim_bridge.recording.disk import Disk
 
 _MAGIC = b"PAR1"
 """First and last bytes of a Parquet file. The footer's length precedes the last ones."""
@@ -25,23 +31,51 @@ _MAX_OVERHEAD_BYTES = 1 << 20
 class GrowingParquet:
     """Writer of a Parquet file with one row group per batch."""
 
-    def __init__(self, path: Path, schema: pa.Schema, **options: Any) -> None:  # noqa: ANN401 (pyarrow's)
-        """Create the file without rows; `options` are those of `pyarrow.parquet.ParquetWriter`."""
+    def __init__(
+        self,
+        path: Path,
+        schema: pa.Schema,
+        disk: Disk | None = None,
+        **options: Any,  # noqa: ANN401 (pyarrow's)
+    ) -> None:
+        """Create the file without rows.
+
+        Args:
+            path: the file.
+            schema: its columns and metadata.
+            disk: errors of its disk, after which no rows are written.
+            options: those of `pyarrow.parquet.ParquetWriter`.
+
+        Raises:
+            OSError: the file cannot be created.
+        """
         self.schema = schema
+        self._disk = disk or Disk()
         self._options = {"compression": "zstd", **options}
         self._file = path.open("wb")
         self._file.write(_MAGIC)
         self._end = len(_MAGIC)
         """Position behind the last row group, where the footer begins."""
         _, self._metadata = self._row_group(pa.RecordBatch.from_pylist([], schema))
-        self._write(b"")
+        self._write(b"", self._metadata)
 
-    def append(self, batch: pa.RecordBatch) -> None:
-        """Write rows as one row group."""
-        if batch.num_rows:
-            rows, metadata = self._row_group(batch)
-            self._metadata.append_row_groups(metadata)
-            self._write(rows)
+    def append(self, batch: pa.RecordBatch, *, provisional: bool = False) -> None:
+        """Write rows as one row group, in place of a provisional one.
+
+        Args:
+            batch: the rows.
+            provisional: whether the next row group is to be written over this one.
+        """
+        if not batch.num_rows or not self._disk.works:
+            return
+        with self._disk.writing():
+            rows, added = self._row_group(batch)
+            metadata = self._metadata
+            if provisional:
+                metadata = pq.read_metadata(io.BytesIO(_footer(metadata)))
+            metadata.append_row_groups(added)
+            self._write(rows, metadata)
+            self._end += 0 if provisional else len(rows)
 
     def close(self) -> None:
         """Close the file. Idempotent."""
@@ -68,11 +102,20 @@ class GrowingParquet:
         footer_bytes = int.from_bytes(written[-tail_bytes : -len(_MAGIC)], "little")
         return written[: -tail_bytes - footer_bytes], metadata[0]
 
-    def _write(self, rows: bytes) -> None:
-        """Replace the footer by rows and a new footer."""
-        footer = io.BytesIO()
-        self._metadata.write_metadata_file(footer)
-        self._file.seek(self._end)
-        self._file.write(rows + footer.getvalue()[len(_MAGIC) :])
+    def _write(self, rows: bytes, metadata: pq.FileMetaData) -> None:
+        """Replace what follows the last row group by rows and a footer."""
+        data = rows + _footer(metadata)[len(_MAGIC) :]
         self._file.flush()
-        self._end += len(rows)
+        # On a full disk, what was written stays readable.
+        os.posix_fallocate(self._file.fileno(), self._end, len(data))
+        self._file.seek(self._end)
+        self._file.write(data)
+        self._file.flush()
+        self._file.truncate(self._end + len(data))
+
+
+def _footer(metadata: pq.FileMetaData) -> bytes:
+    """Return a Parquet file with metadata only."""
+    footer = io.BytesIO()
+    metadata.write_metadata_file(footer)
+    return footer.getvalue()

@@ -9,6 +9,9 @@ The Parquet files are written in row groups during the run, and can be read afte
 the record stores only what is on the road or not written yet, however long the run is. The summary
 is computed from the files when the run ends.
 
+Every `SAVE_EVERY_S`, all rows and a summary until then are saved, with the ending `unfinished`: a
+process that is killed loses no more. If the disk fails, recording stops, and the run goes on.
+
 The metadata of the first two files contain the scenario as JSON (`columns.SCENARIO_KEY`), so that
 figures can be drawn from these files alone. The columns are declared in the module `columns`.
 """
@@ -16,6 +19,7 @@ figures can be drawn from these files alone. The columns are declared in the mod
 from __future__ import annotations
 
 import math
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
@@ -27,6 +31,7 @@ from typing import Protocol
 import pyarrow as pa
 from attrs import define, evolve, field
 
+from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import END_OF_ROAD, Exits, LaneSection
 from laneweave.protocol.scenario.fields import Scenario
@@ -58,6 +63,7 @@ from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEven
 from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
+from laneweave.sim_bridge.recording.disk import Disk
 from laneweave.sim_bridge.recording.events import Events
 from laneweave.sim_bridge.recording.reports import ReportTotals
 from laneweave.sim_bridge.recording.ticks import Ticks
@@ -65,6 +71,8 @@ from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import Trip, Trips, metadata_of, throughput, travel_time
 from laneweave.sim_bridge.road.demand import Arrival
 
+SAVE_EVERY_S = 8.0
+"""Wall time between two savings of a run that goes on."""
 REPEAT_REFUSAL_S = 10.0
 """Shortest time between two events for refused commands of a vehicle, for one reason."""
 NONE_LEFT_OUT: Mapping[str, int] = MappingProxyType({})
@@ -136,6 +144,8 @@ class Ending(Enum):
     """The run was stopped, or something failed."""
     LIMIT = "limit"
     """`max_road_s` was reached."""
+    UNFINISHED = "unfinished"
+    """The run goes on, or its process was killed."""
 
 
 class RunRecord:
@@ -157,24 +167,35 @@ class RunRecord:
             method: value of `laneweave run --method`.
             stopwatch: returns the wall time [s].
             left_out: number of vehicles that the run leaves out, by reason.
+
+        Raises:
+            CommandFailedError: a file cannot be created.
         """
-        folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._scenario = scenario
         self._method = method
         self._stopwatch = stopwatch
         self._began = stopwatch()
+        self._saved_s = time.monotonic()
+        """Time at which everything was last saved."""
+        self._disk = disk = Disk()
         metadata = metadata_of(scenario)
-        self._events = Events(folder / "events.jsonl")
-        self._trajectories = Trajectories(
-            folder / "trajectories.parquet",
-            metadata,
-            scenario.lattice,
-            max(own.limits.min_accel_mps2 for own in scenario.types.values()),
-            self._min_accel_of if scenario.vehicle_type else None,
-        )
-        self._trips = Trips(folder / "trips.parquet", metadata)
-        self._ticks = Ticks(folder / "ticks.parquet")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._events = Events(folder / "events.jsonl", disk)
+            self._trajectories = Trajectories(
+                folder / "trajectories.parquet",
+                metadata,
+                scenario.lattice,
+                max(own.limits.min_accel_mps2 for own in scenario.types.values()),
+                self._min_accel_of if scenario.vehicle_type else None,
+                disk,
+            )
+            self._trips = Trips(folder / "trips.parquet", metadata, disk)
+            self._ticks = Ticks(folder / "ticks.parquet", disk)
+        except OSError as error:
+            text = f"{folder}: the run cannot be recorded: {error.strerror or error}"
+            raise CommandFailedError(text) from error
         self._leadership = _Leadership()
         self._reports = ReportTotals()
         self._level_ticks: Counter[FallbackLevel] = Counter()
@@ -184,6 +205,8 @@ class RunRecord:
         """Time of the last event for a refused command, by vehicle and reason."""
         self._exits = Exits(scenario.geometry.sections, scenario.road.length_m)
         self._closed = False
+        self._recorded_s = 0.0
+        """Road time until which everything is on the disk."""
         self.missed_ticks = 0
         """Number of answers that were missing at their tick's deadline."""
 
@@ -333,6 +356,18 @@ class RunRecord:
     def on_tick(self, t_s: float, on_road: int, duration_s: float) -> None:
         """Record the duration of a tick."""
         self._ticks.add(t_s, on_road, duration_s)
+        if time.monotonic() >= self._saved_s + SAVE_EVERY_S:
+            self.save(t_s)
+            self._saved_s = time.monotonic()
+
+    def save(self, t_s: float) -> None:
+        """Save all rows, and a summary until road time `t_s`: the process may be killed."""
+        for file in (self._trajectories, self._trips, self._ticks):
+            file.save()
+        with self._disk.writing():
+            if self._disk.works:
+                self._write_summary(t_s, Ending.UNFINISHED)
+                self._recorded_s = t_s
 
     # --- the other roles ----------------------------------------------------------------------
 
@@ -379,6 +414,10 @@ class RunRecord:
         with ExitStack() as closing:
             for file in (self._events, self._trajectories, self._trips, self._ticks):
                 closing.callback(file.close)
+        with self._disk.writing():
+            self._write_summary(t_s, ending)
+
+    def _write_summary(self, t_s: float, ending: Ending) -> None:
         write_summary(self._folder, self._summary(self._trips.table(), t_s, ending))
 
     def _summary(self, trips: pa.Table, t_s: float, ending: Ending) -> RunSummary:
@@ -410,6 +449,7 @@ class RunRecord:
             throughput_veh_per_lane_h=throughput(trips, scenario.road.lanes),
             safety=evolve(self._trajectories.safety(), commands_refused=self._counts.refused),
             ending=ending.value,
+            recorded_until_s=None if self._disk.works else round(self._recorded_s, 6),
             planning=self._events.planning(),
             tracking=self._tracking(),
             runtime=RuntimeFigures(

@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 
 from laneweave.protocol.summary import DurationMs
 from laneweave.sim_bridge.recording.columns import TICKS
+from laneweave.sim_bridge.recording.disk import Disk
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 from laneweave.sim_bridge.recording.trips import percentiles_of
 
@@ -21,10 +22,10 @@ ROWS_PER_GROUP = 3000
 class Ticks:
     """Writer of the durations of ticks."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, disk: Disk | None = None) -> None:
         """Open the file."""
         self._path = path
-        self._file = GrowingParquet(path, TICKS.arrow_schema())
+        self._file = GrowingParquet(path, TICKS.arrow_schema(), disk)
         self._rows: list[tuple[float, int, float]] = []
         """Buffered rows."""
 
@@ -33,6 +34,10 @@ class Ticks:
         self._rows.append((t_s, on_road, duration_s * 1e3))
         if len(self._rows) >= ROWS_PER_GROUP:
             self._write_rows()
+
+    def save(self) -> None:
+        """Write the buffered rows as a provisional row group."""
+        self._write_rows(provisional=True)
 
     def close(self) -> None:
         """Write the buffered rows, and close the file."""
@@ -44,12 +49,15 @@ class Ticks:
         tick_ms = pq.read_table(self._path, columns=["tick_ms"])["tick_ms"].to_numpy()
         return DurationMs(**percentiles_of(tick_ms.astype(np.float64), 50, 99))
 
-    def _write_rows(self) -> None:
+    def _write_rows(self, *, provisional: bool = False) -> None:
         if not self._rows:
             return
-        columns, self._rows = zip(*self._rows, strict=True), []
+        columns = zip(*self._rows, strict=True)
         arrays = [
             pa.array(values, column.type)
             for values, column in zip(columns, TICKS.columns, strict=True)
         ]
-        self._file.append(pa.RecordBatch.from_arrays(arrays, schema=self._file.schema))
+        batch = pa.RecordBatch.from_arrays(arrays, schema=self._file.schema)
+        self._file.append(batch, provisional=provisional)
+        if not provisional:
+            self._rows = []

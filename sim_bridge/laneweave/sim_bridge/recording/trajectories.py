@@ -16,6 +16,7 @@ from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.summary import HARD_BRAKE_MPS2, Safety
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.columns import TRAJECTORIES, Metadata
+from laneweave.sim_bridge.recording.disk import Disk
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 from laneweave.sim_bridge.recording.trips import finite
 
@@ -66,6 +67,7 @@ class Trajectories:
         lattice: Lattice,
         min_accel_mps2: float,
         min_accel_of: Callable[[str], float] | None = None,
+        disk: Disk | None = None,
     ) -> None:
         """Open the file.
 
@@ -75,12 +77,14 @@ class Trajectories:
             lattice: the lattice of the scenario.
             min_accel_mps2: braking limit of the type that brakes least.
             min_accel_of: returns the braking limit of a vehicle; None: it is that of all.
+            disk: errors of its disk.
         """
         self.peak = 0
         """Maximum number of vehicles on the road at a tick."""
         self._file = GrowingParquet(
             path,
             TRAJECTORIES.arrow_schema(metadata),
+            disk,
             use_dictionary=[one.name for one in TRAJECTORIES.columns if one.type != pa.float32()],
             use_byte_stream_split=[
                 one.name for one in TRAJECTORIES.columns if one.type == pa.float32()
@@ -155,23 +159,30 @@ class Trajectories:
             max_jerk_mps3=finite(self._max_jerk_mps3),
         )
 
+    def save(self) -> None:
+        """Write the buffered rows as a provisional row group."""
+        self._write_rows(provisional=True)
+
     def close(self) -> None:
         """Write the buffered rows, and close the file."""
         with closing(self._file):
             self._write_rows()
 
-    def _write_rows(self) -> None:
+    def _write_rows(self, *, provisional: bool = False) -> None:
         """Write the buffered rows as one row group."""
-        self._buffered_ticks = 0
+        if not provisional:
+            self._buffered_ticks = 0
         if not self._rows:
             return
         samples = dict(zip(_SAMPLED, zip(*self._rows, strict=True), strict=True))
         values: dict[str, Any] = {"t_s": np.array(self._times), **samples}
-        self._times, self._rows = [], []
+        if not provisional:
+            self._times, self._rows = [], []
         s_m, y_m = np.array(values["s_m"]), np.array(values["y_m"])
         columns, lanes = body_cells(values["t_s"], s_m, y_m, self._lattice)
         no_lattice = np.array([one is None for one in values["reserved_column"]])
         values |= {"column": pa.array(columns, mask=no_lattice), "lane": lanes}
         values |= {"s_m": s_m.astype(np.float32), "y_m": y_m.astype(np.float32)}
         arrays = [pa.array(values[one.name], one.type) for one in TRAJECTORIES.columns]
-        self._file.append(pa.RecordBatch.from_arrays(arrays, schema=self._file.schema))
+        batch = pa.RecordBatch.from_arrays(arrays, schema=self._file.schema)
+        self._file.append(batch, provisional=provisional)

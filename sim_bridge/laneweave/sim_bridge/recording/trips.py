@@ -23,6 +23,7 @@ from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.summary import TravelTime, TripTimes
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.recording.columns import SCENARIO_KEY, TRIPS, Metadata
+from laneweave.sim_bridge.recording.disk import Disk
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 from laneweave.sim_bridge.road.demand import Arrival
 
@@ -97,11 +98,11 @@ def trips_table(trips: Iterable[Trip], last_arrival_s: float, metadata: Metadata
 class Trips:
     """Writer of trips, in order of arrival; stores only those that it has not written yet."""
 
-    def __init__(self, path: Path, metadata: Metadata) -> None:
+    def __init__(self, path: Path, metadata: Metadata, disk: Disk | None = None) -> None:
         """Open the file."""
         self._path = path
         self._metadata = metadata
-        self._file = GrowingParquet(path, TRIPS.arrow_schema(metadata))
+        self._file = GrowingParquet(path, TRIPS.arrow_schema(metadata), disk)
         self._trips: dict[Name, Trip] = {}
         """Trips that are not written yet, in order of arrival."""
         self._last_arrival_s = -math.inf
@@ -118,22 +119,27 @@ class Trips:
         final = list(takewhile(lambda trip: trip.is_final(self._last_arrival_s), first))
         if len(final) == ROWS_PER_GROUP:
             self._write(final)
+            for one in final:
+                del self._trips[Name(one.arrival.vehicle)]
+
+    def save(self) -> None:
+        """Write the remaining trips as a provisional row group."""
+        self._write(self._trips.values(), provisional=True)
 
     def close(self) -> None:
         """Write the remaining trips, and close the file."""
         with closing(self._file):
-            self._write(list(self._trips.values()))
+            self._write(self._trips.values())
 
     def table(self) -> pa.Table:
         """Return all trips, read from the file."""
         return pq.read_table(self._path)
 
-    def _write(self, trips: list[Trip]) -> None:
-        """Write trips as one row group, and discard them."""
+    def _write(self, trips: Iterable[Trip], *, provisional: bool = False) -> None:
+        """Write trips as one row group."""
         rows = [trip.row(self._last_arrival_s) for trip in trips]
-        self._file.append(pa.RecordBatch.from_pylist(rows, self._file.schema))
-        for trip in trips:
-            del self._trips[Name(trip.arrival.vehicle)]
+        batch = pa.RecordBatch.from_pylist(rows, self._file.schema)
+        self._file.append(batch, provisional=provisional)
 
 
 def travel_time(trips: pa.Table) -> TravelTime:

@@ -8,11 +8,12 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from attrs import evolve
 
-from laneweave.launch.run.run_folder import EVENTS_FILE, LOG_FILE, new_folder
+from laneweave.launch.run.run_folder import EVENTS_FILE, LOG_FILE, new_folder, repair_run
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.summary import write_summary
+from laneweave.protocol.summary import read_summary, write_summary
 from support.summaries import make_summary
 
 
@@ -91,3 +92,43 @@ def test_results_and_files_of_others_are_never_removed(tmp_path: Path) -> None:
         before = sorted(folder.iterdir())
         assert refusal(folder).endswith("a new or empty folder")
         assert sorted(folder.iterdir()) == before
+
+
+# --- killed runs ------------------------------------------------------------------------------
+
+
+def killed(folder: Path, ending: str = "unfinished") -> Path:
+    write_events(folder, "entered", "left")
+    (folder / LOG_FILE).touch()
+    write_summary(folder, evolve(make_summary(), ending=ending))
+    return folder
+
+
+def test_the_files_of_a_killed_run_are_completed(tmp_path: Path) -> None:
+    folder = killed(tmp_path / "run")
+    assert repair_run(folder).ending == "interrupted"
+    summary = read_summary(folder)
+    assert summary is not None
+    assert summary.ending == "interrupted"
+    events = (folder / EVENTS_FILE).read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["kind"] for line in events] == ["entered", "left"]
+
+
+@pytest.mark.parametrize("ending", ["complete", "limit", "interrupted"])
+def test_a_run_that_has_ended_is_not_repaired(tmp_path: Path, ending: str) -> None:
+    folder = killed(tmp_path / "run", ending)
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(BadInputError, match=ending):
+        repair_run(folder)
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_run_that_goes_on_is_not_repaired(tmp_path: Path, claims: ExitStack) -> None:
+    folder = killed(claim(claims, tmp_path / "run"))
+    with pytest.raises(BadInputError, match="in use"):
+        repair_run(folder)
+
+
+def test_a_folder_without_a_summary_is_not_repaired(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="killed after its first seconds"):
+        repair_run(tmp_path)

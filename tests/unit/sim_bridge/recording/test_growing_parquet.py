@@ -88,3 +88,53 @@ def test_a_killed_process_loses_only_what_it_has_not_written(tmp_path: Path) -> 
     ended = subprocess.run([sys.executable, "-c", WRITE_AND_DIE, path], timeout=60, check=False)
     assert ended.returncode == -signal.SIGKILL
     assert pq.read_table(path)["number"].to_pylist() == list(range(30))
+
+
+def test_the_next_batch_replaces_a_provisional_one(tmp_path: Path) -> None:
+    path = tmp_path / "file.parquet"
+    with closing(GrowingParquet(path, SCHEMA)) as file:
+        file.append(batch(0, 10))
+        for count in (3000, 5000, 20):
+            file.append(batch(10, count), provisional=True)
+            assert pq.read_table(path).to_pylist() == rows(0, 10 + count)
+        assert path.stat().st_size < 5000  # nothing is left of the longer ones
+        file.append(batch(10, 0))
+        file.append(batch(10, 30))
+        file.append(batch(40, 5), provisional=True)
+    assert pq.read_table(path).to_pylist() == rows(0, 45)
+    assert pq.ParquetFile(path).num_row_groups == 3
+
+
+WRITE_TOO_MUCH = """
+import resource, sys
+from pathlib import Path
+import pyarrow as pa
+from laneweave.sim_bridge.recording.disk import Disk
+from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
+
+schema = pa.schema([pa.field("number", pa.int64())])
+disk = Disk()
+file = GrowingParquet(Path(sys.argv[1]), schema, disk, compression="none", use_dictionary=False)
+numbers = iter(range(1000))
+for size in (10, 10, 100_000, 10):
+    if size > 10:
+        limit = Path(sys.argv[1]).stat().st_size + 1000
+        # The copy of a row group is larger than the file, so it reaches the limit, too.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    rows = [{"number": number} for number in range(size)]
+    file.append(pa.RecordBatch.from_pylist(rows, schema))
+    print(disk.works)
+file.close()
+"""
+
+
+@pytest.mark.slow
+def test_what_was_written_before_the_disk_was_full_can_be_read(tmp_path: Path) -> None:
+    path = tmp_path / "file.parquet"
+    command = [sys.executable, "-c", WRITE_TOO_MUCH, str(path)]
+    ended = subprocess.run(command, timeout=60, check=True, capture_output=True, text=True)
+    assert [line for line in ended.stdout.split() if line in ("True", "False")] == [
+        *("True", "True", "False", "False")
+    ]
+    assert ended.stdout.count("no longer recorded") + ended.stderr.count("no longer recorded") == 1
+    assert pq.read_table(path)["number"].to_pylist() == [*range(10), *range(10)]

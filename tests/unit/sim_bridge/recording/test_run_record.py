@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import struct
 from collections.abc import Iterator
 from itertools import count
@@ -12,7 +14,9 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 from attrs import evolve
+from structlog.testing import capture_logs
 
+from laneweave import load_run
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report
@@ -319,3 +323,58 @@ def test_events_are_written_at_once_and_begin_with_the_time(
     record.event(2.0, "odd", t_s=99, kind="other", more=[1, 2])
     (odd,) = read_events(tmp_path, "odd")
     assert odd == {"t_s": 2.0, "kind": "odd", "role": "bridge", "more": [1, 2]}
+
+
+# --- while it goes on -------------------------------------------------------------------------
+
+
+def drive(record: RunRecord, one: RoadVehicle, ticks: range) -> None:
+    for tick in ticks:
+        t_s = round(0.1 * tick, 6)
+        record.on_positions(t_s, [one], overlaps=(), collisions=(), gaps=NO_GAPS)
+        record.on_tick(t_s, 1, 0.001)
+
+
+def test_a_run_that_goes_on_can_be_read(record: RunRecord, tmp_path: Path) -> None:
+    one = vehicle()
+    record.on_demanded(one.arrival)
+    record.on_entered(one)
+    for until in (30, 50):
+        drive(record, one, range(until - 20, until, 2))
+        record.save(0.1 * until)
+        run = load_run(tmp_path)
+        assert (run.summary.ending, run.summary.simulated_s) == ("unfinished", 0.1 * until)
+        assert run.summary.vehicles.entered == 1
+        assert run.trips()["vehicle"].to_pylist() == ["v0001"]
+        assert run.trajectories().num_rows == run.ticks().num_rows == (until - 10) // 2
+    record.close(5.0, Ending.COMPLETE)
+    run = load_run(tmp_path)
+    assert run.summary.ending == "complete"
+    assert (run.trips().num_rows, run.ticks().num_rows, run.trajectories().num_rows) == (1, 20, 20)
+
+
+def test_a_run_goes_on_when_its_disk_fails(
+    record: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = vehicle()
+    record.on_demanded(one.arrival)
+    record.on_entered(one)
+    drive(record, one, range(10))
+    record.save(1.0)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch, capture_logs() as logs:
+        patch.setattr(os, "posix_fallocate", full)
+        drive(record, one, range(10, 20))
+        record.save(2.0)
+        record.save(2.5)
+        record.event(2.5, "overlap", vehicles=["A", "B"])
+    assert [line["reason"] for line in logs] == ["No space left on device"]
+    # There may be room again, but what was missed is not recorded.
+    record.close(3.0, Ending.COMPLETE)
+    run = load_run(tmp_path)
+    assert (run.summary.ending, run.summary.recorded_until_s) == ("complete", 1.0)
+    assert run.trajectories().num_rows == 10
+    assert not run.events("overlap")
